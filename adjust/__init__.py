@@ -1,0 +1,1 @@
+"""The mathematics of a photogrammetric survey adjustment: values in, values out."""

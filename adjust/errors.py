@@ -1,0 +1,20 @@
+"""What a user can cause and mend; everything else is a bug and keeps its traceback."""
+
+
+class SurveyError(Exception):
+    """Something in the survey that its owner can put right; the message says where, what was found and what to do."""
+
+
+class IndeterminateError(SurveyError):
+    """The observations and the datum leave some unknowns undetermined.
+
+    ``parameters`` names them, strongest share first.
+    """
+
+    def __init__(self, message: str, parameters: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.parameters = parameters
+
+
+class NotConvergedError(SurveyError):
+    """The adjustment did not reach a minimum; the message says what kept moving."""

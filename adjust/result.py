@@ -1,0 +1,128 @@
+"""What an adjustment gives back. Every estimated quantity is one ``Estimate`` under its ``ParameterName``."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from gtsam import Pose3
+
+from adjust.model import BoolArray, FloatArray, IntArray, Survey
+
+# ("lens", camera) ("station_from_camera", camera) ("world_from_station", station[, epoch]) ("mount_from_station", station)
+# ("world_from_table", table) ("table_geometry", table) ("table_angles", table, epoch)
+# ("carrier_from_target", target[, epoch]) ("warp", target) ("point", point)
+ParameterName = tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The adjusted value of one parameter.
+
+    value: Pose3, or (n,) for lens, table, warp and point parameters.
+    components: names of the n (6 for a pose) components: rx ry rz tx ty tz, x y z, fx fy ...
+    units: unit inside, one per component (rad, m, px, mm, 1, ...).
+    cov: (n, n) in the tangent, zero rows for held components, *a priori* (not scaled by sigma0).
+    status: per component "free", "held", "prior" or "tied".
+    """
+
+    name: ParameterName
+    value: Pose3 | FloatArray
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    cov: FloatArray
+    status: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageResiduals:
+    """Residuals of all image points, block after block in the order of ``Survey.image_blocks``.
+
+    block_ptr: (B + 1,) row ranges. residuals: (N, 2) px, predicted minus observed. redundancy: (N, 2) of the whitened
+    components. standardized: (N, 2) px-direction residual over its own sigma. test: (N,) v' inv(Q_vv) v, chi-square
+    with 2 degrees of freedom. used: (N,).
+    """
+
+    block_ptr: IntArray
+    residuals: FloatArray
+    redundancy: FloatArray
+    standardized: FloatArray
+    test: FloatArray
+    used: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationResidual:
+    """One observation that is not an image point: (k,) components in SI units.
+
+    kind: table, pair, distance, coordinates, prior. ids: what it joins, for people.
+    """
+
+    kind: str
+    group: str
+    ids: tuple[str, ...]
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    observed: FloatArray
+    adjusted: FloatArray
+    residual: FloatArray
+    sigma: FloatArray
+    redundancy: FloatArray
+    standardized: FloatArray
+    test: float
+    used: bool
+
+
+@dataclass(frozen=True)
+class GroupSummary:
+    """Redundancy and weighted square sum of one group; ``factor`` is its variance component Omega / r."""
+
+    group: str
+    n_observations: int
+    redundancy: float
+    omega: float
+
+    @property
+    def factor(self) -> float:
+        """Estimated variance factor of the group, nan where the group has no redundancy."""
+        return self.omega / self.redundancy if self.redundancy > 1e-9 else float("nan")
+
+
+@dataclass(frozen=True)
+class GlobalTest:
+    """Chi-square test of sigma0 (two-sided): passed when ``lower <= omega <= upper``."""
+
+    omega: float
+    redundancy: int
+    alpha: float
+    lower: float
+    upper: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the weighted square sum agrees with the a priori sigmas."""
+        return self.lower <= self.omega <= self.upper
+
+
+@dataclass(frozen=True, eq=False)
+class Adjustment:
+    """A solved survey with its precision.
+
+    sigma0: a posteriori standard deviation of unit weight (a priori is 1). omega: v'Pv. iterations: steps taken.
+    max_step: the last step in sigmas of the unknowns. warnings: for people, worst first.
+    """
+
+    survey: Survey
+    estimates: Mapping[ParameterName, Estimate]
+    image_residuals: ImageResiduals
+    other_residuals: tuple[ObservationResidual, ...]
+    groups: tuple[GroupSummary, ...]
+    n_observations: int
+    n_unknowns: int
+    datum_defect: int
+    redundancy: int
+    omega: float
+    sigma0: float
+    global_test: GlobalTest | None
+    iterations: int
+    max_step: float
+    converged: bool
+    warnings: tuple[str, ...]

@@ -1,0 +1,1 @@
+"""Cameras, turntables and the capture session."""

@@ -1,0 +1,1 @@
+"""The jobs around the adjustment: project folders, target detection, reports, the command ``labsurvey``."""
