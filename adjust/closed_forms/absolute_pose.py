@@ -1,0 +1,186 @@
+"""Pose of a camera from known points and the rays to them: all solutions, then refinement of many views at once."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from adjust.closed_forms.rigid import rigid, rotation_exp, rotation_to, skew
+from adjust.errors import SurveyError
+from adjust.model import BoolArray, FloatArray, IntArray
+
+_PLANAR = 1e-4  # thickness against extent below which points count as a plane
+_WIDEST = np.cos(np.deg2rad(80.0))  # rays further off the mean direction are left to the refinement
+
+
+@dataclass(frozen=True, eq=False)
+class PoseCandidates:
+    """All poses that explain a view, best first.
+
+    camera_from_target: (k, 4, 4). error: (k,) rms of the angles between rays and points, rad.
+    """
+
+    camera_from_target: FloatArray
+    error: FloatArray
+
+
+def absolute_pose(x: FloatArray, rays: FloatArray, refinements: int = 5) -> PoseCandidates:
+    """Poses from points (n, 3) m in the target and unit rays (n, 3) in the camera; needs three points not on a line.
+
+    Three points: P3P (Ding et al., CVPR 2023, in OpenCV), up to four solutions. Planar: IPPE (Collins and Bartoli,
+    IJCV 109, 2014), both solutions. Otherwise SQPnP (Terzakis and Lourakis, ECCV 2020), from six points on also EPnP.
+    Each is refined on the angles. Rays may lie in any direction: they are turned to the mean one first.
+    Raises SurveyError for too few points, points on a line, or where no pose has the points in front.
+    """
+    if len(x) < 3:
+        raise SurveyError(f"a camera pose needs 3 known points, got {len(x)}: observe more of them")
+    mean = rays.mean(axis=0)
+    front_from_camera = rotation_to(mean, np.array([0.0, 0.0, 1.0]))
+    turned = rays @ front_from_camera.T
+    near = turned[:, 2] > _WIDEST
+    if near.sum() < 3:
+        raise SurveyError("fewer than 3 rays within 80 degrees of their mean: split the view, or observe more points")
+    centre, axes, thin = _principal_axes(x[near])
+    front_from_target = _solutions(x[near], turned[near, :2] / turned[near, 2:], centre, axes, thin)
+    poses = np.array([rigid(front_from_camera.T, np.zeros(3)) @ pose for pose in front_from_target]).reshape(-1, 4, 4)
+    return _refined(poses, x, rays, refinements)
+
+
+def _refined(poses: FloatArray, x: FloatArray, rays: FloatArray, refinements: int) -> PoseCandidates:
+    k, n = len(poses), len(x)
+    if k:
+        ptr = np.arange(k + 1) * n
+        poses = refine_poses(poses, np.tile(x, (k, 1)), np.tile(rays, (k, 1)), ptr, refinements)
+        error, in_front = view_errors(poses, np.tile(x, (k, 1)), np.tile(rays, (k, 1)), ptr)
+        poses, error = poses[in_front], error[in_front]
+    if not len(poses):
+        raise SurveyError(f"no camera pose has all {n} points in front: they are mis-identified or the lens is wrong")
+    order = np.argsort(error, kind="stable")
+    poses, error = poses[order], error[order]
+    keep = [i for i in range(len(poses)) if not any(np.allclose(poses[i], poses[j], atol=1e-6) for j in range(i))]
+    return PoseCandidates(poses[keep], error[keep])
+
+
+def _principal_axes(x: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
+    """Centroid, axes (rows, right-handed, the thinnest last) and whether the points are a plane."""
+    centre = x.mean(axis=0)
+    _, s, vt = np.linalg.svd(x - centre, full_matrices=True)
+    if len(s) < 2 or s[1] < 1e-6 * s[0]:
+        raise SurveyError(f"{len(x)} points on one line do not determine a camera pose: add one off the line")
+    axes = vt * np.array([[1.0], [1.0], [np.linalg.det(vt)]])
+    return centre, axes, len(s) < 3 or bool(s[2] < _PLANAR * s[0])
+
+
+def _solutions(x: FloatArray, xy: FloatArray, centre: FloatArray, axes: FloatArray, thin: bool) -> list[FloatArray]:
+    """Poses (4, 4) of the target in the turned camera, unrefined."""
+    scale = float(np.max(np.linalg.norm(x - centre, axis=1)))
+    local = (x - centre) @ axes.T / scale  # unit size and the plane at z = 0: what IPPE asks for
+    if thin and len(x) > 3:
+        local = local * np.array([1.0, 1.0, 0.0])
+    found: list[FloatArray] = []
+    identity, none = np.eye(3), np.zeros(0)
+    for flag in _methods(len(x), thin):
+        try:
+            if flag is None:
+                _, turns, shifts = cv2.solveP3P(local[:, None], xy[:, None], identity, none, cv2.SOLVEPNP_P3P)
+            else:
+                _, turns, shifts, _ = cv2.solvePnPGeneric(local[:, None], xy[:, None], identity, none, flags=flag)
+        except cv2.error:  # the linear solution refuses some configurations; the other methods remain
+            continue
+        for turn, shift in zip(turns, shifts, strict=True):
+            pose = rigid(rotation_exp(np.ravel(turn).astype(float)), scale * np.ravel(shift).astype(float))
+            if np.all(np.isfinite(pose)):
+                found.append(pose @ rigid(axes, -axes @ centre))
+    return found
+
+
+def _methods(n: int, thin: bool) -> tuple[int | None, ...]:
+    if n == 3:
+        return (None,)
+    if thin:
+        return (cv2.SOLVEPNP_IPPE,)
+    return (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_EPNP) if n >= 6 else (cv2.SOLVEPNP_SQPNP,)
+
+
+def tangent_axes(rays: FloatArray) -> FloatArray:
+    """Two unit vectors (n, 2, 3) across each unit ray (n, 3)."""
+    helper = np.eye(3)[np.argmin(np.abs(rays), axis=1)]
+    first = np.cross(rays, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(rays, first)], axis=1)
+
+
+def _gnomonic(x_in_camera: FloatArray, rays: FloatArray, across: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Offsets (n, 2) rad of points in the plane tangent at each ray, and the depths (n,) along the ray."""
+    depth = np.sum(x_in_camera * rays, axis=1)
+    safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
+    return (across @ x_in_camera[:, :, None])[..., 0] / safe[:, None], depth
+
+
+def view_errors(
+    camera_from_target: FloatArray, x: FloatArray, rays: FloatArray, ptr: IntArray
+) -> tuple[FloatArray, BoolArray]:
+    """Per view the rms (B,) of its point offsets, rad, and whether (B,) all its points lie in front."""
+    view = np.repeat(np.arange(len(ptr) - 1), np.diff(ptr))
+    p = (camera_from_target[view, :3, :3] @ x[:, :, None])[..., 0] + camera_from_target[view, :3, 3]
+    r, depth = _gnomonic(p, rays, tangent_axes(rays))
+    mean = np.add.reduceat(np.sum(r**2, axis=1), ptr[:-1]) / np.diff(ptr)
+    return np.sqrt(mean), np.asarray(np.minimum.reduceat(depth, ptr[:-1]) > 0)
+
+
+def refine_poses(
+    camera_from_target: FloatArray,
+    x: FloatArray,
+    rays: FloatArray,
+    ptr: IntArray,
+    iterations: int = 5,
+    robust: bool = False,
+) -> FloatArray:
+    """Least-squares poses (B, 4, 4) of B views at once, by Levenberg-Marquardt on the offsets across their rays.
+
+    x, rays: (N, 3), view after view; ptr: (B + 1,) row ranges, none empty. With ``robust`` the points of a view carry
+    Cauchy weights at three times its median offset. A view keeps its pose where a step does not lower its error.
+    """
+    poses = camera_from_target.copy()
+    sizes = np.diff(ptr)
+    view = np.repeat(np.arange(len(sizes)), sizes)
+    across = tangent_axes(rays)
+    damping = np.full(len(sizes), 1e-6)
+    eye = np.eye(6)
+
+    def errors(p4: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        p = (p4[view, :3, :3] @ x[:, :, None])[..., 0] + p4[view, :3, 3]
+        r, depth = _gnomonic(p, rays, across)
+        r = np.where(depth[:, None] > 0, r, 1e3)  # behind the camera: never accepted
+        return p, r, depth, np.sum(r**2, axis=1)
+
+    p, r, depth, square = errors(poses)
+    for _ in range(iterations):
+        w = _cauchy(np.sqrt(square), ptr, view) if robust else np.ones(len(x))
+        by_point = (across - r[:, :, None] * rays[:, None, :]) / depth[:, None, None]
+        j = np.concatenate([-by_point @ skew(p), by_point], axis=2)
+        jw = j * w[:, None, None]
+        normal = np.add.reduceat(np.swapaxes(jw, 1, 2) @ j, ptr[:-1])
+        right = np.add.reduceat((np.swapaxes(jw, 1, 2) @ r[:, :, None])[..., 0], ptr[:-1])
+        diagonal = np.einsum("bii->bi", normal)
+        # the last term keeps a view of three points on a line from stopping all the others
+        system = normal + (damping[:, None] * diagonal + 1e-14 * np.max(diagonal, axis=1)[:, None])[:, :, None] * eye
+        step = -np.linalg.solve(system, right[..., None])[..., 0]
+        trial = rigid(rotation_exp(step[:, :3]), step[:, 3:]) @ poses
+        new = errors(trial)
+        cost_old, cost_new = (np.add.reduceat(w * s, ptr[:-1]) for s in (square, new[3]))
+        better = cost_new < cost_old
+        damping = np.where(better, damping * 0.1, damping * 30.0)
+        poses = np.where(better[:, None, None], trial, poses)
+        take = better[view]
+        p, r = np.where(take[:, None], new[0], p), np.where(take[:, None], new[1], r)
+        depth, square = np.where(take, new[2], depth), np.where(take, new[3], square)
+        if not np.any(better & (cost_old - cost_new > 1e-12 * cost_old)):
+            break
+    return poses
+
+
+def _cauchy(size: FloatArray, ptr: IntArray, view: IntArray) -> FloatArray:
+    order = np.lexsort((size, view))
+    median = size[order][ptr[:-1] + np.diff(ptr) // 2]
+    return np.asarray(1.0 / (1.0 + (size / np.maximum(3.0 * median[view], 1e-12)) ** 2))
