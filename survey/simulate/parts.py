@@ -1,0 +1,270 @@
+"""The pieces of the simulated laboratory and where they stand.
+
+Sizes and lenses of the head follow the published three-camera head (image 1280 x 1024, focal length about 1600 px,
+lenses and camera positions of its tables 2 and 3, 11 x 8 corners of 20 mm, 8 arcsec per table axis). The room is laid
+out in the frame of the table: outer axis x level, inner axis z upright when both angles are zero; the board hangs
+obliquely above the table. World is the frame of the board.
+"""
+
+from typing import Literal
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.model import FloatArray, Point, Station, Table
+from survey.simulate.draft import (
+    ARCSEC,
+    HELD,
+    Draft,
+    Shot,
+    centre,
+    hand_pose,
+    looking_at,
+    outline,
+    pixel_in_cell,
+    ray,
+    rigid,
+    rotation_vector,
+    table_angles,
+)
+from survey.simulate.scene import rotation_about, transform
+from survey.targets import Charuco, Checkerboard, MarkerGrid, TargetKind
+
+BOARD = Checkerboard(11, 8, 0.020)
+CHARUCO = Charuco(9, 6, 0.030, 0.022, "DICT_5X5_100")
+UP = np.array([0.0, 0.0, 1.0])
+WALL_X, WALL_Y, CEILING = 2.5, 2.0, 1.8
+_BOARD_BORDER = 0.034  # squares around the inner corners, and some white
+_TRIALS = 4000
+
+_HEAD_LENSES = {
+    "X": {"fx": 1599.26, "fy": 1599.93, "u0": 632.62, "v0": 522.18, "k1": -0.1301, "k2": 0.2870, "p1": -4.0e-4,
+          "p2": -0.4e-4},
+    "Y": {"fx": 1605.35, "fy": 1603.54, "u0": 619.71, "v0": 505.99, "k1": -0.1128, "k2": 0.0178, "p1": -3.1e-4,
+          "p2": 5.7e-4},
+    "Z": {"fx": 1611.22, "fy": 1610.80, "u0": 649.51, "v0": 531.29, "k1": -0.1048, "k2": 0.1588, "p1": -13.7e-4,
+          "p2": 18.4e-4},
+}  # fmt: skip
+_HEAD_PLACES_MM = {"X": (76.13, -36.84, 78.89), "Y": (-32.50, 75.71, 77.00), "Z": (34.16, 30.83, 119.71)}
+_HEAD_AXES = {
+    "X": rotation_about("y", np.pi / 2)[:3, :3],
+    "Y": rotation_about("x", -np.pi / 2)[:3, :3],
+    "Z": np.eye(3),
+}
+
+
+def wide_lens(rng: np.random.Generator, focal_px: float) -> dict[str, float]:
+    """A lens off the shelf: some barrel distortion, a principal point some pixels from the middle."""
+    fx = focal_px + rng.normal(0.0, 8.0)
+    return {
+        "fx": fx,
+        "fy": fx + rng.normal(0.0, 0.5),
+        "u0": 639.5 + rng.normal(0.0, 8.0),
+        "v0": 511.5 + rng.normal(0.0, 8.0),
+        "k1": -0.20 + rng.normal(0.0, 0.02),
+        "k2": 0.10 + rng.normal(0.0, 0.02),
+        "p1": rng.normal(0.0, 4e-4),
+        "p2": rng.normal(0.0, 4e-4),
+    }
+
+
+def add_head(draft: Draft, n_cameras: int) -> tuple[str, ...]:
+    """The head on the table, with cameras X, Y, Z at right angles and, beyond three, more that look anywhere."""
+    draft.stations.append(Station("head", "table", table_id="turntable", mount_from_station=HELD))
+    draft.truth["mount_from_station", "head"] = Pose3()
+    names = ("X", "Y", "Z", *(f"C{number}" for number in range(4, n_cameras + 1)))[:n_cameras]
+    for name in names:
+        misaligned = rotation_vector(draft.rng.normal(0.0, 0.6, 3))
+        if name in _HEAD_AXES:
+            axes, place, lens = _HEAD_AXES[name], np.array(_HEAD_PLACES_MM[name]) / 1e3, _HEAD_LENSES[name]
+        else:
+            direction = draft.rng.normal(0.0, 1.0, 3) + 1e-3
+            axes = looking_at(direction, np.cross(direction, draft.rng.normal(0.0, 1.0, 3)))
+            place, lens = 0.09 * axes[:, 2], wide_lens(draft.rng, 1600.0)
+        draft.add_camera(name, "head", lens, rigid(axes @ misaligned, place))
+    return names
+
+
+def add_table(draft: Draft, non_orthogonality_arcsec: float, axis_offset_mm: float) -> None:
+    """The two-axis table below the board (held at identity); the board is seen 0.75 m away, tilted by some 25 deg."""
+    draft.add_target("board", BOARD, np.eye(4), held=True)
+    towards = _board_in_table()
+    tilt = rotation_vector(draft.rng.normal(0.0, 3.0, 3) + (18.0, 16.0, 6.0))
+    table_from_world = looking_at(towards, -np.cross([1.0, 0.0, 0.0], towards)) @ tilt
+    place = 0.75 * towards - table_from_world @ centre(BOARD)
+    geometry = np.array([non_orthogonality_arcsec * ARCSEC, axis_offset_mm / 1e3, 0.0, 0.0])
+    draft.tables.append(Table("turntable"))
+    draft.truth["world_from_table", "turntable"] = Pose3(np.linalg.inv(rigid(table_from_world, place)))
+    draft.truth["table_geometry", "turntable"] = geometry
+
+
+def _board_in_table() -> FloatArray:
+    obliquely = np.radians(40.0)
+    return np.array([0.0, -np.sin(obliquely), np.cos(obliquely)])
+
+
+def shoot_board_from_table(draft: Draft, camera_id: str, n: int) -> None:
+    """``n`` epochs of the table with the whole board in one camera, over its whole frame and on both faces."""
+    taken = 0
+    for trial in range(_TRIALS):
+        if taken == n:
+            return
+        pixel = pixel_in_cell(taken + trial // 100, draft.rng)
+        angles = _aimed(draft, camera_id, pixel, face=taken % 2)
+        if angles is None:
+            continue
+        epoch_id = add_table_epoch(draft, "t", angles)
+        shot = Shot(camera_id, epoch_id, ("board",))
+        if draft.outline_visible(shot, "board", outline(BOARD, _BOARD_BORDER), 8.0):
+            draft.shots.append(shot)
+            taken += 1
+        else:
+            drop_table_epoch(draft, epoch_id)
+    raise ValueError(f"no room for {n} images of the board in camera {camera_id}")
+
+
+def _aimed(draft: Draft, camera_id: str, pixel: FloatArray, face: int) -> FloatArray | None:
+    """Angles (2,) that bring the board's middle near a pixel; None where the table cannot.
+
+    The camera stands off the table's centre and moves as it turns, hence the few rounds.
+    """
+    scene = draft.scene()
+    table_from_board = np.linalg.inv(world_from_room(draft)).astype(np.float64)
+    board_in_table = transform(table_from_board, centre(BOARD)[None])[0]
+    pose = draft.truth["station_from_camera", camera_id]
+    mount_from_camera = pose.matrix() if isinstance(pose, Pose3) else np.eye(4)
+    wanted = mount_from_camera[:3, :3] @ ray(draft.truth, camera_id, pixel)
+    place = np.zeros(3)
+    angles = None
+    for _ in range(4):
+        solutions = table_angles(wanted, board_in_table - place)
+        if not solutions:
+            return None
+        angles = solutions[face]
+        place = (scene.table_from_mount("turntable", angles) @ mount_from_camera)[:3, 3]
+    return angles
+
+
+def add_table_epoch(draft: Draft, letter: str, angles: FloatArray) -> str:
+    """One more position of the table, (2,) rad."""
+    number = 1 + sum(epoch_id[0] == letter for epoch_id in draft.table_epochs)
+    epoch_id = f"{letter}{number:02d}"
+    draft.truth["table_angles", "turntable", epoch_id] = angles
+    draft.table_epochs.append(epoch_id)
+    return epoch_id
+
+
+def drop_table_epoch(draft: Draft, epoch_id: str) -> None:
+    """Forget the last position of the table."""
+    draft.table_epochs.remove(epoch_id)
+    del draft.truth["table_angles", "turntable", epoch_id]
+
+
+def shoot_board_by_hand(draft: Draft, camera_id: str, n: int) -> None:
+    """``n`` epochs with the head taken off the table and held before the board."""
+    camera = draft.truth["station_from_camera", camera_id]
+    camera_from_station = np.linalg.inv(camera.matrix()) if isinstance(camera, Pose3) else np.eye(4)
+    for number in range(n):
+        for _ in range(_TRIALS):
+            world_from_camera = np.linalg.inv(hand_pose(draft, camera_id, BOARD, number, (0.45, 1.0)))
+            shot = Shot(camera_id, f"h{camera_id}{number + 1:02d}", ("board",))
+            name = ("world_from_station", "head", shot.epoch_id)
+            draft.truth[name] = Pose3(world_from_camera @ camera_from_station)
+            if draft.outline_visible(shot, "board", outline(BOARD, _BOARD_BORDER), 8.0):
+                draft.shots.append(shot)
+                break
+        else:
+            raise ValueError(f"no pose of camera {camera_id} shows the whole board")
+
+
+def shoot_target_by_hand(
+    draft: Draft, camera_id: str, target_id: str, epochs: list[str], distance_m: tuple[float, float], border_m: float
+) -> None:
+    """A target held before a camera of a fixed station, once per epoch."""
+    kind = draft.kinds[target_id]
+    for number, epoch_id in enumerate(epochs):
+        shot = Shot(camera_id, epoch_id, (target_id,))
+        world_from_camera = draft.scene().world_from_camera(camera_id)
+        for _ in range(_TRIALS):
+            camera_from_target = hand_pose(draft, camera_id, kind, number, distance_m)
+            draft.truth["carrier_from_target", target_id, epoch_id] = Pose3(world_from_camera @ camera_from_target)
+            if draft.outline_visible(shot, target_id, outline(kind, border_m), 8.0):
+                draft.shots.append(shot)
+                break
+        else:
+            raise ValueError(f"no pose of {target_id} is fully in camera {camera_id}")
+
+
+def world_from_room(draft: Draft) -> FloatArray:
+    """(4, 4): the room is laid out in the frame of the table."""
+    pose = draft.truth.get(("world_from_table", "turntable"))
+    matrix: FloatArray = pose.matrix() if isinstance(pose, Pose3) else np.eye(4)
+    return matrix
+
+
+def wall_grid(number: int) -> MarkerGrid:
+    """Twelve markers of 120 mm on a plate; four plates use ids 0 to 47."""
+    return MarkerGrid(4, 3, 0.120, 0.040, "DICT_4X4_50", first_id=12 * number)
+
+
+def wall_centres() -> list[FloatArray]:
+    """Middles of the four walls at the height of the table, (3,) m in the room, counter-clockwise from +x."""
+    return [np.array(place) for place in ((WALL_X, 0, 0), (0, WALL_Y, 0), (-WALL_X, 0, 0), (0, -WALL_Y, 0))]
+
+
+def add_wall_grids(draft: Draft, held: tuple[str, ...] = ()) -> None:
+    """A plate of markers on each wall, hung by eye."""
+    for number, wall in enumerate(wall_centres()):
+        kind: TargetKind = wall_grid(number)
+        rotation = looking_at(wall, -UP) @ rotation_vector(draft.rng.normal(0.0, 2.0, 3))
+        middle = wall + UP * 0.05 + draft.rng.normal(0.0, 0.03, 3)
+        room_from_grid = rigid(rotation, middle - rotation @ centre(kind))
+        name = f"G{number + 1}"
+        draft.add_target(name, kind, world_from_room(draft) @ room_from_grid, held=name in held)
+
+
+def add_beacons(draft: Draft) -> None:
+    """Two light-emitting diodes on each wall, left and right of the plate, and two on the ceiling: B01 to B10."""
+    rng = draft.rng
+    places = []
+    for wall in wall_centres():
+        along = np.cross(UP, wall / np.linalg.norm(wall))
+        places += [wall + side * rng.uniform(0.42, 0.56) * along + UP * rng.uniform(-0.28, 0.34) for side in (-1, 1)]
+    places += [np.array([side * rng.uniform(0.2, 0.35), rng.uniform(-0.2, 0.2), CEILING]) for side in (-1, 1)]
+    in_world = np.array(places) @ world_from_room(draft)[:3, :3].T + world_from_room(draft)[:3, 3]
+    for number, x in enumerate(in_world, start=1):
+        draft.points.append(Point(f"B{number:02d}"))
+        draft.truth["point", f"B{number:02d}"] = x
+
+
+def turn_to_walls(draft: Draft, letter: str, n: int) -> list[str]:
+    """``n`` epochs of the table with the level cameras on the walls, one wall after the other, both faces in turn."""
+    epochs = []
+    for number in range(n):
+        level = np.pi * (number // 4 % 2)
+        wobble = np.radians(draft.rng.uniform(-5.0, 5.0, 2))
+        angles = np.array([level, number % 4 * np.pi / 2]) + wobble
+        epochs.append(add_table_epoch(draft, letter, (angles + np.pi) % (2.0 * np.pi) - np.pi))
+    return epochs
+
+
+def add_relay(draft: Draft, motion: Literal["fixed", "epoch"], place: tuple[float, float, float]) -> FloatArray:
+    """A relay station of four cameras, one for each wall; its frame is that of camera R1.
+
+    Returns room_from_station (4, 4) as the station stands when it is set up at ``place``.
+    """
+    rng = draft.rng
+    offsets = [0.06 * wall / np.linalg.norm(wall) for wall in wall_centres()]
+    room_from_camera = []
+    for wall, offset in zip(wall_centres(), offsets, strict=True):
+        at = np.array(place) + offset
+        attitude = looking_at(wall - at, -UP) @ rotation_vector(rng.normal(0.0, 1.0, 3))
+        room_from_camera.append(rigid(attitude, at))
+    station_from_room = np.linalg.inv(room_from_camera[0])
+    draft.stations.append(Station("relay", motion))
+    if motion == "fixed":
+        draft.truth["world_from_station", "relay"] = Pose3(world_from_room(draft) @ room_from_camera[0])
+    for number, pose in enumerate(room_from_camera):
+        lens = wide_lens(rng, 1200.0)
+        draft.add_camera(f"R{number + 1}", "relay", lens, station_from_room @ pose, held=number == 0)
+    return room_from_camera[0]

@@ -1,0 +1,188 @@
+"""A simulated laboratory: a survey with known truth, and what ideal instruments would read in it.
+
+Everything here is plain matrix lines and OpenCV's projection, on purpose not the code of ``adjust``, so that a mistake
+there cannot hide by being made twice.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from gtsam import Pose3
+
+from adjust.model import BoolArray, Camera, FloatArray, Station, Survey, Table, Target
+from adjust.observations import FrameRef, PositionRef
+from adjust.result import ParameterName
+
+Truth = dict[ParameterName, Pose3 | FloatArray]
+BROWN = ("fx", "fy", "skew", "u0", "v0", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_OPENCV_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_AXIS_NUMBER = {"x": 0, "y": 1, "z": 2}
+_WIDEST_TANGENT = 1.2  # beyond, a Brown polynomial may fold points back into the image
+
+
+def rotation_about(axis: str, angle: float) -> FloatArray:
+    """(4, 4) right-handed turn by ``angle`` rad about a named axis."""
+    vector = np.zeros(3)
+    vector[_AXIS_NUMBER[axis]] = angle
+    matrix = np.eye(4)
+    matrix[:3, :3] = cv2.Rodrigues(vector)[0]
+    return matrix
+
+
+def shift_along(axis: str, distance: float) -> FloatArray:
+    """(4, 4) shift by ``distance`` m along a named axis."""
+    matrix = np.eye(4)
+    matrix[_AXIS_NUMBER[axis], 3] = distance
+    return matrix
+
+
+def transform(matrix: FloatArray, x: FloatArray) -> FloatArray:
+    """Points (n, 3) m through a (4, 4) rigid motion."""
+    moved: FloatArray = x @ matrix[:3, :3].T + matrix[:3, 3]
+    return moved
+
+
+def _warped(target: Target, warp: FloatArray) -> FloatArray:
+    """Points of a sagging board, (n, 3) m, as ``adjust.model.Target`` defines the sag."""
+    x = target.x_in_target.copy()
+    span = np.ptp(x[:, :2], axis=0)
+    u = (x[:, :2] - x[:, :2].min(axis=0)) / np.where(span > 0.0, span, 1.0)
+    x[:, 2] += (4.0 * u * (1.0 - u)) @ warp
+    return x
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A survey and its true values; the methods say what is where and what a camera would see."""
+
+    survey: Survey
+    truth: Truth
+    _cameras: Mapping[str, Camera] = field(init=False, repr=False)
+    _stations: Mapping[str, Station] = field(init=False, repr=False)
+    _tables: Mapping[str, Table] = field(init=False, repr=False)
+    _targets: Mapping[str, Target] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        survey = self.survey
+        object.__setattr__(self, "_cameras", {c.camera_id: c for c in survey.cameras})
+        object.__setattr__(self, "_stations", {s.station_id: s for s in survey.stations})
+        object.__setattr__(self, "_tables", {t.table_id: t for t in survey.tables})
+        object.__setattr__(self, "_targets", {t.target_id: t for t in survey.targets})
+
+    def _pose(self, *name: str) -> FloatArray:
+        pose = self.truth[name]
+        if not isinstance(pose, Pose3):
+            raise TypeError(f"the truth of {name} is not a pose")
+        matrix: FloatArray = pose.matrix()
+        return matrix
+
+    def vector(self, *name: str) -> FloatArray:
+        """The true value of a parameter that is not a pose, (n,)."""
+        value = self.truth[name]
+        if isinstance(value, Pose3):
+            raise TypeError(f"the truth of {name} is a pose")
+        return value
+
+    def table_from_mount(self, table_id: str, angles: FloatArray) -> FloatArray:
+        """(4, 4): outer axis, common perpendicular, inner axis, as ``adjust.model.Table`` writes the chain."""
+        table = self._tables[table_id]
+        if len(table.axes) == 1:
+            return rotation_about(table.axes[0], angles[0] + self.vector("table_geometry", table_id)[0])
+        outer, inner = table.axes
+        third = next(axis for axis in "xyz" if axis not in (outer, inner))
+        skewness, offset, zero_1, zero_2 = self.vector("table_geometry", table_id)
+        return (
+            rotation_about(outer, angles[0] + zero_1)
+            @ shift_along(third, offset)
+            @ rotation_about(third, skewness)
+            @ rotation_about(inner, angles[1] + zero_2)
+        )
+
+    def world_from_station(self, station_id: str, epoch_id: str | None = None) -> FloatArray:
+        """(4, 4) at an epoch: by the table where it was read then, else the station's own pose."""
+        station = self._stations[station_id]
+        if station.motion == "fixed":
+            return self._pose("world_from_station", station_id)
+        if epoch_id is None:
+            raise ValueError(f"station {station_id} moves; an epoch is needed")
+        reading = ("table_angles", str(station.table_id), epoch_id)
+        if station.motion == "epoch" or reading not in self.truth:
+            return self._pose("world_from_station", station_id, epoch_id)
+        return (
+            self._pose("world_from_table", reading[1])
+            @ self.table_from_mount(reading[1], self.vector(*reading))
+            @ self._pose("mount_from_station", station_id)
+        )
+
+    def world_from_camera(self, camera_id: str, epoch_id: str | None = None) -> FloatArray:
+        """(4, 4) of a camera at an epoch."""
+        station_id = self._cameras[camera_id].station_id
+        return self.world_from_station(station_id, epoch_id) @ self._pose("station_from_camera", camera_id)
+
+    def world_from_target(self, target_id: str, epoch_id: str | None = None) -> FloatArray:
+        """(4, 4) of a target at an epoch."""
+        target = self._targets[target_id]
+        name: tuple[str, ...] = ("carrier_from_target", target_id)
+        if target.motion == "epoch":
+            name = (*name, str(epoch_id))
+        carrier = np.eye(4) if target.station_id is None else self.world_from_station(target.station_id, epoch_id)
+        return carrier @ self._pose(*name)
+
+    def target_points(self, target_id: str, epoch_id: str | None = None) -> FloatArray:
+        """The target's points in the world, (n, 3) m."""
+        target = self._targets[target_id]
+        warp = ("warp", target_id)
+        x = _warped(target, self.vector(*warp)) if warp in self.truth else target.x_in_target
+        return transform(self.world_from_target(target_id, epoch_id), x)
+
+    def world_points(self) -> FloatArray:
+        """All of the survey's points, (n, 3) m, in its order."""
+        return np.array([self.vector("point", p.point_id) for p in self.survey.points]).reshape(-1, 3)
+
+    def project(self, camera_id: str, epoch_id: str, x_in_world: FloatArray) -> FloatArray:
+        """Image coordinates (n, 2) px by OpenCV, NaN where a point is behind the camera or far outside its field."""
+        world_from_camera = self.world_from_camera(camera_id, epoch_id)
+        x = transform(np.linalg.inv(world_from_camera).astype(np.float64), x_in_world)
+        ahead = (x[:, 2] > 1e-3) & (np.hypot(x[:, 0], x[:, 1]) < _WIDEST_TANGENT * x[:, 2])
+        uv = np.full((len(x), 2), np.nan)
+        if not ahead.any():
+            return uv
+        lens = dict(zip(BROWN, self.vector("lens", camera_id), strict=True))
+        matrix = np.array([[lens["fx"], lens["skew"], lens["u0"]], [0.0, lens["fy"], lens["v0"]], [0.0, 0.0, 1.0]])
+        distortion = np.array([lens[name] for name in _OPENCV_DISTORTION])
+        # OpenCV ignores the skew of its camera matrix, so its part is added here from the normalized coordinates
+        distorted = cv2.projectPoints(x[ahead], np.zeros(3), np.zeros(3), np.eye(3), distortion)[0].reshape(-1, 2)
+        uv[ahead] = distorted @ matrix[:2, :2].T + matrix[:2, 2]
+        return uv
+
+    def inside(self, camera_id: str, uv: FloatArray, margin_px: float) -> BoolArray:
+        """Which of the image points (n, 2) lie in the image, at least ``margin_px`` from its border."""
+        size = np.array(self._cameras[camera_id].image_size, dtype=float)
+        with np.errstate(invalid="ignore"):
+            within: BoolArray = np.all((uv >= margin_px) & (uv <= size - 1.0 - margin_px), axis=1)
+        return within
+
+    def world_from_frame(self, frame: FrameRef) -> FloatArray:
+        """(4, 4) of any named frame."""
+        if frame.kind == "world":
+            return np.eye(4)
+        if frame.kind == "station":
+            return self.world_from_station(frame.frame_id, frame.epoch_id)
+        if frame.kind == "camera":
+            return self.world_from_camera(frame.frame_id, frame.epoch_id)
+        if frame.kind == "target":
+            return self.world_from_target(frame.frame_id, frame.epoch_id)
+        return self._pose("world_from_table", frame.frame_id)
+
+    def position(self, ref: PositionRef) -> FloatArray:
+        """World coordinates (3,) m of a position."""
+        if ref.frame is None:
+            return self.vector("point", str(ref.point_id))
+        if ref.point_id is None:
+            origin: FloatArray = self.world_from_frame(ref.frame)[:3, 3]
+            return origin
+        target = self._targets[ref.frame.frame_id]
+        x: FloatArray = self.target_points(target.target_id, ref.frame.epoch_id)[target.point_ids.index(ref.point_id)]
+        return x
