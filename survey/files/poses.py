@@ -1,0 +1,140 @@
+"""Poses and points of ``survey.toml``.
+
+A pose is ``{ treatment, translation_mm, rotation_quaternion_wxyz | rotation_euler_xyz_deg, sigmas }``; the Euler angles
+are those of R = Rz(z) Ry(y) Rx(x). The sigmas of a prior hold in the tangent at its value: rotation, then
+translation, in the frame on the right of the pose's name.
+"""
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.model import FloatArray, PointParameter, PoseParameter, Treatment
+from survey.files.covariance import covariance_problem
+from survey.files.node import Node
+from survey.files.units import to_si
+
+TREATMENTS: tuple[Treatment, ...] = ("free", "held", "prior")
+POSE_KEYS = (
+    "treatment",
+    "translation_mm",
+    "rotation_quaternion_wxyz",
+    "rotation_euler_xyz_deg",
+    "sigma_translation_mm",
+    "sigma_rotation_deg",
+    "sigma_rotation_arcsec",
+    "covariance_rad_m",
+)
+POINT_KEYS = ("x_mm", "treatment", "sigma_mm", "covariance_mm2")
+_ROTATIONS = ("rotation_quaternion_wxyz", "rotation_euler_xyz_deg")
+_SIGMAS = POSE_KEYS[4:]
+
+
+def rotation_from_quaternion(wxyz: FloatArray) -> Rot3 | None:
+    """The rotation of a quaternion, or None where its length is not 1 within 1e-3."""
+    length = float(np.linalg.norm(wxyz))
+    if abs(length - 1.0) > 1e-3:
+        return None
+    w, x, y, z = wxyz / length
+    return Rot3.Quaternion(w, x, y, z)
+
+
+def rotation_from_euler(xyz: FloatArray) -> Rot3:
+    """Rz(z) Ry(y) Rx(x) of angles (3,) in rad."""
+    x, y, z = xyz
+    return Rot3.RzRyRx(x, y, z)
+
+
+def read_pose(node: Node) -> PoseParameter:
+    """A pose with its treatment; an absent table is a free pose without start."""
+    node.allow(*POSE_KEYS)
+    treatment = _treatment(node)
+    cov = _pose_cov(node) if treatment == "prior" else None
+    if treatment != "prior":
+        _refuse_sigmas(node, treatment, _SIGMAS)
+    rotation, translation = _rotation(node), _translation(node)
+    if rotation is None and translation is None and treatment == "free":
+        return PoseParameter()
+    vague = np.isinf(np.diagonal(cov)) if cov is not None else np.full(6, treatment == "held")
+    if rotation is None and not vague[:3].all():
+        raise node.error("the rotation is missing; add rotation_quaternion_wxyz or rotation_euler_xyz_deg")
+    if translation is None and not vague[3:].all():
+        raise node.error("translation_mm is missing; add it")
+    value = Pose3(rotation or Rot3(), np.zeros(3) if translation is None else translation)
+    return PoseParameter(value, treatment, cov)
+
+
+def read_point(node: Node) -> PointParameter:
+    """A world point with its treatment."""
+    node.allow(*POINT_KEYS)
+    treatment = _treatment(node)
+    value = to_si(node.numbers("x_mm", (3,)), "mm") if node.has("x_mm") else None
+    if treatment != "prior":
+        _refuse_sigmas(node, treatment, POINT_KEYS[2:])
+    if treatment != "free" and value is None:
+        raise node.error(f"x_mm is missing; a point that is {treatment} needs its coordinates")
+    return PointParameter(value, treatment, _point_cov(node) if treatment == "prior" else None)
+
+
+def _treatment(node: Node) -> Treatment:
+    name = node.choice("treatment", TREATMENTS, "free")
+    return next(treatment for treatment in TREATMENTS if treatment == name)
+
+
+def _refuse_sigmas(node: Node, treatment: str, keys: tuple[str, ...]) -> None:
+    for key in keys:
+        if node.has(key):
+            raise node.error(f'the treatment is "{treatment}", which has no sigma; write treatment = "prior"', key)
+
+
+def _translation(node: Node) -> FloatArray | None:
+    return to_si(node.numbers("translation_mm", (3,)), "mm") if node.has("translation_mm") else None
+
+
+def _rotation(node: Node) -> Rot3 | None:
+    if all(node.has(key) for key in _ROTATIONS):
+        raise node.error("the rotation is given twice; keep the quaternion or the Euler angles", _ROTATIONS[1])
+    if node.has("rotation_euler_xyz_deg"):
+        return rotation_from_euler(to_si(node.numbers("rotation_euler_xyz_deg", (3,)), "deg"))
+    if not node.has("rotation_quaternion_wxyz"):
+        return None
+    wxyz = node.numbers("rotation_quaternion_wxyz", (4,))
+    rotation = rotation_from_quaternion(wxyz)
+    if rotation is None:
+        length = float(np.linalg.norm(wxyz))
+        raise node.error(f"the quaternion has length {length:g}, not 1; correct it (w first)", _ROTATIONS[0])
+    return rotation
+
+
+def _pose_cov(node: Node) -> FloatArray:
+    if node.has("covariance_rad_m"):
+        for key in _SIGMAS[:-1]:
+            if node.has(key):
+                raise node.error("covariance_rad_m is given too; keep one of the two", key)
+        return _matrix(node, "covariance_rad_m", 6)
+    rotation = node.sigmas("sigma_rotation", ("deg", "arcsec"), 3, infinite=True)
+    translation = node.sigmas("sigma_translation", ("mm",), 3, infinite=True)
+    if rotation is None or translation is None:
+        missing = "sigma_rotation_deg" if rotation is None else "sigma_translation_mm"
+        raise node.error(f"a prior needs its sigma; add {missing} (inf where nothing is known)")
+    return np.diag(np.concatenate([rotation, translation]) ** 2)
+
+
+def _point_cov(node: Node) -> FloatArray:
+    if node.has("covariance_mm2"):
+        if node.has("sigma_mm"):
+            raise node.error("covariance_mm2 is given too; keep one of the two", "sigma_mm")
+        return to_si(_matrix(node, "covariance_mm2", 3), "mm2")
+    sigma = node.sigmas("sigma", ("mm",), 3, infinite=True)
+    if sigma is None:
+        raise node.error("a prior needs its sigma; add sigma_mm")
+    return np.diag(sigma**2)
+
+
+def _matrix(node: Node, key: str, k: int) -> FloatArray:
+    """A covariance (k, k); a row and column with an infinite variance is not looked at."""
+    cov = node.numbers(key, (k, k), infinite=True)
+    known = ~np.isinf(np.diagonal(cov))
+    problem = covariance_problem(cov[np.ix_(known, known)][None])
+    if problem:
+        raise node.error(f"{problem[1]}; correct the matrix", key)
+    return cov

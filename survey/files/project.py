@@ -1,0 +1,104 @@
+"""What a project folder holds, as frozen values."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from adjust.model import FloatArray, IntArray, Survey
+from survey.targets import TargetKind
+
+FORMAT = 1
+DEFINITION_FILE = "survey.toml"
+OBSERVATIONS_FOLDER = "observations"
+IMAGES_FOLDER = "images"
+
+
+@dataclass(frozen=True)
+class SpotsRequest:
+    """Light spots that ``detect`` looks for in ``cameras``.
+
+    epochs: None for every image of these cameras in which no target is expected. diameter_px: smallest and largest.
+    gate_px: how far from its prediction a spot may lie to be taken for a beacon.
+    """
+
+    cameras: tuple[str, ...]
+    epochs: tuple[str, ...] | None = None
+    diameter_px: tuple[float, float] = (2.0, 12.0)
+    gate_px: float = 15.0
+
+
+@dataclass(frozen=True, eq=False)
+class SpotBlock:
+    """Spots that one camera saw at one epoch, not yet identified: ``spot_ids`` n, uv (n, 2) px, cov (n, 2, 2) px^2."""
+
+    camera_id: str
+    epoch_id: str
+    spot_ids: tuple[str, ...]
+    uv: FloatArray
+    cov: FloatArray
+
+
+@dataclass(frozen=True)
+class AdjustmentOptions:
+    """The table [adjustment].
+
+    alpha: error probability of the tests. reject_blocks: leave mis-detected images out of the start, then test them.
+    """
+
+    alpha: float = 0.05
+    reject_blocks: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Sigmas:
+    """A priori sigmas where the tables give none, in SI.
+
+    image_px: of image points, None where not given. scale: factor on all sigmas of a group.
+    tables: (axes,) rad by table id.
+    """
+
+    image_px: float | None = None
+    scale: Mapping[str, float] = field(default_factory=dict)
+    tables: Mapping[str, FloatArray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePointsWhere:
+    """Where the image points of ``Survey.image_blocks`` stand: one array of lines (rows of Parquet) per block."""
+
+    file: Path | None = None
+    lines: tuple[IntArray, ...] = ()
+
+    def where(self, block: int, point: int) -> str:
+        """``file:line`` of a point of a block, for messages."""
+        return f"{self.file}:{self.lines[block][point]}"
+
+
+@dataclass(frozen=True, eq=False)
+class Definition:
+    """What survey.toml says, and the images that are there; ``survey`` has no observations.
+
+    images: by (camera_id, epoch_id), in natural order. inputs: sha256 of every file read, by its path in the folder.
+    """
+
+    folder: Path
+    title: str
+    tie_points: bool
+    survey: Survey
+    target_kinds: Mapping[str, TargetKind]
+    images: Mapping[tuple[str, str], Path]
+    spots_request: SpotsRequest | None
+    options: AdjustmentOptions
+    sigmas: Sigmas
+    inputs: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Project(Definition):
+    """A definition whose ``survey`` holds the observations too; ``spots`` are image points without identity.
+
+    The covariances of the observations contain ``sigmas.scale`` already.
+    """
+
+    spots: tuple[SpotBlock, ...] = ()
+    image_points_where: ImagePointsWhere = ImagePointsWhere()

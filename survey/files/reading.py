@@ -1,0 +1,217 @@
+"""Reading a project folder."""
+
+import dataclasses
+from pathlib import Path
+
+from adjust.errors import SurveyError
+from adjust.model import Datum, FloatArray, Point, Survey
+from survey.files.image_points import IMAGE_POINTS, SPOTS, read_image_blocks, read_spots, world_names
+from survey.files.images import find_images
+from survey.files.kinds import read_targets
+from survey.files.measurements import (
+    ANGLES,
+    COORDINATES,
+    COORDINATES_COVARIANCE,
+    DISTANCES,
+    PAIRS,
+    read_angles,
+    read_coordinates,
+    read_distances,
+    read_pairs,
+)
+from survey.files.node import Node, read_toml
+from survey.files.owners import read_cameras, read_stations, read_tables
+from survey.files.poses import read_point
+from survey.files.project import (
+    DEFINITION_FILE,
+    FORMAT,
+    IMAGES_FOLDER,
+    OBSERVATIONS_FOLDER,
+    AdjustmentOptions,
+    Definition,
+    ImagePointsWhere,
+    Project,
+    Sigmas,
+    SpotsRequest,
+)
+from survey.files.references import Names
+from survey.files.tables import Layout, Table, read_table
+from survey.files.text import id_problem, natural_key, suggestion
+
+LAYOUTS = {
+    layout.name: layout
+    for layout in (IMAGE_POINTS, SPOTS, ANGLES, PAIRS, DISTANCES, COORDINATES, COORDINATES_COVARIANCE)
+}
+_GROUPS = ("image", "table", "pair", "distance", "coordinates")
+_TOP_LEVEL = (
+    "format",
+    "title",
+    "tie_points",
+    "cameras",
+    "stations",
+    "tables",
+    "targets",
+    "points",
+    "spots",
+    "sigmas",
+    "datum",
+    "adjustment",
+)
+
+
+def read_definition(folder: Path) -> Definition:
+    """Read survey.toml and list the images; raises SurveyError."""
+    return _read_definition(Path(folder))[0]
+
+
+def read(folder: Path) -> Project:
+    """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError."""
+    definition, root = _read_definition(Path(folder))
+    tables = _read_tables(definition.folder / OBSERVATIONS_FOLDER)
+    _check_scales(root, definition.sigmas, tables)
+    survey = _with_tie_points(definition, tables)
+    _check_datum_points(root, survey)
+    names, sigmas = Names.of(survey), definition.sigmas
+    points = tables.get("image_points")
+    blocks, where = read_image_blocks(points, names, sigmas) if points is not None else ((), ImagePointsWhere())
+    extra = tables.get("coordinates_covariance")
+    if extra is not None and "coordinates" not in tables:
+        raise extra.error(0, "there is no table of coordinates beside it; add coordinates.csv or remove this file")
+    coordinates = tables.get("coordinates")
+    survey = dataclasses.replace(
+        survey,
+        image_blocks=blocks,
+        table_readings=read_angles(tables["table_angles"], names, sigmas) if "table_angles" in tables else (),
+        pairs=read_pairs(tables["pairs"], names, sigmas) if "pairs" in tables else (),
+        distances=read_distances(tables["distances"], names, sigmas) if "distances" in tables else (),
+        coordinates=read_coordinates(coordinates, extra, names, sigmas) if coordinates is not None else (),
+    )
+    fields = {field.name: getattr(definition, field.name) for field in dataclasses.fields(Definition)}
+    hashes = {table.path.relative_to(definition.folder).as_posix(): table.digest for table in tables.values()}
+    fields |= {"survey": survey, "inputs": dict(sorted(({**definition.inputs, **hashes}).items()))}
+    spots = read_spots(tables["spots"], names, sigmas) if "spots" in tables else ()
+    return Project(**fields, spots=spots, image_points_where=where)
+
+
+def _read_definition(folder: Path) -> tuple[Definition, Node]:
+    path = folder / DEFINITION_FILE
+    if not path.is_file():
+        raise SurveyError(f"{path}: there is no such file; a project folder holds a {DEFINITION_FILE}")
+    root, digest = read_toml(path)
+    _check_format(root)
+    root.allow(*_TOP_LEVEL)
+    inputs = {DEFINITION_FILE: digest}
+    tables, table_sigmas = read_tables(root)
+    stations = read_stations(root, tuple(table.table_id for table in tables))
+    station_ids = tuple(station.station_id for station in stations)
+    cameras = read_cameras(root, station_ids)
+    camera_ids = tuple(camera.camera_id for camera in cameras)
+    targets, kinds = read_targets(root, station_ids, inputs)
+    points = tuple(Point(point_id, read_point(node)) for point_id, node in root.tables("points"))
+    datum = _read_datum(root.table("datum"), station_ids)
+    survey = Survey(cameras, stations, tables, targets, points, datum=datum)
+    tie_points = root.flag("tie_points", False)
+    if not tie_points:
+        _check_datum_points(root, survey)
+    definition = Definition(
+        folder=folder,
+        title=root.text("title", ""),
+        tie_points=tie_points,
+        survey=survey,
+        target_kinds=kinds,
+        images=find_images(folder / IMAGES_FOLDER, camera_ids),
+        spots_request=_read_spots_request(root.table("spots"), camera_ids) if root.has("spots") else None,
+        options=_read_options(root.table("adjustment")),
+        sigmas=_read_sigmas(root.table("sigmas"), table_sigmas),
+        inputs=inputs,
+    )
+    return definition, root
+
+
+def _check_format(root: Node) -> None:
+    if not root.has("format"):
+        raise root.error(f"the key 'format' is missing; the first line is 'format = {FORMAT}'", "format")
+    if root.integer("format", 0) != FORMAT:
+        raise root.error(f"found {root.values['format']}; this program reads format {FORMAT}", "format")
+
+
+def _read_datum(node: Node, station_ids: tuple[str, ...]) -> Datum:
+    node.allow("kind", "points", "stations")
+    kind = node.choice("kind", ("given", "inner"), "given")
+    for key in ("points", "stations"):
+        if kind == "given" and node.has(key):
+            raise node.error('only the datum of kind "inner" names points and stations; remove this', key)
+    stations = node.references("stations", station_ids, "station", ())
+    return Datum("inner" if kind == "inner" else "given", node.names("points", ()), stations)
+
+
+def _check_datum_points(root: Node, survey: Survey) -> None:
+    node = root.table("datum")
+    node.references("points", (point.point_id for point in survey.points), "point", ())
+
+
+def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest:
+    node.allow("cameras", "epochs", "diameter_px", "gate_px")
+    cameras = node.references("cameras", camera_ids, "camera")
+    epochs = node.names("epochs") if node.has("epochs") else None
+    for i, epoch_id in enumerate(epochs or ()):
+        problem = id_problem(epoch_id)
+        if problem:
+            raise node.error(problem, "epochs", i)
+    smallest, largest = node.numbers("diameter_px", (2,), [2.0, 12.0]).tolist()
+    if not 0 < smallest <= largest:
+        raise node.error(f"found [{smallest:g}, {largest:g}]; expected [smallest, largest]", "diameter_px")
+    return SpotsRequest(cameras, epochs, (smallest, largest), node.number("gate_px", 15.0, positive=True))
+
+
+def _read_options(node: Node) -> AdjustmentOptions:
+    node.allow("alpha", "reject_blocks")
+    alpha = node.number("alpha", 0.05, positive=True)
+    if alpha >= 1:
+        raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
+    return AdjustmentOptions(alpha, node.flag("reject_blocks", True))
+
+
+def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:
+    node.allow("image_px", "scale")
+    scale = node.table("scale")
+    image_px = node.number("image_px", positive=True) if node.has("image_px") else None
+    return Sigmas(image_px, {group: scale.number(group, positive=True) for group in scale.values}, tables)
+
+
+def _check_scales(root: Node, sigmas: Sigmas, tables: dict[str, Table]) -> None:
+    found = {name for table in tables.values() for name in table.text("group").names if name}
+    for group in sigmas.scale:
+        if group not in (*_GROUPS, *found):
+            problem = f"unknown group; {suggestion(group, (*_GROUPS, *sorted(found)))}"
+            raise root.table("sigmas").table("scale").error(problem, group)
+
+
+def _read_tables(folder: Path) -> dict[str, Table]:
+    """All tables in the folder by name; raises where a file is no known table or one is there twice."""
+    tables: dict[str, Table] = {}
+    paths = sorted(folder.iterdir()) if folder.is_dir() else []
+    for path in paths:
+        if path.suffix not in (".csv", ".parquet") or path.name.startswith("."):
+            continue
+        layout: Layout | None = LAYOUTS.get(path.stem)
+        if layout is None:
+            raise SurveyError(f"{path}: unknown table {path.stem!r}; {suggestion(path.stem, LAYOUTS)}")
+        if path.stem in tables:
+            raise SurveyError(f"{path}: {tables[path.stem].path.name} is there too; keep one of the two")
+        tables[path.stem] = read_table(path, layout)
+    return tables
+
+
+def _with_tie_points(definition: Definition, tables: dict[str, Table]) -> Survey:
+    """The survey with the world points that only the observations name, where the project allows that."""
+    survey = definition.survey
+    if not definition.tie_points:
+        return survey
+    found = world_names(tables["image_points"]) if "image_points" in tables else set()
+    for table, columns in (("distances", ("from_id", "to_id")), ("coordinates", ("point_id",))):
+        for column in columns if table in tables else ():
+            found |= {name for name in tables[table].text(column).names if name and not set(name) & set(":@/")}
+    new = found - {point.point_id for point in survey.points} - {"world"}
+    ordered = sorted((name for name in new if not id_problem(name)), key=natural_key)
+    return dataclasses.replace(survey, points=(*survey.points, *(Point(name) for name in ordered)))

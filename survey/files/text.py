@@ -1,0 +1,90 @@
+"""Files as text: reading with clear errors, writing that never leaves half a file, names for messages."""
+
+import difflib
+import hashlib
+import os
+import re
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+from adjust.errors import SurveyError
+
+_FORBIDDEN_IN_IDS = set('/\\:@,;"|<>*?')
+
+
+def atomic_write(path: Path, content: bytes | str) -> None:
+    """Write ``content`` (text as UTF-8) under a temporary name beside ``path``, then rename: all of it or nothing."""
+    data = content.encode("utf-8") if isinstance(content, str) else content
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.chmod(temporary, 0o666 & ~_umask())  # mkstemp makes files that only their owner can read
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def read_bytes(path: Path) -> tuple[bytes, str]:
+    """Content of a file and its sha256; raises SurveyError where it cannot be read."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SurveyError(f"{path}: cannot be read ({error.strerror}); check the name and the permissions") from error
+    return data, hashlib.sha256(data).hexdigest()
+
+
+def decode(path: Path, data: bytes) -> str:
+    """Text of a UTF-8 file, with or without byte order mark; raises SurveyError with the line of the first bad byte."""
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise SurveyError(f"{path}:1: the file is UTF-16, not UTF-8; save it as UTF-8")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        found = f"byte 0x{data[error.start]:02x}"
+        raise SurveyError(f"{path}:{line}: {found} is not UTF-8; save the file with the encoding UTF-8") from error
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Key that sorts ``e2`` before ``e10``; different names have different keys."""
+    parts = re.split(r"(\d+)", name)
+    numbers = [(0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts if part]
+    return tuple(numbers)
+
+
+def id_problem(name: str) -> str | None:
+    """Why ``name`` cannot be an id, or None. Ids become names of files and parts of references, so both stay safe."""
+    if not name:
+        return "an id is empty; give it a name"
+    if name in (".", "..") or name.startswith(".") or set(name) & _FORBIDDEN_IN_IDS or not name.isprintable():
+        return (
+            f"{name!r} cannot be an id; use letters, digits, '_', '-', '.' (not in front), without / \\ : @ , ; or '..'"
+        )
+    if name != name.strip():
+        return f"{name!r} cannot be an id; remove the blanks around it"
+    return None
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """What to do about an unknown name: the nearest known one, else the known ones."""
+    names = list(dict.fromkeys(known))
+    with_unit = [candidate for candidate in names if candidate.startswith(f"{name}_")]
+    near = with_unit[:1] or difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    if near:
+        return f"did you mean {near[0]!r}?"
+    if not names:
+        return "none is known here"
+    shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+    return f"known: {shown}"
