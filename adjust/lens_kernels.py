@@ -48,9 +48,7 @@ def _depth(q2: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _brown_residual(
-    lens: FloatArray, q0: float, q1: float, q2: float, u: float, v: float
-) -> tuple[float, float]:
+def _brown_residual(lens: FloatArray, q0: float, q1: float, q2: float, u: float, v: float) -> tuple[float, float]:
     """OpenCV's forward Brown-Conrady model with rational radial part."""
     iz = 1.0 / _depth(q2)
     x = q0 * iz
@@ -96,7 +94,8 @@ def _brown_row(
 
     # derivative of g by r2
     dg = i_den * (
-        lens[5] + r2 * (2.0 * lens[6] + 3.0 * r2 * lens[9])
+        lens[5]
+        + r2 * (2.0 * lens[6] + 3.0 * r2 * lens[9])
         - g * (lens[10] + r2 * (2.0 * lens[11] + 3.0 * r2 * lens[12]))
     )
     cross = xy2 * dg + 2.0 * (p1 * x + p2 * y)
@@ -156,9 +155,7 @@ def _atan_series(w: float) -> tuple[float, float]:
     a = 1.0 - w * (
         1 / 3 - w * (1 / 5 - w * (1 / 7 - w * (1 / 9 - w * (1 / 11 - w * (1 / 13 - w * (1 / 15 - w / 17))))))
     )
-    b = -(
-        1 / 3 - w * (2 / 5 - w * (3 / 7 - w * (4 / 9 - w * (5 / 11 - w * (6 / 13 - w * (7 / 15 - w * 8 / 17))))))
-    )
+    b = -(1 / 3 - w * (2 / 5 - w * (3 / 7 - w * (4 / 9 - w * (5 / 11 - w * (6 / 13 - w * (7 / 15 - w * 8 / 17)))))))
     return a, b
 
 
@@ -180,9 +177,7 @@ def _fisheye_angle(lens: FloatArray, rr: float, q2: float) -> tuple[float, float
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fisheye_residual(
-    lens: FloatArray, q0: float, q1: float, q2: float, u: float, v: float
-) -> tuple[float, float]:
+def _fisheye_residual(lens: FloatArray, q0: float, q1: float, q2: float, u: float, v: float) -> tuple[float, float]:
     """OpenCV's equidistant fisheye."""
     _, g, _ = _fisheye_angle(lens, q0 * q0 + q1 * q1, q2)
     xd = q0 * g
@@ -541,9 +536,7 @@ def lens_rows(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def lens_residuals(
-    kind: int, lens: FloatArray, constants: FloatArray, q: FloatArray, uv: FloatArray
-) -> FloatArray:
+def lens_residuals(kind: int, lens: FloatArray, constants: FloatArray, q: FloatArray, uv: FloatArray) -> FloatArray:
     """``lens_residual`` for n points q (n, 3) m and uv (n, 2) px: (n, 2)."""
     n = q.shape[0]
     residuals = np.empty((n, 2))
