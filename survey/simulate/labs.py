@@ -45,7 +45,7 @@ class LabSize:
     n_charuco_epochs: int = 7
 
 
-def _observed(draft: Draft, seed: int, sigma_px: float, table_sigma_arcsec: float = TABLE_SIGMA_ARCSEC) -> Survey:
+def observed(draft: Draft, seed: int, sigma_px: float, table_sigma_arcsec: float = TABLE_SIGMA_ARCSEC) -> Survey:
     """The draft with noisy images and table readings."""
     scene = draft.scene()
     readings = table_readings(draft, "turntable", table_sigma_arcsec * ARCSEC) if draft.tables else []
@@ -89,7 +89,7 @@ def single_camera_draft(seed: int, n_images: int) -> Draft:
 def single_camera(seed: int, *, n_images: int = 12, sigma_px: float = 0.1) -> tuple[Survey, Truth]:
     """One camera and ``n_images`` of a hand-held board."""
     draft = single_camera_draft(seed, n_images)
-    return _observed(draft, seed, sigma_px), draft.truth
+    return observed(draft, seed, sigma_px), draft.truth
 
 
 def stereo_draft(seed: int, n_pairs: int, baseline_m: float = 0.2) -> Draft:
@@ -120,7 +120,7 @@ def stereo_draft(seed: int, n_pairs: int, baseline_m: float = 0.2) -> Draft:
 def stereo(seed: int, *, n_pairs: int = 12, sigma_px: float = 0.1) -> tuple[Survey, Truth]:
     """Two cameras and ``n_pairs`` epochs of a hand-held board; the left camera is the frame."""
     draft = stereo_draft(seed, n_pairs)
-    return _observed(draft, seed, sigma_px), draft.truth
+    return observed(draft, seed, sigma_px), draft.truth
 
 
 def _head_draft(
@@ -149,7 +149,7 @@ def head_on_table(
 ) -> tuple[Survey, Truth]:
     """The head on the two-axis table before the fixed board (world), with table and by-hand epochs for each camera."""
     draft = _head_draft(seed, n_cameras, n_table_epochs, n_free_epochs, non_orthogonality_arcsec, axis_offset_mm)
-    return _observed(draft, seed, sigma_px, table_sigma_arcsec), draft.truth
+    return observed(draft, seed, sigma_px, table_sigma_arcsec), draft.truth
 
 
 def beacons(
@@ -165,7 +165,7 @@ def beacons(
     draft = _head_draft(seed, 3, n_table_epochs, n_free_epochs, 60.0, 0.35)
     add_beacons(draft)
     _shoot_night(draft, n_night_epochs, ("X", "Y", "Z"))
-    return _observed(draft, seed, sigma_px, table_sigma_arcsec), draft.truth
+    return observed(draft, seed, sigma_px, table_sigma_arcsec), draft.truth
 
 
 def _shoot_night(draft: Draft, n_epochs: int, camera_ids: tuple[str, ...]) -> None:
@@ -191,7 +191,7 @@ def relay(seed: int, *, n_epochs: int = 12, sigma_px: float = CORNER_SIGMA_PX) -
         draft.truth["world_from_station", "relay", epoch_id] = Pose3(turned @ room_from_station)
         for camera in draft.cameras:
             _shoot_grids(draft, camera.camera_id, epoch_id)
-    return _observed(draft, seed, sigma_px), draft.truth
+    return observed(draft, seed, sigma_px), draft.truth
 
 
 def _shoot_grids(draft: Draft, camera_id: str, epoch_id: str) -> None:
@@ -230,4 +230,4 @@ def full_lab_draft(seed: int, size: LabSize = LabSize()) -> Draft:
 def full_lab(seed: int, *, size: LabSize = LabSize(), sigma_px: float = CORNER_SIGMA_PX) -> tuple[Survey, Truth]:
     """The whole laboratory of the example, as observations without images."""
     draft = full_lab_draft(seed, size)
-    return _observed(draft, seed, sigma_px), draft.truth
+    return observed(draft, seed, sigma_px), draft.truth

@@ -1,0 +1,55 @@
+"""Ready project folders to try the software on: rendered images, tables of readings, and the truth beside them.
+
+``truth.json`` is for people and tests; no command reads it.
+"""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from adjust.errors import SurveyError
+
+EXAMPLES = {
+    "full-lab": "three-camera head on a two-axis table, board, wall plates, beacons, relay station of four cameras",
+    "stereo": "two cameras and a checkerboard held by hand",
+    "one-camera": "one camera and a checkerboard held by hand",
+}
+
+
+def write_example(name: str, folder: Path, *, seed: int = 1, jobs: int | None = None, progress: bool = False) -> int:
+    """Write the example ``name`` into the new or empty ``folder``; the number of its images.
+
+    Equal seeds give equal folders. jobs: images rendered at a time, by default one per processor. progress: a bar on
+    stderr. The folder appears when everything in it is complete. Raises SurveyError for an unknown name or a folder
+    that holds something.
+    """
+    if name not in EXAMPLES:
+        raise SurveyError(f"example {name!r}: unknown; choose one of {', '.join(EXAMPLES)}")
+    from survey.examples.folders import MAKERS
+    from survey.examples.pictures import write_images
+
+    draft, files = MAKERS[name](seed)
+    with _complete_or_nothing(Path(folder)) as place:
+        for path, text in files.items():
+            (place / path).parent.mkdir(parents=True, exist_ok=True)
+            (place / path).write_text(text, encoding="utf-8")
+        write_images(draft, place / "images", seed, jobs, progress)
+    return len(draft.shots)
+
+
+@contextmanager
+def _complete_or_nothing(folder: Path) -> Iterator[Path]:
+    """A temporary place beside ``folder`` that takes its name in the end."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise SurveyError(f"{folder}: is there already and not empty; give the name of a new folder")
+    place = folder.absolute().with_name(f".{folder.absolute().name}.partial")
+    shutil.rmtree(place, ignore_errors=True)  # left by a run that was killed
+    place.mkdir(parents=True)
+    try:
+        yield place
+        if folder.exists():
+            folder.rmdir()
+        place.rename(folder)
+    finally:
+        shutil.rmtree(place, ignore_errors=True)

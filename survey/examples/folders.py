@@ -1,0 +1,226 @@
+"""What stands in the files of each example folder, images aside."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from adjust.model import FloatArray, Survey
+from survey.examples.truth import truth_json
+from survey.simulate.draft import Draft
+from survey.simulate.labs import (
+    BEACON_SIGMA_MM,
+    DISTANCE_SIGMA_MM,
+    TABLE_SIGMA_ARCSEC,
+    WITHOUT_COORDINATES,
+    full_lab_draft,
+    observed,
+    single_camera_draft,
+    stereo_draft,
+)
+
+Files = dict[str, str]
+_LENS = """
+[cameras.{name}.lens]
+model = "brown"
+free = ["fx", "fy", "u0", "v0", "k1", "k2", "p1", "p2"]
+"""
+
+
+def one_camera(seed: int) -> tuple[Draft, Files]:
+    """One camera and a board held by hand."""
+    draft = single_camera_draft(seed, 12)
+    text = """# One camera and a checkerboard held by hand.
+format = 1
+title = "One camera"
+
+[cameras.C1]
+station = "tripod"
+image_size_px = [1280, 1024]
+station_from_camera = { treatment = "held" }       # the camera is the frame of its station
+"""
+    text += _LENS.format(name="C1")
+    text += """
+[stations.tripod]
+motion = "fixed"
+world_from_station = { treatment = "held" }        # and the station that of the world
+"""
+    return draft, {"survey.toml": text + _hand_board(), "truth.json": truth_json(draft.truth, seed)}
+
+
+def stereo(seed: int) -> tuple[Draft, Files]:
+    """Two cameras and a board held by hand."""
+    draft = stereo_draft(seed, 12)
+    text = """# Two cameras on a bar and a checkerboard held by hand; what is asked for is right to left.
+format = 1
+title = "Stereo"
+
+[cameras.left]
+station = "bar"
+image_size_px = [1280, 1024]
+station_from_camera = { treatment = "held" }       # the left camera is the frame of the bar
+"""
+    text += _LENS.format(name="left")
+    text += """
+[cameras.right]
+station = "bar"
+image_size_px = [1280, 1024]
+"""
+    text += _LENS.format(name="right")
+    text += """
+[stations.bar]
+motion = "fixed"
+world_from_station = { treatment = "held" }        # and the bar that of the world
+"""
+    return draft, {"survey.toml": text + _hand_board(), "truth.json": truth_json(draft.truth, seed)}
+
+
+def _hand_board() -> str:
+    return """
+[targets.board]
+kind = "checkerboard"
+columns = 9                    # inner corners
+rows = 6
+square_mm = 25.0
+motion = "epoch"               # held by hand: another place in every image
+"""
+
+
+def full_lab(seed: int) -> tuple[Draft, Files]:
+    """Everything in one survey."""
+    draft = full_lab_draft(seed)
+    survey = observed(draft, seed, 0.1, TABLE_SIGMA_ARCSEC)
+    return draft, {
+        "survey.toml": _full_lab_toml(draft),
+        "observations/table_angles.csv": _table_angles(survey),
+        "observations/coordinates.csv": _coordinates(survey),
+        "observations/distances.csv": _distances(survey),
+        "truth.json": truth_json(draft.truth, seed),
+    }
+
+
+def _full_lab_toml(draft: Draft) -> str:
+    text = """# A laboratory: a head with three cameras on a two-axis table before a fixed board, plates of markers on the
+# walls, beacons on walls and ceiling, and a relay station of four cameras that looks at all four walls.
+# Images t..: the head on the table, board; h..: the head held by hand, board; w..: the head on the table, wall
+# plates; n..: the head on the table, beacons in the dark; c..: ChArUco board before a relay camera; r01, q01: the
+# relay station, wall plates by day and beacons in the dark.
+format = 1
+title = "Full lab"
+"""
+    for camera in draft.cameras:
+        name = camera.camera_id
+        text += f'\n[cameras.{name}]\nstation = "{camera.station_id}"\nimage_size_px = [1280, 1024]\n'
+        if camera.station_from_camera.treatment == "held":
+            text += 'station_from_camera = { treatment = "held" }       # this camera is the frame of its station\n'
+        text += _LENS.format(name=name)
+    text += f"""
+[stations.head]
+motion = "table"
+table = "turntable"
+mount_from_station = {{ treatment = "held" }}        # the frame of the head is that of the table's inner axis
+
+[stations.relay]
+motion = "fixed"
+
+[tables.turntable]
+axes = ["x", "z"]                                  # outermost first
+sigma_arcsec = {TABLE_SIGMA_ARCSEC:.1f}
+world_from_table = {{ treatment = "free" }}
+geometry = {{ free = ["non_orthogonality", "axis_offset"] }}
+
+[targets.board]
+kind = "checkerboard"
+columns = 11                                       # inner corners
+rows = 8
+square_mm = 20.0
+pose = {{ treatment = "held" }}                      # the board is the world
+
+[targets.charuco]
+kind = "charuco"
+squares_x = 9
+squares_y = 6
+square_mm = 30.0
+marker_mm = 22.0
+dictionary = "5X5_100"
+motion = "epoch"                                   # held by hand
+"""
+    for number in range(4):
+        text += f"""
+[targets.G{number + 1}]
+kind = "marker_grid"
+columns = 4
+rows = 3
+marker_mm = 120.0
+gap_mm = 40.0
+dictionary = "4X4_50"
+first_id = {12 * number}
+"""
+    return text + _points(draft) + _spots(draft)
+
+
+def _points(draft: Draft) -> str:
+    text = "\n# Beacons; most have been surveyed (coordinates.csv), two are known roughly, by a folding rule.\n"
+    for point in draft.points:
+        text += f"[points.{point.point_id}]\n"
+        if point.point_id in WITHOUT_COORDINATES:
+            rough = ", ".join(f"{10.0 * round(100.0 * float(x)):.1f}" for x in _true_point(draft, point.point_id))
+            text += f"x_mm = [{rough}]\n"
+    return text
+
+
+def _true_point(draft: Draft, point_id: str) -> FloatArray:
+    return draft.scene().vector("point", point_id)
+
+
+def _spots(draft: Draft) -> str:
+    cameras = ", ".join(f'"{name}"' for name in dict.fromkeys(s.camera_id for s in draft.shots if s.beacons))
+    epochs = ", ".join(f'"{name}"' for name in dict.fromkeys(s.epoch_id for s in draft.shots if s.beacons))
+    return f"""
+[spots]                                            # images in which beacons are looked for
+cameras = [{cameras}]
+epochs = [{epochs}]
+diameter_px = [2.0, 12.0]
+gate_px = 15.0
+
+[sigmas]
+image_px = 0.1                                     # where the detector gives none
+
+[datum]
+kind = "given"                                     # the board is held
+
+[adjustment]
+alpha = 0.05
+"""
+
+
+def _table_angles(survey: Survey) -> str:
+    lines = ["epoch_id,table_id,axis1_deg,axis2_deg"]
+    for reading in survey.table_readings:
+        a1, a2 = np.degrees(reading.angles)
+        lines.append(f"{reading.epoch_id},{reading.table_id},{a1:.6f},{a2:.6f}")
+    return "\n".join(lines) + "\n"
+
+
+def _coordinates(survey: Survey) -> str:
+    lines = ["point_id,x_mm,y_mm,z_mm,sigma_x_mm,sigma_y_mm,sigma_z_mm"]
+    sigma = f"{BEACON_SIGMA_MM:.1f}"
+    for row in survey.coordinates:
+        x, y, z = 1e3 * row.values[0]
+        lines.append(f"{row.positions[0].point_id},{x:.3f},{y:.3f},{z:.3f},{sigma},{sigma},{sigma}")
+    return "\n".join(lines) + "\n"
+
+
+def _distances(survey: Survey) -> str:
+    lines = ["distance_id,from_id,to_id,value_mm,sigma_mm"]
+    for row in survey.distances:
+        lines.append(
+            f"{row.distance_id},{row.a.point_id},{row.b.point_id},{1e3 * row.value:.3f},{DISTANCE_SIGMA_MM:.1f}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+MAKERS: dict[str, Callable[[int], tuple[Draft, Files]]] = {
+    "full-lab": full_lab,
+    "stereo": stereo,
+    "one-camera": one_camera,
+}

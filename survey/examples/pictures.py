@@ -1,0 +1,80 @@
+"""The images of a simulated survey: each shot rendered with everything that stands before the camera."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+from gtsam import Pose3
+from tqdm import tqdm
+
+from adjust.errors import SurveyError
+from adjust.model import FloatArray
+from survey.rendering import Beacons, BrownCamera, GrayImage, Imaging, PlacedTarget, render
+from survey.simulate.draft import Draft, Shot
+from survey.simulate.scene import BROWN, Scene, transform
+from survey.targets import MarkerBlock, PointList
+
+DAY = Imaging(blur_px=0.8, noise_gray=2.0, background_gray=105.0, gradient=(0.18, -0.12))
+NIGHT = Imaging(blur_px=0.8, noise_gray=1.5, background_gray=6.0)
+BEACON_DIAMETER_M = 0.006
+
+
+def write_images(draft: Draft, folder: Path, seed: int, jobs: int | None, progress: bool) -> None:
+    """Render all shots of a draft into ``folder/<camera_id>/<epoch_id>.png``, several at a time.
+
+    Threads are enough: rendering, noise and PNG compression run outside the interpreter's lock.
+    """
+    scene = draft.scene()
+    shots = sorted(enumerate(draft.shots), key=lambda item: item[1].camera_id)  # a camera's rays are used again
+    for camera_id in {shot.camera_id for shot in draft.shots}:
+        (folder / camera_id).mkdir(parents=True, exist_ok=True)
+
+    def write(item: tuple[int, Shot]) -> None:
+        number, shot = item
+        image = picture(draft, scene, shot, seed=1000 * seed + number)
+        path = folder / shot.camera_id / f"{shot.epoch_id}.png"
+        if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+            raise SurveyError(f"{path}: cannot be written; is the disk full, or the folder protected?")
+
+    with (
+        ThreadPoolExecutor(jobs or os.cpu_count() or 1) as pool,
+        tqdm(total=len(shots), desc="rendering", unit="image", disable=not progress) as bar,
+    ):
+        for _ in pool.map(write, shots):
+            bar.update()
+
+
+def picture(draft: Draft, scene: Scene, shot: Shot, seed: int) -> GrayImage:
+    """One image (height, width), 8 bit: targets by day, beacons by night."""
+    camera = _camera(scene, shot.camera_id)
+    camera_from_world = np.linalg.inv(scene.world_from_camera(shot.camera_id, shot.epoch_id)).astype(np.float64)
+    if shot.beacons:
+        beacons = Beacons(transform(camera_from_world, scene.world_points()), BEACON_DIAMETER_M, 230.0)
+        return render(camera, beacons=beacons, imaging=NIGHT, seed=seed)
+    return render(camera, _placed(draft, scene, shot, camera_from_world), imaging=DAY, seed=seed)
+
+
+def _camera(scene: Scene, camera_id: str) -> BrownCamera:
+    lens = dict(zip(BROWN, scene.vector("lens", camera_id), strict=True))
+    distortion = tuple(float(lens[name]) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"))
+    size = next(c.image_size for c in scene.survey.cameras if c.camera_id == camera_id)
+    return BrownCamera(size, lens["fx"], lens["fy"], lens["u0"], lens["v0"], distortion)
+
+
+def _placed(draft: Draft, scene: Scene, shot: Shot, camera_from_world: FloatArray) -> Sequence[PlacedTarget]:
+    """All that stands in the room at that epoch, whether it is meant to be in the image or not."""
+    placed = []
+    for target in scene.survey.targets:
+        kind = draft.kinds[target.target_id]
+        if target.motion == "epoch" and target.target_id not in shot.target_ids:
+            continue
+        if isinstance(kind, PointList):
+            continue
+        pose = Pose3(camera_from_world @ scene.world_from_target(target.target_id, shot.epoch_id))
+        if not isinstance(kind, MarkerBlock) and pose.translation()[2] < -1.0:
+            continue  # behind the camera
+        placed.append(PlacedTarget(kind, pose))
+    return placed
