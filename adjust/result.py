@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from gtsam import Pose3
 
@@ -108,6 +109,7 @@ class Adjustment:
 
     sigma0: a posteriori standard deviation of unit weight (a priori is 1). omega: v'Pv. iterations: steps taken.
     max_step: the last step in sigmas of the unknowns. warnings: for people, worst first.
+    precision: gives joint covariances, ``precision.joint([name, ...])``.
     """
 
     survey: Survey
@@ -126,3 +128,4 @@ class Adjustment:
     max_step: float
     converged: bool
     warnings: tuple[str, ...]
+    precision: Any = None

@@ -1,0 +1,165 @@
+"""The whole way: survey -> start -> graph -> solution -> precision."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
+
+from adjust.lens import MODELS, lens_constants, monotone_radius_px, principal_point_px
+from adjust.model import FloatArray, Survey
+from adjust.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
+from adjust.result import Adjustment, Estimate, ParameterName
+from adjust.solve import Solved, SolveOptions, solve
+from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
+
+
+@dataclass(frozen=True)
+class AdjustOptions:
+    """alpha: level of the global test."""
+
+    alpha: float = 0.05
+    solve: SolveOptions = field(default_factory=SolveOptions)
+
+
+def adjust(
+    survey: Survey,
+    start: StartValues | None = None,
+    options: AdjustOptions = AdjustOptions(),  # noqa: B008  # frozen
+    progress: Callable[[int, float], None] | None = None,
+) -> Adjustment:
+    """Adjust a survey: start values (found where not given), least squares, precision.
+
+    progress: called with (iteration, v'Pv). Raises SurveyError, IndeterminateError, NotConvergedError.
+    """
+    notes: tuple[str, ...] = ()
+    if start is None:
+        survey, start, notes = starting(survey)
+    graph = GraphBuilder(survey, start.lenses).build(start)
+    solved = solve(graph, options.solve, progress)
+    return assemble(graph, solved, options, notes)
+
+
+def starting(survey: Survey) -> tuple[Survey, StartValues, tuple[str, ...]]:
+    """Start values from nothing; blocks that the search refused take no part in the adjustment, but are tested."""
+    from adjust.initial import find_start
+
+    found = find_start(survey)
+    blocks = list(survey.image_blocks)
+    for i in found.excluded_blocks:
+        blocks[i] = replace(blocks[i], used=np.zeros(len(blocks[i].uv), dtype=np.bool_))
+    start = StartValues(found.lenses, found.poses, found.points, found.vectors)
+    return replace(survey, image_blocks=tuple(blocks)), start, found.notes
+
+
+def assemble(graph: AdjustmentGraph, solved: Solved, options: AdjustOptions, notes: tuple[str, ...] = ()) -> Adjustment:
+    """Everything a report needs, from the solution."""
+    precision = Precision(graph, solved)
+    images = image_residuals(precision)
+    others = other_residuals(precision)
+    groups = group_summaries(graph, images, others)
+    n_observations = sum(g.n_observations for g in groups)
+    n_unknowns = sum(u.dim for u in graph.unknowns.by_name.values())
+    defect = solved.datum.defect if solved.datum else 0
+    redundancy = n_observations - n_unknowns + defect
+    omega = sum(g.omega for g in groups)
+    test = global_test(omega, redundancy, options.alpha)
+    result = Adjustment(
+        graph.survey, estimates(precision), images, others, groups, n_observations, n_unknowns, defect, redundancy,
+        omega, float(np.sqrt(omega / redundancy)) if redundancy > 0 else float("nan"), test, solved.iterations,
+        solved.max_step, True, (), precision,
+    )  # fmt: skip
+    return replace(result, warnings=warnings(graph, result) + notes)
+
+
+def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
+    """Every parameter, free or held, with its covariance."""
+    graph, values = precision.graph, precision.solved.values
+    u, out = graph.unknowns, {}
+    for name, slot in u.slot_of.items():
+        if name[0] == "table_motion":
+            continue
+        key = u.slot_key[slot]
+        pose = u.slot_pose[slot] if key is None else values.atPose3(key)
+        cov = np.zeros((6, 6)) if key is None else precision.cov(key)
+        out[name] = Estimate(name, pose, POSE_COMPONENTS, POSE_UNITS, cov, (u.parameters[name].treatment,) * 6)
+    for name, vector in u.vectors.items():
+        cov = np.zeros((len(vector.names),) * 2)
+        if vector.key is not None:
+            cov = vector.matrix @ precision.cov(vector.key) @ vector.matrix.T
+        out[name] = Estimate(name, vector.full(values), vector.names, vector.units, cov, vector.status)
+    for point in graph.survey.points:
+        name = ("point", point.point_id)
+        treatment = point.x_in_world.treatment
+        free = u.by_name.get(name)
+        x = u.held_points[point.point_id] if free is None else np.asarray(values.atPoint3(free.key))
+        cov = np.zeros((3, 3)) if free is None else precision.cov(free.key)
+        out[name] = Estimate(name, x, ("x", "y", "z"), ("m",) * 3, cov, (treatment,) * 3)
+    for name, unknown in u.by_name.items():
+        if name[0] == "table_angles":
+            n = unknown.dim
+            out[name] = Estimate(name, np.asarray(values.atVector(unknown.key)), unknown.components, ("rad",) * n,
+                                 precision.cov(unknown.key), ("free",) * n)  # fmt: skip
+    return out
+
+
+def warnings(graph: AdjustmentGraph, result: Adjustment) -> tuple[str, ...]:
+    """What its owner should know first."""
+    out = []
+    total = float(result.image_residuals.redundancy.sum() + sum(o.redundancy.sum() for o in result.other_residuals))
+    if abs(total - result.redundancy) > 1e-4 * max(1.0, result.redundancy):
+        out.append(
+            f"the redundancy numbers add up to {total:.4f} instead of {result.redundancy}: the survey is so weak that "
+            "its covariances lose digits"
+        )
+    test = result.global_test
+    if test is not None and not test.passed:
+        side = "larger" if test.omega > test.upper else "smaller"
+        out.append(
+            f"global test failed: sigma0 = {result.sigma0:.3f}, the residuals are {side} than the a priori sigmas say "
+            f"(v'Pv = {test.omega:.1f}, expected {test.lower:.1f} to {test.upper:.1f})"
+        )
+    out += _image_warnings(graph, result) + _lens_warnings(graph, result)
+    return tuple(out)
+
+
+def _image_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
+    out, images = [], result.image_residuals
+    # Sidak: one false alarm in a thousand surveys, however many points there are
+    family = 1.0 - 0.999 ** (1.0 / max(1, len(images.test)))
+    limit = -2.0 * np.log(family) * max(1.0, result.sigma0**2)
+    for i, block in enumerate(graph.survey.image_blocks):
+        rows = slice(images.block_ptr[i], images.block_ptr[i + 1])
+        what = f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}"
+        if not images.used[rows].any() and len(block.uv):
+            out.append(f"{what}: not used")
+            continue
+        bad = int(np.sum(images.test[rows][images.used[rows]] > limit))
+        if bad:
+            out.append(f"{what}: {bad} of {int(images.used[rows].sum())} image points do not fit (probable gross errors)")
+    return out
+
+
+def _lens_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
+    out = []
+    for camera in graph.survey.cameras:
+        model = MODELS[camera.lens.model]
+        values = result.estimates[("lens", camera.camera_id)].value
+        if isinstance(values, Pose3):
+            continue
+        constants = lens_constants(model, camera.image_size, camera.lens.pixel_size_mm)
+        radius = monotone_radius_px(model, values, constants)
+        seen = _largest_radius(graph, camera.camera_id, principal_point_px(model, values, constants))
+        if seen > radius:
+            out.append(
+                f"camera {camera.camera_id}: its distortion folds back at {radius:.0f} px from the principal point, "
+                f"inside the observed {seen:.0f} px; free fewer coefficients or cover the image better"
+            )
+    return out
+
+
+def _largest_radius(graph: AdjustmentGraph, camera_id: str, centre: FloatArray) -> float:
+    blocks = [b.uv for b in graph.survey.image_blocks if b.camera_id == camera_id and len(b.uv)]
+    return max((float(np.linalg.norm(uv - centre, axis=1).max()) for uv in blocks), default=0.0)

@@ -1,0 +1,349 @@
+"""Image points of unknown world points: one factor on the unknowns that other observations touch, the rest hidden.
+
+Points, and the poses nothing else touches, are reduced inside the batch by Schur complements; they sit in the same
+Values, and :meth:`BundleBatch.complete` puts their steps into GTSAM's delta. The factor holds the square root of what
+remains on the interface (Kummerle's and Lourakis' "reduced camera system", condensed once more).
+"""
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from scipy import sparse
+from scipy.linalg import lapack
+
+from adjust.bundle_kernels import (
+    add_direct,
+    back_substitute,
+    direct_influence,
+    point_covariances,
+    reduce_points,
+    rows,
+)
+from adjust.errors import IndeterminateError
+from adjust.image_batch import Chains, square_root_information
+from adjust.lens_kernels import MAX_LENS
+from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.observations import ImageBlock
+from adjust.state import State
+from adjust.unknowns import Chain, Unknowns
+
+
+class BundleBatch:
+    """Image blocks of world points, of which some are unknown.
+
+    points: ids in the order of ``point_idx`` of the blocks. outside: keys that other factors touch.
+    """
+
+    def __init__(
+        self,
+        unknowns: Unknowns,
+        state: State,
+        blocks: Sequence[ImageBlock],
+        chains: Sequence[Chain],
+        points: Sequence[str],
+        outside: set[int],
+    ) -> None:
+        self.unknowns, self.state = unknowns, state
+        self.blocks = tuple(blocks)
+        self.chains = Chains(chains)
+        self.point_ids = tuple(points)
+        self.camera = np.array([state.cameras[b.camera_id] for b in blocks], dtype=np.int64)
+        self.block_ptr: IntArray = np.cumsum([0] + [len(b.uv) for b in blocks])
+        self._choose_interface(outside)
+        self._sort_observations()
+        self._place_local_unknowns()
+        self._prepared: gtsam.Values | None = None
+        self._with_jacobians = False
+        self.chi_square = 0.0
+
+    # -- structure ---------------------------------------------------------------------------------------------------
+
+    def _choose_interface(self, outside: set[int]) -> None:
+        """Hide the free points and per-epoch poses that nothing else touches; two poses stay as anchors of the datum."""
+        key_of = {i: self.unknowns.by_name[("point", p)].key for i, p in enumerate(self.point_ids)
+                  if ("point", p) in self.unknowns.by_name}  # fmt: skip
+        self.point_key = key_of
+        self.tied = sorted(i for i, key in key_of.items() if key in outside)
+        tied = set(self.tied)
+        self.reduced = sorted(i for i in key_of if i not in tied)
+        pose_keys: list[int] = []
+        for slot in self.chains.slot:
+            table = self.unknowns.table_slots.get(int(slot))
+            found = [self.unknowns.slot_key[int(slot)]] if table is None else [table.angles_key, table.geometry.key]
+            pose_keys += [k for k in found if k is not None and k not in pose_keys]
+        may_hide = [
+            k
+            for k in pose_keys
+            if k not in outside and self.unknowns.by_key[k].name[0] == "world_from_station"
+            and len(self.unknowns.by_key[k].name) == 3
+        ]  # fmt: skip
+        self.hidden_poses = may_hide[1:-1] if len(may_hide) == len(pose_keys) else may_hide
+        hidden = set(self.hidden_poses)
+        lens_keys = [m.key for i, m in enumerate(self.state.lens_maps) if m.key is not None and i in set(self.camera)]
+        self.interface = lens_keys + [k for k in pose_keys if k not in hidden] + [key_of[i] for i in self.tied]
+        self.order = self.hidden_poses + self.interface
+        dims = [self.unknowns.by_key[k].dim for k in self.order]
+        starts = np.cumsum([0] + dims)
+        self.key_at = {k: int(starts[i]) for i, k in enumerate(self.order)}
+        self.n_keys = int(starts[-1])
+        self.n_hidden = int(sum(dims[: len(self.hidden_poses)]))
+
+    def _sort_observations(self) -> None:
+        block = np.repeat(np.arange(len(self.blocks)), np.diff(self.block_ptr))
+        point = np.concatenate([b.point_idx for b in self.blocks])
+        group = np.full(len(self.point_ids), 0)  # reduced points first, then those that stay, then the held
+        group[self.tied] = 1
+        group[[i for i in range(len(self.point_ids)) if i not in self.point_key]] = 2
+        self.sorted: IntArray = np.lexsort((block, self.camera[block], point, group[point]))
+        self.block, self.point = block[self.sorted].astype(np.int64), point[self.sorted].astype(np.int64)
+        self.camera_of = self.camera[self.block]
+        self.uv = np.concatenate([b.uv for b in self.blocks])[self.sorted]
+        self.W_all = square_root_information(np.concatenate([b.cov for b in self.blocks]))[self.sorted]
+        self.used: BoolArray = np.concatenate(
+            [b.used if b.used is not None else np.ones(len(b.uv), dtype=np.bool_) for b in self.blocks]
+        )[self.sorted]
+        self.W = self.W_all * self.used[:, None]
+        self.n_reduced = int(np.count_nonzero(group[self.point] == 0))
+        seen = self.point[: self.n_reduced]
+        self.reduced = [int(i) for i in dict.fromkeys(seen)]
+        self.ptr = np.searchsorted(seen, [*self.reduced, np.iinfo(np.int64).max]).astype(np.int64)
+        pair = np.stack([seen, self.camera_of[: self.n_reduced]], axis=1)
+        new = np.ones(len(pair), dtype=np.bool_)
+        new[1:] = (pair[1:] != pair[:-1]).any(axis=1)
+        self.pc_of = (np.cumsum(new) - 1).astype(np.int64)
+        self.pc_camera = pair[new, 1].astype(np.int64)
+        self.pc_ptr = np.searchsorted(pair[new, 0], [*self.reduced, np.iinfo(np.int64).max]).astype(np.int64)
+
+    def _place_local_unknowns(self) -> None:
+        n_lens = self.state.n_lens
+        used_cameras = set(self.camera.tolist())
+        self.lens_at = np.zeros(len(n_lens), dtype=np.int64)
+        offset = 0
+        for i in sorted(used_cameras):
+            self.lens_at[i] = offset
+            offset += int(n_lens[i])
+        self.pose_at = (offset + 6 * self.block).astype(np.int64)
+        self.first_pose = offset
+        offset += 6 * len(self.blocks)
+        self.tied_at = {i: offset + 3 * q for q, i in enumerate(self.tied)}
+        self.point_at = np.array([self.tied_at.get(int(i), -1) for i in self.point], dtype=np.int64)
+        self.n_local = offset + 3 * len(self.tied)
+        k, p = len(self.point), len(self.reduced)
+        self.A = np.zeros((k, 2, MAX_LENS + 7))
+        self.X = np.zeros((k, 3))
+        self.world = np.array([self.unknowns.held_points.get(i, np.zeros(3)) for i in self.point_ids]).reshape(-1, 3)
+        self.Vi, self.h = np.zeros((p, 3, 3)), np.zeros((p, 3))
+        self.W3, self.WL = np.zeros((k, 3, 6)), np.zeros((len(self.pc_camera), 3, MAX_LENS))
+        self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
+
+    def _local_from_keys(self) -> sparse.csr_matrix:
+        """Derivative (n_local, n_keys) of the local unknowns by the keys: lens and points as they are, poses by chains."""
+        entries: list[tuple[int, int, FloatArray]] = []
+        for i in sorted(set(self.camera.tolist())):
+            key = self.state.lens_maps[i].key
+            if key is not None:
+                entries.append((int(self.lens_at[i]), self.key_at[key], np.eye(int(self.state.n_lens[i]))))
+        for b in range(len(self.blocks)):
+            row = self.first_pose + 6 * b
+            for link in range(self.chains.ptr[b], self.chains.ptr[b + 1]):
+                slot = int(self.chains.slot[link])
+                table, C = self.unknowns.table_slots.get(slot), self.chains.C[link]
+                if table is None:
+                    if (key := self.unknowns.slot_key[slot]) is not None:
+                        entries.append((row, self.key_at[key], C))
+                    continue
+                k, D = len(table.axes), self.state.D[self.state.table_index[slot]]
+                entries.append((row, self.key_at[table.angles_key], C @ D[:, :k]))
+                if table.geometry.key is not None:
+                    n_free = len(table.geometry.free)
+                    entries.append((row, self.key_at[table.geometry.key], C @ D[:, k : k + n_free]))
+        for i, at in self.tied_at.items():
+            entries.append((at, self.key_at[self.point_key[i]], np.eye(3)))
+        r = np.concatenate([np.repeat(row + np.arange(m.shape[0]), m.shape[1]) for row, _, m in entries])
+        c = np.concatenate([np.tile(col + np.arange(m.shape[1]), m.shape[0]) for _, col, m in entries])
+        v = np.concatenate([m.ravel() for _, _, m in entries])
+        return sparse.csr_matrix((v, (r, c)), shape=(self.n_local, self.n_keys))
+
+    # -- evaluation --------------------------------------------------------------------------------------------------
+
+    def _rows(self, values: gtsam.Values, W: FloatArray) -> None:
+        s, c = self.state, self.chains
+        for i, key in self.point_key.items():
+            self.world[i] = values.atPoint3(key)
+        self.X[:] = self.world[self.point]
+        rows(
+            self.block, self.camera, s.kind, s.lens, s.constants, s.columns, s.factors, s.n_lens, c.R, c.t, self.X,
+            self.uv, W, self.A, self.chi, self.depth,
+        )  # fmt: skip
+
+    def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
+        """Evaluate at ``values`` (already loaded into the state). Raises IndeterminateError for undetermined points."""
+        self.chains.evaluate(self.state)
+        self._rows(values, self.W)
+        self.chi_square = float(self.chi.sum())
+        if jacobians:
+            self._condense(damping)
+        self._prepared, self._with_jacobians = values, jacobians
+
+    def _condense(self, damping: float) -> None:
+        s = self.state
+        S, g = np.zeros((self.n_local, self.n_local)), np.zeros(self.n_local)
+        bad = reduce_points(
+            self.ptr, self.pc_ptr, self.pc_camera, self.pc_of, self.A, self.camera_of, s.n_lens, self.lens_at,
+            self.pose_at, damping, S, g, self.Vi, self.W3, self.WL, self.h,
+        )  # fmt: skip
+        if bad >= 0:
+            raise self._undetermined_point(bad)
+        add_direct(
+            self.n_reduced, len(self.point), self.A, self.camera_of, s.n_lens, self.lens_at, self.pose_at, self.point_at,
+            S, g,
+        )  # fmt: skip
+        S += np.triu(S, 1).T
+        self.G = self._local_from_keys()
+        N = np.asarray(self.G.T @ (self.G.T @ S).T)
+        gradient = np.asarray(self.G.T @ g)
+        rest = self.chi_square - float(np.einsum("ja,jab,jb->", self.h, self.Vi, self.h))
+        self._reduce_hidden(0.5 * (N + N.T), gradient, rest, damping)
+
+    def _undetermined_point(self, bad: int) -> IndeterminateError:
+        name = self.point_ids[self.reduced[bad]]
+        k = slice(self.ptr[bad], self.ptr[bad + 1])
+        seen = sorted({self.blocks[b].camera_id + " at " + self.blocks[b].epoch_id for b in self.block[k][self.used[k]]})
+        return IndeterminateError(
+            f"point {name!r} is not determined: its rays do not intersect (seen by {', '.join(seen) or 'nothing'}); "
+            "observe it from a second direction, give its coordinates, or leave it out",
+            (f"point {name}",),
+        )
+
+    def _reduce_hidden(self, N: FloatArray, gradient: FloatArray, rest: float, damping: float) -> None:
+        d = np.sqrt(np.maximum(np.diag(N), 1e-300))
+        self.scale = d
+        A = N / d[:, None] / d
+        z = gradient / d
+        nh = self.n_hidden
+        if nh:
+            head = A[:nh, :nh] + damping * np.eye(nh)
+            self.C, info = lapack.dpotrf(np.asfortranarray(head), lower=0)
+            if info != 0:
+                raise self._undetermined_pose(info - 1)
+            right = np.asfortranarray(np.column_stack([A[:nh, nh:], z[:nh]]))
+            self.Y = lapack.dtrtrs(self.C, right, lower=0, trans=1)[0]
+            A = A[nh:, nh:] - self.Y[:, :-1].T @ self.Y[:, :-1]
+            z = z[nh:] - self.Y[:, :-1].T @ self.Y[:, -1]
+            rest -= float(self.Y[:, -1] @ self.Y[:, -1])
+        self._serve(A, z, d[nh:], rest)
+
+    def _undetermined_pose(self, column: int) -> IndeterminateError:
+        key = max((k for k in self.hidden_poses if self.key_at[k] <= column), key=lambda k: self.key_at[k])
+        name = " ".join(self.unknowns.by_key[key].name)
+        return IndeterminateError(
+            f"{name} is not determined by its image points: too few, or all in one direction; "
+            "leave the epoch out or add points",
+            (name,),
+        )
+
+    def _serve(self, A: FloatArray, z: FloatArray, d: FloatArray, rest: float) -> None:
+        """Square root of the interface's normal matrix, which has gauge freedoms: pivoted, rounding pivots left out."""
+        n = len(z)
+        U, pivots, rank, _ = lapack.dpstrf(np.asfortranarray(A), tol=1e-13, lower=0)
+        U = np.triu(U)
+        U[rank:] = 0.0
+        perm = pivots - 1
+        y = np.zeros(n)
+        y[:rank] = lapack.dtrtrs(np.asfortranarray(U[:rank, :rank]), z[perm][:rank], lower=0, trans=1)[0]
+        self.r = np.zeros(n + 1)
+        self.r[:n] = y
+        self.r[n] = np.sqrt(max(0.0, rest - float(y @ y)))
+        R = np.zeros((n + 1, n))
+        R[:n, perm] = U
+        R *= d
+        self.views = []
+        at = 0
+        for key in self.interface:
+            k = self.unknowns.by_key[key].dim
+            self.views.append(np.ascontiguousarray(R[:, at : at + k]))
+            at += k
+
+    def residual(self, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        """What GTSAM's custom factor returns."""
+        if values is not self._prepared or (jacobians is not None and not self._with_jacobians):
+            self.state.load(values)
+            self.prepare(values, jacobians is not None)
+            self._prepared = None
+        if jacobians is None:
+            out = np.zeros(self.n_keys - self.n_hidden + 1)
+            out[-1] = np.sqrt(self.chi_square)
+            return out
+        for i, view in enumerate(self.views):
+            jacobians[i] = view
+        return self.r
+
+    def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """The one factor of this batch."""
+        n = self.n_keys - self.n_hidden + 1
+        graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n), self.interface, _callback(self)))
+
+    def complete(self, delta: gtsam.VectorValues) -> None:
+        """Insert the steps of the hidden poses and points, which follow from those of the interface."""
+        d = np.zeros(self.n_keys)
+        for key in self.interface:
+            at = self.key_at[key]
+            d[at : at + self.unknowns.by_key[key].dim] = delta.at(key)
+        nh = self.n_hidden
+        if nh:
+            right = self.Y[:, :-1] @ (d[nh:] * self.scale[nh:]) + self.Y[:, -1]
+            d[:nh] = -lapack.dtrtrs(self.C, right, lower=0)[0] / self.scale[:nh]
+            for key in self.hidden_poses:
+                delta.insert(key, d[self.key_at[key] : self.key_at[key] + 6])
+        dX = np.zeros((len(self.reduced), 3))
+        back_substitute(
+            self.ptr, self.pc_ptr, self.pc_camera, self.camera_of, self.state.n_lens, self.lens_at, self.pose_at,
+            self.Vi, self.W3, self.WL, self.h, self.G @ d, dX,
+        )  # fmt: skip
+        for j, i in enumerate(self.reduced):
+            delta.insert(self.point_key[i], dX[j])
+
+    def covariances(self, Q_interface: FloatArray, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """From the interface's joint covariance (order ``interface``): that of all poses and tied points (order
+        ``order``), of the reduced points (P, 3, 3), and the whitened A Q A' (K, 3) of every image point (sorted order).
+
+        The batch must be prepared with Jacobians at ``values``.
+        """
+        nh, n = self.n_hidden, self.n_keys
+        Q = np.zeros((n, n))
+        Q[nh:, nh:] = Q_interface
+        if nh:
+            T = -lapack.dtrtrs(self.C, np.asfortranarray(self.Y[:, :-1]), lower=0)[0]
+            T = T / self.scale[:nh, None] * self.scale[nh:]
+            P = lapack.dpotri(self.C.copy(order="F"), lower=0)[0]
+            P = (np.triu(P) + np.triu(P, 1).T) / self.scale[:nh, None] / self.scale[:nh]
+            Q[:nh, nh:] = T @ Q_interface
+            Q[nh:, :nh] = Q[:nh, nh:].T
+            Q[:nh, :nh] = P + Q[:nh, nh:] @ T.T
+        Q_local = np.ascontiguousarray(self.G @ (self.G @ Q).T)
+        self._rows(values, self.W_all)
+        C = np.zeros((len(self.reduced), 3, 3))
+        influence = np.zeros((len(self.point), 3))
+        point_covariances(
+            self.ptr, self.pc_ptr, self.pc_camera, self.pc_of, self.camera_of, self.state.n_lens, self.lens_at,
+            self.pose_at, self.A, self.Vi, self.W3, self.WL, Q_local, C, influence,
+        )  # fmt: skip
+        direct_influence(
+            self.n_reduced, len(self.point), self.A, self.camera_of, self.state.n_lens, self.lens_at, self.pose_at,
+            self.point_at, Q_local, influence,
+        )  # fmt: skip
+        return Q, C, influence
+
+    def residuals_px(self) -> FloatArray:
+        """Unwhitened residuals (K, 2) px, sorted order, of the last :meth:`covariances`."""
+        r = self.A[:, :, MAX_LENS + 6]
+        v = r[:, 1] / self.W_all[:, 2]
+        return np.stack([(r[:, 0] - self.W_all[:, 1] * v) / self.W_all[:, 0], v], axis=1)
+
+
+def _callback(batch: BundleBatch):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
+    def residual(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # as above
+        return batch.residual(values, jacobians)
+
+    return residual

@@ -1,0 +1,318 @@
+"""From a survey and its start values to one GTSAM factor graph."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.bundle_batch import BundleBatch
+from adjust.errors import SurveyError
+from adjust.factors import (
+    ChainPose,
+    Position,
+    coordinates_factor,
+    distance_factor,
+    gaussian,
+    pair_factor,
+    pose_prior_factor,
+    vector_prior_factor,
+)
+from adjust.image_batch import ImageBatch
+from adjust.model import FloatArray, Survey
+from adjust.observations import FrameRef, ImageBlock, PositionRef
+from adjust.result import ParameterName
+from adjust.state import State, collect_vectors
+from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
+
+
+@dataclass(frozen=True, eq=False)
+class StartValues:
+    """Where the adjustment begins: full lens vectors, poses by parameter name, world points, table angles, vectors."""
+
+    lenses: Mapping[str, FloatArray]
+    poses: Mapping[ParameterName, Pose3]
+    points: Mapping[str, FloatArray]
+    vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationFactor:
+    """A factor that is not an image batch, with what a report needs to know of it. ``observed``: (k,)."""
+
+    factor: gtsam.NonlinearFactor
+    kind: str
+    group: str
+    ids: tuple[str, ...]
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    observed: FloatArray
+    used: bool = True
+
+
+@dataclass(eq=False)
+class AdjustmentGraph:
+    """The graph, its start and the batches that serve it. Held together with the survey only by the solver."""
+
+    survey: Survey
+    unknowns: Unknowns
+    state: State
+    graph: gtsam.NonlinearFactorGraph
+    start: gtsam.Values
+    images: ImageBatch
+    bundle: BundleBatch | None
+    image_order: list[tuple[int, bool]]
+    others: list[ObservationFactor]
+
+    def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
+        """Evaluate all batches at ``values``."""
+        self.state.load(values)
+        self.images.prepare(values, jacobians)
+        if self.bundle is not None:
+            self.bundle.prepare(values, jacobians, damping)
+
+    def omega(self, values: gtsam.Values) -> float:
+        """Weighted square sum v'Pv at ``values``."""
+        self.prepare(values, jacobians=False)
+        return 2.0 * float(self.graph.error(values)) + self.images.constant_chi
+
+    def behind_camera(self) -> list[ImageBlock]:
+        """Blocks with a point behind their camera at the prepared values."""
+        found = [b for b, z in zip(self.images.blocks, self.images.depth, strict=True) if z <= 0.0]
+        if self.bundle is not None:
+            found += [b for b, z in zip(self.bundle.blocks, self.bundle.depth, strict=True) if z <= 0.0]
+        fisheye = {c.camera_id for c in self.survey.cameras if c.lens.model == "fisheye"}
+        return [b for b in found if b.camera_id not in fisheye]
+
+
+class GraphBuilder:
+    """Builds an :class:`AdjustmentGraph`; one use."""
+
+    def __init__(self, survey: Survey, lenses: Mapping[str, FloatArray]) -> None:
+        self.survey, self.unknowns = survey, Unknowns()
+        collect_vectors(survey, self.unknowns, dict(lenses))
+        self.frames = FrameTree(survey, self.unknowns)
+        self.point_ids = [p.point_id for p in survey.points]
+        self.targets = {t.target_id: t for t in survey.targets}
+        self.others: list[ObservationFactor] = []
+
+    def build(self, start: StartValues) -> AdjustmentGraph:
+        """The whole graph. Raises SurveyError naming what is missing or contradictory."""
+        self._register_points()
+        split = [self._block(i, block) for i, block in enumerate(self.survey.image_blocks)]
+        chains = {i: self._image_chain(block) for i, _, block in split}
+        positions, pair_chains = self._chains_of_others()
+        state = State(self.survey, self.unknowns)
+        self._other_factors(state, positions, pair_chains)
+        graph = gtsam.NonlinearFactorGraph()
+        for item in self.others:
+            if item.used:
+                graph.add(item.factor)
+        known = [(i, b) for i, free, b in split if not free]
+        images = ImageBatch(
+            self.survey, self.unknowns, state, [b for _, b in known], [chains[i] for i, _ in known],
+            [self._known_points(b) for _, b in known], [self._n_warp(b) for _, b in known],
+        )  # fmt: skip
+        images.add_factors(graph)
+        outside = {k for item in self.others if item.used for k in item.factor.keys()}
+        outside |= {k for keys in images.keys for k in keys}
+        outside |= self._datum_keys()
+        unknown = [(i, b) for i, free, b in split if free]
+        bundle = None
+        if unknown:
+            bundle = BundleBatch(
+                self.unknowns, state, [b for _, b in unknown], [chains[i] for i, _ in unknown], self.point_ids, outside
+            )
+            bundle.add_factors(graph)
+        order = [(i, free) for i, free, _ in split]
+        return AdjustmentGraph(
+            self.survey, self.unknowns, state, graph, self._values(start), images, bundle, order, self.others
+        )
+
+    def _register_points(self) -> None:
+        for point in self.survey.points:
+            parameter = point.x_in_world
+            if parameter.treatment == "held":
+                if parameter.value is None:
+                    raise SurveyError(f"point {point.point_id!r} is held but has no coordinates; give x_mm")
+                self.unknowns.held_points[point.point_id] = np.asarray(parameter.value, dtype=float)
+            else:
+                self.unknowns.add(("point", point.point_id), "point", ("x", "y", "z"), ("m", "m", "m"))
+
+    def _block(self, i: int, block: ImageBlock) -> tuple[int, bool, ImageBlock]:
+        free = block.target_id is None and any(
+            self.point_ids[int(p)] not in self.unknowns.held_points for p in block.point_idx
+        )
+        return i, free, block
+
+    def _image_chain(self, block: ImageBlock) -> Chain:
+        camera = FrameRef("camera", block.camera_id, block.epoch_id)
+        target = FrameRef("target", block.target_id, block.epoch_id) if block.target_id else FrameRef("world")
+        return self.frames.relative(target, camera)
+
+    def _known_points(self, block: ImageBlock) -> FloatArray:
+        if block.target_id is None:
+            return np.array([self.unknowns.held_points[self.point_ids[int(p)]] for p in block.point_idx])
+        return np.asarray(self.targets[block.target_id].x_in_target[block.point_idx])
+
+    def _n_warp(self, block: ImageBlock) -> int:
+        vector = self.unknowns.vectors.get(("warp", block.target_id or ""))
+        if vector is None or vector.key is None:
+            return 0
+        if vector.free != vector.names:
+            raise SurveyError(f"target {block.target_id!r}: free both components of the warp or none")
+        return 2
+
+    def _position_chain(self, ref: PositionRef) -> Chain | None:
+        if ref.frame is None:
+            if ref.point_id not in set(self.point_ids):
+                raise SurveyError(f"point {ref.point_id!r} is observed but not part of the survey; add it under points")
+            return None
+        return self.frames.relative(ref.frame, FrameRef("world"))
+
+    def _chains_of_others(self) -> tuple[dict[PositionRef, Chain | None], list[Chain]]:
+        refs = [r for d in self.survey.distances for r in (d.a, d.b)]
+        refs += [r for c in self.survey.coordinates for r in c.positions]
+        positions = {ref: self._position_chain(ref) for ref in refs}
+        return positions, [self.frames.relative(p.a, p.b) for p in self.survey.pairs]
+
+    def _position(self, state: State, ref: PositionRef, chain: Chain | None) -> Position:
+        if chain is None:
+            unknown = self.unknowns.by_name.get(("point", ref.point_id or ""))
+            held = self.unknowns.held_points.get(ref.point_id or "", np.zeros(3))
+            return Position(None, held, unknown.key if unknown else None)
+        x = np.zeros(3)
+        if ref.point_id is not None and ref.frame is not None:
+            target = self.targets[ref.frame.frame_id]
+            if ref.point_id not in target.point_ids:
+                raise SurveyError(f"target {target.target_id!r} has no point {ref.point_id!r}")
+            x = target.x_in_target[target.point_ids.index(ref.point_id)]
+        return Position(ChainPose(self.unknowns, state, chain), np.asarray(x))
+
+    def _other_factors(
+        self, state: State, positions: Mapping[PositionRef, Chain | None], pair_chains: list[Chain]
+    ) -> None:
+        for reading in self.survey.table_readings:
+            unknown = self.unknowns.by_name.get(("table_angles", reading.table_id, reading.epoch_id))
+            if unknown is not None:
+                factor = gtsam.PriorFactorVector(unknown.key, reading.angles, gaussian(reading.cov))
+                self._other(factor, "table", reading.group, (reading.table_id, reading.epoch_id), unknown.components,
+                            unknown.units, reading.angles)  # fmt: skip
+        for pair, chain in zip(self.survey.pairs, pair_chains, strict=True):
+            self._pair(state, pair, chain)
+        at = {ref: self._position(state, ref, chain) for ref, chain in positions.items()}
+        for d in self.survey.distances:
+            if not at[d.a].keys and not at[d.b].keys:
+                raise SurveyError(f"distance {d.distance_id!r} joins two held positions; it can adjust nothing")
+            self._other(distance_factor(d, at[d.a], at[d.b]), "distance", d.group, (d.distance_id, text(d.a), text(d.b)),
+                        ("distance",), ("m",), np.array([d.value]), d.used)  # fmt: skip
+        for c in self.survey.coordinates:
+            names = tuple(f"{text(p)} {axis}" for p in c.positions for axis in "xyz")
+            self._other(coordinates_factor(c, [at[p] for p in c.positions]), "coordinates", c.group,
+                        tuple(text(p) for p in c.positions), names, ("m",) * len(names), c.values.ravel(), c.used)  # fmt: skip
+        self._priors()
+
+    def _pair(self, state, pair, chain) -> None:  # type: ignore[no-untyped-def]  # three plain values
+        factor = pair_factor(pair, self.unknowns, state, chain)
+        pose = isinstance(pair.b_from_a, Pose3)
+        n = 6 if pose else 3
+        observed = Pose3.Logmap(pair.b_from_a) if pose else Rot3.Logmap(pair.b_from_a)
+        self._other(factor, "pair", pair.group, (pair.pair_id, frame_text(pair.a), frame_text(pair.b)),
+                    POSE_COMPONENTS[:n], POSE_UNITS[:n], observed, pair.used)  # fmt: skip
+
+    def _priors(self) -> None:
+        u = self.unknowns
+        for name, parameter in u.parameters.items():
+            if parameter.treatment == "prior":
+                if parameter.value is None or parameter.prior_cov is None:
+                    raise SurveyError(f"{' '.join(name)} has a prior without value or covariance; give both")
+                factor = pose_prior_factor(parameter, u.by_name[name].key)
+                known = np.isfinite(np.diag(parameter.prior_cov))
+                self._other(factor, "prior", "prior", name, tuple(np.array(POSE_COMPONENTS)[known]),
+                            tuple(np.array(POSE_UNITS)[known]), np.zeros(int(known.sum())))  # fmt: skip
+        for point in self.survey.points:
+            p = point.x_in_world
+            if p.treatment == "prior":
+                if p.value is None or p.prior_cov is None:
+                    raise SurveyError(f"point {point.point_id!r} has a prior without coordinates or sigma; give both")
+                name = ("point", point.point_id)
+                factor = gtsam.PriorFactorPoint3(u.by_name[name].key, p.value, gaussian(p.prior_cov))
+                self._other(factor, "prior", "prior", name, ("x", "y", "z"), ("m",) * 3, p.value)
+        owners = [(("lens", c.camera_id), c.lens.prior) for c in self.survey.cameras]
+        owners += [(("table_geometry", t.table_id), t.geometry.prior) for t in self.survey.tables]
+        owners += [(("warp", t.target_id), t.warp.prior) for t in self.survey.targets if t.warp]
+        for name, prior in owners:
+            vector = u.vectors.get(name)
+            if prior is not None and vector is not None and vector.key is not None:
+                units = tuple(vector.units[vector.names.index(x)] for x in prior.names)
+                self._other(vector_prior_factor(prior, vector), "prior", "prior", name, prior.names, units, prior.mean)
+
+    def _other(
+        self, factor: gtsam.NonlinearFactor, kind: str, group: str, ids: tuple[str, ...], components: tuple[str, ...],
+        units: tuple[str, ...], observed: FloatArray, used: bool = True,
+    ) -> None:  # fmt: skip
+        self.others.append(
+            ObservationFactor(factor, kind, group, ids, components, units, np.asarray(observed, dtype=float), used)
+        )
+
+    def _datum_keys(self) -> set[int]:
+        """Unknowns that carry inner constraints: they have to stay visible to GTSAM."""
+        datum = self.survey.datum
+        if datum.kind != "inner":
+            return set()
+        points = datum.points or (() if datum.stations else tuple(self.point_ids))
+        keys = {u.key for p in points if (u := self.unknowns.by_name.get(("point", p)))}
+        for name, unknown in self.unknowns.by_name.items():
+            wanted = datum.stations or (() if datum.points or keys else tuple(s.station_id for s in self.survey.stations))
+            if name[0] == "world_from_station" and name[1] in wanted:
+                keys.add(unknown.key)
+        return keys
+
+    def _values(self, start: StartValues) -> gtsam.Values:
+        values = gtsam.Values()
+        missing = []
+        for name, unknown in self.unknowns.by_name.items():
+            if unknown.kind == "pose":
+                if name in start.poses:
+                    values.insert(unknown.key, start.poses[name])
+                else:
+                    missing.append(" ".join(name))
+            elif unknown.kind == "point":
+                if name[1] in start.points:
+                    values.insert(unknown.key, np.asarray(start.points[name[1]], dtype=float))
+                else:
+                    missing.append(" ".join(name))
+            else:
+                values.insert(unknown.key, self._start_vector(name, start))
+        if missing:
+            raise SurveyError("no start value for " + ", ".join(missing))
+        return values
+
+    def _start_vector(self, name: ParameterName, start: StartValues) -> FloatArray:
+        if name[0] == "table_angles":
+            for reading in self.survey.table_readings:
+                if (reading.table_id, reading.epoch_id) == name[1:]:
+                    return np.array(start.vectors.get(name, reading.angles), dtype=float)
+        vector = self.unknowns.vectors[name]
+        if name[0] == "lens":
+            full = start.lenses[name[1]]
+        elif name in start.vectors:
+            full = start.vectors[name]
+        elif name[0] == "table_geometry":
+            full = next(t.geometry.values for t in self.survey.tables if t.table_id == name[1])
+        else:
+            full = next(t.warp.values for t in self.survey.targets if t.target_id == name[1] and t.warp)
+        return np.array([full[vector.names.index(x)] for x in vector.free], dtype=float)
+
+
+def frame_text(ref: FrameRef) -> str:
+    """``kind:id@epoch``, as in the tables of the project folder."""
+    return f"{ref.kind}:{ref.frame_id}" + (f"@{ref.epoch_id}" if ref.epoch_id else "")
+
+
+def text(ref: PositionRef) -> str:
+    """A position as people write it."""
+    if ref.frame is None:
+        return str(ref.point_id)
+    return frame_text(ref.frame) + (f"/{ref.point_id}" if ref.point_id else "")

@@ -1,0 +1,264 @@
+"""All image points of known targets: one compiled pass evaluates them, one condensed factor per block serves GTSAM.
+
+A block's rows are the upper triangular square root of its augmented normal matrix over [lens | camera_from_target |
+warp | residual]: the same linear system and chi-square as its 2n rows, for any n (Lawson and Hanson 1974, chapter 27).
+"""
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from adjust.chain_kernels import evaluate_chains
+from adjust.image_kernels import condense, errors, statistics
+from adjust.model import BoolArray, FloatArray, IntArray, Survey
+from adjust.observations import ImageBlock
+from adjust.state import State
+from adjust.unknowns import Chain, Unknowns
+
+_LENS, _POSE, _TABLE, _WARP = 0, 1, 2, 3
+
+
+def square_root_information(cov: FloatArray) -> FloatArray:
+    """Upper triangular W (n, 3: w00, w01, w11) with W'W = inv(cov), for covariances (n, 2, 2)."""
+    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    w11 = 1.0 / np.sqrt(c)
+    w00 = 1.0 / np.sqrt(a - b * b / c)
+    return np.stack([w00, -w00 * b / c, w11], axis=1)
+
+
+def warp_shape(x: FloatArray) -> FloatArray:
+    """The two unit sags 4u(1-u), 4v(1-v) at points (n, 3), u and v running from 0 to 1 over the target."""
+    low, high = x[:, :2].min(axis=0), x[:, :2].max(axis=0)
+    span = np.where(high > low, high - low, 1.0)
+    u = (x[:, :2] - low) / span
+    return np.asarray(4.0 * u * (1.0 - u))
+
+
+class Chains:
+    """Pose chains of many blocks in flat arrays, evaluated together."""
+
+    def __init__(self, chains: Sequence[Chain]) -> None:
+        links = [link for chain in chains for link in chain]
+        self.ptr: IntArray = np.cumsum([0] + [len(chain) for chain in chains])
+        self.slot = np.array([link.slot for link in links], dtype=np.int64)
+        self.inverse: BoolArray = np.array([link.inverse for link in links], dtype=np.bool_)
+        n = len(chains)
+        self.R, self.t, self.C = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((len(links), 6, 6))
+
+    def evaluate(self, state: State) -> None:
+        """Fill R (B, 3, 3), t (B, 3) and C (links, 6, 6)."""
+        evaluate_chains(state.slot_R, state.slot_t, self.ptr, self.slot, self.inverse, self.R, self.t, self.C)
+
+
+class Segments:
+    """Which columns of a block's rows belong to which key, and how they come from the local unknowns."""
+
+    def __init__(self) -> None:
+        self.keys: list[list[int]] = []
+        self.width: list[list[int]] = []
+        self.ptr = [0]
+        self.rows: list[tuple[int, int, int, int, int, int, int]] = []  # block, type, ref, d, start, n, key position
+
+    def block(self, unknowns: Unknowns, state: State, chains: Chains, b: int, camera: int, target: int | None) -> None:
+        """Append the segments of block ``b``."""
+        keys: list[int] = []
+        width: list[int] = []
+
+        def add(key: int | None, kind: int, ref: int, d: int, start: int, n: int) -> None:
+            if key is None or n == 0:
+                return
+            if key not in keys:
+                keys.append(key)
+                width.append(n)
+            self.rows.append((b, kind, ref, d, start, n, keys.index(key)))
+
+        add(state.lens_maps[camera].key, _LENS, -1, -1, 0, int(state.n_lens[camera]))
+        for link in range(chains.ptr[b], chains.ptr[b + 1]):
+            slot = int(chains.slot[link])
+            table = unknowns.table_slots.get(slot)
+            if table is None:
+                add(unknowns.slot_key[slot], _POSE, link, -1, 0, 6)
+            else:
+                d, k = int(state.table_index[slot]), len(table.axes)
+                add(table.angles_key, _TABLE, link, d, 0, k)
+                add(table.geometry.key, _TABLE, link, d, k, len(table.geometry.free))
+        warp = state.warp_maps[target] if target is not None else None
+        if warp is not None:
+            add(warp.key, _WARP, -1, -1, 0, len(warp.free))
+        self.keys.append(keys)
+        self.width.append(width)
+        self.ptr.append(len(self.rows))
+
+    def layout(self, n_rows: IntArray) -> tuple[IntArray, list[list[tuple[int, int, int]]], int]:
+        """Offsets of every segment in one flat buffer; per block (offset, rows, columns) of every key; total size."""
+        offset, places = 0, []
+        out = np.zeros(len(self.rows), dtype=np.int64)
+        for b, widths in enumerate(self.width):
+            starts = []
+            for width in widths:
+                starts.append((offset, int(n_rows[b]), width))
+                offset += int(n_rows[b]) * width
+            for s in range(self.ptr[b], self.ptr[b + 1]):
+                out[s] = starts[self.rows[s][6]][0]
+            places.append(starts)
+        return out, places, offset
+
+    def column(self, i: int) -> IntArray:
+        """Column ``i`` of the segment table."""
+        return np.array([row[i] for row in self.rows], dtype=np.int64)
+
+
+class ImageBatch:
+    """Image points of known targets (and of held world points), grouped per block.
+
+    ``prepare(values)`` evaluates everything; the factors serve what was prepared when they are asked at exactly these
+    values, and evaluate their own block otherwise, so the graph is correct in any GTSAM algorithm.
+    """
+
+    def __init__(
+        self,
+        survey: Survey,
+        unknowns: Unknowns,
+        state: State,
+        blocks: Sequence[ImageBlock],
+        chains: Sequence[Chain],
+        points: Sequence[FloatArray],
+        n_warp: Sequence[int],
+    ) -> None:
+        self.blocks = tuple(blocks)
+        self.state = state
+        self.chains = Chains(chains)
+        n = len(blocks)
+        self.ptr: IntArray = np.cumsum([0] + [len(b.uv) for b in blocks])
+        self.camera = np.array([state.cameras[b.camera_id] for b in blocks], dtype=np.int64)
+        self.warp_id = np.array(
+            [
+                state.targets[b.target_id] if b.target_id and state.warp_maps[state.targets[b.target_id]] else -1
+                for b in blocks
+            ],
+            dtype=np.int64,
+        )
+        self.n_warp = np.array(n_warp, dtype=np.int64)
+        self.X = np.concatenate(points) if n else np.zeros((0, 3))
+        self.shape = np.zeros((len(self.X), 2))
+        self.uv = np.concatenate([b.uv for b in blocks]) if n else np.zeros((0, 2))
+        self.W_all = square_root_information(np.concatenate([b.cov for b in blocks])) if n else np.zeros((0, 3))
+        self.used: BoolArray = np.concatenate(
+            [b.used if b.used is not None else np.ones(len(b.uv), dtype=np.bool_) for b in blocks]
+        ) if n else np.zeros(0, dtype=np.bool_)
+        self.W = self.W_all * self.used[:, None]
+        for i, block in enumerate(blocks):
+            if self.warp_id[i] >= 0:
+                target = survey.targets[self.warp_id[i]]
+                self.shape[self.ptr[i] : self.ptr[i + 1]] = warp_shape(target.x_in_target)[block.point_idx]
+        self._columns(unknowns)
+
+    def _columns(self, unknowns: Unknowns) -> None:
+        segments = Segments()
+        for b, block in enumerate(self.blocks):
+            target = self.state.targets[block.target_id] if self.n_warp[b] else None
+            segments.block(unknowns, self.state, self.chains, b, int(self.camera[b]), target)
+        self.n_rows: IntArray = self.state.n_lens[self.camera] + 6 + self.n_warp + 1
+        self.keys, self.width = segments.keys, segments.width
+        self.seg_ptr = np.array(segments.ptr, dtype=np.int64)
+        self.seg_type, self.seg_ref, self.seg_d = (segments.column(i) for i in (1, 2, 3))
+        self.seg_start, self.seg_n, self.seg_key = (segments.column(i) for i in (4, 5, 6))
+        self.seg_out, places, size = segments.layout(self.n_rows)
+        most = int(self.n_rows.max(initial=1))
+        self.flat, self.r = np.zeros(size), np.zeros((len(self.blocks), most))
+        self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
+        self._views = [
+            [self.flat[offset : offset + rows * columns].reshape(rows, columns) for offset, rows, columns in place]
+            for place in places
+        ]
+        self._r_views = [self.r[b, : self.n_rows[b]] for b in range(len(self.blocks))]
+        self._prepared: gtsam.Values | None = None
+        self._with_jacobians = False
+        self._all = np.arange(len(self.blocks), dtype=np.int64)
+
+    def prepare(self, values: gtsam.Values, jacobians: bool) -> None:
+        """Evaluate all blocks at ``values``; ``state`` must have been loaded from the same values."""
+        self.chains.evaluate(self.state)
+        self._evaluate(self._all, jacobians)
+        self._prepared, self._with_jacobians = values, jacobians
+
+    def _evaluate(self, which: IntArray, jacobians: bool) -> None:
+        s, c = self.state, self.chains
+        if jacobians:
+            condense(
+                which, self.ptr, self.camera, s.kind, s.lens, s.constants, s.columns, s.factors, s.n_lens, c.R, c.t,
+                self.X, self.shape, s.warp, self.n_warp, self.warp_id, self.uv, self.W, self.seg_ptr, self.seg_type,
+                self.seg_ref, self.seg_d, self.seg_start, self.seg_n, self.seg_out, c.C, s.D, self.flat, self.r,
+                self.chi, self.depth,
+            )  # fmt: skip
+        else:
+            errors(
+                which, self.ptr, self.camera, s.kind, s.lens, s.constants, c.R, c.t, self.X, self.shape, s.warp,
+                self.warp_id, self.uv, self.W, self.chi, self.depth,
+            )  # fmt: skip
+
+    def _evaluate_alone(self, b: int, values: gtsam.Values, jacobians: bool) -> None:
+        links = slice(self.chains.ptr[b], self.chains.ptr[b + 1])
+        self.state.load(values, [int(slot) for slot in self.chains.slot[links]])
+        self.chains.evaluate(self.state)
+        self._prepared = None
+        self._evaluate(np.array([b], dtype=np.int64), jacobians)
+
+    def residual(self, b: int, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        """What GTSAM's custom factor of block ``b`` returns: its condensed residual, and its rows by key."""
+        if values is not self._prepared or (jacobians is not None and not self._with_jacobians):
+            self._evaluate_alone(b, values, jacobians is not None)
+        if jacobians is None:
+            out = np.zeros(self.n_rows[b])
+            out[-1] = np.sqrt(self.chi[b])
+            return out
+        for i, view in enumerate(self._views[b]):
+            jacobians[i] = view
+        return self._r_views[b]
+
+    def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """One custom factor per block that has an unknown."""
+        noise = {int(n): gtsam.noiseModel.Unit.Create(int(n)) for n in np.unique(self.n_rows)}
+        for b, keys in enumerate(self.keys):
+            if keys:
+                graph.add(gtsam.CustomFactor(noise[int(self.n_rows[b])], keys, _callback(self, b)))
+
+    @property
+    def constant_chi(self) -> float:
+        """Chi-square of the blocks without any unknown, which have no factor."""
+        return float(sum(self.chi[b] for b, keys in enumerate(self.keys) if not keys))
+
+    def local_from_keys(self, b: int) -> FloatArray:
+        """Derivative (n_lens + 6 + n_warp, sum of key dims) of the block's local unknowns by its keys."""
+        nl, n = int(self.state.n_lens[self.camera[b]]), int(self.n_rows[b]) - 1
+        starts = np.cumsum([0] + self.width[b])
+        G = np.zeros((n, int(starts[-1])))
+        for s in range(self.seg_ptr[b], self.seg_ptr[b + 1]):
+            o = int(starts[self.seg_key[s]])
+            k, start = int(self.seg_n[s]), int(self.seg_start[s])
+            if self.seg_type[s] == _LENS:
+                G[:nl, o : o + k] += np.eye(k)
+            elif self.seg_type[s] == _WARP:
+                G[nl + 6 : nl + 6 + k, o : o + k] += np.eye(k)
+            elif self.seg_type[s] == _POSE:
+                G[nl : nl + 6, o : o + 6] += self.chains.C[self.seg_ref[s]]
+            else:
+                D = self.state.D[self.seg_d[s]][:, start : start + k]
+                G[nl : nl + 6, o : o + k] += self.chains.C[self.seg_ref[s]] @ D
+        return G
+
+    def block_statistics(self, b: int, Q_local: FloatArray, residual: FloatArray, influence: FloatArray) -> None:
+        """Fill residuals (N, 2) px and whitened A Q A' (N, 3) of block ``b``; the batch must be prepared."""
+        s, c = self.state, self.chains
+        statistics(
+            b, self.ptr, self.camera, s.kind, s.lens, s.constants, s.columns, s.factors, s.n_lens, c.R, c.t, self.X,
+            self.shape, s.warp, self.n_warp, self.warp_id, self.uv, self.W_all, Q_local, residual, influence,
+        )  # fmt: skip
+
+
+def _callback(batch: ImageBatch, b: int):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
+    def residual(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # as above
+        return batch.residual(b, values, jacobians)
+
+    return residual

@@ -1,0 +1,183 @@
+"""Covariances, redundancy numbers and standardized residuals of a solved survey.
+
+Redundancy numbers and residual covariances follow Baarda (1968) and Foerstner (1979): Q_vv = Q_ll - A Q A', r = diag of
+Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, chi-square with two degrees of freedom.
+"""
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from scipy.stats import chi2
+
+from adjust.datum import gauge
+from adjust.graph import AdjustmentGraph, ObservationFactor
+from adjust.model import FloatArray
+from adjust.result import GlobalTest, GroupSummary, ImageResiduals, ObservationResidual, ParameterName
+from adjust.solve import Solved
+from adjust.tree_covariance import TreeCovariance
+
+
+class Precision:
+    """Covariances of the adjusted unknowns, a priori (sigma0 = 1), in the survey's datum."""
+
+    def __init__(self, graph: AdjustmentGraph, solved: Solved) -> None:
+        self.graph, self.solved = graph, solved
+        dims = {key: unknown.dim for key, unknown in graph.unknowns.by_key.items()}
+        if solved.use_qr:
+            tree = solved.linear.eliminateMultifrontal(solved.ordering, gtsam.EliminateQR)
+        else:
+            tree = solved.linear.eliminateMultifrontal(solved.ordering)
+        self.tree = TreeCovariance(tree, dims)
+        self.hidden: dict[int, FloatArray] = {}
+        self.bundle_influence = np.zeros((0, 3))
+        if graph.bundle is not None:
+            self._bundle()
+
+    def _bundle(self) -> None:
+        bundle = self.graph.bundle
+        if bundle is None:
+            return
+        Q, points, self.bundle_influence = bundle.covariances(self.tree.joint(bundle.interface), self.solved.values)
+        self.bundle_order_cov = Q
+        for key in bundle.hidden_poses:
+            at = bundle.key_at[key]
+            self.hidden[key] = Q[at : at + 6, at : at + 6]
+        for j, i in enumerate(bundle.reduced):
+            self.hidden[bundle.point_key[i]] = points[j]
+
+    def _excess(self, keys: Sequence[int]) -> FloatArray | float:
+        datum = self.solved.datum
+        if datum is None:
+            return 0.0
+        by_key = self.graph.unknowns.by_key
+        return datum.excess(np.concatenate([gauge(self.graph, by_key[k], self.solved.values) for k in keys]))
+
+    def cov(self, key: int) -> FloatArray:
+        """Covariance (dim, dim) of one unknown."""
+        Q = self.hidden[key] if key in self.hidden else self.tree.marginal(key)
+        return np.asarray(Q - self._excess([key]))
+
+    def joint(self, names: Sequence[ParameterName]) -> FloatArray:
+        """Joint covariance of several unknowns, stacked in this order (lens: its free components).
+
+        Raises KeyError for a name that is not an unknown, and for points or poses that are hidden in a bundle.
+        """
+        keys = [self.graph.unknowns.by_name[name].key for name in names]
+        if len(keys) == 1:
+            return self.cov(keys[0])
+        return np.asarray(self.tree.joint(keys) - self._excess(keys))
+
+    def influence(self, item: ObservationFactor) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Whitened residual (k,), whitened A Q A' (k, k), and the square root information's inverse (k, k)."""
+        linear = item.factor.linearize(self.solved.values)
+        A, b = linear.jacobian()
+        Q = self.tree.joint(list(linear.keys()))
+        noise = item.factor.noiseModel()
+        return -b, A @ Q @ A.T, np.linalg.inv(noise.R())
+
+
+def image_residuals(precision: Precision) -> ImageResiduals:
+    """Residuals and their statistics of all image points, in the order of ``Survey.image_blocks``."""
+    graph = precision.graph
+    images, bundle = graph.images, graph.bundle
+    n = len(images.X)
+    residual, influence = np.zeros((n, 2)), np.zeros((n, 3))
+    for b in range(len(images.blocks)):
+        Q_local = np.zeros((int(images.n_rows[b]) - 1,) * 2)
+        if images.keys[b]:
+            G = images.local_from_keys(b)
+            Q_local = np.ascontiguousarray(G @ precision.tree.joint(images.keys[b]) @ G.T)
+        images.block_statistics(b, Q_local, residual, influence)
+    parts = [_test(residual, influence, images.W_all, images.used)]
+    if bundle is not None:
+        stats = _test(bundle.residuals_px(), precision.bundle_influence, bundle.W_all, bundle.used)
+        back = np.empty(len(bundle.sorted), dtype=np.int64)
+        back[bundle.sorted] = np.arange(len(back))
+        parts.append(tuple(a[back] for a in stats))
+    return _merge(graph, parts)
+
+
+def _test(v: FloatArray, M: FloatArray, W: FloatArray, used: FloatArray) -> tuple[FloatArray, ...]:
+    sign = np.where(used, -1.0, 1.0)
+    q00, q01, q11 = 1.0 + sign * M[:, 0], sign * M[:, 1], 1.0 + sign * M[:, 2]
+    redundancy = np.where(used[:, None], np.stack([q00, q11], axis=1), 0.0)
+    e0, e1 = W[:, 0] * v[:, 0] + W[:, 1] * v[:, 1], W[:, 2] * v[:, 1]
+    det = q00 * q11 - q01 * q01
+    with np.errstate(divide="ignore", invalid="ignore"):
+        test = np.where(det > 1e-9, (q11 * e0 * e0 - 2 * q01 * e0 * e1 + q00 * e1 * e1) / det, np.nan)
+        # covariance of the residuals in pixels: W^-1 Q W^-T with W upper triangular
+        i00, i11 = 1.0 / W[:, 0], 1.0 / W[:, 2]
+        i01 = -W[:, 1] * i00 * i11
+        su = np.sqrt(np.maximum(0.0, i00 * i00 * q00 + 2 * i00 * i01 * q01 + i01 * i01 * q11))
+        sv = np.sqrt(np.maximum(0.0, i11 * i11 * q11))
+        standardized = np.stack([np.where(su > 1e-9 * i00, v[:, 0] / su, np.nan),
+                                 np.where(sv > 1e-9 * i11, v[:, 1] / sv, np.nan)], axis=1)  # fmt: skip
+    return v, redundancy, standardized, test, used
+
+
+def _merge(graph: AdjustmentGraph, parts: list[tuple[FloatArray, ...]]) -> ImageResiduals:
+    ptr = np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks])
+    shapes = [(2,), (2,), (2,), (), ()]
+    out = [np.zeros((int(ptr[-1]), *s), dtype=np.bool_ if i == 4 else np.float64) for i, s in enumerate(shapes)]
+    at = [0, 0]
+    for i, (_, free) in enumerate(graph.image_order):
+        n = int(ptr[i + 1] - ptr[i])
+        source = slice(at[int(free)], at[int(free)] + n)
+        for a, part in zip(out, parts[int(free)], strict=True):
+            a[ptr[i] : ptr[i + 1]] = part[source]
+        at[int(free)] += n
+    return ImageResiduals(ptr, *out)
+
+
+def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
+    """The same for every observation that is not an image point."""
+    out = []
+    for item in precision.graph.others:
+        e, M, root = precision.influence(item)
+        n = len(e)
+        Q = np.eye(n) - M if item.used else np.eye(n) + M
+        v = root @ e
+        cov_v = root @ Q @ root.T
+        own = np.sqrt(np.maximum(0.0, np.diag(cov_v)))
+        sigma = np.sqrt(np.diag(root @ root.T))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            standardized = np.where(own > 1e-6 * sigma, v / own, np.nan)
+        test = float(e @ np.linalg.pinv(Q, rcond=1e-9) @ e)
+        redundancy = np.diag(Q) if item.used else np.zeros(n)
+        out.append(
+            ObservationResidual(item.kind, item.group, item.ids, item.components, item.units, item.observed,
+                                item.observed + v, v, sigma, redundancy, standardized, test, item.used)
+        )  # fmt: skip
+    return tuple(out)
+
+
+def group_summaries(
+    graph: AdjustmentGraph, images: ImageResiduals, others: Sequence[ObservationResidual]
+) -> tuple[GroupSummary, ...]:
+    """Observations, redundancy and weighted square sum of every group, in order of appearance."""
+    sums: dict[str, list[float]] = {}
+
+    def add(group: str, n: int, r: float, omega: float) -> None:
+        total = sums.setdefault(group, [0.0, 0.0, 0.0])
+        total[0], total[1], total[2] = total[0] + n, total[1] + r, total[2] + omega
+
+    for i, block in enumerate(graph.survey.image_blocks):
+        rows = slice(images.block_ptr[i], images.block_ptr[i + 1])
+        used = images.used[rows]
+        v = images.residuals[rows][used]
+        omega = float(np.einsum("ni,nij,nj->", v, np.linalg.inv(block.cov[used]), v)) if used.any() else 0.0
+        add(block.group, 2 * int(used.sum()), float(images.redundancy[rows].sum()), omega)
+    for item, factor in zip(others, graph.others, strict=True):
+        if item.used:
+            e = factor.factor.noiseModel().whiten(item.residual)
+            add(item.group, len(item.residual), float(item.redundancy.sum()), float(e @ e))
+    return tuple(GroupSummary(g, int(n), r, omega) for g, (n, r, omega) in sums.items())
+
+
+def global_test(omega: float, redundancy: int, alpha: float) -> GlobalTest | None:
+    """Two-sided chi-square test of the weighted square sum; None without redundancy."""
+    if redundancy <= 0:
+        return None
+    lower, upper = chi2.ppf([alpha / 2, 1 - alpha / 2], redundancy)
+    return GlobalTest(omega, redundancy, alpha, float(lower), float(upper))

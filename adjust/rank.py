@@ -1,0 +1,179 @@
+"""What observations and datum leave undetermined, by name."""
+
+import gtsam
+import numpy as np
+
+from adjust.datum import GAUGES, Stacking, gauge, stacking, times, visible_keys
+from adjust.errors import IndeterminateError
+from adjust.graph import AdjustmentGraph
+from adjust.model import FloatArray
+from adjust.unknowns import Unknown
+
+_MOST_DIMS = 6000
+_READABLE = {"rx": "rotation x", "ry": "rotation y", "rz": "rotation z", "tx": "x", "ty": "y", "tz": "z"}
+
+
+def unobserved_unknowns(graph: AdjustmentGraph) -> list[str]:
+    """Unknowns that occur in no factor at all."""
+    seen = set(graph.graph.keyVector())
+    if graph.bundle is not None:
+        seen |= set(graph.bundle.hidden_poses) | {graph.bundle.point_key[i] for i in graph.bundle.reduced}
+    return [readable(u) for u in graph.unknowns.by_name.values() if u.key not in seen]
+
+
+def readable(unknown: Unknown) -> str:
+    """An unknown as people say it."""
+    kind, *ids = unknown.name
+    owner = {
+        "lens": "lens of camera {}",
+        "station_from_camera": "pose of camera {} on its station",
+        "mount_from_station": "pose of station {} on the table's mount",
+        "world_from_station": "pose of station {}",
+        "world_from_table": "pose of table {}",
+        "table_geometry": "axes of table {}",
+        "table_angles": "angles of table {}",
+        "carrier_from_target": "pose of target {}",
+        "warp": "warp of target {}",
+        "point": "point {}",
+    }[kind].format(ids[0])
+    return owner + (f" at epoch {ids[1]}" if len(ids) > 1 else "")
+
+
+def null_space(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> tuple[FloatArray, FloatArray]:
+    """Null vectors (n, k) of the normal matrix of the visible unknowns, and its column scale (n,).
+
+    Candidates come from the scaled normal matrix; each is then judged by the length of the whitened Jacobian times it,
+    which rounding reaches only at 1e-13, so that weak but determined directions are not taken for null ones.
+    """
+    N = np.zeros((stack.n, stack.n))
+    for i in range(linear.size()):
+        factor = linear.at(i)
+        A, index = factor.jacobian()[0], stack.index(factor.keys())
+        N[np.ix_(index, index)] += A.T @ A
+    scale = np.sqrt(np.diag(N))
+    empty = scale == 0.0
+    scale[empty] = 1.0
+    N = N / scale[:, None] / scale
+    w, V = np.linalg.eigh(N)
+    V = V[:, w < 1e-7] / scale[:, None]
+    if V.shape[1] == 0:
+        return V, scale
+    _, s, Vt = np.linalg.svd(times(linear, stack, V), full_matrices=False)
+    return V @ Vt[s < 1e-8].T, scale
+
+
+def describe_null_space(
+    graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: gtsam.Values
+) -> IndeterminateError | None:
+    """The error that names what is undetermined, or None where everything is determined (though perhaps weakly)."""
+    keys = visible_keys(graph)
+    stack = stacking(graph, keys)
+    if stack.n > _MOST_DIMS:
+        return IndeterminateError(
+            f"the observations and the datum leave unknowns undetermined; the survey is too large ({stack.n} unknowns) to "
+            "name them: try a part of it"
+        )
+    null, scale = null_space(linear, stack)
+    if null.shape[1] == 0:
+        return None
+    lines: list[str] = []
+    rest = _take_gauges(graph, keys, null * scale[:, None], scale, values, lines)
+    rest = _take_station_frames(graph, keys, rest, scale, values, lines)
+    names = _take_rest(graph, stack, rest, lines)
+    head = f"the observations and the datum leave {null.shape[1]} directions undetermined:"
+    return IndeterminateError("\n  - ".join([head, *lines]), tuple(names) or tuple(lines))
+
+
+def _intersection(null: FloatArray, B: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Coefficients (b, k) of B's columns that lie in span(null), and null's orthonormal rest."""
+    Q = np.linalg.qr(null)[0]
+    lengths = np.linalg.norm(B, axis=0)
+    usable = np.flatnonzero(lengths > 1e-12)
+    unit = B[:, usable] / lengths[usable]
+    U, s, Vt = np.linalg.svd(unit, full_matrices=False)
+    keep = s > 1e-9
+    basis, back = U[:, keep], Vt[keep].T / s[keep]
+    L, cosines, Rt = np.linalg.svd(basis.T @ Q)
+    inside = np.flatnonzero(cosines > 1.0 - 1e-7)
+    coefficients = np.zeros((B.shape[1], len(inside)))
+    coefficients[usable] = (back @ L[:, inside]) / lengths[usable, None]
+    others = np.ones(Q.shape[1], dtype=bool)
+    others[inside] = False
+    return coefficients, Q @ Rt[others].T
+
+
+def _take_gauges(
+    graph: AdjustmentGraph, keys: list[int], null: FloatArray, scale: FloatArray, values: gtsam.Values, lines: list[str]
+) -> FloatArray:
+    B = np.concatenate([gauge(graph, graph.unknowns.by_key[k], values) for k in keys]) * scale[:, None]
+    coefficients, rest = _intersection(null, B)
+    if coefficients.shape[1]:
+        share = np.abs(coefficients) * np.linalg.norm(B, axis=0)[:, None]
+        involved = [GAUGES[i] for i in range(7) if share[i].max() > 1e-3 * share.max()]
+        lines.append(
+            f"datum, {coefficients.shape[1]} of: {', '.join(involved)}; hold a target, a station or coordinates, "
+            "observe coordinates or a distance, or set the datum to inner constraints"
+        )
+    return rest
+
+
+def _frame_motion(graph: AdjustmentGraph, keys: list[int], station_id: str, values: gtsam.Values) -> FloatArray | None:
+    """How the unknowns move (n, 6) when a station's own frame is moved; None where something holds that frame."""
+    survey, u = graph.survey, graph.unknowns
+    inside = [("station_from_camera", c.camera_id) for c in survey.cameras if c.station_id == station_id]
+    inside += [("carrier_from_target", t.target_id) for t in survey.targets if t.station_id == station_id]
+    motion: dict[int, FloatArray] = {}
+    for name, slot in u.slot_of.items():
+        mine = name in inside or (name[0] == "carrier_from_target" and name[:2] in inside)
+        outside = name[0] in ("world_from_station", "mount_from_station") and name[1] == station_id
+        if not mine and not outside:
+            continue
+        key = u.slot_key[slot]
+        if key is None:
+            return None
+        motion[key] = values.atPose3(key).inverse().AdjointMap() if mine else -np.eye(6)
+    if not motion:
+        return None
+    return np.concatenate([motion.get(k, np.zeros((u.by_key[k].dim, 6))) for k in keys])
+
+
+def _take_station_frames(
+    graph: AdjustmentGraph, keys: list[int], null: FloatArray, scale: FloatArray, values: gtsam.Values, lines: list[str]
+) -> FloatArray:
+    for station in graph.survey.stations:
+        motion = _frame_motion(graph, keys, station.station_id, values) if null.shape[1] else None
+        if motion is None:
+            continue
+        coefficients, rest = _intersection(null, motion * scale[:, None])
+        if coefficients.shape[1]:
+            null = rest
+            what = "the frame" if coefficients.shape[1] == 6 else f"{coefficients.shape[1]} directions of the frame"
+            mount = " or its mount" if station.motion == "table" else ""
+            lines.append(
+                f"{what} of station {station.station_id}: it is not separated from the poses of its cameras; hold one "
+                f"camera on it{mount}"
+            )
+    return null
+
+
+def _take_rest(graph: AdjustmentGraph, stack: Stacking, null: FloatArray, lines: list[str]) -> list[str]:
+    """Name what moves together in what is left; sparse directions first (varimax would be prettier, this is enough)."""
+    names: list[str] = []
+    for vector in null.T:
+        weight = np.abs(vector) / np.abs(vector).max()
+        shares = []
+        for key, place in stack.at.items():
+            unknown, part = graph.unknowns.by_key[key], weight[place]
+            strong = [_READABLE.get(c, c) for c, s in zip(unknown.components, part, strict=True) if s > 0.1]
+            if strong:
+                shares.append((float(part.max()), f"{readable(unknown)} ({', '.join(strong)})"))
+        shares.sort(key=lambda item: -item[0])
+        texts = [text for _, text in shares]
+        names += texts
+        more = f" and {len(texts) - 6} more" if len(texts) > 6 else ""
+        lines.append(
+            f"{'; '.join(texts[:6])}{more}: they move together without changing any observation; measure or hold one"
+            if len(texts) > 1
+            else f"{texts[0]}: no observation depends on it; measure or hold it"
+        )
+    return list(dict.fromkeys(names))

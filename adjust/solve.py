@@ -1,0 +1,161 @@
+"""Gauss-Newton with a Levenberg-Marquardt fallback over an :class:`~adjust.graph.AdjustmentGraph`.
+
+Our own loop: GTSAM's optimisers copy all values for every Python callback, stop silently on constraints, and know
+nothing of the unknowns hidden in a batch.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from adjust.datum import InnerDatum, inner_datum, normal_diagonal, stacking, visible_keys
+from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
+from adjust.graph import AdjustmentGraph
+from adjust.rank import describe_null_space, unobserved_unknowns
+
+Progress = Callable[[int, float], None]
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """max_step: convergence, the largest step of any unknown in its own sigmas. max_iterations: steps tried."""
+
+    max_step: float = 1e-6
+    max_iterations: int = 60
+    first_damping: float = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The minimum and how it was reached. linear: GTSAM's linearised graph there, eliminated in ``ordering``."""
+
+    values: gtsam.Values
+    linear: gtsam.GaussianFactorGraph
+    ordering: gtsam.Ordering
+    use_qr: bool
+    omega: float
+    iterations: int
+    max_step: float
+    datum: InnerDatum | None
+
+
+class _Loop:
+    def __init__(self, graph: AdjustmentGraph, options: SolveOptions, progress: Progress | None) -> None:
+        self.graph, self.options, self.progress = graph, options, progress
+        self.datum = inner_datum(graph)
+        self.full = gtsam.NonlinearFactorGraph(graph.graph)
+        if self.datum is not None:
+            self.full.add(self.datum.factor())
+        self.values = graph.start
+        self.damping = 0.0
+        self.use_qr = False
+        self.ordering: gtsam.Ordering | None = None
+
+    def linearize(self) -> gtsam.GaussianFactorGraph:
+        self.graph.prepare(self.values, True, self.damping)
+        return self.full.linearize(self.values)
+
+    def step(self, linear: gtsam.GaussianFactorGraph) -> gtsam.VectorValues:
+        """The (damped) step; raises IndeterminateError by name where there is none."""
+        if self.ordering is None:
+            last = self._last_keys()
+            self.ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(self.full, last)
+        system = linear if self.damping == 0.0 else damped(self.graph, linear, self.damping)
+        try:
+            if self.use_qr:
+                delta = system.optimize(self.ordering, gtsam.EliminateQR)
+            else:
+                delta = system.optimize(self.ordering)
+        except RuntimeError as error:
+            if "ndetermin" not in str(error) or self.use_qr:
+                raise
+            names = describe_null_space(self.graph, linear, self.values)
+            if names is not None:
+                raise names from None
+            self.use_qr = True  # weak, but determined: GTSAM's Cholesky refuses pivots that QR still resolves
+            return self.step(linear)
+        if not np.isfinite(delta.norm()):
+            raise SurveyError("the normal equations have no finite solution; check the sigmas and start values")
+        return delta
+
+    def _last_keys(self) -> list[int]:
+        late = {"lens", "station_from_camera", "mount_from_station", "world_from_table", "table_geometry", "warp"}
+        by_key = self.graph.unknowns.by_key
+        keys = [k for k in self.full.keyVector() if k in by_key and by_key[k].name[0] in late]
+        return keys if len(keys) < len(list(self.full.keyVector())) else []
+
+    def total(self, values: gtsam.Values) -> float:
+        self.graph.prepare(values, jacobians=False)
+        return 2.0 * float(self.full.error(values))
+
+    def run(self) -> Solved:
+        omega = self.total(self.values)
+        linear = self.linearize()
+        moved = np.inf
+        for iteration in range(1, self.options.max_iterations + 1):
+            delta = self.step(linear)
+            gradient = linear.gradientAtZero()
+            moved = np.sqrt(max(0.0, -float(delta.dot(gradient))))
+            if self.graph.bundle is not None:
+                self.graph.bundle.complete(delta)
+            trial = self.values.retract(delta)
+            new = self.total(trial)
+            behind = self.graph.behind_camera()
+            if self._accept(new, omega, moved, bool(behind)):
+                self.values, omega = trial, new
+                if self.progress:
+                    self.progress(iteration, omega)
+                if moved < self.options.max_step and self.damping == 0.0:
+                    return self._finish(omega, iteration, moved)
+                self.damping = self.damping / 10.0 if self.damping > 1e-8 else 0.0
+            else:
+                self.damping = max(self.damping * 10.0, self.options.first_damping)
+                if self.damping > 1e8:
+                    raise self._stuck(iteration, moved)
+            linear = self.linearize()
+        raise self._stuck(self.options.max_iterations, moved)
+
+    @staticmethod
+    def _accept(new: float, old: float, moved: float, behind: bool) -> bool:
+        """Downhill, or at the bottom where rounding decides; never behind a camera."""
+        return np.isfinite(new) and not behind and (new <= old * (1.0 + 1e-12) or moved < 1e-4)
+
+    def _stuck(self, iteration: int, moved: float) -> NotConvergedError:
+        blocks = sorted({f"{b.camera_id} at {b.epoch_id}" for b in self.graph.behind_camera()})
+        what = f"; points behind the camera in {', '.join(blocks[:5])}" if blocks else ""
+        return NotConvergedError(
+            f"the adjustment did not converge in {iteration} steps: the last step moved an unknown by {moved:.2g} sigma"
+            f"{what}; look for gross errors in the observations or a wrong start value"
+        )
+
+    def _finish(self, omega: float, iteration: int, moved: float) -> Solved:
+        linear = self.linearize()
+        if self.ordering is None:
+            raise ValueError("no ordering before the first step")
+        return Solved(
+            self.values, linear, self.ordering, self.use_qr, omega + self.graph.images.constant_chi, iteration, moved,
+            self.datum,
+        )  # fmt: skip
+
+
+def damped(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.GaussianFactorGraph:
+    """The graph with Marquardt's damping: every unknown held with ``damping`` times its own diagonal."""
+    stack = stacking(graph, visible_keys(graph))
+    root = np.sqrt(damping * np.maximum(normal_diagonal(linear, stack), 1e-12))
+    out = linear.clone()
+    for key, place in stack.at.items():
+        n = place.stop - place.start
+        out.add(key, np.diag(root[place]), np.zeros(n), gtsam.noiseModel.Unit.Create(n))
+    return out
+
+
+def solve(graph: AdjustmentGraph, options: SolveOptions = SolveOptions(), progress: Progress | None = None) -> Solved:  # noqa: B008  # frozen
+    """Adjust. Raises IndeterminateError (named), NotConvergedError, SurveyError."""
+    nothing = unobserved_unknowns(graph)
+    if nothing:
+        raise IndeterminateError(
+            "nothing observes " + ", ".join(nothing) + "; leave them out or hold them", tuple(nothing)
+        )
+    return _Loop(graph, options, progress).run()

@@ -1,0 +1,129 @@
+"""The current values of all slots, lenses and warps as plain arrays, for the compiled kernels."""
+
+from collections.abc import Iterable
+
+import gtsam
+import numpy as np
+
+from adjust.chain_kernels import table_motion
+from adjust.errors import SurveyError
+from adjust.lens import MODELS, lens_constants
+from adjust.lens_kernels import MAX_LENS
+from adjust.model import FloatArray, IntArray, Survey, VectorParameter
+from adjust.unknowns import TableSlot, Unknowns, VectorMap, vector_map
+
+
+class State:
+    """Arrays that the kernels read. :meth:`load` fills them from GTSAM values; nothing else changes them.
+
+    slot_R (S, 3, 3), slot_t (S, 3): poses of all slots. D (table slots, 6, 6): derivative of a table's motion by its
+    free angles and free geometry, ``angles`` columns first. lens (C, MAX_LENS), warp (targets, 2) m.
+    """
+
+    def __init__(self, survey: Survey, unknowns: Unknowns) -> None:
+        self.unknowns = unknowns
+        self.cameras = {c.camera_id: i for i, c in enumerate(survey.cameras)}
+        self.targets = {t.target_id: i for i, t in enumerate(survey.targets)}
+        self.lens_maps = [unknowns.vectors[("lens", c.camera_id)] for c in survey.cameras]
+        self.warp_maps: list[VectorMap | None] = [unknowns.vectors.get(("warp", t.target_id)) for t in survey.targets]
+        self.kind = np.array([MODELS[c.lens.model].kind for c in survey.cameras], dtype=np.int64)
+        self.constants = np.zeros((len(survey.cameras), 4))
+        self.columns = np.full((len(survey.cameras), MAX_LENS), -1, dtype=np.int64)
+        self.factors = np.zeros((len(survey.cameras), MAX_LENS))
+        self.n_lens = np.array([len(m.free) for m in self.lens_maps], dtype=np.int64)
+        for i, camera in enumerate(survey.cameras):
+            constants = lens_constants(MODELS[camera.lens.model], camera.image_size, camera.lens.pixel_size_mm)
+            self.constants[i, : len(constants)] = constants
+            for row, weights in enumerate(self.lens_maps[i].matrix):
+                for column in np.flatnonzero(weights):
+                    self.columns[i, row], self.factors[i, row] = column, weights[column]
+        n = len(unknowns.slot_key)
+        self.slot_R, self.slot_t = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        for slot, pose in enumerate(unknowns.slot_pose):
+            self._set(slot, pose)
+        self.table_index: IntArray = np.full(n, -1, dtype=np.int64)
+        for i, slot in enumerate(unknowns.table_slots):
+            self.table_index[slot] = i
+        self.D = np.zeros((max(1, len(unknowns.table_slots)), 6, 6))
+        self.lens = np.zeros((len(survey.cameras), MAX_LENS))
+        self.warp = np.zeros((max(1, len(survey.targets)), 2))
+        self._free_slots = [
+            (slot, key)
+            for slot, key in enumerate(unknowns.slot_key)
+            if key is not None and slot not in unknowns.table_slots
+        ]
+
+    def _set(self, slot: int, pose: gtsam.Pose3) -> None:
+        matrix = pose.matrix()
+        self.slot_R[slot], self.slot_t[slot] = matrix[:3, :3], matrix[:3, 3]
+
+    def load(self, values: gtsam.Values, slots: Iterable[int] | None = None, lenses: bool = True) -> None:
+        """Read everything, or only these slots (and the lenses and warps unless told otherwise), from ``values``."""
+        if slots is None:
+            for slot, key in self._free_slots:
+                self._set(slot, values.atPose3(key))
+            for table_slot in self.unknowns.table_slots.values():
+                self._move_table(values, table_slot)
+        else:
+            for slot in slots:
+                if slot in self.unknowns.table_slots:
+                    self._move_table(values, self.unknowns.table_slots[slot])
+                elif (key := self.unknowns.slot_key[slot]) is not None:
+                    self._set(slot, values.atPose3(key))
+        if lenses:
+            self._load_lenses(values)
+
+    def _load_lenses(self, values: gtsam.Values) -> None:
+        for i, lens_map in enumerate(self.lens_maps):
+            full = lens_map.full(values)
+            self.lens[i, : full.size] = full
+        for i, warp_map in enumerate(self.warp_maps):
+            if warp_map is not None:
+                self.warp[i] = warp_map.full(values)
+
+    def _move_table(self, values: gtsam.Values, table: TableSlot) -> None:
+        angles = values.atVector(table.angles_key)
+        geometry = dict(zip(table.geometry.names, table.geometry.full(values), strict=True))
+        two = len(table.axes) == 2
+        derivative = np.zeros((6, 4))
+        table_motion(
+            table.axes[0],
+            table.axes[1] if two else -1,
+            angles[0] + geometry.get("zero_1", 0.0),
+            angles[1] + geometry.get("zero_2", 0.0) if two else 0.0,
+            geometry.get("non_orthogonality", 0.0),
+            geometry.get("axis_offset", 0.0),
+            self.slot_R[table.slot],
+            self.slot_t[table.slot],
+            derivative,
+        )
+        column = {"zero_1": 0, "zero_2": 1, "non_orthogonality": 2, "axis_offset": 3}
+        k = len(table.axes)
+        D = self.D[self.table_index[table.slot]]
+        D[:, :k] = derivative[:, :k]
+        by_geometry = derivative[:, [column[name] for name in table.geometry.names]] @ table.geometry.matrix
+        D[:, k : k + by_geometry.shape[1]] = by_geometry
+
+
+def collect_vectors(survey: Survey, unknowns: Unknowns, lenses: dict[str, FloatArray]) -> None:
+    """Register the lenses and board warps. ``lenses`` gives the full start vector of every camera.
+
+    Raises SurveyError where a target's warp or a lens names components its model does not have.
+    """
+    for camera in survey.cameras:
+        model = MODELS[camera.lens.model]
+        unknown_names = set(camera.lens.free) - set(model.names)
+        if unknown_names:
+            raise SurveyError(
+                f"camera {camera.camera_id!r}: lens model {model.name!r} has no parameter {sorted(unknown_names)}; "
+                f"it has {', '.join(model.names)}"
+            )
+        parameter = VectorParameter(
+            model.names, lenses[camera.camera_id], camera.lens.free, camera.lens.prior, camera.lens.ties
+        )
+        name = ("lens", camera.camera_id)
+        unknowns.vectors[name] = vector_map(parameter, model.units, unknowns, name)
+    for target in survey.targets:
+        if target.warp is not None:
+            name = ("warp", target.target_id)
+            unknowns.vectors[name] = vector_map(target.warp, ("m", "m"), unknowns, name)
