@@ -99,8 +99,8 @@ def full_lab(seed: int) -> tuple[Draft, Files]:
 
 
 def _full_lab_toml(draft: Draft) -> str:
-    text = """# A laboratory: a head with three cameras on a two-axis table before a fixed board, plates of markers on the
-# walls, beacons on walls and ceiling, and a relay station of four cameras that looks at all four walls.
+    text = """# A laboratory: a head with three cameras on a two-axis table before a fixed board, plates of markers
+# on the walls, beacons on walls and ceiling, and a relay station of four cameras that looks at all four walls.
 # Images t..: the head on the table, board; h..: the head held by hand, board; w..: the head on the table, wall
 # plates; n..: the head on the table, beacons in the dark; c..: ChArUco board before a relay camera; r01, q01: the
 # relay station, wall plates by day and beacons in the dark.

@@ -1,0 +1,290 @@
+"""The command ``labsurvey``: arguments in, exit code out. The jobs are in ``survey.jobs``.
+
+Exit codes: 0 done, 1 something its owner can mend, 2 wrong usage, 3 solved but the global test failed, 130 interrupted.
+Results go to stdout, progress and messages to stderr. Heavy imports happen inside the commands.
+"""
+
+import argparse
+import json
+import os
+import sys
+import traceback
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from adjust.errors import SurveyError
+from survey.examples import EXAMPLES, write_example
+
+if TYPE_CHECKING:
+    from survey.jobs import AdjustOutcome
+
+DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
+
+_OPENING = "labsurvey adjust lab"
+_DESCRIPTION = """\
+Adjusts a whole laboratory at once: cameras, turntable, beacons, relay stations and tape readings.
+
+  labsurvey example full-lab lab      write a ready project into the folder lab
+  labsurvey adjust lab                detect targets in its images, adjust everything, write lab/results
+"""
+_EPILOG = """\
+Next: labsurvey example full-lab lab
+Help for one command: labsurvey adjust --help
+Exit codes: 0 done, 1 error in the project, 2 wrong usage, 3 solved but the global test failed.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command line; the exit code."""
+    arguments = build_parser().parse_args(argv)
+    try:
+        code = int(arguments.run(arguments))
+        sys.stdout.flush()
+        return code
+    except SurveyError as error:
+        return _complain(str(error))
+    except BrokenPipeError:
+        # whoever read our output has left; a second complaint at exit would be noise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except OSError as error:
+        if error.filename is None:
+            raise  # not about a file of the user
+        return _complain(f"{error.filename}: {error.strerror}; check the name, the permissions and the free space")
+    except KeyboardInterrupt:
+        print("\nlabsurvey: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _complain(message: str) -> int:
+    print(f"labsurvey: error: {message}", file=sys.stderr)
+    return FAILED
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All commands and flags."""
+    shared = argparse.ArgumentParser(add_help=False)
+    # SUPPRESS: a flag before the command is not reset by the command's own default
+    shared.add_argument(
+        "--json", action="store_true", default=argparse.SUPPRESS, help="print the summary as one JSON object"
+    )
+    shared.add_argument("-v", "--verbose", action="store_true", default=argparse.SUPPRESS, help="say more on stderr")
+    shared.add_argument(
+        "--quiet", action="store_true", default=argparse.SUPPRESS, help="no progress bars and no messages on stderr"
+    )
+    shaped: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "parents": [shared]}
+    parser = argparse.ArgumentParser(
+        "labsurvey", usage=f"{_OPENING}   (labsurvey COMMAND ...)", description=_DESCRIPTION, epilog=_EPILOG, **shaped
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and stop")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    _add_adjust(commands, shaped)
+    _add_detect(commands, shaped)
+    _add_example(commands, shaped)
+    return parser
+
+
+class _Version(argparse.Action):
+    """Prints the version, which is looked up only when it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            print(f"labsurvey {version('labsurvey')}")
+        except PackageNotFoundError:
+            print("labsurvey, run from its source folder without being installed")
+        parser.exit()
+
+
+def _add_adjust(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "adjust",
+        help="adjust a project folder, or several one after the other (the main job)",
+        usage=f"{_OPENING}   (labsurvey adjust FOLDER [FOLDER ...] [--out DIR] [--redetect])",
+        description="Detects targets where that has not been done, adjusts all observations, writes FOLDER/results.",
+        epilog="Next: open FOLDER/results/report.html",
+        **shaped,
+    )
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="folder with a survey.toml")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
+    parser.add_argument("--redetect", action="store_true", help="detect targets again, even where it was done before")
+    parser.set_defaults(run=_adjust, parser=parser)
+
+
+def _add_detect(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "detect",
+        help="find the targets and beacons in the images of a project folder",
+        usage="labsurvey detect lab   (labsurvey detect FOLDER [--jobs N] [--pictures])",
+        description="Writes FOLDER/observations/image_points.csv, and spots.csv where beacons are asked for.",
+        epilog="Next: labsurvey adjust FOLDER",
+        **shaped,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder with a survey.toml and images/")
+    parser.add_argument("--jobs", type=_positive, metavar="N", help="images at a time; default: one per processor")
+    parser.add_argument("--pictures", action="store_true", help="also write every image with what was found in it")
+    parser.set_defaults(run=_detect, parser=parser)
+
+
+def _add_example(commands: Any, shaped: dict[str, Any]) -> None:
+    listed = "\n".join(f"  {name:<12}{what}" for name, what in EXAMPLES.items())
+    parser = commands.add_parser(
+        "example",
+        help="write a ready project folder to try things on",
+        usage="labsurvey example full-lab lab   (labsurvey example NAME DIR [--seed N] [--jobs N])",
+        description=f"Writes a project with rendered images and simulated readings.\n\n{listed}",
+        epilog="Next: labsurvey adjust DIR",
+        **shaped,
+    )
+    parser.add_argument("name", choices=tuple(EXAMPLES), metavar="NAME", help=", ".join(EXAMPLES))
+    parser.add_argument("folder", type=Path, metavar="DIR", help="new folder")
+    parser.add_argument("--seed", type=_not_negative, default=1, metavar="N", help="other numbers give other noise")
+    parser.add_argument("--jobs", type=_positive, metavar="N", help="images at a time; default: one per processor")
+    parser.set_defaults(run=_example, parser=parser)
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"found {value}; expected 1 or more")
+    return value
+
+
+def _not_negative(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"found {value}; expected 0 or more")
+    return value
+
+
+def _is(arguments: argparse.Namespace, flag: str) -> bool:
+    return bool(getattr(arguments, flag, False))
+
+
+def _say(arguments: argparse.Namespace, *lines: str) -> None:
+    """Messages beside the results."""
+    if not _is(arguments, "quiet"):
+        for line in lines:
+            print(line, file=sys.stderr)
+
+
+def _print_json(value: Mapping[str, Any]) -> None:
+    print(json.dumps(value, indent=1, allow_nan=False))
+
+
+def _require_project(folder: Path) -> None:
+    if not folder.is_dir():
+        hint = "; 'labsurvey example full-lab lab' writes a ready one"
+        raise SurveyError(f"{folder}: no such folder{hint}")
+    if not (folder / "survey.toml").is_file():
+        raise SurveyError(f"{folder}: there is no survey.toml in it; give the folder that holds one")
+
+
+def _example(arguments: argparse.Namespace) -> int:
+    progress = not _is(arguments, "quiet")
+    n = write_example(arguments.name, arguments.folder, seed=arguments.seed, jobs=arguments.jobs, progress=progress)
+    if _is(arguments, "json"):
+        _print_json({"example": arguments.name, "folder": str(arguments.folder), "seed": arguments.seed, "images": n})
+    else:
+        print(
+            f"{arguments.folder}: example {arguments.name} with {n} images\nNext: labsurvey adjust {arguments.folder}"
+        )
+    return DONE
+
+
+def _detect(arguments: argparse.Namespace) -> int:
+    _require_project(arguments.folder)
+    from survey.jobs import detect_job
+
+    outcome = detect_job(
+        arguments.folder,
+        jobs=arguments.jobs,
+        pictures=arguments.pictures,
+        progress=not _is(arguments, "quiet"),
+    )
+    if _is(arguments, "verbose"):
+        _say(arguments, *outcome.messages)
+    if _is(arguments, "json"):
+        _print_json(outcome.summary())
+    else:
+        print(f"{outcome.text()}\nNext: labsurvey adjust {arguments.folder}")
+    return DONE
+
+
+def _adjust(arguments: argparse.Namespace) -> int:
+    folders: list[Path] = arguments.folders
+    if len(folders) > 1:
+        if arguments.out is not None:
+            arguments.parser.error("--out needs a single FOLDER: the results of several would be mixed up")
+        if len({folder.resolve() for folder in folders}) < len(folders):
+            arguments.parser.error("a FOLDER is named twice")
+        return _adjust_several(folders, arguments)
+    code, outcome = _adjust_one(folders[0], arguments)
+    if _is(arguments, "json"):
+        _print_json(outcome.summary())
+    else:
+        print(outcome.text())
+        for path in outcome.paths.values():
+            _say(arguments, f"written: {path}")
+    return code
+
+
+def _adjust_one(folder: Path, arguments: argparse.Namespace, progress: bool = True) -> "tuple[int, AdjustOutcome]":
+    _require_project(folder)
+    from survey.jobs import adjust_job
+
+    outcome = adjust_job(
+        folder,
+        out=arguments.out,
+        progress=progress and not _is(arguments, "quiet"),
+        redetect=arguments.redetect,
+    )
+    test = outcome.adjustment.global_test
+    return (DONE if test is None or test.passed else TEST_FAILED), outcome
+
+
+def _adjust_several(folders: Sequence[Path], arguments: argparse.Namespace) -> int:
+    """A batch goes on past projects that fail; its exit code is that of the worst: 1 before 3 before 0."""
+    from tqdm import tqdm
+
+    rows: list[dict[str, Any]] = []
+    for folder in tqdm(folders, desc="adjusting", unit="folder", disable=_is(arguments, "quiet")):
+        rows.append(_adjust_in_batch(folder, arguments))
+        _say(arguments, *([f"labsurvey: error: {rows[-1]['error']}"] if "error" in rows[-1] else []))
+    if _is(arguments, "json"):
+        _print_json({"folders": rows})
+    else:
+        print(_batch_table(rows))
+    codes = {row["exit_code"] for row in rows}
+    return next(code for code in (FAILED, TEST_FAILED, DONE) if code in codes)
+
+
+def _adjust_in_batch(folder: Path, arguments: argparse.Namespace) -> dict[str, Any]:
+    row: dict[str, Any] = {"folder": str(folder)}
+    try:
+        code, outcome = _adjust_one(folder, arguments, progress=False)
+    except (SurveyError, OSError) as error:
+        return {**row, "exit_code": FAILED, "error": str(error)}
+    except Exception as error:  # a bug in one project must not cost the night's other results
+        traceback.print_exc()
+        return {**row, "exit_code": FAILED, "error": f"{folder}: internal error, {type(error).__name__}: {error}"}
+    return {**row, "exit_code": code, "summary": outcome.summary()}
+
+
+def _batch_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    width = max(len("folder"), *(len(row["folder"]) for row in rows))
+    lines = [f"{'folder':<{width}}  {'state':<18}  sigma0  redundancy"]
+    states = {DONE: "done", FAILED: "error", TEST_FAILED: "global test failed"}
+    for row in rows:
+        numbers = ""
+        if "summary" in row:
+            found = row["summary"].get("summary", row["summary"])
+            numbers = f"{found['sigma0']:6.3f}  {found['redundancy']:10d}"
+        lines.append(f"{row['folder']:<{width}}  {states[row['exit_code']]:<18}  {numbers}".rstrip())
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
