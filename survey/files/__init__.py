@@ -11,6 +11,7 @@ from survey.files.project import (
 )
 from survey.files.reading import read, read_definition
 from survey.files.text import atomic_write
+from survey.files.writing import write_image_points, write_project, write_spots
 
 __all__ = [
     "AdjustmentOptions",
@@ -23,4 +24,7 @@ __all__ = [
     "atomic_write",
     "read",
     "read_definition",
+    "write_image_points",
+    "write_project",
+    "write_spots",
 ]

@@ -10,6 +10,7 @@ from survey.files.node import Node
 from survey.files.owners import read_epochs
 from survey.files.poses import read_pose
 from survey.files.tables import Layout, read_table
+from survey.files.text import suggestion
 from survey.files.units import to_si
 from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind
 
@@ -61,12 +62,21 @@ def _checkerboard(node: Node) -> TargetKind:
     return Checkerboard(node.integer("columns", 2), node.integer("rows", 2), _metres(node, "square_mm"))
 
 
+def _dictionary(node: Node) -> str:
+    from survey.detection.dictionaries import dictionary_names  # brings in OpenCV, which few projects need here
+
+    name, known = _dictionary(node), dictionary_names()
+    if name.upper().removeprefix("DICT_") not in known:
+        raise node.error(f"unknown dictionary {name!r}; {suggestion(name.upper(), known)}", "dictionary")
+    return name
+
+
 def _charuco(node: Node) -> TargetKind:
     square, marker = _metres(node, "square_mm"), _metres(node, "marker_mm")
     if marker >= square:
         raise node.error("the marker is not smaller than the square; correct marker_mm or square_mm", "marker_mm")
     columns, rows = node.integer("squares_x", 2), node.integer("squares_y", 2)
-    return Charuco(columns, rows, square, marker, node.text("dictionary"), node.flag("legacy", False))
+    return Charuco(columns, rows, square, marker, _dictionary(node), node.flag("legacy", False))
 
 
 def _marker_grid(node: Node) -> TargetKind:
@@ -75,7 +85,7 @@ def _marker_grid(node: Node) -> TargetKind:
         node.integer("rows", 1),
         _metres(node, "marker_mm"),
         _metres(node, "gap_mm"),
-        node.text("dictionary"),
+        _dictionary(node),
         node.integer("first_id", 0, 0),
     )
 
@@ -89,7 +99,7 @@ def _marker_block(node: Node) -> TargetKind:
         corners[int(key)] = to_si(markers.numbers(key, (4, 3)), "mm")
     if not corners:
         raise node.error("no markers; write markers = { 7 = [[x, y, z], ... four corners in mm] }", "markers")
-    return MarkerBlock(corners, node.text("dictionary"))
+    return MarkerBlock(corners, _dictionary(node))
 
 
 _READERS: dict[str, Callable[[Node], TargetKind]] = {
@@ -118,7 +128,7 @@ def _points(node: Node, inputs: dict[str, str]) -> TargetKind:
 
 
 def _warp(node: Node, kind_name: str) -> VectorParameter:
-    if kind_name in ("marker_block", "points"):
+    if kind_name == "marker_block":
         raise node.error(f"a target of kind {kind_name!r} is no flat board and has no warp; remove it")
     node.allow("free", "sigma_mm", "warp_x_mm", "warp_y_mm")
     free = WARP if node.flag("free", True) else ()

@@ -5,6 +5,8 @@ are those of R = Rz(z) Ry(y) Rx(x). The sigmas of a prior hold in the tangent at
 translation, in the frame on the right of the pose's name.
 """
 
+from typing import Any
+
 import numpy as np
 from gtsam import Pose3, Rot3
 
@@ -36,6 +38,12 @@ def rotation_from_quaternion(wxyz: FloatArray) -> Rot3 | None:
         return None
     w, x, y, z = wxyz / length
     return Rot3.Quaternion(w, x, y, z)
+
+
+def quaternion_wxyz(rotation: Rot3) -> list[float]:
+    """The unit quaternion of a rotation, w first."""
+    q: Any = rotation.toQuaternion()  # GTSAM's stubs do not know Eigen's quaternion
+    return [q.w(), q.x(), q.y(), q.z()]
 
 
 def rotation_from_euler(xyz: FloatArray) -> Rot3:

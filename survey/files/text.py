@@ -69,9 +69,8 @@ def id_problem(name: str) -> str | None:
     if not name:
         return "an id is empty; give it a name"
     if name in (".", "..") or name.startswith(".") or set(name) & _FORBIDDEN_IN_IDS or not name.isprintable():
-        return (
-            f"{name!r} cannot be an id; use letters, digits, '_', '-', '.' (not in front), without / \\ : @ , ; or '..'"
-        )
+        allowed = "use letters, digits, '_', '-' and '.' (not in front), none of / \\ : @ , ; and not '..'"
+        return f"{name!r} cannot be an id; {allowed}"
     if name != name.strip():
         return f"{name!r} cannot be an id; remove the blanks around it"
     return None

@@ -1,0 +1,62 @@
+"""Columns as CSV or Parquet files."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from adjust.errors import SurveyError
+from adjust.model import FloatArray
+from survey.files.text import atomic_write
+
+Columns = Mapping[str, Sequence[str] | FloatArray]
+
+
+def write_table(folder: Path, name: str, columns: Columns, parquet: bool = False) -> Path:
+    """Write ``folder/name.csv`` or ``.parquet`` and remove the other of the two; nan becomes blank.
+
+    Numbers keep all their digits: reading gives back the same doubles.
+    """
+    path, other = folder / f"{name}.csv", folder / f"{name}.parquet"
+    if parquet:
+        path, other = other, path
+    atomic_write(path, _parquet(path, columns) if parquet else _csv(columns))
+    other.unlink(missing_ok=True)
+    return path
+
+
+def _csv(columns: Columns) -> str:
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(_cells(column) for column in columns.values()), strict=True))
+    return stream.getvalue()
+
+
+def _cells(column: Sequence[str] | FloatArray) -> Sequence[object]:
+    if not isinstance(column, np.ndarray):
+        return column
+    values: list[object] = column.tolist()
+    for row in np.flatnonzero(np.isnan(column)).tolist():
+        values[row] = None
+    return values
+
+
+def _parquet(path: Path, columns: Columns) -> bytes:
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError as error:
+        message = "Parquet needs pyarrow; install it with: pip install 'labsurvey[parquet]', or write CSV"
+        raise SurveyError(f"{path}: {message}") from error
+    arrays = {
+        name: pa.array(column, from_pandas=True)
+        if isinstance(column, np.ndarray)
+        else pa.array(list(column), pa.string()).dictionary_encode()
+        for name, column in columns.items()
+    }
+    stream = io.BytesIO()
+    pq.write_table(pa.table(arrays), stream)
+    return stream.getvalue()
