@@ -7,7 +7,6 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
-
 from adjust.lens import MODELS, lens_constants, monotone_radius_px, principal_point_px
 from adjust.model import FloatArray, Survey
 from adjust.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
@@ -27,7 +26,7 @@ class AdjustOptions:
 def adjust(
     survey: Survey,
     start: StartValues | None = None,
-    options: AdjustOptions = AdjustOptions(),  # noqa: B008  # frozen
+    options: AdjustOptions = AdjustOptions(),
     progress: Callable[[int, float], None] | None = None,
 ) -> Adjustment:
     """Adjust a survey: start values (found where not given), least squares, precision.
@@ -138,7 +137,8 @@ def _image_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
             continue
         bad = int(np.sum(images.test[rows][images.used[rows]] > limit))
         if bad:
-            out.append(f"{what}: {bad} of {int(images.used[rows].sum())} image points do not fit (probable gross errors)")
+            n = int(images.used[rows].sum())
+            out.append(f"{what}: {bad} of {n} image points do not fit (probable gross errors)")
     return out
 
 

@@ -2,7 +2,7 @@
 
 Points, and the poses nothing else touches, are reduced inside the batch by Schur complements; they sit in the same
 Values, and :meth:`BundleBatch.complete` puts their steps into GTSAM's delta. The factor holds the square root of what
-remains on the interface (Kummerle's and Lourakis' "reduced camera system", condensed once more).
+remains on the interface: the reduced camera system, condensed once more.
 """
 
 from collections.abc import Sequence
@@ -60,7 +60,7 @@ class BundleBatch:
     # -- structure ---------------------------------------------------------------------------------------------------
 
     def _choose_interface(self, outside: set[int]) -> None:
-        """Hide the free points and per-epoch poses that nothing else touches; two poses stay as anchors of the datum."""
+        """Hide the free points and per-epoch poses that nothing else touches; two poses stay to anchor the datum."""
         key_of = {i: self.unknowns.by_name[("point", p)].key for i, p in enumerate(self.point_ids)
                   if ("point", p) in self.unknowns.by_name}  # fmt: skip
         self.point_key = key_of
@@ -138,7 +138,7 @@ class BundleBatch:
         self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
 
     def _local_from_keys(self) -> sparse.csr_matrix:
-        """Derivative (n_local, n_keys) of the local unknowns by the keys: lens and points as they are, poses by chains."""
+        """Derivative (n_local, n_keys) of the local unknowns by the keys: lens and points direct, poses by chains."""
         entries: list[tuple[int, int, FloatArray]] = []
         for i in sorted(set(self.camera.tolist())):
             key = self.state.lens_maps[i].key
@@ -196,8 +196,8 @@ class BundleBatch:
         if bad >= 0:
             raise self._undetermined_point(bad)
         add_direct(
-            self.n_reduced, len(self.point), self.A, self.camera_of, s.n_lens, self.lens_at, self.pose_at, self.point_at,
-            S, g,
+            self.n_reduced, len(self.point), self.A, self.camera_of, s.n_lens, self.lens_at, self.pose_at,
+            self.point_at, S, g,
         )  # fmt: skip
         S += np.triu(S, 1).T
         self.G = self._local_from_keys()
@@ -209,7 +209,8 @@ class BundleBatch:
     def _undetermined_point(self, bad: int) -> IndeterminateError:
         name = self.point_ids[self.reduced[bad]]
         k = slice(self.ptr[bad], self.ptr[bad + 1])
-        seen = sorted({self.blocks[b].camera_id + " at " + self.blocks[b].epoch_id for b in self.block[k][self.used[k]]})
+        blocks = [self.blocks[b] for b in self.block[k][self.used[k]]]
+        seen = sorted({f"{b.camera_id} at {b.epoch_id}" for b in blocks})
         return IndeterminateError(
             f"point {name!r} is not determined: its rays do not intersect (seen by {', '.join(seen) or 'nothing'}); "
             "observe it from a second direction, give its coordinates, or leave it out",
@@ -305,10 +306,10 @@ class BundleBatch:
             delta.insert(self.point_key[i], dX[j])
 
     def covariances(self, Q_interface: FloatArray, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """From the interface's joint covariance (order ``interface``): that of all poses and tied points (order
-        ``order``), of the reduced points (P, 3, 3), and the whitened A Q A' (K, 3) of every image point (sorted order).
+        """Covariances of everything hidden, from the interface's joint covariance (order ``interface``).
 
-        The batch must be prepared with Jacobians at ``values``.
+        Returns that of all poses and tied points (order ``order``), of the reduced points (P, 3, 3), and the whitened
+        A Q A' (K, 3) of every image point (sorted order). The batch must be prepared with Jacobians at ``values``.
         """
         nh, n = self.n_hidden, self.n_keys
         Q = np.zeros((n, n))

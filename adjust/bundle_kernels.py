@@ -1,4 +1,4 @@
-"""Compiled bundle adjustment with unknown points: rows, Schur complement over the points, back-substitution, covariances.
+"""Compiled bundle adjustment with unknown points: rows, Schur complement, back-substitution, covariances.
 
 Local unknowns: the free lens parameters of every camera, six of ``camera_from_world`` per block (tangent on the right),
 then the points that stay (tied to other observations). The other points are reduced one by one (Brown 1958; Triggs et
@@ -10,10 +10,15 @@ from numba import njit
 
 from adjust.image_kernels import local_row
 from adjust.lens_kernels import MAX_LENS
+from adjust.model import FloatArray, IntArray
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def rows(block, camera, kind, lens, constants, columns, factors, n_lens, R, t, X, uv, W, A, chi, depth):
+def rows(
+    block: IntArray, camera: IntArray, kind: IntArray, lens: FloatArray, constants: FloatArray, columns: IntArray,
+    factors: FloatArray, n_lens: IntArray, R: FloatArray, t: FloatArray, X: FloatArray, uv: FloatArray,
+    W: FloatArray, A: FloatArray, chi: FloatArray, depth: FloatArray,
+) -> None:  # fmt: skip
     """Whitened rows A (K, 2, MAX_LENS + 7): lens in 0.., pose in MAX_LENS.., residual last; chi (B,), least depth (B,).
 
     The derivative by the point equals that by the translation of the pose.
@@ -28,8 +33,9 @@ def rows(block, camera, kind, lens, constants, columns, factors, n_lens, R, t, X
         c = camera[b]
         nl = n_lens[c]
         z = local_row(
-            kind[c], lens[c], constants[c], R[b], t[b], X[k], uv[k], W[k], columns[c], factors[c], nl, shape, 0, row, out
-        )
+            kind[c], lens[c], constants[c], R[b], t[b], X[k], uv[k], W[k], columns[c], factors[c], nl, shape, 0, row,
+            out,
+        )  # fmt: skip
         for s in range(2):
             for j in range(nl):
                 A[k, s, j] = out[s, j]
@@ -41,7 +47,7 @@ def rows(block, camera, kind, lens, constants, columns, factors, n_lens, R, t, X
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def invert3(V, out):
+def invert3(V: FloatArray, out: FloatArray) -> bool:
     """Inverse of a symmetric positive definite V (3, 3); False where a pivot vanishes against its diagonal."""
     a, b, c = V[0, 0], V[0, 1], V[0, 2]
     d, e, f = V[1, 1], V[1, 2], V[2, 2]
@@ -66,7 +72,10 @@ def invert3(V, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_direct(first, last, A, camera_of, n_lens, lens_at, pose_at, point_at, S, g):
+def add_direct(
+    first: int, last: int, A: FloatArray, camera_of: IntArray, n_lens: IntArray, lens_at: IntArray,
+    pose_at: IntArray, point_at: IntArray, S: FloatArray, g: FloatArray,
+) -> None:  # fmt: skip
     """Add observations first..last as they are: points that stay (point_at >= 0) or are held (< 0)."""
     index = np.empty(MAX_LENS + 9, np.int64)
     a = np.empty(MAX_LENS + 9)
@@ -98,7 +107,11 @@ def add_direct(first, last, A, camera_of, n_lens, lens_at, pose_at, point_at, S,
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def reduce_points(ptr, pc_ptr, pc_camera, pc_of, A, camera_of, n_lens, lens_at, pose_at, damping, S, g, Vi, W, WL, h):
+def reduce_points(
+    ptr: IntArray, pc_ptr: IntArray, pc_camera: IntArray, pc_of: IntArray, A: FloatArray, camera_of: IntArray,
+    n_lens: IntArray, lens_at: IntArray, pose_at: IntArray, damping: float, S: FloatArray, g: FloatArray,
+    Vi: FloatArray, W: FloatArray, WL: FloatArray, h: FloatArray,
+) -> int:  # fmt: skip
     """Schur complement over the points ptr[j]..ptr[j + 1], into the upper triangle of S and g; -1, or the bad point.
 
     W (K, 3, 6), WL (point-cameras, 3, MAX_LENS), Vi (P, 3, 3), h (P, 3) stay for the back-substitution.
@@ -156,7 +169,11 @@ def reduce_points(ptr, pc_ptr, pc_camera, pc_of, A, camera_of, n_lens, lens_at, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_direct_reduced(first, last, pc0, pc1, pc_camera, A, camera_of, n_lens, lens_at, pose_at, Vi, vh, W, WL, S, g):
+def add_direct_reduced(
+    first: int, last: int, pc0: int, pc1: int, pc_camera: IntArray, A: FloatArray, camera_of: IntArray,
+    n_lens: IntArray, lens_at: IntArray, pose_at: IntArray, Vi: FloatArray, vh: FloatArray, W: FloatArray,
+    WL: FloatArray, S: FloatArray, g: FloatArray,
+) -> None:  # fmt: skip
     """The direct part of one point's observations, and minus its share in the poses."""
     Y = np.empty((3, 6))
     for k in range(first, last):
@@ -196,7 +213,10 @@ def add_direct_reduced(first, last, pc0, pc1, pc_camera, A, camera_of, n_lens, l
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def back_substitute(ptr, pc_ptr, pc_camera, camera_of, n_lens, lens_at, pose_at, Vi, W, WL, h, d, dX):
+def back_substitute(
+    ptr: IntArray, pc_ptr: IntArray, pc_camera: IntArray, camera_of: IntArray, n_lens: IntArray, lens_at: IntArray,
+    pose_at: IntArray, Vi: FloatArray, W: FloatArray, WL: FloatArray, h: FloatArray, d: FloatArray, dX: FloatArray,
+) -> None:  # fmt: skip
     """Steps dX (P, 3) of the reduced points from the step d of the local unknowns."""
     s = np.empty(3)
     for j in range(ptr.size - 1):
@@ -217,8 +237,10 @@ def back_substitute(ptr, pc_ptr, pc_camera, camera_of, n_lens, lens_at, pose_at,
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def point_covariances(
-    ptr, pc_ptr, pc_camera, pc_of, camera_of, n_lens, lens_at, pose_at, A_all, Vi, W, WL, Q, CX, influence
-):
+    ptr: IntArray, pc_ptr: IntArray, pc_camera: IntArray, pc_of: IntArray, camera_of: IntArray, n_lens: IntArray,
+    lens_at: IntArray, pose_at: IntArray, A_all: FloatArray, Vi: FloatArray, W: FloatArray, WL: FloatArray,
+    Q: FloatArray, CX: FloatArray, influence: FloatArray,
+) -> None:  # fmt: skip
     """Covariances CX (P, 3, 3) of the reduced points and whitened A Q A' (K, 3) of their observations.
 
     Q: full covariance of the local unknowns. With Y = -V^-1 W: Q_XX = V^-1 + Y Q Y', Q_Xc = Y Q. A_all: rows whitened
@@ -288,7 +310,10 @@ def point_covariances(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def direct_influence(first, last, A_all, camera_of, n_lens, lens_at, pose_at, point_at, Q, influence):
+def direct_influence(
+    first: int, last: int, A_all: FloatArray, camera_of: IntArray, n_lens: IntArray, lens_at: IntArray,
+    pose_at: IntArray, point_at: IntArray, Q: FloatArray, influence: FloatArray,
+) -> None:  # fmt: skip
     """Whitened A Q A' of observations whose point stays or is held."""
     index = np.empty(MAX_LENS + 9, np.int64)
     r = np.empty((2, MAX_LENS + 9))

@@ -8,9 +8,11 @@ forward link i reaches T through ``Ad((A_{i+1} ... A_n)^-1)``; of an inverted li
 import numpy as np
 from numba import njit
 
+from adjust.model import BoolArray, FloatArray, IntArray
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def adjoint_of_inverse(R, t, out):
+def adjoint_of_inverse(R: FloatArray, t: FloatArray, out: FloatArray) -> None:
     """Fill ``out`` (6, 6) with Ad(T^-1) of T = (R, t)."""
     for i in range(3):
         for j in range(3):
@@ -25,7 +27,7 @@ def adjoint_of_inverse(R, t, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def compose_left(Ra, ta, inverse, R, t):
+def compose_left(Ra: FloatArray, ta: FloatArray, inverse: bool, R: FloatArray, t: FloatArray) -> None:
     """(R, t) <- A^+-1 (R, t), in place."""
     r = np.empty((3, 3))
     s = np.empty(3)
@@ -44,7 +46,10 @@ def compose_left(Ra, ta, inverse, R, t):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def evaluate_chains(slot_R, slot_t, link_ptr, link_slot, link_inverse, R, t, C):
+def evaluate_chains(
+    slot_R: FloatArray, slot_t: FloatArray, link_ptr: IntArray, link_slot: IntArray, link_inverse: BoolArray,
+    R: FloatArray, t: FloatArray, C: FloatArray,
+) -> None:  # fmt: skip
     """Poses R (B, 3, 3), t (B, 3) of all chains, and C (links, 6, 6), the derivative of each pose by each link."""
     for b in range(link_ptr.size - 1):
         Rb, tb = R[b], t[b]
@@ -64,7 +69,7 @@ def evaluate_chains(slot_R, slot_t, link_ptr, link_slot, link_inverse, R, t, C):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _turn(axis, angle, R):
+def _turn(axis: int, angle: float, R: FloatArray) -> None:
     c, s = np.cos(angle), np.sin(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     R[:] = 0.0
@@ -76,8 +81,11 @@ def _turn(axis, angle, R):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def table_motion(axis1, axis2, angle1, angle2, tilt, offset, R, t, D):
-    """``table_from_mount`` = R1(angle1) Trans3(offset) R3(tilt) R2(angle2) and D (6, 4) by (angle1, angle2, tilt, offset).
+def table_motion(
+    axis1: int, axis2: int, angle1: float, angle2: float, tilt: float, offset: float, R: FloatArray, t: FloatArray,
+    D: FloatArray,
+) -> None:  # fmt: skip
+    """``table_from_mount`` = R1(angle1) Trans3(offset) R3(tilt) R2(angle2); D (6, 4) by angle1, angle2, tilt, offset.
 
     ``axis2`` < 0: a one-axis table, of which only R1 remains.
     """

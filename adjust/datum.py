@@ -14,7 +14,7 @@ from gtsam import Pose3
 
 from adjust.errors import SurveyError
 from adjust.factors import Jacobians, custom
-from adjust.graph import AdjustmentGraph
+from adjust.graph import AdjustmentGraph, inner_datum_keys
 from adjust.model import FloatArray, IntArray
 from adjust.result import ParameterName
 from adjust.unknowns import Unknown
@@ -109,7 +109,7 @@ def normal_diagonal(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> Float
 
 @dataclass(frozen=True, eq=False)
 class InnerDatum:
-    """Inner constraints: rows (k, sum of dims) over ``keys``, relative to the start; ``directions`` (7, k) the defects."""
+    """Inner constraints: rows (k, dim) per key, relative to the start; ``directions`` (7, k) are the defects."""
 
     keys: list[int]
     rows: dict[int, FloatArray]
@@ -122,7 +122,7 @@ class InnerDatum:
     @property
     def defect(self) -> int:
         """Number of undetermined motions."""
-        return self.directions.shape[1]
+        return int(self.directions.shape[1])
 
     def factor(self) -> gtsam.NonlinearFactor:
         """The constraint rows as a factor."""
@@ -171,7 +171,7 @@ def inner_datum(graph: AdjustmentGraph) -> InnerDatum | None:
     """
     if graph.survey.datum.kind != "inner":
         return None
-    keys = datum_keys(graph)
+    keys = inner_datum_keys(graph.survey, graph.unknowns)
     if not keys:
         raise SurveyError("datum kind 'inner' needs free points or free fixed stations; name some, or hold something")
     graph.prepare(graph.start, jacobians=True)
@@ -183,7 +183,7 @@ def inner_datum(graph: AdjustmentGraph) -> InnerDatum | None:
     stacked = np.concatenate([gauge(graph, by_key[k], graph.start) @ directions for k in keys])
     Q, triangular = np.linalg.qr(stacked)
     if np.abs(np.diag(triangular)).min() < 1e-9 * np.abs(triangular).max():
-        raise SurveyError("the points and stations named for the inner datum cannot carry it; name at least three points")
+        raise SurveyError("the points and stations named for the inner datum cannot carry it; name three points")
     stack = stacking(graph, visible_keys(graph))
     mine = normal_diagonal(linear, stack)[stack.index(keys)]
     sigma = float(1.0 / np.sqrt(np.median(mine)))
@@ -195,15 +195,3 @@ def inner_datum(graph: AdjustmentGraph) -> InnerDatum | None:
     kinds = {k: by_key[k].kind for k in keys}
     addition = sigma**2 * inverse @ inverse.T
     return InnerDatum(keys, rows, graph.start, kinds, directions, sigma, addition)
-
-
-def datum_keys(graph: AdjustmentGraph) -> list[int]:
-    """The unknowns that the survey names (or all points, else all fixed stations) for inner constraints."""
-    datum, by_name = graph.survey.datum, graph.unknowns.by_name
-    points = datum.points or (() if datum.stations else tuple(p.point_id for p in graph.survey.points))
-    keys = [u.key for p in points if (u := by_name.get(("point", p)))]
-    stations = datum.stations
-    if not datum.points and not datum.stations and not keys:
-        stations = tuple(s.station_id for s in graph.survey.stations)
-    keys += [u.key for name, u in by_name.items() if name[0] == "world_from_station" and name[1] in stations]
-    return keys

@@ -151,26 +151,35 @@ def pair_factor(observation: Pair, unknowns: Unknowns, state: State, chain: Chai
     simple = len(chain) == 2 and chain[0].inverse and not chain[1].inverse
     keys = [unknowns.slot_key[link.slot] for link in chain]
     measured = observation.b_from_a
-    if simple and isinstance(measured, Pose3) and not any(link.slot in unknowns.table_slots for link in chain):
+    predicted = ChainPose(unknowns, state, chain)
+    if isinstance(measured, Rot3):
+        residual = _rotation_residual(predicted, measured)
+        return custom(predicted.keys, observation.cov, residual)
+    if simple and not any(link.slot in unknowns.table_slots for link in chain):
         b, a = keys
         if a is not None and b is not None and a != b:
             return gtsam.BetweenFactorPose3(b, a, measured, gaussian(observation.cov))
-    predicted = ChainPose(unknowns, state, chain)
+    return custom(predicted.keys, observation.cov, _pose_residual(predicted, measured))
 
-    def pose_residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+
+def _pose_residual(predicted: ChainPose, measured: Pose3) -> Residual:
+    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
         pose, jacobians = predicted(values)
         D = np.zeros((6, 6), order="F")
         r = Pose3.Logmap(measured.between(pose), D)
         return np.asarray(r), [(k, D @ J) for k, J in jacobians]
 
-    def rotation_residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+    return residual
+
+
+def _rotation_residual(predicted: ChainPose, measured: Rot3) -> Residual:
+    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
         pose, jacobians = predicted(values)
         D = np.zeros((3, 3), order="F")
         r = Rot3.Logmap(measured.between(pose.rotation()), D)
         return np.asarray(r), [(k, D @ J[:3]) for k, J in jacobians]
 
-    chosen = pose_residual if isinstance(measured, Pose3) else rotation_residual
-    return custom(predicted.keys, observation.cov, chosen)
+    return residual
 
 
 def vector_prior_factor(prior: VectorPrior, vector: VectorMap) -> gtsam.NonlinearFactor:

@@ -115,7 +115,7 @@ class GraphBuilder:
             [self._known_points(b) for _, b in known], [self._n_warp(b) for _, b in known],
         )  # fmt: skip
         images.add_factors(graph)
-        outside = {k for item in self.others if item.used for k in item.factor.keys()}
+        outside = {k for item in self.others if item.used for k in list(item.factor.keys())}
         outside |= {k for keys in images.keys for k in keys}
         outside |= self._datum_keys()
         unknown = [(i, b) for i, free, b in split if free]
@@ -205,12 +205,14 @@ class GraphBuilder:
         for d in self.survey.distances:
             if not at[d.a].keys and not at[d.b].keys:
                 raise SurveyError(f"distance {d.distance_id!r} joins two held positions; it can adjust nothing")
-            self._other(distance_factor(d, at[d.a], at[d.b]), "distance", d.group, (d.distance_id, text(d.a), text(d.b)),
-                        ("distance",), ("m",), np.array([d.value]), d.used)  # fmt: skip
+            ids = (d.distance_id, text(d.a), text(d.b))
+            self._other(distance_factor(d, at[d.a], at[d.b]), "distance", d.group, ids, ("distance",), ("m",),
+                        np.array([d.value]), d.used)  # fmt: skip
         for c in self.survey.coordinates:
             names = tuple(f"{text(p)} {axis}" for p in c.positions for axis in "xyz")
-            self._other(coordinates_factor(c, [at[p] for p in c.positions]), "coordinates", c.group,
-                        tuple(text(p) for p in c.positions), names, ("m",) * len(names), c.values.ravel(), c.used)  # fmt: skip
+            ids = tuple(text(p) for p in c.positions)
+            self._other(coordinates_factor(c, [at[p] for p in c.positions]), "coordinates", c.group, ids, names,
+                        ("m",) * len(names), c.values.ravel(), c.used)  # fmt: skip
         self._priors()
 
     def _pair(self, state, pair, chain) -> None:  # type: ignore[no-untyped-def]  # three plain values
@@ -258,16 +260,9 @@ class GraphBuilder:
 
     def _datum_keys(self) -> set[int]:
         """Unknowns that carry inner constraints: they have to stay visible to GTSAM."""
-        datum = self.survey.datum
-        if datum.kind != "inner":
+        if self.survey.datum.kind != "inner":
             return set()
-        points = datum.points or (() if datum.stations else tuple(self.point_ids))
-        keys = {u.key for p in points if (u := self.unknowns.by_name.get(("point", p)))}
-        for name, unknown in self.unknowns.by_name.items():
-            wanted = datum.stations or (() if datum.points or keys else tuple(s.station_id for s in self.survey.stations))
-            if name[0] == "world_from_station" and name[1] in wanted:
-                keys.add(unknown.key)
-        return keys
+        return set(inner_datum_keys(self.survey, self.unknowns))
 
     def _values(self, start: StartValues) -> gtsam.Values:
         values = gtsam.Values()
@@ -304,6 +299,18 @@ class GraphBuilder:
         else:
             full = next(t.warp.values for t in self.survey.targets if t.target_id == name[1] and t.warp)
         return np.array([full[vector.names.index(x)] for x in vector.free], dtype=float)
+
+
+def inner_datum_keys(survey: Survey, unknowns: Unknowns) -> list[int]:
+    """The unknowns that the survey names (or all points, else all stations) for inner constraints."""
+    datum, by_name = survey.datum, unknowns.by_name
+    points = datum.points or (() if datum.stations else tuple(p.point_id for p in survey.points))
+    keys = [u.key for p in points if (u := by_name.get(("point", p)))]
+    stations = datum.stations
+    if not datum.points and not datum.stations and not keys:
+        stations = tuple(s.station_id for s in survey.stations)
+    keys += [u.key for name, u in by_name.items() if name[0] == "world_from_station" and name[1] in stations]
+    return keys
 
 
 def frame_text(ref: FrameRef) -> str:

@@ -132,11 +132,9 @@ class ImageBatch:
         n = len(blocks)
         self.ptr: IntArray = np.cumsum([0] + [len(b.uv) for b in blocks])
         self.camera = np.array([state.cameras[b.camera_id] for b in blocks], dtype=np.int64)
+        warped = {t: i for t, i in state.targets.items() if state.warp_maps[i] is not None}
         self.warp_id = np.array(
-            [
-                state.targets[b.target_id] if b.target_id and state.warp_maps[state.targets[b.target_id]] else -1
-                for b in blocks
-            ],
+            [warped.get(b.target_id or "", -1) for b in blocks],
             dtype=np.int64,
         )
         self.n_warp = np.array(n_warp, dtype=np.int64)
@@ -157,7 +155,7 @@ class ImageBatch:
     def _columns(self, unknowns: Unknowns) -> None:
         segments = Segments()
         for b, block in enumerate(self.blocks):
-            target = self.state.targets[block.target_id] if self.n_warp[b] else None
+            target = self.state.targets[block.target_id or ""] if self.n_warp[b] else None
             segments.block(unknowns, self.state, self.chains, b, int(self.camera[b]), target)
         self.n_rows: IntArray = self.state.n_lens[self.camera] + 6 + self.n_warp + 1
         self.keys, self.width = segments.keys, segments.width

@@ -8,11 +8,16 @@ import numpy as np
 from numba import njit
 
 from adjust.lens_kernels import MAX_LENS, lens_residual, lens_row
+from adjust.model import FloatArray, IntArray
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def local_row(kind, lens, constants, R, t, x, uv, w, columns, factors, n_lens, shape, n_warp, row, out):
-    """One image point: whitened rows ``out`` (2, n_lens + 6 + n_warp + 1), the last column the residual; depth returned.
+def local_row(
+    kind: int, lens: FloatArray, constants: FloatArray, R: FloatArray, t: FloatArray, x: FloatArray, uv: FloatArray,
+    w: FloatArray, columns: IntArray, factors: FloatArray, n_lens: int, shape: FloatArray, n_warp: int,
+    row: FloatArray, out: FloatArray,
+) -> float:  # fmt: skip
+    """One image point: whitened rows ``out`` (2, n_lens + 6 + n_warp + 1), residual last; returns the depth.
 
     w: upper triangular square root of the information (w00, w01, w11). columns, factors: where each lens parameter
     goes among the free ones (-1: held). shape: (2,) the warp functions at the point.
@@ -45,12 +50,13 @@ def local_row(kind, lens, constants, R, t, x, uv, w, columns, factors, n_lens, s
     for j in range(m + 1):
         out[0, j] = w[0] * out[0, j] + w[1] * out[1, j]
         out[1, j] = w[2] * out[1, j]
-    return q2
+    depth: float = q2
+    return depth
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def half_cholesky(H, n):
-    """Upper triangular R with R'R = H for a positive semidefinite H (n, n), in place; a vanishing pivot leaves a zero row.
+def half_cholesky(H: FloatArray, n: int) -> None:
+    """Upper triangular R with R'R = H, positive semidefinite (n, n), in place; a vanishing pivot leaves a zero row.
 
     H is scaled to a unit diagonal first, so a pivot below 1e-14 is rounding.
     """
@@ -83,9 +89,13 @@ def half_cholesky(H, n):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def condense(
-    blocks, ptr, camera, kind, lens, constants, columns, factors, n_lens, R, t, X, shape, warp, n_warp, warp_id, uv, W,
-    seg_ptr, seg_type, seg_ref, seg_d, seg_start, seg_n, seg_out, C, D, flat, r_out, chi, depth,
-):  # fmt: skip
+    blocks: IntArray, ptr: IntArray, camera: IntArray, kind: IntArray, lens: FloatArray, constants: FloatArray,
+    columns: IntArray, factors: FloatArray, n_lens: IntArray, R: FloatArray, t: FloatArray, X: FloatArray,
+    shape: FloatArray, warp: FloatArray, n_warp: IntArray, warp_id: IntArray, uv: FloatArray, W: FloatArray,
+    seg_ptr: IntArray, seg_type: IntArray, seg_ref: IntArray, seg_d: IntArray, seg_start: IntArray, seg_n: IntArray,
+    seg_out: IntArray, C: FloatArray, D: FloatArray, flat: FloatArray, r_out: FloatArray, chi: FloatArray,
+    depth: FloatArray,
+) -> None:  # fmt: skip
     """For each listed block: the condensed rows, chained to its keys, into ``flat``; chi-square and least depth."""
     row = np.zeros((2, MAX_LENS + 3))
     x = np.empty(3)
@@ -121,8 +131,12 @@ def condense(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def serve(b, H, n, nl, nw, seg_ptr, seg_type, seg_ref, seg_d, seg_start, seg_n, seg_out, C, D, flat):
-    """Spread condensed rows H (n, n) over the keys of block b: lens as it is, poses through the chain, table through D."""
+def serve(
+    b: int, H: FloatArray, n: int, nl: int, nw: int, seg_ptr: IntArray, seg_type: IntArray, seg_ref: IntArray,
+    seg_d: IntArray, seg_start: IntArray, seg_n: IntArray, seg_out: IntArray, C: FloatArray, D: FloatArray,
+    flat: FloatArray,
+) -> None:  # fmt: skip
+    """Spread condensed rows H (n, n) over the keys of block b: lens as it is, poses by the chain, table by D."""
     for s in range(seg_ptr[b], seg_ptr[b + 1]):
         o, k = seg_out[s], seg_n[s]
         for j in range(n * k):
@@ -157,7 +171,11 @@ def serve(b, H, n, nl, nw, seg_ptr, seg_type, seg_ref, seg_d, seg_start, seg_n, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def errors(blocks, ptr, camera, kind, lens, constants, R, t, X, shape, warp, warp_id, uv, W, chi, depth):
+def errors(
+    blocks: IntArray, ptr: IntArray, camera: IntArray, kind: IntArray, lens: FloatArray, constants: FloatArray,
+    R: FloatArray, t: FloatArray, X: FloatArray, shape: FloatArray, warp: FloatArray, warp_id: IntArray,
+    uv: FloatArray, W: FloatArray, chi: FloatArray, depth: FloatArray,
+) -> None:  # fmt: skip
     """Chi-square (whitened) and least depth of each listed block."""
     for i in range(blocks.size):
         b = blocks[i]
@@ -182,9 +200,11 @@ def errors(blocks, ptr, camera, kind, lens, constants, R, t, X, shape, warp, war
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def statistics(
-    b, ptr, camera, kind, lens, constants, columns, factors, n_lens, R, t, X, shape, warp, n_warp, warp_id, uv, W, Q,
-    residual, influence,
-):  # fmt: skip
+    b: int, ptr: IntArray, camera: IntArray, kind: IntArray, lens: FloatArray, constants: FloatArray,
+    columns: IntArray, factors: FloatArray, n_lens: IntArray, R: FloatArray, t: FloatArray, X: FloatArray,
+    shape: FloatArray, warp: FloatArray, n_warp: IntArray, warp_id: IntArray, uv: FloatArray, W: FloatArray,
+    Q: FloatArray, residual: FloatArray, influence: FloatArray,
+) -> None:  # fmt: skip
     """Residuals (px) of block b and the whitened covariance A Q A' (2 x 2: 00, 01, 11) of its adjusted image points.
 
     Q: joint covariance of the block's local unknowns. W here is that of all points, used or not.
@@ -200,8 +220,9 @@ def statistics(
         if warp_id[b] >= 0:
             x[2] += warp[warp_id[b], 0] * shape[p, 0] + warp[warp_id[b], 1] * shape[p, 1]
         local_row(
-            kind[c], lens[c], constants[c], R[b], t[b], x, uv[p], W[p], columns[c], factors[c], nl, shape[p], nw, row, out
-        )
+            kind[c], lens[c], constants[c], R[b], t[b], x, uv[p], W[p], columns[c], factors[c], nl, shape[p], nw, row,
+            out,
+        )  # fmt: skip
         rv = out[1, n] / W[p, 2]
         residual[p, 1] = rv
         residual[p, 0] = (out[0, n] - W[p, 1] * rv) / W[p, 0]

@@ -5,6 +5,7 @@ Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, ch
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.stats import chi2
 
 from adjust.datum import gauge
 from adjust.graph import AdjustmentGraph, ObservationFactor
-from adjust.model import FloatArray
+from adjust.model import BoolArray, FloatArray
 from adjust.result import GlobalTest, GroupSummary, ImageResiduals, ObservationResidual, ParameterName
 from adjust.solve import Solved
 from adjust.tree_covariance import TreeCovariance
@@ -73,8 +74,13 @@ class Precision:
         linear = item.factor.linearize(self.solved.values)
         A, b = linear.jacobian()
         Q = self.tree.joint(list(linear.keys()))
-        noise = item.factor.noiseModel()
-        return -b, A @ Q @ A.T, np.linalg.inv(noise.R())
+        return -b, A @ Q @ A.T, np.asarray(np.linalg.inv(noise_of(item).R()))
+
+
+def noise_of(item: ObservationFactor) -> gtsam.noiseModel.Gaussian:
+    """The factor's noise; GTSAM's stubs give it only to some factors, the library to all that have one."""
+    noise: gtsam.noiseModel.Gaussian = item.factor.noiseModel()  # type: ignore[attr-defined]  # see above
+    return noise
 
 
 def image_residuals(precision: Precision) -> ImageResiduals:
@@ -98,7 +104,7 @@ def image_residuals(precision: Precision) -> ImageResiduals:
     return _merge(graph, parts)
 
 
-def _test(v: FloatArray, M: FloatArray, W: FloatArray, used: FloatArray) -> tuple[FloatArray, ...]:
+def _test(v: FloatArray, M: FloatArray, W: FloatArray, used: BoolArray) -> tuple[Any, ...]:
     sign = np.where(used, -1.0, 1.0)
     q00, q01, q11 = 1.0 + sign * M[:, 0], sign * M[:, 1], 1.0 + sign * M[:, 2]
     redundancy = np.where(used[:, None], np.stack([q00, q11], axis=1), 0.0)
@@ -116,10 +122,11 @@ def _test(v: FloatArray, M: FloatArray, W: FloatArray, used: FloatArray) -> tupl
     return v, redundancy, standardized, test, used
 
 
-def _merge(graph: AdjustmentGraph, parts: list[tuple[FloatArray, ...]]) -> ImageResiduals:
+def _merge(graph: AdjustmentGraph, parts: list[tuple[Any, ...]]) -> ImageResiduals:
     ptr = np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks])
-    shapes = [(2,), (2,), (2,), (), ()]
-    out = [np.zeros((int(ptr[-1]), *s), dtype=np.bool_ if i == 4 else np.float64) for i, s in enumerate(shapes)]
+    n_points = int(ptr[-1])
+    out: list[Any] = [np.zeros((n_points, 2)) for _ in range(3)]
+    out += [np.zeros(n_points), np.zeros(n_points, dtype=np.bool_)]
     at = [0, 0]
     for i, (_, free) in enumerate(graph.image_order):
         n = int(ptr[i + 1] - ptr[i])
@@ -170,7 +177,7 @@ def group_summaries(
         add(block.group, 2 * int(used.sum()), float(images.redundancy[rows].sum()), omega)
     for item, factor in zip(others, graph.others, strict=True):
         if item.used:
-            e = factor.factor.noiseModel().whiten(item.residual)
+            e = noise_of(factor).whiten(item.residual)
             add(item.group, len(item.residual), float(item.redundancy.sum()), float(e @ e))
     return tuple(GroupSummary(g, int(n), r, omega) for g, (n, r, omega) in sums.items())
 

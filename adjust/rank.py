@@ -70,8 +70,8 @@ def describe_null_space(
     stack = stacking(graph, keys)
     if stack.n > _MOST_DIMS:
         return IndeterminateError(
-            f"the observations and the datum leave unknowns undetermined; the survey is too large ({stack.n} unknowns) to "
-            "name them: try a part of it"
+            "the observations and the datum leave unknowns undetermined; the survey is too large "
+            f"({stack.n} unknowns) to name them: try a part of it"
         )
     null, scale = null_space(linear, stack)
     if null.shape[1] == 0:

@@ -8,8 +8,8 @@ from gtsam import Pose3
 
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 
-# ("lens", camera) ("station_from_camera", camera) ("world_from_station", station[, epoch]) ("mount_from_station", station)
-# ("world_from_table", table) ("table_geometry", table) ("table_angles", table, epoch)
+# ("lens", camera) ("station_from_camera", camera) ("world_from_station", station[, epoch])
+# ("mount_from_station", station) ("world_from_table", table) ("table_geometry", table) ("table_angles", table, epoch)
 # ("carrier_from_target", target[, epoch]) ("warp", target) ("point", point)
 ParameterName = tuple[str, ...]
 

@@ -64,10 +64,8 @@ class _Loop:
             self.ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(self.full, last)
         system = linear if self.damping == 0.0 else damped(self.graph, linear, self.damping)
         try:
-            if self.use_qr:
-                delta = system.optimize(self.ordering, gtsam.EliminateQR)
-            else:
-                delta = system.optimize(self.ordering)
+            how = (self.ordering, gtsam.EliminateQR) if self.use_qr else (self.ordering,)
+            delta = system.optimize(*how)
         except RuntimeError as error:
             if "ndetermin" not in str(error) or self.use_qr:
                 raise
@@ -151,7 +149,9 @@ def damped(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, damping: f
     return out
 
 
-def solve(graph: AdjustmentGraph, options: SolveOptions = SolveOptions(), progress: Progress | None = None) -> Solved:  # noqa: B008  # frozen
+def solve(
+    graph: AdjustmentGraph, options: SolveOptions = SolveOptions(), progress: Progress | None = None
+) -> Solved:
     """Adjust. Raises IndeterminateError (named), NotConvergedError, SurveyError."""
     nothing = unobserved_unknowns(graph)
     if nothing:

@@ -42,8 +42,8 @@ class State:
         for slot, pose in enumerate(unknowns.slot_pose):
             self._set(slot, pose)
         self.table_index: IntArray = np.full(n, -1, dtype=np.int64)
-        for i, slot in enumerate(unknowns.table_slots):
-            self.table_index[slot] = i
+        for i, table_slot in enumerate(unknowns.table_slots):
+            self.table_index[table_slot] = i
         self.D = np.zeros((max(1, len(unknowns.table_slots)), 6, 6))
         self.lens = np.zeros((len(survey.cameras), MAX_LENS))
         self.warp = np.zeros((max(1, len(survey.targets)), 2))
@@ -68,8 +68,8 @@ class State:
             for slot in slots:
                 if slot in self.unknowns.table_slots:
                     self._move_table(values, self.unknowns.table_slots[slot])
-                elif (key := self.unknowns.slot_key[slot]) is not None:
-                    self._set(slot, values.atPose3(key))
+                elif (found := self.unknowns.slot_key[slot]) is not None:
+                    self._set(slot, values.atPose3(found))
         if lenses:
             self._load_lenses(values)
 

@@ -71,6 +71,6 @@ class TreeCovariance:
             at, C = self._cliques[self._home[key]]
             if all(k in at for k in keys):
                 index = np.concatenate([np.arange(at[k], at[k] + self.dims[k]) for k in keys])
-                return C[np.ix_(index, index)]
+                return np.asarray(C[np.ix_(index, index)])
         joint = self.tree.jointMarginalCovariance(list(keys))
         return np.block([[joint.at(a, b) for b in keys] for a in keys])

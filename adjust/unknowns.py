@@ -40,7 +40,7 @@ class Unknown:
 
 @dataclass(frozen=True, eq=False)
 class VectorMap:
-    """A parameter vector as a function of its unknown: full = base + matrix @ free; ``key`` is None when all is held."""
+    """A parameter vector from its unknown: full = base + matrix @ free; ``key`` is None when all is held."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -204,7 +204,7 @@ class FrameTree:
         if station.motion == "fixed":
             return [Link(self.unknowns.slot(("world_from_station", station.station_id), station.world_from_station))]
         if epoch_id is None:
-            raise SurveyError(f"station {station.station_id!r} moves between epochs: name the epoch of this observation")
+            raise SurveyError(f"station {station.station_id!r} moves between epochs: name the observation's epoch")
         if station.motion == "table" and (station.table_id, epoch_id) in self.on_table:
             table = self._get(self.tables, "table", station.table_id or "")
             return [
@@ -220,7 +220,7 @@ class FrameTree:
         parameter = target.carrier_from_target
         if target.motion == "epoch":
             if epoch_id is None:
-                raise SurveyError(f"target {target.target_id!r} moves between epochs: name the epoch of this observation")
+                raise SurveyError(f"target {target.target_id!r} moves between epochs: name the observation's epoch")
             name = (*name, epoch_id)
             parameter = target.epochs.get(epoch_id, parameter)
         link = [Link(self.unknowns.slot(name, parameter))]
