@@ -1,0 +1,22 @@
+"""What every section of a report is made from."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from adjust.model import BoolArray
+from adjust.result import Adjustment
+from survey.quantities import Scale
+from survey.residual_tables import ImageRows
+from survey.solution import RunInfo
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """The adjustment, its solution as plain values, and the image points row by row; ``suspect`` (N,)."""
+
+    adjustment: Adjustment
+    run: RunInfo
+    solution: dict[str, Any]
+    scale: Scale
+    rows: ImageRows
+    suspect: BoolArray

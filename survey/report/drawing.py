@@ -1,0 +1,97 @@
+"""Pieces of SVG: lines, labels, ellipses, scale bars with round numbers, in coordinates of the picture, y down."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from adjust.model import FloatArray
+from survey.report.markup import esc
+
+INK, GREY, FAINT = "#1c2733", "#7b8794", "#d5dbe1"
+BLUE, RED, ORANGE, GREEN = "#2166ac", "#c0392b", "#d98200", "#2f7d4f"
+CAMERA_COLOURS = ("#2166ac", "#b2560d", "#2f7d4f", "#7a3e9d", "#a8324a", "#00798c", "#6b6b00", "#4a4a8a")
+
+
+def svg(width: float, height: float, parts: Iterable[str], title: str) -> str:
+    """A picture with its accessible title."""
+    return (
+        f'<svg viewBox="0 0 {width:g} {height:g}" width="{width:g}" height="{height:g}" role="img" '
+        f'aria-label="{esc(title)}">{"".join(parts)}</svg>'
+    )
+
+
+def text(
+    x: float, y: float, words: str, anchor: str = "start", size: float = 11, colour: str = GREY, more: str = ""
+) -> str:
+    """A label; ``words`` are escaped here."""
+    place = f'x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" fill="{colour}" text-anchor="{anchor}"'
+    return f"<text {place}{more}>{esc(words)}</text>"
+
+
+def line(x1: float, y1: float, x2: float, y2: float, colour: str = GREY, width: float = 1, more: str = "") -> str:
+    """A straight line."""
+    ends = f'x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"'
+    return f'<line {ends} stroke="{colour}" stroke-width="{width:g}"{more}/>'
+
+
+def rect(x: float, y: float, w: float, h: float, fill: str, more: str = "") -> str:
+    """A rectangle."""
+    return f'<rect x="{x:.1f}" y="{y:.1f}" width="{w:.1f}" height="{h:.1f}" fill="{fill}"{more}/>'
+
+
+def polygon(xy: FloatArray, fill: str, stroke: str, width: float = 1, more: str = "") -> str:
+    """A closed outline."""
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in xy)
+    look = f'fill="{fill}" stroke="{stroke}" stroke-width="{width:g}" stroke-linejoin="round"'
+    return f'<polygon points="{points}" {look}{more}/>'
+
+
+def polyline(xy: FloatArray, stroke: str, width: float = 1, more: str = "") -> str:
+    """An open line."""
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in xy)
+    return f'<polyline points="{points}" fill="none" stroke="{stroke}" stroke-width="{width:g}"{more}/>'
+
+
+def dot(x: float, y: float, radius: float, fill: str, more: str = "") -> str:
+    """A filled circle."""
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="{fill}"{more}/>'
+
+
+def ellipse(centre: FloatArray, cov: FloatArray, fill: str, stroke: str) -> str:
+    """The ellipse ``x' inv(cov) x = 1`` about a centre, in the picture's units."""
+    variances, vectors = np.linalg.eigh(cov)
+    b, a = np.sqrt(np.clip(variances, 0.0, None))
+    angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+    return (
+        f'<ellipse rx="{a:.1f}" ry="{b:.1f}" fill="{fill}" fill-opacity="0.16" stroke="{stroke}" stroke-width="0.9" '
+        f'transform="translate({centre[0]:.1f} {centre[1]:.1f}) rotate({angle:.1f})"/>'
+    )
+
+
+def arrows(start: FloatArray, end: FloatArray, colour: str, width: float, head: float = 0.0) -> str:
+    """Many arrows (n, 2) as one path; ``head`` is the length of the barbs, 0 for none."""
+    if not len(start):
+        return ""
+    d = [f"M{a[0]:.1f} {a[1]:.1f}l{b[0] - a[0]:.1f} {b[1] - a[1]:.1f}" for a, b in zip(start, end, strict=True)]
+    if head > 0.0:
+        delta = end - start
+        angle = np.arctan2(delta[:, 1], delta[:, 0])
+        size = np.minimum(head, 0.45 * np.hypot(delta[:, 0], delta[:, 1]))
+        for side in (2.65, -2.65):
+            barb = size[:, None] * np.column_stack([np.cos(angle + side), np.sin(angle + side)])
+            d += [f"M{b[0]:.1f} {b[1]:.1f}l{x[0]:.1f} {x[1]:.1f}" for b, x in zip(end, barb, strict=True)]
+    return f'<path d="{"".join(d)}" fill="none" stroke="{colour}" stroke-width="{width:g}" stroke-linecap="round"/>'
+
+
+def round_below(value: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above ``value``."""
+    if not (np.isfinite(value) and value > 0.0):
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(max(m * power for m in (1.0, 2.0, 5.0) if m * power <= value * (1 + 1e-9)))
+
+
+def scale_bar(x: float, y: float, length: float, words: str) -> str:
+    """A bar of ``length`` with its meaning to the right."""
+    ends = line(x, y - 3, x, y + 3, INK) + line(x + length, y - 3, x + length, y + 3, INK)
+    return line(x, y, x + length, y, INK, 1.4) + ends + text(x + length + 6, y + 3.8, words, colour=INK)

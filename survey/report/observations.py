@@ -1,0 +1,102 @@
+"""Sections on what was observed: residuals and tests, the worst first."""
+
+import numpy as np
+
+from adjust.result import ObservationResidual
+from survey.quantities import sigma_unit_for_people, unit_for_people
+from survey.report.context import Context
+from survey.report.markup import count, esc, fixed, general, pill, section, sigma_text, table, value_text
+
+_MOST_OTHER = 200
+_MOST_IMAGE = 30
+_MOST_IMAGES = 10
+
+
+def _flag(used: bool, suspect: bool) -> str:
+    if not used:
+        return pill("soft", "not used")
+    return pill("bad", "suspect") if suspect else ""
+
+
+def _row_class(used: bool, suspect: bool) -> str:
+    return "off" if not used else "suspect" if suspect else ""
+
+
+def others(c: Context) -> str:
+    """Everything but image points, one row per component, sorted by |standardized residual|."""
+    limit = c.solution["summary"]["suspects"]["standardized_limit"]
+    every = [(o, i) for o in c.adjustment.other_residuals for i in range(len(o.components))]
+    # what cannot be tested (no redundancy, no number) comes last
+    size = [abs(o.standardized[i]) if np.isfinite(o.standardized[i]) else -1.0 for o, i in every]
+    order = sorted(range(len(every)), key=lambda k: -size[k])[:_MOST_OTHER]
+    rows = [_other_row(*every[k], size[k] > limit) for k in order]
+    classes = [_row_class(every[k][0].used, size[k] > limit) for k in order]
+    columns = (
+        "<Kind", "<Between", "<Component", "Observed", "Adjusted", "<Unit", "Residual", "σ", "<Unit", "Redundancy",
+        "Standardized", "<",
+    )  # fmt: skip
+    more = (
+        f" The worst {count(len(rows))} of {count(len(every))} rows; all in residuals_other.csv."
+        if len(every) > len(rows)
+        else ""
+    )
+    note = f"Suspect: |standardized residual| above {fixed(limit, 2)}. Sigmas are those given to the program.{more}"
+    return section("observations", "Other observations", table(columns, rows, "", classes) if rows else "", note)
+
+
+def _other_row(o: ObservationResidual, i: int, suspect: bool) -> list[str]:
+    unit, factor = unit_for_people(o.components[i], o.units[i])
+    sigma_unit, sigma_factor = sigma_unit_for_people(o.units[i])
+    shown_sigma = float(o.sigma[i] * factor)
+    residual, sigma = float(o.residual[i] * sigma_factor), float(o.sigma[i] * sigma_factor)
+    # an r of zero means that nothing controls the observation: its residual says nothing
+    redundancy = fixed(o.redundancy[i], 2) + ("" if o.redundancy[i] > 0.05 else " " + pill("warn", "uncontrolled"))
+    kind = esc(o.kind) if o.group == o.kind else f"{esc(o.kind)} <small>{esc(o.group)}</small>"
+    return [
+        kind, esc(" · ".join(o.ids)), f"<code>{esc(o.components[i])}</code>",
+        value_text(float(o.observed[i] * factor), shown_sigma), value_text(float(o.adjusted[i] * factor), shown_sigma),
+        esc(unit), value_text(residual, sigma), sigma_text(sigma), esc(sigma_unit), redundancy,
+        fixed(o.standardized[i], 2), _flag(o.used, suspect),
+    ]  # fmt: skip
+
+
+def image_points(c: Context) -> str:
+    """The image points with the largest test, and the images with the largest residuals."""
+    found, blocks = c.adjustment.image_residuals, c.adjustment.survey.image_blocks
+    test = np.nan_to_num(found.test, nan=-1.0)
+    worst = np.argsort(-test, kind="stable")[:_MOST_IMAGE]
+    rows, classes = [], []
+    for k in worst:
+        block = blocks[c.rows.block[k]]
+        used, suspect = bool(found.used[k]), bool(c.suspect[k])
+        values = (*c.rows.uv[k], *found.residuals[k], *found.standardized[k])
+        numbers = [fixed(v, n) for v, n in zip(values, (2, 2, 3, 3, 2, 2), strict=True)]
+        names = (block.camera_id, block.epoch_id, block.target_id or "world", c.rows.point_ids[c.rows.point[k]])
+        redundancy = [fixed(r, 2) for r in found.redundancy[k]]
+        rows.append([*(esc(n) for n in names), *numbers, *redundancy, general(found.test[k], 4), _flag(used, suspect)])
+        classes.append(_row_class(used, suspect))
+    columns = (
+        "<Camera", "<Epoch", "<Target", "<Point", "u [px]", "v [px]", "res. u [px]", "res. v [px]", "std. u", "std. v",
+        "red. u", "red. v", "Test", "<",
+    )  # fmt: skip
+    s = c.solution["summary"]["suspects"]
+    note = (
+        f"The {len(rows)} largest of {count(len(test))}. The test is chi-square with 2 degrees of freedom, suspect above "
+        f"{fixed(s['image_test_limit'], 1)} ({100 * s['alpha']:g} % together). The others are in "
+        "residuals.csv."
+    )
+    body = table(columns, rows, "", classes) + _images(c) if rows else ""
+    return section("image-points", "Image points", body, note)
+
+
+def _images(c: Context) -> str:
+    every = [
+        (camera_id, epoch, image["rms_residual_px"], image["n_image_points"])
+        for camera_id, camera in c.solution["cameras"].items()
+        for epoch, image in camera["images"].items()
+        if image["rms_residual_px"] is not None
+    ]
+    worst = sorted(every, key=lambda x: -x[2])[:_MOST_IMAGES]
+    rows = [[esc(camera), esc(epoch), count(n), fixed(rms, 3)] for camera, epoch, rms, n in worst]
+    columns = ("<Camera", "<Epoch", "Points", "RMS residual [px]")
+    return f"<h3>Images with the largest residuals</h3>{table(columns, rows)}" if rows else ""

@@ -1,0 +1,219 @@
+"""The survey seen from above and from a corner, drawn as SVG; confidence ellipsoids enlarged by a stated factor."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.model import FloatArray
+from survey.report import drawing as d
+from survey.report.scene import Scene, Shot
+
+WIDTH, HEIGHT, MARGIN = 540.0, 450.0, 36.0
+_MOST_LABELS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Picture coordinates of world points, ``to_picture`` (n, 3) -> (n, 2), and the picture units per metre."""
+
+    to_picture: Callable[[FloatArray], FloatArray]
+    unit: float
+    name: str
+
+    def jacobian(self, x: FloatArray) -> FloatArray:
+        """Derivative (2, 3) of the picture at a point."""
+        h = 1e-4
+        steps = np.concatenate([x + h * np.eye(3), x - h * np.eye(3)])
+        xy = self.to_picture(steps)
+        return (xy[:3] - xy[3:]).T / (2 * h)
+
+
+def _fit(xy: FloatArray) -> tuple[float, FloatArray]:
+    """Scale and shift that bring flat coordinates (y up) into the picture."""
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    extent = np.maximum(high - low, 1e-6)
+    scale = float(min((WIDTH - 2 * MARGIN) / extent[0], (HEIGHT - 2 * MARGIN - 16) / extent[1]))
+    return scale, 0.5 * (low + high)
+
+
+def _placed(flat: Callable[[FloatArray], FloatArray], everything: FloatArray, name: str) -> View:
+    scale, middle = _fit(flat(everything))
+
+    def to_picture(x: FloatArray) -> FloatArray:
+        xy = (flat(np.atleast_2d(x)) - middle) * scale
+        return np.column_stack([0.5 * WIDTH + xy[:, 0], 0.5 * HEIGHT + 2 - xy[:, 1]])
+
+    return View(to_picture, scale, name)
+
+
+def plan(everything: FloatArray) -> View:
+    """Along -z on the world's x (right) and y (up)."""
+    return _placed(lambda x: x[:, :2], everything, "Plan (world x to the right, y up)")
+
+
+def perspective(everything: FloatArray) -> View:
+    """From a corner above, with mild perspective."""
+    azimuth, elevation = np.radians(-62.0), np.radians(27.0)
+    middle = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
+    away = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    up = np.cross(away, right)
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    floor = np.array([(x, y, low[2]) for x in (low[0], high[0]) for y in (low[1], high[1])])
+    distance = 2.2 * max(float(np.linalg.norm(np.ptp(everything, axis=0))), 1e-6)
+
+    def flat(x: FloatArray) -> FloatArray:
+        depth = distance - (x - middle) @ away
+        flat_x = np.column_stack([(x - middle) @ right, (x - middle) @ up])
+        return np.asarray(flat_x * (distance / np.maximum(depth, 0.1 * distance))[:, None])
+
+    return _placed(flat, np.concatenate([everything, floor]), "Perspective (world z up)")
+
+
+def enlargement(scene: Scene, ellipsoid: float, extent: float) -> float:
+    """How much the ellipsoids are enlarged: a round number that draws a typical one at about 3 % of the picture."""
+    semi_axes = [ellipsoid * float(np.sqrt(max(np.linalg.eigvalsh(s.cov)[-1], 0.0))) for s in scene.spots]
+    positive = [a for a in semi_axes if a > 0.0]
+    return d.round_below(0.035 * extent / float(np.median(positive))) if positive else 1.0
+
+
+def _ground(view: View, everything: FloatArray) -> list[str]:
+    """A grid on the lowest level, which makes heights and distances readable."""
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    step = d.round_below(float(np.ptp(everything[:, :2], axis=0).max()) / 4.0)
+    parts = []
+    (x0, y0), (x1, y1) = low[:2], high[:2]
+    for x in np.arange(np.ceil(x0 / step), np.floor(x1 / step) + 1) * step:
+        parts.append(d.polyline(view.to_picture(np.array([(x, y0, low[2]), (x, y1, low[2])])), "#e3e8ed"))
+    for y in np.arange(np.ceil(y0 / step), np.floor(y1 / step) + 1) * step:
+        parts.append(d.polyline(view.to_picture(np.array([(x0, y, low[2]), (x1, y, low[2])])), "#e3e8ed"))
+    return parts
+
+
+def _frustum(view: View, shot: Shot, depth: float) -> str:
+    """A camera as its field of view; away from the first epoch as its optical axis alone."""
+    if not shot.main:
+        ends = view.to_picture(shot.pose.transformFrom(np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 1.3 * depth)]).T).T)
+        return d.polyline(ends, d.CAMERA_COLOURS[shot.camera_idx % len(d.CAMERA_COLOURS)], 0.8, ' stroke-opacity="0.4"')
+    tx, ty = np.tan(shot.half_angles)
+    rim = depth * np.array([(-tx, -ty, 1.0), (tx, -ty, 1.0), (tx, ty, 1.0), (-tx, ty, 1.0)])
+    corners = view.to_picture(shot.pose.transformFrom(rim.T).T)
+    eye = view.to_picture(np.asarray(shot.pose.translation()))[0]
+    colour = d.CAMERA_COLOURS[shot.camera_idx % len(d.CAMERA_COLOURS)]
+    edges = "".join(f"M{eye[0]:.1f} {eye[1]:.1f}L{x:.1f} {y:.1f}" for x, y in corners)
+    return d.polygon(corners, colour, colour, 1.0, ' fill-opacity="0.2"') + (
+        f'<path d="{edges}" stroke="{colour}" stroke-width="0.9" fill="none"/>'
+    )
+
+
+class _Labels:
+    """Places labels beside their points, tries four sides, leaves out what would cover another label."""
+
+    def __init__(self, taken: FloatArray) -> None:
+        self.boxes: list[tuple[float, float, float, float]] = [(x - 2, y - 2, x + 2, y + 2) for x, y in taken]
+
+    def place(self, xy: FloatArray, words: str, colour: str, size: float = 10.5, gap: float = 5.0) -> str:
+        w, h = 0.6 * size * len(words), size
+        for dx, dy in (
+            (gap, -3.0),
+            (gap, h + 1),
+            (-gap - w, -3.0),
+            (-gap - w, h + 1),
+            (-w / 2, -gap - 5),
+            (-w / 2, h + gap + 4),
+        ):
+            x, y = xy[0] + dx, xy[1] + dy
+            box = (x, y - h, x + w, y + 1)
+            inside = box[0] > 0 and box[1] > 0 and box[2] < WIDTH and box[3] < HEIGHT
+            free = all(box[0] > b[2] or box[2] < b[0] or box[1] > b[3] or box[3] < b[1] for b in self.boxes)
+            if inside and free:
+                self.boxes.append(box)
+                halo = ' paint-order="stroke" stroke="#fff" stroke-width="2.5"'
+                return d.text(x, y, words, size=size, colour=colour, more=halo)
+        return ""
+
+
+def _tables(view: View, scene: Scene, reach: float) -> list[str]:
+    parts = []
+    for _, pose, axes in scene.tables:
+        for axis in axes:
+            direction = np.zeros(3)
+            direction["xyz".index(axis)] = reach
+            ends = view.to_picture(pose.transformFrom(np.column_stack([-direction, direction])).T)
+            parts.append(d.polyline(ends, d.INK, 1.1, ' stroke-dasharray="7 3 1.5 3"'))
+    return parts
+
+
+def _world_axes(view: View, reach: float) -> list[str]:
+    start = view.to_picture(np.zeros((1, 3)))[0]
+    inside = 0 <= start[0] <= WIDTH and 0 <= start[1] <= HEIGHT
+    parts = []
+    for i, (name, colour) in enumerate((("x", "#b03030"), ("y", "#2f7d4f"), ("z", "#2b50a8"))):
+        end = view.to_picture(reach * np.eye(3)[i])[0]
+        if inside and np.hypot(*(end - start)) > 3.0:
+            parts.append(d.arrows(start[None], end[None], colour, 1.6, 5.0))
+            tip = start + (end - start) * (1 + 8.0 / np.hypot(*(end - start)))
+            parts.append(d.text(tip[0], tip[1] + 3.5, name, "middle", 10.5, colour))
+    return parts
+
+
+def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, ellipsoid: float) -> str:
+    """One view of the scene as SVG."""
+    extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
+    parts = [
+        d.text(0, 12, view.name, colour=d.INK, size=11.5),
+        *_ground(view, everything),
+        *_world_axes(view, 0.07 * extent),
+    ]
+    if view.name.startswith("Persp"):
+        floor = everything[:, 2].min()
+        for spot in scene.spots:
+            foot = view.to_picture(np.array([spot.x, (*spot.x[:2], floor)]))
+            parts.append(d.polyline(foot, d.FAINT, 0.8, ' stroke-dasharray="2 2"'))
+    parts += [d.polygon(view.to_picture(x), "#4d5b69", d.INK, 1.0, ' fill-opacity="0.18"') for _, x in scene.outlines]
+    parts += [d.dot(x, y, 1.2, d.INK) for _, cloud in scene.clouds for x, y in view.to_picture(cloud)]
+    parts += _tables(view, scene, 0.06 * extent)
+    parts += [_frustum(view, s, 0.075 * extent) for s in sorted(scene.shots, key=lambda s: s.main)]
+    for spot in sorted(scene.spots, key=lambda s: s.kind):
+        J = view.jacobian(spot.x) * ellipsoid * enlarged
+        colour = d.RED if spot.kind == "point" else d.GREEN
+        x, y = view.to_picture(spot.x)[0]
+        parts.append(d.ellipse(np.array([x, y]), J @ spot.cov @ J.T, colour, colour))
+        parts.append(d.dot(x, y, 2.2 if spot.kind == "point" else 3.0, colour))
+    parts += _labels(view, scene, 0.09 * extent)
+    step = d.round_below(0.25 * WIDTH / view.unit)
+    parts.append(d.scale_bar(2, HEIGHT - 8, step * view.unit, f"{step:g} m"))
+    return d.svg(WIDTH, HEIGHT, parts, view.name)
+
+
+def _labels(view: View, scene: Scene, ahead: float) -> list[str]:
+    """Names; those of cameras stand ``ahead`` of them, m."""
+    taken = [view.to_picture(s.x)[0] for s in scene.spots]
+    labels, parts = _Labels(np.array(taken).reshape(-1, 2)), []
+    for label, x in scene.outlines + scene.clouds:
+        parts.append(labels.place(view.to_picture(x).mean(axis=0), label, d.INK) if label else "")
+    for shot in scene.shots:
+        if shot.main:
+            colour = d.CAMERA_COLOURS[shot.camera_idx % len(d.CAMERA_COLOURS)]
+            tip = view.to_picture(shot.pose.transformFrom(np.array([0.0, 0.0, ahead])))[0]
+            parts.append(labels.place(tip, shot.label, colour, 12.5, 1.0))
+    for table_id, pose, _ in scene.tables:
+        parts.append(labels.place(view.to_picture(np.asarray(pose.translation()))[0], table_id, d.INK, gap=10.0))
+    for spot in scene.spots[:_MOST_LABELS]:
+        if spot.label:
+            parts.append(
+                labels.place(view.to_picture(spot.x)[0], spot.label, d.RED if spot.kind == "point" else d.GREEN)
+            )
+    return parts
+
+
+def pictures(scene: Scene, ellipsoid: float) -> tuple[str, float]:
+    """Both views side by side, and the factor by which ellipsoids are enlarged; nothing for an empty scene."""
+    everything = scene.positions()
+    if not len(everything):
+        return "", 1.0
+    extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
+    enlarged = enlargement(scene, ellipsoid, extent)
+    views = (plan(everything), perspective(everything))
+    return "".join(f"<figure>{draw(scene, v, everything, enlarged, ellipsoid)}</figure>" for v in views), enlarged

@@ -1,0 +1,125 @@
+"""What a picture of a survey shows, in world coordinates: cameras, stations, tables, targets, points."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.model import FloatArray, Target
+from adjust.observations import FrameRef
+from adjust.result import Adjustment
+from survey.adjusted_frames import AdjustedFrames
+from survey.quantities import Scale
+
+_MOST_EPOCHS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Spot:
+    """A position (3,) m with its covariance (3, 3) m^2, a posteriori where the report is; ``kind`` point or station."""
+
+    label: str
+    kind: str
+    x: FloatArray
+    cov: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A camera where it stood: ``world_from_camera``, half angles of its field of view; ``main`` of the first epoch."""
+
+    camera_idx: int
+    label: str
+    pose: Pose3
+    half_angles: tuple[float, float]
+    main: bool
+
+
+@dataclass(eq=False)
+class Scene:
+    """Everything to be drawn; outlines are closed polygons (k, 3), axes are directions of table axes (2, 3) m."""
+
+    spots: list[Spot] = field(default_factory=list)
+    shots: list[Shot] = field(default_factory=list)
+    outlines: list[tuple[str, FloatArray]] = field(default_factory=list)
+    clouds: list[tuple[str, FloatArray]] = field(default_factory=list)
+    tables: list[tuple[str, Pose3, tuple[str, ...]]] = field(default_factory=list)
+
+    def positions(self) -> FloatArray:
+        """Everything with a place, (n, 3)."""
+        parts = [np.array([s.x for s in self.spots]).reshape(-1, 3)]
+        parts.append(np.array([np.asarray(s.pose.translation()) for s in self.shots]).reshape(-1, 3))
+        parts += [x for _, x in self.outlines + self.clouds]
+        parts.append(np.array([np.asarray(p.translation()) for _, p, _ in self.tables]).reshape(-1, 3))
+        return np.concatenate(parts)
+
+
+def scene_of(adjustment: Adjustment, scale: Scale) -> Scene:
+    """The scene at the adjusted values; of many epochs an even selection."""
+    frames, scene = AdjustedFrames(adjustment), Scene()
+    epochs = list(dict.fromkeys(b.epoch_id for b in adjustment.survey.image_blocks)) or [""]
+    shown = [epochs[i] for i in np.unique(np.linspace(0, len(epochs) - 1, min(len(epochs), _MOST_EPOCHS)).astype(int))]
+    _add_cameras(scene, adjustment, frames, shown)
+    _add_stations(scene, adjustment, scale)
+    _add_targets(scene, adjustment, frames, shown)
+    for table in adjustment.survey.tables:
+        pose = frames.world_from(FrameRef("table", table.table_id))
+        if pose is not None:
+            scene.tables.append((table.table_id, pose, table.axes))
+    for name, estimate in adjustment.estimates.items():
+        if name[0] == "point" and not isinstance(estimate.value, Pose3):
+            scene.spots.append(Spot(name[1], "point", estimate.value, scale.factor**2 * estimate.cov))
+    return scene
+
+
+def _add_cameras(scene: Scene, adjustment: Adjustment, frames: AdjustedFrames, epochs: list[str]) -> None:
+    seen = {(b.camera_id, b.epoch_id) for b in adjustment.survey.image_blocks}
+    for i, camera in enumerate(adjustment.survey.cameras):
+        half_angles = _half_angles(adjustment, camera.camera_id)
+        for epoch in epochs:
+            # the first epoch shows all cameras together, the others only those that took an image
+            main = epoch == epochs[0]
+            pose = frames.world_from(FrameRef("camera", camera.camera_id, epoch))
+            if pose is None or not (main or (camera.camera_id, epoch) in seen):
+                continue
+            if main or not any(s.pose.equals(pose, 1e-9) for s in scene.shots):
+                scene.shots.append(Shot(i, camera.camera_id, pose, half_angles, main))
+
+
+def _half_angles(adjustment: Adjustment, camera_id: str) -> tuple[float, float]:
+    """Half the field of view from an fx in pixels, a drawing's 25 degrees where the lens names none."""
+    camera = next(c for c in adjustment.survey.cameras if c.camera_id == camera_id)
+    estimate = adjustment.estimates.get(("lens", camera_id))
+    width, height = camera.image_size
+    if estimate is None or isinstance(estimate.value, Pose3) or "fx" not in estimate.components:
+        return np.radians(25.0), np.radians(25.0 * height / width)
+    fx = float(estimate.value[estimate.components.index("fx")])
+    return float(np.arctan(0.5 * width / fx)), float(np.arctan(0.5 * height / fx))
+
+
+def _add_stations(scene: Scene, adjustment: Adjustment, scale: Scale) -> None:
+    for name, estimate in adjustment.estimates.items():
+        if name[0] == "world_from_station" and isinstance(estimate.value, Pose3):
+            R = estimate.value.rotation().matrix()
+            cov = scale.factor**2 * R @ estimate.cov[3:, 3:] @ R.T
+            label = name[1] if len(name) == 2 else ""
+            scene.spots.append(Spot(label, "station", np.asarray(estimate.value.translation()), cov))
+
+
+def _add_targets(scene: Scene, adjustment: Adjustment, frames: AdjustedFrames, epochs: list[str]) -> None:
+    for target in adjustment.survey.targets:
+        for epoch in epochs if target.motion == "epoch" else epochs[:1]:
+            pose = frames.world_from(FrameRef("target", target.target_id, epoch))
+            if pose is None:
+                continue
+            label = target.target_id if epoch == epochs[0] else ""
+            flat = np.ptp(target.x_in_target[:, 2]) < 1e-3 * max(float(np.ptp(target.x_in_target, axis=0).max()), 1e-9)
+            if flat and len(target.x_in_target) > 3:
+                scene.outlines.append((label, pose.transformFrom(_corners(target).T).T))
+            else:
+                scene.clouds.append((label, pose.transformFrom(np.asarray(target.x_in_target, dtype=float).T).T))
+
+
+def _corners(target: Target) -> FloatArray:
+    (x0, y0, z0), (x1, y1, _) = target.x_in_target.min(axis=0), target.x_in_target.max(axis=0)
+    return np.array([(x0, y0, z0), (x1, y0, z0), (x1, y1, z0), (x0, y1, z0)])

@@ -1,0 +1,134 @@
+"""The summary of an adjustment for the terminal: about twenty-five aligned lines, the worst first."""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from adjust.result import Adjustment
+from survey.solution import RunInfo, solution_dict
+
+_WIDTH = 100
+_WORDS = {"passed": "PASSED", "check": "NEEDS A LOOK", "failed": "FAILED"}
+_MOST_WARNINGS, _MOST_GROUPS, _MOST_CAMERAS, _MOST_OTHER, _MOST_POINTS = 6, 6, 6, 4, 3
+
+
+def summary_text(adjustment: Adjustment, run: RunInfo) -> str:
+    """Verdict, warnings, key figures, groups, cameras, worst observations and points."""
+    solution = solution_dict(adjustment, run)
+    lines: list[str] = []
+    for part in (_head, _warnings, _figures, _groups, _cameras):
+        lines += part(solution)
+    lines += _observations(adjustment, solution["summary"]["suspects"]["standardized_limit"])
+    lines += _points(solution)
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def _number(value: float | None, width: int, decimals: int) -> str:
+    return f"{'-':>{width}}" if value is None or not math.isfinite(value) else f"{value:{width}.{decimals}f}"
+
+
+def _cut(text: str, width: int) -> str:
+    return text if len(text) <= width else text[: width - 1] + "…"
+
+
+def _head(solution: dict[str, Any]) -> Iterator[str]:
+    s = solution["summary"]
+    yield f"{_cut(s['title'] or solution['inputs']['folder'], 70)}: {_WORDS[s['verdict']]}"
+    yield s["reason"]
+
+
+def _warnings(solution: dict[str, Any]) -> Iterator[str]:
+    warnings = solution["warnings"]
+    yield from (f"  ! {w}" for w in warnings[:_MOST_WARNINGS])
+    if len(warnings) > _MOST_WARNINGS:
+        yield f"  ! and {len(warnings) - _MOST_WARNINGS} more, see the report"
+
+
+def _figures(solution: dict[str, Any]) -> Iterator[str]:
+    s, test = solution["summary"], solution["summary"]["global_test"]
+    found = s["suspects"]
+    yield ""
+    yield (
+        f"  sigma0 {_number(s['sigma0'], 0, 4)}   observations {s['n_observations']}   unknowns {s['n_unknowns']}   "
+        f"redundancy {s['redundancy']}   iterations {s['iterations']}"
+    )
+    if test:
+        yield (
+            f"  global test {'passed' if test['passed'] else 'FAILED'}: omega {test['omega']:.1f}, accepted "
+            f"{test['lower']:.1f} to {test['upper']:.1f} at {100 * (1 - test['alpha']):g} %"
+        )
+    yield (
+        f"  suspect: {found['n_image_points']} image points, {found['n_other']} other observations; "
+        f"not used: {found['n_not_used']}   (sigmas below {s['sigmas'].replace('_', ' ')})"
+    )
+
+
+def _groups(solution: dict[str, Any]) -> Iterator[str]:
+    groups = sorted(solution["groups"].items(), key=lambda x: -abs(x[1]["deviation"] or 0.0))
+    if groups:
+        yield ""
+        yield f"  {'group':<18}{'observations':>13}{'redundancy':>12}{'variance factor':>17}"
+    for name, g in groups[:_MOST_GROUPS]:
+        factor = _number(g["variance_factor"], 17, 3)
+        yield f"  {_cut(name, 18):<18}{g['n_observations']:>13}{g['redundancy']:>12.1f}{factor}"
+    if len(groups) > _MOST_GROUPS:
+        yield f"  and {len(groups) - _MOST_GROUPS} more groups"
+
+
+def _cameras(solution: dict[str, Any]) -> Iterator[str]:
+    cameras = sorted(solution["cameras"].items(), key=lambda x: -(x[1]["rms_residual_px"] or 0.0))
+    if cameras:
+        yield ""
+        yield f"  {'camera':<18}{'images':>7}{'points':>9}{'RMS px':>9}   largest sigma of the lens"
+    for camera_id, c in cameras[:_MOST_CAMERAS]:
+        rms = _number(c["rms_residual_px"], 9, 3)
+        yield f"  {_cut(camera_id, 18):<18}{c['n_images']:>7}{c['n_image_points']:>9}{rms}   {_lens(c.get('lens'))}"
+    if len(cameras) > _MOST_CAMERAS:
+        yield f"  and {len(cameras) - _MOST_CAMERAS} more cameras"
+
+
+def _lens(lens: dict[str, Any] | None) -> str:
+    if lens is None:
+        return ""
+    sigmas = {k[6:-3]: v for k, v in lens.items() if k.startswith("sigma_") and k.endswith("_px") and v}
+    parts = []
+    if sigmas:
+        name = max(sigmas, key=lambda k: sigmas[k])
+        parts.append(f"{name} {sigmas[name]:.2g} px")
+    if lens["not_significant"]:
+        parts.append(f"not significant: {' '.join(lens['not_significant'])}")
+    if lens["correlations_over_95_percent"]:
+        strong = lens["correlations_over_95_percent"][0]
+        parts.append(f"{strong['a']}-{strong['b']} correlated {100 * strong['correlation']:.1f} %")
+    return ", ".join(parts)
+
+
+def _observations(adjustment: Adjustment, limit: float) -> Iterator[str]:
+    sized = [
+        (float(np.nanmax(np.abs(o.standardized), initial=0.0)), k)
+        for k, o in enumerate(adjustment.other_residuals)
+        if o.used
+    ]
+    worst = sorted(sized, key=lambda x: (-x[0], x[1]))[:_MOST_OTHER]
+    if worst:
+        yield ""
+        yield "  largest standardized residuals"
+    for size, k in worst:
+        o = adjustment.other_residuals[k]
+        flag = "  SUSPECT" if size > limit else ""
+        yield f"  {_cut(f'{o.kind} {chr(32).join(o.ids)}', 44):<44}{size:>8.2f}{flag}"
+
+
+def _points(solution: dict[str, Any]) -> Iterator[str]:
+    sized = {k: p["ellipsoid_95_semi_axes_mm"][0] for k, p in solution["points"].items()}
+    worst = sorted(sized, key=lambda k: -sized[k])[:_MOST_POINTS]
+    if worst:
+        yield ""
+        heading = f"least precise of {len(sized)} points"
+        yield f"  {heading:<32}{'sigma x y z mm':>24}{'95 % semi-axis mm':>20}"
+    for name in worst:
+        p = solution["points"][name]
+        sigmas = "".join(_number(p[f"sigma_{a}_mm"], 8, 3) for a in "xyz")
+        yield f"  {_cut(name, 32):<32}{sigmas}{sized[name]:>20.3f}"

@@ -1,0 +1,86 @@
+"""The results of a survey as files: ``solution.json``, ``covariance.npz``, residuals as CSV and ``report.html``."""
+
+import io
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adjust.result import Adjustment
+from survey.files import atomic_write
+from survey.quantities import SigmaKind, scale_of
+from survey.report import report_html, summary_text
+from survey.residual_tables import image_residuals_csv, other_residuals_csv
+from survey.solution import RunInfo, solution_dict, solution_json
+
+__all__ = [
+    "RESULTS",
+    "RunInfo",
+    "covariance_npz",
+    "read_covariances",
+    "solution_dict",
+    "solution_json",
+    "summary_text",
+    "write_results",
+]
+
+RESULTS = "results"
+_README = (
+    "names[i] is kind/id[/epoch]/component; units[i] its unit; parameters[k] is kind/id[/epoch].",
+    "Parameter k has the components start[k]:start[k+1] of names; its covariance is covariance[block[k]:block[k+1]], "
+    "row by row.",
+    "Tangent of a pose a_from_b: rotation (rad) then translation (m), in frame b: a_from_b * Exp(tangent).",
+    "Covariances are a priori times factor**2; factor is 1 where sigmas is a_priori, sigma0 where it is a_posteriori.",
+)
+
+
+def covariance_npz(adjustment: Adjustment, sigmas: SigmaKind = "a_posteriori") -> bytes:
+    """Covariance of every parameter, joint within the parameter, as an ``.npz`` that explains itself."""
+    scale, estimates = scale_of(adjustment, sigmas), list(adjustment.estimates.values())
+    parameters = ["/".join(e.name) for e in estimates]
+    names = [f"{p}/{c}" for p, e in zip(parameters, estimates, strict=True) for c in e.components]
+    sizes = np.array([len(e.components) for e in estimates], dtype=np.int64)
+    out = io.BytesIO()
+    np.savez_compressed(
+        out,
+        README=np.array(_README),
+        names=np.array(names, dtype=str),
+        units=np.array([u for e in estimates for u in e.units], dtype=str),
+        parameters=np.array(parameters, dtype=str),
+        start=np.concatenate([[0], np.cumsum(sizes)]),
+        block=np.concatenate([[0], np.cumsum(sizes**2)]),
+        covariance=np.concatenate([*((scale.factor**2 * e.cov).ravel() for e in estimates), np.empty(0)]),
+        sigmas=np.array(scale.sigmas),
+        factor=np.array(scale.factor),
+    )
+    return out.getvalue()
+
+
+def read_covariances(path: Path) -> dict[str, Any]:
+    """The blocks of a ``covariance.npz`` by ``kind/id[/epoch]``, each (n, n), as they were written."""
+    with np.load(path) as found:
+        sizes, block, flat = np.diff(found["start"]), found["block"], found["covariance"]
+        return {
+            str(name): flat[block[k] : block[k + 1]].reshape(sizes[k], sizes[k])
+            for k, name in enumerate(found["parameters"])
+        }
+
+
+def write_results(folder: Path, adjustment: Adjustment, run: RunInfo) -> dict[str, Path]:
+    """Write everything into ``folder/results``, each file whole or not at all; the paths by file name."""
+    results = folder / RESULTS
+    results.mkdir(parents=True, exist_ok=True)
+    solution = solution_dict(adjustment, run)
+    makers: Mapping[str, Callable[[], bytes]] = {
+        "covariance.npz": lambda: covariance_npz(adjustment, run.sigmas),
+        "residuals.csv": lambda: image_residuals_csv(adjustment),
+        "residuals_other.csv": lambda: other_residuals_csv(adjustment),
+        "report.html": lambda: report_html(adjustment, run, solution).encode(),
+        # last: whoever waits for the solution finds the rest beside it
+        "solution.json": lambda: solution_json(solution).encode(),
+    }
+    paths = {name: results / name for name in makers}
+    for name, make in makers.items():
+        atomic_write(paths[name], make())
+    return paths
