@@ -1,0 +1,235 @@
+"""The command line: usage, messages and exit codes. The jobs behind it are replaced here."""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+from adjust.errors import SurveyError
+from survey.cli import build_parser, main
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def _run(*arguments, **more):
+    return subprocess.run(
+        [sys.executable, "-m", "survey", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=60, **more
+    )
+
+
+@dataclass
+class _Outcome:
+    folder: Path
+    passed: bool = True
+    paths: dict = field(default_factory=dict)
+
+    @property
+    def adjustment(self):
+        return SimpleNamespace(global_test=SimpleNamespace(passed=self.passed))
+
+    def summary(self):
+        return {"summary": {"sigma0": 1.25, "redundancy": 77}}
+
+    def text(self):
+        return f"text of {self.folder.name}"
+
+
+@pytest.fixture
+def jobs(monkeypatch):
+    """``survey.jobs`` whose result depends on the folder's name."""
+    calls = []
+
+    def adjust_job(folder, *, out, progress, redetect):
+        calls.append(SimpleNamespace(folder=folder, out=out, progress=progress, redetect=redetect))
+        if folder.name == "bad":
+            raise SurveyError(f"{folder}/survey.toml:3: no such thing; write another")
+        if folder.name == "bug":
+            raise ZeroDivisionError("oops")
+        if folder.name == "stopped":
+            raise KeyboardInterrupt
+        if folder.name == "gone":
+            raise PermissionError(13, "Permission denied", str(folder / "results"))
+        return _Outcome(folder, passed=folder.name != "poor")
+
+    module = ModuleType("survey.jobs")
+    module.adjust_job = adjust_job
+    monkeypatch.setitem(sys.modules, "survey.jobs", module)
+    return calls
+
+
+@pytest.fixture
+def project(tmp_path):
+    def make(name):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "survey.toml").write_text("format = 1\n")
+        return str(tmp_path / name)
+
+    return make
+
+
+def test_help_opens_with_a_real_command_and_names_the_next():
+    result = _run("--help")
+    assert result.returncode == 0
+    assert result.stdout.startswith("usage: labsurvey adjust lab")
+    assert "Next: labsurvey example full-lab lab" in result.stdout
+
+
+@pytest.mark.parametrize("command", ["adjust", "detect", "example"])
+def test_help_of_commands_does_the_same(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    text = capsys.readouterr().out
+    assert stop.value.code == 0
+    assert text.startswith(f"usage: labsurvey {command} ")
+    assert "Next: " in text
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys\nfrom survey.cli import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "print('LOADED', sorted({'numpy', 'gtsam', 'cv2', 'scipy', 'numba', 'matplotlib'} & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert result.stdout.strip().endswith("LOADED []")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["adust", "lab"], ["adjust"], ["adjust", "lab", "--nonsense"], ["example", "lab", "x"],
+     ["detect", "lab", "--jobs", "0"], ["adjust", "a", "b", "--out", "c"], ["adjust", "a", "./a"],
+     ["example", "stereo", "x", "--seed", "-1"]],
+)  # fmt: skip
+def test_wrong_usage_is_2(arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    assert "error: " in capsys.readouterr().err
+
+
+def test_an_error_of_the_user_is_one_message_without_traceback(tmp_path):
+    result = _run("adjust", str(tmp_path / "nowhere"))
+    assert result.returncode == 1
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert "no such folder" in result.stderr
+    assert "labsurvey example full-lab lab" in result.stderr
+
+
+def test_a_folder_without_definition_is_named(tmp_path, capsys):
+    assert main(["detect", str(tmp_path)]) == 1
+    assert "there is no survey.toml in it" in capsys.readouterr().err
+
+
+def test_adjust_prints_the_result_and_is_0(jobs, project, capsys):
+    assert main(["adjust", project("good"), "--redetect", "--quiet"]) == 0
+    assert capsys.readouterr() == ("text of good\n", "")
+    assert jobs[0].redetect
+    assert not jobs[0].progress
+    assert jobs[0].out is None
+
+
+def test_a_failed_global_test_is_3(jobs, project):
+    assert main(["adjust", project("poor")]) == 3
+
+
+def test_a_survey_error_is_1_and_says_where(jobs, project, capsys):
+    folder = project("bad")
+    assert main(["adjust", folder]) == 1
+    assert capsys.readouterr().err == f"labsurvey: error: {folder}/survey.toml:3: no such thing; write another\n"
+
+
+def test_a_bug_keeps_its_traceback(jobs, project):
+    with pytest.raises(ZeroDivisionError):
+        main(["adjust", project("bug")])
+
+
+def test_a_file_that_cannot_be_written_is_named(jobs, project, capsys):
+    assert main(["adjust", project("gone")]) == 1
+    assert "gone/results: Permission denied" in capsys.readouterr().err
+
+
+def test_an_interrupt_is_clean(jobs, project, capsys):
+    assert main(["adjust", project("stopped")]) == 130
+    assert capsys.readouterr().err.strip() == "labsurvey: interrupted"
+
+
+@pytest.mark.parametrize("place", ["before", "after"])
+def test_json_is_one_object_wherever_the_flag_stands(jobs, project, capsys, place):
+    folder = project("good")
+    arguments = ["--json", "adjust", folder] if place == "before" else ["adjust", folder, "--json"]
+    assert main(arguments) == 0
+    assert json.loads(capsys.readouterr().out)["summary"]["redundancy"] == 77
+
+
+def test_a_batch_goes_on_past_failures_and_lists_all(jobs, project, capsys):
+    folders = [project(name) for name in ("good", "bad", "bug", "poor", "last")]
+    assert main(["adjust", *folders]) == 1
+    out, err = capsys.readouterr()
+    assert [line.split()[1] for line in out.splitlines()[1:]] == ["done", "error", "error", "global", "done"]
+    assert "no such thing" in err
+    assert "ZeroDivisionError" in err
+    assert [call.folder.name for call in jobs] == ["good", "bad", "bug", "poor", "last"]
+
+
+def test_a_batch_without_errors_is_3_where_a_global_test_failed(jobs, project, capsys):
+    assert main(["--json", "--quiet", "adjust", project("good"), project("poor")]) == 3
+    rows = json.loads(capsys.readouterr().out)["folders"]
+    assert [row["exit_code"] for row in rows] == [0, 3]
+    assert [Path(row["folder"]).name for row in rows] == ["good", "poor"]
+
+
+def test_a_reader_that_leaves_is_no_error(tmp_path):
+    command = f"{shlex.quote(sys.executable)} -m survey example one-camera {shlex.quote(str(tmp_path / 'x'))} --help"
+    result = subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {command} | true"], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert "Traceback" not in result.stderr
+
+
+def _readme_command_lines():
+    text = (ROOT / "README.md").read_text()
+    chained = [part for block in re.findall(r"```\n(.*?)```", text, re.S) for part in re.split(r"&&|\n", block)]
+    inline = re.findall(r"`(labsurvey [^`]*)`", text)
+    lines = [part.strip().removeprefix(".venv/bin/") for part in chained + inline]
+    return [line for line in lines if line.startswith("labsurvey ")]
+
+
+def test_readme_has_exactly_two_set_up_commands():
+    text = (ROOT / "README.md").read_text()
+    setups = [line for line in text.splitlines() if "-m venv" in line]
+    assert len(setups) == 2
+    assert setups[0].endswith("labsurvey adjust lab")
+    assert setups[1].endswith(".venv/bin/pytest")
+
+
+@pytest.mark.parametrize("line", _readme_command_lines())
+def test_every_command_line_of_the_readme_is_understood(line, capsys):
+    arguments = shlex.split(line.replace("NAME", "stereo"))[1:]
+    if "--help" in arguments:
+        with pytest.raises(SystemExit) as stop:
+            build_parser().parse_args(arguments)
+        assert stop.value.code == 0
+        return
+    assert callable(build_parser().parse_args(arguments).run)
+
+
+def test_every_flag_of_the_readme_exists(capsys):
+    flags = set(re.findall(r"`(--?[a-z]+)", (ROOT / "README.md").read_text())) - {"--strict"}
+    with pytest.raises(SystemExit):
+        main(["adjust", "--help"])
+    known = capsys.readouterr().out
+    assert flags
+    assert all(flag in known for flag in flags)
+
+
+def test_the_check_script_is_executable_and_parses():
+    assert os.access(ROOT / ".ci" / "run", os.X_OK)
+    assert subprocess.run(["bash", "-n", str(ROOT / ".ci" / "run")], timeout=20).returncode == 0
