@@ -105,7 +105,7 @@ def test_jacobian_is_the_change_of_the_converted_values(name):
     scale = np.abs(measured).max(axis=1, keepdims=True)
     assert np.all(scale[there.values != 0] > 0)
     scale[scale == 0] = 1.0
-    np.testing.assert_allclose(there.jacobian / scale, measured / scale, atol=2e-3)
+    np.testing.assert_allclose(there.jacobian / scale, measured / scale, atol=2e-5)
 
 
 def test_covariance_goes_through_the_jacobian_and_keeps_the_precision_of_rays():
