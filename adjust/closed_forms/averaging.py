@@ -3,7 +3,7 @@
 import numpy as np
 
 from adjust.closed_forms.rigid import nearest_rotation, rigid, rotation_log
-from adjust.model import FloatArray
+from adjust.model import FloatArray, IntArray
 
 _MEDOID_LIMIT = 150  # more candidates than this are thinned out for the quadratic search of the medoid
 
@@ -21,7 +21,7 @@ def mean_rotation(rotations: FloatArray, weights: FloatArray | None = None) -> F
 
 
 def mean_pose(
-    poses: FloatArray, lever: float, members: FloatArray | None = None, iterations: int = 20
+    poses: FloatArray, lever: float, members: IntArray | None = None, iterations: int = 20
 ) -> tuple[FloatArray, FloatArray]:
     """Robust mean (4, 4) of rigid motions (n, 4, 4), and the distance (n,) m of each from it.
 
@@ -45,14 +45,14 @@ def mean_pose(
     return mean, pose_distance(poses, mean, lever)
 
 
-def _nearest(distance: FloatArray, index: np.ndarray) -> np.ndarray:
+def _nearest(distance: FloatArray, index: IntArray) -> IntArray:
     """Position of the nearest alternative of each observation."""
     order = np.lexsort((distance, index))
     first = np.concatenate([[True], np.diff(index[order]) > 0])
     return np.asarray(order[first])
 
 
-def _medoid(poses: FloatArray, lever: float, index: np.ndarray) -> FloatArray:
+def _medoid(poses: FloatArray, lever: float, index: IntArray) -> FloatArray:
     """The motion with the least sum of distances to the nearest alternatives of all observations."""
     step = max(1, -(-len(poses) // _MEDOID_LIMIT))
     trial = poses[::step]

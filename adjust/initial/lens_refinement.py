@@ -1,0 +1,150 @@
+"""Lens and target poses of one camera together, by a small Levenberg-Marquardt with the poses eliminated."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.closed_forms import rigid, rotation_exp
+from adjust.closed_forms.rigid import skew
+from adjust.lens import LensModel, lens_derivatives, lens_residuals
+from adjust.model import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class LensFit:
+    """values (n,), poses (B, 4, 4), residuals (N, 2) px, and the covariance (p, p) of the free lens components."""
+
+    values: FloatArray
+    poses: FloatArray
+    residuals: FloatArray
+    cov: FloatArray
+
+
+def fit_lens(
+    model: LensModel,
+    constants: FloatArray,
+    values: FloatArray,
+    directions: FloatArray,
+    poses: FloatArray,
+    x: FloatArray,
+    uv: FloatArray,
+    ptr: IntArray,
+    iterations: int = 25,
+) -> LensFit:
+    """Least squares over ``values + directions @ p`` and the poses camera_from_target (B, 4, 4), with Cauchy weights.
+
+    directions: (n, p), what of the lens may move. x: (N, 3) m, uv: (N, 2) px, view after view by ``ptr`` (B + 1,).
+    Source: Levenberg-Marquardt with the poses eliminated (Schur complement; Triggs et al., Bundle adjustment, 2000, 6.1).
+    """
+    view = np.repeat(np.arange(len(poses)), np.diff(ptr))
+    damping, residuals = 1e-4, _residuals(model, values, constants, poses, x, uv, view)
+    for _ in range(iterations):
+        weights = _cauchy(residuals)
+        system = _normal_equations(model, values, constants, directions, poses, x, uv, ptr, weights)
+        cost = float(weights @ np.sum(residuals**2, axis=1))
+        gain = 0.0
+        for _ in range(6):
+            by_lens, by_pose = _step(*system, damping)
+            new_values = values + directions @ by_lens
+            new_poses = rigid(rotation_exp(by_pose[:, :3]), by_pose[:, 3:]) @ poses
+            new_residuals = _residuals(model, new_values, constants, new_poses, x, uv, view)
+            new_cost = float(weights @ np.sum(new_residuals**2, axis=1))
+            if new_cost < cost:
+                gain, damping = cost - new_cost, damping * 0.1
+                values, poses, residuals = new_values, new_poses, new_residuals
+                break
+            damping = max(damping, 1e-8) * 10.0
+        if gain < 1e-6 * cost:
+            break
+    cov = _lens_covariance(
+        *_normal_equations(model, values, constants, directions, poses, x, uv, ptr, _cauchy(residuals))
+    )
+    scale = float(np.median(np.sum(residuals**2, axis=1)) / np.log(4.0))  # median of a 2-D normal's square is s^2 ln 4
+    return LensFit(values, poses, residuals, cov * scale)
+
+
+def _in_camera(poses: FloatArray, x: FloatArray, view: IntArray) -> FloatArray:
+    return np.asarray((poses[view, :3, :3] @ x[:, :, None])[..., 0] + poses[view, :3, 3])
+
+
+def _residuals(
+    model: LensModel,
+    values: FloatArray,
+    constants: FloatArray,
+    poses: FloatArray,
+    x: FloatArray,
+    uv: FloatArray,
+    view: IntArray,
+) -> FloatArray:
+    p = _in_camera(poses, x, view)
+    r = lens_residuals(model, values, constants, p, uv)
+    # a point behind the camera must never look like an improvement
+    bad = ~np.all(np.isfinite(r), axis=1) | ((p[:, 2] <= 0) & (model.name != "fisheye"))
+    return np.where(bad[:, None], 1e6, r)
+
+
+def _cauchy(residuals: FloatArray) -> FloatArray:
+    size = np.linalg.norm(residuals, axis=1)
+    return np.asarray(1.0 / (1.0 + (size / max(3.0 * float(np.median(size)), 1e-9)) ** 2))
+
+
+def _normal_equations(
+    model: LensModel,
+    values: FloatArray,
+    constants: FloatArray,
+    directions: FloatArray,
+    poses: FloatArray,
+    x: FloatArray,
+    uv: FloatArray,
+    ptr: IntArray,
+    weights: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Lens block (p, p), mixed (B, 6, p), pose blocks (B, 6, 6) and right sides (p,), (B, 6)."""
+    view = np.repeat(np.arange(len(poses)), np.diff(ptr))
+    p = _in_camera(poses, x, view)
+    r, by_values, by_point = lens_derivatives(model, values, constants, p, uv)
+    a = by_values @ directions
+    j = np.concatenate([-by_point @ skew(p), by_point], axis=2)
+    jw = np.swapaxes(j * weights[:, None, None], 1, 2)
+    aw = a * weights[:, None, None]
+    return (
+        np.asarray(np.tensordot(aw, a, axes=([0, 1], [0, 1]))),
+        np.add.reduceat(jw @ a, ptr[:-1]),
+        np.add.reduceat(jw @ j, ptr[:-1]),
+        np.asarray(np.tensordot(aw, r, axes=([0, 1], [0, 1]))),
+        np.add.reduceat((jw @ r[:, :, None])[..., 0], ptr[:-1]),
+    )
+
+
+def _step(
+    lens: FloatArray,
+    mixed: FloatArray,
+    pose: FloatArray,
+    right_lens: FloatArray,
+    right_pose: FloatArray,
+    damping: float,
+) -> tuple[FloatArray, FloatArray]:
+    diagonal = np.einsum("bii->bi", pose)
+    pose = pose + (damping * diagonal + 1e-14 * diagonal.max())[:, :, None] * np.eye(6)
+    lens = lens + np.diag(damping * np.diag(lens) + 1e-300)
+    solved = np.linalg.solve(pose, np.concatenate([mixed, right_pose[..., None]], axis=2))
+    turned = np.swapaxes(mixed, 1, 2)
+    reduced = lens - np.sum(turned @ solved[..., :-1], axis=0)
+    right = right_lens - np.sum((turned @ solved[..., -1:])[..., 0], axis=0)
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(lens), 1e-300))
+    by_lens = -unit * np.linalg.lstsq(reduced * np.outer(unit, unit), unit * right, rcond=1e-13)[0]
+    by_pose = -solved[..., -1] - (solved[..., :-1] @ by_lens[:, None])[..., 0]
+    return by_lens, by_pose
+
+
+def _lens_covariance(
+    lens: FloatArray, mixed: FloatArray, pose: FloatArray, right_lens: FloatArray, right_pose: FloatArray
+) -> FloatArray:
+    """Inverse of the reduced normal matrix, infinite where it is singular."""
+    try:
+        reduced = lens - np.sum(np.swapaxes(mixed, 1, 2) @ np.linalg.solve(pose, mixed), axis=0)
+        unit = 1.0 / np.sqrt(np.diag(lens))
+        cov = np.linalg.inv(reduced * np.outer(unit, unit)) * np.outer(unit, unit)
+    except np.linalg.LinAlgError:
+        return np.diag(np.full(len(lens), np.inf))
+    return np.asarray(cov) if np.all(np.diag(cov) > 0) else np.diag(np.full(len(lens), np.inf))

@@ -1,0 +1,196 @@
+"""World points and the cameras that see them: resection from known points, intersection from known cameras, in turns."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pycolmap
+
+from adjust.closed_forms import intersect, inverse
+from adjust.errors import SurveyError
+from adjust.initial.network import ChainObservation, PoseNetwork
+from adjust.initial.views import View, block_text, make_view, refine_views, used_rows
+from adjust.model import BoolArray, FloatArray, IntArray, Survey
+from adjust.unknowns import Chain
+
+PARALLAX = (np.deg2rad(3.0), np.deg2rad(0.3), 0.0)
+"""What an intersection needs, rad; the next only where nothing goes on with the first."""
+_TOGETHER = 4  # points that the cameras of a station must see together
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A block of world points: positions (n,) in the survey's points, rays (n, 3) in the camera, camera_from_world."""
+
+    block_idx: int
+    camera_id: str
+    text: str
+    rows: IntArray
+    rays: FloatArray
+    focal_px: float
+    chain: Chain
+
+
+@dataclass(eq=False)
+class PointField:
+    """The world's points, (n, 3) m: nan until known. ``given`` (n,): coordinates that came with the survey."""
+
+    x: FloatArray
+    given: BoolArray
+    sights: list[Sight] = field(default_factory=list)
+
+    @property
+    def known(self) -> BoolArray:
+        """Which points (n,) have coordinates by now."""
+        return np.asarray(np.isfinite(self.x[:, 0]))
+
+    def add(self, survey: Survey, block_idx: int, rays: FloatArray, focal_px: float, chain: Chain) -> None:
+        """Take in a block of world points."""
+        block = survey.image_blocks[block_idx]
+        used = used_rows(block)
+        rows = np.asarray(block.point_idx, dtype=np.int64)[used]
+        self.sights.append(Sight(block_idx, block.camera_id, block_text(block), rows, rays[used], focal_px, chain))
+
+    def seen(self) -> BoolArray:
+        """Which points (n,) any block sees."""
+        out = np.zeros(len(self.x), dtype=bool)
+        for sight in self.sights:
+            out[sight.rows] = True
+        return out
+
+
+def point_field(survey: Survey) -> PointField:
+    """The points of a survey with their given or observed coordinates."""
+    x = np.full((len(survey.points), 3), np.nan)
+    index = {p.point_id: i for i, p in enumerate(survey.points)}
+    for observed in survey.coordinates:
+        for ref, value in zip(observed.positions, observed.values, strict=True):
+            if ref.frame is None and ref.point_id in index and observed.used:
+                x[index[ref.point_id]] = value
+    for i, point in enumerate(survey.points):
+        if point.x_in_world.value is not None:
+            x[i] = point.x_in_world.value
+    return PointField(x, np.asarray(np.isfinite(x[:, 0])))
+
+
+def resect(network: PoseNetwork, points: PointField) -> bool:
+    """Give a pose to the blocks that see enough known points and have none yet; whether there were any."""
+    have = {o.block_idx for o in network.observations}
+    views, sights = [], {}
+    known = points.known
+    for sight in points.sights:
+        if sight.block_idx in have or not network.unknown_links(sight.chain) or known[sight.rows].sum() < 3:
+            continue
+        try:
+            views.append(_view(sight, points, known))
+            sights[sight.block_idx] = sight
+        except SurveyError:  # on a line, or none in front: other blocks may do
+            continue
+    # three points fit up to four poses exactly: they count only where nothing better is left
+    strong = [v for v in views if len(v.x) >= 4]
+    if not strong and _resect_together(network, points):
+        return True
+    for view in refine_views(strong or views):
+        sight = sights[view.block_idx]
+        network.observations.append(ChainObservation(sight.chain, view.poses, sight.text, view.block_idx))
+    return bool(views)
+
+
+def _view(sight: Sight, points: PointField, known: BoolArray) -> View:
+    rows = known[sight.rows]
+    return make_view(sight.block_idx, points.x[sight.rows][rows], sight.rays[rows], sight.focal_px)
+
+
+def _resect_together(network: PoseNetwork, points: PointField) -> bool:
+    """Poses of stations whose cameras see enough known points only together; whether one was found."""
+    groups: dict[tuple[int, bool], list[tuple[Sight, int]]] = {}
+    for sight in points.sights:
+        missing = network.unknown_links(sight.chain)
+        if len(missing) == 1 and points.known[sight.rows].any():
+            link = sight.chain[missing[0]]
+            groups.setdefault((link.slot, link.inverse), []).append((sight, missing[0]))
+    found = False
+    for (slot, inverted), group in sorted(groups.items(), key=lambda item: item[0]):
+        pose = _generalised_pose(network, points, group)
+        if pose is not None:
+            network.known[slot] = inverse(pose) if inverted else pose
+            found = True
+    return found
+
+
+def _generalised_pose(
+    network: PoseNetwork, points: PointField, group: Sequence[tuple[Sight, int]]
+) -> FloatArray | None:
+    """Pose (4, 4) of the link that all these chains lack (GP3P inside RANSAC with a fixed seed, COLMAP), or None."""
+    uv, x = [], []
+    index: list[int] = []
+    rigs: list[pycolmap.Rigid3d] = []
+    cameras: list[pycolmap.Camera] = []
+    for sight, position in group:
+        rows = points.known[sight.rows] & (sight.rays[:, 2] > 0.1)
+        before, after = network.product(sight.chain[:position]), network.product(sight.chain[position + 1 :])
+        world = points.x[sight.rows][rows]
+        uv.append(sight.rays[rows, :2] / sight.rays[rows, 2:] * sight.focal_px)
+        x.append(world @ after[:3, :3].T + after[:3, 3])
+        index += [len(rigs)] * int(rows.sum())
+        rigs.append(pycolmap.Rigid3d(before[:3]))
+        params = [sight.focal_px, sight.focal_px, 0.0, 0.0]
+        cameras.append(pycolmap.Camera(model="PINHOLE", width=1, height=1, params=params))
+    if len(index) < _TOGETHER:
+        return None
+    options = pycolmap.RANSACOptions(max_error=12.0, random_seed=1)
+    answer = pycolmap.estimate_and_refine_generalized_absolute_pose(
+        np.concatenate(uv), np.concatenate(x), index, rigs, cameras, options
+    )
+    if answer is None or answer["num_inliers"] < _TOGETHER:
+        return None
+    pose = np.eye(4)
+    pose[:3] = answer["rig_from_world"].matrix()
+    return pose
+
+
+def intersect_points(network: PoseNetwork, points: PointField, parallax: float, renew: bool = False) -> int:
+    """Intersect the unknown points (all but the given ones with ``renew``) from the cameras known; how many are new."""
+    origins, directions, rows = [], [], []
+    for sight in points.sights:
+        if network.unknown_links(sight.chain):
+            continue
+        world_from_camera = inverse(network.product(sight.chain))
+        directions.append(sight.rays @ world_from_camera[:3, :3].T)
+        origins.append(np.broadcast_to(world_from_camera[:3, 3], sight.rays.shape))
+        rows.append(sight.rows)
+    if not rows:
+        return 0
+    row = np.concatenate(rows)
+    found = intersect(np.concatenate(origins), np.concatenate(directions), row, len(points.x))
+    ahead = np.ones(len(points.x), dtype=bool)
+    behind = np.bincount(row, weights=found.residual > np.pi / 2, minlength=len(points.x))
+    ahead &= 2 * behind < np.bincount(row, minlength=len(points.x))
+    good = (found.parallax > parallax) & np.isfinite(found.x[:, 0]) & ahead & ~points.given
+    new = good & ~points.known
+    points.x[good if renew else new] = found.x[good if renew else new]
+    return int(new.sum())
+
+
+def improve(network: PoseNetwork, points: PointField, movable: set[int]) -> None:
+    """One round: every block's pose from all points now known, the movable poses from these, and the points again."""
+    views, sights = [], {}
+    known = points.known
+    for sight in points.sights:
+        if network.unknown_links(sight.chain) or known[sight.rows].sum() < 4:
+            continue
+        try:
+            view = _view(sight, points, known)
+        except SurveyError:
+            continue
+        present = network.product(sight.chain)[None]
+        views.append(replace(view, poses=np.concatenate([present, view.poses])))
+        sights[sight.block_idx] = sight
+    renewed = {
+        v.block_idx: ChainObservation(sights[v.block_idx].chain, v.poses, sights[v.block_idx].text, v.block_idx)
+        for v in refine_views(views)
+    }
+    network.observations = [renewed.pop(o.block_idx, o) for o in network.observations] + list(renewed.values())
+    touched = {link.slot for sight in sights.values() for link in sight.chain}
+    network.relax(movable & touched)
+    intersect_points(network, points, PARALLAX[1], renew=True)

@@ -1,0 +1,281 @@
+"""From a survey to start values: lenses, the pose of every view, then the network of frames and points."""
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.closed_forms import align, rigid
+from adjust.errors import SurveyError
+from adjust.initial.gauge import fix_one_gauge, frames_of, world_is_free
+from adjust.initial.lenses import Sighting, start_lens
+from adjust.initial.motion import solve_motion
+from adjust.initial.network import ChainObservation, PoseNetwork, as_pose3
+from adjust.initial.points import PARALLAX, PointField, improve, intersect_points, point_field, resect
+from adjust.initial.result import Start
+from adjust.initial.undetermined import undetermined
+from adjust.initial.views import (
+    View,
+    all_rays,
+    block_text,
+    focal_px,
+    make_view,
+    refine_views,
+    target_points,
+    untrustworthy,
+    used_rows,
+)
+from adjust.model import FloatArray, Survey
+from adjust.observations import FrameRef, PositionRef
+from adjust.result import ParameterName
+from adjust.unknowns import Chain, FrameTree, Unknowns
+
+_ROUNDS = 3
+_OFF = 10.0  # a block this many times worse than the typical one contradicts the others
+
+
+def find_start(survey: Survey) -> Start:
+    """Start values for every parameter that the observations of a survey need.
+
+    Given values are used as they are; everything else comes from closed forms and robust means, in a fixed order, so the
+    same survey gives the same start. Blocks of image points that no pose explains, or that contradict the others, are
+    named in ``excluded_blocks`` and do not take part. What no observation tells (the datum) is chosen.
+    Raises SurveyError naming each parameter that nothing determines, and what is missing.
+    """
+    search = _Search(survey)
+    search.find_lenses()
+    search.find_views()
+    search.solve()
+    search.settle()
+    return search.result()
+
+
+class _Search:
+    """The state of one search."""
+
+    def __init__(self, survey: Survey) -> None:
+        self.survey = survey
+        self.targets = {t.target_id: t for t in survey.targets}
+        self.cameras = {c.camera_id: c for c in survey.cameras}
+        unknowns = Unknowns()
+        self.network = PoseNetwork(unknowns, FrameTree(survey, unknowns))
+        self.chains: list[Chain] = [self._block_chain(i) for i in range(len(survey.image_blocks))]
+        self.points: PointField = point_field(survey)
+        self.lenses: dict[str, FloatArray] = {}
+        self.reasons: dict[int, str] = {}
+        self.notes: list[str] = []
+        self.views: dict[int, View] = {}
+        self.doubtful: list[ChainObservation] = []
+        self._register_pairs_and_positions()
+        self.network.register(survey)
+
+    def _block_chain(self, i: int) -> Chain:
+        block = self.survey.image_blocks[i]
+        camera = FrameRef("camera", block.camera_id, block.epoch_id)
+        target = FrameRef("world") if block.target_id is None else FrameRef("target", block.target_id, block.epoch_id)
+        return self.network.frames.relative(target, camera)
+
+    def _register_pairs_and_positions(self) -> None:
+        for pair in self.survey.pairs:
+            chain = self.network.frames.relative(pair.a, pair.b)
+            full = isinstance(pair.b_from_a, Pose3)
+            matrix = pair.b_from_a.matrix()
+            pose = np.asarray(matrix, dtype=float) if full else rigid(matrix, np.zeros(3))
+            observation = ChainObservation(chain, pose[None], f"pair {pair.pair_id!r}", rotation_only=not full)
+            (self.network.observations if pair.used else self.doubtful).append(observation)
+        refs = [ref for d in self.survey.distances for ref in (d.a, d.b)]
+        refs += [ref for c in self.survey.coordinates for ref in c.positions]
+        for ref in refs:
+            if ref.frame is not None:
+                self.network.frames.world_from(ref.frame)
+
+    def find_lenses(self) -> None:
+        """Lens values of every camera, given or from its images of known points."""
+        sightings: dict[str, list[Sighting]] = {c.camera_id: [] for c in self.survey.cameras}
+        known = self.points.known
+        for i, block in enumerate(self.survey.image_blocks):
+            if block.camera_id not in self.cameras or (block.target_id and block.target_id not in self.targets):
+                continue  # the chain has already named it
+            used = used_rows(block)
+            if block.target_id is not None:
+                x = target_points(self.targets[block.target_id])[block.point_idx[used]]
+                sightings[block.camera_id].append(Sighting(i, x, block.uv[used]))
+            else:
+                rows = used & known[block.point_idx]
+                sightings[block.camera_id].append(Sighting(i, self.points.x[block.point_idx[rows]], block.uv[rows]))
+        for camera in self.survey.cameras:
+            found = start_lens(camera, [s for s in sightings[camera.camera_id] if len(s.x)])
+            self.lenses[camera.camera_id] = found.values
+            self.notes.append(f"camera {camera.camera_id!r}: {found.note}")
+            for i, reason in found.excluded.items():
+                self.reasons[i] = f"{block_text(self.survey.image_blocks[i])}: {reason}"
+
+    def find_views(self) -> None:
+        """Rays of all blocks and poses of all targets seen; blocks that cannot be trusted are set aside."""
+        rays, failed = all_rays(self.survey, self.lenses)
+        focal = {c.camera_id: focal_px(c, self.lenses[c.camera_id]) for c in self.survey.cameras}
+        target_x = {t.target_id: target_points(t) for t in self.survey.targets}
+        views: list[View] = []
+        for i, block in enumerate(self.survey.image_blocks):
+            used = used_rows(block)
+            if i in failed:
+                self.reasons.setdefault(i, f"{block_text(block)}: {failed[i]}")
+            elif block.target_id is None:
+                self.points.add(self.survey, i, rays[i], focal[block.camera_id], self.chains[i])
+            elif used.any():
+                try:
+                    x = target_x[block.target_id][block.point_idx[used]]
+                    views.append(make_view(i, x, rays[i][used], focal[block.camera_id]))
+                except SurveyError as error:
+                    self.reasons.setdefault(i, f"{block_text(block)}: {error}")
+        refined = refine_views(views)
+        reasons, notes = untrustworthy([v for v in refined if v.block_idx not in self.reasons], self.survey)
+        self.reasons = {**reasons, **self.reasons}
+        self.notes += notes
+        self.views = {v.block_idx: v for v in refined}
+        for i, view in self.views.items():
+            text = block_text(self.survey.image_blocks[i])
+            observation = ChainObservation(self.chains[i], view.poses, text, i)
+            (self.doubtful if i in self.reasons else self.network.observations).append(observation)
+        distances = [float(np.linalg.norm(v.poses[0][:3, 3])) for v in refined]
+        self.network.lever = float(np.median(distances)) if distances else 1.0
+
+    def solve(self) -> None:
+        """Determine all poses and points, the safest first; what floats is set freely one by one."""
+        while self._advance():
+            pass
+        self.network.observations += self.doubtful
+        # a pose that only distrusted blocks show still needs some value
+        while self._advance():
+            pass
+        self.network.observations = [o for o in self.network.observations if o not in self.doubtful]
+        missing = undetermined(self.survey, self.network, self.points)
+        if missing:
+            raise SurveyError(missing)
+
+    def _advance(self) -> bool:
+        """One step, the first of the list that is possible; whether there was one."""
+        network, points = self.network, self.points
+        if network.propagate():
+            return True
+        for parallax in PARALLAX:
+            if intersect_points(network, points, parallax) or resect(network, points):
+                return True
+        floating = network.observations + self._unseen_chains()
+        slot = fix_one_gauge(network, floating)
+        if slot is not None:
+            self.notes.append(f"{' '.join(network.names[slot])}: set freely, no observation tells it")
+            return True
+        note = solve_motion(network)
+        if note is not None:
+            self.notes.append(note)
+            return True
+        return network.propagate(rotation_only=True)
+
+    def _unseen_chains(self) -> list[ChainObservation]:
+        """Chains of blocks of world points that have no pose yet; they bind the world only by points that are known."""
+        have = {o.block_idx for o in self.network.observations}
+        known = self.points.known
+        return [
+            ChainObservation(s.chain, np.zeros((0, 4, 4)), s.text, s.block_idx, ends=(True, bool(known[s.rows].any())))
+            for s in self.points.sights
+            if s.block_idx not in have
+        ]
+
+    def settle(self) -> None:
+        """Renew what was found from all observations together, and set aside the blocks that contradict the rest."""
+        network = self.network
+        movable = set(network.known) - network.fixed - set(network.gauged)
+        for _ in range(_ROUNDS if self.points.sights else 0):
+            improve(network, self.points, movable)
+        self._move_to_coordinates()
+        self._set_aside_contradictions()
+
+    def _move_to_coordinates(self) -> None:
+        """Move the whole world onto observed coordinates where nothing given holds it."""
+        if not world_is_free(self.network, self.survey) or self.points.given.any():
+            return
+        observed, present = [], []
+        for item in self.survey.coordinates:
+            for ref, value in zip(item.positions, item.values, strict=True):
+                place = self._place(ref) if item.used else None
+                if place is not None:
+                    observed.append(value)
+                    present.append(place)
+        if not observed:
+            return
+        new_from_old = align(np.array(observed), np.array(present))
+        for slot, name in self.network.names.items():
+            if ("world",) == frames_of(self.network, name)[0]:
+                self.network.known[slot] = new_from_old @ self.network.known[slot]
+        self.points.x = self.points.x @ new_from_old[:3, :3].T + new_from_old[:3, 3]
+        self.notes.append(f"world moved onto {len(observed)} observed positions")
+
+    def _place(self, ref: PositionRef) -> FloatArray | None:
+        """Present world coordinates (3,) of a position."""
+        if ref.frame is None:
+            index = next((i for i, p in enumerate(self.survey.points) if p.point_id == ref.point_id), None)
+            return None if index is None or not self.points.known[index] else self.points.x[index]
+        world_from_frame = self.network.product(tuple(self.network.frames.world_from(ref.frame)))
+        local = np.zeros(3)
+        if ref.point_id is not None:
+            target = self.targets[ref.frame.frame_id]
+            local = target_points(target)[target.point_ids.index(ref.point_id)]
+        return np.asarray(world_from_frame[:3, :3] @ local + world_from_frame[:3, 3])
+
+    def _set_aside_contradictions(self) -> None:
+        rms = self._block_rms()
+        trusted = [i for i in range(len(rms)) if i not in self.reasons and np.isfinite(rms[i])]
+        if not trusted:
+            return
+        limit = max(15.0, _OFF * float(np.median([rms[i] for i in trusted])))
+        for i in range(len(rms)):
+            if i not in self.reasons and rms[i] > limit:
+                what = "has points behind the camera" if np.isinf(rms[i]) else f"is {rms[i]:.1f} px off"
+                text = block_text(self.survey.image_blocks[i])
+                self.reasons[i] = (
+                    f"{text}: {what} where the other blocks put it (typical: {np.median(rms[trusted]):.1f} px)"
+                )
+
+    def _block_rms(self) -> FloatArray:
+        """Robust misfit of every block at the present values: 1.2 times the median offset, px."""
+        rms = np.full(len(self.survey.image_blocks), np.nan)
+        sights = {s.block_idx: s for s in self.points.sights}
+        for i, chain in enumerate(self.chains):
+            if i in self.views:
+                x, rays, focal = self.views[i].x, self.views[i].rays, self.views[i].focal_px
+            elif i in sights:
+                x, rays, focal = self.points.x[sights[i].rows], sights[i].rays, sights[i].focal_px
+            else:
+                continue
+            pose = self.network.product(chain)
+            p = x @ pose[:3, :3].T + pose[:3, 3]
+            along, across = np.sum(p * rays, axis=1), np.linalg.norm(np.cross(rays, p), axis=1)
+            offset = np.where(along > 0, across / np.where(along > 0, along, 1.0), np.inf) * focal
+            # the median of a circular normal's radius is 1.18 sigma, its rms 1.41 sigma
+            rms[i] = 1.2 * float(np.median(offset)) if len(offset) else np.nan
+        return rms
+
+    def result(self) -> Start:
+        """The start values under their names."""
+        network, survey = self.network, self.survey
+        poses: dict[ParameterName, Pose3] = {
+            name: as_pose3(network.known[slot]) for slot, name in network.names.items() if name[0] != "table_motion"
+        }
+        vectors: dict[ParameterName, FloatArray] = {}
+        for table in survey.tables:
+            vectors[("table_geometry", table.table_id)] = np.array(table.geometry.values, dtype=float)
+        for reading in survey.table_readings:
+            vectors[("table_angles", reading.table_id, reading.epoch_id)] = np.array(reading.angles, dtype=float)
+        for target in survey.targets:
+            if target.warp is not None:
+                vectors[("warp", target.target_id)] = np.array(target.warp.values, dtype=float)
+        rms = self._block_rms()
+        good = [rms[i] for i in range(len(rms)) if i not in self.reasons and np.isfinite(rms[i])]
+        if good:
+            self.notes.append(
+                f"{len(good)} blocks in the start, misfit median {np.median(good):.2f} px, worst {np.max(good):.2f} px;"
+                f" {len(self.reasons)} left out"
+            )
+        order = tuple(sorted(self.reasons))
+        points = {p.point_id: self.points.x[i] for i, p in enumerate(survey.points) if self.points.known[i]}
+        reasons = tuple(self.reasons[i] for i in order)
+        return Start(self.lenses, poses, points, vectors, order, reasons, tuple(rms.tolist()), tuple(self.notes))

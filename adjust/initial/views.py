@@ -1,0 +1,156 @@
+"""Blocks of image points as rays, and the camera poses that each explains by itself."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adjust.closed_forms import absolute_pose, refine_poses, view_errors
+from adjust.errors import SurveyError
+from adjust.lens import focal_length_px, lens_constants, lens_model, unit_rays
+from adjust.model import BoolArray, Camera, FloatArray, Survey, Target
+from adjust.observations import ImageBlock
+
+_RIVAL = 4.0  # a second pose whose error is within this factor of the best stays a candidate
+_NOISE_PX = 0.3  # ... or within this much of it
+_GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustworthy
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One block as rays. x: (n, 3) m in the target. rays: (n, 3) unit in the camera. focal_px: turns angles into px.
+
+    poses: (k, 4, 4) camera_from_target, likeliest first; error_px: (k,).
+    """
+
+    block_idx: int
+    x: FloatArray
+    rays: FloatArray
+    focal_px: float
+    poses: FloatArray
+    error_px: FloatArray
+
+
+def used_rows(block: ImageBlock) -> BoolArray:
+    """Rows of the block that take part, (n,) bool."""
+    return np.ones(len(block.uv), dtype=bool) if block.used is None else np.asarray(block.used, dtype=bool)
+
+
+def target_points(target: Target) -> FloatArray:
+    """Points (n, 3) m of a target, with the sag of its given warp."""
+    x = np.array(target.x_in_target, dtype=float)
+    if target.warp is not None and np.any(target.warp.values):
+        low, span = x.min(axis=0), np.maximum(np.ptp(x, axis=0), 1e-12)
+        u, v = ((x - low) / span).T[:2]
+        sag = dict(zip(target.warp.names, target.warp.values, strict=True))
+        x[:, 2] += sag.get("warp_x", 0.0) * 4 * u * (1 - u) + sag.get("warp_y", 0.0) * 4 * v * (1 - v)
+    return x
+
+
+def block_text(block: ImageBlock) -> str:
+    """The block as people know it."""
+    seen = f"target {block.target_id!r}" if block.target_id else "world points"
+    return f"camera {block.camera_id!r}, epoch {block.epoch_id!r}, {seen}"
+
+
+def rays_of(camera: Camera, values: FloatArray, uv: FloatArray) -> FloatArray:
+    """Unit rays (n, 3) of pixels (n, 2); raises SurveyError for pixels the lens cannot have imaged."""
+    model = lens_model(camera.lens.model)
+    constants = lens_constants(model, camera.image_size, camera.lens.pixel_size_mm)
+    return unit_rays(model, values, constants, np.asarray(uv, dtype=float))
+
+
+def focal_px(camera: Camera, values: FloatArray) -> float:
+    """Principal distance in px."""
+    model = lens_model(camera.lens.model)
+    return focal_length_px(model, values, lens_constants(model, camera.image_size, camera.lens.pixel_size_mm))
+
+
+def all_rays(survey: Survey, lenses: dict[str, FloatArray]) -> tuple[dict[int, FloatArray], dict[int, str]]:
+    """Rays (n, 3) of all rows of every block, and the reason for each block that has none."""
+    rays: dict[int, FloatArray] = {}
+    failed: dict[int, str] = {}
+    cameras = {c.camera_id: c for c in survey.cameras}
+    for camera_id, values in lenses.items():
+        mine = [i for i, b in enumerate(survey.image_blocks) if b.camera_id == camera_id and len(b.uv)]
+        if not mine:
+            continue
+        camera, blocks = cameras[camera_id], [survey.image_blocks[i] for i in mine]
+        try:
+            found = rays_of(camera, values, np.concatenate([b.uv for b in blocks]))
+            ends = np.cumsum([len(b.uv) for b in blocks])
+            rays.update(zip(mine, np.split(found, ends[:-1]), strict=True))
+        except SurveyError:  # some pixel of some block: find out which
+            for i, block in zip(mine, blocks, strict=True):
+                try:
+                    rays[i] = rays_of(camera, values, block.uv)
+                except SurveyError as error:
+                    failed[i] = str(error)
+    return rays, failed
+
+
+def make_view(block_idx: int, x: FloatArray, rays: FloatArray, focal: float) -> View:
+    """A view with its unrefined candidate poses; raises SurveyError where there are none."""
+    found = absolute_pose(x, rays, refinements=0)
+    return View(block_idx, x, rays, focal, found.camera_from_target, found.error * focal)
+
+
+def refine_views(views: Sequence[View], iterations: int = 8) -> list[View]:
+    """All candidates of all views refined in one go, robustly; implausible candidates dropped."""
+    if not views:
+        return []
+    counts = [len(v.poses) for v in views]
+    x = np.concatenate([np.tile(v.x, (k, 1)) for v, k in zip(views, counts, strict=True)])
+    rays = np.concatenate([np.tile(v.rays, (k, 1)) for v, k in zip(views, counts, strict=True)])
+    sizes = np.repeat([len(v.x) for v in views], counts)
+    ptr = np.concatenate([[0], np.cumsum(sizes)])
+    poses = refine_poses(np.concatenate([v.poses for v in views]), x, rays, ptr, iterations, robust=True)
+    error, in_front = view_errors(poses, x, rays, ptr)
+    first = np.concatenate([[0], np.cumsum(counts)])
+    return [
+        _ranked(v, poses[a:b], error[a:b] * v.focal_px, in_front[a:b])
+        for v, a, b in zip(views, first[:-1], first[1:], strict=True)
+    ]
+
+
+def _ranked(view: View, poses: FloatArray, error_px: FloatArray, in_front: BoolArray) -> View:
+    order = [int(i) for i in np.lexsort((error_px, ~in_front))]
+    best = error_px[order[0]]
+    keep = [i for i in order if in_front[i] and error_px[i] <= max(_RIVAL * best, best + _NOISE_PX)]
+    keep = keep or order[:1]
+    return replace(view, poses=poses[keep], error_px=error_px[keep])
+
+
+def point_errors_px(view: View, camera_from_target: FloatArray) -> FloatArray:
+    """Offsets (n,) px of the points of a view at a pose; infinite for points behind."""
+    p = view.x @ camera_from_target[:3, :3].T + camera_from_target[:3, 3]
+    along = np.sum(p * view.rays, axis=1)
+    across = np.linalg.norm(np.cross(view.rays, p), axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(along > 0, across / along, np.inf) * view.focal_px
+
+
+def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str], list[str]]:
+    """Reasons against blocks that no pose explains, and notes on blocks with single gross points.
+
+    The limit of a camera is ten times the median error of its blocks, but at least 3 px.
+    """
+    reasons: dict[int, str] = {}
+    notes: list[str] = []
+    by_camera: dict[str, list[View]] = {}
+    for view in views:
+        by_camera.setdefault(survey.image_blocks[view.block_idx].camera_id, []).append(view)
+    for mine in by_camera.values():
+        errors = [point_errors_px(v, v.poses[0]) for v in mine]
+        limit = max(3.0, 10.0 * float(np.median([np.median(e) for e in errors])))
+        for view, error in zip(mine, errors, strict=True):
+            bad = error > limit
+            text = block_text(survey.image_blocks[view.block_idx])
+            if bad.mean() > _GROSS_SHARE:
+                reasons[view.block_idx] = (
+                    f"{text}: {int(bad.sum())} of {len(bad)} points are more than {limit:.1f} px off the best pose"
+                    " (mis-detected, or points in the wrong order)"
+                )
+            elif bad.any():
+                notes.append(f"{text}: {int(bad.sum())} of {len(bad)} points are gross errors (over {limit:.1f} px)")
+    return reasons, notes
