@@ -21,7 +21,8 @@ IMAGE_COLUMNS = (
     "redundancy_u,redundancy_v,standardized_u,standardized_v,test,used"
 )
 OTHER_COLUMNS = (
-    "kind,group,ids,component,unit,observed,adjusted,residual_unit,residual,sigma,redundancy,standardized,test,used"
+    "kind,group,ids,component,value_unit,observed,adjusted,residual_unit,residual,sigma,redundancy,standardized,test,"
+    "used"
 )
 _CHUNK = 100_000
 
@@ -100,7 +101,7 @@ def _fixed(values: FloatArray, decimals: int) -> Bytes:
     finite = np.isfinite(values)
     magnitude = np.where(finite, np.abs(values), 0.0) * 10.0**decimals
     if magnitude.size and magnitude.max() > 1e17:
-        return _text([repr(float(v)) if ok else "" for v, ok in zip(values, finite, strict=True)])
+        return _text([repr(float(v) + 0.0) if ok else "" for v, ok in zip(values, finite, strict=True)])
     whole = np.rint(magnitude).astype(np.int64)
     n_digits = max(len(str(int(whole.max()))) if whole.size else 1, decimals + 1)
     out = np.zeros((values.size, n_digits + 1 + (decimals > 0)), dtype=np.uint8)

@@ -12,6 +12,8 @@ from adjust.result import Adjustment
 class Suspects:
     """Observations whose test exceeds its limit, all of them taken together at the level alpha (Bonferroni).
 
+    Where sigma0 is above its limit, wrong sigmas would make everything suspect: the limits then grow with sigma0.
+
     image_limit: of the chi-square test with 2 degrees of freedom; w_limit: of |standardized residual| (Baarda).
     """
 
@@ -24,12 +26,14 @@ class Suspects:
 
 
 def suspects(adjustment: Adjustment) -> Suspects:
-    """Count observations that disagree with the others more than chance allows; the variance factor is 1."""
-    alpha = adjustment.global_test.alpha if adjustment.global_test else 0.05
+    """Count observations that disagree with the others more than chance allows."""
+    test = adjustment.global_test
     image, others = adjustment.image_residuals, adjustment.other_residuals
     used = [o for o in others if o.used]
     n = max(int(image.used.sum()) + sum(len(o.components) for o in used), 1)
-    image_limit, w_limit = float(chi2.isf(alpha / n, 2)), float(norm.isf(alpha / (2 * n)))
+    alpha = test.alpha if test is not None else 0.05
+    spread = adjustment.sigma0 if test is not None and test.omega > test.upper else 1.0
+    image_limit, w_limit = spread**2 * float(chi2.isf(alpha / n, 2)), spread * float(norm.isf(alpha / (2 * n)))
     n_not_used = int((~image.used).sum()) + len(others) - len(used)
     n_other = sum(bool(np.nanmax(np.abs(o.standardized), initial=0.0) > w_limit) for o in used)
     n_image = int(((image.test > image_limit) & image.used).sum())

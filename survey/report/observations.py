@@ -81,7 +81,7 @@ def image_points(c: Context) -> str:
     )  # fmt: skip
     s = c.solution["summary"]["suspects"]
     note = (
-        f"The {len(rows)} largest of {count(len(test))}. The test is chi-square with 2 degrees of freedom, suspect above "
+        f"The {len(rows)} largest of {count(len(test))}. Test: chi-square with 2 degrees of freedom, suspect above "
         f"{fixed(s['image_test_limit'], 1)} ({100 * s['alpha']:g} % together). The others are in "
         "residuals.csv."
     )

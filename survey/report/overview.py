@@ -9,6 +9,7 @@ from survey.report.picture import pictures
 from survey.report.scene import scene_of
 
 _WORDS = {"passed": "Passed", "check": "Needs a look", "failed": "Failed"}
+_MOST_WARNINGS = 25
 _CLEAR = 3.0  # deviations of a group beyond this many sigmas are marked
 
 
@@ -18,7 +19,10 @@ def header(c: Context) -> str:
     version = c.run.versions.get("labsurvey", "")
     meta = " · ".join(esc(x) for x in (c.run.folder, c.run.date, f"labsurvey {version}".strip()) if x)
     found = s["suspects"]
-    problems = [esc(w) for w in c.solution["warnings"]]
+    warnings = c.solution["warnings"]
+    problems = [esc(w) for w in warnings[:_MOST_WARNINGS]]
+    if len(warnings) > _MOST_WARNINGS:
+        problems.append(f"{count(len(warnings) - _MOST_WARNINGS)} more warnings in solution.json.")
     if found["n_image_points"]:
         problems.append(f'<a href="#image-points">{count(found["n_image_points"])} image points</a> are suspect.')
     if found["n_other"]:
@@ -110,9 +114,9 @@ def groups(c: Context) -> str:
             (esc(name), count(g["n_observations"]), fixed(g["redundancy"], 1), general(g["omega"], 6), *numbers)
         )
     note = (
-        "The variance factor is the weighted square sum omega over the redundancy of the group; its root is the number by "
-        "which the sigmas given for the group would have to be multiplied to agree with its residuals. Deviation: of omega "
-        "from the redundancy, in sigmas of chi-square."
+        "The variance factor is the weighted square sum omega over the redundancy of the group; its root is the number "
+        "by which the sigmas given for the group would have to be multiplied to agree with its residuals. Deviation: "
+        "of omega from the redundancy, in sigmas of chi-square."
     )
     columns = ("<Group", "Observations", "Redundancy", "Omega", "Variance factor", "Scale of sigmas", "Deviation [σ]")
     return section("groups", "Groups of observations", table(columns, rows) if rows else "", note)
@@ -120,10 +124,13 @@ def groups(c: Context) -> str:
 
 def picture(c: Context) -> str:
     """Plan and perspective."""
-    drawn, enlarged = pictures(scene_of(c.adjustment, c.scale), c.scale.ellipsoid)
+    scene = scene_of(c.adjustment, c.scale)
+    drawn, enlarged = pictures(scene, c.scale.ellipsoid)
+    left_out = f" {count(scene.n_left_out)} points are left out for clarity." if scene.n_left_out else ""
     note = (
-        f"95 % confidence ellipsoids of points (red) and stations (green), enlarged {general(enlarged, 3)} times. Cameras "
-        "are drawn at the first epoch; thin lines are their axes at others, dash-dotted lines the axes of tables."
+        f"95 % confidence ellipsoids of points (red) and stations (green), enlarged {general(enlarged, 3)} times. "
+        "Cameras are drawn at the first epoch; thin lines are their axes at others, dash-dotted lines those of tables."
+        f"{left_out}"
     )
     return section("picture", "The survey", f'<div class="figures">{drawn}</div>' if drawn else "", note)
 

@@ -12,6 +12,7 @@ from survey.adjusted_frames import AdjustedFrames
 from survey.quantities import Scale
 
 _MOST_EPOCHS = 24
+_MOST_POINTS = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,7 @@ class Scene:
     outlines: list[tuple[str, FloatArray]] = field(default_factory=list)
     clouds: list[tuple[str, FloatArray]] = field(default_factory=list)
     tables: list[tuple[str, Pose3, tuple[str, ...]]] = field(default_factory=list)
+    n_left_out: int = 0
 
     def positions(self) -> FloatArray:
         """Everything with a place, (n, 3)."""
@@ -66,10 +68,17 @@ def scene_of(adjustment: Adjustment, scale: Scale) -> Scene:
         pose = frames.world_from(FrameRef("table", table.table_id))
         if pose is not None:
             scene.tables.append((table.table_id, pose, table.axes))
-    for name, estimate in adjustment.estimates.items():
-        if name[0] == "point" and not isinstance(estimate.value, Pose3):
-            scene.spots.append(Spot(name[1], "point", estimate.value, scale.factor**2 * estimate.cov))
+    _add_points(scene, adjustment, scale)
     return scene
+
+
+def _add_points(scene: Scene, adjustment: Adjustment, scale: Scale) -> None:
+    points = [e for name, e in adjustment.estimates.items() if name[0] == "point"]
+    every = max(1, -(-len(points) // _MOST_POINTS))
+    scene.n_left_out = len(points) - len(points[::every])
+    for estimate in points[::every]:
+        x = np.asarray(estimate.value, dtype=float)
+        scene.spots.append(Spot(estimate.name[1], "point", x, scale.factor**2 * estimate.cov))
 
 
 def _add_cameras(scene: Scene, adjustment: Adjustment, frames: AdjustedFrames, epochs: list[str]) -> None:

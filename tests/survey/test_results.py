@@ -1,0 +1,409 @@
+import csv
+import io
+import json
+from dataclasses import replace
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gtsam import Pose3, Rot3
+from scipy.spatial.transform import Rotation
+
+from adjust.observations import FrameRef
+from adjust.result import Adjustment, Estimate, GlobalTest
+from survey.adjusted_frames import AdjustedFrames, table_from_mount
+from survey.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry
+from survey.residual_tables import _fixed, image_residuals_csv, other_residuals_csv
+from survey.results import covariance_npz, read_covariances, write_results
+from survey.solution import RunInfo, correlated, solution_dict, solution_json
+from survey.verdict import suspects, verdict
+from tests.survey.adjustments import POSE_COMPONENTS, POSE_UNITS, Lab, correlate, lab_adjustment
+
+RUN = RunInfo("lab", "A lab", {"survey.toml": "12ab"}, {"alpha": 0.05}, {"labsurvey": "0.1.0"}, "2026-01-02T03:04:05Z")
+ARCSEC = np.pi / 180 / 3600
+
+
+@pytest.fixture(scope="module")
+def adjustment() -> Adjustment:
+    return lab_adjustment(Lab(n_epochs=6, blunders=4), ("Point B2 is weak.",))
+
+
+def numbers(value: Any, path: str = "") -> dict[str, float]:
+    """Every number of a solution by its path."""
+    if isinstance(value, dict):
+        return {k: v for key, x in value.items() for k, v in numbers(x, f"{path}/{key}").items()}
+    if isinstance(value, list):
+        return {k: v for i, x in enumerate(value) for k, v in numbers(x, f"{path}/{i}").items()}
+    return {path: value} if isinstance(value, float) else {}
+
+
+def pose_estimate(pose: Pose3, sigmas: list[float]) -> Estimate:
+    cov = np.diag(np.square(sigmas))
+    return Estimate(("world_from_station", "s"), pose, POSE_COMPONENTS, POSE_UNITS, cov, ("free",) * 6)
+
+
+def test_sigmas_of_a_translation_are_turned_into_the_left_frame(adjustment: Adjustment) -> None:
+    estimate = pose_estimate(
+        Pose3(Rot3.Rz(np.pi / 2), (1, 2, 3)), [1 * ARCSEC, 2 * ARCSEC, 3 * ARCSEC, 1e-3, 2e-3, 3e-3]
+    )
+    entry = pose_entry(estimate, scale_of(adjustment, "a_priori"))
+    # x of the station points along y of the world: its 1 mm becomes the sigma of y
+    np.testing.assert_allclose(entry["sigma_translation_mm"], (2, 1, 3), rtol=1e-12)
+    np.testing.assert_allclose(entry["sigma_rotation_arcsec"], (1, 2, 3), rtol=1e-12)
+    np.testing.assert_allclose(entry["translation_mm"], (1000, 2000, 3000))
+
+
+def test_quaternion_and_euler_angles_agree_with_scipy(adjustment: Adjustment) -> None:
+    # z, y, x intrinsic: R = Rz Ry Rx
+    expected = Rotation.from_euler("ZYX", (170, -40, 100), degrees=True)
+    entry = pose_entry(
+        pose_estimate(Pose3(Rot3(expected.as_matrix()), np.zeros(3)), [1.0] * 6), scale_of(adjustment, "a_priori")
+    )
+    np.testing.assert_allclose(entry["rotation_euler_xyz_deg"], (100, -40, 170), atol=1e-9)
+    xyzw = expected.as_quat(canonical=True)
+    np.testing.assert_allclose(entry["rotation_quaternion_wxyz"], xyzw[[3, 0, 1, 2]], atol=1e-12)
+
+
+def test_units_are_part_of_the_key() -> None:
+    assert key_of("fx", "px") == "fx_px"
+    assert key_of("k1", "") == "k1"
+    assert key_of("K1", "1/mm^2") == key_of("K1", "mm^-2") == "K1_per_mm2"
+    assert key_of("P1", "1/mm") == key_of("P1", "mm^-1") == "P1_per_mm"
+
+
+def test_table_geometry_and_angles_have_their_units(adjustment: Adjustment) -> None:
+    scale = scale_of(adjustment, "a_priori")
+    geometry = Estimate(
+        ("table_geometry", "t"), np.array([10 * ARCSEC, 2e-3]), ("non_orthogonality", "axis_offset"), ("rad", "m"),
+        np.diag([ARCSEC**2, 1e-8]), ("free", "prior"),
+    )  # fmt: skip
+    entry = vector_entry(geometry, scale)
+    assert entry["non_orthogonality_arcsec"] == pytest.approx(10)
+    assert entry["sigma_non_orthogonality_arcsec"] == pytest.approx(1)
+    assert entry["axis_offset_mm"] == pytest.approx(2)
+    assert entry["sigma_axis_offset_mm"] == pytest.approx(0.1)
+    assert entry["status"] == {"non_orthogonality": "free", "axis_offset": "prior"}
+    angle = Estimate(
+        ("table_angles", "t", "e"), np.array([np.pi / 6]), ("axis1",), ("rad",), np.eye(1) * ARCSEC**2, ("free",)
+    )
+    entry = vector_entry(angle, scale)
+    assert set(entry) == {"axis1_deg", "sigma_axis1_arcsec", "status"}
+    assert (entry["axis1_deg"], entry["sigma_axis1_arcsec"]) == pytest.approx((30, 1))
+
+
+def test_ellipsoid_of_a_known_covariance(adjustment: Adjustment) -> None:
+    cov = np.diag([4.0, 9.0, 1.0])
+    axes, directions = ellipsoid(cov, scale_of(adjustment, "a_priori"))
+    # 7.8147: chi-square table, 3 degrees of freedom, 95 %
+    np.testing.assert_allclose(axes, np.sqrt(7.8147) * np.array([3, 2, 1]), rtol=1e-5)
+    np.testing.assert_allclose(directions, [[0, 1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+
+
+def test_ellipsoid_of_an_estimated_sigma0_uses_the_f_distribution(adjustment: Adjustment) -> None:
+    few = replace(adjustment, redundancy=4, sigma0=2.0)
+    # 6.591: table of F for 3 and 4 degrees of freedom, 95 %
+    assert ellipsoid(np.eye(3), scale_of(few, "a_posteriori"))[0] == pytest.approx(2 * np.sqrt(3 * 6.591), rel=1e-4)
+
+
+def test_all_sigmas_scale_with_sigma0_and_nothing_else_does(adjustment: Adjustment) -> None:
+    factor = 3.0
+    large = replace(adjustment, sigma0=factor, redundancy=10**7)
+    prior = numbers({k: v for k, v in solution_dict(large, replace(RUN, sigmas="a_priori")).items() if k != "summary"})
+    posterior = numbers({k: v for k, v in solution_dict(large, RUN).items() if k != "summary"})
+    scaled = [k for k, v in prior.items() if v and posterior[k] != pytest.approx(v)]
+    # sigma_scale is of observations
+    sigma_keys = [k for k, v in prior.items() if v and ("/sigma_" in k or "semi_axes" in k) and "sigma_scale" not in k]
+    ratios = [k for k in prior if "value_over_sigma" in k]
+    assert set(scaled) == set(sigma_keys) | set(ratios)
+    assert len(sigma_keys) > 100
+    for k in sigma_keys:
+        assert posterior[k] == pytest.approx(factor * prior[k], rel=1e-5), k
+    for k in ratios:
+        assert posterior[k] == pytest.approx(prior[k] / factor), k
+
+
+def test_without_redundancy_sigmas_stay_a_priori(adjustment: Adjustment) -> None:
+    summary = solution_dict(replace(adjustment, redundancy=0, sigma0=float("nan"), global_test=None), RUN)["summary"]
+    assert summary["sigmas"] == "a_priori"
+    assert summary["sigma_factor"] == 1.0
+    assert summary["sigma0"] is None
+    assert summary["verdict"] == "check"
+
+
+def test_solution_has_the_documented_keys(adjustment: Adjustment) -> None:
+    s = solution_dict(adjustment, RUN)
+    assert {
+        "summary",
+        "cameras",
+        "stations",
+        "points",
+        "tables",
+        "targets",
+        "pairs",
+        "groups",
+        "warnings",
+        "inputs",
+    } <= set(s)
+    point = adjustment.estimates["point", "B3"]
+    assert s["points"]["B3"]["x_mm"] == pytest.approx(1e3 * np.asarray(point.value)[0])
+    sigma = 1e3 * adjustment.sigma0 * np.sqrt(point.cov[2, 2])
+    assert s["points"]["B3"]["sigma_z_mm"] == pytest.approx(sigma)
+    lens = s["cameras"]["X"]["lens"]
+    assert lens["fx_px"] == pytest.approx(np.asarray(adjustment.estimates["lens", "X"].value)[0])
+    assert lens["status"]["fx"] == "free"
+    assert lens["status"]["k3"] == "held"
+    assert lens["sigma_k3"] == 0.0
+    assert "e03" in s["tables"]["turntable"]["epochs"]
+    assert s["inputs"]["hashes"] == {"survey.toml": "12ab"}
+    assert s["warnings"] == ["Point B2 is weak."]
+
+
+def test_rms_of_a_camera_counts_used_points_only(adjustment: Adjustment) -> None:
+    found = adjustment.image_residuals
+    squares = []
+    for block, first, last in zip(
+        adjustment.survey.image_blocks, found.block_ptr[:-1], found.block_ptr[1:], strict=True
+    ):
+        if block.camera_id == "Y":
+            squares += [
+                r @ r / 2 for r, u in zip(found.residuals[first:last], found.used[first:last], strict=True) if u
+            ]
+    entry = solution_dict(adjustment, RUN)["cameras"]["Y"]
+    assert entry["rms_residual_px"] == pytest.approx(np.sqrt(np.mean(squares)))
+    assert entry["n_image_points"] == len(squares)
+    assert sum(i["n_image_points"] for i in entry["images"].values()) == len(squares)
+
+
+def test_json_is_strict_and_the_same_every_time(adjustment: Adjustment) -> None:
+    group = replace(adjustment.groups[0], redundancy=0.0)  # its factor is nan
+    broken = replace(adjustment, groups=(group,), max_step=float("inf"))
+
+    def refuse(word: str) -> None:
+        raise AssertionError(word)
+
+    text = solution_json(solution_dict(broken, RUN))
+    read = json.loads(text, parse_constant=refuse)
+    assert read == solution_dict(broken, RUN)
+    assert read["groups"]["image"]["variance_factor"] is None
+    assert read["summary"]["last_step_sigmas"] is None
+    assert text == solution_json(solution_dict(broken, RUN))
+    later = solution_json(solution_dict(broken, replace(RUN, date="later", seconds={"solve": 1.0})))
+    assert later != text
+    assert later.replace('"later"', f'"{RUN.date}"') == text
+
+
+def test_correlated_components_are_named(adjustment: Adjustment) -> None:
+    lens = correlate(adjustment.estimates["lens", "Z"], "k1", "k2", -0.97)
+    strong = correlated(lens)
+    assert [(p["a"], p["b"]) for p in strong] == [("k1", "k2")]
+    assert strong[0]["correlation"] == pytest.approx(-0.97)
+    assert correlated(correlate(lens, "k1", "k2", 0.9)) == []
+
+
+def test_a_parameter_that_may_be_zero_is_named(adjustment: Adjustment) -> None:
+    lens = adjustment.estimates["lens", "X"]
+    values, sigmas = np.array(lens.value, dtype=float), np.sqrt(np.diag(lens.cov))
+    values[5], values[8] = 1.9 * sigmas[5], 2.0 * sigmas[8]
+    changed = replace(adjustment, estimates={**adjustment.estimates, ("lens", "X"): replace(lens, value=values)})
+    weak = solution_dict(changed, replace(RUN, sigmas="a_priori"))["cameras"]["X"]["lens"]["not_significant"]
+    assert "k1" in weak
+    assert "p2" not in weak
+
+
+def test_pairs_give_the_adjusted_rotation(adjustment: Adjustment) -> None:
+    pair = solution_dict(adjustment, RUN)["pairs"]["relay-board"]
+    relay = adjustment.estimates["world_from_station", "relay"].value
+    board = adjustment.estimates["carrier_from_target", "board"].value
+    assert isinstance(relay, Pose3)
+    assert isinstance(board, Pose3)
+    relay_from_board = relay.rotation().matrix().T @ board.rotation().matrix()
+    expected = Rotation.from_matrix(relay_from_board).as_euler("ZYX", degrees=True)[::-1]
+    np.testing.assert_allclose(pair["adjusted"]["rotation_euler_xyz_deg"], expected, atol=1e-9)
+    assert "translation_mm" not in pair["adjusted"]
+    assert (pair["a"], pair["b"]) == ("target:board", "station:relay")
+
+
+def test_motion_of_a_table_is_the_formula_of_the_model() -> None:
+    def turn(axis: str, angle: float) -> np.ndarray:
+        out = np.eye(4)
+        out[:3, :3] = Rotation.from_euler(axis, angle).as_matrix()
+        return out
+
+    shift = np.eye(4)
+    shift[1, 3] = 0.01
+    expected = reduce(np.matmul, (turn("x", 0.3 + 0.01), shift, turn("y", 0.02), turn("z", -0.5 + 0.03)))
+    geometry = {"non_orthogonality": 0.02, "axis_offset": 0.01, "zero_1": 0.01, "zero_2": 0.03}
+    got = table_from_mount(("x", "z"), geometry, np.array([0.3, -0.5]))
+    np.testing.assert_allclose(got.matrix(), expected, atol=1e-14)
+    np.testing.assert_allclose(
+        table_from_mount(("z",), {"zero_1": 0.1}, np.array([0.2])).matrix(), turn("z", 0.3), atol=1e-14
+    )
+
+
+def test_frames_follow_the_table_and_its_adjusted_angles(adjustment: Adjustment) -> None:
+    frames, e = AdjustedFrames(adjustment), adjustment.estimates
+    estimate = e["table_geometry", "turntable"]
+    geometry = dict(zip(estimate.components, np.asarray(estimate.value).tolist(), strict=True))
+    motion = table_from_mount(("x", "z"), geometry, np.asarray(e["table_angles", "turntable", "e02"].value))
+    mount = adjustment.survey.stations[0].mount_from_station.value
+    table, camera = e["world_from_table", "turntable"].value, e["station_from_camera", "Y"].value
+    assert isinstance(table, Pose3)
+    assert isinstance(camera, Pose3)
+    assert mount is not None
+    expected = table * motion * mount * camera
+    got = frames.world_from(FrameRef("camera", "Y", "e02"))
+    assert got is not None
+    assert got.equals(expected, 1e-12)
+    assert frames.world_from(FrameRef("station", "head", "by hand")) is None
+    assert frames.world_from(FrameRef("station", "nowhere")) is None
+
+
+def test_covariances_come_back_as_they_were(adjustment: Adjustment, tmp_path: Path) -> None:
+    path = tmp_path / "covariance.npz"
+    path.write_bytes(covariance_npz(adjustment))
+    blocks = read_covariances(path)
+    assert len(blocks) == len(adjustment.estimates)
+    np.testing.assert_allclose(
+        blocks["world_from_station/relay"],
+        adjustment.sigma0**2 * adjustment.estimates["world_from_station", "relay"].cov, rtol=1e-14,
+    )  # fmt: skip
+    with np.load(path) as found:
+        assert "table_angles/turntable/e01/axis2" in found["names"]
+        assert str(found["sigmas"]) == "a_posteriori"
+        assert "tangent" in " ".join(found["README"]).lower()
+        assert len(found["names"]) == len(found["units"]) == found["start"][-1]
+    assert covariance_npz(adjustment) == covariance_npz(adjustment)
+
+
+def rows_of(text: bytes) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text.decode(), newline="")))
+
+
+def test_residuals_are_written_row_by_row(adjustment: Adjustment) -> None:
+    rows, found = rows_of(image_residuals_csv(adjustment)), adjustment.image_residuals
+    assert len(rows) == len(found.test)
+    block_idx = len(adjustment.survey.image_blocks) // 2
+    block, first = adjustment.survey.image_blocks[block_idx], int(found.block_ptr[block_idx])
+    row = rows[first + 1]
+    target = next((t for t in adjustment.survey.targets if t.target_id == block.target_id), None)
+    names = target.point_ids if target else [p.point_id for p in adjustment.survey.points]
+    assert (row["epoch_id"], row["camera_id"], row["target_id"]) == (
+        block.epoch_id,
+        block.camera_id,
+        block.target_id or "",
+    )
+    assert row["point_id"] == names[block.point_idx[1]]
+    assert float(row["v_px"]) == pytest.approx(block.uv[1, 1], abs=1e-4)
+    for column, values in (
+        ("residual_u_px", found.residuals[:, 0]),
+        ("redundancy_v", found.redundancy[:, 1]),
+        ("test", found.test),
+    ):
+        np.testing.assert_allclose([float(r[column]) for r in rows], values, atol=1e-4)
+    np.testing.assert_allclose([float(r["sigma_u_px"]) for r in rows], 0.115, atol=1e-6)
+    assert [r["used"] for r in rows] == ["1" if u else "0" for u in found.used]
+
+
+def test_names_with_commas_and_numbers_that_are_missing(adjustment: Adjustment) -> None:
+    survey = adjustment.survey
+    board = replace(survey.targets[0], point_ids=tuple(f'r,"{i}" é' for i in range(88)))
+    found = adjustment.image_residuals
+    test = found.test.copy()
+    test[3] = np.nan
+    changed = replace(
+        adjustment,
+        survey=replace(survey, targets=(board, *survey.targets[1:])),
+        image_residuals=replace(found, test=test),
+    )
+    rows = rows_of(image_residuals_csv(changed))
+    assert rows[3]["test"] == ""
+    assert {r["point_id"] for r in rows if r["target_id"] == "board"} <= set(board.point_ids)
+
+
+@pytest.mark.parametrize("decimals", [0, 2, 6])
+def test_fixed_numbers_are_what_python_prints(decimals: int) -> None:
+    rng = np.random.default_rng(1)
+    values = np.concatenate(
+        [rng.normal(0, 10.0**k, 50) for k in range(-7, 8)]
+        + [[0.0, -0.0, -1e-9, 9.9999999, 99.5, 1e30, np.nan, -np.inf]]
+    )
+    for part in (values, values[np.abs(values) < 1e9], np.array([-3.0]), np.empty(0)):
+        words = [bytes(row[row != 0]).decode() for row in _fixed(part, decimals)]
+        assert len(words) == len(part)
+        for word, value in zip(words, part, strict=True):
+            if not np.isfinite(value):
+                assert word == ""
+            else:
+                assert float(word) == pytest.approx(value, abs=0.5000001 * 10.0**-decimals)
+                assert not word.startswith("-") or float(word) < 0
+                # a number too large for this is the only reason to write a column another way
+                assert part is values or len(word.partition(".")[2]) == decimals
+
+
+def test_other_residuals_have_units_for_people(adjustment: Adjustment) -> None:
+    rows = rows_of(other_residuals_csv(adjustment))
+    assert len(rows) == sum(len(o.components) for o in adjustment.other_residuals)
+    table = next(o for o in adjustment.other_residuals if o.kind == "table")
+    assert rows[0]["value_unit"] == "deg"
+    assert rows[0]["residual_unit"] == "arcsec"
+    assert float(rows[0]["observed"]) == pytest.approx(np.degrees(table.observed[0]))
+    assert float(rows[0]["residual"]) == pytest.approx(table.residual[0] / ARCSEC)
+    assert float(rows[0]["sigma"]) == pytest.approx(8.0)
+    distance = next(r for r in rows if r["kind"] == "distance")
+    assert (distance["value_unit"], distance["residual_unit"], distance["ids"]) == ("mm", "mm", "d1 B1 B2")
+    assert float(distance["sigma"]) == pytest.approx(0.3)
+
+
+def test_suspects_are_counted_at_a_common_level(adjustment: Adjustment) -> None:
+    found = suspects(adjustment)
+    # four blunders of more than 7 sigma: two are not used, the others suspect
+    assert (found.n_image, found.n_other, found.n_not_used) == (2, 0, 2)
+    image = adjustment.image_residuals
+    one = replace(
+        adjustment, other_residuals=(),
+        image_residuals=replace(image, used=np.arange(len(image.used)) == 0, test=np.full(len(image.used), 5.0)),
+    )  # fmt: skip
+    one = replace(one, global_test=None)
+    # a single test at 5 %: the tables of chi-square (2) and of the normal distribution
+    assert suspects(one).image_limit == pytest.approx(5.9915, abs=1e-4)
+    assert suspects(one).w_limit == pytest.approx(1.95996, abs=1e-4)
+    assert suspects(one).n_image == 0
+    # sigma0 = 3, far too large: the limits grow with it
+    loose = replace(one, sigma0=3.0, global_test=GlobalTest(900.0, 100, 0.05, 74.2, 129.6))
+    assert suspects(loose).image_limit == pytest.approx(9 * 5.9915, abs=1e-3)
+    assert suspects(loose).w_limit == pytest.approx(3 * 1.95996, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "word"),
+    [
+        ({}, "passed", "agree"),
+        ({"converged": False}, "failed", "converge"),
+        ({"global_test": GlobalTest(200.0, 100, 0.05, 74.2, 129.6)}, "failed", "times what"),
+        ({"global_test": GlobalTest(50.0, 100, 0.05, 74.2, 129.6)}, "check", "too large"),
+        ({"global_test": None}, "check", "redundant"),
+        ({"warnings": ("Look.",)}, "check", "warnings"),
+    ],
+)
+def test_verdict(change: dict[str, Any], level: str, word: str) -> None:
+    test = GlobalTest(100.0, 100, 0.05, 74.2, 129.6)
+    adjusted = replace(lab_adjustment(Lab(n_epochs=3)), global_test=test)
+    changed = replace(adjusted, **change)
+    got, reason = verdict(changed, replace(suspects(changed), n_image=0, n_other=0))
+    assert got == level
+    assert word in reason
+    if level == "passed":
+        assert verdict(changed, replace(suspects(changed), n_image=1))[0] == "check"
+
+
+def test_results_are_written_whole(adjustment: Adjustment, tmp_path: Path) -> None:
+    paths = write_results(tmp_path, adjustment, RUN)
+    expected = {"solution.json", "covariance.npz", "residuals.csv", "residuals_other.csv", "report.html"}
+    assert {p.name for p in (tmp_path / "results").iterdir()} == expected == set(paths)
+    first = {name: path.read_bytes() for name, path in paths.items()}
+    assert json.loads(first["solution.json"])["summary"]["n_unknowns"] == adjustment.n_unknowns
+    again = write_results(tmp_path, adjustment, replace(RUN, date="another day"))
+    for name, path in again.items():
+        assert path.read_bytes().replace(b"another day", RUN.date.encode()) == first[name], name
