@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from adjust.model import FloatArray, Survey
+from adjust.model import FloatArray, Survey, Target
 from survey.examples.truth import truth_json
 from survey.simulate.draft import Draft
 from survey.simulate.labs import (
@@ -17,6 +17,7 @@ from survey.simulate.labs import (
     single_camera_draft,
     stereo_draft,
 )
+from survey.targets import Charuco, Checkerboard, MarkerGrid, TargetKind
 
 Files = dict[str, str]
 _LENS = """
@@ -44,7 +45,7 @@ station_from_camera = { treatment = "held" }       # the camera is the frame of 
 motion = "fixed"
 world_from_station = { treatment = "held" }        # and the station that of the world
 """
-    return draft, {"survey.toml": text + _hand_board(), "truth.json": truth_json(draft.truth, seed)}
+    return draft, {"survey.toml": text + _targets(draft), "truth.json": truth_json(draft.truth, seed)}
 
 
 def stereo(seed: int) -> tuple[Draft, Files]:
@@ -71,18 +72,31 @@ image_size_px = [1280, 1024]
 motion = "fixed"
 world_from_station = { treatment = "held" }        # and the bar that of the world
 """
-    return draft, {"survey.toml": text + _hand_board(), "truth.json": truth_json(draft.truth, seed)}
+    return draft, {"survey.toml": text + _targets(draft), "truth.json": truth_json(draft.truth, seed)}
 
 
-def _hand_board() -> str:
-    return """
-[targets.board]
-kind = "checkerboard"
-columns = 9                    # inner corners
-rows = 6
-square_mm = 25.0
-motion = "epoch"               # held by hand: another place in every image
-"""
+def _targets(draft: Draft) -> str:
+    return "".join(_target(target, draft.kinds[target.target_id]) for target in draft.targets)
+
+
+def _target(target: Target, kind: TargetKind) -> str:
+    lines = [f"\n[targets.{target.target_id}]"]
+    if isinstance(kind, Checkerboard):
+        lines += ['kind = "checkerboard"', f"columns = {kind.columns}       # inner corners", f"rows = {kind.rows}"]
+        lines += [f"square_mm = {1e3 * kind.square_m:.1f}"]
+    elif isinstance(kind, Charuco):
+        lines += ['kind = "charuco"', f"squares_x = {kind.squares_x}", f"squares_y = {kind.squares_y}"]
+        lines += [f"square_mm = {1e3 * kind.square_m:.1f}", f"marker_mm = {1e3 * kind.marker_m:.1f}"]
+        lines += [f'dictionary = "{kind.dictionary.removeprefix("DICT_")}"']
+    elif isinstance(kind, MarkerGrid):
+        lines += ['kind = "marker_grid"', f"columns = {kind.columns}", f"rows = {kind.rows}"]
+        lines += [f"marker_mm = {1e3 * kind.marker_m:.1f}", f"gap_mm = {1e3 * kind.gap_m:.1f}"]
+        lines += [f'dictionary = "{kind.dictionary.removeprefix("DICT_")}"', f"first_id = {kind.first_id}"]
+    if target.motion == "epoch":
+        lines.append('motion = "epoch"    # held by hand: another place in every image')
+    elif target.carrier_from_target.treatment == "held":
+        lines.append('pose = { treatment = "held" }    # this target is the world')
+    return "\n".join(lines) + "\n"
 
 
 def full_lab(seed: int) -> tuple[Draft, Files]:
@@ -127,35 +141,8 @@ axes = ["x", "z"]                                  # outermost first
 sigma_arcsec = {TABLE_SIGMA_ARCSEC:.1f}
 world_from_table = {{ treatment = "free" }}
 geometry = {{ free = ["non_orthogonality", "axis_offset"] }}
-
-[targets.board]
-kind = "checkerboard"
-columns = 11                                       # inner corners
-rows = 8
-square_mm = 20.0
-pose = {{ treatment = "held" }}                      # the board is the world
-
-[targets.charuco]
-kind = "charuco"
-squares_x = 9
-squares_y = 6
-square_mm = 30.0
-marker_mm = 22.0
-dictionary = "5X5_100"
-motion = "epoch"                                   # held by hand
 """
-    for number in range(4):
-        text += f"""
-[targets.G{number + 1}]
-kind = "marker_grid"
-columns = 4
-rows = 3
-marker_mm = 120.0
-gap_mm = 40.0
-dictionary = "4X4_50"
-first_id = {12 * number}
-"""
-    return text + _points(draft) + _spots(draft)
+    return text + _targets(draft) + _points(draft) + _spots(draft)
 
 
 def _points(draft: Draft) -> str:
