@@ -7,6 +7,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.initial import find_start
 from adjust.lens import MODELS, lens_constants, monotone_radius_px, principal_point_px
 from adjust.model import FloatArray, Survey
 from adjust.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
@@ -43,14 +44,12 @@ def adjust(
 
 def starting(survey: Survey) -> tuple[Survey, StartValues, tuple[str, ...]]:
     """Start values from nothing; blocks that the search refused take no part in the adjustment, but are tested."""
-    from adjust.initial import find_start
-
     found = find_start(survey)
     blocks = list(survey.image_blocks)
     for i in found.excluded_blocks:
         blocks[i] = replace(blocks[i], used=np.zeros(len(blocks[i].uv), dtype=np.bool_))
     start = StartValues(found.lenses, found.poses, found.points, found.vectors)
-    return replace(survey, image_blocks=tuple(blocks)), start, found.notes
+    return replace(survey, image_blocks=tuple(blocks)), start, found.reasons
 
 
 def assemble(graph: AdjustmentGraph, solved: Solved, options: AdjustOptions, notes: tuple[str, ...] = ()) -> Adjustment:

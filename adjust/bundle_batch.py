@@ -116,7 +116,7 @@ class BundleBatch:
         self.pc_ptr = np.searchsorted(pair[new, 0], [*self.reduced, np.iinfo(np.int64).max]).astype(np.int64)
 
     def _place_local_unknowns(self) -> None:
-        n_lens = self.state.n_lens
+        n_lens = self.state.lenses.n_free
         used_cameras = set(self.camera.tolist())
         self.lens_at = np.zeros(len(n_lens), dtype=np.int64)
         offset = 0
@@ -143,7 +143,7 @@ class BundleBatch:
         for i in sorted(set(self.camera.tolist())):
             key = self.state.lens_maps[i].key
             if key is not None:
-                entries.append((int(self.lens_at[i]), self.key_at[key], np.eye(int(self.state.n_lens[i]))))
+                entries.append((int(self.lens_at[i]), self.key_at[key], np.eye(int(self.state.lenses.n_free[i]))))
         for b in range(len(self.blocks)):
             row = self.first_pose + 6 * b
             for link in range(self.chains.ptr[b], self.chains.ptr[b + 1]):
@@ -173,8 +173,7 @@ class BundleBatch:
             self.world[i] = values.atPoint3(key)
         self.X[:] = self.world[self.point]
         rows(
-            self.block, self.camera, s.kind, s.lens, s.constants, s.columns, s.factors, s.n_lens, c.R, c.t, self.X,
-            self.uv, W, self.A, self.chi, self.depth,
+            self.block, self.camera, s.lenses, c.R, c.t, self.X, self.uv, W, self.A, self.chi, self.depth,
         )  # fmt: skip
 
     def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
@@ -190,13 +189,13 @@ class BundleBatch:
         s = self.state
         S, g = np.zeros((self.n_local, self.n_local)), np.zeros(self.n_local)
         bad = reduce_points(
-            self.ptr, self.pc_ptr, self.pc_camera, self.pc_of, self.A, self.camera_of, s.n_lens, self.lens_at,
+            self.ptr, self.pc_ptr, self.pc_camera, self.pc_of, self.A, self.camera_of, s.lenses.n_free, self.lens_at,
             self.pose_at, damping, S, g, self.Vi, self.W3, self.WL, self.h,
         )  # fmt: skip
         if bad >= 0:
             raise self._undetermined_point(bad)
         add_direct(
-            self.n_reduced, len(self.point), self.A, self.camera_of, s.n_lens, self.lens_at, self.pose_at,
+            self.n_reduced, len(self.point), self.A, self.camera_of, s.lenses.n_free, self.lens_at, self.pose_at,
             self.point_at, S, g,
         )  # fmt: skip
         S += np.triu(S, 1).T
@@ -299,7 +298,7 @@ class BundleBatch:
                 delta.insert(key, d[self.key_at[key] : self.key_at[key] + 6])
         dX = np.zeros((len(self.reduced), 3))
         back_substitute(
-            self.ptr, self.pc_ptr, self.pc_camera, self.camera_of, self.state.n_lens, self.lens_at, self.pose_at,
+            self.ptr, self.pc_ptr, self.pc_camera, self.camera_of, self.state.lenses.n_free, self.lens_at, self.pose_at,
             self.Vi, self.W3, self.WL, self.h, self.G @ d, dX,
         )  # fmt: skip
         for j, i in enumerate(self.reduced):
@@ -327,12 +326,12 @@ class BundleBatch:
         C = np.zeros((len(self.reduced), 3, 3))
         influence = np.zeros((len(self.point), 3))
         point_covariances(
-            self.ptr, self.pc_ptr, self.pc_camera, self.pc_of, self.camera_of, self.state.n_lens, self.lens_at,
+            self.ptr, self.pc_ptr, self.pc_camera, self.pc_of, self.camera_of, self.state.lenses.n_free, self.lens_at,
             self.pose_at, self.A, self.Vi, self.W3, self.WL, Q_local, C, influence,
         )  # fmt: skip
         direct_influence(
-            self.n_reduced, len(self.point), self.A, self.camera_of, self.state.n_lens, self.lens_at, self.pose_at,
-            self.point_at, Q_local, influence,
+            self.n_reduced, len(self.point), self.A, self.camera_of, self.state.lenses.n_free, self.lens_at,
+            self.pose_at, self.point_at, Q_local, influence,
         )  # fmt: skip
         return Q, C, influence
 

@@ -5,18 +5,20 @@ then the points that stay (tied to other observations). The other points are red
 al. 2000, "Bundle adjustment - a modern synthesis", section 6). Observations are sorted by point, then camera.
 """
 
+# mypy: disable-error-code="untyped-decorator"
+# reason: numba ships no types, so its decorator leaves every function below untyped
+
 import numpy as np
 from numba import njit
 
-from adjust.image_kernels import local_row
+from adjust.image_kernels import LensArrays, local_row
 from adjust.lens_kernels import MAX_LENS
 from adjust.model import FloatArray, IntArray
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def rows(
-    block: IntArray, camera: IntArray, kind: IntArray, lens: FloatArray, constants: FloatArray, columns: IntArray,
-    factors: FloatArray, n_lens: IntArray, R: FloatArray, t: FloatArray, X: FloatArray, uv: FloatArray,
+    block: IntArray, camera: IntArray, lenses: LensArrays, R: FloatArray, t: FloatArray, X: FloatArray, uv: FloatArray,
     W: FloatArray, A: FloatArray, chi: FloatArray, depth: FloatArray,
 ) -> None:  # fmt: skip
     """Whitened rows A (K, 2, MAX_LENS + 7): lens in 0.., pose in MAX_LENS.., residual last; chi (B,), least depth (B,).
@@ -25,16 +27,16 @@ def rows(
     """
     row = np.zeros((2, MAX_LENS + 3))
     out = np.zeros((2, MAX_LENS + 7))
-    shape = np.zeros(2)
     chi[:] = 0.0
     depth[:] = np.inf
     for k in range(block.size):
         b = block[k]
         c = camera[b]
-        nl = n_lens[c]
+        nl = lenses.n_free[c]
         z = local_row(
-            kind[c], lens[c], constants[c], R[b], t[b], X[k], uv[k], W[k], columns[c], factors[c], nl, shape, 0, row,
-            out,
+            lenses.kind[c], lenses.values[c], lenses.constants[c], R[b], t[b], X[k, 0], X[k, 1], X[k, 2], uv[k, 0],
+            uv[k, 1], W[k, 0], W[k, 1], W[k, 2], lenses.n_map[c], lenses.source[c], lenses.column[c],
+            lenses.factor[c], nl, 0.0, 0.0, 0, row, out,
         )  # fmt: skip
         for s in range(2):
             for j in range(nl):

@@ -210,8 +210,8 @@ class GraphBuilder:
                         np.array([d.value]), d.used)  # fmt: skip
         for c in self.survey.coordinates:
             names = tuple(f"{text(p)} {axis}" for p in c.positions for axis in "xyz")
-            ids = tuple(text(p) for p in c.positions)
-            self._other(coordinates_factor(c, [at[p] for p in c.positions]), "coordinates", c.group, ids, names,
+            owners = tuple(text(p) for p in c.positions)
+            self._other(coordinates_factor(c, [at[p] for p in c.positions]), "coordinates", c.group, owners, names,
                         ("m",) * len(names), c.values.ravel(), c.used)  # fmt: skip
         self._priors()
 

@@ -10,13 +10,23 @@ import gtsam
 import numpy as np
 
 from adjust.chain_kernels import evaluate_chains
-from adjust.image_kernels import condense, errors, statistics
+from adjust.image_kernels import (
+    SEGMENT_LENS,
+    SEGMENT_POSE,
+    SEGMENT_TABLE,
+    SEGMENT_WARP,
+    BlockArrays,
+    PointArrays,
+    SegmentArrays,
+    condense,
+    errors,
+    statistics,
+)
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations import ImageBlock
+from adjust.parallel import run_split, split_blocks
 from adjust.state import State
 from adjust.unknowns import Chain, Unknowns
-
-_LENS, _POSE, _TABLE, _WARP = 0, 1, 2, 3
 
 
 def square_root_information(cov: FloatArray) -> FloatArray:
@@ -73,19 +83,19 @@ class Segments:
                 width.append(n)
             self.rows.append((b, kind, ref, d, start, n, keys.index(key)))
 
-        add(state.lens_maps[camera].key, _LENS, -1, -1, 0, int(state.n_lens[camera]))
+        add(state.lens_maps[camera].key, SEGMENT_LENS, -1, -1, 0, int(state.lenses.n_free[camera]))
         for link in range(chains.ptr[b], chains.ptr[b + 1]):
             slot = int(chains.slot[link])
             table = unknowns.table_slots.get(slot)
             if table is None:
-                add(unknowns.slot_key[slot], _POSE, link, -1, 0, 6)
+                add(unknowns.slot_key[slot], SEGMENT_POSE, link, -1, 0, 6)
             else:
                 d, k = int(state.table_index[slot]), len(table.axes)
-                add(table.angles_key, _TABLE, link, d, 0, k)
-                add(table.geometry.key, _TABLE, link, d, k, len(table.geometry.free))
+                add(table.angles_key, SEGMENT_TABLE, link, d, 0, k)
+                add(table.geometry.key, SEGMENT_TABLE, link, d, k, len(table.geometry.free))
         warp = state.warp_maps[target] if target is not None else None
         if warp is not None:
-            add(warp.key, _WARP, -1, -1, 0, len(warp.free))
+            add(warp.key, SEGMENT_WARP, -1, -1, 0, len(warp.free))
         self.keys.append(keys)
         self.width.append(width)
         self.ptr.append(len(self.rows))
@@ -150,6 +160,8 @@ class ImageBatch:
             if self.warp_id[i] >= 0:
                 target = survey.targets[self.warp_id[i]]
                 self.shape[self.ptr[i] : self.ptr[i + 1]] = warp_shape(target.x_in_target)[block.point_idx]
+        self.arrays = BlockArrays(self.ptr, self.camera, self.warp_id, self.n_warp)
+        self.points = PointArrays(self.X, self.shape, self.uv)
         self._columns(unknowns)
 
     def _columns(self, unknowns: Unknowns) -> None:
@@ -157,12 +169,13 @@ class ImageBatch:
         for b, block in enumerate(self.blocks):
             target = self.state.targets[block.target_id or ""] if self.n_warp[b] else None
             segments.block(unknowns, self.state, self.chains, b, int(self.camera[b]), target)
-        self.n_rows: IntArray = self.state.n_lens[self.camera] + 6 + self.n_warp + 1
+        self.n_rows: IntArray = self.state.lenses.n_free[self.camera] + 6 + self.n_warp + 1
         self.keys, self.width = segments.keys, segments.width
-        self.seg_ptr = np.array(segments.ptr, dtype=np.int64)
-        self.seg_type, self.seg_ref, self.seg_d = (segments.column(i) for i in (1, 2, 3))
-        self.seg_start, self.seg_n, self.seg_key = (segments.column(i) for i in (4, 5, 6))
-        self.seg_out, places, size = segments.layout(self.n_rows)
+        seg_out, places, size = segments.layout(self.n_rows)
+        self.seg_key = segments.column(6)
+        ptr = np.array(segments.ptr, dtype=np.int64)
+        kind, link, table, start, n = (segments.column(i) for i in (1, 2, 3, 4, 5))
+        self.segments = SegmentArrays(ptr, kind, link, table, start, n, seg_out)
         most = int(self.n_rows.max(initial=1))
         self.flat, self.r = np.zeros(size), np.zeros((len(self.blocks), most))
         self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
@@ -173,7 +186,7 @@ class ImageBatch:
         self._r_views = [self.r[b, : self.n_rows[b]] for b in range(len(self.blocks))]
         self._prepared: gtsam.Values | None = None
         self._with_jacobians = False
-        self._all = np.arange(len(self.blocks), dtype=np.int64)
+        self._all = split_blocks(self.ptr)
 
     def prepare(self, values: gtsam.Values, jacobians: bool) -> None:
         """Evaluate all blocks at ``values``; ``state`` must have been loaded from the same values."""
@@ -181,27 +194,20 @@ class ImageBatch:
         self._evaluate(self._all, jacobians)
         self._prepared, self._with_jacobians = values, jacobians
 
-    def _evaluate(self, which: IntArray, jacobians: bool) -> None:
+    def _evaluate(self, runs: list[IntArray], jacobians: bool) -> None:
         s, c = self.state, self.chains
+        given = (self.arrays, self.points, self.W, s.lenses, c.R, c.t, s.warp)
         if jacobians:
-            condense(
-                which, self.ptr, self.camera, s.kind, s.lens, s.constants, s.columns, s.factors, s.n_lens, c.R, c.t,
-                self.X, self.shape, s.warp, self.n_warp, self.warp_id, self.uv, self.W, self.seg_ptr, self.seg_type,
-                self.seg_ref, self.seg_d, self.seg_start, self.seg_n, self.seg_out, c.C, s.D, self.flat, self.r,
-                self.chi, self.depth,
-            )  # fmt: skip
+            run_split(condense, runs, *given, self.segments, c.C, s.D, self.flat, self.r, self.chi, self.depth)
         else:
-            errors(
-                which, self.ptr, self.camera, s.kind, s.lens, s.constants, c.R, c.t, self.X, self.shape, s.warp,
-                self.warp_id, self.uv, self.W, self.chi, self.depth,
-            )  # fmt: skip
+            run_split(errors, runs, *given, self.chi, self.depth)
 
     def _evaluate_alone(self, b: int, values: gtsam.Values, jacobians: bool) -> None:
         links = slice(self.chains.ptr[b], self.chains.ptr[b + 1])
         self.state.load(values, [int(slot) for slot in self.chains.slot[links]])
         self.chains.evaluate(self.state)
         self._prepared = None
-        self._evaluate(np.array([b], dtype=np.int64), jacobians)
+        self._evaluate([np.array([b], dtype=np.int64)], jacobians)
 
     def residual(self, b: int, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         """What GTSAM's custom factor of block ``b`` returns: its condensed residual, and its rows by key."""
@@ -229,30 +235,29 @@ class ImageBatch:
 
     def local_from_keys(self, b: int) -> FloatArray:
         """Derivative (n_lens + 6 + n_warp, sum of key dims) of the block's local unknowns by its keys."""
-        nl, n = int(self.state.n_lens[self.camera[b]]), int(self.n_rows[b]) - 1
+        nl, n = int(self.state.lenses.n_free[self.camera[b]]), int(self.n_rows[b]) - 1
         starts = np.cumsum([0] + self.width[b])
         G = np.zeros((n, int(starts[-1])))
-        for s in range(self.seg_ptr[b], self.seg_ptr[b + 1]):
+        for s in range(self.segments.ptr[b], self.segments.ptr[b + 1]):
             o = int(starts[self.seg_key[s]])
-            k, start = int(self.seg_n[s]), int(self.seg_start[s])
-            if self.seg_type[s] == _LENS:
+            k, start = int(self.segments.n[s]), int(self.segments.start[s])
+            if self.segments.kind[s] == SEGMENT_LENS:
                 G[:nl, o : o + k] += np.eye(k)
-            elif self.seg_type[s] == _WARP:
+            elif self.segments.kind[s] == SEGMENT_WARP:
                 G[nl + 6 : nl + 6 + k, o : o + k] += np.eye(k)
-            elif self.seg_type[s] == _POSE:
-                G[nl : nl + 6, o : o + 6] += self.chains.C[self.seg_ref[s]]
+            elif self.segments.kind[s] == SEGMENT_POSE:
+                G[nl : nl + 6, o : o + 6] += self.chains.C[self.segments.link[s]]
             else:
-                D = self.state.D[self.seg_d[s]][:, start : start + k]
-                G[nl : nl + 6, o : o + k] += self.chains.C[self.seg_ref[s]] @ D
+                D = self.state.D[self.segments.table[s]][:, start : start + k]
+                G[nl : nl + 6, o : o + k] += self.chains.C[self.segments.link[s]] @ D
         return G
 
     def block_statistics(self, b: int, Q_local: FloatArray, residual: FloatArray, influence: FloatArray) -> None:
         """Fill residuals (N, 2) px and whitened A Q A' (N, 3) of block ``b``; the batch must be prepared."""
         s, c = self.state, self.chains
         statistics(
-            b, self.ptr, self.camera, s.kind, s.lens, s.constants, s.columns, s.factors, s.n_lens, c.R, c.t, self.X,
-            self.shape, s.warp, self.n_warp, self.warp_id, self.uv, self.W_all, Q_local, residual, influence,
-        )  # fmt: skip
+            b, self.arrays, self.points, self.W_all, s.lenses, c.R, c.t, s.warp, Q_local, residual, influence
+        )
 
 
 def _callback(batch: ImageBatch, b: int):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped

@@ -150,7 +150,8 @@ class Target:
     motion: ``fixed`` or ``epoch`` (moved between epochs, as a board held by hand).
     carrier_from_target: ``world_from_target``, or ``station_from_target`` where ``station_id`` is given; with motion
     ``epoch`` what holds for every epoch that is not listed in ``epochs``.
-    warp: sag of a board, names ("warp_x", "warp_y") m: z = warp_x 4u(1-u) + warp_y 4v(1-v), u, v from 0 to 1 over the board.
+    warp: sag of a board, names ("warp_x", "warp_y") m: z = warp_x 4u(1-u) + warp_y 4v(1-v), with u, v from 0 to 1 over
+    the board.
     """
 
     target_id: str

@@ -20,7 +20,7 @@ Progress = Callable[[int, float], None]
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """max_step: convergence, the largest step of any unknown in its own sigmas. max_iterations: steps tried."""
+    """max_step: convergence, what is left to go for any unknown in its own sigmas. max_iterations: steps tried."""
 
     max_step: float = 1e-6
     max_iterations: int = 60
@@ -91,11 +91,11 @@ class _Loop:
     def run(self) -> Solved:
         omega = self.total(self.values)
         linear = self.linearize()
-        moved = np.inf
+        moved = before = np.inf
         for iteration in range(1, self.options.max_iterations + 1):
             delta = self.step(linear)
             gradient = linear.gradientAtZero()
-            moved = np.sqrt(max(0.0, -float(delta.dot(gradient))))
+            before, moved = moved, np.sqrt(max(0.0, -float(delta.dot(gradient))))
             if self.graph.bundle is not None:
                 self.graph.bundle.complete(delta)
             trial = self.values.retract(delta)
@@ -105,7 +105,9 @@ class _Loop:
                 self.values, omega = trial, new
                 if self.progress:
                     self.progress(iteration, omega)
-                if moved < self.options.max_step and self.damping == 0.0:
+                # steps shrink at least linearly near the minimum: what is left is below the next step
+                left = moved * min(1.0, moved / before if np.isfinite(before) else 1.0)
+                if self.damping == 0.0 and left < self.options.max_step:
                     return self._finish(omega, iteration, moved)
                 self.damping = self.damping / 10.0 if self.damping > 1e-8 else 0.0
             else:

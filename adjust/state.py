@@ -7,6 +7,7 @@ import numpy as np
 
 from adjust.chain_kernels import table_motion
 from adjust.errors import SurveyError
+from adjust.image_kernels import LensArrays
 from adjust.lens import MODELS, lens_constants
 from adjust.lens_kernels import MAX_LENS
 from adjust.model import FloatArray, IntArray, Survey, VectorParameter
@@ -17,7 +18,7 @@ class State:
     """Arrays that the kernels read. :meth:`load` fills them from GTSAM values; nothing else changes them.
 
     slot_R (S, 3, 3), slot_t (S, 3): poses of all slots. D (table slots, 6, 6): derivative of a table's motion by its
-    free angles and free geometry, ``angles`` columns first. lens (C, MAX_LENS), warp (targets, 2) m.
+    free angles and free geometry, ``angles`` columns first. lenses: see LensArrays. warp (targets, 2) m.
     """
 
     def __init__(self, survey: Survey, unknowns: Unknowns) -> None:
@@ -26,17 +27,7 @@ class State:
         self.targets = {t.target_id: i for i, t in enumerate(survey.targets)}
         self.lens_maps = [unknowns.vectors[("lens", c.camera_id)] for c in survey.cameras]
         self.warp_maps: list[VectorMap | None] = [unknowns.vectors.get(("warp", t.target_id)) for t in survey.targets]
-        self.kind = np.array([MODELS[c.lens.model].kind for c in survey.cameras], dtype=np.int64)
-        self.constants = np.zeros((len(survey.cameras), 4))
-        self.columns = np.full((len(survey.cameras), MAX_LENS), -1, dtype=np.int64)
-        self.factors = np.zeros((len(survey.cameras), MAX_LENS))
-        self.n_lens = np.array([len(m.free) for m in self.lens_maps], dtype=np.int64)
-        for i, camera in enumerate(survey.cameras):
-            constants = lens_constants(MODELS[camera.lens.model], camera.image_size, camera.lens.pixel_size_mm)
-            self.constants[i, : len(constants)] = constants
-            for row, weights in enumerate(self.lens_maps[i].matrix):
-                for column in np.flatnonzero(weights):
-                    self.columns[i, row], self.factors[i, row] = column, weights[column]
+        self.lenses = self._lens_arrays(survey)
         n = len(unknowns.slot_key)
         self.slot_R, self.slot_t = np.zeros((n, 3, 3)), np.zeros((n, 3))
         for slot, pose in enumerate(unknowns.slot_pose):
@@ -45,13 +36,33 @@ class State:
         for i, table_slot in enumerate(unknowns.table_slots):
             self.table_index[table_slot] = i
         self.D = np.zeros((max(1, len(unknowns.table_slots)), 6, 6))
-        self.lens = np.zeros((len(survey.cameras), MAX_LENS))
         self.warp = np.zeros((max(1, len(survey.targets)), 2))
         self._free_slots = [
             (slot, key)
             for slot, key in enumerate(unknowns.slot_key)
             if key is not None and slot not in unknowns.table_slots
         ]
+
+    def _lens_arrays(self, survey: Survey) -> LensArrays:
+        n = len(survey.cameras)
+        integers = (np.zeros((n, MAX_LENS), dtype=np.int64), np.zeros((n, MAX_LENS), dtype=np.int64))
+        arrays = LensArrays(
+            np.array([MODELS[c.lens.model].kind for c in survey.cameras], dtype=np.int64),
+            np.zeros((n, MAX_LENS)),
+            np.zeros((n, 4)),
+            np.array([len(m.free) for m in self.lens_maps], dtype=np.int64),
+            np.zeros(n, dtype=np.int64),
+            *integers,
+            np.zeros((n, MAX_LENS)),
+        )
+        for i, camera in enumerate(survey.cameras):
+            model = MODELS[camera.lens.model]
+            arrays.constants[i] = lens_constants(model, camera.image_size, camera.lens.pixel_size_mm)
+            sources, columns = np.nonzero(self.lens_maps[i].matrix)
+            k = arrays.n_map[i] = len(sources)
+            arrays.source[i, :k], arrays.column[i, :k] = sources, columns
+            arrays.factor[i, :k] = self.lens_maps[i].matrix[sources, columns]
+        return arrays
 
     def _set(self, slot: int, pose: gtsam.Pose3) -> None:
         matrix = pose.matrix()
@@ -76,7 +87,7 @@ class State:
     def _load_lenses(self, values: gtsam.Values) -> None:
         for i, lens_map in enumerate(self.lens_maps):
             full = lens_map.full(values)
-            self.lens[i, : full.size] = full
+            self.lenses.values[i, : full.size] = full
         for i, warp_map in enumerate(self.warp_maps):
             if warp_map is not None:
                 self.warp[i] = warp_map.full(values)
