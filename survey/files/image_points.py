@@ -53,11 +53,9 @@ def read_image_blocks(table: Table, names: Names, sigmas: Sigmas) -> tuple[tuple
     _refuse_duplicates(table, "point_id", rows, target, point_idx)
     order = np.lexsort((point_idx, group, target, rows.epoch, rows.camera))
     keys = np.stack([rows.camera, rows.epoch, target, group])[:, order]
-    starts = np.flatnonzero(np.r_[True, (np.diff(keys, axis=1) != 0).any(axis=0)][: len(order)])
     used = table.flags("used")
     blocks, lines = [], []
-    for start, stop in zip(starts, np.r_[starts[1:], len(order)], strict=True):
-        part = order[start:stop]
+    for part in _runs(order, keys):
         row = part[0]
         blocks.append(
             ImageBlock(
@@ -84,14 +82,19 @@ def read_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[SpotBlock, .
     _refuse_duplicates(table, "spot_id", rows, np.zeros(len(table), dtype=np.int64), spot)
     order = np.lexsort((spot, rows.epoch, rows.camera))
     keys = np.stack([rows.camera, rows.epoch])[:, order]
-    starts = np.flatnonzero(np.r_[True, (np.diff(keys, axis=1) != 0).any(axis=0)][: len(order)])
     blocks = []
-    for start, stop in zip(starts, np.r_[starts[1:], len(order)], strict=True):
-        part = order[start:stop]
+    for part in _runs(order, keys):
         camera_id, epoch_id = (column.names[column.codes[part[0]]] for column in (cameras, epochs))
         spot_ids = tuple(spots.names[code] for code in spots.codes[part].tolist())
         blocks.append(SpotBlock(camera_id, epoch_id, spot_ids, rows.uv[part], rows.cov[part]))
     return tuple(blocks)
+
+
+def _runs(order: IntArray, keys: IntArray) -> list[IntArray]:
+    """The pieces of ``order`` (n,) over which the columns of ``keys`` (k, n) stay the same."""
+    if not len(order):
+        return []
+    return np.split(order, np.flatnonzero((np.diff(keys, axis=1) != 0).any(axis=0)) + 1)
 
 
 def _groups(table: Table) -> TextColumn:

@@ -65,7 +65,7 @@ def _checkerboard(node: Node) -> TargetKind:
 def _dictionary(node: Node) -> str:
     from survey.detection.dictionaries import dictionary_names  # brings in OpenCV, which few projects need here
 
-    name, known = _dictionary(node), dictionary_names()
+    name, known = node.text("dictionary"), dictionary_names()
     if name.upper().removeprefix("DICT_") not in known:
         raise node.error(f"unknown dictionary {name!r}; {suggestion(name.upper(), known)}", "dictionary")
     return name

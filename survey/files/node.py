@@ -31,6 +31,8 @@ def read_toml(path: Path) -> tuple["Node", str]:
         found = re.search(r"at line (\d+)", str(error))
         line = int(found.group(1)) if found else text.count("\n") + 1
         raise SurveyError(f"{path}:{line}: not valid TOML: {error}; correct this line") from error
+    except RecursionError as error:
+        raise SurveyError(f"{path}:1: lists or tables are nested too deeply; remove the brackets") from error
     return Node(path, key_lines(text), (), values), digest
 
 

@@ -41,9 +41,9 @@ def rotation_from_quaternion(wxyz: FloatArray) -> Rot3 | None:
 
 
 def quaternion_wxyz(rotation: Rot3) -> list[float]:
-    """The unit quaternion of a rotation, w first."""
+    """The unit quaternion of a rotation, w first, to 1e-15: the way there and back through a matrix keeps no more."""
     q: Any = rotation.toQuaternion()  # GTSAM's stubs do not know Eigen's quaternion
-    return [q.w(), q.x(), q.y(), q.z()]
+    return [round(part, 15) for part in (q.w(), q.x(), q.y(), q.z())]
 
 
 def rotation_from_euler(xyz: FloatArray) -> Rot3:

@@ -4,10 +4,11 @@ A CSV file is read in chunks whose rows, columns and numbers are taken apart by 
 become codes into their different names, so that nothing later runs per row.
 """
 
+import contextlib
 import csv
 import io
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -147,32 +148,59 @@ def read_table(path: Path, layout: Layout) -> Table:
         raise SurveyError(f"{path}:1: the file is empty; the first line names the columns: {','.join(layout.required)}")
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     try:
-        return _read_rows(path, layout, reader, digest)
+        header = next(reader)
+        check_header(path, header, layout)
+        rows = _plain_columns(text, len(header)) or _quoted_columns(path, reader, len(header))
+        return _assemble(path, layout, digest, header, rows)
     except csv.Error as error:
-        raise SurveyError(f"{path}:{reader.line_num}: not a CSV line ({error}); correct the quotes") from error
+        raise SurveyError(f"{path}:{_last_start(text)}: not a CSV line ({error}); correct the quotes") from error
 
 
-def _read_rows(path: Path, layout: Layout, reader: Any, digest: str) -> Table:
-    header = next(reader)
-    check_header(path, header, layout)
-    builders = [_TextBuilder() if layout.is_text(name) else _NumberBuilder() for name in header]
-    all_lines: list[IntArray] = []
+def _last_start(text: str) -> int:
+    """The line on which the row begins that the csv module cannot read."""
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    line = 1
+    with contextlib.suppress(csv.Error):
+        for _ in reader:
+            line = reader.line_num + 1
+    return line
+
+
+_Chunk = tuple[IntArray, Sequence[Sequence[str]]]
+
+
+def _plain_columns(text: str, n: int) -> Iterator[_Chunk] | None:
+    """Lines and columns of a text without quotes, blank lines or wrong lengths, chunk by chunk; None for any other."""
+    if '"' in text or n < 2:
+        return None
+    body = text.replace("\r\n", "\n").rstrip("\n").encode()
+    ends = np.flatnonzero(np.frombuffer(body, np.uint8) == ord("\n"))
+    commas = np.flatnonzero(np.frombuffer(body, np.uint8) == ord(","))
+    counts = np.diff(np.searchsorted(commas, np.r_[0, ends, len(body)]))
+    if b"\r" in body or (counts != n - 1).any():
+        return None
+    return _split(body, ends, n)
+
+
+def _split(body: bytes, ends: IntArray, n: int) -> Iterator[_Chunk]:
+    """Columns of the lines after the first; one list per chunk and no list per row keeps the garbage collector out."""
+    starts = (ends + 1).tolist()
+    for first in range(0, len(starts), _CHUNK):
+        stop = starts[first + _CHUNK] - 1 if first + _CHUNK < len(starts) else len(body)
+        fields = body[starts[first] : stop].decode().replace("\n", ",").split(",")
+        yield np.arange(first + 2, first + 2 + len(fields) // n), [fields[i::n] for i in range(n)]
+
+
+def _quoted_columns(path: Path, reader: Any, n: int) -> Iterator[_Chunk]:
+    """The same for any CSV, through the csv module; raises where a row has a wrong length."""
     line = reader.line_num + 1
     while rows := list(itertools.islice(reader, _CHUNK)):
         lines = np.arange(line, line + len(rows))
-        _check_lengths(path, rows, lines, len(header), reader.line_num)
+        _check_lengths(path, rows, lines, n, reader.line_num)
         line += len(rows)
-        if not all(rows):
-            lines = lines[np.fromiter(map(bool, rows), bool, len(rows))]
-            rows = [row for row in rows if row]
-        if not rows:
-            continue
-        all_lines.append(lines)
-        for name, builder, column in zip(header, builders, zip(*rows, strict=True), strict=True):
-            bad = builder.add(column, name in layout.required)
-            if bad is not None:
-                raise SurveyError(f"{path}:{lines[bad[0]]}: {name}: {bad[1]}")
-    return _assemble(path, layout, digest, np.concatenate([np.zeros(0, np.int64), *all_lines]), header, builders)
+        filled = np.fromiter(map(bool, rows), bool, len(rows))
+        if filled.any():
+            yield lines[filled], list(zip(*filter(None, rows), strict=True))
 
 
 def _check_lengths(path: Path, rows: list[list[str]], lines: IntArray, n: int, last_line: int) -> None:
@@ -185,17 +213,25 @@ def _check_lengths(path: Path, rows: list[list[str]], lines: IntArray, n: int, l
         raise SurveyError(f"{path}:{lines[i]}: a quoted field runs over the end of the line; close its quotes")
 
 
-def _assemble(
-    path: Path, layout: Layout, digest: str, lines: IntArray, header: Sequence[str], builders: Sequence[Any]
-) -> Table:
-    texts: dict[str, TextColumn] = {}
-    numbers: dict[str, FloatArray] = {}
-    for name, builder in zip(header, builders, strict=True):
-        if isinstance(builder, _TextBuilder):
-            texts[name] = builder.column()
-        else:
-            numbers[name] = np.concatenate([np.zeros(0), *builder.parts])
-    return Table(path, layout, digest, lines, texts, numbers)
+def _assemble(path: Path, layout: Layout, digest: str, header: Sequence[str], chunks: Iterable[_Chunk]) -> Table:
+    texts = {name: _TextBuilder() for name in header if layout.is_text(name)}
+    numbers = {name: _NumberBuilder() for name in header if not layout.is_text(name)}
+    builders: dict[str, _TextBuilder | _NumberBuilder] = {**texts, **numbers}
+    all_lines = [np.zeros(0, np.int64)]
+    for lines, columns in chunks:
+        all_lines.append(lines)
+        for name, column in zip(header, columns, strict=True):
+            bad = builders[name].add(column, name in layout.required)
+            if bad is not None:
+                raise SurveyError(f"{path}:{lines[bad[0]]}: {name}: {bad[1]}")
+    return Table(
+        path,
+        layout,
+        digest,
+        np.concatenate(all_lines),
+        {name: builder.column() for name, builder in texts.items()},
+        {name: builder.column() for name, builder in numbers.items()},
+    )
 
 
 def check_header(path: Path, header: Sequence[str], layout: Layout) -> None:
@@ -259,6 +295,9 @@ class _NumberBuilder:
             values[np.fromiter((text == "" for text in column), bool, len(column))] = np.nan
         self.parts.append(values)
         return None
+
+    def column(self) -> FloatArray:
+        return np.concatenate([np.zeros(0), *self.parts])
 
 
 def _read_parquet(path: Path, layout: Layout, data: bytes, digest: str) -> Table:
