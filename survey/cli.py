@@ -37,29 +37,30 @@ Exit codes: 0 done, 1 error in the project, 2 wrong usage, 3 solved but the glob
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; the exit code."""
-    arguments = build_parser().parse_args(argv)
     try:
-        code = int(arguments.run(arguments))
-        sys.stdout.flush()
-        return code
-    except SurveyError as error:
-        return _complain(str(error))
+        try:
+            arguments = build_parser().parse_args(argv)
+            return int(arguments.run(arguments))
+        finally:
+            sys.stdout.flush()
     except BrokenPipeError:
         # whoever read our output has left; a second complaint at exit would be noise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
-    except OSError as error:
-        if error.filename is None:
+    except (SurveyError, OSError) as error:
+        if isinstance(error, OSError) and error.filename is None:
             raise  # not about a file of the user
-        return _complain(f"{error.filename}: {error.strerror}; check the name, the permissions and the free space")
+        print(f"labsurvey: error: {_message(error)}", file=sys.stderr)
+        return FAILED
     except KeyboardInterrupt:
         print("\nlabsurvey: interrupted", file=sys.stderr)
         return INTERRUPTED
 
 
-def _complain(message: str) -> int:
-    print(f"labsurvey: error: {message}", file=sys.stderr)
-    return FAILED
+def _message(error: SurveyError | OSError) -> str:
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}; check the name, the permissions and the free space"
+    return str(error)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -266,7 +267,7 @@ def _adjust_in_batch(folder: Path, arguments: argparse.Namespace) -> dict[str, A
     try:
         code, outcome = _adjust_one(folder, arguments, progress=False)
     except (SurveyError, OSError) as error:
-        return {**row, "exit_code": FAILED, "error": str(error)}
+        return {**row, "exit_code": FAILED, "error": _message(error)}
     except Exception as error:  # a bug in one project must not cost the night's other results
         traceback.print_exc()
         return {**row, "exit_code": FAILED, "error": f"{folder}: internal error, {type(error).__name__}: {error}"}
