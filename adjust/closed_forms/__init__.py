@@ -1,6 +1,6 @@
 """Solutions without a start: pure functions of arrays, each with the source of its formula."""
 
-from adjust.closed_forms.absolute_pose import PoseCandidates, absolute_pose, refine_poses, view_errors
+from adjust.closed_forms.absolute_pose import PoseCandidates, absolute_pose, pose_solutions, refine_poses, view_errors
 from adjust.closed_forms.averaging import mean_pose, mean_rotation, pose_distance
 from adjust.closed_forms.hand_eye import degenerate_direction, relative_motions, solve_ax_xb, solve_ax_zb
 from adjust.closed_forms.homography import apply_homography, homography
@@ -24,6 +24,7 @@ __all__ = [
     "nearest_rotation",
     "pinhole_from_homographies",
     "pose_distance",
+    "pose_solutions",
     "radial_distortion",
     "refine_poses",
     "relative_motions",

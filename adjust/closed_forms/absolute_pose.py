@@ -32,6 +32,11 @@ def absolute_pose(x: FloatArray, rays: FloatArray, refinements: int = 5) -> Pose
     Each is refined on the angles. Rays may lie in any direction: they are turned to the mean one first.
     Raises SurveyError for too few points, points on a line, or where no pose has the points in front.
     """
+    return _refined(pose_solutions(x, rays), x, rays, refinements)
+
+
+def pose_solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
+    """The unrefined poses (k, 4, 4) of :func:`absolute_pose`, in no order and not checked for what lies in front."""
     if len(x) < 3:
         raise SurveyError(f"a camera pose needs 3 known points, got {len(x)}: observe more of them")
     mean = rays.mean(axis=0)
@@ -42,8 +47,8 @@ def absolute_pose(x: FloatArray, rays: FloatArray, refinements: int = 5) -> Pose
         raise SurveyError("fewer than 3 rays within 80 degrees of their mean: split the view, or observe more points")
     centre, axes, thin = _principal_axes(x[near])
     front_from_target = _solutions(x[near], turned[near, :2] / turned[near, 2:], centre, axes, thin)
-    poses = np.array([rigid(front_from_camera.T, np.zeros(3)) @ pose for pose in front_from_target]).reshape(-1, 4, 4)
-    return _refined(poses, x, rays, refinements)
+    camera_from_front = rigid(front_from_camera.T, np.zeros(3))
+    return np.array([camera_from_front @ pose for pose in front_from_target]).reshape(-1, 4, 4)
 
 
 def _refined(poses: FloatArray, x: FloatArray, rays: FloatArray, refinements: int) -> PoseCandidates:
@@ -103,11 +108,15 @@ def _methods(n: int, thin: bool) -> tuple[int | None, ...]:
 
 
 def tangent_axes(rays: FloatArray) -> FloatArray:
-    """Two unit vectors (n, 2, 3) across each unit ray (n, 3)."""
-    helper = np.eye(3)[np.argmin(np.abs(rays), axis=1)]
-    first = np.cross(rays, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(rays, first)], axis=1)
+    """Two unit vectors (n, 2, 3) across each unit ray (n, 3) (Duff et al., J. Comput. Graph. Techn. 6(1), 2017)."""
+    x, y, z = rays.T
+    sign = np.where(z >= 0, 1.0, -1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    out = np.empty((len(rays), 2, 3))
+    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = b, sign + y * y * a, -y
+    return out
 
 
 def _gnomonic(x_in_camera: FloatArray, rays: FloatArray, across: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""What no observation can tell: where a frame lies that only unknown poses reach. One of these is set, the rest follow."""
+"""What no observation can tell: where a frame lies that only unknown poses reach. One is set, the rest follow."""
 
 from dataclasses import dataclass
 
@@ -114,7 +114,7 @@ def frames_of(network: PoseNetwork, name: ParameterName) -> tuple[Node, Node]:
 
 
 def _rank(network: PoseNetwork, slot: int) -> int:
-    """Which pose is set first: one with some prior, a fixed target in the world, the mount, a fixed station, a camera."""
+    """What is set first: a pose with some prior, a fixed target in the world, the mount, a fixed station, a camera."""
     name = network.names[slot]
     if partial_pose(network.unknowns.parameters.get(name)) is not None:
         return 0

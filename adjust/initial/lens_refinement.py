@@ -34,7 +34,7 @@ def fit_lens(
     """Least squares over ``values + directions @ p`` and the poses camera_from_target (B, 4, 4), with Cauchy weights.
 
     directions: (n, p), what of the lens may move. x: (N, 3) m, uv: (N, 2) px, view after view by ``ptr`` (B + 1,).
-    Source: Levenberg-Marquardt with the poses eliminated (Schur complement; Triggs et al., Bundle adjustment, 2000, 6.1).
+    Source: Levenberg-Marquardt with the poses eliminated (Schur complement; Triggs et al., Bundle adjustment, 2000).
     """
     view = np.repeat(np.arange(len(poses)), np.diff(ptr))
     damping, residuals = 1e-4, _residuals(model, values, constants, poses, x, uv, view)

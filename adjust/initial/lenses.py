@@ -21,6 +21,7 @@ from adjust.model import Camera, FloatArray
 
 _MOST_IMAGES = 30
 _SCAN_IMAGES = 8
+_GOOD_START = 0.01  # of the image width: with less error a closed form needs no scan beside it
 _FOCAL = {"fx", "fy", "c", "ck"}
 _CENTRE = {"u0", "v0", "xp", "yp", "px", "py", "xh", "yh"}
 _RADIAL = {"k1": 1, "k2": 2, "K1": 1, "K2": 2, "A1": 1, "A2": 2}
@@ -101,7 +102,7 @@ class _LensSearch:
         chosen = spread_out(good) or [s for s in usable if s.block_idx not in excluded][:_MOST_IMAGES]
         if not chosen:
             raise SurveyError(
-                f"camera {self.camera.camera_id!r}: none of its {len(flat)} images fits the plane of its target, first: "
+                f"camera {self.camera.camera_id!r}: none of its {len(flat)} images fits a plane; the first: "
                 + next(iter(excluded.values()))
             )
         start, how = self._focal_length([s for s in chosen if _is_plane(s.x)], chosen)
@@ -138,15 +139,18 @@ class _LensSearch:
                 )
                 trials.append((values, f"Zhang, {found.variant}"))
         trial_images = _every(chosen, _SCAN_IMAGES)
+        errors = [self._error_px(values, trial_images) for values, _ in trials]
+        if errors and min(errors) < _GOOD_START * max(self.size):
+            return trials[int(np.argmin(errors))]
         low, high = (0.15, 2.0) if self.model.name == "fisheye" else (0.35, 8.0)
         for factor in np.geomspace(low, high, 16):
             trials.append((self._values(factor * max(self.size)), "scan of focal lengths"))
-        errors = [self._error_px(values, trial_images) for values, _ in trials]
+        errors += [self._error_px(values, trial_images) for values, _ in trials[len(errors) :]]
         best = int(np.argmin(errors))
         if not np.isfinite(errors[best]):
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: no focal length from {low:g} to {high:g} image widths explains its"
-                " images of known points; check the point order, the coordinates and the image size, or give lens values"
+                " images of known points; check point order, coordinates and image size, or give lens values"
             )
         return trials[best]
 
@@ -184,18 +188,16 @@ class _LensSearch:
             )
         x, uv = np.concatenate([s.x for s in images]), np.concatenate([s.uv for s in images])
         ptr = np.concatenate([[0], np.cumsum([len(s.x) for s in images])])
-        current, fit, freed = start, None, "focal"
-        for level in ("focal", "focal k1", "focal centre k1", "focal centre k1 k2"):
+        for level in ("focal centre k1 k2", "focal centre k1", "focal k1", "focal"):
             directions = self._directions(level)
             if directions.shape[1] == 0 or ("centre" in level and len(images) < 3):
                 continue
-            trial = fit_lens(self.model, self.constants, current, directions, poses, x, uv, ptr)
-            if not self._sane(trial, directions):
-                break
-            current, poses, fit, freed = trial.values, trial.poses, trial, level
-        rms = float("nan") if fit is None else float(np.median(np.linalg.norm(fit.residuals, axis=1)))
-        note = f"lens from {len(images)} images ({how}; refined: {freed}), median error {rms:.2f} px"
-        return LensStart(current, note, excluded)
+            fit = fit_lens(self.model, self.constants, start, directions, poses, x, uv, ptr)
+            if self._sane(fit, directions):
+                median = float(np.median(np.linalg.norm(fit.residuals, axis=1)))
+                note = f"lens from {len(images)} images ({how}; refined: {level}), median error {median:.2f} px"
+                return LensStart(fit.values, note, excluded)
+        return LensStart(start, f"lens from {len(images)} images ({how}; too few to refine it)", excluded)
 
     def _poses(self, values: FloatArray, chosen: Sequence[Sighting]) -> tuple[list[Sighting], FloatArray]:
         images, poses = [], []
@@ -209,7 +211,7 @@ class _LensSearch:
         return images, np.array(poses).reshape(-1, 4, 4)
 
     def _directions(self, level: str) -> FloatArray:
-        """Columns (n, p) of the lens components that this level frees, ties included; fx and fy one by one from k1 on."""
+        """Columns (n, p) of the lens components that this level frees, ties included; fx, fy apart only with the centre."""
         wanted = set(_FOCAL)
         wanted |= _CENTRE if "centre" in level else set()
         wanted |= {name for name, order in _RADIAL.items() if f"k{order}" in level}
@@ -241,9 +243,8 @@ class _LensSearch:
         pixel = 1.0 / self.constants[0] if self.model.in_mm else 1.0
         limits = {**dict.fromkeys(_FOCAL, 0.1 * focal), **dict.fromkeys(_CENTRE, 0.1 * width)}
         known = all(s * pixel <= limits[n] for n, s in zip(self.model.names, sigma, strict=True) if n in limits)
-        inside = np.all(
-            np.abs(principal_point_px(self.model, fit.values, self.constants) - self.constants[1:3]) < 0.3 * width
-        )
+        centre = principal_point_px(self.model, fit.values, self.constants)
+        inside = np.all(np.abs(centre - self.constants[1:3]) < 0.3 * width)
         try:
             corners = np.array([[0.0, 0.0], [self.size[0] - 1.0, 0.0], [0.0, self.size[1] - 1.0]])
             unit_rays(self.model, fit.values, self.constants, 0.85 * corners + 0.15 * self.constants[1:3])
@@ -269,7 +270,7 @@ def _unit(xy: FloatArray) -> FloatArray:
 def _homography_misfit(s: Sighting) -> float:
     """Median distance from the plane's image, relative to the extent of the points in the image."""
     xy = _plane_coordinates(s.x)
-    h, _ = homography(xy, s.uv, refinements=1)
+    h, _ = homography(xy, s.uv, refinements=0)
     extent = float(np.linalg.norm(np.ptp(s.uv, axis=0)))
     return float(np.median(np.linalg.norm(apply_homography(h, xy) - s.uv, axis=1))) / max(extent, 1e-9)
 

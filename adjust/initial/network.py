@@ -155,9 +155,9 @@ def given_pose(parameter: PoseParameter) -> FloatArray | None:
     """
     if parameter.value is None:
         return IDENTITY if parameter.treatment == "held" else None
-    if parameter.treatment == "prior" and parameter.prior_cov is not None:
-        if not np.all(np.isfinite(np.diag(parameter.prior_cov))):
-            return None
+    cov = parameter.prior_cov if parameter.treatment == "prior" else None
+    if cov is not None and not np.all(np.isfinite(np.diag(cov))):
+        return None
     return np.asarray(parameter.value.matrix(), dtype=float)
 
 

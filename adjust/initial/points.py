@@ -1,4 +1,4 @@
-"""World points and the cameras that see them: resection from known points, intersection from known cameras, in turns."""
+"""World points and the cameras that see them: resection from known points and intersection from known cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -10,6 +10,7 @@ from adjust.initial.lenses import Sighting, start_lens
 from adjust.initial.motion import solve_motion
 from adjust.initial.network import ChainObservation, PoseNetwork, as_pose3
 from adjust.initial.points import PARALLAX, PointField, improve, intersect_points, point_field, resect
+from adjust.initial.polish import polish
 from adjust.initial.result import Start
 from adjust.initial.undetermined import undetermined
 from adjust.initial.views import (
@@ -18,6 +19,7 @@ from adjust.initial.views import (
     block_text,
     focal_px,
     make_view,
+    ray_errors,
     refine_views,
     target_points,
     untrustworthy,
@@ -29,15 +31,16 @@ from adjust.result import ParameterName
 from adjust.unknowns import Chain, FrameTree, Unknowns
 
 _ROUNDS = 3
+_POLISH_PX = 2.0  # below this the robust means are a good start already
 _OFF = 10.0  # a block this many times worse than the typical one contradicts the others
 
 
 def find_start(survey: Survey) -> Start:
     """Start values for every parameter that the observations of a survey need.
 
-    Given values are used as they are; everything else comes from closed forms and robust means, in a fixed order, so the
-    same survey gives the same start. Blocks of image points that no pose explains, or that contradict the others, are
-    named in ``excluded_blocks`` and do not take part. What no observation tells (the datum) is chosen.
+    Given values are used as they are; everything else comes from closed forms and robust means, in a fixed order, so
+    the same survey gives the same start. Blocks of image points that no pose explains, or that contradict the others,
+    are named in ``excluded_blocks`` and do not take part. What no observation tells (the datum) is chosen.
     Raises SurveyError naming each parameter that nothing determines, and what is missing.
     """
     search = _Search(survey)
@@ -64,6 +67,7 @@ class _Search:
         self.notes: list[str] = []
         self.views: dict[int, View] = {}
         self.doubtful: list[ChainObservation] = []
+        self.motion_solved = False
         self._register_pairs_and_positions()
         self.network.register(survey)
 
@@ -120,7 +124,7 @@ class _Search:
                 self.reasons.setdefault(i, f"{block_text(block)}: {failed[i]}")
             elif block.target_id is None:
                 self.points.add(self.survey, i, rays[i], focal[block.camera_id], self.chains[i])
-            elif used.any():
+            elif used.sum() >= 3:  # fewer give no pose, but may well serve in the adjustment
                 try:
                     x = target_x[block.target_id][block.point_idx[used]]
                     views.append(make_view(i, x, rays[i][used], focal[block.camera_id]))
@@ -167,6 +171,7 @@ class _Search:
         note = solve_motion(network)
         if note is not None:
             self.notes.append(note)
+            self.motion_solved = True
             return True
         return network.propagate(rotation_only=True)
 
@@ -186,6 +191,9 @@ class _Search:
         movable = set(network.known) - network.fixed - set(network.gauged)
         for _ in range(_ROUNDS if self.points.sights else 0):
             improve(network, self.points, movable)
+        moved = set(network.known) - network.fixed - set(network.gauged)
+        if self.motion_solved or np.nanmax(self._block_rms(), initial=0.0) > _POLISH_PX:
+            polish(network, moved, self.views)
         self._move_to_coordinates()
         self._set_aside_contradictions()
 
@@ -204,7 +212,7 @@ class _Search:
             return
         new_from_old = align(np.array(observed), np.array(present))
         for slot, name in self.network.names.items():
-            if ("world",) == frames_of(self.network, name)[0]:
+            if frames_of(self.network, name)[0] == ("world",):
                 self.network.known[slot] = new_from_old @ self.network.known[slot]
         self.points.x = self.points.x @ new_from_old[:3, :3].T + new_from_old[:3, 3]
         self.notes.append(f"world moved onto {len(observed)} observed positions")
@@ -247,9 +255,7 @@ class _Search:
             else:
                 continue
             pose = self.network.product(chain)
-            p = x @ pose[:3, :3].T + pose[:3, 3]
-            along, across = np.sum(p * rays, axis=1), np.linalg.norm(np.cross(rays, p), axis=1)
-            offset = np.where(along > 0, across / np.where(along > 0, along, 1.0), np.inf) * focal
+            offset = ray_errors(pose, x, rays) * focal
             # the median of a circular normal's radius is 1.18 sigma, its rms 1.41 sigma
             rms[i] = 1.2 * float(np.median(offset)) if len(offset) else np.nan
         return rms

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.closed_forms import absolute_pose, refine_poses, view_errors
+from adjust.closed_forms import pose_solutions, refine_poses, view_errors
 from adjust.errors import SurveyError
 from adjust.lens import focal_length_px, lens_constants, lens_model, unit_rays
 from adjust.model import BoolArray, Camera, FloatArray, Survey, Target
@@ -91,8 +91,12 @@ def all_rays(survey: Survey, lenses: dict[str, FloatArray]) -> tuple[dict[int, F
 
 def make_view(block_idx: int, x: FloatArray, rays: FloatArray, focal: float) -> View:
     """A view with its unrefined candidate poses; raises SurveyError where there are none."""
-    found = absolute_pose(x, rays, refinements=0)
-    return View(block_idx, x, rays, focal, found.camera_from_target, found.error * focal)
+    poses = pose_solutions(x, rays)
+    if not len(poses):
+        raise SurveyError(f"no camera pose explains its {len(x)} points; check their order and coordinates")
+    ptr = np.arange(len(poses) + 1) * len(x)
+    error, in_front = view_errors(poses, np.tile(x, (len(poses), 1)), np.tile(rays, (len(poses), 1)), ptr)
+    return _ranked(View(block_idx, x, rays, focal, poses, error * focal), poses, error * focal, in_front)
 
 
 def refine_views(views: Sequence[View], iterations: int = 8) -> list[View]:
@@ -123,11 +127,17 @@ def _ranked(view: View, poses: FloatArray, error_px: FloatArray, in_front: BoolA
 
 def point_errors_px(view: View, camera_from_target: FloatArray) -> FloatArray:
     """Offsets (n,) px of the points of a view at a pose; infinite for points behind."""
-    p = view.x @ camera_from_target[:3, :3].T + camera_from_target[:3, 3]
-    along = np.sum(p * view.rays, axis=1)
-    across = np.linalg.norm(np.cross(view.rays, p), axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(along > 0, across / along, np.inf) * view.focal_px
+    return ray_errors(camera_from_target, view.x, view.rays) * view.focal_px
+
+
+def ray_errors(camera_from_x: FloatArray, x: FloatArray, rays: FloatArray) -> FloatArray:
+    """Tangents (n,) of the angles between rays and points; infinite for points behind."""
+    p = x @ camera_from_x[:3, :3].T + camera_from_x[:3, 3]
+    along = np.einsum("ij,ij->i", p, rays)
+    across2 = np.maximum(np.einsum("ij,ij->i", p, p) - along**2, 0.0)
+    out = np.full(len(p), np.inf)
+    np.divide(np.sqrt(across2), along, out=out, where=along > 0)
+    return out
 
 
 def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str], list[str]]:

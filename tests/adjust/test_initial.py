@@ -100,8 +100,8 @@ def assert_near(found, truth, deg, mm):
 
 
 def assert_small_misfit(start, px=1.0):
-    good = [r for i, r in enumerate(start.block_rms_px) if i not in start.excluded_blocks]
-    assert good
+    good = [r for i, r in enumerate(start.block_rms_px) if i not in start.excluded_blocks and np.isfinite(r)]
+    assert len(good) > 0.5 * len(start.block_rms_px)
     assert max(good) < px
 
 
@@ -137,7 +137,7 @@ def test_the_same_survey_gives_the_same_start():
 @pytest.mark.parametrize("damage", ["order", "gross"])
 def test_a_mis_detected_image_is_named_and_left_out(damage):
     rng = np.random.default_rng(2)
-    survey, views = single(rng)
+    survey, _ = single(rng)
     blocks = list(survey.image_blocks)
     uv = blocks[4].uv.copy()
     if damage == "order":
@@ -167,17 +167,17 @@ def test_one_gross_corner_leaves_its_image_in():
 def test_stereo_on_a_fixed_station_with_a_moved_board():
     rng = np.random.default_rng(4)
     right_from_left = pose((1, -8, 2), (-0.1, 0.01, 0.02))
-    blocks, views = [], board_views(rng, 10)
+    blocks, views = [], board_views(rng, 10, 0.7)
     for i, m in enumerate(views):
         blocks.append(block("left", f"e{i}", "board", grid(), m, rng))
         blocks.append(block("right", f"e{i}", "board", grid(), right_from_left @ m, rng))
-    flipped = replace(blocks[7], uv=blocks[7].uv[::-1].copy())  # the board read from its other end: fits, but elsewhere
-    blocks[7] = flipped
+    assert len(blocks[7].uv) == 88
+    blocks[7] = replace(blocks[7], uv=blocks[7].uv[::-1].copy())  # read from its other end: fits, but elsewhere
     cameras = (camera("left"), camera("right"))
     survey = Survey(cameras, (Station("s"),), targets=(board(motion="epoch"),), image_blocks=tuple(blocks))
     start = find_start(survey)
     left, right = (start.poses[("station_from_camera", c)].matrix() for c in ("left", "right"))
-    assert_near(inv(right) @ left, right_from_left, 0.2, 2)
+    assert_near(inv(right) @ left, right_from_left, 0.3, 3)
     assert start.excluded_blocks == (7,)
     assert "where the other blocks put it" in start.reasons[0]
     assert_small_misfit(start, 3.0)
@@ -201,7 +201,7 @@ def three_camera_head(rng, axes=("x", "z"), n=14):
             epoch = f"{name}{i}"
             world_from_camera = world_from_table @ table_motion("t", angles) @ head_from_camera
             blocks.append(block(name, epoch, "board", grid(), inv(world_from_camera) @ shift, rng))
-            readings.append(TableReading("t", epoch, angles[-len(axes):], np.eye(len(axes)) * 1e-10))
+            readings.append(TableReading("t", epoch, angles[-len(axes) :], np.eye(len(axes)) * 1e-10))
     station = Station("head", "table", table_id="t", mount_from_station=HELD)
     if len(axes) == 1:
         table = Table("t", axes, geometry=replace(Table("t").geometry, names=("zero_1",), values=np.zeros(1), free=()))
@@ -220,7 +220,7 @@ def test_three_cameras_without_common_view_on_a_two_axis_table():
     assert_near(start.poses[("world_from_table", "t")], world_from_table, 0.5, 8)
     for name, truth in cameras.items():
         assert_near(start.poses[("station_from_camera", name)], truth, 0.5, 8)
-    assert_small_misfit(start, 5.0)
+    assert_small_misfit(start, 1.0)
     assert ("table_angles", "t", "X0") in start.vectors
     assert ("table_geometry", "t") in start.vectors
 
@@ -229,19 +229,19 @@ def test_one_axis_table_gets_a_consistent_start():
     survey, _, _ = three_camera_head(np.random.default_rng(6), axes=("z",))
     start = find_start(survey)
     assert any("one axis" in note for note in start.notes)
-    assert_small_misfit(start, 10.0)
+    assert_small_misfit(start, 1.0)
 
 
 def test_two_cameras_without_common_view_by_their_motion():
     rng = np.random.default_rng(7)
     second_from_first = pose((5, 170, 0), (0.02, 0.05, -0.1))
-    world_from_first_board, world_from_second_board = np.eye(4), pose((3, 180, 5), (0.3, 0.1, -1.2))
+    second_from_first_board = pose((3, 180, 5), (0.3, 0.1, -1.2))
     blocks = []
     for i in range(12):
         m = pose(rng.uniform(-20, 20, 3))
         first_from_board = pose(t=(*rng.uniform(-0.03, 0.03, 2), 0.5)) @ m @ pose(t=(-0.1, -0.07, 0))
         blocks.append(block("a", f"e{i}", "A", grid(), first_from_board, rng))
-        second_from_other = second_from_first @ first_from_board @ world_from_second_board
+        second_from_other = second_from_first @ first_from_board @ second_from_first_board
         if second_from_other[2, 3] > 0.2:
             blocks.append(block("b", f"e{i}", "B", grid(), second_from_other, rng))
     blocks = [b for b in blocks if len(b.uv) > 12]
@@ -251,9 +251,9 @@ def test_two_cameras_without_common_view_by_their_motion():
     start = find_start(survey)
     a, b = (start.poses[("station_from_camera", c)].matrix() for c in ("a", "b"))
     assert_near(inv(b) @ a, second_from_first, 0.4, 6)
-    assert_near(inv(start.poses[("carrier_from_target", "A")].matrix()) @ start.poses[("carrier_from_target", "B")].matrix(),
-                world_from_second_board, 0.6, 8)  # fmt: skip
-    assert_small_misfit(start, 6.0)
+    first, second = (start.poses[("carrier_from_target", t)].matrix() for t in ("A", "B"))
+    assert_near(inv(first) @ second, second_from_first_board, 0.6, 8)
+    assert_small_misfit(start, 1.0)
 
 
 def looking_at(eye, at):
@@ -270,7 +270,8 @@ def looking_at(eye, at):
 def beacons(rng, n_known, n=12):
     x = rng.uniform([-1, -0.8, -0.3], [1, 0.8, 0.3], (n, 3))
     points = tuple(
-        Point(f"B{i}", PointParameter(x[i] if i < n_known else None, "held" if i < n_known else "free")) for i in range(n)
+        Point(f"B{i}", PointParameter(x[i] if i < n_known else None, "held" if i < n_known else "free"))
+        for i in range(n)
     )
     return x, points
 
@@ -278,7 +279,9 @@ def beacons(rng, n_known, n=12):
 def test_beacons_are_intersected_from_stations_resected_on_a_few():
     rng = np.random.default_rng(8)
     x, points = beacons(rng, 5)
-    eyes = [looking_at(np.array(e), (0, 0, 0)) for e in ((0.5, 0.3, -4.0), (2.5, 0, -3), (-2.5, 0.5, -3), (0, -2, -3.5))]
+    eyes = [
+        looking_at(np.array(e), (0, 0, 0)) for e in ((0.5, 0.3, -4.0), (2.5, 0, -3), (-2.5, 0.5, -3), (0, -2, -3.5))
+    ]
     blocks = tuple(block("c", f"e{i}", None, x, inv(m), rng) for i, m in enumerate(eyes))
     survey = Survey((camera(values=TRUE, station_from_camera=HELD),), (Station("s", "epoch"),), points=points,
                     image_blocks=blocks)  # fmt: skip
@@ -295,7 +298,9 @@ def test_relay_station_places_its_cameras_from_beacons_with_observed_coordinates
     x, points = beacons(rng, 0)
     station_from = {"a": pose(), "b": pose((0, 30, 0), (0.2, 0, 0)), "c": pose((0, -30, 5), (-0.2, 0, 0))}
     world_from_station = looking_at(np.array([0.2, 0.1, -3.0]), (0, 0, 0))
-    wide = np.concatenate([x, x @ pose((0, 30, 0))[:3, :3].T + [1.5, 0, 0], x @ pose((0, -30, 0))[:3, :3].T - [1.5, 0, 0]])
+    wide = np.concatenate(
+        [x, x @ pose((0, 30, 0))[:3, :3].T + [1.5, 0, 0], x @ pose((0, -30, 0))[:3, :3].T - [1.5, 0, 0]]
+    )
     points = tuple(Point(f"B{i}") for i in range(len(wide)))
     known = Coordinates(tuple(PositionRef(p.point_id) for p in points), wide, np.eye(3 * len(wide)) * 1e-8)
     blocks = tuple(block(c, "e", None, wide, inv(world_from_station @ m), rng) for c, m in station_from.items())
@@ -346,7 +351,7 @@ def test_pairs_alone_place_stations_and_rotations_do_where_nothing_else_does():
 
 def test_a_free_world_is_moved_onto_observed_coordinates():
     rng = np.random.default_rng(11)
-    survey, views = single(rng, 6)
+    survey, _ = single(rng, 6)
     world_from_board = pose((100, 30, -60), (5, 6, 7))
     rows = (0, 10, 77)
     seen_at = grid()[list(rows)] @ world_from_board[:3, :3].T + world_from_board[:3, 3]
