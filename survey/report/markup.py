@@ -28,7 +28,7 @@ def general(value: float | None, digits: int = 4) -> str:
     """A number of unknown size with its significant digits."""
     if value is None or not math.isfinite(value):
         return MISSING
-    return f"{value:.{digits}g}".replace("-", MINUS)
+    return f"{value + 0.0:.{digits}g}".replace("-", MINUS)  # adding zero takes the sign off a negative one
 
 
 def decimals_for(sigma: float | None, most: int = 7) -> int | None:

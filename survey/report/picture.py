@@ -72,10 +72,12 @@ def perspective(everything: FloatArray) -> View:
 
 
 def enlargement(scene: Scene, ellipsoid: float, extent: float) -> float:
-    """How much the ellipsoids are enlarged: a round number that draws a typical one at about 3 % of the picture."""
+    """How much ellipsoids are enlarged, a round number: a typical one to 3.5 %, the largest to 20 % of the extent."""
     semi_axes = [ellipsoid * float(np.sqrt(max(np.linalg.eigvalsh(s.cov)[-1], 0.0))) for s in scene.spots]
     positive = [a for a in semi_axes if a > 0.0]
-    return d.round_below(0.035 * extent / float(np.median(positive))) if positive else 1.0
+    if not positive:
+        return 1.0
+    return d.round_below(extent * min(0.035 / float(np.median(positive)), 0.2 / max(positive)))
 
 
 def _ground(view: View, everything: FloatArray) -> list[str]:
@@ -173,6 +175,7 @@ def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, elli
             parts.append(d.polyline(foot, d.FAINT, 0.8, ' stroke-dasharray="2 2"'))
     parts += [d.polygon(view.to_picture(x), "#4d5b69", d.INK, 1.0, ' fill-opacity="0.18"') for _, x in scene.outlines]
     parts += [d.dot(x, y, 1.2, d.INK) for _, cloud in scene.clouds for x, y in view.to_picture(cloud)]
+    parts += [d.dot(x, y, 1.4, d.GREEN, ' fill-opacity="0.6"') for m in scene.moves for x, y in view.to_picture(m)]
     parts += _tables(view, scene, 0.06 * extent)
     parts += [_frustum(view, s, 0.075 * extent) for s in sorted(scene.shots, key=lambda s: s.main)]
     for spot in sorted(scene.spots, key=lambda s: s.kind):

@@ -38,13 +38,14 @@ class Shot:
 
 @dataclass(eq=False)
 class Scene:
-    """Everything to be drawn; outlines are closed polygons (k, 3), axes are directions of table axes (2, 3) m."""
+    """Everything to be drawn: outlines are closed polygons (k, 3) m, moves the origins of stations at single epochs."""
 
     spots: list[Spot] = field(default_factory=list)
     shots: list[Shot] = field(default_factory=list)
     outlines: list[tuple[str, FloatArray]] = field(default_factory=list)
     clouds: list[tuple[str, FloatArray]] = field(default_factory=list)
     tables: list[tuple[str, Pose3, tuple[str, ...]]] = field(default_factory=list)
+    moves: list[FloatArray] = field(default_factory=list)
     n_left_out: int = 0
 
     def positions(self) -> FloatArray:
@@ -52,6 +53,7 @@ class Scene:
         parts = [np.array([s.x for s in self.spots]).reshape(-1, 3)]
         parts.append(np.array([np.asarray(s.pose.translation()) for s in self.shots]).reshape(-1, 3))
         parts += [x for _, x in self.outlines + self.clouds]
+        parts.append(np.array(self.moves).reshape(-1, 3))
         parts.append(np.array([np.asarray(p.translation()) for _, p, _ in self.tables]).reshape(-1, 3))
         return np.concatenate(parts)
 
@@ -111,8 +113,11 @@ def _add_stations(scene: Scene, adjustment: Adjustment, scale: Scale) -> None:
         if name[0] == "world_from_station" and isinstance(estimate.value, Pose3):
             R = estimate.value.rotation().matrix()
             cov = scale.factor**2 * R @ estimate.cov[3:, 3:] @ R.T
-            label = name[1] if len(name) == 2 else ""
-            scene.spots.append(Spot(label, "station", np.asarray(estimate.value.translation()), cov))
+            x = np.asarray(estimate.value.translation())
+            if len(name) == 2:
+                scene.spots.append(Spot(name[1], "station", x, cov))
+            else:
+                scene.moves.append(x)
 
 
 def _add_targets(scene: Scene, adjustment: Adjustment, frames: AdjustedFrames, epochs: list[str]) -> None:

@@ -99,8 +99,9 @@ def _lens(lens: dict[str, Any] | None) -> str:
         parts.append(f"{name} {sigmas[name]:.2g} px")
     if lens["not_significant"]:
         parts.append(f"not significant: {' '.join(lens['not_significant'])}")
-    if lens["correlations_over_95_percent"]:
-        strong = lens["correlations_over_95_percent"][0]
+    # fx and fy of a camera always go together; that is no news
+    strong = next((p for p in lens["correlations_over_95_percent"] if {p["a"], p["b"]} != {"fx", "fy"}), None)
+    if strong is not None:
         parts.append(f"{strong['a']}-{strong['b']} correlated {100 * strong['correlation']:.1f} %")
     return ", ".join(parts)
 

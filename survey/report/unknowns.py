@@ -21,6 +21,7 @@ from survey.report.markup import (
 )
 
 _MOST_ROWS = 250
+_MANY_EPOCHS = 12
 _POSE_COLUMNS = ("<Pose", "<Epoch", "x [mm]", "y [mm]", "z [mm]", "rx [°]", "ry [°]", "rz [°]", "<Status")
 _POSE_NOTE = (
     "A pose a_from_b is the origin of b in a and R = Rz Ry Rx. Below each coordinate its sigma along the axes of a in "
@@ -53,7 +54,11 @@ def _value_in(unit: str, value: float | None, sigma: float | None, sigma_unit: s
 def vector_table(entry: dict[str, Any], ratios: dict[str, float] | None = None) -> str:
     """Components of a lens, a table or a warp; ``ratios`` adds the column of significance."""
     rows = []
+    idle = []
     for name, value, unit, sigma, sigma_unit, status in _components(entry):
+        if status == "held" and not value:
+            idle.append(f"<code>{esc(name)}</code>")
+            continue
         row = [f"<code>{esc(name)}</code>", _value_in(unit, value, sigma, sigma_unit), sigma_text(sigma)]
         shown = unit if unit == sigma_unit else f"{unit} (σ {sigma_unit})"
         row += [esc(shown.replace("_", " ")), status_pill(status)]
@@ -63,7 +68,8 @@ def vector_table(entry: dict[str, Any], ratios: dict[str, float] | None = None) 
             row.append(pill("warn", fixed(ratio, 1)) if weak else fixed(ratio, 1))
         rows.append(row)
     columns = ["<Parameter", "Value", "σ", "<Unit", "<Status"] + ([] if ratios is None else ["|value| / σ"])
-    return table(columns, rows)
+    note = f'<p class="note">Held at zero: {", ".join(idle)}.</p>' if idle else ""
+    return (table(columns, rows) if rows else "") + note
 
 
 def pose_row(name: str, epoch: str, entry: dict[str, Any]) -> list[str]:
@@ -151,9 +157,12 @@ def _remarks(lens: dict[str, Any]) -> str:
         f"<code>{esc(p['a'])}</code> with <code>{esc(p['b'])}</code> {fixed(100 * p['correlation'], 1)} %"
         for p in strong
     )
-    remarks = [
-        f"{pill('warn', 'correlated above 95 %')} {named}" if strong else "No correlation above 95 % within the lens."
-    ]
+    # fx and fy of a camera always go together; alone they are no warning
+    kind = "warn" if any({p["a"], p["b"]} != {"fx", "fy"} for p in strong) else "quiet"
+    correlation = (
+        f"{pill(kind, 'correlated above 95 %')} {named}" if strong else "No correlation above 95 % within the lens."
+    )
+    remarks = [correlation]
     if weak:
         names = ", ".join(f"<code>{esc(name)}</code>" for name in weak)
         remarks.append(f"{pill('warn', 'not significant')} {names}: not distinguishable from zero at 95 %.")
@@ -168,7 +177,13 @@ def stations(c: Context) -> str:
         for i, e in c.solution[kind].items()
         for row in _pose_rows(i, e)
     ]
-    return section("poses", "Poses of stations, tables and targets", _limited(_POSE_COLUMNS, rows), _POSE_NOTE)
+    by_epoch = [row for row in rows if row[1]]
+    body = _limited(_POSE_COLUMNS, rows)
+    if len(by_epoch) > _MANY_EPOCHS:
+        body = _limited(_POSE_COLUMNS, [row for row in rows if not row[1]])
+        title = f"{count(len(by_epoch))} poses by epoch"
+        body += f"<details><summary>{title}</summary>{_limited(_POSE_COLUMNS, by_epoch)}</details>"
+    return section("poses", "Poses of stations, tables and targets", body, _POSE_NOTE)
 
 
 def tables(c: Context) -> str:
@@ -186,7 +201,7 @@ def tables(c: Context) -> str:
                 + [x for _, v, u, s, su, _ in _components(angles) for x in (_value_in(u, v, s, su), sigma_text(s))]
                 for epoch, angles in entry["epochs"].items()
             ]
-            opened = " open" if len(rows) <= 12 else ""
+            opened = " open" if len(rows) <= _MANY_EPOCHS else ""
             title = f"{count(len(rows))} epochs: adjusted angles"
             body += f"<details{opened}><summary>{title}</summary>{_limited(columns, rows)}</details>"
         parts.append(body)
