@@ -32,7 +32,8 @@ CONVENTIONS = {
 class RunInfo:
     """What was run: everything in a result file that the adjustment itself does not know.
 
-    date: time stamp, ISO 8601. seconds: duration per step. sigmas: how sigmas of unknowns are given.
+    date: time stamp, ISO 8601. seconds: duration per step; printed, but in no file, so that equal input gives equal
+    files. sigmas: how sigmas of unknowns are given.
     """
 
     folder: str

@@ -136,13 +136,11 @@ def picture(c: Context) -> str:
 
 
 def inputs(c: Context) -> str:
-    """What went in: files with their hashes, options, versions; how long it took."""
+    """What went in: files with their hashes, options, versions."""
     i = c.solution["inputs"]
     files = table(("<File", "<Hash"), [(esc(k), f"<code>{esc(v)}</code>") for k, v in i["hashes"].items()])
     parts = [files] if i["hashes"] else []
     for title, entries in (("Options", i["options"]), ("Versions", i["versions"])):
         if entries:
             parts.append(f"<h3>{title}</h3>" + definition((k, esc(v)) for k, v in entries.items()))
-    if c.run.seconds:
-        parts.append("<h3>Duration</h3>" + definition((k, f"{v:.2f} s") for k, v in c.run.seconds.items()))
     return section("inputs", "Inputs", "".join(parts))

@@ -22,6 +22,8 @@ def summary_text(adjustment: Adjustment, run: RunInfo) -> str:
         lines += part(solution)
     lines += _observations(adjustment, solution["summary"]["suspects"]["standardized_limit"])
     lines += _points(solution)
+    if run.seconds:
+        lines += ["", "  " + ", ".join(f"{step} {seconds:.2f} s" for step, seconds in run.seconds.items())]
     return "\n".join(line.rstrip() for line in lines) + "\n"
 
 
