@@ -227,8 +227,9 @@ def _adjust(arguments: argparse.Namespace) -> int:
         _print_json(outcome.summary())
     else:
         print(outcome.text())
-        for path in outcome.paths.values():
-            _say(arguments, f"written: {path}")
+        _say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+    if _is(arguments, "verbose"):
+        _say(arguments, *(f"{step}: {seconds:.2f} s" for step, seconds in outcome.run.seconds.items()))
     return code
 
 
@@ -281,8 +282,9 @@ def _batch_table(rows: Sequence[Mapping[str, Any]]) -> str:
     for row in rows:
         numbers = ""
         if "summary" in row:
-            found = row["summary"].get("summary", row["summary"])
-            numbers = f"{found['sigma0']:6.3f}  {found['redundancy']:10d}"
+            found = row["summary"]["summary"]
+            sigma0 = "-" if found["sigma0"] is None else f"{found['sigma0']:.3f}"
+            numbers = f"{sigma0:>6}  {found['redundancy']:10d}"
         lines.append(f"{row['folder']:<{width}}  {states[row['exit_code']]:<18}  {numbers}".rstrip())
     return "\n".join(lines)
 
