@@ -19,16 +19,6 @@ from adjust.model import FloatArray, IntArray
 from adjust.result import ParameterName
 from adjust.unknowns import Unknown
 
-GAUGES = (
-    "position of the whole survey along world x",
-    "position of the whole survey along world y",
-    "position of the whole survey along world z",
-    "rotation of the whole survey about world x",
-    "rotation of the whole survey about world y",
-    "rotation of the whole survey about world z",
-    "scale of the whole survey",
-)
-
 
 def _skew(x: FloatArray) -> FloatArray:
     return np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])

@@ -2,8 +2,9 @@
 
 import gtsam
 import numpy as np
+from scipy.linalg import qr
 
-from adjust.datum import GAUGES, Stacking, gauge, stacking, times, visible_keys
+from adjust.datum import Stacking, gauge, stacking, times, visible_keys
 from adjust.errors import IndeterminateError
 from adjust.graph import AdjustmentGraph
 from adjust.model import FloatArray
@@ -76,45 +77,62 @@ def describe_null_space(
     null, scale = null_space(linear, stack)
     if null.shape[1] == 0:
         return None
+    scaled = np.linalg.qr(null * scale[:, None])[0]
     lines: list[str] = []
-    rest = _take_gauges(graph, keys, null * scale[:, None], scale, values, lines)
-    rest = _take_station_frames(graph, keys, rest, scale, values, lines)
-    names = _take_rest(graph, stack, rest, lines)
+    found = [_gauges(graph, keys, scaled, scale, values, lines)]
+    found += _station_frames(graph, keys, scaled, scale, values, lines)
+    rest = _complement(scaled, np.hstack(found))
+    names = _rest(graph, stack, rest / scale[:, None], lines)
     head = f"the observations and the datum leave {null.shape[1]} directions undetermined:"
     return IndeterminateError("\n  - ".join([head, *lines]), tuple(names) or tuple(lines))
 
 
+def _complement(null: FloatArray, found: FloatArray) -> FloatArray:
+    """Orthonormal basis of what is left of span(null) beside span(found), which lies in it."""
+    if found.shape[1] == 0:
+        return null
+    U, s, _ = np.linalg.svd(null.T @ found, full_matrices=True)
+    rank = int(np.sum(s > 1e-6 * s.max()))
+    return np.asarray(null @ U[:, rank:])
+
+
 def _intersection(null: FloatArray, B: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Coefficients (b, k) of B's columns that lie in span(null), and null's orthonormal rest."""
-    Q = np.linalg.qr(null)[0]
+    """What span(null) (orthonormal) and span(B) have in common: coefficients (b, k) of B's columns, basis (n, k)."""
     lengths = np.linalg.norm(B, axis=0)
     usable = np.flatnonzero(lengths > 1e-12)
-    unit = B[:, usable] / lengths[usable]
-    U, s, Vt = np.linalg.svd(unit, full_matrices=False)
+    U, s, Vt = np.linalg.svd(B[:, usable] / lengths[usable], full_matrices=False)
     keep = s > 1e-9
     basis, back = U[:, keep], Vt[keep].T / s[keep]
-    L, cosines, Rt = np.linalg.svd(basis.T @ Q)
+    L, cosines, _ = np.linalg.svd(basis.T @ null)
     inside = np.flatnonzero(cosines > 1.0 - 1e-7)
     coefficients = np.zeros((B.shape[1], len(inside)))
     coefficients[usable] = (back @ L[:, inside]) / lengths[usable, None]
-    others = np.ones(Q.shape[1], dtype=bool)
-    others[inside] = False
-    return coefficients, Q @ Rt[others].T
+    return coefficients, basis @ L[:, inside]
 
 
-def _take_gauges(
+def _gauges(
     graph: AdjustmentGraph, keys: list[int], null: FloatArray, scale: FloatArray, values: gtsam.Values, lines: list[str]
 ) -> FloatArray:
     B = np.concatenate([gauge(graph, graph.unknowns.by_key[k], values) for k in keys]) * scale[:, None]
-    coefficients, rest = _intersection(null, B)
+    coefficients, common = _intersection(null, B)
     if coefficients.shape[1]:
         share = np.abs(coefficients) * np.linalg.norm(B, axis=0)[:, None]
-        involved = [GAUGES[i] for i in range(7) if share[i].max() > 1e-3 * share.max()]
+        involved = [i for i in range(7) if share[i].max() > 1e-3 * share.max()]
+        count = "" if len(involved) == coefficients.shape[1] else f"{coefficients.shape[1]} directions of "
         lines.append(
-            f"datum, {coefficients.shape[1]} of: {', '.join(involved)}; hold a target, a station or coordinates, "
-            "observe coordinates or a distance, or set the datum to inner constraints"
+            f"the datum: {count}the {_gauge_text(involved)} of the whole survey: hold a target, a station or "
+            "coordinates, observe coordinates or a distance, or set the datum to inner constraints"
         )
-    return rest
+    return common
+
+
+def _gauge_text(involved: list[int]) -> str:
+    parts = []
+    for what, first in (("position along world", 0), ("rotation about world", 3)):
+        axes = ["xyz"[i - first] for i in involved if first <= i < first + 3]
+        if axes:
+            parts.append(f"{what} {', '.join(axes)}")
+    return " and the ".join(parts + (["scale"] if 6 in involved else []))
 
 
 def _frame_motion(graph: AdjustmentGraph, keys: list[int], station_id: str, values: gtsam.Values) -> FloatArray | None:
@@ -137,38 +155,35 @@ def _frame_motion(graph: AdjustmentGraph, keys: list[int], station_id: str, valu
     return np.concatenate([motion.get(k, np.zeros((u.by_key[k].dim, 6))) for k in keys])
 
 
-def _take_station_frames(
+def _station_frames(
     graph: AdjustmentGraph, keys: list[int], null: FloatArray, scale: FloatArray, values: gtsam.Values, lines: list[str]
-) -> FloatArray:
+) -> list[FloatArray]:
+    found = []
     for station in graph.survey.stations:
-        motion = _frame_motion(graph, keys, station.station_id, values) if null.shape[1] else None
+        motion = _frame_motion(graph, keys, station.station_id, values)
         if motion is None:
             continue
-        coefficients, rest = _intersection(null, motion * scale[:, None])
+        coefficients, common = _intersection(null, motion * scale[:, None])
         if coefficients.shape[1]:
-            null = rest
+            found.append(common)
             what = "the frame" if coefficients.shape[1] == 6 else f"{coefficients.shape[1]} directions of the frame"
             mount = " or its mount" if station.motion == "table" else ""
             lines.append(
-                f"{what} of station {station.station_id}: it is not separated from the poses of its cameras; hold one "
+                f"{what} of station {station.station_id} is not separated from the poses of its cameras: hold one "
                 f"camera on it{mount}"
             )
-    return null
+    return found
 
 
-def _take_rest(graph: AdjustmentGraph, stack: Stacking, null: FloatArray, lines: list[str]) -> list[str]:
-    """Name what moves together in what is left; sparse directions first (varimax would be prettier, this is enough)."""
+def _rest(graph: AdjustmentGraph, stack: Stacking, null: FloatArray, lines: list[str]) -> list[str]:
+    """Name what moves together in what is left, each direction by one component that no other one moves."""
+    if null.shape[1] == 0:
+        return []
+    size = np.abs(null).max(axis=1)
+    pivots = qr((null / np.where(size > 0, size, 1.0)[:, None] ** 0.5).T, pivoting=True, mode="r")[1][: null.shape[1]]
     names: list[str] = []
-    for vector in null.T:
-        weight = np.abs(vector) / np.abs(vector).max()
-        shares = []
-        for key, place in stack.at.items():
-            unknown, part = graph.unknowns.by_key[key], weight[place]
-            strong = [_READABLE.get(c, c) for c, s in zip(unknown.components, part, strict=True) if s > 0.1]
-            if strong:
-                shares.append((float(part.max()), f"{readable(unknown)} ({', '.join(strong)})"))
-        shares.sort(key=lambda item: -item[0])
-        texts = [text for _, text in shares]
+    for vector in (null @ np.linalg.inv(null[pivots])).T:
+        texts = _moving(graph, stack, vector)
         names += texts
         more = f" and {len(texts) - 6} more" if len(texts) > 6 else ""
         lines.append(
@@ -177,3 +192,24 @@ def _take_rest(graph: AdjustmentGraph, stack: Stacking, null: FloatArray, lines:
             else f"{texts[0]}: no observation depends on it; measure or hold it"
         )
     return list(dict.fromkeys(names))
+
+
+def _moving(graph: AdjustmentGraph, stack: Stacking, vector: FloatArray) -> list[str]:
+    """What moves along ``vector``, largest share first, what there is once before what there is at every epoch."""
+    weight = np.abs(vector) / np.abs(vector).max()
+    shares: dict[tuple[str, ...], tuple[float, Unknown, dict[str, None], int]] = {}
+    for key, place in stack.at.items():
+        unknown, part = graph.unknowns.by_key[key], weight[place]
+        strong = [_READABLE.get(c, c) for c, s in zip(unknown.components, part, strict=True) if s > 0.1]
+        if strong:
+            at_epochs = len(unknown.name) > 2
+            same = unknown.name[:2] if at_epochs else unknown.name
+            most, first, components, count = shares.get(same, (0.0, unknown, {}, 0))
+            components |= dict.fromkeys(strong)
+            shares[same] = max(most, float(part.max())), first, components, count + 1
+    ordered = sorted(shares.values(), key=lambda item: (len(item[1].name) > 2, -item[0]))
+    out = []
+    for _, unknown, components, count in ordered:
+        owner = readable(unknown) if count == 1 else f"{readable(unknown).split(' at epoch ')[0]} at {count} epochs"
+        out.append(f"{owner} ({', '.join(components)})")
+    return out
