@@ -1,8 +1,8 @@
 """Images as a real lens would see them: boards, marker blocks and LED beacons, with exactly known geometry.
 
-The lens is OpenCV's (fx fy cx cy, k1 k2 p1 p2 k3 k4 k5 k6), the centre of the first pixel is (0, 0). Each pixel
-integrates over its area (a Fibonacci lattice of rays where it sees an edge), then follow a Gaussian point spread,
-illumination, Gaussian noise and the digits of the sensor. What is nearer hides what is behind it.
+The lens is OpenCV's (fx fy cx cy, k1 k2 p1 p2 k3 k4 k5 k6), the centre of the first pixel is (0, 0). Sub-pixels
+integrate over their area (a Fibonacci lattice of rays where they see an edge); then follow a Gaussian point spread, the
+sum to pixels, illumination, Gaussian noise and the digits of the sensor. What is nearer hides what is behind it.
 
 Textures: the square of a checkerboard between r0c0, r0c1, r1c1 and r1c0 is dark, as is the outer one at r0c0; boards
 have one row of squares outside the inner corners and a bright margin. Targets show a plain back.
@@ -83,7 +83,9 @@ class Imaging:
     """How light becomes digits.
 
     blur_px: standard deviation of the point spread. noise_gray: of each pixel. gradient: relative change of the
-    illumination across the image's width and height. samples: rays in a pixel that sees an edge.
+    illumination across the image's width and height. samples: rays in a sub-pixel that sees an edge. oversampling:
+    sub-pixels across a pixel in which the point spread is applied (with 1 it becomes a staircase of whole pixels, which
+    displaces axis-parallel edges by up to 0.03 px at a blur of 0.7 px).
     bits: grey values 0 to 255 are scaled to the full range of that many bits; above 8 the image is 16-bit.
     """
 
@@ -91,7 +93,8 @@ class Imaging:
     noise_gray: float = 2.0
     background_gray: float = 128.0
     gradient: tuple[float, float] = (0.0, 0.0)
-    samples: Literal[34, 55, 89, 144, 233, 377] = 89
+    samples: Literal[21, 34, 55, 89, 144, 233, 377] = 55
+    oversampling: int = 3
     bits: int = 8
 
 
@@ -132,11 +135,7 @@ def render(
     """The image (height, width) of all targets and beacons; equal arguments give equal images."""
     imaging = imaging or Imaging()
     facets = [facet for placed in targets for facet in _facets(placed)]
-    image = _planes(camera, facets, imaging)
-    if imaging.blur_px > 0.0:
-        image = np.asarray(
-            cv2.GaussianBlur(image, (0, 0), imaging.blur_px, borderType=cv2.BORDER_REPLICATE), np.float32
-        )
+    image = _blurred_planes(camera, facets, imaging)
     image *= _illumination(camera.image_size, imaging.gradient)
     if beacons is not None:
         _add_beacons(image, camera, beacons, facets, imaging.blur_px)
@@ -146,6 +145,16 @@ def render(
     full = 2**imaging.bits - 1
     digits = np.clip(np.rint(image * (full / 255.0)), 0, full)
     return np.asarray(digits, np.uint8) if imaging.bits <= 8 else np.asarray(digits, np.uint16)
+
+
+def _blurred_planes(camera: BrownCamera, facets: list[_Facet], imaging: Imaging) -> _Gray32:
+    """Grey values under the point spread, which acts on sub-pixels before they are summed to pixels."""
+    n = imaging.oversampling if imaging.blur_px > 0.0 else 1
+    image = _planes(camera, n, facets, imaging)
+    if imaging.blur_px > 0.0:
+        blurred = cv2.GaussianBlur(image, (0, 0), n * imaging.blur_px, borderType=cv2.BORDER_REPLICATE)
+        image = np.asarray(cv2.resize(blurred, camera.image_size, interpolation=cv2.INTER_AREA), np.float32)
+    return image
 
 
 def _illumination(image_size: tuple[int, int], gradient: tuple[float, float]) -> _Gray32:
@@ -163,21 +172,21 @@ def _rays(camera: BrownCamera) -> FloatArray:
 
 
 def _lattice(n: int) -> FloatArray:
-    """Fibonacci lattice (n, 2) in the unit square; no two points share a row or column, so it suits axis-parallel edges too."""
+    """Fibonacci lattice (n, 2) in the unit square; no two points share a row or column, which suits axis-parallel edges."""
     previous, current = 1, 1
     while current < n:
         previous, current = current, previous + current
     if current != n:
-        raise SurveyError(f"samples: {n} is not a Fibonacci number; use 34, 55, 89, 144, 233 or 377")
+        raise SurveyError(f"samples: {n} is not a Fibonacci number; use 21, 34, 55, 89, 144, 233 or 377")
     i = np.arange(n)
     return np.stack([(i + 0.5) / n, ((i * previous) % n + 0.5) / n], axis=1)
 
 
-def _planes(camera: BrownCamera, facets: list[_Facet], imaging: Imaging) -> _Gray32:
-    """Grey values before the point spread, float32."""
+def _planes(camera: BrownCamera, n: int, facets: list[_Facet], imaging: Imaging) -> _Gray32:
+    """Grey values of n x n sub-pixels in each pixel, before the point spread."""
     width, height = camera.image_size
     if not facets:
-        return np.full((height, width), imaging.background_gray, np.float32)
+        return np.full((n * height, n * width), imaging.background_gray, np.float32)
     n_x, n_y = max(len(f.x_edges) for f in facets), max(len(f.y_edges) for f in facets)
     x_edges, y_edges = np.zeros((len(facets), n_x)), np.zeros((len(facets), n_y))
     cells, counts = np.zeros((len(facets), n_y - 1, n_x - 1)), np.zeros((len(facets), 2), np.int64)
@@ -188,7 +197,7 @@ def _planes(camera: BrownCamera, facets: list[_Facet], imaging: Imaging) -> _Gra
     inverse = np.stack([np.linalg.inv(f.camera_from_facet) for f in facets])
     bounds = np.stack([_bounds(f) for f in facets])
     planes = (inverse, bounds, counts, x_edges, y_edges, cells)
-    image = draw_facets(_rays(camera), *planes, imaging.background_gray, _lattice(imaging.samples))
+    image = draw_facets(_rays(camera), n, planes, float(imaging.background_gray), _lattice(imaging.samples))
     return np.asarray(image, np.float32)
 
 

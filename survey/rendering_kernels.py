@@ -5,6 +5,8 @@
 import numpy as np
 from numba import njit
 
+_BLOCK = 6  # pixels; lens distortion is linear across a block to far below the size of a sub-pixel
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _distort(x, y, d):
@@ -107,46 +109,91 @@ def _footprint(corners, m, count, x_edges, y_edges):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def draw_facets(rays, facet_from_ray, bounds, counts, x_edges, y_edges, cells, background, samples):
-    """Grey values (height, width), each integrated over its pixel; one ray a pixel where that sees a single cell.
+def _classify(corners, facet_from_ray, bounds, counts, x_edges, y_edges, cells, background, candidates):
+    """What a quadrangle of rays (4, 2) sees: number of candidate facets, whether it needs sampling, else its grey value."""
+    x_low, x_high = corners[:, 0].min(), corners[:, 0].max()
+    y_low, y_high = corners[:, 1].min(), corners[:, 1].max()
+    n, mixed, nearest, gray = 0, False, 0.0, background
+    for f in range(facet_from_ray.shape[0]):
+        if x_high < bounds[f, 0] or x_low > bounds[f, 1] or y_high < bounds[f, 2] or y_low > bounds[f, 3]:
+            continue
+        kind, depth, i, j = _footprint(corners, facet_from_ray[f], counts[f], x_edges[f], y_edges[f])
+        if kind == 0:
+            continue
+        candidates[n] = f
+        n += 1
+        mixed = mixed or kind == 2
+        if kind == 1 and depth > nearest:
+            nearest, gray = depth, cells[f, j, i]
+    return n, mixed, gray
 
-    bounds: (F, 4) bounding boxes in x/z, y/z. samples: (S, 2) offsets in the unit square.
-    """
-    height, width = rays.shape[0] - 1, rays.shape[1] - 1
-    image = np.full((height, width), background)
-    corners = np.empty((4, 2))
-    candidates = np.empty(facet_from_ray.shape[0], np.int64)
-    for v in range(height):
-        for u in range(width):
-            corners[0], corners[1] = rays[v, u], rays[v, u + 1]
-            corners[2], corners[3] = rays[v + 1, u], rays[v + 1, u + 1]
-            x_low, x_high = corners[:, 0].min(), corners[:, 0].max()
-            y_low, y_high = corners[:, 1].min(), corners[:, 1].max()
-            n, mixed, nearest, gray = 0, False, 0.0, background
-            for f in range(facet_from_ray.shape[0]):
-                if not (
-                    x_high >= bounds[f, 0]
-                    and x_low <= bounds[f, 1]
-                    and y_high >= bounds[f, 2]
-                    and y_low <= bounds[f, 3]
-                ):
-                    continue
-                kind, depth, i, j = _footprint(corners, facet_from_ray[f], counts[f], x_edges[f], y_edges[f])
-                if kind == 0:
-                    continue
-                candidates[n] = f
-                n += 1
-                mixed = mixed or kind == 2
-                if kind == 1 and depth > nearest:
-                    nearest, gray = depth, cells[f, j, i]
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _inner(corners, s, t, out):
+    """Ray at (s, t) in the unit square between four corner rays (bilinear)."""
+    w0, w1, w2, w3 = (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
+    out[0] = w0 * corners[0, 0] + w1 * corners[1, 0] + w2 * corners[2, 0] + w3 * corners[3, 0]
+    out[1] = w0 * corners[0, 1] + w1 * corners[1, 1] + w2 * corners[2, 1] + w3 * corners[3, 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw_pixel(corners, sub, n, facets, background, samples, candidates, ray, out):
+    """Grey values of the n x n sub-pixels of one pixel."""
+    facet_from_ray, bounds, counts, x_edges, y_edges, cells = facets
+    for b in range(n):
+        for a in range(n):
+            for k in range(4):
+                _inner(corners, (a + k % 2) / n, (b + k // 2) / n, sub[k])
+            m, mixed, gray = _classify(
+                sub, facet_from_ray, bounds, counts, x_edges, y_edges, cells, background, candidates
+            )
             if mixed:
-                total = 0.0
+                gray = 0.0
                 for k in range(samples.shape[0]):
-                    s, t = samples[k, 0], samples[k, 1]
-                    w0, w1, w2, w3 = (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
-                    x = w0 * corners[0, 0] + w1 * corners[1, 0] + w2 * corners[2, 0] + w3 * corners[3, 0]
-                    y = w0 * corners[0, 1] + w1 * corners[1, 1] + w2 * corners[2, 1] + w3 * corners[3, 1]
-                    total += _sample(x, y, facet_from_ray, counts, x_edges, y_edges, cells, background, candidates, n)
-                gray = total / samples.shape[0]
-            image[v, u] = gray
+                    _inner(sub, samples[k, 0], samples[k, 1], ray)
+                    gray += _sample(
+                        ray[0], ray[1], facet_from_ray, counts, x_edges, y_edges, cells, background, candidates, m
+                    )
+                gray /= samples.shape[0]
+            out[b, a] = gray
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def draw_facets(rays, n, facets, background, samples):
+    """Grey values (n * height, n * width) of sub-pixels, each integrated over its area.
+
+    Blocks of pixels and pixels that see a single cell are filled at once. rays: of the pixel corners.
+    facets: facet_from_ray (F, 3, 3), bounding boxes in x/z, y/z (F, 4), numbers of cells (F, 2), edges, grey values.
+    samples: (S, 2) offsets in the unit square of a sub-pixel.
+    """
+    facet_from_ray, bounds, counts, x_edges, y_edges, cells = facets
+    height, width = rays.shape[0] - 1, rays.shape[1] - 1
+    image = np.full((n * height, n * width), np.float32(background), np.float32)
+    corners, sub, ray = np.empty((4, 2)), np.empty((4, 2)), np.empty(2)
+    candidates = np.empty(facet_from_ray.shape[0], np.int64)
+    for v0 in range(0, height, _BLOCK):
+        for u0 in range(0, width, _BLOCK):
+            v1, u1 = min(v0 + _BLOCK, height), min(u0 + _BLOCK, width)
+            corners[0], corners[1], corners[2], corners[3] = rays[v0, u0], rays[v0, u1], rays[v1, u0], rays[v1, u1]
+            if not np.isnan(corners).any():
+                _, mixed, gray = _classify(
+                    corners, facet_from_ray, bounds, counts, x_edges, y_edges, cells, background, candidates
+                )
+                if not mixed:
+                    image[n * v0 : n * v1, n * u0 : n * u1] = gray
+                    continue
+            for v in range(v0, v1):
+                for u in range(u0, u1):
+                    corners[0], corners[1] = rays[v, u], rays[v, u + 1]
+                    corners[2], corners[3] = rays[v + 1, u], rays[v + 1, u + 1]
+                    if np.isnan(corners).any():
+                        continue
+                    _, mixed, gray = _classify(
+                        corners, facet_from_ray, bounds, counts, x_edges, y_edges, cells, background, candidates
+                    )
+                    pixel = image[n * v : n * v + n, n * u : n * u + n]
+                    if mixed:
+                        _draw_pixel(corners, sub, n, facets, background, samples, candidates, ray, pixel)
+                    else:
+                        pixel[:] = gray
     return image

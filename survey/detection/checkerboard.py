@@ -1,0 +1,113 @@
+"""Finding a checkerboard's inner corners, in an order that its colours define."""
+
+import cv2
+import numpy as np
+
+from adjust.model import BoolArray, FloatArray
+from survey.detection.corners import CornerFit, refine_corners
+from survey.detection.gray import Gray8, Gray32
+from survey.detection.results import Detection, nothing_found
+from survey.targets import Checkerboard
+
+_COARSE_PX = 900  # longer side of the image in which the board is looked for first
+
+
+def find_checkerboard(gray: Gray32, gray8: Gray8, target: Checkerboard) -> Detection:
+    """All inner corners of the board that could be measured; empty where the board is not complete in the image.
+
+    Order: rows and columns are right-handed as on the board's front, and the square between r0c0, r0c1, r1c1 and r1c0
+    is dark. Where one of the two numbers of corners is odd and the other even, this leaves one order. Otherwise it is
+    ambiguous: of the orders left, r0c0 is the one nearest the upper left of the image (least u + v).
+    """
+    found = _find(gray8, target.columns, target.rows)
+    if found is None:
+        return nothing_found(f"no complete board of {target.columns} x {target.rows} inner corners")
+    grid, ambiguous = _ordered(gray, found.reshape(target.rows, target.columns, 2))
+    edges = grid_edges(grid)
+    start = _settle(gray8, grid, edges)
+    fit = refine_corners(gray, start, edges.reshape(-1, 2, 2))
+    keep = fit.good & _on_grid(fit, grid.shape[:2])
+    if keep.sum() < max(6, keep.size // 2):
+        return nothing_found(f"board found, but only {int(keep.sum())} of {keep.size} corners could be measured")
+    notes = () if keep.all() else (f"{int((~keep).sum())} of {keep.size} corners were not sharp or not free",)
+    if ambiguous:
+        notes += ("order is ambiguous: the board looks the same after a turn",)
+    blur, contrast = float(np.median(fit.blur_px[keep])), float(np.median(fit.contrast[keep]))
+    return Detection(np.flatnonzero(keep), fit.uv[keep], fit.cov[keep], blur, contrast, notes, ambiguous)
+
+
+def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
+    """Corners (n, 2) px to about a pixel: the classic finder on a reduced and the full image, then the sector finder."""
+    scale = max(1.0, max(gray8.shape) / _COARSE_PX)
+    size = (round(gray8.shape[1] / scale), round(gray8.shape[0] / scale))
+    coarse = cv2.resize(gray8, size, interpolation=cv2.INTER_AREA) if scale > 1.0 else gray8
+    factor = np.array([gray8.shape[1] / coarse.shape[1], gray8.shape[0] / coarse.shape[0]])
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    pattern = (columns, rows)
+    ok, corners = cv2.findChessboardCorners(coarse, pattern, flags=flags)
+    if not ok:
+        ok, corners = cv2.findChessboardCornersSB(coarse, pattern, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if ok:
+        return np.asarray((np.reshape(corners, (-1, 2)).astype(float) + 0.5) * factor - 0.5)
+    if scale > 1.0:
+        ok, corners = cv2.findChessboardCorners(gray8, pattern, flags=flags | cv2.CALIB_CB_FAST_CHECK)
+    return np.reshape(corners, (-1, 2)).astype(float) if ok else None
+
+
+def _ordered(gray: Gray32, grid: FloatArray) -> tuple[FloatArray, bool]:
+    """The grid (rows, columns, 2) in the order that ``find_checkerboard`` defines, and whether that is ambiguous."""
+    edges = grid_edges(grid).mean((0, 1))
+    if edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0] < 0.0:
+        grid = grid[:, ::-1]
+    turns = [grid, grid[::-1, ::-1]]
+    if grid.shape[0] == grid.shape[1]:
+        quarter = grid.transpose(1, 0, 2)[:, ::-1]
+        turns += [quarter, quarter[::-1, ::-1]]
+    dark = [turn for turn in turns if _first_square_is_dark(gray, turn)] or turns
+    return min(dark, key=lambda turn: float(turn[0, 0].sum())), len(dark) > 1
+
+
+def _first_square_is_dark(gray: Gray32, grid: FloatArray) -> bool:
+    """By the centres of all inner squares, those of the first one's colour against the others."""
+    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4.0
+    level = _bilinear_patch(gray, centres)
+    row, column = np.indices(level.shape)
+    even = (row + column) % 2 == 0
+    return bool(level[even].mean() < level[~even].mean())
+
+
+def _bilinear_patch(gray: Gray32, uv: FloatArray) -> FloatArray:
+    points = uv.astype(np.float32)
+    return np.asarray(
+        cv2.remap(gray, points[..., 0], points[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    )
+
+
+def grid_edges(grid: FloatArray) -> FloatArray:
+    """Vectors (rows, columns, 2, 2) px along the row and along the column at each corner of a grid, one square long."""
+    return np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=2)
+
+
+def _settle(gray8: Gray8, grid: FloatArray, edges: FloatArray) -> FloatArray:
+    """Corners (n, 2) moved to the saddle of the grey values nearby, where that is no further than the window."""
+    start = grid.reshape(-1, 2)
+    area = np.abs(edges[..., 0, 0] * edges[..., 1, 1] - edges[..., 0, 1] * edges[..., 1, 0])
+    across = float(np.min(area / np.linalg.norm(edges, axis=3).max(2)))
+    half = int(np.clip(0.4 * across, 2, 9))
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+    points = np.ascontiguousarray(start, np.float32).reshape(-1, 1, 2)
+    moved = cv2.cornerSubPix(gray8, points.copy(), (half, half), (-1, -1), criteria).reshape(-1, 2).astype(float)
+    near = np.linalg.norm(moved - start, axis=1) <= half
+    return np.where(near[:, None], moved, start)
+
+
+def _on_grid(fit: CornerFit, shape: tuple[int, int]) -> BoolArray:
+    """Which corners lie where their neighbours in the row and the column put them, to a fifth of a square."""
+    grid = np.where(fit.good[:, None], fit.uv, np.nan).reshape(*shape, 2)
+    spacing = float(np.nanmedian(np.linalg.norm(np.diff(grid, axis=1), axis=2)))
+    off = np.zeros(shape, bool)
+    for axis in (0, 1):
+        g = np.moveaxis(grid, axis, 0)
+        bend = np.linalg.norm(g[2:] - 2.0 * g[1:-1] + g[:-2], axis=2)
+        np.moveaxis(off, axis, 0)[1:-1] |= bend > 0.4 * spacing
+    return ~off.ravel()

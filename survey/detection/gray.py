@@ -1,0 +1,59 @@
+"""Images as grey values: what is read from a file or a camera, and what the detectors work on."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from adjust.errors import SurveyError
+
+Gray8 = npt.NDArray[np.uint8]
+Gray32 = npt.NDArray[np.float32]
+AnyImage = npt.NDArray[np.generic]
+
+
+def read_image(path: Path) -> AnyImage:
+    """The image as stored, (h, w) or (h, w, channels), 8 or 16 bit; its EXIF orientation is not applied.
+
+    Raises SurveyError where the file is missing or is no image.
+    """
+    if not path.is_file():
+        raise SurveyError(f"{path}: there is no such file; correct the name or take it out of the project")
+    data = np.fromfile(path, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    if image is None:
+        raise SurveyError(
+            f"{path}: not an image that OpenCV can read ({len(data)} bytes); export it again as PNG or TIFF"
+        )
+    return np.asarray(image)
+
+
+def gray_values(image: AnyImage) -> Gray32:
+    """Grey values (h, w) in the image's own range; colour is weighed 0.299 R + 0.587 G + 0.114 B (order B G R, alpha left out)."""
+    if image.ndim == 3 and image.shape[2] == 1:
+        image = image[:, :, 0]
+    if image.ndim == 3 and image.shape[2] in (3, 4):
+        b, g, r = (image[:, :, k].astype(np.float32) for k in range(3))
+        return np.asarray(0.114 * b + 0.587 * g + 0.299 * r, np.float32)
+    if image.ndim != 2 or image.size == 0:
+        raise SurveyError(f"image of shape {image.shape}: give (h, w) grey or (h, w, 3) colour")
+    return np.ascontiguousarray(image, np.float32)
+
+
+def saturation_level(image: AnyImage) -> float:
+    """Grey value of a full pixel: 255, or the end of the smallest of 10, 12, 14, 16 bit that holds the image."""
+    if image.dtype == np.uint8:
+        return 255.0
+    top = float(np.max(image))
+    return float(next((2**bits - 1 for bits in (8, 10, 12, 14, 16) if top <= 2**bits - 1), top))
+
+
+def for_finding(gray: Gray32) -> Gray8:
+    """8 bit for OpenCV's finders; deeper images and dim ones are stretched between their 0.1 and 99.9 percentiles."""
+    sample = gray[::7, ::7]
+    low, high = np.percentile(sample, [0.1, 99.9])
+    if 0.0 <= low and 60.0 <= high - low and high <= 255.0:
+        return np.asarray(np.rint(np.clip(gray, 0.0, 255.0)), np.uint8)
+    scaled = (gray - low) * (255.0 / max(high - low, 1.0))
+    return np.asarray(np.rint(np.clip(scaled, 0.0, 255.0)), np.uint8)

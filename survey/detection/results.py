@@ -1,0 +1,86 @@
+"""What detection gives back, as frozen values."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from adjust.model import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """Points of one target in one image; empty where it was not found, and ``reason`` says why.
+
+    point_idx: (n,) positions in the target's ``points()``. uv: (n, 2) px. cov: (n, 2, 2) px^2.
+    blur_px: median standard deviation of the point spread. contrast: median step from dark to bright, grey values.
+    ambiguous: the target looks the same after a turn, so its order is a convention (see ``find_checkerboard``).
+    notes: what was left out, and why.
+    """
+
+    point_idx: IntArray
+    uv: FloatArray
+    cov: FloatArray
+    blur_px: float = float("nan")
+    contrast: float = float("nan")
+    notes: tuple[str, ...] = ()
+    ambiguous: bool = False
+    reason: str = ""
+
+    def __len__(self) -> int:
+        return len(self.point_idx)
+
+
+def nothing_found(reason: str, notes: tuple[str, ...] = ()) -> Detection:
+    """An empty detection."""
+    return Detection(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)), notes=notes, reason=reason)
+
+
+@dataclass(frozen=True, eq=False)
+class Spots:
+    """Luminous spots of one image, brightest first: uv (n, 2) px, cov (n, 2, 2) px^2, full width at half maximum (n,).
+
+    peak: (n,) grey values above the background; saturated: (n,) number of pixels left out for being saturated.
+    """
+
+    uv: FloatArray
+    cov: FloatArray
+    diameter_px: FloatArray
+    peak: FloatArray
+    saturated: IntArray
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+
+@dataclass(frozen=True)
+class SpotOptions:
+    """Which spots to look for.
+
+    diameter_px: full width at half maximum, from and to. min_contrast: peak above the background, in standard
+    deviations of the noise. max_elongation: longest over shortest axis. max_count: the brightest ones are kept.
+    """
+
+    diameter_px: tuple[float, float] = (2.0, 12.0)
+    min_contrast: float = 10.0
+    max_elongation: float = 1.6
+    max_count: int = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class ImageReport:
+    """What became of one image. status ``found`` (something), ``nothing``, or ``failed`` (unreadable); message says more.
+
+    detections: by target id, empty ones with their reason included. spots: None where none were asked for.
+    """
+
+    path: Path
+    camera_id: str
+    epoch_id: str
+    status: Literal["found", "nothing", "failed"]
+    message: str = ""
+    detections: dict[str, Detection] = field(default_factory=dict)
+    spots: Spots | None = None
+    image_size: tuple[int, int] | None = None
