@@ -1,67 +1,34 @@
-"""Tables of the observations that are not image points: table angles, pairs, distances, coordinates."""
+"""Tables of angles, distances and coordinates."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from gtsam import Pose3, Rot3
 
-from adjust.model import BoolArray, FloatArray
-from adjust.observations import Coordinates, Distance, Pair, PositionRef, TableReading
+from adjust.model import FloatArray
+from adjust.observations import Coordinates, Distance, PositionRef, TableReading
 from survey.files.covariance import covariance_from_sigmas, covariance_problem
-from survey.files.poses import rotation_from_euler, rotation_from_quaternion
 from survey.files.project import Sigmas
 from survey.files.references import (
     NameProblemError,
     Names,
     check_epochs,
-    read_frame,
     read_position,
 )
-from survey.files.tables import Layout, Table, first_row
+from survey.files.tables import FLAGS, Layout, Table, first_row, group_names
 from survey.files.text import natural_key, suggestion
 from survey.files.units import to_si
 
-_FLAGS = ("group", "used")
-QUATERNION = ("qw", "qx", "qy", "qz")
-EULER = ("euler_x_deg", "euler_y_deg", "euler_z_deg")
-TRANSLATION = ("tx_mm", "ty_mm", "tz_mm")
-_TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
-
-
-def covariance_column(i: int, j: int) -> str:
-    """Column of one element of a pair's covariance, in rad and m."""
-    unit = {0: "rad2", 1: "rad_m", 2: "m2"}[(i >= 3) + (j >= 3)]
-    return f"cov_{_TANGENT[i]}_{_TANGENT[j]}_{unit}"
-
-
-SIGMA_COLUMNS = {
-    "rotation": [("sigma_rotation_deg",) * 3, ("sigma_rotation_arcsec",) * 3]
-    + [tuple(f"sigma_{a}_{unit}" for a in _TANGENT[:3]) for unit in ("deg", "arcsec")],
-    "translation": [("sigma_translation_mm",) * 3, tuple(f"sigma_{a}_mm" for a in _TANGENT[3:])],
-}
-COVARIANCE_COLUMNS = tuple(covariance_column(i, j) for i in range(6) for j in range(6))
 ANGLES = Layout(
     "table_angles",
     ("epoch_id", "table_id"),
     ("axis1_deg",),
-    _FLAGS[:1],
+    FLAGS[:1],
     ("axis2_deg", "sigma_arcsec", "sigma_axis1_arcsec", "sigma_axis2_arcsec", "rho_12"),
 )
-PAIRS = Layout(
-    "pairs",
-    ("pair_id", "a_id", "b_id"),
-    (),
-    _FLAGS,
-    QUATERNION
-    + EULER
-    + TRANSLATION
-    + tuple(dict.fromkeys(name for columns in SIGMA_COLUMNS.values() for names in columns for name in names))
-    + COVARIANCE_COLUMNS,
-)
-DISTANCES = Layout("distances", ("distance_id", "from_id", "to_id"), (), _FLAGS, ("value_mm", "value_m", "sigma_mm"))
+DISTANCES = Layout("distances", ("distance_id", "from_id", "to_id"), (), FLAGS, ("value_mm", "value_m", "sigma_mm"))
 XYZ_SIGMAS, XYZ_RHO = ("sigma_x_mm", "sigma_y_mm", "sigma_z_mm"), ("rho_xy", "rho_xz", "rho_yz")
-COORDINATES = Layout("coordinates", ("point_id",), ("x_mm", "y_mm", "z_mm", *XYZ_SIGMAS), ("set_id", *_FLAGS), XYZ_RHO)
+COORDINATES = Layout("coordinates", ("point_id",), ("x_mm", "y_mm", "z_mm", *XYZ_SIGMAS), ("set_id", *FLAGS), XYZ_RHO)
 COORDINATES_COVARIANCE = Layout(
     "coordinates_covariance", ("set_id", "a_id", "a_axis", "b_id", "b_axis"), ("covariance_mm2",)
 )
@@ -72,8 +39,7 @@ def read_angles(table: Table, names: Names, sigmas: Sigmas) -> tuple[TableReadin
     axes = {t.table_id: len(t.axes) for t in names.survey.tables}
     epochs, tables = table.ids("epoch_id").values(), table.text("table_id").values()
     angles = np.stack([table.numbers("axis1_deg"), table.numbers("axis2_deg")], axis=1)
-    groups = _groups(table, "table")
-    readings: dict[tuple[str, str], TableReading] = {}
+    groups = group_names(table, "table")
     lines: dict[tuple[str, str], int] = {}
     for row, (epoch_id, table_id) in enumerate(zip(epochs, tables, strict=True)):
         if table_id not in axes:
@@ -86,134 +52,40 @@ def read_angles(table: Table, names: Names, sigmas: Sigmas) -> tuple[TableReadin
         if int((~np.isnan(angles[row])).sum()) != k:
             advice = "fill in axis2_deg" if k == 2 else "leave axis2_deg blank"
             raise table.error(row, f"axis2_deg: table {table_id!r} has {k} axes; {advice}")
-        cov = _angle_cov(table, row, table_id, k, sigmas) * sigmas.scale.get(groups[row], 1.0) ** 2
-        readings[key] = TableReading(table_id, epoch_id, to_si(angles[row, :k], "deg"), cov, groups[row])
-    order = sorted(readings, key=lambda key: (natural_key(key[0]), natural_key(key[1])))
-    return tuple(readings[key] for key in order)
+    sigma = _angle_sigmas(table, [axes[table_id] for table_id in tables], sigmas)
+    rho = _angle_correlations(table)
+    readings = []
+    for row, (epoch_id, table_id) in enumerate(zip(epochs, tables, strict=True)):
+        k = axes[table_id]
+        cov = covariance_from_sigmas(sigma[None, row, :k], np.full((1, k - 1), rho[row]))[0]
+        scaled = cov * sigmas.scale.get(groups[row], 1.0) ** 2
+        readings.append(TableReading(table_id, epoch_id, to_si(angles[row, :k], "deg"), scaled, groups[row]))
+    return tuple(sorted(readings, key=lambda r: (natural_key(r.table_id), natural_key(r.epoch_id))))
 
 
-def _angle_cov(table: Table, row: int, table_id: str, k: int, sigmas: Sigmas) -> FloatArray:
-    both = table.positive("sigma_arcsec")[row]
-    each = np.array([table.positive(f"sigma_axis{i + 1}_arcsec")[row] for i in range(k)])
-    rho = np.nan_to_num(table.numbers("rho_12")[row])
-    if not np.isnan(both) and not np.isnan(each).all():
-        raise table.error(row, "sigma_arcsec and sigma_axis1_arcsec are both given; keep one of the two")
-    sigma = to_si(np.full(k, both) if not np.isnan(both) else each, "arcsec")
-    if np.isnan(sigma).all() and table_id in sigmas.tables:
-        sigma = sigmas.tables[table_id]
-    if np.isnan(sigma).any():
-        raise table.error(row, f"the row has no sigma; add sigma_arcsec here or to [tables.{table_id}]")
-    if abs(rho) >= 1:
-        raise table.error(row, f"rho_12: found {rho:g}; a correlation lies between -1 and 1")
-    return np.asarray(covariance_from_sigmas(sigma[None], np.full((1, k * (k - 1) // 2), rho))[0])
-
-
-def read_pairs(table: Table, names: Names, sigmas: Sigmas) -> tuple[Pair, ...]:
-    """Measured pairs sorted by id: poses where there is a translation, else rotations."""
-    pair_ids = table.unique_ids("pair_id")
-    is_pose = _all_or_none(table, TRANSLATION)
-    cov = _pair_covariances(table, is_pose)
-    groups, used = _groups(table, "pair"), table.flags("used").tolist()
-    rotations = _pair_rotations(table)
-    translation = to_si(np.stack([table.numbers(name) for name in TRANSLATION], axis=1), "mm")
-    ends = list(zip(table.text("a_id").values(), table.text("b_id").values(), strict=True))
-    pairs = []
-    for row, (a_text, b_text) in enumerate(ends):
-        try:
-            a, b = read_frame(a_text, names), read_frame(b_text, names)
-            check_epochs(a, b, names)
-        except NameProblemError as problem:
-            raise table.error(row, f"a_id, b_id: {problem}") from problem
-        if a == b:
-            raise table.error(row, f"a_id, b_id: both are {a_text!r}; a pair joins two different frames")
-        k = 6 if is_pose[row] else 3
-        b_from_a = Pose3(rotations[row], translation[row]) if is_pose[row] else rotations[row]
-        scaled = cov[row, :k, :k] * sigmas.scale.get(groups[row], 1.0) ** 2
-        pairs.append(Pair(pair_ids[row], a, b, b_from_a, scaled, groups[row], used[row]))
-    return tuple(sorted(pairs, key=lambda pair: natural_key(pair.pair_id)))
-
-
-def _pair_rotations(table: Table) -> list[Rot3]:
-    by_quaternion, by_euler = _all_or_none(table, QUATERNION), _all_or_none(table, EULER)
-    wrong = by_quaternion == by_euler
+def _angle_correlations(table: Table) -> FloatArray:
+    rho = np.nan_to_num(table.numbers("rho_12"))
+    wrong = np.abs(rho) >= 1
     if wrong.any():
         row = first_row(wrong)
-        found = "twice; keep one" if by_euler[row] else "nowhere; fill in"
-        raise table.error(row, f"the rotation is given {found} of {','.join(QUATERNION)} and {','.join(EULER)}")
-    wxyz = np.stack([table.numbers(name) for name in QUATERNION], axis=1)
-    euler = to_si(np.stack([table.numbers(name) for name in EULER], axis=1), "deg")
-    rotations = []
-    for row in range(len(table)):
-        rotation = rotation_from_quaternion(wxyz[row]) if by_quaternion[row] else rotation_from_euler(euler[row])
-        if rotation is None:
-            length = np.linalg.norm(wxyz[row])
-            raise table.error(row, f"the quaternion qw,qx,qy,qz has length {length:g}, not 1; correct it")
-        rotations.append(rotation)
-    return rotations
+        raise table.error(row, f"rho_12: found {rho[row]:g}; a correlation lies between -1 and 1")
+    return rho
 
 
-def _pair_covariances(table: Table, is_pose: BoolArray) -> FloatArray:
-    """Covariances (n, 6, 6) in rad and m, of rotations only in the upper left (3, 3)."""
-    cov = np.zeros((len(table), 6, 6))
-    full = np.stack([table.numbers(name) for name in COVARIANCE_COLUMNS], axis=1)
-    given: BoolArray = np.asarray((~np.isnan(full)).any(axis=1))
-    if given.any():
-        cov[given] = _full_covariances(table, given, is_pose)
-    if not given.all():
-        sigma = np.concatenate([_sigmas(table, "rotation"), _sigmas(table, "translation")], axis=1)
-        sigma[~is_pose, 3:] = np.where(np.isnan(sigma[~is_pose, 3:]), 1.0, np.inf)
-        for name, part in (("rotation", sigma[:, :3]), ("translation", sigma[:, 3:])):
-            bad = ~given & (~np.isfinite(part)).any(axis=1)
-            if bad.any():
-                row = first_row(bad)
-                surplus = "the pair has a sigma of the translation but no translation; remove it"
-                missing = f"the pair has no sigma of the {name}; fill in {SIGMA_COLUMNS[name][-1][0]} or the like"
-                raise table.error(row, surplus if np.isinf(part[row]).any() else missing)
-        cov[~given] = covariance_from_sigmas(sigma[~given])
-    cov[~is_pose, 3:, :] = 0.0
-    cov[~is_pose, :, 3:] = 0.0
-    for mask, k in ((is_pose, 6), (~is_pose, 3)):
-        problem = covariance_problem(cov[mask][:, :k, :k])
-        if problem:
-            raise table.error(int(np.flatnonzero(mask)[problem[0]]), f"{problem[1]}; correct the cov columns")
-    return cov
-
-
-def _full_covariances(table: Table, given: BoolArray, is_pose: BoolArray) -> FloatArray:
-    """Matrices (n, 6, 6) of the rows ``given``: the upper triangle is needed, the lower one filled in where blank."""
-    full = np.stack([table.numbers(name) for name in COVARIANCE_COLUMNS], axis=1).reshape(-1, 6, 6)
-    upper = np.triu(np.ones((6, 6), dtype=bool))
-    needed = upper & ~(~is_pose[:, None, None] & (np.arange(6) >= 3))
-    missing = given[:, None, None] & needed & np.isnan(full)
-    if missing.any():
-        row, i, j = (int(x[0]) for x in np.nonzero(missing))
-        raise table.error(row, f"{covariance_column(i, j)}: is blank; fill in the whole upper triangle")
-    doubled = given & ~np.isnan(np.concatenate([_sigmas(table, "rotation"), _sigmas(table, "translation")], 1)).all(1)
-    if doubled.any():
-        raise table.error(first_row(doubled), "the covariance and sigmas are both given; keep one of the two")
-    full = np.nan_to_num(np.where(np.isnan(full), full.transpose(0, 2, 1), full))
-    return np.asarray(full[given])
-
-
-def _sigmas(table: Table, part: str) -> FloatArray:
-    """Sigmas (n, 3) rad or m from whichever columns give them; nan where none does."""
-    result = np.full((len(table), 3), np.nan)
-    for columns in SIGMA_COLUMNS[part]:
-        values = to_si(np.stack([table.positive(name) for name in columns], axis=1), columns[0].rpartition("_")[2])
-        twice = ~np.isnan(values).all(axis=1) & ~np.isnan(result).all(axis=1)
-        if twice.any():
-            raise table.error(first_row(twice), f"{columns[0]}: the sigma of the {part} is given twice; keep one")
-        result = np.where(np.isnan(values), result, values)
+def _angle_sigmas(table: Table, row_axes: list[int], sigmas: Sigmas) -> FloatArray:
+    """Sigmas (n, 2) rad of the readings, from the row or else from survey.toml; nan beside a table's one axis."""
+    both = table.positive("sigma_arcsec")
+    each = np.stack([table.positive("sigma_axis1_arcsec"), table.positive("sigma_axis2_arcsec")], axis=1)
+    twice = ~np.isnan(both) & ~np.isnan(each).all(axis=1)
+    if twice.any():
+        raise table.error(first_row(twice), "sigma_arcsec and sigma_axis1_arcsec are both given; keep one of the two")
+    result = to_si(np.where(np.isnan(each), both[:, None], each), "arcsec")
+    for row, (table_id, k) in enumerate(zip(table.text("table_id").values(), row_axes, strict=True)):
+        if np.isnan(result[row]).all() and table_id in sigmas.tables:
+            result[row, :k] = sigmas.tables[table_id]
+        if np.isnan(result[row, :k]).any():
+            raise table.error(row, f"the row has no sigma; add sigma_arcsec here or to [tables.{table_id}]")
     return result
-
-
-def _all_or_none(table: Table, columns: tuple[str, ...]) -> BoolArray:
-    """Rows (n,) in which all ``columns`` are filled; raises where only some are."""
-    filled = np.stack([~np.isnan(table.numbers(name)) for name in columns], axis=1)
-    some = filled.any(axis=1) & ~filled.all(axis=1)
-    if some.any():
-        raise table.error(first_row(some), f"{','.join(columns)}: only some are filled in; give all or none")
-    return np.asarray(filled.all(axis=1))
 
 
 def read_distances(table: Table, names: Names, sigmas: Sigmas) -> tuple[Distance, ...]:
@@ -226,7 +98,7 @@ def read_distances(table: Table, names: Names, sigmas: Sigmas) -> tuple[Distance
     if np.isnan(sigma_mm).any():
         raise table.error(first_row(np.isnan(sigma_mm)), "sigma_mm: is blank; fill it in")
     values = np.where(np.isnan(in_m), to_si(in_mm, "mm"), in_m).tolist()
-    groups, used = _groups(table, "distance"), table.flags("used").tolist()
+    groups, used = group_names(table, "distance"), table.flags("used").tolist()
     ends = list(zip(table.text("from_id").values(), table.text("to_id").values(), strict=True))
     distances = []
     for row, (from_text, to_text) in enumerate(ends):
@@ -273,7 +145,7 @@ def read_coordinates(table: Table, extra: Table | None, names: Names, sigmas: Si
         _add_entries(extra, sets, members)
     values = to_si(np.stack([table.numbers(name) for name in ("x_mm", "y_mm", "z_mm")], axis=1), "mm")
     own = _own_covariances(table)
-    groups, used = _groups(table, "coordinates"), table.flags("used").tolist()
+    groups, used = group_names(table, "coordinates"), table.flags("used").tolist()
     result = []
     for name in sorted(sets, key=natural_key):
         rows = sorted(sets[name].rows, key=lambda row: natural_key(texts[row]))
@@ -343,7 +215,3 @@ def _joint_covariance(table: Table, rows: list[int], own: FloatArray, members: _
     if problem:
         raise table.error(rows[0], f"set {members.name!r}: {problem[1]}; correct coordinates_covariance")
     return cov
-
-
-def _groups(table: Table, default: str) -> list[str]:
-    return [name or default for name in table.text("group").values()]

@@ -8,14 +8,8 @@ from gtsam import Pose3
 from adjust.model import FloatArray, Survey
 from adjust.observations import Coordinates, Distance, ImageBlock, Pair, TableReading
 from survey.files.covariance import sigmas_and_correlations
-from survey.files.measurements import (
-    COVARIANCE_COLUMNS,
-    QUATERNION,
-    SIGMA_COLUMNS,
-    TRANSLATION,
-    XYZ_RHO,
-    XYZ_SIGMAS,
-)
+from survey.files.measurements import XYZ_RHO, XYZ_SIGMAS
+from survey.files.pairs import COVARIANCE_COLUMNS, QUATERNION, SIGMA_COLUMNS, TRANSLATION
 from survey.files.poses import quaternion_wxyz
 from survey.files.project import SpotBlock
 from survey.files.references import frame_text, position_text

@@ -13,14 +13,13 @@ from survey.files.measurements import (
     COORDINATES,
     COORDINATES_COVARIANCE,
     DISTANCES,
-    PAIRS,
     read_angles,
     read_coordinates,
     read_distances,
-    read_pairs,
 )
 from survey.files.node import Node, read_toml
 from survey.files.owners import read_cameras, read_stations, read_tables
+from survey.files.pairs import PAIRS, read_pairs
 from survey.files.poses import read_point
 from survey.files.project import (
     DEFINITION_FILE,

@@ -1,14 +1,9 @@
 """Tables of observations: CSV or Parquet into columns, with the line of every row.
 
-A CSV file is read in chunks whose rows, columns and numbers are taken apart by the interpreter's C code; text columns
-become codes into their different names, so that nothing later runs per row.
+Text columns become codes into their different names, so that nothing later runs per row.
 """
 
-import contextlib
-import csv
-import io
-import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,9 +13,10 @@ import numpy.typing as npt
 
 from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
+from survey.files.csv_chunks import Chunk, csv_chunks
 from survey.files.text import decode, id_problem, read_bytes, suggestion
 
-_CHUNK = 65536
+FLAGS = ("group", "used")  # optional text columns of every table of observations
 
 
 @dataclass(frozen=True)
@@ -133,6 +129,11 @@ class Table:
         return np.array([meanings[name.lower()] for name in result.names], dtype=bool)[result.codes]
 
 
+def group_names(table: Table, default: str) -> list[str]:
+    """The group of every row."""
+    return [name or default for name in table.text("group").values()]
+
+
 def first_row(mask: npt.ArrayLike) -> int:
     """The first row that is true."""
     return int(np.argmax(mask))
@@ -146,74 +147,12 @@ def read_table(path: Path, layout: Layout) -> Table:
     text = decode(path, data)
     if not text.strip():
         raise SurveyError(f"{path}:1: the file is empty; the first line names the columns: {','.join(layout.required)}")
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    try:
-        header = next(reader)
-        check_header(path, header, layout)
-        rows = _plain_columns(text, len(header)) or _quoted_columns(path, reader, len(header))
-        return _assemble(path, layout, digest, header, rows)
-    except csv.Error as error:
-        raise SurveyError(f"{path}:{_last_start(text)}: not a CSV line ({error}); correct the quotes") from error
+    header, chunks = csv_chunks(path, text)
+    check_header(path, header, layout)
+    return _assemble(path, layout, digest, header, chunks)
 
 
-def _last_start(text: str) -> int:
-    """The line on which the row begins that the csv module cannot read."""
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    line = 1
-    with contextlib.suppress(csv.Error):
-        for _ in reader:
-            line = reader.line_num + 1
-    return line
-
-
-_Chunk = tuple[IntArray, Sequence[Sequence[str]]]
-
-
-def _plain_columns(text: str, n: int) -> Iterator[_Chunk] | None:
-    """Lines and columns of a text without quotes, blank lines or wrong lengths, chunk by chunk; None for any other."""
-    if '"' in text or n < 2:
-        return None
-    body = text.replace("\r\n", "\n").rstrip("\n").encode()
-    ends = np.flatnonzero(np.frombuffer(body, np.uint8) == ord("\n"))
-    commas = np.flatnonzero(np.frombuffer(body, np.uint8) == ord(","))
-    counts = np.diff(np.searchsorted(commas, np.r_[0, ends, len(body)]))
-    if b"\r" in body or (counts != n - 1).any():
-        return None
-    return _split(body, ends, n)
-
-
-def _split(body: bytes, ends: IntArray, n: int) -> Iterator[_Chunk]:
-    """Columns of the lines after the first; one list per chunk and no list per row keeps the garbage collector out."""
-    starts = (ends + 1).tolist()
-    for first in range(0, len(starts), _CHUNK):
-        stop = starts[first + _CHUNK] - 1 if first + _CHUNK < len(starts) else len(body)
-        fields = body[starts[first] : stop].decode().replace("\n", ",").split(",")
-        yield np.arange(first + 2, first + 2 + len(fields) // n), [fields[i::n] for i in range(n)]
-
-
-def _quoted_columns(path: Path, reader: Any, n: int) -> Iterator[_Chunk]:
-    """The same for any CSV, through the csv module; raises where a row has a wrong length."""
-    line = reader.line_num + 1
-    while rows := list(itertools.islice(reader, _CHUNK)):
-        lines = np.arange(line, line + len(rows))
-        _check_lengths(path, rows, lines, n, reader.line_num)
-        line += len(rows)
-        filled = np.fromiter(map(bool, rows), bool, len(rows))
-        if filled.any():
-            yield lines[filled], list(zip(*filter(None, rows), strict=True))
-
-
-def _check_lengths(path: Path, rows: list[list[str]], lines: IntArray, n: int, last_line: int) -> None:
-    if not set(map(len, rows)) <= {0, n}:
-        i = next(i for i, row in enumerate(rows) if len(row) not in (0, n))
-        hint = "; numbers have a decimal point, not a comma" if len(rows[i]) > n else ""
-        raise SurveyError(f"{path}:{lines[i]}: found {len(rows[i])} fields, expected {n} as in the first line{hint}")
-    if last_line != lines[-1]:
-        i = next(i for i, row in enumerate(rows) if any("\n" in field or "\r" in field for field in row))
-        raise SurveyError(f"{path}:{lines[i]}: a quoted field runs over the end of the line; close its quotes")
-
-
-def _assemble(path: Path, layout: Layout, digest: str, header: Sequence[str], chunks: Iterable[_Chunk]) -> Table:
+def _assemble(path: Path, layout: Layout, digest: str, header: Sequence[str], chunks: Iterable[Chunk]) -> Table:
     texts = {name: _TextBuilder() for name in header if layout.is_text(name)}
     numbers = {name: _NumberBuilder() for name in header if not layout.is_text(name)}
     builders: dict[str, _TextBuilder | _NumberBuilder] = {**texts, **numbers}
@@ -279,13 +218,15 @@ class _NumberBuilder:
         try:
             values = np.fromiter(map(float, column), np.float64, len(column))
         except ValueError:
+            values = None
+        if values is None or "_" in "".join(column):  # Python takes 1_000 for a number, people do not
             values = np.empty(len(column))
             for row, text in enumerate(column):
                 if text == "" and not is_required:
                     values[row] = 0.0
                     continue
                 try:
-                    values[row] = float(text)
+                    values[row] = float(text.replace("_", "?"))
                 except ValueError:
                     return row, "is blank; fill it in" if text == "" else f"found {text!r}, expected a number"
         bad = ~np.isfinite(values)

@@ -356,6 +356,7 @@ TABLE_FAULTS = [
     Fault("quote open", _row("image_points", _POINT, '"' + _POINT), r"image_points\.csv:\d+: .*quote"),
     Fault("field over two lines", _row("distances", "d2,", '"d\n2",'), r"csv:3: a quoted field runs over the end"),
     Fault("not a number", _row("image_points", "110.25", "11O.25"), r"csv:3: u_px: found '11O\.25', expected a number"),
+    Fault("digits with underscore", _row("image_points", "110.25", "1_10.25"), r"csv:3: u_px: found '1_10\.25', expected a number"),
     Fault("blank number", _row("image_points", "110.25", ""), r"csv:3: u_px: is blank"),
     Fault("blank id", _row("image_points", "e1,X,board,r0c1", ",X,board,r0c1"), r"csv:3: epoch_id: is blank"),
     Fault("nan in table", _row("image_points", "110.25", "nan"), r"csv:3: u_px: found 'nan'; .*finite"),
@@ -387,6 +388,10 @@ TABLE_FAULTS = [
     Fault("angle missing", _row("table_angles", "10.0,50.0", "10.0,"), r"csv:3: axis2_deg: .*has 2 axes; fill in"),
     Fault("angle too many", _row("table_angles", "33.0,,", "33.0,1.0,"), r"csv:4: axis2_deg: .*has 1 axes; leave"),
     Fault("angle without sigma", _row("table_angles", "33.0,,2.0", "33.0,,"), r"csv:4: the row has no sigma.*tables\.rotary"),
+    Fault("angle sigma twice", _write("observations/table_angles.csv", "epoch_id,table_id,axis1_deg,sigma_arcsec,sigma_axis1_arcsec\n"
+          "e1,rotary,33.0,2,2\n", "e1,rotary"), r"csv:2: sigma_arcsec and .*both given"),
+    Fault("angle correlation", _write("observations/table_angles.csv", "epoch_id,table_id,axis1_deg,axis2_deg,rho_12\n"
+          "e1,turntable,33.0,1.0,-1\n", "e1,turntable"), r"csv:2: rho_12: found -1"),
     Fault("pair twice", _row("pairs", "p2,", "p1,"), r"pairs\.csv:3: pair_id: 'p1' stands already in line 2"),
     Fault("pair of unknown station", _row("pairs", "station:pillar", "station:piller"), r"csv:2: .*'piller'; did you mean 'pillar'"),
     Fault("pair of unknown kind", _row("pairs", "station:pillar", "stat:pillar"), r"csv:2: .*unknown kind of frame 'stat'"),
