@@ -31,7 +31,7 @@ def fit_lens(
     ptr: IntArray,
     iterations: int = 25,
 ) -> LensFit:
-    """Least squares over ``values + directions @ p`` and the poses camera_from_target (B, 4, 4), with Cauchy weights.
+    """Least squares over ``values + directions @ p`` and the poses camera_from_target (B, 4, 4), with Huber weights.
 
     directions: (n, p), what of the lens may move. x: (N, 3) m, uv: (N, 2) px, view after view by ``ptr`` (B + 1,).
     Source: Levenberg-Marquardt with the poses eliminated (Schur complement; Triggs et al., Bundle adjustment, 2000).
@@ -39,7 +39,7 @@ def fit_lens(
     view = np.repeat(np.arange(len(poses)), np.diff(ptr))
     damping, residuals = 1e-4, _residuals(model, values, constants, poses, x, uv, view)
     for _ in range(iterations):
-        weights = _cauchy(residuals)
+        weights = _huber(residuals)
         system = _normal_equations(model, values, constants, directions, poses, x, uv, ptr, weights)
         cost = float(weights @ np.sum(residuals**2, axis=1))
         gain = 0.0
@@ -57,7 +57,7 @@ def fit_lens(
         if gain < 1e-6 * cost:
             break
     cov = _lens_covariance(
-        *_normal_equations(model, values, constants, directions, poses, x, uv, ptr, _cauchy(residuals))
+        *_normal_equations(model, values, constants, directions, poses, x, uv, ptr, _huber(residuals))
     )
     scale = float(np.median(np.sum(residuals**2, axis=1)) / np.log(4.0))  # median of a 2-D normal's square is s^2 ln 4
     return LensFit(values, poses, residuals, cov * scale)
@@ -83,9 +83,11 @@ def _residuals(
     return np.where(bad[:, None], 1e6, r)
 
 
-def _cauchy(residuals: FloatArray) -> FloatArray:
+def _huber(residuals: FloatArray) -> FloatArray:
+    """Weights (N,): convex, since points far out under an unfinished distortion must not be taken for gross errors."""
     size = np.linalg.norm(residuals, axis=1)
-    return np.asarray(1.0 / (1.0 + (size / max(3.0 * float(np.median(size)), 1e-9)) ** 2))
+    limit = max(3.0 * float(np.median(size)), 1e-9)
+    return np.asarray(limit / np.maximum(size, limit))
 
 
 def _normal_equations(

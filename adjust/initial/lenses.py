@@ -22,6 +22,8 @@ from adjust.model import Camera, FloatArray
 _MOST_IMAGES = 30
 _SCAN_IMAGES = 8
 _GOOD_START = 0.01  # of the image width: with less error a closed form needs no scan beside it
+_LEVELS = ("focal centre k1 k2", "focal centre k1", "focal k1", "focal")
+_SIMPLE_PX = 2.0
 _FOCAL = {"fx", "fy", "c", "ck"}
 _CENTRE = {"u0", "v0", "xp", "yp", "px", "py", "xh", "yh"}
 _RADIAL = {"k1": 1, "k2": 2, "K1": 1, "K2": 2, "A1": 1, "A2": 2}
@@ -188,13 +190,18 @@ class _LensSearch:
             )
         x, uv = np.concatenate([s.x for s in images]), np.concatenate([s.uv for s in images])
         ptr = np.concatenate([[0], np.cumsum([len(s.x) for s in images])])
-        for level in ("focal centre k1 k2", "focal centre k1", "focal k1", "focal"):
+        for level in _LEVELS:
             directions = self._directions(level)
             if directions.shape[1] == 0 or ("centre" in level and len(images) < 3):
                 continue
             fit = fit_lens(self.model, self.constants, start, directions, poses, x, uv, ptr)
             if self._sane(fit, directions):
-                median = float(np.median(np.linalg.norm(fit.residuals, axis=1)))
+                if level == _LEVELS[0] and _median(fit) > _SIMPLE_PX:  # a wide lens needs all its terms
+                    everything = self._directions("all")
+                    full = fit_lens(self.model, self.constants, fit.values, everything, fit.poses, x, uv, ptr, 60)
+                    if self._sane(full, everything) and _median(full) < 0.5 * _median(fit):
+                        fit, level = full, "all that is free"
+                median = _median(fit)
                 note = f"lens from {len(images)} images ({how}; refined: {level}), median error {median:.2f} px"
                 return LensStart(fit.values, note, excluded)
         return LensStart(start, f"lens from {len(images)} images ({how}; too few to refine it)", excluded)
@@ -211,11 +218,12 @@ class _LensSearch:
         return images, np.array(poses).reshape(-1, 4, 4)
 
     def _directions(self, level: str) -> FloatArray:
-        """Columns (n, p) of the lens components that this level frees, ties included; fx, fy apart only with the centre."""
+        """Columns (n, p) of the lens components that this level frees, with ties; fx, fy apart only with the centre."""
         wanted = set(_FOCAL)
         wanted |= _CENTRE if "centre" in level else set()
         wanted |= {name for name, order in _RADIAL.items() if f"k{order}" in level}
         names, columns = self.model.names, []
+        wanted = set(names) if level == "all" else wanted
         for i, name in enumerate(names):
             if name not in wanted or name not in self.camera.lens.free or name in self.tied or name in self.prior:
                 continue
@@ -225,11 +233,7 @@ class _LensSearch:
                 if tie.to == name:
                     column[names.index(tie.name)] = tie.factor
             columns.append(column)
-        if (
-            "centre" not in level
-            and self.model.names[:2] == ("fx", "fy")
-            and {"fx", "fy"} <= set(self.camera.lens.free)
-        ):
+        if level in _LEVELS[2:] and self.model.names[:2] == ("fx", "fy") and {"fx", "fy"} <= set(self.camera.lens.free):
             # few or frontal images cannot tell fx from fy: one direction for both
             both = [c for c in columns if c[0] or c[1]]
             columns = [c for c in columns if not (c[0] or c[1])] + ([np.sum(both, axis=0)] if both else [])
@@ -251,6 +255,10 @@ class _LensSearch:
         except SurveyError:
             return False
         return bool(known and inside and 0.05 * width < focal < 50 * width)
+
+
+def _median(fit: LensFit) -> float:
+    return float(np.median(np.linalg.norm(fit.residuals, axis=1)))
 
 
 def _is_plane(x: FloatArray) -> bool:
