@@ -1,13 +1,13 @@
 """The whole way: survey -> start -> graph -> solution -> precision."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
-from adjust.initial import find_start
+from adjust.initial import Start, find_start
 from adjust.lens import MODELS, lens_constants, monotone_radius_px, principal_point_px
 from adjust.model import FloatArray, Survey
 from adjust.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
@@ -36,20 +36,45 @@ def adjust(
     """
     notes: tuple[str, ...] = ()
     if start is None:
-        survey, start, notes = starting(survey)
+        survey, start, notes = _trusted(survey, options)
     graph = GraphBuilder(survey, start.lenses).build(start)
     solved = solve(graph, options.solve, progress)
     return assemble(graph, solved, options, notes)
 
 
-def starting(survey: Survey) -> tuple[Survey, StartValues, tuple[str, ...]]:
-    """Start values from nothing; blocks that the search refused take no part in the adjustment, but are tested."""
+def _trusted(survey: Survey, options: AdjustOptions) -> tuple[Survey, StartValues, tuple[str, ...]]:
+    """Start values; what the search refused gets a second chance with the lenses that the rest determines."""
     found = find_start(survey)
-    blocks = list(survey.image_blocks)
-    for i in found.excluded_blocks:
-        blocks[i] = replace(blocks[i], used=np.zeros(len(blocks[i].uv), dtype=np.bool_))
-    start = StartValues(found.lenses, found.poses, found.points, found.vectors)
-    return replace(survey, image_blocks=tuple(blocks)), start, found.reasons
+    if not found.excluded_blocks:
+        return survey, start_values(found), ()
+    kept = _without(survey, found.excluded_blocks)
+    graph = GraphBuilder(kept, found.lenses).build(start_values(found))
+    values = solve(graph, options.solve).values
+    lenses = {c.camera_id: graph.unknowns.vectors[("lens", c.camera_id)].full(values) for c in survey.cameras}
+    cameras = tuple(replace(c, lens=replace(c.lens, values=lenses[c.camera_id])) for c in survey.cameras)
+    again = find_start(replace(survey, cameras=cameras))
+    return _without(survey, again.excluded_blocks), start_values(again), again.reasons
+
+
+def start_values(found: Start) -> StartValues:
+    """The start as the graph takes it."""
+    return StartValues(found.lenses, found.poses, found.points, found.vectors)
+
+
+def _without(survey: Survey, excluded: Sequence[int]) -> Survey:
+    """Blocks that are not trusted: predicted and tested where the others determine their poses, else left out."""
+    refused = set(excluded)
+    builder = GraphBuilder(survey, {c.camera_id: np.zeros(len(MODELS[c.lens.model].names)) for c in survey.cameras})
+    chains = [builder.block_keys(block) for block in survey.image_blocks]
+    known = {key for i, keys in enumerate(chains) if i not in refused for key in keys}
+    known |= builder.table_keys()
+    blocks = []
+    for i, block in enumerate(survey.image_blocks):
+        if i not in refused:
+            blocks.append(block)
+        elif chains[i] <= known:
+            blocks.append(replace(block, used=np.zeros(len(block.uv), dtype=np.bool_)))
+    return replace(survey, image_blocks=tuple(blocks))
 
 
 def assemble(graph: AdjustmentGraph, solved: Solved, options: AdjustOptions, notes: tuple[str, ...] = ()) -> Adjustment:

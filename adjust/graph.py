@@ -151,6 +151,19 @@ class GraphBuilder:
         target = FrameRef("target", block.target_id, block.epoch_id) if block.target_id else FrameRef("world")
         return self.frames.relative(target, camera)
 
+    def block_keys(self, block: ImageBlock) -> set[int]:
+        """Keys of the pose and table unknowns that an image block depends on."""
+        keys: set[int] = set()
+        for link in self._image_chain(block):
+            table = self.unknowns.table_slots.get(link.slot)
+            found = [self.unknowns.slot_key[link.slot]] if table is None else [table.angles_key, table.geometry.key]
+            keys |= {k for k in found if k is not None}
+        return keys
+
+    def table_keys(self) -> set[int]:
+        """Keys of the table angles, which are always read."""
+        return {u.key for name, u in self.unknowns.by_name.items() if name[0] == "table_angles"}
+
     def _known_points(self, block: ImageBlock) -> FloatArray:
         if block.target_id is None:
             return np.array([self.unknowns.held_points[self.point_ids[int(p)]] for p in block.point_idx])

@@ -23,7 +23,7 @@ class SolveOptions:
     """max_step: convergence, what is left to go for any unknown in its own sigmas. max_iterations: steps tried."""
 
     max_step: float = 1e-6
-    max_iterations: int = 60
+    max_iterations: int = 200
     first_damping: float = 1e-4
 
 

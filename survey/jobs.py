@@ -1,0 +1,264 @@
+"""The jobs behind the commands: read, detect, adjust, write."""
+
+import platform
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from adjust.adjustment import AdjustOptions, adjust
+from adjust.errors import IndeterminateError, SurveyError
+from adjust.observations import ImageBlock
+from adjust.result import Adjustment
+from survey.detection import DetectionTask, ImageReport, SpotOptions, detect_images
+from survey.files import Definition, Project, SpotBlock, read, read_definition, write_image_points, write_spots
+from survey.identify import Identification, identify_spots, without_points
+from survey.results import RunInfo, solution_dict, summary_text, write_results
+from survey.targets import DetectableTarget, PointList
+
+PICTURES = "detected"
+_PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-headless", "numba")
+
+
+@dataclass(frozen=True)
+class DetectOutcome:
+    """What detection did: one report per image, and the files written."""
+
+    folder: Path
+    reports: tuple[ImageReport, ...]
+    paths: tuple[Path, ...]
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """One line per image."""
+        return tuple(f"{r.path}: {r.status}{': ' + r.message if r.message else ''}" for r in self.reports)
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """The lines of the images in which nothing was found, or that could not be read."""
+        return tuple(m for m, r in zip(self.messages, self.reports, strict=True) if r.status != "found")
+
+    def summary(self) -> dict[str, Any]:
+        """Counts as plain values."""
+        return {
+            "folder": str(self.folder),
+            "images": len(self.reports),
+            "found": sum(r.status == "found" for r in self.reports),
+            "nothing": sum(r.status == "nothing" for r in self.reports),
+            "failed": sum(r.status == "failed" for r in self.reports),
+            "image_points": sum(len(d) for r in self.reports for d in r.detections.values()),
+            "spots": sum(len(r.spots) for r in self.reports if r.spots is not None),
+            "written": [str(p) for p in self.paths],
+        }
+
+    def text(self) -> str:
+        """The counts, and every image that gave nothing, for people."""
+        s = self.summary()
+        head = f"{self.folder}: {s['found']} of {s['images']} images show {s['image_points']} target points"
+        head += f" and {s['spots']} spots" if s["spots"] else ""
+        return "\n".join([head, *(f"  {line}" for line in self.problems)])
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustOutcome:
+    """An adjusted project and where its results are."""
+
+    adjustment: Adjustment
+    run: RunInfo
+    paths: dict[str, Path] = field(default_factory=dict)
+
+    def summary(self) -> dict[str, Any]:
+        """``summary`` and ``warnings`` of the solution, with the paths written."""
+        solution = solution_dict(self.adjustment, self.run)
+        return {
+            "folder": self.run.folder,
+            "summary": solution["summary"],
+            "warnings": solution["warnings"],
+            "written": {name: str(path) for name, path in self.paths.items()},
+        }
+
+    def text(self) -> str:
+        """The summary for people."""
+        return summary_text(self.adjustment, self.run)
+
+
+def detect_job(
+    folder: Path, *, jobs: int | None = None, pictures: bool = False, progress: bool = True
+) -> DetectOutcome:
+    """Find targets and spots in all images of a project, and write their tables.
+
+    Raises SurveyError where there is nothing to look at or to look for.
+    """
+    definition = read_definition(folder)
+    tasks = list(_tasks(definition))
+    if not definition.images:
+        raise SurveyError(f"{folder}/images: no images; put them at images/<camera_id>/<epoch_id>.png")
+    if not tasks:
+        raise SurveyError(
+            f"{folder}/survey.toml: nothing to look for; name a target that can be detected (checkerboard, charuco, "
+            "marker_grid, marker_block) or a table [spots]"
+        )
+    folder = Path(folder)
+    reports = detect_images(tasks, jobs=jobs, progress=progress, pictures=folder / PICTURES if pictures else None)
+    blocks, spots = _blocks(definition, reports)
+    if not blocks and not spots:
+        lines = "\n".join(f"  {r.path}: {r.message}" for r in reports[:10])
+        raise SurveyError(f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}")
+    paths = [write_image_points(folder, blocks, definition.survey)] if blocks else []
+    paths += [write_spots(folder, spots)] if spots else []
+    return DetectOutcome(folder, tuple(reports), tuple(paths))
+
+
+def _tasks(definition: Definition) -> Iterator[DetectionTask]:
+    """Every image with what may be in it: all targets, except on images that are reserved for spots."""
+    request = definition.spots_request
+    targets: dict[str, DetectableTarget] = {
+        target_id: kind for target_id, kind in definition.target_kinds.items() if not isinstance(kind, PointList)
+    }
+    for (camera_id, epoch_id), path in definition.images.items():
+        wanted = request is not None and camera_id in request.cameras
+        reserved = wanted and request is not None and request.epochs is not None and epoch_id in request.epochs
+        spots = None
+        if wanted and request is not None and (reserved or (request.epochs is None and not targets)):
+            spots = SpotOptions(diameter_px=request.diameter_px)
+        here = {} if reserved else targets
+        if here or spots:
+            yield DetectionTask(path, camera_id, epoch_id, here, spots)
+
+
+def _blocks(definition: Definition, reports: Sequence[ImageReport]) -> tuple[list[ImageBlock], list[SpotBlock]]:
+    sizes = {c.camera_id: c.image_size for c in definition.survey.cameras}
+    blocks, spots = [], []
+    for report in reports:
+        size = report.image_size
+        if size is not None and size != sizes[report.camera_id]:
+            raise SurveyError(
+                f"{report.path}: the image is {size[0]} x {size[1]} px, but survey.toml says camera "
+                f"{report.camera_id!r} has {sizes[report.camera_id][0]} x {sizes[report.camera_id][1]}; correct "
+                "image_size_px or take the right image"
+            )
+        for target_id, found in report.detections.items():
+            if len(found):
+                blocks.append(
+                    ImageBlock(report.camera_id, report.epoch_id, target_id, found.point_idx, found.uv, found.cov)
+                )
+        if report.spots is not None and len(report.spots):
+            names = tuple(f"s{i + 1}" for i in range(len(report.spots)))
+            spots.append(SpotBlock(report.camera_id, report.epoch_id, names, report.spots.uv, report.spots.cov))
+    return blocks, spots
+
+
+class _Clock:
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+def adjust_job(
+    folder: Path, *, out: Path | None = None, progress: bool = True, redetect: bool = False
+) -> AdjustOutcome:
+    """The main job: detect where that has not been done, adjust everything, write the results. Raises SurveyError."""
+    clock, folder = _Clock(), Path(folder)
+    with clock.step("read"):
+        project = read(folder)
+    messages: tuple[str, ...] = ()
+    if project.images and (redetect or not (project.survey.image_blocks or project.spots)):
+        with clock.step("detect"):
+            messages = detect_job(folder, progress=progress).problems
+            project = read(folder)
+    with clock.step("adjust"):
+        adjustment = _adjust_project(project, progress)
+    notes = tuple(f"detection: {m}" for m in messages)
+    adjustment = replace(adjustment, warnings=adjustment.warnings + notes)
+    run = _run_info(project, clock.seconds)
+    with clock.step("report"):
+        paths = write_results(out if out is not None else folder, adjustment, run)
+    return AdjustOutcome(adjustment, run, paths)
+
+
+def _adjust_project(project: Project, progress: bool) -> Adjustment:
+    survey = project.survey
+    if not (survey.image_blocks or project.spots or survey.pairs or survey.distances or survey.coordinates):
+        raise SurveyError(
+            f"{project.folder}: there is nothing to adjust; put images at images/<camera_id>/<epoch_id>.png or tables "
+            "into observations/"
+        )
+    options = AdjustOptions(alpha=project.options.alpha)
+    with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
+
+        def step(_iteration: int, omega: float) -> None:
+            bar.set_postfix_str(f"v'Pv = {omega:.6g}")
+            bar.update()
+
+        notes: tuple[str, ...] = ()
+        if project.spots:
+            found = _identify(project, options, step)
+            notes = found.notes
+            if found.unidentified:
+                notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
+            survey = replace(survey, image_blocks=survey.image_blocks + found.blocks)
+            survey = _seen_points(survey)
+        result = adjust(survey, options=options, progress=step)
+    return replace(result, warnings=result.warnings + notes)
+
+
+def _identify(project: Project, options: AdjustOptions, step: Any) -> Identification:
+    gate = project.spots_request.gate_px if project.spots_request is not None else 15.0
+    try:
+        first = adjust(without_points(project.survey), options=options, progress=step)
+    except IndeterminateError as error:
+        raise SurveyError(
+            f"{project.folder}/observations: the spots cannot be identified, because cameras and stations are not "
+            f"determined without them; name the spots' beacons in image_points.csv, or hold a board\n({error})"
+        ) from error
+    return identify_spots(project.survey, first, project.spots, gate)
+
+
+def _seen_points(survey: Any) -> Any:
+    """Leave out the beacons that nothing observes any more: a beacon may be hidden in all images."""
+    observed = {survey.points[int(i)].point_id for b in survey.image_blocks if b.target_id is None for i in b.point_idx}
+    observed |= {r.point_id for c in survey.coordinates for r in c.positions if r.frame is None}
+    kept = tuple(p for p in survey.points if p.point_id in observed or p.x_in_world.treatment != "free")
+    if len(kept) == len(survey.points):
+        return survey
+    ids = {p.point_id: i for i, p in enumerate(kept)}
+    blocks = tuple(
+        b if b.target_id is not None
+        else replace(b, point_idx=_reindexed(survey, b, ids))
+        for b in survey.image_blocks
+    )  # fmt: skip
+    distances = tuple(
+        d for d in survey.distances if all(r.frame is not None or r.point_id in ids for r in (d.a, d.b))
+    )
+    return replace(survey, points=kept, image_blocks=blocks, distances=distances)
+
+
+def _reindexed(survey: Any, block: ImageBlock, ids: dict[str, int]) -> Any:
+    import numpy as np
+
+    return np.array([ids[survey.points[int(i)].point_id] for i in block.point_idx], dtype=np.int64)
+
+
+def _run_info(project: Project, seconds: dict[str, float]) -> RunInfo:
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    options = {"alpha": project.options.alpha, "datum": project.survey.datum.kind}
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    name = project.folder.resolve().name  # the name alone: results of a copied folder stay the same
+    return RunInfo(name, project.title, project.inputs, options, versions, date, seconds)
