@@ -374,3 +374,48 @@ def opencv_left_solution(folder: Path) -> OpenCvSolution:
 
 def _opencv_epoch(name: str, side: str) -> str:
     return Path(name).stem.removeprefix(side)
+
+
+# --- AICON: 115 images of 150 points with self-calibration ------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class AiconResult:
+    """AICON's adjusted network: lens (10,) mm, images omega phi kappa (rad) X Y Z (m), points (m).
+
+    image, point: (n,) ids of the image points used; measured, residuals: (n, 2) mm, y up, computed - observed.
+    """
+
+    lens: FloatArray
+    r0_mm: float
+    images: dict[int, FloatArray]
+    points: dict[int, FloatArray]
+    image: list[int]
+    point: list[int]
+    measured: FloatArray
+    residuals: FloatArray
+
+
+def aicon_result(folder: Path) -> AiconResult:
+    """Read .ior (ck xh yh A1 A2 r0 / A3 / B1 B2 / C1 C2), .eor (mm, rad), .obc (mm) and .phc (mm).
+
+    ck is negative in the file. The last but one column of the .phc tells which image points were used;
+    those of points without coordinates were not adjusted.
+    """
+    lines = (folder / "example.ior").read_text().splitlines()
+    _, _, ck, xh, yh, a1, a2, r0 = (float(x) for x in lines[0].split()[:8])
+    a3, b1, b2, c1, c2 = (float(x) for line in lines[1:4] for x in line.split()[:2])
+    images = {}
+    for line in (folder / "example.eor").read_text().splitlines():
+        number, _, *fields = line.split()
+        row = np.array([float(x) for x in fields[:6]])
+        images[int(number)] = np.concatenate([row[3:], row[:3] / 1000])
+    points = {}
+    for line in (folder / "example.obc").read_text().splitlines():
+        point, *fields = line.split()
+        points[int(point)] = np.array([float(x) for x in fields[:3]]) / 1000
+    rows = np.array([line.split()[:10] for line in (folder / "example.phc").read_text().splitlines()], dtype=float)
+    rows = rows[(rows[:, 9] == 1) & np.isin(rows[:, 1], list(points))]
+    lens = np.array([-ck, xh, yh, a1, a2, a3, b1, b2, c1, c2])
+    ids = rows[:, :2].astype(int)
+    return AiconResult(lens, r0, images, points, list(ids[:, 0]), list(ids[:, 1]), rows[:, 2:4], rows[:, 6:8])

@@ -168,3 +168,18 @@ def test_opencv_stereo_survey_pairs_the_views():
     epochs = {side: [b.epoch_id for b in survey.image_blocks if b.camera_id == side] for side in ("left", "right")}
     assert epochs["left"] == epochs["right"] == list(published.opencv_images(folder, "right"))
     assert all(path.exists() for side in ("left", "right") for path in published.opencv_images(folder, side).values())
+
+
+def test_aicon_residuals_of_all_image_points():
+    result = published.aicon_result(data_folder("network", "jaicov"))
+    pixel_size_mm = 0.005  # any: the model is in millimetres
+    constants = lens_constants("aicon", (1, 1), pixel_size_mm, result.r0_mm)
+    poses = {image: published.world_from_camera(p) for image, p in result.images.items()}
+    q = [poses[i].transformTo(result.points[p]) for i, p in zip(result.image, result.point, strict=True)]
+    y_down = np.array([1.0, -1.0])
+    uv = result.measured * y_down / pixel_size_mm
+    residuals = lens_residuals(MODELS["aicon"], result.lens, constants, np.array(q), uv) * y_down * pixel_size_mm
+    assert residuals.shape == (9972, 2)
+    assert 3.9e-4 < residuals.std() < 4.0e-4
+    # object coordinates are printed to 1e-4 mm, a 50th of that in the image, the lens to 5e-6 mm
+    np.testing.assert_allclose(residuals, result.residuals, atol=1e-5)
