@@ -58,7 +58,9 @@ def write_project(
     parquet: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Write survey.toml and all tables, so that ``read`` gives the same survey back (to the rounding of its units).
+    """Write survey.toml and all tables, so that ``read`` gives the same survey back.
+
+    Image coordinates keep every bit, other numbers lose a few in their units; observations come back sorted by ids.
 
     target_kinds: a target that is not in it becomes a list of points. sigmas: of future tables without sigma columns;
     its ``scale`` is not written, because the covariances of the observations contain it. overwrite: replace a project

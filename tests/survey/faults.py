@@ -329,6 +329,7 @@ DEFINITION_FAULTS = [
     Fault("point twice in file", _replace("sheet_points.csv", "p3,0,100,5", "p1,0,100,5"), r"csv:4: point_id: 'p1' .*line 2"),
     Fault("id leaves the folder", _toml("[points.B1]", '[points."../B1"]'), r"'\.\./B1' cannot be an id"),
     Fault("id with separator", _toml("[stations.pillar]", '[stations."a/b"]'), r"'a/b' cannot be an id"),
+    Fault("id is hidden", _toml("[points.B1]", '[points.".B1"]'), r"'\.B1' cannot be an id"),
     Fault("id is empty", _toml("[points.B1]", '[points.""]'), r"points\.: an id is empty"),
     Fault("spots of unknown camera", _toml('cameras = ["X", "Y"]', 'cameras = ["X", "W"]'), r"unknown camera 'W'"),
     Fault("spots upside down", _toml('epochs = ["n1"]', "diameter_px = [12.0, 2.0]"), r"diameter_px: .*smallest"),

@@ -21,6 +21,7 @@ from survey import files
 from survey.files import csv_chunks, tables
 from survey.files.toml_lines import key_lines
 from survey.files.units import from_si, to_si
+from survey.simulate import full_lab
 from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList
 from tests.survey.faults import write_good_project
 
@@ -142,6 +143,17 @@ def test_pairs_and_joint_coordinates(good: Path) -> None:
     assert joint.cov[3, 4] == pytest.approx(0.5e-8)
 
 
+def test_scales_multiply_the_sigmas_of_their_group(good: Path) -> None:
+    before = files.read(good).survey
+    text = (good / "survey.toml").read_text()
+    scales = "{ image = 3.0, table = 4.0, pair = 5.0, distance = 2.0, coordinates = 6.0 }"
+    (good / "survey.toml").write_text(text.replace("{ distance = 2.0 }", scales))
+    after = files.read(good).survey
+    for name, scale in {"image_blocks": 3, "table_readings": 4, "pairs": 5, "coordinates": 6}.items():
+        for a, b in zip(getattr(before, name), getattr(after, name), strict=True):
+            np.testing.assert_allclose(b.cov, scale**2 * a.cov, rtol=1e-14)
+
+
 def test_inputs_are_hashed(good: Path) -> None:
     before = files.read(good).inputs
     assert set(before) == {"survey.toml", "sheet_points.csv"} | {
@@ -220,6 +232,23 @@ def test_what_only_programs_write(tmp_path: Path) -> None:
     assert differences(survey, again) == []
 
 
+def test_simulated_lab_returns_in_canonical_order(tmp_path: Path) -> None:
+    survey, _ = full_lab(1)
+    files.write_project(tmp_path, survey)
+    again = files.read(tmp_path).survey
+    for name in ("cameras", "stations", "tables", "targets", "points", "datum"):
+        assert differences(getattr(survey, name), getattr(again, name), name) == []
+    for name, ids in {
+        "image_blocks": ("camera_id", "epoch_id", "target_id"),
+        "table_readings": ("table_id", "epoch_id"),
+        "distances": ("distance_id",),
+        "coordinates": ("positions",),
+    }.items():
+        before = {tuple(getattr(x, key) for key in ids): x for x in getattr(survey, name)}
+        after = {tuple(getattr(x, key) for key in ids): x for x in getattr(again, name)}
+        assert differences(before, after, name) == []
+
+
 def test_existing_project_is_not_overwritten_by_chance(good: Path) -> None:
     project = files.read(good)
     with pytest.raises(SurveyError, match=r"survey\.toml: there is a project already"):
@@ -248,6 +277,7 @@ def test_tables_without_rows_observe_nothing(good: Path) -> None:
 
 def test_tie_points_become_free_points(good: Path) -> None:
     text = (good / "survey.toml").read_text().replace("format = 1", "format = 1\ntie_points = true")
+    text = text.replace('points = ["B1", "B2"]', 'points = ["B1", "T9"]')
     (good / "survey.toml").write_text(text)
     with (good / "observations" / "image_points.csv").open("a") as stream:
         stream.write("e2,X,,T10,5,5,,,\ne2,X,,T9,6,6,,,\n")
