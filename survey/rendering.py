@@ -172,7 +172,7 @@ def _rays(camera: BrownCamera) -> FloatArray:
 
 
 def _lattice(n: int) -> FloatArray:
-    """Fibonacci lattice (n, 2) in the unit square; no two points share a row or column, which suits axis-parallel edges."""
+    """Fibonacci lattice (n, 2) in the unit square; no two points share a row or column (good for straight edges)."""
     previous, current = 1, 1
     while current < n:
         previous, current = current, previous + current

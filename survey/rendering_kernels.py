@@ -110,7 +110,7 @@ def _footprint(corners, m, count, x_edges, y_edges):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _classify(corners, facet_from_ray, bounds, counts, x_edges, y_edges, cells, background, candidates):
-    """What a quadrangle of rays (4, 2) sees: number of candidate facets, whether it needs sampling, else its grey value."""
+    """What a quadrangle of rays (4, 2) sees: number of candidates, whether to sample them, else its grey value."""
     x_low, x_high = corners[:, 0].min(), corners[:, 0].max()
     y_low, y_high = corners[:, 1].min(), corners[:, 1].max()
     n, mixed, nearest, gray = 0, False, 0.0, background

@@ -29,7 +29,9 @@ def find_checkerboard(gray: Gray32, gray8: Gray8, target: Checkerboard) -> Detec
     keep = fit.good & _on_grid(fit, grid.shape[:2])
     if keep.sum() < max(6, keep.size // 2):
         return nothing_found(f"board found, but only {int(keep.sum())} of {keep.size} corners could be measured")
-    notes = () if keep.all() else (f"{int((~keep).sum())} of {keep.size} corners were not sharp or not free",)
+    notes: tuple[str, ...] = (
+        () if keep.all() else (f"{int((~keep).sum())} of {keep.size} corners were not sharp or not free",)
+    )
     if ambiguous:
         notes += ("order is ambiguous: the board looks the same after a turn",)
     blur, contrast = float(np.median(fit.blur_px[keep])), float(np.median(fit.contrast[keep]))
@@ -37,7 +39,7 @@ def find_checkerboard(gray: Gray32, gray8: Gray8, target: Checkerboard) -> Detec
 
 
 def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
-    """Corners (n, 2) px to about a pixel: the classic finder on a reduced and the full image, then the sector finder."""
+    """Corners (n, 2) px to about a pixel: classic and sector finder on a reduced image, then the full one."""
     scale = max(1.0, max(gray8.shape) / _COARSE_PX)
     size = (round(gray8.shape[1] / scale), round(gray8.shape[0] / scale))
     coarse = cv2.resize(gray8, size, interpolation=cv2.INTER_AREA) if scale > 1.0 else gray8

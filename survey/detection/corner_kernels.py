@@ -12,6 +12,8 @@ from math import asin, cos, erfc, exp, log, pi, sin, sqrt
 import numpy as np
 from numba import njit
 
+from survey.detection.solve_kernels import scaled_solve
+
 N_PARAMETERS = 9  # u, v, angle 1, angle 2, level, step, log(blur), slope u, slope v
 _NODES = np.polynomial.legendre.leggauss(8)[0]
 _WEIGHTS = np.polynomial.legendre.leggauss(8)[1]
@@ -72,53 +74,6 @@ def corner_row(x, y, p, crossing, row):
     row[7] = x
     row[8] = y
     return p[4] + b * f + p[7] * x + p[8] * y
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _cholesky_solve(A, n, B):
-    """Solves A X = B in place for the leading n rows; False where A is not positive definite."""
-    for i in range(n):
-        for j in range(i + 1):
-            total = A[i, j]
-            for k in range(j):
-                total -= A[i, k] * A[j, k]
-            if i == j:
-                if not total > 1e-14:
-                    return False
-                A[i, i] = sqrt(total)
-            else:
-                A[i, j] = total / A[j, j]
-    for c in range(B.shape[1]):
-        for i in range(n):
-            for k in range(i):
-                B[i, c] -= A[i, k] * B[k, c]
-            B[i, c] /= A[i, i]
-        for i in range(n - 1, -1, -1):
-            for k in range(i + 1, n):
-                B[i, c] -= A[k, i] * B[k, c]
-            B[i, c] /= A[i, i]
-    return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _scaled_solve(H, n, damping, B):
-    """Solves (H + damping diag(H)) X = B in place, scaled to a unit diagonal."""
-    d = np.empty(n)
-    for i in range(n):
-        d[i] = 1.0 / sqrt(H[i, i]) if H[i, i] > 0.0 else 0.0
-    A = np.empty((n, n))
-    for i in range(n):
-        for j in range(n):
-            A[i, j] = H[i, j] * d[i] * d[j]
-        A[i, i] += damping + 1e-12
-        for c in range(B.shape[1]):
-            B[i, c] *= d[i]
-    if not _cholesky_solve(A, n, B):
-        return False
-    for i in range(n):
-        for c in range(B.shape[1]):
-            B[i, c] *= d[i]
-    return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -191,13 +146,13 @@ def _normals(p, crossing, offsets, values, n, row, H, g):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fit(p, n_free, crossing, offsets, values, n, row, H, trial_H, g, trial_g):
-    """Levenberg-Marquardt over the first ``n_free`` parameters, in place; returns the cost, or -1 without convergence."""
+    """Levenberg-Marquardt over the first ``n_free`` parameters, in place; returns the cost, -1 without convergence."""
     damping = 1e-3
     cost = _normals(p, crossing, offsets, values, n, row, H, g)
     trial = np.empty(9)
     for _ in range(40):
         step = g.copy()
-        if not _scaled_solve(H, n_free, damping, step):
+        if not scaled_solve(H, n_free, damping, step):
             damping = max(damping * 10.0, 1e-6)
             continue
         trial[:] = p
@@ -260,7 +215,7 @@ def fit_corners(image, start, directions, blur, shapes, crossing, max_shift):
         rms[c] = sqrt(variance)
         unit[:] = 0.0
         unit[0, 0] = unit[1, 1] = 1.0
-        if not _scaled_solve(H, n_free, 0.0, unit):
+        if not scaled_solve(H, n_free, 0.0, unit):
             status[c] = 3
             continue
         cov[c] = variance * unit[:2, :2]

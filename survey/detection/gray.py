@@ -30,7 +30,7 @@ def read_image(path: Path) -> AnyImage:
 
 
 def gray_values(image: AnyImage) -> Gray32:
-    """Grey values (h, w) in the image's own range; colour is weighed 0.299 R + 0.587 G + 0.114 B (order B G R, alpha left out)."""
+    """Grey values (h, w) in the image's own range; colour (B G R, alpha left out): 0.299 R + 0.587 G + 0.114 B."""
     if image.ndim == 3 and image.shape[2] == 1:
         image = image[:, :, 0]
     if image.ndim == 3 and image.shape[2] in (3, 4):
@@ -53,7 +53,7 @@ def for_finding(gray: Gray32) -> Gray8:
     """8 bit for OpenCV's finders; deeper images and dim ones are stretched between their 0.1 and 99.9 percentiles."""
     sample = gray[::7, ::7]
     low, high = np.percentile(sample, [0.1, 99.9])
-    if 0.0 <= low and 60.0 <= high - low and high <= 255.0:
+    if low >= 0.0 and high - low >= 60.0 and high <= 255.0:
         return np.asarray(np.rint(np.clip(gray, 0.0, 255.0)), np.uint8)
     scaled = (gray - low) * (255.0 / max(high - low, 1.0))
     return np.asarray(np.rint(np.clip(scaled, 0.0, 255.0)), np.uint8)

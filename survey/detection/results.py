@@ -71,8 +71,9 @@ class SpotOptions:
 
 @dataclass(frozen=True, eq=False)
 class ImageReport:
-    """What became of one image. status ``found`` (something), ``nothing``, or ``failed`` (unreadable); message says more.
+    """What became of one image.
 
+    status: ``found`` (something), ``nothing``, or ``failed`` (unreadable); message says more.
     detections: by target id, empty ones with their reason included. spots: None where none were asked for.
     """
 

@@ -1,0 +1,119 @@
+"""Corners of ArUco and AprilTag markers and of ChArUco boards.
+
+OpenCV's finders name the markers; the corners are then fitted anew (``refine_corners``), so that all families have
+the same pixel origin, the centre of the first pixel, whatever their finder's own.
+"""
+
+from collections import Counter
+
+import cv2
+import numpy as np
+
+from adjust.model import FloatArray, IntArray
+from survey.detection.corners import CornerFit, refine_corners
+from survey.detection.dictionaries import charuco_board, marker_dictionary
+from survey.detection.gray import Gray8, Gray32
+from survey.detection.results import Detection, nothing_found
+from survey.targets import Charuco, MarkerBlock, MarkerGrid
+
+
+def find_markers(gray: Gray32, gray8: Gray8, target: MarkerGrid | MarkerBlock) -> Detection:
+    """The corners of those of the target's markers that are in the image; a marker seen twice is left out."""
+    wanted = _first_indices(target)
+    markers, quads = _seen_markers(gray8, target.dictionary)
+    notes: tuple[str, ...] = ()
+    twice = sorted(m for m, count in Counter(markers.tolist()).items() if count > 1 and m in wanted)
+    if twice:
+        notes += (f"marker {', '.join(map(str, twice))} seen more than once: left out",)
+    keep = np.array([m in wanted and m not in twice for m in markers.tolist()], bool)
+    if not keep.any():
+        return nothing_found(f"none of the {len(wanted)} markers ({target.dictionary}) was found", notes)
+    markers, quads = markers[keep], quads[keep]
+    cells = int(marker_dictionary(target.dictionary).markerSize) + 2
+    fit = _fit_quads(gray, quads, cells, _gap_cells(target, cells))
+    point_idx = np.array([wanted[m] + corner for m in markers.tolist() for corner in range(4)], np.int64)
+    return _detection(point_idx, fit, notes, "marker corners")
+
+
+def find_charuco(gray: Gray32, gray8: Gray8, target: Charuco) -> Detection:
+    """The board's inner corners that are seen, part of the board being enough."""
+    detector = cv2.aruco.CharucoDetector(charuco_board(target))
+    corners, ids, _, marker_ids = detector.detectBoard(gray8)
+    n_markers = 0 if marker_ids is None else len(np.ravel(marker_ids))
+    if ids is None or len(np.ravel(ids)) < 4:
+        n = 0 if ids is None else len(np.ravel(ids))
+        return nothing_found(f"{n} corners by {n_markers} markers ({target.dictionary}) found; at least 4 are needed")
+    point_idx = np.ravel(ids).astype(np.int64)
+    start = np.reshape(corners, (-1, 2)).astype(float)
+    edges = _board_edges(target, point_idx, start)
+    if edges is None:
+        return nothing_found(f"the {len(point_idx)} corners found lie on one line")
+    margin = (target.square_m - target.marker_m) / (2.0 * target.square_m)
+    free = margin * np.linalg.norm(edges, axis=2).min(1)
+    fit = refine_corners(gray, start, edges, free)
+    return _detection(point_idx, fit, (), "corners")
+
+
+def _first_indices(target: MarkerGrid | MarkerBlock) -> dict[int, int]:
+    """Position of corner 0 in the target's points, by marker id."""
+    if isinstance(target, MarkerGrid):
+        return {target.first_id + k: 4 * k for k in range(target.rows * target.columns)}
+    return {marker: 4 * k for k, marker in enumerate(sorted(target.corners))}
+
+
+def _gap_cells(target: MarkerGrid | MarkerBlock, cells: int) -> float:
+    """Width of the bright margin around a marker, in cells; one cell is what a finder needs."""
+    if isinstance(target, MarkerGrid):
+        return min(1.0, cells * target.gap_m / target.marker_m)
+    return 1.0
+
+
+def _seen_markers(gray8: Gray8, dictionary: str) -> tuple[IntArray, FloatArray]:
+    """Ids (n,) and corners (n, 4, 2) px of all markers of a dictionary, in ascending id."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
+    corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters).detectMarkers(gray8)
+    if ids is None or len(np.ravel(ids)) == 0:
+        return np.zeros(0, np.int64), np.zeros((0, 4, 2))
+    markers = np.ravel(ids).astype(np.int64)
+    quads = np.stack([np.reshape(quad, (4, 2)) for quad in corners]).astype(float)
+    order = np.argsort(markers, kind="stable")
+    return markers[order], quads[order]
+
+
+def _fit_quads(gray: Gray32, quads: FloatArray, cells: int, gap_cells: float) -> CornerFit:
+    """Corners of dark quadrangles, each by the two edges that end there and as far as one cell from those."""
+    edges = np.stack([np.roll(quads, -1, axis=1) - quads, np.roll(quads, 1, axis=1) - quads], axis=2)
+    across = _across(edges)
+    free = across * min(1.0, gap_cells) / cells
+    return refine_corners(gray, quads.reshape(-1, 2), edges.reshape(-1, 2, 2), free.ravel(), crossing=False)
+
+
+def _across(edges: FloatArray) -> FloatArray:
+    """Least height of the parallelogram that two edges span, px."""
+    area = np.abs(edges[..., 0, 0] * edges[..., 1, 1] - edges[..., 0, 1] * edges[..., 1, 0])
+    return np.asarray(area / np.maximum(np.linalg.norm(edges, axis=-1).max(-1), 1e-9))
+
+
+def _board_edges(target: Charuco, point_idx: IntArray, start: FloatArray) -> FloatArray | None:
+    """Vectors (n, 2, 2) px along the board's rows and columns at its corners, one square long, from a homography."""
+    xy = target.points()[1][point_idx, :2] / target.square_m
+    if len(np.unique(xy[:, 0])) < 2 or len(np.unique(xy[:, 1])) < 2:
+        return None
+    H, _ = cv2.findHomography(xy, start, cv2.RANSAC, 5.0)
+    if H is None:
+        return None
+    q = np.column_stack([xy, np.ones(len(xy))]) @ np.asarray(H, float).T
+    jacobian = (H[None, :2, :2] - (q[:, :2] / q[:, 2:])[:, :, None] * H[None, 2:, :2]) / q[:, 2, None, None]
+    return np.asarray(jacobian.transpose(0, 2, 1))
+
+
+def _detection(point_idx: IntArray, fit: CornerFit, notes: tuple[str, ...], name: str) -> Detection:
+    good = fit.good
+    if not good.all():
+        notes += (f"{int((~good).sum())} of {good.size} {name} were not sharp or not free",)
+    if not good.any():
+        return nothing_found(f"found, but none of its {good.size} {name} could be measured", notes)
+    order = np.argsort(point_idx[good], kind="stable")
+    blur, contrast = float(np.median(fit.blur_px[good])), float(np.median(fit.contrast[good]))
+    return Detection(point_idx[good][order], fit.uv[good][order], fit.cov[good][order], blur, contrast, notes)
