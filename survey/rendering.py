@@ -303,8 +303,8 @@ def _add_beacons(image: _Gray32, camera: BrownCamera, beacons: Beacons, facets: 
         _splat(image, uv, abs(scale) * area * float(gray), blur_px)
 
 
-def _spot_points(centre: FloatArray, beacons: Beacons, n: int = 400) -> tuple[FloatArray, float]:
-    """Points (n, 3) of equal flux on a spot that faces the camera (sunflower pattern), and its area in m^2."""
+def _spot_points(centre: FloatArray, beacons: Beacons, n: int = 200) -> tuple[FloatArray, float]:
+    """Points (2 n, 3) of equal flux on a spot that faces the camera (sunflower pattern), and its area in m^2."""
     k = np.arange(n) + 0.5
     radius, angle = np.sqrt(k / n), np.pi * (1.0 + 5.0**0.5) * k
     r = beacons.diameter_m / 2.0
@@ -312,7 +312,7 @@ def _spot_points(centre: FloatArray, beacons: Beacons, n: int = 400) -> tuple[Fl
     if beacons.profile == "gaussian":
         radius, area = np.sqrt(-2.0 * np.log1p(-(radius**2))) / 2.0, 2.0 * np.pi * (r / 2.0) ** 2
     local = r * np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    local -= local.mean(0)
+    local = np.concatenate([local, -local])  # odd moments vanish: the spot's centre is its centroid and its mode
     return centre + local @ _axes(centre), area
 
 

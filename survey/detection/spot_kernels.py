@@ -28,7 +28,7 @@ def _pixel_share(d, sigma):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def spot_row(x, y, p, profile, row):
-    """Grey value at (x, y) and its derivatives by p: u, v, background, amplitude, log width u, log width v, log softness.
+    """Grey value at (x, y) and its derivatives by p: u, v, background, amplitude, log widths u, v, log softness.
 
     Gaussian: amplitude is the flux, widths are standard deviations (no softness). Disc: amplitude is the step, widths
     are radii and the softness is the standard deviation of the blurred rim.

@@ -76,7 +76,7 @@ def _candidates(
     mask = (residual > options.min_contrast * noise).astype(np.uint8)
     n, low = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
     peaks = np.zeros(n, np.float32)
-    np.maximum.at(peaks, low[mask > 0], residual[mask > 0])
+    np.maximum.at(peaks, np.asarray(low[mask > 0], np.int64), residual[mask > 0])
     half = ((low > 0) & (residual > 0.5 * peaks[low])).astype(np.uint8)
     n, labels, stats, _ = cv2.connectedComponentsWithStats(half, connectivity=8, ltype=cv2.CV_32S)
     rows = []
@@ -88,7 +88,9 @@ def _candidates(
             continue
         window = np.where(labels[top : top + height, left : left + width] == k, 1.0, 0.0)
         weight = window * residual[top : top + height, left : left + width]
-        rows.append((*_moments(weight, left, top), diameter, float(weight.max())))
+        u, v, elongation = _moments(np.asarray(weight, float), left, top)
+        # the axes of a dozen pixels are noise; the fit judges those
+        rows.append((u, v, elongation if area >= 12 else 1.0, diameter, float(weight.max())))
     table = np.array(rows).reshape(-1, 5)
     return labels, table[:, :2], table[:, 3], table[:, 4], table[:, 2]
 
