@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 from scipy import sparse
-from scipy.linalg import lapack
+from scipy.linalg import block_diag, lapack
 
 from adjust.bundle_kernels import (
     add_direct,
@@ -334,6 +334,44 @@ class BundleBatch:
             self.pose_at, self.point_at, Q_local, influence,
         )  # fmt: skip
         return Q, C, influence
+
+    def hidden_from_interface(self, keys: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """How hidden poses and points follow from the interface, stacked: M (n, n_interface), and their own scatter.
+
+        Their covariance is M Q_interface M' plus the second matrix (n, n); with any unknown b outside it is
+        M Cov(interface, b). The batch must be prepared with Jacobians.
+        """
+        nh, n = self.n_hidden, self.n_keys
+        T, own = np.zeros((n, n - nh)), np.zeros((n, n))
+        T[nh:] = np.eye(n - nh)
+        if nh:
+            from_interface = -lapack.dtrtrs(self.C, np.asfortranarray(self.Y[:, :-1]), lower=0)[0]
+            T[:nh] = from_interface / self.scale[:nh, None] * self.scale[nh:]
+            P = lapack.dpotri(self.C.copy(order="F"), lower=0)[0]
+            own[:nh, :nh] = (np.triu(P) + np.triu(P, 1).T) / self.scale[:nh, None] / self.scale[:nh]
+        reduced = {self.point_key[i]: j for j, i in enumerate(self.reduced)}
+        rows, V = [], []
+        for key in keys:
+            if key in reduced:
+                rows.append(self._point_from_local(reduced[key]) @ self.G)
+                V.append(self.Vi[reduced[key]])
+            else:
+                at = self.key_at[key]
+                rows.append(sparse.csr_matrix((np.ones(6), (np.arange(6), at + np.arange(6))), shape=(6, n)))
+                V.append(np.zeros((6, 6)))
+        L = sparse.vstack(rows).tocsr()
+        scatter = np.asarray(L @ (L @ own).T) + block_diag(*V)
+        return np.asarray(L @ T), scatter
+
+    def _point_from_local(self, j: int) -> sparse.csr_matrix:
+        """Derivative (3, n_local) of reduced point ``j`` by the local unknowns: -V^-1 W."""
+        Y = np.zeros((3, self.n_local))
+        for i in range(self.pc_ptr[j], self.pc_ptr[j + 1]):
+            at, n = self.lens_at[self.pc_camera[i]], self.state.lenses.n_free[self.pc_camera[i]]
+            Y[:, at : at + n] -= self.Vi[j] @ self.WL[i, :, :n]
+        for k in range(self.ptr[j], self.ptr[j + 1]):
+            Y[:, self.pose_at[k] : self.pose_at[k] + 6] -= self.Vi[j] @ self.W3[k]
+        return sparse.csr_matrix(Y)
 
     def residuals_px(self) -> FloatArray:
         """Unwhitened residuals (K, 2) px, sorted order, of the last :meth:`covariances`."""

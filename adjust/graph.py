@@ -21,7 +21,7 @@ from adjust.factors import (
 )
 from adjust.image_batch import ImageBatch
 from adjust.model import FloatArray, Survey
-from adjust.observations import FrameRef, ImageBlock, PositionRef
+from adjust.observations import FrameRef, ImageBlock, Pair, PositionRef
 from adjust.result import ParameterName
 from adjust.state import State, collect_vectors
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
@@ -228,11 +228,11 @@ class GraphBuilder:
                         ("m",) * len(names), c.values.ravel(), c.used)  # fmt: skip
         self._priors()
 
-    def _pair(self, state, pair, chain) -> None:  # type: ignore[no-untyped-def]  # three plain values
+    def _pair(self, state: State, pair: Pair, chain: Chain) -> None:
         factor = pair_factor(pair, self.unknowns, state, chain)
-        pose = isinstance(pair.b_from_a, Pose3)
-        n = 6 if pose else 3
-        observed = Pose3.Logmap(pair.b_from_a) if pose else Rot3.Logmap(pair.b_from_a)
+        measured = pair.b_from_a
+        observed = Pose3.Logmap(measured) if isinstance(measured, Pose3) else Rot3.Logmap(measured)
+        n = len(observed)
         self._other(factor, "pair", pair.group, (pair.pair_id, frame_text(pair.a), frame_text(pair.b)),
                     POSE_COMPONENTS[:n], POSE_UNITS[:n], observed, pair.used)  # fmt: skip
 

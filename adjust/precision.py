@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from scipy.stats import chi2
 
-from adjust.datum import gauge
+from adjust.datum import gauge, stacking
 from adjust.graph import AdjustmentGraph, ObservationFactor
 from adjust.model import BoolArray, FloatArray
 from adjust.result import GlobalTest, GroupSummary, ImageResiduals, ObservationResidual, ParameterName
@@ -60,14 +60,27 @@ class Precision:
         return np.asarray(Q - self._excess([key]))
 
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:
-        """Joint covariance of several unknowns, stacked in this order (lens: its free components).
+        """Joint covariance of several unknowns, stacked in this order (of vectors their free components).
 
-        Raises KeyError for a name that is not an unknown, and for points or poses that are hidden in a bundle.
+        Raises KeyError for a name that is not an unknown.
         """
         keys = [self.graph.unknowns.by_name[name].key for name in names]
-        if len(keys) == 1:
-            return self.cov(keys[0])
-        return np.asarray(self.tree.joint(keys) - self._excess(keys))
+        hidden = [k for k in keys if k in self.hidden]
+        bundle = self.graph.bundle
+        if not hidden or bundle is None:
+            return np.asarray(self.tree.joint(keys) - self._excess(keys))
+        seen = [k for k in keys if k not in self.hidden]
+        outer = list(dict.fromkeys(bundle.interface + seen))
+        Q, at = self.tree.joint(outer), stacking(self.graph, outer)
+        M, own = bundle.hidden_from_interface(hidden)
+        interface, mine = at.index(bundle.interface), stacking(self.graph, hidden)
+        L = np.zeros((sum(self.tree.dims[k] for k in keys), at.n))
+        scatter, place = np.zeros((len(L), len(L))), stacking(self.graph, keys)
+        L[np.ix_(place.index(hidden), interface)] = M[mine.index(hidden)]
+        scatter[np.ix_(place.index(hidden), place.index(hidden))] = own
+        if seen:
+            L[place.index(seen), at.index(seen)] = 1.0
+        return np.asarray(L @ Q @ L.T + scatter - self._excess(keys))
 
     def influence(self, item: ObservationFactor) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Whitened residual (k,), whitened A Q A' (k, k), and the square root information's inverse (k, k)."""

@@ -3,7 +3,7 @@
 import platform
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -11,10 +11,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.errors import IndeterminateError, SurveyError
+from adjust.model import IntArray, Survey
 from adjust.observations import ImageBlock
 from adjust.result import Adjustment
 from survey.detection import DetectionTask, ImageReport, SpotOptions, detect_images
@@ -111,8 +113,9 @@ def detect_job(
     if not blocks and not spots:
         lines = "\n".join(f"  {r.path}: {r.message}" for r in reports[:10])
         raise SurveyError(f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}")
-    paths = [write_image_points(folder, blocks, definition.survey)] if blocks else []
-    paths += [write_spots(folder, spots)] if spots else []
+    # an empty table is written too: one of an earlier run must not stay behind
+    paths = [write_image_points(folder, blocks, definition.survey)]
+    paths += [write_spots(folder, spots)] if definition.spots_request is not None else []
     return DetectOutcome(folder, tuple(reports), tuple(paths))
 
 
@@ -214,7 +217,7 @@ def _adjust_project(project: Project, progress: bool) -> Adjustment:
     return replace(result, warnings=result.warnings + notes)
 
 
-def _identify(project: Project, options: AdjustOptions, step: Any) -> Identification:
+def _identify(project: Project, options: AdjustOptions, step: Callable[[int, float], None]) -> Identification:
     gate = project.spots_request.gate_px if project.spots_request is not None else 15.0
     try:
         first = adjust(without_points(project.survey), options=options, progress=step)
@@ -226,7 +229,7 @@ def _identify(project: Project, options: AdjustOptions, step: Any) -> Identifica
     return identify_spots(project.survey, first, project.spots, gate)
 
 
-def _seen_points(survey: Any) -> Any:
+def _seen_points(survey: Survey) -> Survey:
     """Leave out the beacons that nothing observes any more: a beacon may be hidden in all images."""
     observed = {survey.points[int(i)].point_id for b in survey.image_blocks if b.target_id is None for i in b.point_idx}
     observed |= {r.point_id for c in survey.coordinates for r in c.positions if r.frame is None}
@@ -245,9 +248,7 @@ def _seen_points(survey: Any) -> Any:
     return replace(survey, points=kept, image_blocks=blocks, distances=distances)
 
 
-def _reindexed(survey: Any, block: ImageBlock, ids: dict[str, int]) -> Any:
-    import numpy as np
-
+def _reindexed(survey: Survey, block: ImageBlock, ids: dict[str, int]) -> IntArray:
     return np.array([ids[survey.points[int(i)].point_id] for i in block.point_idx], dtype=np.int64)
 
 
