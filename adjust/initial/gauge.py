@@ -66,7 +66,8 @@ def _join_chain(classes: _Classes, network: PoseNetwork, observation: ChainObser
     previous: End = _BOUND if observation.ends[0] else _POINTS
     known: list[int] = []
     open_links = network.unknown_links(observation.chain)
-    if not open_links:
+    if not open_links:  # an image with a known pose binds the points that it sees
+        classes.join(previous, _BOUND if observation.ends[1] else _POINTS, [])
         return
     for i, link in enumerate(observation.chain):
         if i not in open_links:

@@ -11,6 +11,7 @@ from adjust.initial.motion import solve_motion
 from adjust.initial.network import ChainObservation, PoseNetwork, as_pose3
 from adjust.initial.points import PARALLAX, PointField, improve, intersect_points, point_field, resect
 from adjust.initial.polish import polish
+from adjust.initial.relative import orient_second, scale_lengths
 from adjust.initial.result import Start
 from adjust.initial.undetermined import undetermined
 from adjust.initial.views import (
@@ -68,6 +69,7 @@ class _Search:
         self.views: dict[int, View] = {}
         self.doubtful: list[ChainObservation] = []
         self.motion_solved = False
+        self.scale_free = False
         self._register_pairs_and_positions()
         self.network.register(survey)
 
@@ -173,14 +175,20 @@ class _Search:
             self.notes.append(note)
             self.motion_solved = True
             return True
-        return network.propagate(rotation_only=True)
+        if network.propagate(rotation_only=True):
+            return True
+        note = orient_second(network, points) if not points.known.any() else None
+        if note is not None:
+            self.notes.append(note)
+            self.scale_free = True
+        return note is not None
 
     def _unseen_chains(self) -> list[ChainObservation]:
-        """Chains of blocks of world points that have no pose yet; they bind the world only by points that are known."""
+        """Chains of blocks of world points that have no pose yet; they bind the world as soon as any point is known."""
         have = {o.block_idx for o in self.network.observations}
-        known = self.points.known
+        bound = bool(self.points.known.any())
         return [
-            ChainObservation(s.chain, np.zeros((0, 4, 4)), s.text, s.block_idx, ends=(True, bool(known[s.rows].any())))
+            ChainObservation(s.chain, np.zeros((0, 4, 4)), s.text, s.block_idx, ends=(True, bound))
             for s in self.points.sights
             if s.block_idx not in have
         ]
@@ -194,23 +202,45 @@ class _Search:
         moved = set(network.known) - network.fixed - set(network.gauged)
         if self.motion_solved or np.nanmax(self._block_rms(), initial=0.0) > _POLISH_PX:
             polish(network, moved, self.views)
+        self._settle_scale()
         self._move_to_coordinates()
         self._set_aside_contradictions()
+
+    def _settle_scale(self) -> None:
+        """The scale of a network of relative orientations, from observed distances or coordinates."""
+        if not self.scale_free or self.views:
+            return
+        ratios = []
+        for distance in self.survey.distances:
+            a, b = self._place(distance.a), self._place(distance.b)
+            if distance.used and a is not None and b is not None and np.linalg.norm(a - b) > 0:
+                ratios.append(distance.value / float(np.linalg.norm(a - b)))
+        observed, present = self._observed_positions()
+        if not ratios and len(observed) > 1:
+            ratios = [float(np.std(observed, axis=0).max() / max(np.std(present, axis=0).max(), 1e-12))]
+        if ratios:
+            slots = [s for s in self.network.known if s not in self.network.fixed]
+            scale_lengths(self.network, self.points, float(np.median(ratios)), slots)
+            self.notes.append(f"scale from {len(ratios)} observed length(s)")
+
+    def _observed_positions(self) -> tuple[FloatArray, FloatArray]:
+        """Observed coordinates (m, 3) and where their positions are at present (m, 3)."""
+        rows = []
+        for item in self.survey.coordinates:
+            for ref, value in zip(item.positions, item.values, strict=True):
+                place = self._place(ref) if item.used else None
+                if place is not None:
+                    rows.append((value, place))
+        return np.array([r[0] for r in rows]).reshape(-1, 3), np.array([r[1] for r in rows]).reshape(-1, 3)
 
     def _move_to_coordinates(self) -> None:
         """Move the whole world onto observed coordinates where nothing given holds it."""
         if not world_is_free(self.network, self.survey) or self.points.given.any():
             return
-        observed, present = [], []
-        for item in self.survey.coordinates:
-            for ref, value in zip(item.positions, item.values, strict=True):
-                place = self._place(ref) if item.used else None
-                if place is not None:
-                    observed.append(value)
-                    present.append(place)
-        if not observed:
+        observed, present = self._observed_positions()
+        if not len(observed):
             return
-        new_from_old = align(np.array(observed), np.array(present))
+        new_from_old = align(observed, present)
         for slot, name in self.network.names.items():
             if frames_of(self.network, name)[0] == ("world",):
                 self.network.known[slot] = new_from_old @ self.network.known[slot]

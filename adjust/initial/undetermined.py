@@ -13,7 +13,7 @@ def undetermined(survey: Survey, network: PoseNetwork, points: PointField) -> st
         for slot, name in sorted(network.names.items())
         if slot not in network.known
     ]
-    needed = points.seen() & ~points.known
+    needed = ~points.known
     lines += [
         f"point {p.point_id}: {_missing_point(network, points, i)}" for i, p in enumerate(survey.points) if needed[i]
     ]
@@ -49,6 +49,8 @@ def _missing_pose(network: PoseNetwork, points: PointField, name: ParameterName,
 
 def _missing_point(network: PoseNetwork, points: PointField, row: int) -> str:
     seen = [s for s in points.sights if row in s.rows]
+    if not seen:
+        return "no image shows it and it has no coordinates; give them, or take it out of the survey"
     ready = sum(not network.unknown_links(s.chain) for s in seen)
     return (
         f"seen in {len(seen)} image(s), {ready} of them from a known pose; two from different directions are needed:"

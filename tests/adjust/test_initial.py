@@ -21,7 +21,7 @@ from adjust.model import (
     Table,
     Target,
 )
-from adjust.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef, TableReading
+from adjust.observations import Coordinates, Distance, FrameRef, ImageBlock, Pair, PositionRef, TableReading
 
 SIZE = (1280, 1024)
 FREE = ("fx", "fy", "u0", "v0", "k1", "k2", "p1", "p2")
@@ -382,3 +382,23 @@ def test_given_values_are_kept():
     start = find_start(survey)
     assert start.poses[("carrier_from_target", "board")].equals(given, 1e-12)
     assert start.lenses["c"][0] == TRUE[0] + 5
+
+
+def test_a_field_of_unknown_points_is_oriented_and_scaled_by_one_distance():
+    rng = np.random.default_rng(14)
+    x, points = beacons(rng, 0, n=30)
+    eyes = [
+        looking_at(np.array(e), (0, 0, 0)) for e in ((0.5, 0.3, -4.0), (2.5, 0, -3), (-2.5, 0.5, -3), (0, -2, -3.5))
+    ]
+    blocks = tuple(block("c", f"e{i}", None, x, inv(m), rng) for i, m in enumerate(eyes))
+    tape = Distance("d", PositionRef("B3"), PositionRef("B17"), float(np.linalg.norm(x[3] - x[17])), 1e-4)
+    survey = Survey((camera(values=TRUE, station_from_camera=HELD),), (Station("s", "epoch"),), points=points,
+                    image_blocks=blocks, distances=(tape,))  # fmt: skip
+    start = find_start(survey)
+    found = np.array([start.points[f"B{i}"] for i in range(30)])
+    distances = np.linalg.norm(found[:, None] - found[None], axis=2)
+    truth = np.linalg.norm(x[:, None] - x[None], axis=2)
+    np.testing.assert_allclose(distances, truth, atol=0.03)
+    assert_small_misfit(start, 0.5)
+    with pytest.raises(SurveyError, match="point B30: no image shows it"):
+        find_start(replace(survey, points=(*points, Point("B30"))))
