@@ -15,7 +15,9 @@ class Start:
 
     lenses: full vectors (n,) by camera. poses: by parameter name. points: (3,) m by point id. vectors: table_angles,
     table_geometry and warp by parameter name. excluded_blocks: positions in ``Survey.image_blocks`` of what is not
-    trusted, each with its reason. block_rms_px: misfit of every block at the start, px (nan where it has no rays).
+    trusted, each with its reason. orphans: poses that only such blocks reach; they have a value here, but nothing in an
+    adjustment without these blocks determines them: leave the blocks out altogether, or hold the poses. block_rms_px:
+    misfit of every block at the start, px (nan where it has no rays).
     """
 
     lenses: Mapping[str, FloatArray]
@@ -24,5 +26,6 @@ class Start:
     vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
     excluded_blocks: tuple[int, ...] = ()
     reasons: tuple[str, ...] = ()
+    orphans: tuple[ParameterName, ...] = ()
     block_rms_px: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()

@@ -196,8 +196,10 @@ class _Search:
     def settle(self) -> None:
         """Renew what was found from all observations together, and set aside the blocks that contradict the rest."""
         network = self.network
-        movable = set(network.known) - network.fixed - set(network.gauged)
-        for _ in range(_ROUNDS if self.points.sights else 0):
+        movable = set(network.known) - network.fixed - (set() if self.scale_free else set(network.gauged))
+        # a field that grew from one pair has errors that only fade from round to round
+        rounds = _ROUNDS * (4 if self.scale_free else 1)
+        for _ in range(rounds if self.points.sights else 0):
             improve(network, self.points, movable)
         moved = set(network.known) - network.fixed - set(network.gauged)
         if self.motion_solved or np.nanmax(self._block_rms(), initial=0.0) > _POLISH_PX:
@@ -314,4 +316,15 @@ class _Search:
         order = tuple(sorted(self.reasons))
         points = {p.point_id: self.points.x[i] for i, p in enumerate(survey.points) if self.points.known[i]}
         reasons = tuple(self.reasons[i] for i in order)
-        return Start(self.lenses, poses, points, vectors, order, reasons, tuple(rms.tolist()), tuple(self.notes))
+        return Start(
+            self.lenses, poses, points, vectors, order, reasons, self._orphans(), tuple(rms.tolist()), tuple(self.notes)
+        )
+
+    def _orphans(self) -> tuple[ParameterName, ...]:
+        """Poses that only distrusted blocks reach."""
+        chains = [chain for i, chain in enumerate(self.chains) if i not in self.reasons]
+        chains += [o.chain for o in self.network.observations if o.block_idx < 0]
+        reached = {link.slot for chain in chains for link in chain}
+        doubted = {link.slot for i in self.reasons for link in self.chains[i]}
+        names = self.network.names
+        return tuple(names[slot] for slot in sorted(doubted - reached - self.network.fixed))

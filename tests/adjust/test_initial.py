@@ -149,7 +149,9 @@ def test_a_mis_detected_image_is_named_and_left_out(damage):
     assert start.excluded_blocks == (4,)
     assert "epoch 'e4'" in start.reasons[0]
     np.testing.assert_allclose(start.lenses["c"][[0, 1, 3, 4]], TRUE[:4], atol=8)
+    # nothing else shows the station at this epoch: it has a value, and is said to hang on this image alone
     assert ("world_from_station", "s", "e4") in start.poses
+    assert start.orphans == (("world_from_station", "s", "e4"),)
     assert_small_misfit(start)
 
 
@@ -399,6 +401,6 @@ def test_a_field_of_unknown_points_is_oriented_and_scaled_by_one_distance():
     distances = np.linalg.norm(found[:, None] - found[None], axis=2)
     truth = np.linalg.norm(x[:, None] - x[None], axis=2)
     np.testing.assert_allclose(distances, truth, atol=0.03)
-    assert_small_misfit(start, 0.5)
+    assert_small_misfit(start, 1.0)
     with pytest.raises(SurveyError, match="point B30: no image shows it"):
         find_start(replace(survey, points=(*points, Point("B30"))))
