@@ -8,7 +8,7 @@ from gtsam import Pose3
 
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.initial import Start, find_start
-from adjust.lens import MODELS, lens_constants, monotone_radius_px, principal_point_px
+from adjust.lens import MODELS, camera_constants, monotone_radius_px, principal_point_px
 from adjust.model import FloatArray, Survey
 from adjust.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
 from adjust.result import Adjustment, Estimate, ParameterName
@@ -173,7 +173,7 @@ def _lens_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
         values = result.estimates[("lens", camera.camera_id)].value
         if isinstance(values, Pose3):
             continue
-        constants = lens_constants(model, camera.image_size, camera.lens.pixel_size_mm)
+        constants = camera_constants(camera)
         radius = monotone_radius_px(model, values, constants)
         seen = _largest_radius(graph, camera.camera_id, principal_point_px(model, values, constants))
         if seen > radius:

@@ -13,7 +13,7 @@ import numpy as np
 from adjust import lens_kernels as kernels
 from adjust.errors import SurveyError
 from adjust.lens_radial import RadialProfile, invert_radius, radial_profile
-from adjust.model import BoolArray, FloatArray
+from adjust.model import BoolArray, Camera, FloatArray
 
 RAY_TOLERANCE = 1e-13
 """Newton's last step on a ray, in tangents of the angle to the axis."""
@@ -109,6 +109,12 @@ def lens_constants(
         raise SurveyError(f"pixel_size_mm is {pixel_size_mm}; it must be positive")
     width, height = image_size
     return np.array([pixel_size_mm, (width - 1) / 2, (height - 1) / 2, r0_mm])
+
+
+def camera_constants(camera: Camera) -> FloatArray:
+    """Constants (4,) of a camera of a survey, see :func:`lens_constants`."""
+    lens = camera.lens
+    return lens_constants(lens.model, camera.image_size, lens.pixel_size_mm, lens.balance_radius_mm)
 
 
 def default_start(

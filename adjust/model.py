@@ -82,6 +82,7 @@ class LensParameter:
     values: (n,) in the order of the model's parameters, or None where the program must find a start.
     free: the parameters to be estimated; the others are held at ``values`` (zero where those are None).
     pixel_size_mm: needed by the models whose parameters are in millimetres.
+    balance_radius_mm: where the radial distortion of the model "aicon" is zero (its r0); no other model uses it.
     """
 
     model: str
@@ -90,6 +91,7 @@ class LensParameter:
     prior: VectorPrior | None = None
     ties: tuple[Tie, ...] = ()
     pixel_size_mm: float | None = None
+    balance_radius_mm: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 from adjust.chain_kernels import table_motion
 from adjust.errors import SurveyError
 from adjust.image_kernels import LensArrays
-from adjust.lens import MODELS, lens_constants
+from adjust.lens import MODELS, camera_constants
 from adjust.lens_kernels import MAX_LENS
 from adjust.model import FloatArray, IntArray, Survey, VectorParameter
 from adjust.unknowns import TableSlot, Unknowns, VectorMap, vector_map
@@ -56,8 +56,7 @@ class State:
             np.zeros((n, MAX_LENS)),
         )
         for i, camera in enumerate(survey.cameras):
-            model = MODELS[camera.lens.model]
-            arrays.constants[i] = lens_constants(model, camera.image_size, camera.lens.pixel_size_mm)
+            arrays.constants[i] = camera_constants(camera)
             sources, columns = np.nonzero(self.lens_maps[i].matrix)
             k = arrays.n_map[i] = len(sources)
             arrays.source[i, :k], arrays.column[i, :k] = sources, columns

@@ -10,9 +10,9 @@ from adjust.errors import SurveyError
 from adjust.initial.lens_refinement import LensFit, fit_lens
 from adjust.lens import (
     LensModel,
+    camera_constants,
     default_start,
     focal_length_px,
-    lens_constants,
     lens_model,
     principal_point_px,
     unit_rays,
@@ -77,7 +77,7 @@ class _LensSearch:
 
     def __init__(self, camera: Camera, model: LensModel) -> None:
         self.camera, self.model, self.size = camera, model, camera.image_size
-        self.constants = lens_constants(model, camera.image_size, camera.lens.pixel_size_mm)
+        self.constants = camera_constants(camera)
         self.prior = {}
         if camera.lens.prior is not None:
             self.prior = dict(zip(camera.lens.prior.names, camera.lens.prior.mean, strict=True))
@@ -97,7 +97,7 @@ class _LensSearch:
         if not usable:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: no lens values are given and no image shows 4 or more known points;"
-                " show it a target, or give start values (the focal length in pixels is enough for fx and fy)"
+                " show it a target, or give lens values"
             )
         flat = [s for s in usable if _is_plane(s.x)]
         good, excluded = self._screen(flat) if flat else ([], {})
@@ -262,13 +262,15 @@ def _median(fit: LensFit) -> float:
 
 
 def _is_plane(x: FloatArray) -> bool:
-    s = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
-    return bool(s[1] > 1e-3 * s[0] and (len(s) < 3 or s[2] < 1e-2 * s[1]))
+    centred = x - x.mean(axis=0)
+    s = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred), 0.0))
+    return bool(s[1] > 1e-3 * s[2] and s[0] < 1e-2 * s[1])
 
 
 def _plane_coordinates(x: FloatArray) -> FloatArray:
-    _, _, vt = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)
-    return np.asarray((x - x.mean(axis=0)) @ vt[:2].T)
+    centred = x - x.mean(axis=0)
+    _, vectors = np.linalg.eigh(centred.T @ centred)
+    return np.asarray(centred @ vectors[:, :0:-1])
 
 
 def _unit(xy: FloatArray) -> FloatArray:

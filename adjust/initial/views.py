@@ -7,7 +7,7 @@ import numpy as np
 
 from adjust.closed_forms import pose_solutions, refine_poses, view_errors
 from adjust.errors import SurveyError
-from adjust.lens import focal_length_px, lens_constants, lens_model, unit_rays
+from adjust.lens import camera_constants, focal_length_px, lens_model, unit_rays
 from adjust.model import BoolArray, Camera, FloatArray, Survey, Target
 from adjust.observations import ImageBlock
 
@@ -56,14 +56,14 @@ def block_text(block: ImageBlock) -> str:
 def rays_of(camera: Camera, values: FloatArray, uv: FloatArray) -> FloatArray:
     """Unit rays (n, 3) of pixels (n, 2); raises SurveyError for pixels the lens cannot have imaged."""
     model = lens_model(camera.lens.model)
-    constants = lens_constants(model, camera.image_size, camera.lens.pixel_size_mm)
+    constants = camera_constants(camera)
     return unit_rays(model, values, constants, np.asarray(uv, dtype=float))
 
 
 def focal_px(camera: Camera, values: FloatArray) -> float:
     """Principal distance in px."""
     model = lens_model(camera.lens.model)
-    return focal_length_px(model, values, lens_constants(model, camera.image_size, camera.lens.pixel_size_mm))
+    return focal_length_px(model, values, camera_constants(camera))
 
 
 def all_rays(survey: Survey, lenses: dict[str, FloatArray]) -> tuple[dict[int, FloatArray], dict[int, str]]:

@@ -5,6 +5,7 @@ import pytest
 from adjust.errors import SurveyError
 from adjust.lens import (
     MODELS,
+    camera_constants,
     default_start,
     focal_length_px,
     lens_constants,
@@ -16,6 +17,7 @@ from adjust.lens import (
     unit_rays,
 )
 from adjust.lens_radial import invert_radius, radial_profile
+from adjust.model import Camera, LensParameter
 from tests.adjust.lenses import IMAGE_SIZE, NAMES, lens, points_in_camera
 
 
@@ -157,3 +159,9 @@ def test_names_and_units_of_the_models():
         assert len(model.units) == model.n
     assert " ".join(MODELS["brown"].names) == "fx fy skew u0 v0 k1 k2 p1 p2 k3 k4 k5 k6"
     assert MODELS["brown_backward"].units[3] == "1/mm^2"
+
+
+def test_constants_of_a_camera_of_a_survey():
+    lens_of_survey = LensParameter("aicon", (), pixel_size_mm=0.004, balance_radius_mm=13.5)
+    camera = Camera("c", "s", (640, 480), lens_of_survey)
+    np.testing.assert_array_equal(camera_constants(camera), [0.004, 319.5, 239.5, 13.5])
