@@ -77,18 +77,24 @@ class ChainPose:
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """A position in the world: a world point (key or held value), or a point fixed in the frame of a chain."""
+    """A position in the world: a world point (key or held value), or a point fixed in the frame of a chain.
+
+    warp: of the target that the point is on, and the two unit sags at the point.
+    """
 
     chain: ChainPose | None
     x_in_frame: FloatArray
     point_key: int | None = None
+    warp: VectorMap | None = None
+    sag: tuple[float, float] = (0.0, 0.0)
 
     @property
     def keys(self) -> list[int]:
         """The unknowns it depends on."""
         if self.point_key is not None:
             return [self.point_key]
-        return self.chain.keys if self.chain else []
+        warp = [self.warp.key] if self.warp is not None and self.warp.key is not None else []
+        return (self.chain.keys if self.chain else []) + warp
 
     def __call__(self, values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
         """Coordinates (3,) m in the world and Jacobians (3, dim)."""
@@ -99,9 +105,14 @@ class Position:
         pose, jacobians = self.chain(values)
         R = pose.rotation().matrix()
         x = self.x_in_frame
+        if self.warp is not None:
+            x = x + np.array([0.0, 0.0, np.asarray(self.sag) @ self.warp.full(values)])
         cross = np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
         by_pose = np.hstack([-R @ cross, R])
-        return R @ x + pose.translation(), [(key, by_pose @ J) for key, J in jacobians]
+        out = [(key, by_pose @ J) for key, J in jacobians]
+        if self.warp is not None and self.warp.key is not None:
+            out.append((self.warp.key, np.outer(R[:, 2], np.asarray(self.sag) @ self.warp.matrix)))
+        return R @ x + pose.translation(), out
 
 
 def distance_residual(a: Position, b: Position, value: float) -> Residual:

@@ -19,7 +19,7 @@ from adjust.factors import (
     pose_prior_factor,
     vector_prior_factor,
 )
-from adjust.image_batch import ImageBatch
+from adjust.image_batch import ImageBatch, warp_shape
 from adjust.model import FloatArray, Survey
 from adjust.observations import FrameRef, ImageBlock, Pair, PositionRef
 from adjust.result import ParameterName
@@ -195,13 +195,16 @@ class GraphBuilder:
             unknown = self.unknowns.by_name.get(("point", ref.point_id or ""))
             held = self.unknowns.held_points.get(ref.point_id or "", np.zeros(3))
             return Position(None, held, unknown.key if unknown else None)
-        x = np.zeros(3)
-        if ref.point_id is not None and ref.frame is not None:
-            target = self.targets[ref.frame.frame_id]
-            if ref.point_id not in target.point_ids:
-                raise SurveyError(f"target {target.target_id!r} has no point {ref.point_id!r}")
-            x = target.x_in_target[target.point_ids.index(ref.point_id)]
-        return Position(ChainPose(self.unknowns, state, chain), np.asarray(x))
+        pose = ChainPose(self.unknowns, state, chain)
+        if ref.point_id is None or ref.frame is None:
+            return Position(pose, np.zeros(3))
+        target = self.targets[ref.frame.frame_id]
+        if ref.point_id not in target.point_ids:
+            raise SurveyError(f"target {target.target_id!r} has no point {ref.point_id!r}")
+        i = target.point_ids.index(ref.point_id)
+        sag = warp_shape(target.x_in_target)[i]
+        warp = self.unknowns.vectors.get(("warp", target.target_id))
+        return Position(pose, target.x_in_target[i], None, warp, (float(sag[0]), float(sag[1])))
 
     def _other_factors(
         self, state: State, positions: Mapping[PositionRef, Chain | None], pair_chains: list[Chain]
