@@ -69,11 +69,12 @@ def _refined(poses: FloatArray, x: FloatArray, rays: FloatArray, refinements: in
 def _principal_axes(x: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
     """Centroid, axes (rows, right-handed, the thinnest last) and whether the points are a plane."""
     centre = x.mean(axis=0)
-    _, s, vt = np.linalg.svd(x - centre, full_matrices=True)
-    if len(s) < 2 or s[1] <= 1e-6 * s[0]:
+    squares, vectors = np.linalg.eigh((x - centre).T @ (x - centre))
+    s, vt = np.sqrt(np.maximum(squares[::-1], 0.0)), vectors.T[::-1]
+    if s[1] <= 1e-6 * s[0]:
         raise SurveyError(f"{len(x)} points on one line do not determine a camera pose: add one off the line")
     axes = vt * np.array([[1.0], [1.0], [np.linalg.det(vt)]])
-    return centre, axes, len(s) < 3 or bool(s[2] < _PLANAR * s[0])
+    return centre, axes, bool(s[2] < _PLANAR * s[0])
 
 
 def _solutions(x: FloatArray, xy: FloatArray, centre: FloatArray, axes: FloatArray, thin: bool) -> list[FloatArray]:

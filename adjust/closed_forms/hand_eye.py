@@ -24,7 +24,7 @@ def degenerate_direction(turns: FloatArray) -> FloatArray | None:
             f"the largest of {len(turns)} turns is {np.rad2deg(largest):.3f} deg: rotation and translation are"
             " undetermined in all directions; turn by 30 deg or more about two axes"
         )
-    _, s, vt = np.linalg.svd(turns, full_matrices=True)
+    _, s, vt = np.linalg.svd(turns, full_matrices=False)
     second = s[1] if len(s) > 1 else 0.0
     return np.asarray(vt[0]) if second < _PARALLEL * s[0] else None
 

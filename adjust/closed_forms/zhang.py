@@ -61,7 +61,7 @@ def _solve(rows: FloatArray, variant: str) -> FloatArray | None:
     norms = np.linalg.norm(m, axis=0)
     if np.any(norms < 1e-9):
         return None
-    _, s, vt = np.linalg.svd(m / norms)
+    _, s, vt = np.linalg.svd(m / norms, full_matrices=len(m) < m.shape[1])
     if len(s) < m.shape[1] - 1 or s[m.shape[1] - 2] < _CONDITION * s[0]:
         return None
     b = vt[-1] / norms

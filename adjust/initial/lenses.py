@@ -21,6 +21,7 @@ from adjust.model import Camera, FloatArray
 
 _MOST_IMAGES = 30
 _SCAN_IMAGES = 8
+_MOST_SCREENED = 120
 _GOOD_START = 0.01  # of the image width: with less error a closed form needs no scan beside it
 _LEVELS = ("focal centre k1 k2", "focal centre k1", "focal k1", "focal")
 _SIMPLE_PX = 2.0
@@ -99,7 +100,8 @@ class _LensSearch:
                 f"camera {self.camera.camera_id!r}: no lens values are given and no image shows 4 or more known points;"
                 " show it a target, or give lens values"
             )
-        flat = [s for s in usable if _is_plane(s.x)]
+        # the other images of a long series are screened by their poses
+        flat = _every([s for s in usable if _is_plane(s.x)], _MOST_SCREENED)
         good, excluded = self._screen(flat) if flat else ([], {})
         chosen = spread_out(good) or [s for s in usable if s.block_idx not in excluded][:_MOST_IMAGES]
         if not chosen:
@@ -286,7 +288,9 @@ def _homography_misfit(s: Sighting) -> float:
 
 
 def _every(images: Sequence[Sighting], n: int) -> list[Sighting]:
-    return [images[int(i)] for i in np.unique(np.linspace(0, len(images) - 1, min(n, len(images))).round())]
+    if len(images) <= n:
+        return list(images)
+    return [images[int(i)] for i in np.unique(np.linspace(0, len(images) - 1, n).round())]
 
 
 def spread_out(images: Sequence[Sighting], n: int = _MOST_IMAGES) -> list[Sighting]:

@@ -8,11 +8,12 @@ import numpy as np
 from adjust.closed_forms import pose_solutions, refine_poses, view_errors
 from adjust.errors import SurveyError
 from adjust.lens import camera_constants, focal_length_px, lens_model, unit_rays
-from adjust.model import BoolArray, Camera, FloatArray, Survey, Target
+from adjust.model import BoolArray, Camera, FloatArray, IntArray, Survey, Target
 from adjust.observations import ImageBlock
 
 _RIVAL = 4.0  # a second pose whose error is within this factor of the best stays a candidate
 _NOISE_PX = 0.3  # ... or within this much of it
+_ENOUGH = 36  # points of a view from which its pose is found before all of them refine it
 _GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustworthy
 
 
@@ -91,23 +92,38 @@ def all_rays(survey: Survey, lenses: dict[str, FloatArray]) -> tuple[dict[int, F
 
 def make_view(block_idx: int, x: FloatArray, rays: FloatArray, focal: float) -> View:
     """A view with its unrefined candidate poses; raises SurveyError where there are none."""
-    poses = pose_solutions(x, rays)
+    few = _sample(len(x))
+    poses = pose_solutions(x[few], rays[few])
     if not len(poses):
         raise SurveyError(f"no camera pose explains its {len(x)} points; check their order and coordinates")
-    ptr = np.arange(len(poses) + 1) * len(x)
-    error, in_front = view_errors(poses, np.tile(x, (len(poses), 1)), np.tile(rays, (len(poses), 1)), ptr)
+    ptr = np.arange(len(poses) + 1) * len(few)
+    error, in_front = view_errors(poses, np.tile(x[few], (len(poses), 1)), np.tile(rays[few], (len(poses), 1)), ptr)
     return _ranked(View(block_idx, x, rays, focal, poses, error * focal), poses, error * focal, in_front)
 
 
+def _sample(n: int) -> IntArray:
+    """Positions of at most ``_ENOUGH`` of n points, without the pattern of a grid, the same at every call."""
+    return np.arange(n) if n <= _ENOUGH else np.sort(np.random.default_rng(n).permutation(n)[:_ENOUGH])
+
+
 def refine_views(views: Sequence[View], iterations: int = 8) -> list[View]:
-    """All candidates of all views refined in one go, robustly; implausible candidates dropped."""
+    """All candidates of all views refined in one go, robustly; implausible candidates dropped.
+
+    First on a sample of each view's points, then in two more steps on all of them.
+    """
     if not views:
         return []
+    if any(len(v.x) > _ENOUGH for v in views):
+        rough = _refined(views, [_sample(len(v.x)) for v in views], iterations)
+        return _refined(rough, [np.arange(len(v.x)) for v in views], 2)
+    return _refined(views, [np.arange(len(v.x)) for v in views], iterations)
+
+
+def _refined(views: Sequence[View], rows: Sequence[IntArray], iterations: int) -> list[View]:
     counts = [len(v.poses) for v in views]
-    x = np.concatenate([np.tile(v.x, (k, 1)) for v, k in zip(views, counts, strict=True)])
-    rays = np.concatenate([np.tile(v.rays, (k, 1)) for v, k in zip(views, counts, strict=True)])
-    sizes = np.repeat([len(v.x) for v in views], counts)
-    ptr = np.concatenate([[0], np.cumsum(sizes)])
+    x = np.concatenate([np.tile(v.x[r], (k, 1)) for v, r, k in zip(views, rows, counts, strict=True)])
+    rays = np.concatenate([np.tile(v.rays[r], (k, 1)) for v, r, k in zip(views, rows, counts, strict=True)])
+    ptr = np.concatenate([[0], np.cumsum(np.repeat([len(r) for r in rows], counts))])
     poses = refine_poses(np.concatenate([v.poses for v in views]), x, rays, ptr, iterations, robust=True)
     error, in_front = view_errors(poses, x, rays, ptr)
     first = np.concatenate([[0], np.cumsum(counts)])
