@@ -20,7 +20,7 @@ from survey.detection.results import ImageReport, SpotOptions
 from survey.detection.spots import detect_spots
 from survey.targets import DetectableTarget
 
-_IMAGES_PER_PROCESS = 6  # fewer are done sooner than a process has started
+_IMAGES_PER_PROCESS = 25  # a process takes some seconds to start, the time of that many images
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,15 +42,17 @@ def refine_corners(
     which there is nothing else, per corner, where that is less than a square (the margin around a marker).
     crossing: corners of four squares; otherwise corners of a dark marker.
     """
-    shapes = _window_shapes(edges, np.broadcast_to(np.asarray(free_px, float), (len(start),)), crossing)
+    free = np.broadcast_to(np.asarray(free_px, float), (len(start),))
     angles = np.arctan2(edges[:, :, 1], edges[:, :, 0])
     blur = np.full(len(start), 1.0)
     # a second pass from the first one's result: its window is centred and turned to the corner itself
+    shapes = _window_shapes(edges, free, crossing, blur)
     first, _, _, _, status = fit_corners(gray, start, angles, blur, shapes, crossing, 3.0)
     again = status == 0
     centred = np.where(again[:, None], first[:, :2], start)
     angles = np.where(again[:, None], first[:, 2:4], angles)
     blur = np.where(again, np.exp(first[:, 6]), blur)
+    shapes = _window_shapes(edges, free, crossing, blur)
     p, cov, _, rms, status = fit_corners(gray, centred, angles, blur, shapes, crossing, 0.5)
     cov = cov + MODEL_FLOOR_PX**2 * np.eye(2)
     contrast = np.abs(p[:, 5]) * (2.0 if crossing else 1.0)
@@ -60,16 +62,17 @@ def refine_corners(
     return CornerFit(p[:, :2], cov, np.sqrt(np.maximum(total_blur**2 - _PIXEL_VARIANCE, 0.0)), contrast, good)
 
 
-def _window_shapes(edges: FloatArray, free_px: FloatArray, crossing: bool) -> FloatArray:
+def _window_shapes(edges: FloatArray, free_px: FloatArray, crossing: bool, blur: FloatArray) -> FloatArray:
     """Windows (n, 4) for ``fit_corners``: they keep clear of the neighbouring edges, blurred as those are."""
     lengths = np.linalg.norm(edges, axis=2)
     area = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
     across = area / np.maximum(lengths.max(1), 1e-9)  # distance to the next parallel edge
     shapes = np.zeros((len(edges), 4))
     if crossing and not np.isfinite(free_px).any():
-        shapes[:, 0] = np.clip(0.6 * across, 2.6, 11.0)
+        shapes[:, 0] = np.clip(np.minimum(0.6 * across, across - 3.0 * blur), 2.6, 11.0)
         return shapes
-    width = np.clip(0.75 * np.minimum(free_px, across), 2.0, 8.0)
+    limit = np.minimum(free_px, across)
+    width = np.clip(np.minimum(0.75 * limit, limit - 2.5 * blur), 1.5, 8.0)
     shapes[:, 0] = width
     shapes[:, 1] = width
     shapes[:, 2:] = np.clip(0.6 * lengths, width[:, None], 20.0 if crossing else 24.0)

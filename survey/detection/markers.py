@@ -49,8 +49,7 @@ def find_charuco(gray: Gray32, gray8: Gray8, target: Charuco) -> Detection:
     if edges is None:
         return nothing_found(f"the {len(point_idx)} corners found lie on one line")
     margin = (target.square_m - target.marker_m) / (2.0 * target.square_m)
-    free = margin * np.linalg.norm(edges, axis=2).min(1)
-    fit = refine_corners(gray, start, edges, free)
+    fit = refine_corners(gray, start, edges, margin * _across(edges))
     return _detection(point_idx, fit, (), "corners")
 
 

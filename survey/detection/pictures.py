@@ -28,6 +28,7 @@ def write_picture(path: Path, image: AnyImage, report: ImageReport, targets: Map
     if report.spots is not None:
         _draw_spots(canvas, report.spots, scale)
         lines.append((f"{len(report.spots)} spots", _SPOT_COLOUR))
+    cv2.rectangle(canvas, (0, 0), (560, 12 + 20 * len(lines)), (0, 0, 0), cv2.FILLED)
     for k, (text, colour) in enumerate(lines):
         _text(canvas, text, (8, 22 + 20 * k), colour, 0.55)
     if not cv2.imwrite(str(path), canvas):
@@ -60,5 +61,4 @@ def _draw_spots(canvas: Gray8, spots: Spots, scale: int) -> None:
 
 
 def _text(canvas: Gray8, text: str, place: tuple[int, int], colour: tuple[int, int, int], size: float) -> None:
-    cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, (0, 0, 0), 3, cv2.LINE_AA)
     cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
