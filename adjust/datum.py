@@ -99,11 +99,11 @@ def normal_diagonal(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> Float
 
 @dataclass(frozen=True, eq=False)
 class InnerDatum:
-    """Inner constraints: rows (k, dim) per key, relative to the start; ``directions`` (7, k) are the defects."""
+    """Inner constraints: rows (k, dim) per key, relative to ``base``; ``directions`` (7, k) are the defects there."""
 
     keys: list[int]
     rows: dict[int, FloatArray]
-    start: gtsam.Values
+    base: gtsam.Values
     kinds: dict[int, str]
     directions: FloatArray
     sigma: float
@@ -116,17 +116,17 @@ class InnerDatum:
 
     def factor(self) -> gtsam.NonlinearFactor:
         """The constraint rows as a factor."""
-        start, kinds, rows = self.start, self.kinds, self.rows
+        base, kinds, rows = self.base, self.kinds, self.rows
 
         def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
             r, blocks = np.zeros(self.defect), []
             for key, row in rows.items():
                 if kinds[key] == "point":
-                    r += row @ (np.asarray(values.atPoint3(key)) - np.asarray(start.atPoint3(key)))
+                    r += row @ (np.asarray(values.atPoint3(key)) - np.asarray(base.atPoint3(key)))
                     blocks.append((key, row))
                 else:
                     D = np.zeros((6, 6), order="F")
-                    r += row @ Pose3.Logmap(start.atPose3(key).between(values.atPose3(key)), D)
+                    r += row @ Pose3.Logmap(base.atPose3(key).between(values.atPose3(key)), D)
                     blocks.append((key, row @ D))
             return r, blocks
 
@@ -154,8 +154,8 @@ def defects(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: g
     return out
 
 
-def inner_datum(graph: AdjustmentGraph) -> InnerDatum | None:
-    """The inner constraints that the survey asks for, or None where its datum is given.
+def inner_datum(graph: AdjustmentGraph, base: gtsam.Values) -> InnerDatum | None:
+    """The inner constraints about ``base`` that the survey asks for, or None where its datum is given.
 
     Raises SurveyError where nothing named can carry them.
     """
@@ -164,13 +164,13 @@ def inner_datum(graph: AdjustmentGraph) -> InnerDatum | None:
     keys = inner_datum_keys(graph.survey, graph.unknowns)
     if not keys:
         raise SurveyError("datum kind 'inner' needs free points or free fixed stations; name some, or hold something")
-    graph.prepare(graph.start, jacobians=True)
-    linear = graph.graph.linearize(graph.start)
-    directions = defects(graph, linear, graph.start)
+    graph.prepare(base, jacobians=True)
+    linear = graph.graph.linearize(base)
+    directions = defects(graph, linear, base)
     if directions.shape[1] == 0:
         return None
     by_key = graph.unknowns.by_key
-    stacked = np.concatenate([gauge(graph, by_key[k], graph.start) @ directions for k in keys])
+    stacked = np.concatenate([gauge(graph, by_key[k], base) @ directions for k in keys])
     Q, triangular = np.linalg.qr(stacked)
     if np.abs(np.diag(triangular)).min() < 1e-9 * np.abs(triangular).max():
         raise SurveyError("the points and stations named for the inner datum cannot carry it; name three points")
@@ -184,4 +184,4 @@ def inner_datum(graph: AdjustmentGraph) -> InnerDatum | None:
     inverse = np.linalg.inv(triangular)
     kinds = {k: by_key[k].kind for k in keys}
     addition = sigma**2 * inverse @ inverse.T
-    return InnerDatum(keys, rows, graph.start, kinds, directions, sigma, addition)
+    return InnerDatum(keys, rows, base, kinds, directions, sigma, addition)

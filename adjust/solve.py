@@ -44,14 +44,17 @@ class Solved:
 class _Loop:
     def __init__(self, graph: AdjustmentGraph, options: SolveOptions, progress: Progress | None) -> None:
         self.graph, self.options, self.progress = graph, options, progress
-        self.datum = inner_datum(graph)
-        self.full = gtsam.NonlinearFactorGraph(graph.graph)
-        if self.datum is not None:
-            self.full.add(self.datum.factor())
         self.values = graph.start
+        self._set_datum()
         self.damping = 0.0
         self.use_qr = False
         self.ordering: gtsam.Ordering | None = None
+
+    def _set_datum(self) -> None:
+        self.datum = inner_datum(self.graph, self.values)
+        self.full = gtsam.NonlinearFactorGraph(self.graph.graph)
+        if self.datum is not None:
+            self.full.add(self.datum.factor())
 
     def linearize(self) -> gtsam.GaussianFactorGraph:
         self.graph.prepare(self.values, True, self.damping)
@@ -131,6 +134,8 @@ class _Loop:
         )
 
     def _finish(self, omega: float, iteration: int, moved: float) -> Solved:
+        if self.datum is not None:
+            self._set_datum()  # about the solution, where the covariances belong; the solution stays
         linear = self.linearize()
         if self.ordering is None:
             raise ValueError("no ordering before the first step")
