@@ -9,8 +9,10 @@ from adjust.model import BoolArray, FloatArray
 from survey.detection.corner_kernels import fit_corners
 
 # What the fit cannot know: the pixel's square is taken for a Gaussian of equal variance, and edges for straight lines.
-# Measured on noiseless renderings (tests/survey/test_detection.py).
-MODEL_FLOOR_PX = 0.002
+# Edges bent by distortion act alike on both sides of a crossing, but not at a marker's corner, where they end. Measured
+# on noiseless renderings with k1 = -0.2 (tests/survey/test_detection.py): 0.001 to 0.002 px rms, and 0.002 to 0.003 px.
+CROSSING_FLOOR_PX = 0.002
+MARKER_FLOOR_PX = 0.003
 _PIXEL_VARIANCE = 1.0 / 12.0
 
 
@@ -54,7 +56,8 @@ def refine_corners(
     blur = np.where(again, np.exp(first[:, 6]), blur)
     shapes = _window_shapes(edges, free, crossing, blur)
     p, cov, _, rms, status = fit_corners(gray, centred, angles, blur, shapes, crossing, 0.5)
-    cov = cov + MODEL_FLOOR_PX**2 * np.eye(2)
+    floor = CROSSING_FLOOR_PX if crossing else MARKER_FLOOR_PX
+    cov = cov + floor**2 * np.eye(2)
     contrast = np.abs(p[:, 5]) * (2.0 if crossing else 1.0)
     total_blur = np.exp(p[:, 6])
     good = (status == 0) & again & (rms < 0.2 * contrast) & (np.trace(cov, axis1=1, axis2=2) < 1.0)
@@ -75,5 +78,5 @@ def _window_shapes(edges: FloatArray, free_px: FloatArray, crossing: bool, blur:
     width = np.clip(np.minimum(0.75 * limit, limit - 2.5 * blur), 1.5, 8.0)
     shapes[:, 0] = width
     shapes[:, 1] = width
-    shapes[:, 2:] = np.clip(0.6 * lengths, width[:, None], 20.0 if crossing else 24.0)
+    shapes[:, 2:] = np.clip(0.6 * lengths, width[:, None], 14.0 if crossing else 20.0)
     return shapes

