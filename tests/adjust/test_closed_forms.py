@@ -253,3 +253,8 @@ def test_mean_pose_ignores_a_minority_and_picks_among_alternatives():
     both = np.array([m for i in range(8) for m in ((poses[i], motion(rng))[:: 1 if i % 2 else -1])])
     mean, _ = cf.mean_pose(both, lever=1.0, members=np.repeat(np.arange(8), 2))
     assert cf.pose_distance(mean, truth, 1.0) < 2e-3
+
+
+def test_zhang_does_not_take_one_view_seen_three_times_for_three():
+    one = homographies(np.random.default_rng(7), 1, tilt=0.6, noise=0.05)
+    assert cf.pinhole_from_homographies(np.repeat(one, 3, axis=0), SIZE).variant != "full"

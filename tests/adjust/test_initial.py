@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from adjust.errors import SurveyError
 from adjust.initial import find_start
+from adjust.initial.network import table_from_mount
 from adjust.model import (
+    TABLE_GEOMETRY,
     Camera,
     LensParameter,
     Point,
@@ -20,6 +22,7 @@ from adjust.model import (
     Survey,
     Table,
     Target,
+    VectorParameter,
 )
 from adjust.observations import Coordinates, Distance, FrameRef, ImageBlock, Pair, PositionRef, TableReading
 
@@ -404,3 +407,23 @@ def test_a_field_of_unknown_points_is_oriented_and_scaled_by_one_distance():
     assert_small_misfit(start, 1.0)
     with pytest.raises(SurveyError, match="point B30: no image shows it"):
         find_start(replace(survey, points=(*points, Point("B30"))))
+
+
+def test_a_block_of_gross_points_is_left_out_also_where_the_lens_is_given():
+    survey, _ = single(np.random.default_rng(15), 6)
+    blocks = list(survey.image_blocks)
+    uv = blocks[2].uv.copy()
+    uv[::3] += np.random.default_rng(16).uniform(20, 60, uv[::3].shape)
+    blocks[2] = replace(blocks[2], uv=uv)
+    start = find_start(replace(survey, cameras=(camera(values=TRUE),), image_blocks=tuple(blocks)))
+    assert start.excluded_blocks == (2,)
+    assert "30 of 88 points are more than 3.0 px off" in start.reasons[0]
+
+
+def test_a_table_with_given_geometry_moves_as_its_formula_says():
+    table = Table("t", ("x", "z"), geometry=VectorParameter(TABLE_GEOMETRY, np.array([0.02, 0.01, 0.3, -0.2])))
+    a1, a2 = np.rad2deg([0.5 + 0.3, -0.7 - 0.2])
+    expected = pose((a1, 0, 0)) @ pose(t=(0, 0.01, 0)) @ pose((0, np.rad2deg(0.02), 0)) @ pose((0, 0, a2))
+    np.testing.assert_allclose(table_from_mount(table, np.array([0.5, -0.7])), expected, atol=1e-12)
+    with pytest.raises(SurveyError, match="2 axes, a reading has 1"):
+        table_from_mount(table, np.array([0.5]))
