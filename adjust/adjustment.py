@@ -9,18 +9,20 @@ from gtsam import Pose3
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.initial import Start, find_start
 from adjust.lens import MODELS, camera_constants, monotone_radius_px, principal_point_px
-from adjust.model import FloatArray, Survey
+from adjust.model import BoolArray, FloatArray, Survey
 from adjust.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
 from adjust.result import Adjustment, Estimate, ParameterName
+from adjust.robust import limit, screen
 from adjust.solve import Solved, SolveOptions, solve
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
 
 
 @dataclass(frozen=True)
 class AdjustOptions:
-    """alpha: level of the global test."""
+    """alpha: level of the global test. reject_points: leave gross errors among the image points out, and list them."""
 
     alpha: float = 0.05
+    reject_points: bool = False
     solve: SolveOptions = field(default_factory=SolveOptions)
 
 
@@ -39,7 +41,35 @@ def adjust(
         survey, start, notes = _trusted(survey, options)
     graph = GraphBuilder(survey, start.lenses).build(start)
     solved = solve(graph, options.solve, progress)
+    if options.reject_points:
+        screened = screen(graph, solved, options.solve)
+        solved, survey = screened.solved, with_used(survey, screened.used)
+        return replace(assemble(graph, solved, options, rejections(survey) + notes), survey=survey)
     return assemble(graph, solved, options, notes)
+
+
+def with_used(survey: Survey, used: BoolArray) -> Survey:
+    """The survey with these image points (N,) in use."""
+    ptr = np.cumsum([0] + [len(b.uv) for b in survey.image_blocks])
+    blocks = tuple(replace(b, used=used[ptr[i] : ptr[i + 1]]) for i, b in enumerate(survey.image_blocks))
+    return replace(survey, image_blocks=blocks)
+
+
+def rejections(survey: Survey) -> tuple[str, ...]:
+    """Image points that are not used, by block."""
+    out, targets = [], {t.target_id: t.point_ids for t in survey.targets}
+    points = tuple(p.point_id for p in survey.points)
+    for block in survey.image_blocks:
+        if block.used is None or block.used.all() or not block.used.any():
+            continue
+        ids = targets[block.target_id] if block.target_id else points
+        names = [ids[int(i)] for i in block.point_idx[~block.used]]
+        more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+        out.append(
+            f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}: left out as "
+            f"gross errors: {', '.join(names[:8])}{more}"
+        )
+    return tuple(out)
 
 
 def _trusted(survey: Survey, options: AdjustOptions) -> tuple[Survey, StartValues, tuple[str, ...]]:
@@ -150,16 +180,14 @@ def warnings(graph: AdjustmentGraph, result: Adjustment) -> tuple[str, ...]:
 
 def _image_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
     out, images = [], result.image_residuals
-    # Sidak: one false alarm in a thousand surveys, however many points there are
-    family = 1.0 - 0.999 ** (1.0 / max(1, len(images.test)))
-    limit = -2.0 * np.log(family) * max(1.0, result.sigma0**2)
+    bound = limit(len(images.test)) * max(1.0, result.sigma0**2)
     for i, block in enumerate(graph.survey.image_blocks):
         rows = slice(images.block_ptr[i], images.block_ptr[i + 1])
         what = f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}"
         if not images.used[rows].any() and len(block.uv):
             out.append(f"{what}: not used")
             continue
-        bad = int(np.sum(images.test[rows][images.used[rows]] > limit))
+        bad = int(np.sum(images.test[rows][images.used[rows]] > bound))
         if bad:
             n = int(images.used[rows].sum())
             out.append(f"{what}: {bad} of {n} image points do not fit (probable gross errors)")

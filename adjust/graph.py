@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -20,11 +21,14 @@ from adjust.factors import (
     vector_prior_factor,
 )
 from adjust.image_batch import ImageBatch, warp_shape
-from adjust.model import FloatArray, Survey
+from adjust.model import BoolArray, FloatArray, Survey
 from adjust.observations import FrameRef, ImageBlock, Pair, PositionRef
 from adjust.result import ParameterName
 from adjust.state import State, collect_vectors
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
+
+
+_Rows = TypeVar("_Rows", FloatArray, BoolArray)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +81,42 @@ class AdjustmentGraph:
         self.prepare(values, jacobians=False)
         return 2.0 * float(self.graph.error(values)) + self.images.constant_chi
 
+    def _split(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rows (N, ...) in the order of ``Survey.image_blocks``, for the image batch and for the bundle."""
+        ptr = np.cumsum([0] + [len(b.uv) for b in self.survey.image_blocks])
+        parts: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+        for i, free in self.image_order:
+            parts[int(free)].append(rows[ptr[i] : ptr[i + 1]])
+        known, unknown = (np.concatenate(p) if p else rows[:0] for p in parts)
+        return known, unknown
+
+    def _joined(self, known: _Rows, unknown: _Rows) -> _Rows:
+        out, at = [], [0, 0]
+        for i, free in self.image_order:
+            n = len(self.survey.image_blocks[i].uv)
+            source = unknown if free else known
+            out.append(source[at[int(free)] : at[int(free)] + n])
+            at[int(free)] += n
+        return np.concatenate(out) if out else known
+
+    def used(self) -> BoolArray:
+        """Which image points (N,) take part, in the order of ``Survey.image_blocks``."""
+        none: BoolArray = np.zeros(0, dtype=np.bool_)
+        return self._joined(self.images.used, none if self.bundle is None else self.bundle.unsorted(self.bundle.used))
+
+    def set_weights(self, weights: FloatArray) -> None:
+        """Weights (N,) of the image points, on top of their covariance; zero leaves a point out."""
+        known, unknown = self._split(weights)
+        self.images.set_weights(known)
+        if self.bundle is not None:
+            self.bundle.set_weights(unknown)
+
+    def whitened_squares(self, values: gtsam.Values) -> FloatArray:
+        """Weighted squares v' inv(Q_ll) v (N,) of all image points at ``values``, whatever their weight."""
+        self.prepare(values, jacobians=False)
+        bundle = self.bundle.whitened_squares(values) if self.bundle is not None else np.zeros(0)
+        return self._joined(self.images.whitened_squares(), bundle)
+
     def behind_camera(self) -> list[ImageBlock]:
         """Blocks with a point behind their camera at the prepared values."""
         found = [b for b, z in zip(self.images.blocks, self.images.depth, strict=True) if z <= 0.0]
@@ -115,7 +155,8 @@ class GraphBuilder:
             [self._known_points(b) for _, b in known], [self._n_warp(b) for _, b in known],
         )  # fmt: skip
         images.add_factors(graph)
-        outside = {k for item in self.others if item.used for k in list(item.factor.keys())}
+        # unused observations too: they are predicted with the joint covariance of their unknowns
+        outside = {k for item in self.others for k in list(item.factor.keys())}
         outside |= {k for keys in images.keys for k in keys}
         outside |= self._datum_keys()
         unknown = [(i, b) for i, free, b in split if free]

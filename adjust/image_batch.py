@@ -37,6 +37,11 @@ def square_root_information(cov: FloatArray) -> FloatArray:
     return np.stack([w00, -w00 * b / c, w11], axis=1)
 
 
+def whitened_squares(v: FloatArray, W: FloatArray) -> FloatArray:
+    """|W v|^2 (n,) of residuals v (n, 2) with W (n, 3) upper triangular."""
+    return np.asarray((W[:, 0] * v[:, 0] + W[:, 1] * v[:, 1]) ** 2 + (W[:, 2] * v[:, 1]) ** 2)
+
+
 def warp_shape(x: FloatArray) -> FloatArray:
     """The two unit sags 4u(1-u), 4v(1-v) at points (n, 3), u and v running from 0 to 1 over the target."""
     low, high = x[:, :2].min(axis=0), x[:, :2].max(axis=0)
@@ -220,6 +225,20 @@ class ImageBatch:
         for i, view in enumerate(self._views[b]):
             jacobians[i] = view
         return self._r_views[b]
+
+    def set_weights(self, weights: FloatArray) -> None:
+        """Weights (N,) on top of the covariances; a point of weight zero is left out, the others are used."""
+        self._prepared = None
+        self.used = weights > 0.0
+        self.W[:] = self.W_all * np.sqrt(weights)[:, None]
+
+    def whitened_squares(self) -> FloatArray:
+        """Weighted squares v' inv(Q_ll) v (N,) of all points where the chains were last evaluated."""
+        residual, influence = np.zeros((len(self.X), 2)), np.zeros((len(self.X), 3))
+        for b in range(len(self.blocks)):
+            n = int(self.n_rows[b]) - 1
+            self.block_statistics(b, np.zeros((n, n)), residual, influence)
+        return whitened_squares(residual, self.W_all)
 
     def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
         """One custom factor per block that has an unknown."""

@@ -198,7 +198,7 @@ def _adjust_project(project: Project, progress: bool) -> Adjustment:
             f"{project.folder}: there is nothing to adjust; put images at images/<camera_id>/<epoch_id>.png or tables "
             "into observations/"
         )
-    options = AdjustOptions(alpha=project.options.alpha)
+    options = AdjustOptions(alpha=project.options.alpha, reject_points=True)
     with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
 
         def step(_iteration: int, omega: float) -> None:

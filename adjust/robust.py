@@ -1,0 +1,81 @@
+"""Gross errors among the image points: found by reweighting, confirmed by test, left out of a clean least squares.
+
+Cauchy weights with a scale from the median (Huber 1981, section 7.8; Zhang 1997 for the constant) bring the solution to
+what most points agree on; there every point is tested with the error probability of the whole family (Sidak).
+"""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from adjust.graph import AdjustmentGraph
+from adjust.model import BoolArray, FloatArray
+from adjust.precision import Precision, image_residuals
+from adjust.solve import Solved, SolveOptions, solve
+
+_CAUCHY = 2.385**2
+_MEDIAN = 2.0 * np.log(2.0)  # of chi-square with two degrees of freedom
+_FAMILY = 0.001
+_ROUNDS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """A clean solution, and which image points (N,), in the order of ``Survey.image_blocks``, it uses."""
+
+    solved: Solved
+    used: BoolArray
+    rejected: int
+
+
+def limit(n: int) -> float:
+    """Chi-square (2) that one of n good image points exceeds with probability 0.001."""
+    return float(-2.0 * np.log(-np.expm1(np.log1p(-_FAMILY) / max(1, n))))
+
+
+def scale(test: FloatArray) -> float:
+    """Variance factor of most points, not below the a priori 1."""
+    test = test[np.isfinite(test)]
+    return max(1.0, float(np.median(test)) / _MEDIAN) if test.size else 1.0
+
+
+def screen(graph: AdjustmentGraph, solved: Solved, options: SolveOptions) -> Screened:
+    """Look for gross errors; ends in a least squares of the points that are left. The graph keeps them."""
+    given = graph.used()
+    used = given.copy()
+    test = image_residuals(Precision(graph, solved)).test
+    if _suspects(test, used).any():
+        graph.start = _reweighted(graph, solved, used, options)
+        for _ in range(_ROUNDS):
+            solved = solve(graph, options)
+            test = image_residuals(Precision(graph, solved)).test
+            now = given & ~_suspects(test, given)
+            if (now == used).all():
+                break
+            used = now
+            graph.set_weights(used.astype(np.float64))
+            graph.start = solved.values
+    return Screened(solved, used, int(given.sum() - used.sum()))
+
+
+def _suspects(test: FloatArray, used: BoolArray) -> BoolArray:
+    factor = scale(test[used])
+    return np.asarray(used & (test > limit(int(used.sum())) * factor))
+
+
+def _reweighted(graph: AdjustmentGraph, solved: Solved, used: BoolArray, options: SolveOptions) -> gtsam.Values:
+    """Values near which Cauchy weights settle; leaves the points that agree there as the used ones."""
+    values = solved.values
+    e = graph.whitened_squares(values)
+    for _ in range(15):
+        factor = scale(e[used])
+        graph.set_weights(used / (1.0 + e / (_CAUCHY * factor)))
+        graph.start = values
+        values = solve(graph, SolveOptions(max_step=1e-2, max_iterations=options.max_iterations)).values
+        before, e = e, graph.whitened_squares(values)
+        if np.abs(np.sqrt(e[used]) - np.sqrt(before[used])).max() < 0.05 * np.sqrt(factor):
+            break
+    used &= e <= limit(int(used.sum())) * scale(e[used])
+    graph.set_weights(used.astype(np.float64))
+    return values
