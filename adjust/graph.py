@@ -27,7 +27,6 @@ from adjust.result import ParameterName
 from adjust.state import State, collect_vectors
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
 
-
 _Rows = TypeVar("_Rows", FloatArray, BoolArray)
 
 
