@@ -15,10 +15,11 @@ from adjust.model import FloatArray
 from survey.rendering import Beacons, BrownCamera, GrayImage, Imaging, PlacedTarget, render
 from survey.simulate.draft import Draft, Shot
 from survey.simulate.scene import BROWN, Scene, transform
-from survey.targets import MarkerBlock, PointList
+from survey.targets import PointList
 
-DAY = Imaging(blur_px=0.8, noise_gray=2.0, background_gray=105.0, gradient=(0.18, -0.12))
-NIGHT = Imaging(blur_px=0.8, noise_gray=1.5, background_gray=6.0)
+# a gray sensor with some gain in a room of ordinary light
+DAY = Imaging(blur_px=0.9, noise_gray=4.0, background_gray=105.0, gradient=(0.18, -0.12))
+NIGHT = Imaging(blur_px=0.9, noise_gray=2.0, background_gray=6.0)
 BEACON_DIAMETER_M = 0.006
 
 
@@ -74,7 +75,20 @@ def _placed(draft: Draft, scene: Scene, shot: Shot, camera_from_world: FloatArra
         if isinstance(kind, PointList):
             continue
         pose = Pose3(camera_from_world @ scene.world_from_target(target.target_id, shot.epoch_id))
-        if not isinstance(kind, MarkerBlock) and pose.translation()[2] < -1.0:
-            continue  # behind the camera
-        placed.append(PlacedTarget(kind, pose))
+        if _may_be_seen(_camera(scene, shot.camera_id), pose, target.x_in_target):
+            placed.append(PlacedTarget(kind, pose))
     return placed
+
+
+def _may_be_seen(camera: BrownCamera, camera_from_target: Pose3, x_in_target: FloatArray) -> bool:
+    """Whether a sphere around the target reaches into the cone around the image; rendering the others costs time."""
+    middle = x_in_target.mean(axis=0)
+    radius = 1.3 * float(
+        np.linalg.norm(x_in_target - middle, axis=1).max()
+    )  # with squares and margin around the points
+    x, y, z = camera_from_target.transformFrom(middle)
+    distance = float(np.linalg.norm((x, y, z)))
+    if distance <= radius:
+        return True
+    half_field = np.arctan(0.5 * np.hypot(*camera.image_size) / min(camera.fx, camera.fy)) + np.radians(6.0)
+    return bool(np.arctan2(np.hypot(x, y), z) < half_field + np.arcsin(radius / distance))
