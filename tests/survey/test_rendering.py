@@ -36,10 +36,7 @@ def test_grey_values_agree_with_a_texture_warped_by_opencv():
     image = render(camera, [PlacedTarget(BOARD, pose, 0.0, 200.0)], imaging=Imaging(1.0, 0.0, 100.0))
     matrix = np.array([[400.0, 0, 155.0], [0, 410.0, 118.0], [0, 0, 1]])
     grid = np.stack(np.meshgrid(np.arange(320.0), np.arange(240.0)), -1).reshape(-1, 1, 2)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
-    rays = cv2.undistortPointsIter if hasattr(cv2, "undistortPointsIter") else cv2.undistortPoints
-    d = np.array(camera.distortion)
-    xy = rays(grid, matrix, d, None, None, None, criteria) if rays is not cv2.undistortPoints else rays(grid, matrix, d)
+    xy = cv2.undistortPoints(grid, matrix, np.array(camera.distortion))
     ray = np.column_stack([xy.reshape(-1, 2), np.ones(320 * 240)])
     q = ray @ np.linalg.inv(np.column_stack([pose.rotation().matrix()[:, :2], pose.translation()])).T
     i, j = np.floor(q[:, 0] / q[:, 2] / 0.02), np.floor(q[:, 1] / q[:, 2] / 0.02)
