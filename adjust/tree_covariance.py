@@ -9,68 +9,153 @@ from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
-from scipy.linalg import lapack
 
-from adjust.model import FloatArray
+from adjust.model import FloatArray, IntArray
+from adjust.tree_kernels import covariance_rows, fill_block, invert_cliques, joint_blocks, solve_cliques
 
 
 class TreeCovariance:
-    """Marginal and joint covariances. ``dims`` gives the dimension of every key."""
+    """Marginal and joint covariances. ``dims`` gives the dimension of every key; keys are also counted 0, 1, ..."""
 
     def __init__(self, tree: gtsam.GaussianBayesTree, dims: Mapping[int, int]) -> None:
-        self.tree, self.dims = tree, dims
-        self._home: dict[int, int] = {}
-        self._cliques: list[tuple[dict[int, int], FloatArray]] = []
-        stack: list[tuple[gtsam.GaussianBayesTreeClique, int]] = [(root, -1) for root in tree.roots()]
-        while stack:
-            clique, parent = stack.pop()
-            self._add(clique, parent)
-            me = len(self._cliques) - 1
-            stack += [(clique[j], me) for j in range(clique.nrChildren())]
-
-    def _add(self, clique: gtsam.GaussianBayesTreeClique, parent: int) -> None:
-        conditional = clique.conditional()
-        keys = list(conditional.keys())
-        R = conditional.R()
-        nf = R.shape[0]
-        at, n = {}, 0
-        for key in keys:
-            at[key] = n
-            n += self.dims[key]
-        inverse, info = lapack.dtrtri(R)
-        if info != 0:
+        self.dims = dims
+        blocks, clique_keys, fronts, parents = _collect(tree)
+        order = list(dict.fromkeys(k for keys in clique_keys for k in keys))
+        self.number = {key: i for i, key in enumerate(order)}
+        self._dims = np.array([dims[k] for k in order], dtype=np.int64)
+        self._first = np.concatenate([[0], np.cumsum(self._dims)]).astype(np.int64)
+        self._keys = np.array([self.number[k] for keys in clique_keys for k in keys], dtype=np.int64)
+        self._key_ptr = np.cumsum([0] + [len(keys) for keys in clique_keys]).astype(np.int64)
+        self._front = np.array([b.shape[0] for b in blocks], dtype=np.int64)
+        self._width = np.array([b.shape[1] for b in blocks], dtype=np.int64)
+        self._at = np.cumsum([0] + [b.size for b in blocks])[:-1].astype(np.int64)
+        self._data = np.concatenate([b.ravel() for b in blocks]) if blocks else np.zeros(0)
+        self._parents = np.array(parents, dtype=np.int64)
+        self._n_front = self._frontal_keys(fronts)
+        self._home = np.zeros(len(order), dtype=np.int64)
+        for c in range(len(blocks)):
+            start = self._key_ptr[c]
+            self._home[self._keys[start : start + self._n_front[c]]] = c
+        if invert_cliques(self._front, self._width, self._at, self._data) >= 0:
             raise ZeroDivisionError("the Bayes tree is singular")
-        model = conditional.get_model()
-        C = np.empty((n, n))
-        C[:nf, :nf] = inverse @ inverse.T if model is None else (inverse * model.sigmas() ** 2) @ inverse.T
-        if n > nf:
-            T = -(inverse @ conditional.S())
-            parent_at, parent_C = self._cliques[parent]
-            index = np.concatenate(
-                [np.arange(parent_at[k], parent_at[k] + self.dims[k]) for k in keys if at[k] >= nf]
-            )
-            Qss = parent_C[np.ix_(index, index)]
-            C[:nf, nf:] = T @ Qss
-            C[nf:, :nf] = C[:nf, nf:].T
-            C[nf:, nf:] = Qss
-            C[:nf, :nf] += C[:nf, nf:] @ T.T
-        for key in keys:
-            if at[key] < nf:
-                self._home[key] = len(self._cliques)
-        self._cliques.append((at, C))
+        self._cov = np.empty_like(self._data)
+        covariance_rows(self._n_front, self._key_ptr, self._keys, self._dims, self._home, self._front, self._width,
+                        self._at, self._data, self._cov)  # fmt: skip
+
+    def _frontal_keys(self, fronts: list[int]) -> IntArray:
+        """Number of frontal keys of every clique, from the number of its frontal rows."""
+        out = np.empty(len(fronts), dtype=np.int64)
+        dims, ptr = self._dims[self._keys].tolist(), self._key_ptr.tolist()
+        for c, rows in enumerate(fronts):
+            n, total = 0, 0
+            while total < rows:
+                total += dims[ptr[c] + n]
+                n += 1
+            out[c] = n
+        return out
+
+    def _block(self, a: int, b: int) -> FloatArray | None:
+        out = np.empty((self._dims[a], self._dims[b]))
+        found = fill_block(a, b, self._home, self._key_ptr, self._keys, self._dims, self._front, self._width, self._at,
+                           self._cov, out)  # fmt: skip
+        return out if found else None
 
     def marginal(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
-        at, C = self._cliques[self._home[key]]
-        i = slice(at[key], at[key] + self.dims[key])
-        return C[i, i]
+        block = self._block(self.number[key], self.number[key])
+        if block is None:
+            raise KeyError(key)
+        return block
 
     def joint(self, keys: Sequence[int]) -> FloatArray:
         """Joint covariance of any unknowns, stacked in this order; fast where they share a clique."""
-        for key in keys:
-            at, C = self._cliques[self._home[key]]
-            if all(k in at for k in keys):
-                index = np.concatenate([np.arange(at[k], at[k] + self.dims[k]) for k in keys])
-                return np.asarray(C[np.ix_(index, index)])
-        joint = self.tree.jointMarginalCovariance(list(keys))
-        return np.block([[joint.at(a, b) for b in keys] for a in keys])
+        numbers = [self.number[k] for k in keys]
+        deepest = numbers[int(np.argmax(self._home[numbers]))]
+        c = int(self._home[deepest])
+        inside = set(self._keys[self._key_ptr[c] : self._key_ptr[c + 1]].tolist())
+        if not inside.issuperset(numbers):
+            return self._apart(numbers)
+        at = np.concatenate([[0], np.cumsum(self._dims[numbers])])
+        out = np.empty((at[-1], at[-1]))
+        for i, a in enumerate(numbers):
+            for j, b in enumerate(numbers[: i + 1]):
+                block = self._block(a, b)
+                if block is None:
+                    return self._apart(numbers)
+                out[at[i] : at[i + 1], at[j] : at[j + 1]] = block
+                out[at[j] : at[j + 1], at[i] : at[i + 1]] = block.T
+        return out
+
+    def _apart(self, numbers: list[int]) -> FloatArray:
+        """Joint covariance of unknowns of different cliques: columns of the inverse, on their ways to the root only."""
+        rows = np.concatenate([np.arange(self._first[k], self._first[k + 1]) for k in numbers])
+        x = np.zeros((int(self._first[-1]), len(rows)))
+        x[rows, np.arange(len(rows))] = 1.0
+        cliques = self._ancestors(set(self._home[numbers].tolist()))
+        self._solve(cliques, x)
+        out = x[rows]
+        return np.asarray(0.5 * (out + out.T))
+
+    def _ancestors(self, cliques: set[int]) -> IntArray:
+        found: set[int] = set()
+        for start in cliques:
+            c = start
+            while c >= 0 and c not in found:
+                found.add(c)
+                c = int(self._parents[c])
+        return np.array(sorted(found), dtype=np.int64)
+
+    def _solve(self, cliques: IntArray, x: FloatArray) -> None:
+        solve_cliques(cliques, self._key_ptr, self._keys, self._dims, self._first, self._front, self._width, self._at,
+                      self._data, x)  # fmt: skip
+
+    def rows(self, keys: Sequence[int]) -> IntArray:
+        """Rows of these keys in a stacked vector of all unknowns, as :meth:`times` takes it."""
+        return np.concatenate([np.arange(self._first[k], self._first[k + 1]) for k in (self.number[q] for q in keys)])
+
+    @property
+    def n(self) -> int:
+        """Length of a stacked vector of all unknowns."""
+        return int(self._first[-1])
+
+    def times(self, columns: FloatArray) -> FloatArray:
+        """The whole covariance matrix times columns (n, m), without forming it."""
+        x = np.array(columns, dtype=float)
+        self._solve(np.arange(len(self._front), dtype=np.int64), x)
+        return x
+
+    def pairs(self, first: IntArray, second: IntArray, dim: int) -> FloatArray:
+        """Joint covariances (p, 2 dim, 2 dim) of pairs of keys that share a factor; -1 stands for a constant.
+
+        Raises KeyError for a pair that shares none.
+        """
+        table = np.full(max(self.number, default=0) + 2, -1, dtype=np.int64)
+        table[np.array(list(self.number), dtype=np.int64)] = np.arange(len(self.number))
+        a, b = table[first], table[second]
+        out = np.empty((len(a), 2 * dim, 2 * dim))
+        lost = joint_blocks(a, b, dim, self._home, self._key_ptr, self._keys, self._dims, self._front, self._width,
+                            self._at, self._cov, out)  # fmt: skip
+        if lost >= 0:
+            raise KeyError((int(first[lost]), int(second[lost])))
+        return out
+
+
+def _collect(tree: gtsam.GaussianBayesTree) -> tuple[list[FloatArray], list[list[int]], list[int], list[int]]:
+    """Blocks [R S] (nf, n), keys, frontal rows and parent of every clique, parents first."""
+    blocks: list[FloatArray] = []
+    keys: list[list[int]] = []
+    parents: list[int] = []
+    stack: list[tuple[gtsam.GaussianBayesTreeClique, int]] = [(root, -1) for root in tree.roots()]
+    while stack:
+        clique, parent = stack.pop()
+        conditional = clique.conditional()
+        A = conditional.getA()
+        model = conditional.get_model()
+        if model is not None:
+            A = A / model.sigmas()[:, None]
+        me = len(blocks)
+        blocks.append(np.ascontiguousarray(A))
+        keys.append(list(conditional.keys()))
+        parents.append(parent)
+        stack += [(clique[j], me) for j in range(clique.nrChildren())]
+    return blocks, keys, [len(b) for b in blocks], parents
