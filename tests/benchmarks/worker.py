@@ -1,0 +1,53 @@
+"""One competitor in a process of its own: ``python -m tests.benchmarks.worker KIND NAME CASE WARM OUT``.
+
+Warms up on the case WARM, then answers every line on stdin with one run, as a line of JSON; the solution goes to OUT.
+"""
+
+import json
+import os
+import resource
+import sys
+from pathlib import Path
+from time import perf_counter, process_time
+
+import cv2
+import numpy as np
+
+from tests.benchmarks import bundle, competitors
+from tests.benchmarks.competitors import Competitor
+from tests.benchmarks.data import Calibration
+
+
+def peak_mb() -> float:
+    """Largest resident size of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def make(kind: str, name: str, path: Path) -> Competitor:
+    """The competitor on the case of that file."""
+    if kind == "calibration":
+        return competitors.CALIBRATION[name](Calibration.load(path))
+    return bundle.BUNDLE[name](bundle.Bundle.load(path))
+
+
+def main() -> None:
+    """Serve until stdin ends."""
+    kind, name, case, warm, out = sys.argv[1:]
+    cv2.setNumThreads(int(os.environ["LABSURVEY_THREADS"]))
+    answers, sys.stdout = sys.stdout, sys.stderr  # what a library prints must not disturb the answers
+    make(kind, name, Path(warm))()
+    run = make(kind, name, Path(case))
+    idle = peak_mb()
+    print(json.dumps({"ready": True}), file=answers, flush=True)
+    for _ in sys.stdin:
+        wall, cpu = perf_counter(), process_time()
+        outcome = run()
+        wall, cpu = perf_counter() - wall, process_time() - cpu
+        np.savez(out, **outcome.solution)
+        answer = {"stages": outcome.stages, "wall": wall, "cpu": cpu, "note": outcome.note, "idle_mb": idle,
+                  "peak_mb": peak_mb(), "numbers": outcome.numbers}  # fmt: skip
+        print(json.dumps(answer), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()
