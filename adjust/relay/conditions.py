@@ -1,0 +1,135 @@
+"""The condition form: one unknown per measured pair, its measurement with covariance, and loops that must close.
+
+Minimise the sum of ``r_e' C_e^-1 r_e``, ``r_e = Log(measured_e^-1 X_e)``, under the independent loop closures
+(Chao et al. 2011, eqs. 26-30, here with three or six equations a loop and the rigorous total residuals). At X the
+tangent's cofactors are Q_e = Jr C_e Jr', and with misclosures w and their derivatives B
+
+    N = B Q B',   lambda = N^-1 (w - B r),   d = -r - Q B' lambda,   cov = Q - Q B' N^-1 B Q
+
+(Koch 1999, section 3.2; Jr(r) r = r). At a fixed point the loops close and r = -Q B' lambda, so it is the constrained
+minimum, the same as that of :mod:`adjust.relay.parametric`.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from adjust.errors import NotConvergedError
+from adjust.model import FloatArray
+from adjust.relay.condition_factors import FactorSolution, solve_factors
+from adjust.relay.loops import LoopBasis, evaluate_loops, loop_basis, loop_misclosures
+from adjust.relay.motions import Motions, right_jacobian
+from adjust.relay.network import Network
+from adjust.relay.normal_equations import (
+    NormalEquations,
+    SparseNormals,
+    TreeNormals,
+    condition_matrix,
+    joint_covariance,
+)
+from adjust.relay.result import AdjustedPairs, adjusted_pairs, whitening
+
+# side of the dense matrix that the spanning tree's way may need
+MAX_TREE_SIDE = 3000
+
+
+@dataclass(frozen=True)
+class ConditionOptions:
+    """When to stop, and which loops.
+
+    closure: largest misclosure allowed at the end, rad, and m per m of the longest pair. max_step: last correction, in
+    sigmas of the measured pairs. loops: ``auto`` takes a spanning tree's in dense networks, else the shortest.
+    """
+
+    closure: float = 1e-12
+    max_step: float = 1e-8
+    max_iterations: int = 50
+    loops: Literal["auto", "shortest", "tree"] = "auto"
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionAdjustment:
+    """pairs: adjusted pairs and statistics. basis: the loops used. closure: the largest misclosure left."""
+
+    pairs: AdjustedPairs
+    basis: LoopBasis
+    closure: float
+
+
+def adjust_conditions(network: Network, options: ConditionOptions = ConditionOptions()) -> ConditionAdjustment:
+    """Adjust by the normal equations of the conditions; any size, connected or not.
+
+    Raises NotConvergedError, naming the loop that closes worst.
+    """
+    basis = loop_basis(network.topology, _loop_kind(network, options))
+    limit = options.closure * max(1.0, _reach(network))
+    X, root = network.b_from_a, whitening(network.cov)
+    for iteration in range(1, options.max_iterations + 1):
+        w, blocks, r, Q = _linearise(network, basis, X)
+        B, normals = condition_matrix(basis, blocks), _normals(basis, blocks, Q)
+        multipliers = normals.solve(w.ravel() - B @ r.ravel())
+        d = -r - (Q @ (B.T @ multipliers).reshape(*r.shape, 1))[..., 0]
+        X = X.retract(d)
+        step = float(np.abs(root @ d[..., None]).max())
+        closure = float(np.abs(evaluate_loops(basis, X)[0]).max()) if len(basis) else 0.0
+        if not np.isfinite(step):
+            break
+        if closure < limit and step < options.max_step:
+            return _finish(network, basis, X, closure, iteration)
+    worst = loop_misclosures(network)
+    raise NotConvergedError(
+        f"the loops do not close after {options.max_iterations} steps (misclosure left {closure:.2g}, last step "
+        f"{step:.2g} sigma); look for a wrong pair in {worst.text(int(np.argmax(worst.test)))}"
+    )
+
+
+def adjust_condition_factors(network: Network, options: ConditionOptions = ConditionOptions()) -> ConditionAdjustment:
+    """The same by GTSAM: a prior per pair and a hard closure factor per loop; for small sets of loops.
+
+    Raises SurveyError for more loops than GTSAM eliminates safely, NotConvergedError where they do not close.
+    """
+    basis = loop_basis(network.topology, _loop_kind(network, options))
+    limit = options.closure * max(1.0, _reach(network))
+    found: FactorSolution = solve_factors(network, basis, limit, options.max_step, options.max_iterations)
+    total = network.dim * len(basis)
+    pairs = adjusted_pairs(network, found.b_from_a, found.cov, total, found.iterations, found.joint)
+    return ConditionAdjustment(pairs, basis, found.closure)
+
+
+def _loop_kind(network: Network, options: ConditionOptions) -> Literal["shortest", "tree"]:
+    if options.loops != "auto":
+        return options.loops
+    top = network.topology
+    side = top.n_stations * network.dim
+    dense = top.n_pairs > 3 * top.n_stations and side <= MAX_TREE_SIDE
+    return "tree" if dense else "shortest"
+
+
+def _reach(network: Network) -> float:
+    """The longest pair, m."""
+    t = network.b_from_a.translation
+    return 0.0 if t is None or not len(t) else float(np.linalg.norm(t, axis=1).max())
+
+
+def _linearise(network: Network, basis: LoopBasis, X: Motions) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    w, blocks = evaluate_loops(basis, X)
+    r = (network.b_from_a.inverse() @ X).log()
+    forward = right_jacobian(r)
+    return w, blocks, r, forward @ network.cov @ np.swapaxes(forward, -1, -2)
+
+
+def _normals(basis: LoopBasis, blocks: FloatArray, Q: FloatArray) -> NormalEquations:
+    if basis.chord_idx is not None and 2 * len(basis) > len(np.unique(basis.pair_idx)):
+        return TreeNormals(basis, blocks, Q)
+    return SparseNormals(basis, blocks, Q)
+
+
+def _finish(network: Network, basis: LoopBasis, X: Motions, closure: float, iterations: int) -> ConditionAdjustment:
+    _, blocks, _, Q = _linearise(network, basis, X)
+    B, normals = condition_matrix(basis, blocks), _normals(basis, blocks, Q)
+    pairs = adjusted_pairs(
+        network, X, normals.adjusted_covariances(), network.dim * len(basis), iterations,
+        lambda pair_idx: joint_covariance(normals, B, Q, pair_idx),
+    )  # fmt: skip
+    return ConditionAdjustment(pairs, basis, closure)

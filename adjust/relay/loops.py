@@ -1,0 +1,180 @@
+"""Independent loops of a network, and their misclosures one by one.
+
+A loop is walked from its first station; the product of its pairs, each taken along or against its direction, would be
+the identity without errors. Its logarithm is the misclosure, in the frame of the first station.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.stats import chi2
+
+from adjust.model import FloatArray, IntArray
+from adjust.relay.cycle_kernels import forest_loops, independent_of, meeting_stations, shortest_loops
+from adjust.relay.graph_kernels import adjacency, breadth_first
+from adjust.relay.motions import Motions, identities, right_jacobian_inverse
+from adjust.relay.network import Network, Topology
+
+LoopKind = Literal["shortest", "tree"]
+
+# a bit matrix of 50 MB; larger networks get the loops of a spanning tree
+MAX_SHORTEST_LOOPS = 20_000
+# elementary steps, some seconds
+SEARCH_BUDGET = 3_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class LoopBasis:
+    """E - n + c independent loops: loop k are the pairs ``pair_idx[ptr[k]:ptr[k + 1]]`` in the order of the walk.
+
+    sense: +1 where a pair is walked from a to b, -1 from b to a. start_idx: (L,) first station. minimal: whether the
+    total length is the least possible. chord_idx: (L,) for loops of a spanning tree the pair that only this loop has.
+    note: how the loops were found, for people.
+    """
+
+    topology: Topology
+    ptr: IntArray
+    pair_idx: IntArray
+    sense: IntArray
+    start_idx: IntArray
+    minimal: bool
+    note: str
+    chord_idx: IntArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.start_idx)
+
+    @property
+    def lengths(self) -> IntArray:
+        """Pairs in each loop (L,)."""
+        return np.diff(self.ptr)
+
+    def pairs(self, loop: int) -> tuple[str, ...]:
+        """Ids of the pairs of a loop, in the order of the walk."""
+        return tuple(self.topology.pair_ids[e] for e in self.pair_idx[self.ptr[loop] : self.ptr[loop + 1]])
+
+    def stations(self, loop: int) -> tuple[str, ...]:
+        """Ids of the stations of a loop, in the order of the walk."""
+        rows = slice(self.ptr[loop], self.ptr[loop + 1])
+        a, b = self.topology.a_idx[self.pair_idx[rows]], self.topology.b_idx[self.pair_idx[rows]]
+        return tuple(self.topology.station_ids[i] for i in np.where(self.sense[rows] > 0, a, b))
+
+
+def loop_basis(topology: Topology, kind: LoopKind = "shortest", budget: int = SEARCH_BUDGET) -> LoopBasis:
+    """Independent loops: ``shortest`` (a minimal cycle basis) or ``tree`` (of a spanning tree from the busiest).
+
+    Above ``MAX_SHORTEST_LOOPS`` loops the spanning tree's are taken; where the search exceeds its budget they complete
+    what was found. ``minimal`` and ``note`` say so.
+    """
+    n = topology.n_stations
+    walk = adjacency(n, topology.a_idx, topology.b_idx)
+    busiest = np.argsort(-np.diff(walk[0]), kind="stable")
+    _, parent, by, depth, _ = breadth_first(*walk, busiest)
+    in_tree = np.zeros(topology.n_pairs, dtype=np.bool_)
+    in_tree[by[by >= 0]] = True
+    chords = np.flatnonzero(~in_tree)
+    tree = forest_loops(topology.a_idx, topology.b_idx, parent, by, depth, chords)
+    from_tree = _basis(topology, *tree, topology.a_idx[chords], False, "loops of a spanning tree", chords)
+    if kind == "tree" or not len(chords):
+        return from_tree
+    if len(chords) > MAX_SHORTEST_LOOPS:
+        note = f"loops of a spanning tree: more than {MAX_SHORTEST_LOOPS} loops are too many for the shortest ones"
+        return _basis(topology, *tree, topology.a_idx[chords], False, note, chords)
+    number = np.full(topology.n_pairs, -1, dtype=np.int64)
+    number[chords] = np.arange(len(chords))
+    roots = meeting_stations(walk[0], walk[1])
+    ptr, pairs, start, rows, taken = shortest_loops(*walk, roots, number, len(chords), budget)
+    if len(start) == len(chords):
+        return _basis(topology, ptr, pairs, start, True, "shortest independent loops")
+    keep = independent_of(*tree, number, rows, taken)
+    more = np.concatenate([pairs, *(tree[1][tree[0][k] : tree[0][k + 1]] for k in np.flatnonzero(keep))])
+    ptr = np.concatenate([ptr, ptr[-1] + np.cumsum(np.diff(tree[0])[keep])])
+    note = f"the {len(start)} shortest loops, and {int(keep.sum())} of a spanning tree: the search used up its budget"
+    return _basis(topology, ptr, more, np.concatenate([start, topology.a_idx[chords[keep]]]), False, note)
+
+
+def _basis(
+    topology: Topology, ptr: IntArray, pairs: IntArray, start: IntArray, minimal: bool, note: str,
+    chords: IntArray | None = None,
+) -> LoopBasis:  # fmt: skip
+    sense, at = np.zeros(len(pairs), dtype=np.int64), start.copy()
+    for rows, loops in _steps(ptr):
+        a, b = topology.a_idx[pairs[rows]], topology.b_idx[pairs[rows]]
+        along = a == at[loops]
+        sense[rows] = np.where(along, 1, -1)
+        at[loops] = np.where(along, b, a)
+    return LoopBasis(topology, ptr, pairs, sense, start, minimal, note, chords)
+
+
+def _steps(ptr: IntArray) -> list[tuple[IntArray, IntArray]]:
+    """Step by step, the rows (of all loops that are this long) and the loops they belong to."""
+    lengths = np.diff(ptr)
+    out = []
+    loops = np.arange(len(lengths))
+    for step in range(int(lengths.max()) if len(lengths) else 0):
+        loops = loops[lengths[loops] > step]
+        out.append((ptr[loops] + step, loops))
+    return out
+
+
+def evaluate_loops(basis: LoopBasis, b_from_a: Motions) -> tuple[FloatArray, FloatArray]:
+    """Misclosures (L, dim) and their derivatives (K, dim, dim) by the pairs, in the order of ``basis.pair_idx``.
+
+    With M the product round the loop and Z that up to station a of the pair: M moves by ``+-Ad(Z^-1) d`` on the right,
+    and its logarithm by Jr^-1 of it; + where the pair is walked from a to b.
+    """
+    dim = b_from_a.dim
+    product = identities(len(basis), dim)
+    before = np.zeros((len(basis.pair_idx), dim, dim))
+    for rows, loops in _steps(basis.ptr):
+        step, along = b_from_a[basis.pair_idx[rows]], basis.sense[rows] > 0
+        now = product[loops]
+        after = step.where(along, step.inverse()) @ now
+        before[rows] = now.where(along, after).inverse().adjoint()
+        product.rotation[loops] = after.rotation
+        if product.translation is not None and after.translation is not None:
+            product.translation[loops] = after.translation
+    w = product.log()
+    outer = right_jacobian_inverse(w)[np.repeat(np.arange(len(basis)), basis.lengths)]
+    return w, basis.sense[:, None, None] * (outer @ before)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopMisclosures:
+    """Misclosures of the measured pairs: vector (L, dim), cov (L, dim, dim), test = w' cov^-1 w (L,), p_value (L,).
+
+    Under the a priori covariances each test is chi-square with dim degrees of freedom.
+    """
+
+    basis: LoopBasis
+    vector: FloatArray
+    cov: FloatArray
+    test: FloatArray
+    p_value: FloatArray
+
+    def failed(self, alpha: float = 0.001) -> IntArray:
+        """Loops that do not close, worst first; ``alpha`` is for the whole network (Sidak)."""
+        single = -np.expm1(np.log1p(-alpha) / max(1, len(self.test)))
+        order = np.argsort(self.p_value, kind="stable")
+        return np.asarray(order[self.p_value[order] < single], dtype=np.int64)
+
+    def text(self, loop: int) -> str:
+        """One loop for people."""
+        turn = np.degrees(np.linalg.norm(self.vector[loop, :3])) * 3600.0
+        shift = f", {1e3 * np.linalg.norm(self.vector[loop, 3:]):.3f} mm" if self.vector.shape[1] == 6 else ""
+        way = " -> ".join((*self.basis.stations(loop), self.basis.stations(loop)[0]))
+        return (
+            f"{way}: misclosure {turn:.2f} arcsec{shift}, test {self.test[loop]:.1f} (p {self.p_value[loop]:.2g}), "
+            f"pairs {', '.join(self.basis.pairs(loop))}"
+        )
+
+
+def loop_misclosures(network: Network, basis: LoopBasis | None = None) -> LoopMisclosures:
+    """How well each loop closes, from the measured pairs alone."""
+    basis = basis or loop_basis(network.topology)
+    w, blocks = evaluate_loops(basis, network.b_from_a)
+    each = blocks @ network.cov[basis.pair_idx] @ np.swapaxes(blocks, -1, -2)
+    cov = np.add.reduceat(each, basis.ptr[:-1], axis=0) if len(basis) else np.zeros((0, network.dim, network.dim))
+    test = np.einsum("li,li->l", w, np.linalg.solve(cov, w[..., None])[..., 0])
+    return LoopMisclosures(basis, w, cov, test, np.asarray(chi2.sf(test, network.dim)))

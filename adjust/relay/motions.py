@@ -1,0 +1,169 @@
+"""Many rotations or rigid motions at once, as arrays, with GTSAM's tangents.
+
+A tangent is (3,) rad, or (6,) rad and m with the rotation first, applied on the right: ``X Exp(d)``. The derivatives of
+Exp and Log follow Sola, Deray and Atchuthan (2018, "A micro Lie theory", eqs. 143-146, 174-180) and Barfoot (2017,
+"State Estimation for Robotics", eq. 7.86 for the coupling block).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.closed_forms.rigid import rotation_exp, rotation_log, skew
+from adjust.model import BoolArray, FloatArray, IntArray
+
+_SMALL = 0.3  # rad; below it the series are exact to the last digit, above it the closed forms lose none
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """n rotations (translation None) or rigid motions: rotation (n, 3, 3), translation (n, 3) m."""
+
+    rotation: FloatArray
+    translation: FloatArray | None = None
+
+    @property
+    def dim(self) -> int:
+        """3 for rotations, 6 for rigid motions."""
+        return 3 if self.translation is None else 6
+
+    def __len__(self) -> int:
+        return len(self.rotation)
+
+    def __getitem__(self, index: IntArray | BoolArray | slice) -> "Motions":
+        t = self.translation
+        return Motions(self.rotation[index], None if t is None else t[index])
+
+    def __matmul__(self, other: "Motions") -> "Motions":
+        rotation = self.rotation @ other.rotation
+        if self.translation is None or other.translation is None:
+            return Motions(rotation)
+        return Motions(rotation, (self.rotation @ other.translation[..., None])[..., 0] + self.translation)
+
+    def inverse(self) -> "Motions":
+        """The motions the other way round."""
+        back = np.swapaxes(self.rotation, -1, -2)
+        if self.translation is None:
+            return Motions(back)
+        return Motions(back, -(back @ self.translation[..., None])[..., 0])
+
+    def where(self, mask: BoolArray, other: "Motions") -> "Motions":
+        """These where ``mask`` (n,) holds, the others elsewhere."""
+        rotation = np.where(mask[:, None, None], self.rotation, other.rotation)
+        if self.translation is None or other.translation is None:
+            return Motions(rotation)
+        return Motions(rotation, np.where(mask[:, None], self.translation, other.translation))
+
+    def retract(self, delta: FloatArray) -> "Motions":
+        """Moved by tangents (n, dim) on the right."""
+        return self @ exp(delta)
+
+    def log(self) -> FloatArray:
+        """Tangents (n, dim) at identity."""
+        omega = rotation_log(self.rotation)
+        if self.translation is None:
+            return omega
+        back = right_jacobian_inverse(-omega)  # the left Jacobian's inverse
+        return np.concatenate([omega, (back @ self.translation[..., None])[..., 0]], axis=-1)
+
+    def adjoint(self) -> FloatArray:
+        """Ad (n, dim, dim): ``X Exp(d) X^-1 = Exp(Ad d)``."""
+        if self.translation is None:
+            return self.rotation
+        out = np.zeros((len(self), 6, 6))
+        out[:, :3, :3] = out[:, 3:, 3:] = self.rotation
+        out[:, 3:, :3] = skew(self.translation) @ self.rotation
+        return out
+
+
+def identities(n: int, dim: int) -> Motions:
+    """As many identities."""
+    return Motions(np.broadcast_to(np.eye(3), (n, 3, 3)).copy(), None if dim == 3 else np.zeros((n, 3)))
+
+
+def exp(delta: FloatArray) -> Motions:
+    """Motions of tangents (n, 3) or (n, 6)."""
+    omega = delta[..., :3]
+    if delta.shape[-1] == 3:
+        return Motions(rotation_exp(omega))
+    left = right_jacobian(-omega)
+    return Motions(rotation_exp(omega), (left @ delta[..., 3:, None])[..., 0])
+
+
+def right_jacobian(delta: FloatArray) -> FloatArray:
+    """Jr (n, dim, dim): ``Exp(d + e) = Exp(d) Exp(Jr e)`` to first order."""
+    omega = delta[..., :3]
+    K = skew(omega)
+    _, b, c = _coefficients(omega)
+    turn = np.eye(3) - b * K + c * (K @ K)
+    if delta.shape[-1] == 3:
+        return np.asarray(turn)
+    out = np.zeros((*delta.shape[:-1], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = turn
+    out[..., 3:, :3] = _coupling(delta)
+    return out
+
+
+def right_jacobian_inverse(delta: FloatArray) -> FloatArray:
+    """Jr^-1 (n, dim, dim), the derivative of Log: ``Log(Exp(d) Exp(e)) = d + Jr^-1 e`` to first order."""
+    omega = delta[..., :3]
+    K = skew(omega)
+    turn = np.eye(3) + 0.5 * K + _inverse_coefficient(omega) * (K @ K)
+    if delta.shape[-1] == 3:
+        return np.asarray(turn)
+    out = np.zeros((*delta.shape[:-1], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = turn
+    out[..., 3:, :3] = -turn @ _coupling(delta) @ turn
+    return out
+
+
+def _series(x: FloatArray, terms: tuple[float, ...]) -> FloatArray:
+    """Polynomial in x = angle^2."""
+    return np.asarray(np.polynomial.polynomial.polyval(x, np.array(terms)))
+
+
+def _angles(omega: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """Angle (..., 1, 1), where it is small, and the angle made safe to divide by."""
+    angle = np.linalg.norm(omega, axis=-1)[..., None, None]
+    small = angle < _SMALL
+    return angle, small, np.where(small, 1.0, angle)
+
+
+def _coefficients(omega: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3."""
+    angle, small, safe = _angles(omega)
+    x = angle**2
+    a = _series(x, (1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800))
+    b = _series(x, (1 / 2, -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800, -1 / 479001600))
+    c = _series(x, (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800, -1 / 6227020800))
+    sine, cosine = np.sin(safe), np.cos(safe)
+    return (
+        np.where(small, a, sine / safe),
+        np.where(small, b, (1.0 - cosine) / safe**2),
+        np.where(small, c, (safe - sine) / safe**3),
+    )
+
+
+def _inverse_coefficient(omega: FloatArray) -> FloatArray:
+    """1/x^2 - (1 + cos x)/(2 x sin x), written with the half angle so that it holds up to half a turn."""
+    angle, small, safe = _angles(omega)
+    series = _series(angle**2, (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000))
+    half = 0.5 * safe
+    return np.where(small, series, (1.0 - half * np.cos(half) / np.sin(half)) / safe**2)
+
+
+def _coupling(delta: FloatArray) -> FloatArray:
+    """Lower left block of the right Jacobian of rigid motions (Barfoot's Q at the opposite tangent)."""
+    omega, u = -delta[..., :3], -delta[..., 3:]
+    P, U = skew(omega), skew(u)
+    angle, small, safe = _angles(omega)
+    x = angle**2
+    _, _, c1 = _coefficients(omega)
+    c2 = _series(x, (1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600, -1 / 87178291200))
+    c3 = _series(x, (1 / 120, -1 / 2520, 1 / 120960, -1 / 9979200, 1 / 1245404160, -1 / 217945728000))
+    sine, cosine = np.sin(safe), np.cos(safe)
+    c2 = np.where(small, c2, (safe**2 + 2.0 * cosine - 2.0) / (2.0 * safe**4))
+    c3 = np.where(small, c3, (2.0 * safe - 3.0 * sine + safe * cosine) / (2.0 * safe**5))
+    PU, UP = P @ U, U @ P
+    PUP = PU @ P
+    return np.asarray(0.5 * U + c1 * (PU + UP + PUP) + c2 * (P @ PU + UP @ P - 3.0 * PUP) + c3 * (PUP @ P + P @ PUP))

@@ -1,0 +1,172 @@
+"""A network of stations and the pairs measured between them, as arrays.
+
+A station is here any frame that carries an eye: a camera, a marker block, a whole relay station. A measured pair is
+``b_from_a``; its covariance is in the tangent on the right, that is in frame a.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.errors import SurveyError
+from adjust.factors import gaussian
+from adjust.graph import frame_text
+from adjust.model import FloatArray, IntArray
+from adjust.observations import Pair
+from adjust.relay.motions import Motions
+
+
+@dataclass(frozen=True, eq=False)
+class Topology:
+    """Who was measured with whom: pair e joins stations ``a_idx[e]`` and ``b_idx[e]``."""
+
+    station_ids: tuple[str, ...]
+    pair_ids: tuple[str, ...]
+    a_idx: IntArray
+    b_idx: IntArray
+
+    @property
+    def n_stations(self) -> int:
+        """Number of stations."""
+        return len(self.station_ids)
+
+    @property
+    def n_pairs(self) -> int:
+        """Number of measured pairs."""
+        return len(self.pair_ids)
+
+    def ends(self, pair_idx: int) -> tuple[str, str]:
+        """Ids of the two stations of a pair."""
+        return self.station_ids[int(self.a_idx[pair_idx])], self.station_ids[int(self.b_idx[pair_idx])]
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """Measured pairs ``b_from_a`` with covariances ``cov`` (E, dim, dim); all rotations, or all rigid motions."""
+
+    topology: Topology
+    b_from_a: Motions
+    cov: FloatArray
+
+    @property
+    def dim(self) -> int:
+        """3 for rotations, 6 for poses."""
+        return self.b_from_a.dim
+
+    @property
+    def dispersion(self) -> FloatArray:
+        """Standard deviation (E,) rad of the measured rotations, over all directions."""
+        return np.asarray(np.sqrt(np.trace(self.cov[:, :3, :3], axis1=1, axis2=2) / 3.0))
+
+
+def topology(pairs: Iterable[tuple[str, str, str]], stations: Sequence[str] = ()) -> Topology:
+    """From (pair id, a id, b id); ``stations`` names those that stand first, measured or not.
+
+    Raises SurveyError for an id that comes twice and for a pair of a station with itself.
+    """
+    rows = list(pairs)
+    for what, ids in (("pair", [row[0] for row in rows]), ("station", list(stations))):
+        twice = [i for i, n in Counter(ids).items() if n > 1]
+        if twice:
+            raise SurveyError(f"{what} {twice[0]!r} is there twice; give every {what} an id of its own")
+    alone = [row for row in rows if row[1] == row[2]]
+    if alone:
+        raise SurveyError(f"pair {alone[0][0]!r} joins {alone[0][1]!r} with itself; correct a or b")
+    index = {station: i for i, station in enumerate(stations)}
+    ends = [index.setdefault(end, len(index)) for row in rows for end in row[1:]]
+    a, b = np.array(ends, dtype=np.int64).reshape(-1, 2).T
+    return Topology(tuple(index), tuple(row[0] for row in rows), a.copy(), b.copy())
+
+
+def complete_topology(station_ids: Sequence[str]) -> Topology:
+    """Every station measured with every other, in the order (1, 2), (1, 3), ..., (2, 3), ...; ids are ``a-b``."""
+    a, b = np.triu_indices(len(station_ids), 1)
+    ids = tuple(f"{station_ids[i]}-{station_ids[j]}" for i, j in zip(a.tolist(), b.tolist(), strict=True))
+    return Topology(tuple(station_ids), ids, a.astype(np.int64), b.astype(np.int64))
+
+
+def network_from_pairs(pairs: Sequence[Pair], rotations_only: bool = False) -> Network:
+    """The network of the pairs in use; its stations are named as ``kind:id@epoch``.
+
+    rotations_only: take of poses their rotation alone, as where some pairs have no translation.
+    Raises SurveyError for mixed kinds, and for covariances of a wrong shape or not positive definite.
+    """
+    used = [p for p in pairs if p.used]
+    if not used:
+        raise SurveyError("no measured pair is in use; a relay network needs pairs")
+    rotations = [p for p in used if isinstance(p.b_from_a, Rot3)]
+    if rotations and len(rotations) < len(used) and not rotations_only:
+        raise SurveyError(
+            f"pair {rotations[0].pair_id!r} is a rotation while others are poses; adjust the rotations alone, or "
+            "measure its translation"
+        )
+    dim = 3 if rotations or rotations_only else 6
+    # of a pose the rotation comes first in the tangent, and its share of the covariance stands by itself
+    cov = np.array([_checked_covariance(p)[:dim, :dim] for p in used])
+    top = topology((p.pair_id, frame_text(p.a), frame_text(p.b)) for p in used)
+    rotation = np.array([_rotation(p.b_from_a).matrix() for p in used])
+    translation = np.array([p.b_from_a.translation() for p in used if isinstance(p.b_from_a, Pose3)])
+    return Network(top, Motions(rotation, translation if dim == 6 else None), cov)
+
+
+def rotation_network(network: Network) -> Network:
+    """The rotations of a network of poses, with their share of the covariances."""
+    return replace(network, b_from_a=Motions(network.b_from_a.rotation), cov=network.cov[:, :3, :3])
+
+
+def gtsam_motion(motions: Motions, idx: int) -> Rot3 | Pose3:
+    """One motion as GTSAM's type."""
+    rotation = Rot3(motions.rotation[idx])
+    return rotation if motions.translation is None else Pose3(rotation, motions.translation[idx])
+
+
+def station_values(motions: Motions) -> gtsam.Values:
+    """Values with one rotation or pose per station, under the station's number as key."""
+    values = gtsam.Values()
+    for i in range(len(motions)):
+        values.insert(i, gtsam_motion(motions, i))
+    return values
+
+
+def motions_from_values(values: gtsam.Values, n: int, dim: int) -> Motions:
+    """The rotations or poses under the keys 0 to n - 1."""
+    if dim == 3:
+        return Motions(np.array([values.atRot3(i).matrix() for i in range(n)]).reshape(-1, 3, 3))
+    matrices = np.array([values.atPose3(i).matrix() for i in range(n)]).reshape(-1, 4, 4)
+    return Motions(matrices[:, :3, :3], matrices[:, :3, 3])
+
+
+def prior_factor(key: int, motion: Rot3 | Pose3, cov: FloatArray) -> gtsam.NonlinearFactor:
+    """A rotation or pose known with covariance in its tangent."""
+    if isinstance(motion, Rot3):
+        return gtsam.PriorFactorRot3(key, motion, gaussian(cov))
+    return gtsam.PriorFactorPose3(key, motion, gaussian(cov))
+
+
+def between_factor(b: int, a: int, b_from_a: Rot3 | Pose3, cov: FloatArray) -> gtsam.NonlinearFactor:
+    """A measured relative rotation or pose of the stations under the keys b and a."""
+    if isinstance(b_from_a, Rot3):
+        return gtsam.BetweenFactorRot3(b, a, b_from_a, gaussian(cov))
+    return gtsam.BetweenFactorPose3(b, a, b_from_a, gaussian(cov))
+
+
+def _rotation(motion: Pose3 | Rot3) -> Rot3:
+    return motion if isinstance(motion, Rot3) else motion.rotation()
+
+
+def _checked_covariance(pair: Pair) -> FloatArray:
+    n = 3 if isinstance(pair.b_from_a, Rot3) else 6
+    cov = np.asarray(pair.cov, dtype=float)
+    what = f"pair {pair.pair_id!r} ({frame_text(pair.a)} to {frame_text(pair.b)})"
+    if cov.shape != (n, n):
+        raise SurveyError(f"{what}: its covariance has shape {cov.shape}, expected ({n}, {n})")
+    if not np.allclose(cov, cov.T, rtol=1e-6, atol=0.0) or not np.isfinite(cov).all():
+        raise SurveyError(f"{what}: its covariance is not symmetric and finite; correct it")
+    scale = np.sqrt(np.abs(np.diag(cov)))
+    if not (scale > 0.0).all() or np.linalg.eigvalsh(cov / np.outer(scale, scale)).min() <= 1e-12:
+        raise SurveyError(f"{what}: its covariance is not positive definite; give every direction a sigma")
+    return np.asarray(0.5 * (cov + cov.T))

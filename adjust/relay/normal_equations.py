@@ -1,0 +1,159 @@
+"""The normal equations of the conditions, ``N = B Q B'`` with a row of blocks per loop: solved, and inverted in parts.
+
+Two ways to the same solution. With short loops N is sparse and factorised as it stands. With the loops of a spanning
+tree each loop has one pair to itself, so that N is block diagonal but for the tree's few pairs, ``N = D + U S U'``,
+and the Sherman-Morrison-Woodbury formula needs no more than a matrix of the tree's size: the way for dense networks.
+"""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import gtsam
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from adjust.factors import Jacobians, custom
+from adjust.model import FloatArray, IntArray
+from adjust.relay.loops import LoopBasis
+from adjust.relay.result import whitening
+from adjust.tree_covariance import TreeCovariance
+
+
+class NormalEquations(Protocol):
+    """N = B Q B' of one linearisation."""
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """N^-1 applied to columns (L dim, k) or one vector (L dim,)."""
+
+    def adjusted_covariances(self) -> FloatArray:
+        """Q - Q B' N^-1 B Q, the diagonal blocks (E, dim, dim) of all pairs."""
+
+
+def condition_matrix(basis: LoopBasis, blocks: FloatArray) -> sp.bsr_array:
+    """B (L dim, E dim) from the derivatives (K, dim, dim) of the misclosures."""
+    dim = blocks.shape[-1]
+    shape = (len(basis) * dim, basis.topology.n_pairs * dim)
+    return sp.bsr_array((blocks, basis.pair_idx, basis.ptr), shape=shape)
+
+
+def block_diagonal(blocks: FloatArray) -> sp.bsr_array:
+    """Sparse matrix of diagonal blocks (n, dim, dim)."""
+    n, dim, _ = blocks.shape
+    return sp.bsr_array((np.ascontiguousarray(blocks), np.arange(n), np.arange(n + 1)), shape=(n * dim, n * dim))
+
+
+class SparseNormals:
+    """N factorised as it is; for short loops."""
+
+    def __init__(self, basis: LoopBasis, blocks: FloatArray, Q: FloatArray) -> None:
+        self.basis, self.blocks, self.Q = basis, blocks, Q
+        B = condition_matrix(basis, blocks)
+        N = (B @ block_diagonal(Q) @ B.T).tocsc()
+        # N is positive definite: pivots stay on the diagonal, whatever their size
+        self.factor = splu(N, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """N^-1 applied to ``right``."""
+        return np.asarray(self.factor.solve(right))
+
+    def adjusted_covariances(self) -> FloatArray:
+        """One pass over the Bayes tree of the loops' multipliers.
+
+        N is the sum over the pairs of (B_e Q_e^1/2)(...)': a linear factor per pair on the loops through it. These
+        loops share a clique, so the tree's one pass gives all blocks of N^-1 that the covariances ask for.
+        """
+        dim: int = self.Q.shape[-1]
+        loop = np.repeat(np.arange(len(self.basis)), self.basis.lengths)
+        order = np.argsort(self.basis.pair_idx, kind="stable")
+        pair_ptr = np.searchsorted(self.basis.pair_idx[order], np.arange(self.basis.topology.n_pairs + 1))
+        root = np.swapaxes(np.linalg.cholesky(self.Q), -1, -2)
+        out, graph, members = self.Q.copy(), gtsam.GaussianFactorGraph(), {}
+        for e in range(len(self.Q)):
+            rows = order[pair_ptr[e] : pair_ptr[e + 1]]
+            if len(rows):
+                members[e] = ([int(k) for k in loop[rows]], np.swapaxes(self.blocks[rows], -1, -2))
+                graph.add(_linear_factor(members[e][0], root[e] @ members[e][1], dim))
+        tree = TreeCovariance(_eliminate(graph), dict.fromkeys(range(len(self.basis)), dim))
+        for e, (keys, transposed) in members.items():
+            G = self.Q[e] @ np.concatenate(list(transposed), axis=1)
+            out[e] -= G @ tree.joint(keys) @ G.T
+        return out
+
+
+class TreeNormals:
+    """N through its block diagonal part and the pairs of the spanning tree; for dense networks."""
+
+    def __init__(self, basis: LoopBasis, blocks: FloatArray, Q: FloatArray) -> None:
+        if basis.chord_idx is None:
+            raise ValueError("these normal equations need the loops of a spanning tree")
+        dim, n_pairs = Q.shape[-1], basis.topology.n_pairs
+        first = basis.ptr[:-1]  # each loop begins with its own pair
+        self.Q, self.chords = Q, basis.chord_idx
+        self.tree_pairs = np.setdiff1d(np.unique(basis.pair_idx), self.chords)
+        own = blocks[first]
+        root = own @ np.linalg.cholesky(Q[self.chords])
+        inverse_root = np.linalg.inv(root)
+        self.D_inverse = block_diagonal(np.swapaxes(inverse_root, -1, -2) @ inverse_root)
+        columns = (self.tree_pairs[:, None] * dim + np.arange(dim)).ravel()
+        self.U = condition_matrix(basis, blocks).tocsc()[:, columns].tocsr()
+        self.n_pairs, self.own = n_pairs, own
+        S_root_inverse = whitening(Q[self.tree_pairs])
+        S_inverse = scipy.linalg.block_diag(*(np.swapaxes(S_root_inverse, -1, -2) @ S_root_inverse))
+        self.capacitance = scipy.linalg.cho_factor(S_inverse + (self.U.T @ self.D_inverse @ self.U).toarray())
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """D^-1 - D^-1 U (S^-1 + U' D^-1 U)^-1 U' D^-1, applied to ``right``."""
+        y = self.D_inverse @ right
+        return np.asarray(y - self.D_inverse @ (self.U @ scipy.linalg.cho_solve(self.capacitance, self.U.T @ y)))
+
+    def adjusted_covariances(self) -> FloatArray:
+        """The tree's pairs have (S^-1 + U' D^-1 U)^-1; the others follow from them through their own loops."""
+        dim, out = self.Q.shape[-1], self.Q.copy()
+        n = len(self.tree_pairs)
+        T = scipy.linalg.cho_solve(self.capacitance, np.eye(n * dim))
+        at = np.arange(n)
+        out[self.tree_pairs] = T.reshape(n, dim, n, dim)[at, :, at, :]
+        F = self.U.tobsr(blocksize=(dim, dim))
+        inverse_own = np.linalg.inv(self.own)
+        for k, e in enumerate(self.chords):
+            rows = slice(F.indptr[k], F.indptr[k + 1])
+            index = (F.indices[rows, None] * dim + np.arange(dim)).ravel()
+            G = inverse_own[k] @ np.concatenate(list(F.data[rows]), axis=1)
+            out[e] = G @ T[np.ix_(index, index)] @ G.T
+        return out
+
+
+def joint_covariance(
+    normals: NormalEquations, B: sp.bsr_array, Q: FloatArray, pair_idx: Sequence[int] | IntArray
+) -> FloatArray:
+    """Q_ij - Q_i B_i' N^-1 B_j Q_j of some adjusted pairs, stacked; one solution per column, no inverse."""
+    dim, k = Q.shape[-1], len(pair_idx)
+    index = np.asarray(pair_idx, dtype=np.int64)
+    columns = (index[:, None] * dim + np.arange(dim)).ravel()
+    own = scipy.linalg.block_diag(*Q[index]) if k else np.zeros((0, 0))
+    BQ = B.tocsc()[:, columns].toarray() @ own
+    return np.asarray(own - BQ.T @ normals.solve(BQ))
+
+
+def _linear_factor(keys: list[int], blocks: FloatArray, dim: int) -> gtsam.GaussianFactor:
+    """A linear factor on any number of keys; GTSAM's own constructors in Python take three at most."""
+    values = gtsam.Values()
+    for key in keys:
+        values.insert(key, np.zeros(6) if dim == 6 else np.zeros(3))
+
+    def residual(_: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+        return np.zeros(dim), list(zip(keys, blocks, strict=True))
+
+    return custom(keys, np.eye(dim), residual).linearize(values)
+
+
+def _eliminate(graph: gtsam.GaussianFactorGraph) -> gtsam.GaussianBayesTree:
+    try:
+        return graph.eliminateMultifrontal()
+    except RuntimeError as error:
+        if "ndetermin" not in str(error):
+            raise
+        # weak but determined: GTSAM's Cholesky refuses pivots that QR still resolves
+        return graph.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(graph), gtsam.EliminateQR)

@@ -1,0 +1,123 @@
+"""What the adjustment of a relay network gives back, the same for both forms."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from adjust.model import FloatArray, IntArray
+from adjust.precision import global_test
+from adjust.relay.motions import Motions, right_jacobian_inverse
+from adjust.relay.network import Network
+from adjust.result import GlobalTest
+
+# eigenvalues of a residual's cofactors (1 where others control it fully) below which it is not tested
+_UNCONTROLLED = 1e-9
+
+
+@dataclass(frozen=True)
+class SuspectPair:
+    """A pair whose residual is too large: test = v' Q_vv^-1 v, chi-square with ``freedom`` degrees of freedom."""
+
+    pair_id: str
+    a_id: str
+    b_id: str
+    test: float
+    freedom: int
+    p_value: float
+    residual: FloatArray
+
+    def __str__(self) -> str:
+        turn = np.degrees(np.linalg.norm(self.residual[:3])) * 3600.0
+        shift = f" and {1e3 * np.linalg.norm(self.residual[3:]):.3f} mm" if len(self.residual) == 6 else ""
+        return (
+            f"pair {self.pair_id} ({self.a_id} to {self.b_id}): residual {turn:.1f} arcsec{shift}, "
+            f"test {self.test:.1f}, p {self.p_value:.2g}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedPairs:
+    """Adjusted pairs with their statistics (Baarda 1968), a priori sigma0 = 1.
+
+    b_from_a: adjusted. residual: (E, dim) Log(measured^-1 adjusted), in frame a. cov: (E, dim, dim) of the adjusted
+    pairs in their tangents. redundancy: (E, dim) numbers of the whitened components. standardized: (E, dim) residuals
+    over their own sigmas (nan where uncontrolled). test, freedom, p_value: (E,) of the whole pair, nan where no loop
+    controls it. omega: v'Pv. redundancy_total: equations of the independent conditions.
+    joint: covariance of several adjusted pairs (k dim, k dim), by their positions.
+    """
+
+    network: Network
+    b_from_a: Motions
+    residual: FloatArray
+    cov: FloatArray
+    redundancy: FloatArray
+    standardized: FloatArray
+    test: FloatArray
+    freedom: IntArray
+    p_value: FloatArray
+    omega: float
+    redundancy_total: int
+    iterations: int
+    joint: Callable[[Sequence[int]], FloatArray]
+
+    @property
+    def sigma0(self) -> float:
+        """A posteriori standard deviation of unit weight, nan without redundancy."""
+        return float(np.sqrt(self.omega / self.redundancy_total)) if self.redundancy_total else float("nan")
+
+    def global_test(self, alpha: float = 0.05) -> GlobalTest | None:
+        """Two-sided chi-square test of v'Pv."""
+        return global_test(self.omega, self.redundancy_total, alpha)
+
+    def suspects(self, alpha: float = 0.001) -> tuple[SuspectPair, ...]:
+        """Pairs that do not fit, worst first; ``alpha`` is for the whole network (Sidak).
+
+        Only the first is surely meant: an error in it also shows in the residuals of its neighbours.
+        """
+        tested = self.freedom > 0
+        single = -np.expm1(np.log1p(-alpha) / max(1, int(tested.sum())))
+        order = np.argsort(np.where(tested, -self.test / np.maximum(self.freedom, 1), np.inf), kind="stable")
+        bad = [int(e) for e in order if tested[e] and self.p_value[e] < single]
+        top = self.network.topology
+        return tuple(
+            SuspectPair(top.pair_ids[e], *top.ends(e), float(self.test[e]), int(self.freedom[e]),
+                        float(self.p_value[e]), self.residual[e])
+            for e in bad
+        )  # fmt: skip
+
+
+def adjusted_pairs(
+    network: Network, b_from_a: Motions, cov: FloatArray, redundancy_total: int, iterations: int,
+    joint: Callable[[Sequence[int]], FloatArray],
+) -> AdjustedPairs:  # fmt: skip
+    """The statistics that follow from the adjusted pairs and their covariances: Q_vv = Q_ll - Q_adjusted."""
+    v = (network.b_from_a.inverse() @ b_from_a).log()
+    back = right_jacobian_inverse(v)
+    root = whitening(network.cov)
+    e = (root @ v[..., None])[..., 0]
+    to_white = root @ back
+    Q = np.eye(network.dim) - to_white @ cov @ np.swapaxes(to_white, -1, -2)
+    s, V = np.linalg.eigh(0.5 * (Q + np.swapaxes(Q, -1, -2)))
+    controlled = s > _UNCONTROLLED
+    freedom = controlled.sum(axis=-1)
+    inner = np.einsum("eij,ei->ej", V, e)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        test = np.where(freedom > 0, np.where(controlled, inner**2 / s, 0.0).sum(axis=-1), np.nan)
+        unwhiten = np.linalg.inv(root)
+        own = np.sqrt(np.maximum(np.einsum("eij,ejk,eik->ei", unwhiten, Q, unwhiten), 0.0))
+        sigma = np.sqrt(np.diagonal(network.cov, axis1=1, axis2=2))
+        standardized = np.where(own > np.sqrt(_UNCONTROLLED) * sigma, v / own, np.nan)
+    return AdjustedPairs(
+        network, b_from_a, v, cov, np.diagonal(Q, axis1=1, axis2=2).copy(), standardized, test, freedom,
+        np.where(freedom > 0, chi2.sf(test, np.maximum(freedom, 1)), np.nan), float(np.sum(e * e)), redundancy_total,
+        iterations, joint,
+    )  # fmt: skip
+
+
+def whitening(cov: FloatArray) -> FloatArray:
+    """Upper triangular W (E, dim, dim) with W'W = cov^-1, as GTSAM's noise models have it."""
+    # a Cholesky of the reversed matrix: cov = U U' with U upper triangular, W = U^-1
+    flipped = np.linalg.cholesky(cov[..., ::-1, ::-1])[..., ::-1, ::-1]
+    return np.linalg.inv(flipped)
