@@ -17,7 +17,7 @@ from survey.detection.detect import detect_image
 from survey.detection.gray import read_image
 from survey.detection.pictures import write_picture
 from survey.detection.results import ImageReport, SpotOptions
-from survey.detection.spots import detect_spots
+from survey.detection.spots import detect_spots, outside_targets
 from survey.targets import DetectableTarget
 
 _IMAGES_PER_PROCESS = 25  # a process takes some seconds to start, the time of that many images
@@ -86,7 +86,7 @@ def detect_task(task: DetectionTask, pictures: Path | None = None) -> ImageRepor
     try:
         image = read_image(task.path)
         detections = {target_id: detect_image(image, target) for target_id, target in task.targets.items()}
-        spots = None if task.spots is None else detect_spots(image, task.spots)
+        spots = None if task.spots is None else outside_targets(detect_spots(image, task.spots), detections.values())
         report = ImageReport(
             task.path,
             task.camera_id,

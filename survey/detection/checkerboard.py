@@ -10,6 +10,7 @@ from survey.detection.results import Detection, nothing_found
 from survey.targets import Checkerboard
 
 _COARSE_PX = 900  # longer side of the image in which the board is looked for first
+_MAX_DECOYS = 3
 
 
 def find_checkerboard(gray: Gray32, gray8: Gray8, target: Checkerboard) -> Detection:
@@ -19,19 +20,34 @@ def find_checkerboard(gray: Gray32, gray8: Gray8, target: Checkerboard) -> Detec
     is dark. Where one of the two numbers of corners is odd and the other even, this leaves one order. Otherwise it is
     ambiguous: of the orders left, r0c0 is the one nearest the upper left of the image (least u + v).
     """
-    found = _find(gray8, target.columns, target.rows)
-    if found is None:
-        return nothing_found(f"no complete board of {target.columns} x {target.rows} inner corners")
-    grid, ambiguous = _ordered(gray, found.reshape(target.rows, target.columns, 2))
+    reason = f"no complete board of {target.columns} x {target.rows} inner corners"
+    for _ in range(_MAX_DECOYS):
+        found = _find(gray8, target.columns, target.rows)
+        if found is None:
+            break
+        detection = _measured(gray, gray8, found.reshape(target.rows, target.columns, 2))
+        if len(detection):
+            return detection
+        # a ChArUco board or a picture of a board can look like the one that is wanted: cover it, search again
+        reason = detection.reason
+        gray8 = gray8.copy()
+        cv2.fillConvexPoly(gray8, cv2.convexHull(np.rint(found).astype(np.int32)), (128,))
+    return nothing_found(reason)
+
+
+def _measured(gray: Gray32, gray8: Gray8, rough: FloatArray) -> Detection:
+    """The detection from corners (rows, columns, 2) px of a finder; empty where they are no corners of a board."""
+    grid, ambiguous = _ordered(gray, rough)
     edges = grid_edges(grid)
     start = _settle(gray8, grid, edges)
     fit = refine_corners(gray, start, edges.reshape(-1, 2, 2))
-    keep = fit.good & _on_grid(fit, grid.shape[:2])
-    if keep.sum() < max(6, keep.size // 2):
+    needed = max(6, fit.good.size // 2)
+    keep = fit.good & _on_grid(fit, grid.shape[:2]) if fit.good.sum() >= needed else fit.good
+    if keep.sum() < needed:
         return nothing_found(f"board found, but only {int(keep.sum())} of {keep.size} corners could be measured")
-    notes: tuple[str, ...] = (
-        () if keep.all() else (f"{int((~keep).sum())} of {keep.size} corners were not sharp or not free",)
-    )
+    notes: tuple[str, ...] = ()
+    if not keep.all():
+        notes += (f"{int((~keep).sum())} of {keep.size} corners were not sharp or not free",)
     if ambiguous:
         notes += ("order is ambiguous: the board looks the same after a turn",)
     blur, contrast = float(np.median(fit.blur_px[keep])), float(np.median(fit.contrast[keep]))
@@ -106,7 +122,8 @@ def _settle(gray8: Gray8, grid: FloatArray, edges: FloatArray) -> FloatArray:
 def _on_grid(fit: CornerFit, shape: tuple[int, int]) -> BoolArray:
     """Which corners lie where their neighbours in the row and the column put them, to a fifth of a square."""
     grid = np.where(fit.good[:, None], fit.uv, np.nan).reshape(*shape, 2)
-    spacing = float(np.nanmedian(np.linalg.norm(np.diff(grid, axis=1), axis=2)))
+    steps = np.linalg.norm(np.diff(grid, axis=1), axis=2)
+    spacing = float(np.median(steps[np.isfinite(steps)])) if np.isfinite(steps).any() else np.inf
     off = np.zeros(shape, bool)
     for axis in (0, 1):
         g = np.moveaxis(grid, axis, 0)

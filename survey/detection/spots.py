@@ -1,12 +1,14 @@
 """Luminous spots (LED beacons): finding them on an uneven background, and their centres with covariance."""
 
+from collections.abc import Iterable
+
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from adjust.model import FloatArray
 from survey.detection.gray import AnyImage, Gray32, gray_values, saturation_level
-from survey.detection.results import SpotOptions, Spots
+from survey.detection.results import Detection, SpotOptions, Spots
 from survey.detection.spot_kernels import GAUSSIAN, fit_spots
 
 # Neither profile is quite that of a small disc under a point spread, least of all on the rim that saturation leaves;
@@ -52,6 +54,22 @@ def detect_spots(image: AnyImage, options: SpotOptions | None = None) -> Spots:
     floor = np.where(saturated[order] > 0, SATURATED_FLOOR_PX, SPOT_FLOOR_PX)
     honest = cov[order] + floor[:, None, None] ** 2 * np.eye(2)
     return Spots(p[order, :2], honest, width[order], peak[order], saturated[order], notes)
+
+
+def outside_targets(spots: Spots, detections: Iterable[Detection]) -> Spots:
+    """The spots that are no bright cells of the targets found: outside their points' hull by more than the spacing."""
+    keep = np.ones(len(spots), bool)
+    for uv in (detection.uv for detection in detections if len(detection) >= 4):
+        between = np.linalg.norm(uv[:, None] - uv[None], axis=2) + np.where(np.eye(len(uv)) > 0, np.inf, 0.0)
+        margin = 1.2 * float(np.median(between.min(1)))
+        hull = cv2.convexHull(uv.astype(np.float32))
+        inside = [cv2.pointPolygonTest(hull, (float(u), float(v)), True) > -margin for u, v in spots.uv]
+        keep &= ~np.array(inside, bool)
+    if keep.all():
+        return spots
+    notes = (*spots.notes, f"{int((~keep).sum())} bright places on or beside a target")
+    peak, saturated = spots.peak[keep], spots.saturated[keep]
+    return Spots(spots.uv[keep], spots.cov[keep], spots.diameter_px[keep], peak, saturated, notes)
 
 
 def _diameters(p: FloatArray, profile: npt.NDArray[np.int64]) -> FloatArray:

@@ -4,7 +4,7 @@ from gtsam import Pose3, Rot3
 
 from survey.detection import DetectionTask, SpotOptions, detect_images
 from survey.rendering import Beacons, BrownCamera, Imaging, PlacedTarget, render
-from survey.targets import Checkerboard, MarkerGrid
+from survey.targets import Charuco, Checkerboard, MarkerGrid
 
 CAMERA = BrownCamera((480, 360), 600.0, 600.0, 239.5, 179.5)
 BOARD = Checkerboard(6, 5, 0.02)
@@ -65,3 +65,24 @@ def test_several_processes_give_the_same_reports_in_the_same_order(tmp_path):
     check(reports, tmp_path / "seen")
     alone = detect_images(tasks[:1], jobs=1, progress=False)
     assert np.array_equal(alone[0].detections["board"].uv, reports[0].detections["board"].uv)
+
+
+def test_a_board_beside_its_charuco_twin_and_beacons_beside_both_are_told_apart(tmp_path):
+    camera = BrownCamera((1280, 1024), 1600.0, 1600.0, 639.5, 511.5, (-0.2, 0.05))
+    targets = {"board": Checkerboard(8, 5, 0.02), "charuco": Charuco(9, 6, 0.02, 0.015, "4X4_50")}
+    poses = (
+        Pose3(Rot3.Rx(0.3), np.array([-0.27, -0.16, 0.75])),
+        Pose3(Rot3.Rz(0.1), np.array([0.08, -0.15, 0.75])),
+    )
+    views = [PlacedTarget(t, pose) for t, pose in zip(targets.values(), poses, strict=True)]
+    leds = np.array([[0.15, 0.15, 0.8], [0.2, 0.2, 0.8]])
+    cv2.imwrite(str(tmp_path / "e.png"), render(camera, views, Beacons(leds, 0.003, 400.0)))
+    task = DetectionTask(tmp_path / "e.png", "X", "e", targets, SpotOptions())
+    report = detect_images([task], progress=False)[0]
+    for view, detection in zip(views, report.detections.values(), strict=True):
+        x = view.camera_from_target.transformFrom(np.ascontiguousarray(view.target.points()[1].T)).T
+        assert len(detection) == 40
+        assert np.abs(detection.uv - camera.project(x)).max() < 0.05
+    assert len(report.spots) == 2
+    assert np.linalg.norm(report.spots.uv[:, None] - camera.project(leds)[None], axis=2).min(1).max() < 0.05
+    assert any("beside a target" in note for note in report.spots.notes)
