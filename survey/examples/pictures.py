@@ -48,14 +48,18 @@ def write_images(draft: Draft, folder: Path, seed: int, jobs: int | None, progre
             bar.update()
 
 
-def picture(draft: Draft, scene: Scene, shot: Shot, seed: int) -> GrayImage:
-    """One image (height, width), 8 bit: targets by day, beacons by night."""
+def picture(draft: Draft, scene: Scene, shot: Shot, seed: int, clutter: bool = False) -> GrayImage:
+    """One image (height, width), 8 bit: targets by day, beacons by night.
+
+    clutter: also what stands in the room without being meant, such as wall plates behind a board held by hand, which
+    hides parts of them. The examples' plates are hung for the epochs that are meant to show them.
+    """
     camera = _camera(scene, shot.camera_id)
     camera_from_world = np.linalg.inv(scene.world_from_camera(shot.camera_id, shot.epoch_id)).astype(np.float64)
     if shot.beacons:
         beacons = Beacons(transform(camera_from_world, scene.world_points()), BEACON_DIAMETER_M, 230.0)
         return render(camera, beacons=beacons, imaging=NIGHT, seed=seed)
-    return render(camera, _placed(draft, scene, shot, camera_from_world), imaging=DAY, seed=seed)
+    return render(camera, _placed(draft, scene, shot, camera_from_world, clutter), imaging=DAY, seed=seed)
 
 
 def _camera(scene: Scene, camera_id: str) -> BrownCamera:
@@ -65,12 +69,13 @@ def _camera(scene: Scene, camera_id: str) -> BrownCamera:
     return BrownCamera(size, lens["fx"], lens["fy"], lens["u0"], lens["v0"], distortion)
 
 
-def _placed(draft: Draft, scene: Scene, shot: Shot, camera_from_world: FloatArray) -> Sequence[PlacedTarget]:
-    """All that stands in the room at that epoch, whether it is meant to be in the image or not."""
+def _placed(
+    draft: Draft, scene: Scene, shot: Shot, camera_from_world: FloatArray, clutter: bool
+) -> Sequence[PlacedTarget]:
     placed = []
     for target in scene.survey.targets:
         kind = draft.kinds[target.target_id]
-        if target.motion == "epoch" and target.target_id not in shot.target_ids:
+        if target.target_id not in shot.target_ids and (target.motion == "epoch" or not clutter):
             continue
         if isinstance(kind, PointList):
             continue
