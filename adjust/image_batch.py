@@ -188,6 +188,9 @@ class ImageBatch:
             [self.flat[offset : offset + rows * columns].reshape(rows, columns) for offset, rows, columns in place]
             for place in places
         ]
+        # without Jacobians only the length of a residual is asked for: zeros, then the length
+        self.length = np.zeros_like(self.r)
+        self._length_views = [self.length[b, most - self.n_rows[b] :] for b in range(len(self.blocks))]
         self._r_views = [self.r[b, : self.n_rows[b]] for b in range(len(self.blocks))]
         self._prepared: gtsam.Values | None = None
         self._with_jacobians = False
@@ -219,9 +222,8 @@ class ImageBatch:
         if values is not self._prepared or (jacobians is not None and not self._with_jacobians):
             self._evaluate_alone(b, values, jacobians is not None)
         if jacobians is None:
-            out = np.zeros(self.n_rows[b])
-            out[-1] = np.sqrt(self.chi[b])
-            return out
+            self.length[b, -1] = np.sqrt(self.chi[b])
+            return self._length_views[b]
         for i, view in enumerate(self._views[b]):
             jacobians[i] = view
         return self._r_views[b]

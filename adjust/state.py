@@ -42,6 +42,8 @@ class State:
             for slot, key in enumerate(unknowns.slot_key)
             if key is not None and slot not in unknowns.table_slots
         ]
+        self._pose_keys = {key for _, key in self._free_slots}
+        self._slots_by_key = np.array([s for s, _ in sorted(self._free_slots, key=lambda x: x[1])], dtype=np.int64)
 
     def _lens_arrays(self, survey: Survey) -> LensArrays:
         n = len(survey.cameras)
@@ -70,8 +72,7 @@ class State:
     def load(self, values: gtsam.Values, slots: Iterable[int] | None = None, lenses: bool = True) -> None:
         """Read everything, or only these slots (and the lenses and warps unless told otherwise), from ``values``."""
         if slots is None:
-            for slot, key in self._free_slots:
-                self._set(slot, values.atPose3(key))
+            self._load_poses(values)
             for table_slot in self.unknowns.table_slots.values():
                 self._move_table(values, table_slot)
         else:
@@ -82,6 +83,16 @@ class State:
                     self._set(slot, values.atPose3(found))
         if lenses:
             self._load_lenses(values)
+
+    def _load_poses(self, values: gtsam.Values) -> None:
+        """All free poses: in one call where ``values`` hold no others, which it gives in the order of their keys."""
+        rows = gtsam.utilities.extractPose3(values)  # (n, 12): rotation by rows, translation
+        if len(rows) == len(self._free_slots) and self._pose_keys.issubset(values.keys()):
+            self.slot_R[self._slots_by_key] = rows[:, :9].reshape(-1, 3, 3)
+            self.slot_t[self._slots_by_key] = rows[:, 9:]
+            return
+        for slot, key in self._free_slots:
+            self._set(slot, values.atPose3(key))
 
     def _load_lenses(self, values: gtsam.Values) -> None:
         for i, lens_map in enumerate(self.lens_maps):
