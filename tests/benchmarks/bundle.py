@@ -66,8 +66,8 @@ def simulated(images: int, points: int, per_point: int, seed: int = 2) -> Bundle
     for i, pose in enumerate(poses):
         q = (x - pose[:3, 3]) @ pose[:3, :3]
         uv = pixels(q, TRUE_LENS)
-        for p in np.flatnonzero(np.all((uv > 0) & (uv < np.array(SIZE)), axis=1)):
-            seen[int(p)].append((i, uv[p]))
+        for n in np.flatnonzero(np.all((uv > 0) & (uv < np.array(SIZE)), axis=1)):
+            seen[int(n)].append((i, uv[n]))
     for p, views in enumerate(seen):
         for k in rng.permutation(len(views))[:per_point]:
             rows.append((views[k][0], p, *views[k][1]))

@@ -18,6 +18,7 @@ from tests.benchmarks.data import Calibration
 
 SYSTEM_PYTHON = "/usr/bin/python3"
 MRCAL = "mrcal optimize"
+Case = Calibration | Bundle
 
 
 @dataclass(eq=False)
@@ -66,7 +67,7 @@ class Child:
 
     def __init__(self, kind: str, name: str, case: Path, warm: Path, threads: int) -> None:
         self.out = case.with_name(f"{case.stem}.{abs(hash(name))}.out.npz")
-        self.errors = tempfile.TemporaryFile(mode="w+")
+        self.errors = tempfile.TemporaryFile(mode="w+")  # noqa: SIM115  # lives as long as the process
         command = [sys.executable, "-m", "tests.benchmarks.worker", kind, name, str(case), str(warm), str(self.out)]
         if name == MRCAL:
             script = Path(__file__).with_name("mrcal_worker.py")
@@ -110,7 +111,7 @@ class Child:
 
 
 def compete(
-    label: str, case: Calibration | Bundle, warm: Calibration | Bundle, names: Sequence[str], rounds: int = 5,
+    label: str, case: Case, warm: Case, names: Sequence[str], rounds: int = 5,
     threads: int = 1, budget: float = 60.0,
 ) -> list[Measured]:  # fmt: skip
     """All competitors on one case, in turn; one that has used its ``budget`` (s) drops out of the later rounds."""

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
+from typing import Any
 
 import cv2
 import numpy as np
@@ -167,7 +168,7 @@ def opencv_multiview(case: Calibration) -> Competitor:
 
     def run() -> Outcome:
         t0 = perf_counter()
-        _, K, d, R, T, *_ = cv2.calibrateMultiview(
+        _, K, d, R, T, *_ = cv2.calibrateMultiview(  # type: ignore[call-overload]  # the stubs do not know None for what it finds
             [board] * n, views, [SIZE] * cameras, np.ones((cameras, n), np.uint8), np.zeros(cameras, np.uint8),
             None, None, None, None, np.full(cameras, cv2.CALIB_FIX_K3, np.int32), 0, TIGHT,
         )  # fmt: skip
@@ -179,11 +180,11 @@ def opencv_multiview(case: Calibration) -> Competitor:
     return run
 
 
-def _opencv_lens(k: FloatArray, d: FloatArray) -> FloatArray:
+def _opencv_lens(k: Any, d: Any) -> FloatArray:
     return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], *np.ravel(d)[:4]])
 
 
-def _opencv_pose(r: FloatArray, t: FloatArray) -> FloatArray:
+def _opencv_pose(r: Any, t: Any) -> FloatArray:
     r = np.asarray(r)
     return matrix(cv2.Rodrigues(r)[0].ravel() if r.size == 9 else r.ravel(), np.ravel(t))
 

@@ -80,7 +80,7 @@ class Model:
 
     def start(self) -> FloatArray:
         """The rough start as a vector."""
-        poses = [m for m in self.case.camera_from_head[1:]] + list(self.case.head_from_board)
+        poses = list(self.case.camera_from_head[1:]) + list(self.case.head_from_board)
         vectors = [np.concatenate([Rotation.from_matrix(m[:3, :3]).as_rotvec(), m[:3, 3]]) for m in poses]
         return np.concatenate([self.case.lens.ravel(), *vectors])
 

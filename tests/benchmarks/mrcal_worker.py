@@ -4,19 +4,19 @@ Needs numpy and mrcal only. Answers as the other workers do.
 """
 
 import json
-import resource
 import sys
 import time
+from typing import Any
 
-import mrcal
+import mrcal  # type: ignore[import-not-found]  # lives in the system Python
 import numpy as np
 
 
-def rotation_vector_pose(m):
+def rotation_vector_pose(m: Any) -> Any:
     return mrcal.rt_from_Rt(np.vstack([m[:3, :3], m[:3, 3]]))
 
 
-def problem(path):
+def problem(path: str) -> dict[str, Any]:
     """Arguments of ``mrcal.optimize`` from the rough start, without regularisation and outlier rejection."""
     with np.load(path) as data:
         case = {name: data[name] for name in data.files}
@@ -44,22 +44,24 @@ def problem(path):
     }
 
 
-def matrix(rt):
+def matrix(rt: Any) -> Any:
     out = np.eye(4)
     Rt = mrcal.Rt_from_rt(rt)
     out[:3, :3], out[:3, 3] = Rt[:3], Rt[3]
     return out
 
 
-def peak_mb():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+def memory_mb(what: str) -> float:
+    """As for the other workers."""
+    with open("/proc/self/status") as file:
+        return next(int(line.split()[1]) / 1024 for line in file if line.startswith(what))
 
 
-def main():
+def main() -> None:
     path, warm, out = sys.argv[1:]
     mrcal.optimize(**problem(warm))
     given = problem(path)
-    idle = peak_mb()
+    idle = memory_mb("VmRSS")
     print(json.dumps({"ready": True}), flush=True)
     for _ in sys.stdin:
         arguments = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in given.items()}
@@ -70,7 +72,7 @@ def main():
         boards = [matrix(rt) for rt in arguments["frames_rt_toref"]]
         np.savez(out, lens=arguments["intrinsics"], camera_from_head=np.array(heads), head_from_board=np.array(boards))
         answer = {"stages": {"optimize": wall}, "wall": wall, "cpu": cpu, "note": "", "idle_mb": idle,
-                  "peak_mb": peak_mb(), "numbers": {}}  # fmt: skip
+                  "peak_mb": memory_mb("VmHWM"), "numbers": {}}  # fmt: skip
         print(json.dumps(answer), flush=True)
 
 
