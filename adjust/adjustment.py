@@ -19,9 +19,14 @@ from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
 
 @dataclass(frozen=True)
 class AdjustOptions:
-    """alpha: level of the global test. reject_points: leave gross errors among the image points out, and list them."""
+    """What is decided on the way.
+
+    alpha: level of the global test. reject_blocks: images that contradict all others take no part, and are listed.
+    reject_points: the same for gross errors among the image points.
+    """
 
     alpha: float = 0.05
+    reject_blocks: bool = True
     reject_points: bool = False
     solve: SolveOptions = field(default_factory=SolveOptions)
 
@@ -75,7 +80,7 @@ def rejections(survey: Survey) -> tuple[str, ...]:
 def _trusted(survey: Survey, options: AdjustOptions) -> tuple[Survey, StartValues, tuple[str, ...]]:
     """Start values; what the search refused gets a second chance with the lenses that the rest determines."""
     found = find_start(survey)
-    if not found.excluded_blocks:
+    if not found.excluded_blocks or not options.reject_blocks:
         return survey, start_values(found), ()
     kept = _without(survey, found.excluded_blocks)
     graph = GraphBuilder(kept, found.lenses).build(start_values(found))

@@ -89,7 +89,11 @@ def identify_spots(
 
 
 def predict(
-    survey: Survey, adjustment: Adjustment, camera_id: str, world_from_camera: Pose3, positions: Mapping[str, FloatArray]
+    survey: Survey,
+    adjustment: Adjustment,
+    camera_id: str,
+    world_from_camera: Pose3,
+    positions: Mapping[str, FloatArray],
 ) -> dict[str, FloatArray]:
     """Image points (2,) px of the world points that are in front of a camera and inside its image."""
     camera = next(c for c in survey.cameras if c.camera_id == camera_id)
@@ -107,8 +111,9 @@ def predict(
         return {}
     uv = project(model, estimate, constants, q[front])
     width, height = camera.image_size
-    inside = (uv > -0.5).all(axis=1) & (uv < np.array([width, height]) - 0.5).all(axis=1)
-    return {n: x for n, x, ok in zip(np.array(names)[front], uv, inside, strict=True) if ok}
+    inside = np.all((uv > -0.5) & (uv < np.array([width, height]) - 0.5), axis=1)
+    seen = [n for n, ok in zip(names, front, strict=True) if ok]
+    return {n: x for n, x, ok in zip(seen, uv, np.atleast_1d(inside), strict=True) if ok}
 
 
 def match(uv: FloatArray, predicted: Mapping[str, FloatArray], gate_px: float) -> tuple[list[tuple[int, str]], int]:

@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -131,7 +131,8 @@ def _tasks(definition: Definition) -> Iterator[DetectionTask]:
         spots = None
         if wanted and request is not None and (reserved or (request.epochs is None and not targets)):
             spots = SpotOptions(diameter_px=request.diameter_px)
-        here = {} if reserved else targets
+        only = definition.target_cameras
+        here = {} if reserved else {t: k for t, k in targets.items() if camera_id in only.get(t, (camera_id,))}
         if here or spots:
             yield DetectionTask(path, camera_id, epoch_id, here, spots)
 
@@ -198,7 +199,7 @@ def _adjust_project(project: Project, progress: bool) -> Adjustment:
             f"{project.folder}: there is nothing to adjust; put images at images/<camera_id>/<epoch_id>.png or tables "
             "into observations/"
         )
-    options = AdjustOptions(alpha=project.options.alpha, reject_points=True)
+    options = AdjustOptions(project.options.alpha, project.options.reject_blocks, project.options.reject_points)
     with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
 
         def step(_iteration: int, omega: float) -> None:
@@ -259,7 +260,7 @@ def _run_info(project: Project, seconds: dict[str, float]) -> RunInfo:
             versions[package] = version(package)
         except PackageNotFoundError:
             continue
-    options = {"alpha": project.options.alpha, "datum": project.survey.datum.kind}
+    options = {**asdict(project.options), "datum": project.survey.datum.kind}
     date = datetime.now(UTC).isoformat(timespec="seconds")
     name = project.folder.resolve().name  # the name alone: results of a copied folder stay the same
     return RunInfo(name, project.title, project.inputs, options, versions, date, seconds)

@@ -39,6 +39,8 @@ def detect_spots(image: AnyImage, options: SpotOptions | None = None) -> Spots:
     shape = np.exp(np.abs(p[:, 4] - p[:, 5]))
     low, high = options.diameter_px
     good = (profile >= 0) & (rms < 0.15 * peak) & (np.hypot(*(p[:, :2] - start).T) < 0.5 * diameter + 0.5)
+    # a spot cut by the edge may have its centre outside: no image point
+    good &= ((p[:, :2] > -0.5) & (p[:, :2] < np.array(gray.shape[::-1]) - 0.5)).all(axis=1)
     sized = good & (width >= low) & (width <= high)
     round_ = sized & (np.maximum(shape, elongation) <= options.max_elongation)
     notes = tuple(

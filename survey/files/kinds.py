@@ -14,7 +14,7 @@ from survey.files.text import suggestion
 from survey.files.units import to_si
 from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind
 
-_COMMON = ("kind", "station", "motion", "pose", "epochs", "warp")
+_COMMON = ("kind", "station", "motion", "pose", "epochs", "warp", "cameras")
 _KEYS = {
     "checkerboard": ("columns", "rows", "square_mm"),
     "charuco": ("squares_x", "squares_y", "square_mm", "marker_mm", "dictionary", "legacy"),
@@ -27,10 +27,13 @@ POINTS_LAYOUT = Layout("points of a target", ("point_id",), ("x_mm", "y_mm", "z_
 
 
 def read_targets(
-    root: Node, station_ids: tuple[str, ...], inputs: dict[str, str]
-) -> tuple[tuple[Target, ...], dict[str, TargetKind]]:
-    """The targets under [targets.*]; the hashes of the files of point lists are added to ``inputs``."""
-    targets, kinds = [], {}
+    root: Node, station_ids: tuple[str, ...], camera_ids: tuple[str, ...], inputs: dict[str, str]
+) -> tuple[tuple[Target, ...], dict[str, TargetKind], dict[str, tuple[str, ...]]]:
+    """The targets under [targets.*], their kinds, and the cameras that may see those that name some.
+
+    The hashes of the files of point lists are added to ``inputs``.
+    """
+    targets, kinds, seen_by = [], {}, {}
     for target_id, node in root.tables("targets"):
         kind_name = node.choice("kind", _KEYS)
         node.allow(*_COMMON, *_KEYS[kind_name])
@@ -51,7 +54,9 @@ def read_targets(
             )
         )
         kinds[target_id] = kind
-    return tuple(targets), kinds
+        if node.has("cameras"):
+            seen_by[target_id] = node.references("cameras", camera_ids, "camera")
+    return tuple(targets), kinds, seen_by
 
 
 def _metres(node: Node, key: str) -> float:

@@ -43,10 +43,12 @@ class AdjustmentOptions:
     """The table [adjustment].
 
     alpha: error probability of the tests. reject_blocks: leave mis-detected images out of the start, then test them.
+    reject_points: leave gross errors among the image points out, and list them.
     """
 
     alpha: float = 0.05
     reject_blocks: bool = True
+    reject_points: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +81,7 @@ class Definition:
     """What survey.toml says, and the images that are there; ``survey`` has no observations.
 
     images: by (camera_id, epoch_id), in natural order. inputs: sha256 of every file read, by its path in the folder.
+    target_cameras: the cameras in whose images a target is looked for, where not in all.
     """
 
     folder: Path
@@ -91,6 +94,7 @@ class Definition:
     options: AdjustmentOptions
     sigmas: Sigmas
     inputs: Mapping[str, str]
+    target_cameras: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -105,7 +105,7 @@ def _read_definition(folder: Path) -> tuple[Definition, Node]:
     station_ids = tuple(station.station_id for station in stations)
     cameras = read_cameras(root, station_ids)
     camera_ids = tuple(camera.camera_id for camera in cameras)
-    targets, kinds = read_targets(root, station_ids, inputs)
+    targets, kinds, seen_by = read_targets(root, station_ids, camera_ids, inputs)
     points = tuple(Point(point_id, read_point(node)) for point_id, node in root.tables("points"))
     datum = _read_datum(root.table("datum"), station_ids)
     survey = Survey(cameras, stations, tables, targets, points, datum=datum)
@@ -123,6 +123,7 @@ def _read_definition(folder: Path) -> tuple[Definition, Node]:
         options=_read_options(root.table("adjustment")),
         sigmas=_read_sigmas(root.table("sigmas"), table_sigmas),
         inputs=inputs,
+        target_cameras=seen_by,
     )
     return definition, root
 
@@ -164,11 +165,11 @@ def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest
 
 
 def _read_options(node: Node) -> AdjustmentOptions:
-    node.allow("alpha", "reject_blocks")
+    node.allow("alpha", "reject_blocks", "reject_points")
     alpha = node.number("alpha", 0.05, positive=True)
     if alpha >= 1:
         raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
-    return AdjustmentOptions(alpha, node.flag("reject_blocks", True))
+    return AdjustmentOptions(alpha, node.flag("reject_blocks", True), node.flag("reject_points", True))
 
 
 def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:

@@ -62,7 +62,8 @@ def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, si
         sections.append((("spots",), spots))
     if sigmas.image_px is not None:
         sections.append((("sigmas",), {"image_px": sigmas.image_px}))
-    return [*sections, (("adjustment",), {"alpha": options.alpha, "reject_blocks": options.reject_blocks})]
+    flags = {"reject_blocks": options.reject_blocks, "reject_points": options.reject_points}
+    return [*sections, (("adjustment",), {"alpha": options.alpha, **flags})]
 
 
 def pose_to_toml(pose: PoseParameter, where: str) -> dict[str, Any]:

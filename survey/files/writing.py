@@ -50,6 +50,7 @@ def write_project(
     *,
     title: str = "",
     target_kinds: Mapping[str, TargetKind] | None = None,
+    target_cameras: Mapping[str, tuple[str, ...]] | None = None,
     tie_points: bool = False,
     options: AdjustmentOptions | None = None,
     sigmas: Sigmas | None = None,
@@ -62,18 +63,21 @@ def write_project(
 
     Image coordinates keep every bit, other numbers lose a few in their units; observations come back sorted by ids.
 
-    target_kinds: a target that is not in it becomes a list of points. sigmas: of future tables without sigma columns;
-    its ``scale`` is not written, because the covariances of the observations contain it. overwrite: replace a project
-    that is there, and remove those of its tables that the new one does not have; else that raises SurveyError.
+    target_kinds: a target that is not in it becomes a list of points. target_cameras: in whose images targets are
+    looked for, where not in all. sigmas: of future tables without sigma columns; its ``scale`` is not written, because
+    the covariances of the observations contain it. overwrite: replace a project that is there, and remove those of its
+    tables that the new one does not have; else that raises SurveyError.
     """
     folder = Path(folder)
     _make_room(folder, overwrite)
     kinds = _complete_kinds(survey, target_kinds or {})
     sigmas = sigmas or Sigmas()
+    seen_by = {("targets", target_id): {"cameras": ids} for target_id, ids in (target_cameras or {}).items()}
+    sections = [(path, {**values, **seen_by.get(path, {})}) for path, values in survey_sections(survey, kinds, sigmas)]
     text = toml_text(
         [
             head_section(title, tie_points),
-            *survey_sections(survey, kinds, sigmas),
+            *sections,
             *option_sections(options or AdjustmentOptions(), spots_request, sigmas),
         ]
     )
