@@ -1,0 +1,7 @@
+"""Networks of 10^2 to 10^5 stations joined by measured relative poses or rotations."""
+
+from adjust.pose_network.network import PoseNetwork, pose_network
+from adjust.pose_network.solution import NetworkSolution, solve_network
+from adjust.pose_network.solve import NetworkOptions
+
+__all__ = ["NetworkOptions", "NetworkSolution", "PoseNetwork", "pose_network", "solve_network"]

@@ -1,0 +1,254 @@
+"""Stations joined by measured relative poses or rotations, as arrays, and what defines the datum."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from adjust.closed_forms import nearest_rotation
+from adjust.errors import IndeterminateError, SurveyError
+from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.relay.graph_kernels import adjacency, covers, depth_first
+
+_FEW = 8
+
+
+@dataclass(frozen=True, eq=False)
+class PoseNetwork:
+    """N stations and E measured pairs ``b_from_a``; made by :func:`pose_network`, which checks everything.
+
+    rotations (E, 3, 3), translations (E, 3) m, nan where only the rotation was measured. cov: (E, 6, 6) in the tangent
+    of the frame on the right (a), infinite variance where nothing was measured. used: (E,), the others are predicted
+    and tested only. station_rotations (N, 3, 3), station_translations (N, 3): ``world_from_station`` of the held ones
+    and of those with a prior, start of the others, nan where nothing is known. prior_cov: (6, 6) by station position.
+    inner: positions of the stations that carry inner constraints (free network), empty where the datum is given.
+    """
+
+    station_ids: tuple[str, ...]
+    pair_ids: tuple[str, ...]
+    a_idx: IntArray
+    b_idx: IntArray
+    rotations: FloatArray
+    translations: FloatArray
+    cov: FloatArray
+    used: BoolArray
+    station_rotations: FloatArray
+    station_translations: FloatArray
+    held: IntArray
+    prior_cov: Mapping[int, FloatArray] = field(default_factory=dict)
+    inner: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    @property
+    def n_stations(self) -> int:
+        """Number of stations."""
+        return len(self.station_ids)
+
+    @property
+    def n_pairs(self) -> int:
+        """Number of measured pairs, used or not."""
+        return len(self.pair_ids)
+
+    @cached_property
+    def is_pose(self) -> BoolArray:
+        """Which pairs (E,) measured a translation too."""
+        return np.isfinite(self.cov[:, 3, 3])
+
+    @cached_property
+    def rotation_only(self) -> bool:
+        """Whether positions play no part at all: every unknown is a rotation."""
+        return not self.is_pose.any() and not any(np.isfinite(c[3, 3]) for c in self.prior_cov.values())
+
+    @property
+    def dim(self) -> int:
+        """Unknowns of a station: 6, or 3 in a network of rotations."""
+        return 3 if self.rotation_only else 6
+
+    @cached_property
+    def whitening(self) -> FloatArray:
+        """W (E, dim, dim), upper triangular, with W'W the inverse covariance; zero rows where nothing was measured."""
+        d = self.dim
+        out = np.zeros((self.n_pairs, d, d))
+        for rows, n in ((self.is_pose, 6), (~self.is_pose, 3)):
+            if rows.any():
+                info = np.linalg.inv(self.cov[rows][:, :n, :n])
+                W = np.swapaxes(np.linalg.cholesky(0.5 * (info + np.swapaxes(info, 1, 2))), 1, 2)
+                out[np.ix_(rows, np.arange(n), np.arange(n))] = W
+        return out
+
+    @cached_property
+    def index_of(self) -> dict[str, int]:
+        """Position of every station id."""
+        return {s: i for i, s in enumerate(self.station_ids)}
+
+    @cached_property
+    def pair_index_of(self) -> dict[str, int]:
+        """Position of every pair id."""
+        return {p: i for i, p in enumerate(self.pair_ids)}
+
+    @cached_property
+    def anchor(self) -> int | None:
+        """The station that a free network is solved against, None where the datum is given."""
+        if len(self.held) or self.prior_cov or not len(self.inner):
+            return None
+        return int(self.inner[0])
+
+    @cached_property
+    def constants(self) -> BoolArray:
+        """Stations (N,) that are no unknowns of the solution: the held ones, or the anchor."""
+        out = np.zeros(self.n_stations, dtype=np.bool_)
+        out[self.held] = True
+        if self.anchor is not None:
+            out[self.anchor] = True
+        return out
+
+    def with_used(self, used: BoolArray) -> "PoseNetwork":
+        """The same network with other pairs in use; whitening is not computed again."""
+        out = replace(self, used=np.asarray(used, dtype=np.bool_))
+        for name in ("whitening", "is_pose", "rotation_only", "index_of", "pair_index_of"):
+            if name in self.__dict__:
+                out.__dict__[name] = self.__dict__[name]
+        return out
+
+    def components(self, used: BoolArray | None = None, poses_only: bool = False) -> IntArray:
+        """Connected part (N,) of every station over the pairs in use (those with a translation only, if asked)."""
+        rows = self.used if used is None else used
+        if poses_only:
+            rows = rows & self.is_pose
+        ones = np.ones(int(rows.sum()))
+        graph = coo_array((ones, (self.a_idx[rows], self.b_idx[rows])), shape=(self.n_stations,) * 2)
+        return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def pose_network(
+    station_ids: Sequence[str], pair_ids: Sequence[str], a_idx: npt.ArrayLike, b_idx: npt.ArrayLike,
+    rotations: FloatArray, translations: FloatArray | None, cov: FloatArray, *,
+    held: Mapping[int, FloatArray] | None = None, start: Mapping[int, FloatArray] | None = None, prior: Mapping[int, tuple[FloatArray, FloatArray]] | None = None,
+    inner: Sequence[int] | None = None, used: BoolArray | None = None,
+) -> PoseNetwork:  # fmt: skip
+    """A checked network from arrays.
+
+    translations: (E, 3), nan rows for pairs of which only the rotation was measured; None where that is all of them.
+    cov: (E, 6, 6), or (E, 3, 3) without translations. held, start: ``world_from_station`` (4, 4) by station position.
+    prior: the same with covariance (6, 6). inner: station positions for inner constraints; a network without held,
+    prior or inner stations takes all of them. Raises SurveyError naming the first pair or station that is wrong.
+    """
+    n, n_pairs = len(station_ids), len(pair_ids)
+    a, b = np.asarray(a_idx, dtype=np.int64).ravel(), np.asarray(b_idx, dtype=np.int64).ravel()
+    t = np.full((n_pairs, 3), np.nan) if translations is None else np.array(translations, dtype=float)
+    Q = _full_cov(np.asarray(cov, dtype=float), t, n_pairs)
+    R, T = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
+    held, start, prior = dict(held or {}), dict(start or {}), dict(prior or {})
+    for i, pose in {**start, **{k: p for k, (p, _) in prior.items()}, **held}.items():
+        R[i], T[i] = nearest_rotation(np.asarray(pose, dtype=float)[:3, :3]), np.asarray(pose)[:3, 3]
+    if inner is None:
+        inner = range(n) if not held and not prior else ()
+    network = PoseNetwork(
+        tuple(station_ids), tuple(pair_ids), a, b, np.array(rotations, dtype=float).reshape(n_pairs, 3, 3), t, Q,
+        np.ones(n_pairs, dtype=np.bool_) if used is None else np.asarray(used, dtype=np.bool_), R, T,
+        np.array(sorted(held), dtype=np.int64), {k: np.asarray(c, dtype=float) for k, (_, c) in prior.items()},
+        np.array(sorted(inner), dtype=np.int64),
+    )  # fmt: skip
+    check_network(network)
+    return network
+
+
+def _full_cov(cov: FloatArray, t: FloatArray, n_pairs: int) -> FloatArray:
+    """(E, 6, 6) with infinite variances where nothing was measured."""
+    measured = np.isfinite(t).all(axis=1)
+    out = np.zeros((n_pairs, 6, 6))
+    k = cov.shape[-1] if cov.ndim == 3 else 0
+    if cov.shape not in ((n_pairs, 6, 6), (n_pairs, 3, 3)):
+        raise SurveyError(f"covariances of {n_pairs} pairs have shape {cov.shape}; expected ({n_pairs}, 6, 6)")
+    out[:, :k, :k] = cov
+    out[~measured, 3:, :] = out[~measured, :, 3:] = 0.0
+    for i in range(3, 6):
+        out[~measured, i, i] = np.inf
+    return out
+
+
+def check_network(network: PoseNetwork) -> None:
+    """Raise SurveyError for what cannot be, naming the pair or station."""
+    n, E = network.n_stations, network.n_pairs
+    for what, ids in (("station", network.station_ids), ("pair", network.pair_ids)):
+        if len(set(ids)) != len(ids):
+            twice = next(x for i, x in enumerate(ids) if x in ids[:i])
+            raise SurveyError(f"{what} id {twice!r} occurs twice; give every {what} a name of its own")
+    a, b = network.a_idx, network.b_idx
+    if len(a) != E or len(b) != E or len(network.used) != E or len(network.translations) != E:
+        raise SurveyError(f"{E} pair ids, but arrays of {len(a)}, {len(b)}, {len(network.used)} pairs")
+    if E == 0:
+        raise SurveyError("a network needs at least one measured pair")
+    _pairs_where(network, (a < 0) | (a >= n) | (b < 0) | (b >= n), "names a station that does not exist")
+    _pairs_where(network, a == b, "joins a station with itself")
+    off = np.abs(network.rotations @ np.swapaxes(network.rotations, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    bad = ~(off < 1e-6) | ~(np.linalg.det(network.rotations) > 0.0)
+    _pairs_where(network, bad, "has a matrix that is no rotation; normalize its quaternion")
+    _check_cov(network)
+    free = ~np.isfinite(network.station_translations[network.held]).all(axis=1)
+    if free.any():
+        raise SurveyError(f"station {network.station_ids[network.held[free][0]]!r} is held but has no pose")
+
+
+def _check_cov(network: PoseNetwork) -> None:
+    for rows, k in ((network.is_pose, 6), (~network.is_pose, 3)):
+        C = network.cov[rows][:, :k, :k]
+        at = np.flatnonzero(rows)
+        scale = np.sqrt(np.maximum(np.diagonal(C, axis1=1, axis2=2), 1e-300))
+        correlation = C / scale[:, :, None] / scale[:, None, :]
+        fine = np.isfinite(correlation).all(axis=(1, 2))
+        whole = np.where(fine[:, None, None], correlation, -1.0)
+        fine = np.linalg.eigvalsh(whole).min(axis=1, initial=1.0) > 1e-12
+        fine &= np.abs(whole - np.swapaxes(whole, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6
+        wrong = np.zeros(network.n_pairs, dtype=np.bool_)
+        wrong[at[~fine]] = True
+        _pairs_where(network, wrong, "has a covariance that is not symmetric and positive definite")
+
+
+def _pairs_where(network: PoseNetwork, wrong: BoolArray, what: str) -> None:
+    found = np.flatnonzero(wrong)
+    if len(found):
+        more = f" (and {len(found) - 1} others)" if len(found) > 1 else ""
+        raise SurveyError(f"pair {network.pair_ids[found[0]]!r}{more} {what}")
+
+
+def check_determined(network: PoseNetwork, used: BoolArray | None = None) -> None:
+    """Raise IndeterminateError naming the stations that the pairs in use leave floating."""
+    for poses_only in (False, True):
+        if poses_only and (network.rotation_only or network.is_pose.all()):
+            continue
+        part = network.components(used, poses_only)
+        known = set(network.held.tolist()) | ({network.anchor} if network.anchor is not None else set())
+        known |= {i for i, c in network.prior_cov.items() if np.isfinite(np.diag(c)[: 6 if poses_only else 3]).all()}
+        reached = {int(part[i]) for i in known}
+        lost = [i for i in range(network.n_stations) if int(part[i]) not in reached]
+        if lost:
+            ids = tuple(network.station_ids[i] for i in lost)
+            what = "the position of " if poses_only else ""
+            more = f" and {len(ids) - _FEW} more" if len(ids) > _FEW else ""
+            raise IndeterminateError(
+                f"no measured pair ties {what}{', '.join(ids[:_FEW])}{more} to the datum; measure a pair to the rest, "
+                "hold a station of that part, or leave it out", ids,
+            )  # fmt: skip
+
+
+def loop_marks(network: PoseNetwork, used: BoolArray) -> tuple[IntArray, IntArray]:
+    """Of every pair (E,): the number of independent loops through it, and a mark equal for pairs that share them all.
+
+    Pairs without a loop are controlled by nothing; pairs with the same mark cannot be told apart. All stations with a
+    given pose count as one. Pairs out of use have zero.
+    """
+    node = np.arange(network.n_stations)
+    given = np.concatenate([network.held, np.array(sorted(network.prior_cov), dtype=np.int64)])
+    if len(given):
+        node[given] = given[0]
+    rows = np.flatnonzero(used)
+    a, b = node[network.a_idx[rows]], node[network.b_idx[rows]]
+    label = np.random.default_rng(0).integers(1, 2**63 - 1, size=len(rows), dtype=np.int64)
+    found = covers(*depth_first(*adjacency(network.n_stations, a, b)), a, b, label)
+    loops, mark = np.zeros((2, network.n_pairs), dtype=np.int64)
+    loops[rows], mark[rows] = found
+    return loops, mark

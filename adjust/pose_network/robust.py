@@ -1,0 +1,209 @@
+"""Wrong pairs: found by graduated non-convexity, judged by their own tests, listed, and taken back where they fit.
+
+Rotations first, then positions, each by a solver that needs no start, with the truncated least squares weights of Yang,
+Antonante, Tzoumas and Carlone (Graduated non-convexity for robust spatial perception, RA-L 2020). What that sorts out
+is only a proposal: a clean least squares over the rest decides, pair by pair, by the chi-square test of the pair
+against all others, at one level for the whole network (Sidak 1967).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from adjust.errors import NotConvergedError
+from adjust.model import BoolArray, FloatArray
+from adjust.pose_network.network import PoseNetwork, loop_marks
+from adjust.pose_network.precision import NetworkPrecision, PairStatistics
+from adjust.pose_network.solve import Minimum, NetworkOptions, Progress, minimize
+from adjust.pose_network.start import (
+    rotation_residuals,
+    start_rotations,
+    start_translations,
+    translation_misfits,
+    translation_sigmas,
+)
+
+_TRUNCATION = float(chi2.isf(1e-4, 3))
+_SLACK = 4.0  # positions inherit what is left in the rotations of the first stage
+_LEAST = 1e-6  # pairs that are sorted out keep this weight, so that the network holds together
+_GROWTH = 1.6
+_ROUNDS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class RejectedPair:
+    """A pair that contradicts the rest: test against its prediction, chi-square with ``freedom`` degrees of freedom.
+
+    residual: (dim,) Log(measured^-1 predicted). inseparable: pairs that might as well be the wrong one, since they
+    share all their loops with it.
+    """
+
+    pair_id: str
+    test: float
+    freedom: int
+    p_value: float
+    residual: FloatArray
+    inseparable: tuple[str, ...]
+
+    def __str__(self) -> str:
+        turn = np.degrees(np.linalg.norm(self.residual[:3]))
+        shift = f" and {np.linalg.norm(self.residual[3:]):.4g} m" if len(self.residual) == 6 else ""
+        alike = f"; {', '.join(self.inseparable)} could as well be wrong" if self.inseparable else ""
+        return f"pair {self.pair_id}: off by {turn:.4g} deg{shift}, test {self.test:.1f}, p {self.p_value:.2g}{alike}"
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaned:
+    """Least squares over the pairs that hold together, with the statistics of all. variance_factor: see below."""
+
+    network: PoseNetwork
+    minimum: Minimum
+    precision: NetworkPrecision
+    rejected: tuple[RejectedPair, ...]
+    variance_factor: float
+
+
+def variance_factor(pairs: PairStatistics, used: BoolArray) -> float:
+    """How much larger than claimed the typical pair's test is, at least 1: median over chi-square's median.
+
+    With sigmas that are too small throughout every pair would fail; a pair is wrong only beside the others.
+    """
+    rows = used & (pairs.freedom > 0)
+    if int(rows.sum()) < 20:
+        return 1.0
+    return max(1.0, float(np.median(pairs.test[rows] / chi2.median(pairs.freedom[rows]))))
+
+
+def excess(pairs: PairStatistics, used: BoolArray, candidates: BoolArray, alpha: float) -> FloatArray:
+    """Test of every pair over its limit (E,); above 1 it fails at ``alpha`` for the whole network, 0 where untested."""
+    tested = candidates & (pairs.freedom > 0)
+    single = -np.expm1(np.log1p(-alpha) / max(1, int(tested.sum())))
+    limit = chi2.isf(single, np.maximum(pairs.freedom, 1)) * variance_factor(pairs, used)
+    return np.where(tested, np.nan_to_num(pairs.test) / limit, 0.0)
+
+
+def _graduated(
+    network: PoseNetwork, fit: Callable[[FloatArray], FloatArray], c2: float, weights: FloatArray
+) -> FloatArray:
+    """Weights (E,) after graduated non-convexity; ``fit`` gives the squared misfits (E,) of a weighted solution."""
+    rows = network.used & (weights > 0.5)
+    r2 = fit(np.maximum(weights, _LEAST))
+    worst = float(r2[rows].max(initial=0.0))
+    if 2.0 * worst <= c2:
+        return weights
+    mu = c2 / (2.0 * worst - c2)
+    while True:
+        with np.errstate(divide="ignore"):
+            middle = np.sqrt(c2 * mu * (mu + 1.0) / np.maximum(r2, 1e-300)) - mu
+        new = np.where(r2 >= (mu + 1.0) / mu * c2, 0.0, np.where(r2 <= mu / (mu + 1.0) * c2, 1.0, middle))
+        new = np.where(rows, new, 0.0)
+        if mu > 1e3 or (mu > 1.0 and not np.any((new > 0.01) & (new < 0.99))):
+            return new
+        mu *= _GROWTH
+        r2 = fit(np.maximum(new, _LEAST))
+
+
+def graduated_weights(network: PoseNetwork) -> FloatArray:
+    """1 for the pairs (E,) that agree on rotations and positions, 0 for the others."""
+    info = np.linalg.inv(network.cov[:, :3, :3])
+
+    def rotations(weights: FloatArray) -> FloatArray:
+        R = start_rotations(network, weights)
+        e = rotation_residuals(network, R)
+        return np.asarray(np.einsum("ni,nij,nj->n", e, info, e))
+
+    weights = _graduated(network, rotations, _TRUNCATION, network.used.astype(float))
+    if not network.is_pose.any():
+        return weights
+    R = start_rotations(network, np.maximum(weights, _LEAST))
+    sigma = translation_sigmas(network)
+
+    def positions(w: FloatArray) -> FloatArray:
+        t = start_translations(network, R, w)
+        return np.asarray((translation_misfits(network, R, t) / sigma) ** 2)
+
+    return _graduated(network, positions, _SLACK * _TRUNCATION, weights)
+
+
+def clean(
+    network: PoseNetwork, options: NetworkOptions, start: tuple[FloatArray, FloatArray] | None = None,
+    progress: Progress | None = None,
+) -> Cleaned:  # fmt: skip
+    """Least squares over the pairs that pass their tests. Raises as :func:`adjust.pose_network.solve.minimize`."""
+    candidates = network.used
+    if options.robust == "auto":
+        try:
+            first = _judged(network, minimize(network, start, options, progress=progress), candidates, options)
+            if not (first[2] > 1.0).any():
+                return Cleaned(network, first[0], first[1], (), variance_factor(first[1].pairs, candidates))
+        except NotConvergedError:
+            pass  # wrong pairs can do that; without them the next attempt says more
+    used = _connected(network, graduated_weights(network))
+    taken_back = np.zeros(network.n_pairs, dtype=np.bool_)
+    poses: tuple[FloatArray, FloatArray] | None = None
+    for _ in range(_ROUNDS):
+        current = network.with_used(used)
+        minimum, precision, over = _judged(current, minimize(current, poses, options, progress=progress), candidates,
+                                           options)  # fmt: skip
+        poses = minimum.rotations, minimum.translations
+        back = candidates & ~used & (over <= 1.0) & ~taken_back
+        out = _worst_around(network, np.where(used, over, 0.0))
+        if not back.any() and not out.any():
+            return Cleaned(current, minimum, precision, _listed(current, precision, candidates),
+                           variance_factor(precision.pairs, used))  # fmt: skip
+        taken_back |= back
+        used = (used | back) & ~out
+    raise NotConvergedError(f"no set of pairs that agree was found in {_ROUNDS} rounds; the pairs contradict throughout")
+
+
+def _judged(
+    network: PoseNetwork, minimum: Minimum, candidates: BoolArray, options: NetworkOptions
+) -> tuple[Minimum, NetworkPrecision, FloatArray]:
+    precision = NetworkPrecision(network, minimum)
+    return minimum, precision, excess(precision.pairs, network.used, candidates, options.alpha)
+
+
+def _worst_around(network: PoseNetwork, over: FloatArray) -> BoolArray:
+    """Pairs that fail worse than every other pair at their stations: an error shows in its neighbours too."""
+    bad = np.flatnonzero(over > 1.0)
+    out = np.zeros(network.n_pairs, dtype=np.bool_)
+    blocked = np.zeros(network.n_stations, dtype=np.bool_)
+    for e in bad[np.argsort(-over[bad], kind="stable")]:
+        a, b = network.a_idx[e], network.b_idx[e]
+        out[e] = not blocked[a] and not blocked[b]
+        blocked[a] = blocked[b] = True
+    return out
+
+
+def _connected(network: PoseNetwork, weights: FloatArray) -> BoolArray:
+    """The pairs of weight above one half, and of the others as many as hold the network together."""
+    used = network.used & (weights > 0.5)
+    for poses_only in (False, True):
+        part = network.components(used, poses_only)
+        if part.max(initial=0) == 0:
+            continue
+        whole = network.components(network.used, poses_only)
+        for e in np.flatnonzero(network.used & ~used):
+            if poses_only and not network.is_pose[e]:
+                continue
+            a, b = part[network.a_idx[e]], part[network.b_idx[e]]
+            if a != b and whole[network.a_idx[e]] == whole[network.b_idx[e]]:
+                used[e] = True
+                part[part == b] = a
+    return used
+
+
+def _listed(network: PoseNetwork, precision: NetworkPrecision, candidates: BoolArray) -> tuple[RejectedPair, ...]:
+    out = []
+    pairs = precision.pairs
+    for e in np.flatnonzero(candidates & ~network.used):
+        loops, mark = loop_marks(network, network.used | (np.arange(network.n_pairs) == e))
+        same = np.flatnonzero((mark == mark[e]) & (loops > 0)) if loops[e] else np.zeros(0, dtype=np.int64)
+        alike = tuple(network.pair_ids[i] for i in same if i != e)
+        out.append(
+            RejectedPair(network.pair_ids[e], float(pairs.test[e]), int(pairs.freedom[e]), float(pairs.p_value[e]),
+                         pairs.residual[e], alike)
+        )  # fmt: skip
+    return tuple(sorted(out, key=lambda r: -r.test))

@@ -1,0 +1,102 @@
+"""A solved pose network."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.model import FloatArray
+from adjust.pose_network.graph import prior_whitening
+from adjust.pose_network.network import PoseNetwork
+from adjust.pose_network.precision import NetworkPrecision, pair_jacobians
+from adjust.pose_network.robust import RejectedPair, clean
+from adjust.pose_network.solve import Minimum, NetworkOptions, Progress, minimize
+from adjust.precision import global_test
+from adjust.relay.motions import Motions
+from adjust.result import GlobalTest
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkSolution:
+    """``world_from_station`` of all stations: rotations (N, 3, 3), translations (N, 3) m, zero in rotation networks.
+
+    network: as solved; its ``used`` leaves out what was rejected. omega: v'Pv of the pairs in use and the priors.
+    redundancy: observations less unknowns. iterations, max_step, history: of the last least squares.
+    """
+
+    network: PoseNetwork
+    rotations: FloatArray
+    translations: FloatArray
+    omega: float
+    redundancy: int
+    iterations: int
+    max_step: float
+    history: tuple[float, ...]
+    rejected: tuple[RejectedPair, ...]
+    minimum: Minimum
+
+    @cached_property
+    def precision(self) -> NetworkPrecision:
+        """Covariances and tests, computed when first asked for."""
+        return NetworkPrecision(self.network, self.minimum)
+
+    @property
+    def sigma0(self) -> float:
+        """A posteriori standard deviation of unit weight, nan without redundancy."""
+        return float(np.sqrt(self.omega / self.redundancy)) if self.redundancy > 0 else float("nan")
+
+    def global_test(self, alpha: float = 0.05) -> GlobalTest | None:
+        """Chi-square test of v'Pv; None without redundancy."""
+        return global_test(self.omega, self.redundancy, alpha)
+
+    def pose(self, station_id: str) -> Pose3:
+        """``world_from_station`` of one station."""
+        i = self.network.index_of[station_id]
+        return Pose3(Rot3(self.rotations[i]), self.translations[i])
+
+    def relative(self, a_id: str, b_id: str) -> tuple[FloatArray, FloatArray]:
+        """``b_from_a`` (4, 4) and its covariance (dim, dim) in the tangent of a, whatever the datum."""
+        index = self.network.index_of
+        return self.precision.relative(index[a_id], index[b_id])
+
+    def reinstated(self, pair_ids: tuple[str, ...]) -> PoseNetwork:
+        """The network with these rejected pairs in use again, to be solved anew."""
+        used = self.network.used.copy()
+        used[[self.network.pair_index_of[p] for p in pair_ids]] = True
+        return self.network.with_used(used)
+
+
+def solve_network(
+    network: PoseNetwork, start: tuple[FloatArray, FloatArray] | None = None,
+    options: NetworkOptions = NetworkOptions(), progress: Progress | None = None,
+) -> NetworkSolution:  # fmt: skip
+    """Solve a network from nothing (or from a start), without its wrong pairs.
+
+    Raises IndeterminateError naming the stations that float, NotConvergedError.
+    """
+    if options.robust == "off":
+        return as_solution(network, minimize(network, start, options, progress=progress))
+    found = clean(network, options, start, progress)
+    solution = as_solution(found.network, found.minimum, found.rejected)
+    solution.__dict__["precision"] = found.precision  # already computed for the tests
+    return solution
+
+
+def as_solution(network: PoseNetwork, minimum: Minimum, rejected: tuple[RejectedPair, ...] = ()) -> NetworkSolution:
+    """The minimum with its counts."""
+    rows = network.used
+    flat = network.rotation_only
+    here = Motions(minimum.rotations, None if flat else minimum.translations)
+    omega = float(np.sum(np.einsum("nij,nj->ni", network.whitening, pair_jacobians(network, here)[0])[rows] ** 2))
+    n_observations = int((np.where(network.is_pose, 6, 3) if not flat else np.full(network.n_pairs, 3))[rows].sum())
+    for i, W in prior_whitening(network).items():
+        given = Motions(network.station_rotations[i : i + 1], None if flat else network.station_translations[i : i + 1])
+        e = (given.inverse() @ here[slice(i, i + 1)]).log()[0]
+        omega += float(np.sum((W @ e) ** 2))
+        n_observations += int(np.count_nonzero(np.abs(W).max(axis=1)))
+    n_unknowns = network.dim * int((~network.constants).sum())
+    return NetworkSolution(
+        network, minimum.rotations, minimum.translations, omega, n_observations - n_unknowns, minimum.iterations,
+        minimum.max_step, minimum.history, rejected, minimum,
+    )  # fmt: skip
