@@ -1,6 +1,7 @@
 """The command ``labsurvey``: arguments in, exit code out. The jobs are in ``survey.jobs``.
 
-Exit codes: 0 done, 1 something its owner can mend, 2 wrong usage, 3 solved but the global test failed, 130 interrupted.
+Exit codes: 0 done, 1 something its owner can mend, 2 wrong usage, 3 solved but the global test failed (residuals larger
+than the sigmas say), 130 interrupted.
 Results go to stdout, progress and messages to stderr. Heavy imports happen inside the commands.
 """
 

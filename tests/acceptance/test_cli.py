@@ -13,6 +13,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from adjust.errors import SurveyError
+from adjust.result import GlobalTest
 from survey.cli import build_parser, main
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -27,12 +28,12 @@ def _run(*arguments, **more):
 @dataclass
 class _Outcome:
     folder: Path
-    passed: bool = True
+    omega: float = 100.0
     paths: dict = field(default_factory=dict)
 
     @property
     def adjustment(self):
-        return SimpleNamespace(global_test=SimpleNamespace(passed=self.passed))
+        return SimpleNamespace(global_test=GlobalTest(self.omega, 100, 0.05, 74.0, 130.0))
 
     def summary(self):
         return {"summary": {"sigma0": 1.25, "redundancy": 77}}
@@ -56,7 +57,7 @@ def jobs(monkeypatch):
             raise KeyboardInterrupt
         if folder.name == "gone":
             raise PermissionError(13, "Permission denied", str(folder / "results"))
-        return _Outcome(folder, passed=folder.name != "poor")
+        return _Outcome(folder, {"poor": 200.0, "cautious": 50.0}.get(folder.name, 100.0))
 
     module = ModuleType("survey.jobs")
     module.adjust_job = adjust_job
@@ -138,6 +139,10 @@ def test_adjust_prints_the_result_and_is_0(jobs, project, capsys):
 
 def test_a_failed_global_test_is_3(jobs, project):
     assert main(["adjust", project("poor")]) == 3
+
+
+def test_residuals_smaller_than_the_sigmas_mislead_nobody_and_are_0(jobs, project):
+    assert main(["adjust", project("cautious")]) == 0
 
 
 def test_a_survey_error_is_1_and_says_where(jobs, project, capsys):
