@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 from gtsam import Pose3
 
+from adjust.bundle_batch import ROUNDING_PIVOT
 from adjust.errors import SurveyError
 from adjust.factors import Jacobians, custom
 from adjust.graph import AdjustmentGraph, inner_datum_keys
@@ -138,6 +139,14 @@ class InnerDatum:
         return np.asarray(B @ self.addition @ B.T)
 
 
+def blind(graph: AdjustmentGraph) -> float:
+    """Length of the whitened Jacobian times a scaled direction that the observations do not see.
+
+    Rounding reaches 1e-13; through a bundle's normal equations the square root of its rounding pivots.
+    """
+    return 1e-8 if graph.bundle is None else 3.0 * ROUNDING_PIVOT**0.5
+
+
 def defects(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> FloatArray:
     """Directions (7, k) of the whole-survey motions that the observations do not see."""
     keys = visible_keys(graph)
@@ -148,7 +157,7 @@ def defects(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: g
     usable = lengths > 0.0
     scaled = times(linear, stack, B[:, usable] / lengths[usable])
     _, s, Vt = np.linalg.svd(scaled, full_matrices=False)
-    null = Vt[s < 1e-8].T
+    null = Vt[s < blind(graph)].T
     out = np.zeros((7, null.shape[1]))
     out[usable] = null / lengths[usable, None]
     return out

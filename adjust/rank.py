@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import qr
 
-from adjust.datum import Stacking, gauge, stacking, times, visible_keys
+from adjust.datum import Stacking, blind, gauge, stacking, times, visible_keys
 from adjust.errors import IndeterminateError
 from adjust.graph import AdjustmentGraph
 from adjust.model import FloatArray
@@ -40,11 +40,13 @@ def readable(unknown: Unknown) -> str:
     return owner + (f" at epoch {ids[1]}" if len(ids) > 1 else "")
 
 
-def null_space(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> tuple[FloatArray, FloatArray]:
+def null_space(
+    linear: gtsam.GaussianFactorGraph, stack: Stacking, limit: float = 1e-8
+) -> tuple[FloatArray, FloatArray]:
     """Null vectors (n, k) of the normal matrix of the visible unknowns, and its column scale (n,).
 
-    Candidates come from the scaled normal matrix; each is then judged by the length of the whitened Jacobian times it,
-    which rounding reaches only at 1e-13, so that weak but determined directions are not taken for null ones.
+    Candidates come from the scaled normal matrix; each is then judged by the length of the whitened Jacobian times it
+    against ``limit``, so that weak but determined directions are not taken for null ones.
     """
     N = np.zeros((stack.n, stack.n))
     for i in range(linear.size()):
@@ -60,7 +62,7 @@ def null_space(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> tuple[Floa
     if V.shape[1] == 0:
         return V, scale
     _, s, Vt = np.linalg.svd(times(linear, stack, V), full_matrices=False)
-    return V @ Vt[s < 1e-8].T, scale
+    return V @ Vt[s < limit].T, scale
 
 
 def describe_null_space(
@@ -74,7 +76,7 @@ def describe_null_space(
             "the observations and the datum leave unknowns undetermined; the survey is too large "
             f"({stack.n} unknowns) to name them: try a part of it"
         )
-    null, scale = null_space(linear, stack)
+    null, scale = null_space(linear, stack, blind(graph))
     if null.shape[1] == 0:
         return None
     scaled = np.linalg.qr(null * scale[:, None])[0]

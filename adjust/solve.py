@@ -98,9 +98,11 @@ class _Loop:
         for iteration in range(1, self.options.max_iterations + 1):
             delta = self.step(linear)
             gradient = linear.gradientAtZero()
-            before, moved = moved, np.sqrt(max(0.0, -float(delta.dot(gradient))))
+            decrease = -float(delta.dot(gradient))
             if self.graph.bundle is not None:
+                decrease += self.graph.bundle.hidden_decrease
                 self.graph.bundle.complete(delta)
+            before, moved = moved, np.sqrt(max(0.0, decrease))
             trial = self.values.retract(delta)
             new = self.total(trial)
             behind = self.graph.behind_camera()
