@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import gtsam
 import numpy as np
+import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
@@ -26,7 +27,7 @@ from adjust.model import (
     VectorParameter,
 )
 from adjust.observations import Coordinates, Distance, FrameRef, ImageBlock, PositionRef, TableReading
-from adjust.precision import Precision
+from adjust.precision import Precision, image_residuals, other_residuals
 from adjust.result import ParameterName
 from adjust.solve import Solved, SolveOptions, solve
 from survey.simulate import resample
@@ -536,3 +537,107 @@ def network(
 
 def station_frame(station_id: str, epoch_id: str | None = None) -> FrameRef:
     return FrameRef("station", station_id, epoch_id)
+
+
+# -- the whole precision against the dense one -------------------------------------------------------------------------
+
+
+def check_against_dense(survey: Survey, start: StartValues, tolerance: float = 1e-8) -> tuple[Precision, Dense]:
+    """Solve, and compare the minimum, all covariances and all statistics with one dense matrix."""
+    graph, done = solved(survey, start)
+    precision = Precision(graph, done)
+    full = dense(graph, dict(start.lenses), done.values)
+    gauge = inner_rows(graph, full, done)
+    Q = full.inverse(gauge)
+    check_minimum(full, done, Q)
+    for name, place in full.place.items():
+        mine, expected = covariance_of(precision, name), Q[place, place]
+        assert relative(mine, expected) < tolerance, (name, relative(mine, expected))
+    check_statistics(precision, full, Q)
+    return precision, full
+
+
+def check_minimum(full: Dense, done: Solved, Q: FloatArray) -> None:
+    """No unknown has further to go than a millionth of its sigma; the weighted square sum is the plain one."""
+    A, e = full.A[full.used], full.e[full.used]
+    step = Q @ A.T @ e
+    assert np.max(np.abs(step) / np.sqrt(np.diag(Q))) < 1e-6
+    np.testing.assert_allclose(done.omega, e @ e, rtol=1e-9)
+
+
+def check_statistics(precision: Precision, full: Dense, Q: FloatArray) -> None:
+    """Residuals, redundancy numbers, standardized residuals and tests against Q_vv of the dense matrix."""
+    images, others = image_residuals(precision), other_residuals(precision)
+    n = full.n_image
+    np.testing.assert_allclose(images.residuals.ravel(), full.v[: 2 * n], atol=1e-8)
+    sums, at = 0.0, 0
+    for k in range(n + len(others)):
+        rows = slice(at, at + len(full.W[k]))
+        at = rows.stop
+        A, e, used = full.A[rows], full.e[rows], bool(full.used[rows.start])
+        Qv = np.eye(len(A)) + (-1.0 if used else 1.0) * A @ Q @ A.T
+        inverse_root = np.linalg.inv(full.W[k])
+        sigma_v = np.sqrt(np.diag(inverse_root @ Qv @ inverse_root.T))
+        v = full.v[rows]
+        redundancy = np.diag(Qv) if used else np.zeros(len(A))
+        sums += redundancy.sum()
+        if k < n:
+            found = images.redundancy[k], images.standardized[k], images.test[k]
+        else:
+            item = others[k - n]
+            np.testing.assert_allclose(item.residual, v, atol=1e-9)
+            np.testing.assert_allclose(item.sigma, np.sqrt(np.diag(inverse_root @ inverse_root.T)), rtol=1e-9)
+            found = item.redundancy, item.standardized, np.asarray(item.test)
+        np.testing.assert_allclose(found[0], redundancy, atol=1e-7)
+        if np.linalg.eigvalsh(Qv)[0] > 1e-4:
+            np.testing.assert_allclose(found[1], v / sigma_v, rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(found[2], e @ np.linalg.solve(Qv, e), rtol=1e-5, atol=1e-6)
+    datum = precision.solved.datum
+    defect = datum.defect if datum else 0
+    assert sums == pytest.approx(int(full.used.sum()) - full.A.shape[1] + defect, abs=1e-5)
+
+
+def inner_rows(graph: AdjustmentGraph, full: Dense, done: Solved) -> FloatArray | None:
+    """Rows (k, n) of inner constraints over the datum's unknowns, from differences: how these move with the world.
+
+    Which of the seven motions are free is decided by what the plain residuals see of them.
+    """
+    datum = graph.survey.datum
+    if datum.kind != "inner":
+        return None
+    motions = np.column_stack([world_motion(graph, full, done.values, i) for i in range(7)])
+    seen = np.linalg.norm(full.A[full.used] @ motions, axis=0) / np.linalg.norm(motions, axis=0)
+    free = motions[:, seen < 1e-4 * np.linalg.norm(full.A[full.used]) / np.sqrt(full.A.shape[1])]
+    points = datum.points or (() if datum.stations else tuple(p.point_id for p in graph.survey.points))
+    stations = datum.stations
+    if not points and not stations:
+        stations = tuple(s.station_id for s in graph.survey.stations)
+    mask = np.zeros(len(free))
+    for name, place in full.place.items():
+        if (name[0] == "point" and name[1] in points) or (name[0] == "world_from_station" and name[1] in stations):
+            mask[place] = 1.0
+    return (free * mask[:, None]).T
+
+
+def world_motion(graph: AdjustmentGraph, full: Dense, values: gtsam.Values, i: int) -> FloatArray:
+    """How all unknowns (n,) move with the world: translations 0-2, rotations 3-5, scale 6; by differences."""
+    h, total = 1e-4, np.zeros(full.A.shape[1])
+    for k, weight in ((1, 8.0), (-1, -8.0), (2, -1.0), (-2, 1.0)):
+        turn, shift = np.zeros(3), np.zeros(3)
+        turn[i - 3 : i - 2] = h * k if 3 <= i < 6 else 0.0
+        shift[i : i + 1] = h * k if i < 3 else 0.0
+        motion, scale = Pose3(Rot3.Expmap(turn), shift), np.exp(h * k) if i == 6 else 1.0
+        for name, place in full.place.items():
+            unknown = graph.unknowns.by_name[name]
+            if unknown.kind == "point":
+                x = np.asarray(values.atPoint3(unknown.key))
+                total[place] += weight * (motion.transformFrom(scale * x) - x)
+            elif unknown.kind == "pose":
+                p = values.atPose3(unknown.key)
+                moved = Pose3(p.rotation(), scale * p.translation())
+                in_world = name[0] in ("world_from_station", "world_from_table") or (
+                    name[0] == "carrier_from_target"
+                    and next(t for t in graph.survey.targets if t.target_id == name[1]).station_id is None
+                )
+                total[place] += weight * Pose3.Logmap(p.inverse() * (motion * moved if in_world else moved))
+    return total / (12.0 * h)
