@@ -9,6 +9,7 @@ from adjust.initial.gauge import fix_one_gauge, frames_of, world_is_free
 from adjust.initial.lenses import Sighting, start_lens
 from adjust.initial.motion import solve_motion
 from adjust.initial.network import ChainObservation, PoseNetwork, as_pose3
+from adjust.initial.pairs import network_start
 from adjust.initial.points import PARALLAX, PointField, improve, intersect_points, point_field, resect
 from adjust.initial.polish import polish
 from adjust.initial.relative import orient_second, scale_lengths
@@ -44,6 +45,9 @@ def find_start(survey: Survey) -> Start:
     are named in ``excluded_blocks`` and do not take part. What no observation tells (the datum) is chosen.
     Raises SurveyError naming each parameter that nothing determines, and what is missing.
     """
+    network = network_start(survey)
+    if network is not None:
+        return network
     search = _Search(survey)
     search.find_lenses()
     search.find_views()

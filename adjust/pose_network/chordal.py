@@ -32,7 +32,7 @@ class ChordalMinimum:
 
 
 def chordal_weights(network: PoseNetwork) -> tuple[FloatArray, FloatArray]:
-    """kappa (E,) and tau (E,). Raises SurveyError for pairs without translation."""
+    """The weights kappa (E,) and tau (E,). Raises SurveyError for pairs without translation."""
     if not network.is_pose.all():
         pair = network.pair_ids[int(np.argmin(network.is_pose))]
         raise SurveyError(f"pair {pair!r} is a rotation only; the chordal cost is that of poses")
@@ -43,7 +43,7 @@ def chordal_weights(network: PoseNetwork) -> tuple[FloatArray, FloatArray]:
 
 
 def chordal_cost(network: PoseNetwork, rotations: FloatArray, translations: FloatArray) -> float:
-    """f at these poses (N, 3, 3), (N, 3) over the pairs in use."""
+    """The cost at these poses (N, 3, 3), (N, 3) over the pairs in use."""
     kappa, tau = chordal_weights(network)
     use, a, b = network.used, network.a_idx, network.b_idx
     turn = rotations[a] - rotations[b] @ network.rotations
@@ -123,8 +123,9 @@ def _linear(
         a, b = int(network.a_idx[e]), int(network.b_idx[e])
         if fixed[a] or fixed[b]:
             if not (fixed[a] and fixed[b]):
-                graph.add(gtsam.JacobianFactor(a if fixed[b] else b, by_a[e] if fixed[b] else by_b[e], -residual[e], unit))
-                near.add(a if fixed[b] else b)
+                key, J = (a, by_a[e]) if fixed[b] else (b, by_b[e])
+                graph.add(gtsam.JacobianFactor(key, J, -residual[e], unit))
+                near.add(key)
         else:
             graph.add(gtsam.JacobianFactor(b, by_b[e], a, by_a[e], -residual[e], unit))
     if damping > 0.0:

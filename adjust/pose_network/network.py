@@ -126,7 +126,8 @@ class PoseNetwork:
 def pose_network(
     station_ids: Sequence[str], pair_ids: Sequence[str], a_idx: npt.ArrayLike, b_idx: npt.ArrayLike,
     rotations: FloatArray, translations: FloatArray | None, cov: FloatArray, *,
-    held: Mapping[int, FloatArray] | None = None, start: Mapping[int, FloatArray] | None = None, prior: Mapping[int, tuple[FloatArray, FloatArray]] | None = None,
+    held: Mapping[int, FloatArray] | None = None, start: Mapping[int, FloatArray] | None = None,
+    prior: Mapping[int, tuple[FloatArray, FloatArray]] | None = None,
     inner: Sequence[int] | None = None, used: BoolArray | None = None,
 ) -> PoseNetwork:  # fmt: skip
     """A checked network from arrays.
@@ -188,9 +189,9 @@ def check_network(network: PoseNetwork) -> None:
     bad = ~(off < 1e-6) | ~(np.linalg.det(network.rotations) > 0.0)
     _pairs_where(network, bad, "has a matrix that is no rotation; normalize its quaternion")
     _check_cov(network)
-    free = ~np.isfinite(network.station_translations[network.held]).all(axis=1)
-    if free.any():
-        raise SurveyError(f"station {network.station_ids[network.held[free][0]]!r} is held but has no pose")
+    free = [i for i in network.held.tolist() if not np.isfinite(network.station_translations[i]).all()]
+    if free:
+        raise SurveyError(f"station {network.station_ids[free[0]]!r} is held but has no pose")
 
 
 def _check_cov(network: PoseNetwork) -> None:
@@ -199,12 +200,12 @@ def _check_cov(network: PoseNetwork) -> None:
         at = np.flatnonzero(rows)
         scale = np.sqrt(np.maximum(np.diagonal(C, axis1=1, axis2=2), 1e-300))
         correlation = C / scale[:, :, None] / scale[:, None, :]
-        fine = np.isfinite(correlation).all(axis=(1, 2))
-        whole = np.where(fine[:, None, None], correlation, -1.0)
-        fine = np.linalg.eigvalsh(whole).min(axis=1, initial=1.0) > 1e-12
-        fine &= np.abs(whole - np.swapaxes(whole, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6
+        fine: BoolArray = np.isfinite(correlation).all(axis=(1, 2))
+        whole = np.where(np.expand_dims(fine, (1, 2)), correlation, -1.0)
+        fine = np.asarray(np.linalg.eigvalsh(whole).min(axis=1, initial=1.0) > 1e-12)
+        fine = fine & (np.abs(whole - np.swapaxes(whole, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6)
         wrong = np.zeros(network.n_pairs, dtype=np.bool_)
-        wrong[at[~fine]] = True
+        wrong[at[np.logical_not(fine)]] = True
         _pairs_where(network, wrong, "has a covariance that is not symmetric and positive definite")
 
 

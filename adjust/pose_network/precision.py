@@ -29,7 +29,8 @@ class PairStatistics:
 
     whitened: (E, dim). redundancy: (E, dim) numbers of the whitened components, zero for pairs out of use. test,
     freedom, p_value: of the whole pair; freedom 0 and nan where nothing controls it. A pair out of use is tested
-    against its prediction from the others. adjusted_cov: (E, dim, dim) of the adjusted ``b_from_a``.
+    against its prediction from the others. adjusted_cov: (E, dim, dim) of the adjusted ``b_from_a``. residual_cov:
+    (E, dim, dim).
     """
 
     residual: FloatArray
@@ -39,6 +40,7 @@ class PairStatistics:
     freedom: IntArray
     p_value: FloatArray
     adjusted_cov: FloatArray
+    residual_cov: FloatArray
 
 
 class NetworkPrecision:
@@ -134,8 +136,9 @@ class NetworkPrecision:
         for e in np.flatnonzero(~network.used):
             Q[e] = self._joint([int(b[e]), int(a[e])])
         W = network.whitening
-        A = W @ np.concatenate([by_b, by_a], axis=2)
-        M = A @ Q @ np.swapaxes(A, 1, 2)
+        B = np.concatenate([by_b, by_a], axis=2)
+        scatter = B @ Q @ np.swapaxes(B, 1, 2)
+        M = W @ scatter @ np.swapaxes(W, 1, 2)
         measured = (np.abs(W).max(axis=2) > 0.0).astype(float)
         sign = np.where(network.used, -1.0, 1.0)[:, None, None]
         Qvv = np.eye(d) * measured[:, :, None] + sign * M
@@ -145,7 +148,10 @@ class NetworkPrecision:
         with np.errstate(invalid="ignore"):
             p = np.where(freedom > 0, chi2.sf(test, np.maximum(freedom, 1)), np.nan)
         redundancy = np.where(network.used[:, None], np.diagonal(Qvv, axis1=1, axis2=2), 0.0)
-        return PairStatistics(residual, white, redundancy, test, freedom, p, J @ Q @ np.swapaxes(J, 1, 2))
+        own = J @ Q @ np.swapaxes(J, 1, 2)
+        return PairStatistics(
+            residual, white, redundancy, test, freedom, p, own, network.cov[:, :d, :d] + sign * scatter
+        )
 
 
 def pair_jacobians(
@@ -161,7 +167,7 @@ def pair_jacobians(
 
 
 def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:
-    """v' Q^+ v (E,) and the rank of Q, eigenvalues below ``UNCONTROLLED`` counting as zero."""
+    """The forms v' Q^+ v (E,) and the rank of Q, eigenvalues below ``UNCONTROLLED`` counting as zero."""
     w, U = np.linalg.eigh(Q)
     kept = w > UNCONTROLLED
     y = np.einsum("nij,ni->nj", U, v)

@@ -155,7 +155,7 @@ def clean(
                            variance_factor(precision.pairs, used))  # fmt: skip
         taken_back |= back
         used = (used | back) & ~out
-    raise NotConvergedError(f"no set of pairs that agree was found in {_ROUNDS} rounds; the pairs contradict throughout")
+    raise NotConvergedError(f"no set of pairs that agree was found in {_ROUNDS} rounds; the pairs contradict")
 
 
 def _judged(

@@ -11,7 +11,7 @@ from adjust.pose_network.graph import prior_whitening
 from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.precision import NetworkPrecision, pair_jacobians
 from adjust.pose_network.robust import RejectedPair, clean
-from adjust.pose_network.solve import Minimum, NetworkOptions, Progress, minimize
+from adjust.pose_network.solve import DEFAULTS, Minimum, NetworkOptions, Progress, minimize
 from adjust.precision import global_test
 from adjust.relay.motions import Motions
 from adjust.result import GlobalTest
@@ -69,7 +69,7 @@ class NetworkSolution:
 
 def solve_network(
     network: PoseNetwork, start: tuple[FloatArray, FloatArray] | None = None,
-    options: NetworkOptions = NetworkOptions(), progress: Progress | None = None,
+    options: NetworkOptions = DEFAULTS, progress: Progress | None = None,
 ) -> NetworkSolution:  # fmt: skip
     """Solve a network from nothing (or from a start), without its wrong pairs.
 

@@ -35,6 +35,9 @@ class NetworkOptions:
     patience: int = 8
 
 
+DEFAULTS = NetworkOptions()
+
+
 @dataclass(frozen=True, eq=False)
 class Minimum:
     """Where least squares ended: poses (N, 3, 3), (N, 3), v'Pv, steps taken, last step in sigmas, and GTSAM's graph.
@@ -135,7 +138,7 @@ class GaussNewton:
 
 def minimize(
     network: PoseNetwork, start: tuple[FloatArray, FloatArray] | None = None,
-    options: NetworkOptions = NetworkOptions(), weights: FloatArray | None = None, progress: Progress | None = None,
+    options: NetworkOptions = DEFAULTS, weights: FloatArray | None = None, progress: Progress | None = None,
 ) -> Minimum:  # fmt: skip
     """Least squares over the pairs in use, weighted (E,) if asked, from a start or from nothing.
 

@@ -25,13 +25,13 @@ def find_network_start(network: PoseNetwork, weights: FloatArray | None = None) 
 
 def datum_stations(network: PoseNetwork) -> IntArray:
     """Stations whose given pose says where the network lies, (k,)."""
-    given = np.isfinite(network.station_rotations).all(axis=(1, 2))
     if len(network.held):
         return network.held
     if network.prior_cov:
         known = [i for i, c in network.prior_cov.items() if np.isfinite(np.diag(c)[:3]).all()]
         return np.array(sorted(known), dtype=np.int64)
-    return network.inner if bool(np.all(given[network.inner])) else np.zeros(0, dtype=np.int64)
+    all_given = bool(np.isfinite(network.station_rotations[network.inner]).all())
+    return network.inner if all_given else np.zeros(0, dtype=np.int64)
 
 
 def start_rotations(network: PoseNetwork, weights: FloatArray | None = None) -> FloatArray:

@@ -1,0 +1,333 @@
+"""A network that grows: stations and pairs added to a solved network, one by one or in groups.
+
+iSAM2 (Kaess et al., IJRR 2012) over native factors, with QR, since its Cholesky refuses long corridors: an addition
+re-eliminates only what it touches, so on corridors the time stays flat however long they are. Where additions keep
+touching a large share of the network (grids, small networks), a batch iteration is cheaper and is used instead.
+:meth:`NetworkSession.finish` ends in batch Gauss-Newton, so that the result equals a batch solution of all the pairs.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.errors import SurveyError
+from adjust.model import FloatArray
+from adjust.observations import Pair
+from adjust.pose_network.graph import NoiseCache, pair_factors, prior_factors
+from adjust.pose_network.growth import Batch, Growth, Tree, moved_over
+from adjust.pose_network.network import PoseNetwork, pose_network
+from adjust.pose_network.solution import NetworkSolution, as_solution, solve_network
+from adjust.pose_network.solve import DEFAULTS, NetworkOptions, minimize
+
+_SHARE = 0.3
+_WINDOW = 20
+_LEAST = 50  # stations; below it nothing is worth a thought
+
+
+@dataclass(frozen=True)
+class SessionOptions:
+    """How additions are solved.
+
+    relinearize: change (rad, m) from which a station is linearised anew. wildfire: change below which steps do not
+    spread. moved_rad, moved_m: what counts as moved. batch_share: share of the network that additions may touch on
+    average before batch iterations take over; 1 never.
+    """
+
+    relinearize: float = 1e-3
+    wildfire: float = 1e-4
+    moved_rad: float = 1e-6
+    moved_m: float = 1e-5
+    batch_share: float = _SHARE
+
+
+@dataclass(frozen=True, eq=False)
+class Addition:
+    """What an addition did.
+
+    new: ``world_from_station`` of the stations added. moved: how far the others went, (rad, m).
+    misfit: v'Pv of every pair added, at the new estimates. touched: stations that were solved anew.
+    """
+
+    new: dict[str, Pose3]
+    moved: dict[str, tuple[float, float]]
+    misfit: dict[str, float]
+    touched: int
+
+
+@dataclass(eq=False)
+class _Grown:
+    """Arrays that grow: one entry a pair."""
+
+    ids: list[str] = field(default_factory=list)
+    a: list[int] = field(default_factory=list)
+    b: list[int] = field(default_factory=list)
+    rotations: list[FloatArray] = field(default_factory=list)
+    translations: list[FloatArray] = field(default_factory=list)
+    cov: list[FloatArray] = field(default_factory=list)
+    factor: list[int] = field(default_factory=list)
+
+
+class NetworkSession:
+    """A solved network that takes additions; not a value, but the state of one piece of work."""
+
+    def __init__(
+        self, network: PoseNetwork | NetworkSolution, options: SessionOptions = SessionOptions(),
+        solve: NetworkOptions = DEFAULTS,
+    ) -> None:  # fmt: skip
+        solution = network if isinstance(network, NetworkSolution) else solve_network(network, options=solve)
+        self.options, self.solve_options = options, solve
+        self._base = solution.network
+        if self._base.rotation_only:
+            raise SurveyError("sessions take networks of poses; solve a network of rotations as a whole")
+        self._ids = list(self._base.station_ids)
+        self._index = dict(self._base.index_of)
+        self._pair_ids = set(self._base.pair_ids)
+        self._grown = _Grown()
+        self._noise = NoiseCache()
+        self._neighbours: list[list[int]] = [[] for _ in self._ids]
+        used = self._base.used
+        for a, b in zip(self._base.a_idx[used].tolist(), self._base.b_idx[used].tolist(), strict=True):
+            self._neighbours[a].append(b)
+            self._neighbours[b].append(a)
+        self._constant = {int(i): solution.pose(self._ids[i]) for i in np.flatnonzero(self._base.constants)}
+        self._removed: set[str] = set()
+        self._shares: list[float] = []
+        self._switched_at = 0
+        self._restart(solution)
+
+    def _restart(self, solution: NetworkSolution) -> None:
+        """A new tree at a solution."""
+        network = solution.network
+        R, t = solution.rotations, solution.translations
+        self._last = {i: Pose3(Rot3(R[i]), t[i]) for i in range(network.n_stations)}
+        graph, values, self._factor_of = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}
+        for factor in prior_factors(network, self._noise):
+            graph.push_back(factor)
+        rows = [e for e in np.flatnonzero(network.used).tolist()
+                if not (network.constants[network.a_idx[e]] and network.constants[network.b_idx[e]])]  # fmt: skip
+        first = graph.size()
+        for n, factor in enumerate(pair_factors(network, np.array(rows, dtype=np.int64), R, t, noise=self._noise)):
+            graph.push_back(factor)
+            self._factor_of[network.pair_ids[rows[n]]] = first + n
+        for i in np.flatnonzero(~network.constants).tolist():
+            values.insert(i, self._last[i])
+        self._growth: Growth = Tree(self.options.relinearize, self.options.wildfire)
+        self._growth.update(graph, values)
+
+    @property
+    def n_stations(self) -> int:
+        """Stations so far."""
+        return len(self._ids)
+
+    def estimate(self, station_id: str) -> Pose3:
+        """Present ``world_from_station`` of one station."""
+        return self._estimate(self._index[station_id])
+
+    def _estimate(self, i: int) -> Pose3:
+        return self._constant[i] if i in self._constant else self._growth.estimate(i)
+
+    def add(self, pairs: Sequence[Pair]) -> Addition:
+        """Add pairs between stations; stations named for the first time are new.
+
+        Raises SurveyError for a pair id that exists, for a pair that does not join stations and for new stations that
+        no pair ties to the network; the session is then as before.
+        """
+        new, start = self._placed(pairs)
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for station in new:
+            self._index[station] = len(self._ids)
+            self._ids.append(station)
+            self._neighbours.append([])
+            values.insert(self._index[station], start[station])
+            self._last[self._index[station]] = start[station]
+        kept = []
+        for pair in pairs:
+            factor = self._take(pair)
+            if factor is not None:
+                graph.push_back(factor)
+                kept.append(pair)
+        positions, touched = self._growth.update(graph, values)
+        self._factor_of |= {pair.pair_id: n for pair, n in zip(kept, positions, strict=True)}
+        self._choose(touched)
+        ends = sorted({self._index[r.frame_id] for p in pairs for r in (p.a, p.b)})
+        moved = self._moved(ends, {self._index[s] for s in new})
+        misfit = {p.pair_id: self._misfit(p) for p in kept}
+        return Addition({s: self.estimate(s) for s in new}, moved, misfit, touched)
+
+    def _placed(self, pairs: Sequence[Pair]) -> tuple[list[str], dict[str, Pose3]]:
+        """New stations in the order found and where the best of their pairs puts them; checks all pairs first."""
+        fresh: set[str] = set()
+        for pair in pairs:
+            if pair.pair_id in self._pair_ids or pair.pair_id in fresh:
+                raise SurveyError(f"pair id {pair.pair_id!r} exists already; give every pair a name of its own")
+            fresh.add(pair.pair_id)
+            if pair.a.kind != "station" or pair.b.kind != "station" or pair.a.frame_id == pair.b.frame_id:
+                raise SurveyError(f"pair {pair.pair_id!r} does not join two stations")
+            if not np.isfinite(pair.cov).all() or np.linalg.eigvalsh(pair.cov).min() <= 0.0:
+                raise SurveyError(f"pair {pair.pair_id!r} has a covariance that is not symmetric and positive definite")
+        ordered = sorted((p for p in pairs if isinstance(p.b_from_a, Pose3)), key=lambda p: float(np.trace(p.cov)))
+        start: dict[str, Pose3] = {}
+        while True:
+            found = next((p for p in ordered if self._known(p.a.frame_id, start) != self._known(p.b.frame_id, start)),
+                         None)  # fmt: skip
+            if found is None:
+                break
+            a, b = found.a.frame_id, found.b.frame_id
+            measured = found.b_from_a
+            if not isinstance(measured, Pose3):
+                continue
+            if self._known(b, start):
+                start[a] = self._pose_of(b, start).compose(measured)
+            else:
+                start[b] = self._pose_of(a, start).compose(measured.inverse())
+        named = dict.fromkeys(r.frame_id for p in pairs for r in (p.a, p.b))
+        lost = [s for s in named if not self._known(s, start)]
+        if lost:
+            raise SurveyError(f"no pair with a translation ties {', '.join(lost[:8])} to the network; measure one")
+        return [s for s in named if s in start], start
+
+    def _known(self, station: str, start: dict[str, Pose3]) -> bool:
+        return station in self._index or station in start
+
+    def _pose_of(self, station: str, start: dict[str, Pose3]) -> Pose3:
+        return start[station] if station in start else self.estimate(station)
+
+    def _take(self, pair: Pair) -> gtsam.NonlinearFactor | None:
+        """Note a pair down and make its factor (None between held stations)."""
+        a, b = self._index[pair.a.frame_id], self._index[pair.b.frame_id]
+        g, k = self._grown, len(pair.cov)
+        cov = np.zeros((6, 6))
+        cov[:k, :k] = pair.cov
+        measured = pair.b_from_a
+        full = isinstance(measured, Pose3)
+        g.ids.append(pair.pair_id)
+        g.a.append(a)
+        g.b.append(b)
+        g.rotations.append(measured.rotation().matrix() if isinstance(measured, Pose3) else measured.matrix())
+        g.translations.append(measured.translation() if isinstance(measured, Pose3) else np.full(3, np.nan))
+        if not full:
+            cov[3:, 3:] = np.diag([np.inf] * 3)
+        g.cov.append(cov)
+        self._pair_ids.add(pair.pair_id)
+        self._neighbours[a].append(b)
+        self._neighbours[b].append(a)
+        return self._factor(a, b, measured, pair.cov)
+
+    def _factor(self, a: int, b: int, measured: Pose3 | Rot3, cov: FloatArray) -> gtsam.NonlinearFactor | None:
+        k = len(cov)
+        info = np.linalg.inv(cov)
+        W = np.zeros((6, 6))
+        W[:k, :k] = np.linalg.cholesky(0.5 * (info + info.T)).T
+        z = measured if isinstance(measured, Pose3) else Pose3(measured, np.zeros(3))
+        if a in self._constant and b in self._constant:
+            return None
+        if b in self._constant:
+            return gtsam.PriorFactorPose3(a, self._constant[b].compose(z), self._noise(W))
+        if a in self._constant:
+            turned = np.asarray(np.linalg.qr(W @ z.inverse().AdjointMap(), mode="r"))
+            return gtsam.PriorFactorPose3(b, self._constant[a].compose(z.inverse()), self._noise(turned))
+        return gtsam.BetweenFactorPose3(b, a, z, self._noise(W))
+
+    def _moved(self, ends: list[int], new: set[int]) -> dict[str, tuple[float, float]]:
+        """Stations that moved since last asked, found by spreading from the ends of the added pairs."""
+        out: dict[str, tuple[float, float]] = {}
+        waiting, seen = list(ends), set(ends)
+        while waiting:
+            i = waiting.pop()
+            if i in self._constant:
+                continue
+            now = self._estimate(i)
+            step = Pose3.Logmap(self._last[i].between(now))
+            turn, shift = float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:]))
+            far = turn > self.options.moved_rad or shift > self.options.moved_m
+            if far:
+                self._last[i] = now
+                if i not in new:
+                    out[self._ids[i]] = turn, shift
+            if far or i in new:
+                for j in self._neighbours[i]:
+                    if j not in seen:
+                        seen.add(j)
+                        waiting.append(j)
+        return out
+
+    def _misfit(self, pair: Pair) -> float:
+        a, b = self.estimate(pair.a.frame_id), self.estimate(pair.b.frame_id)
+        present, measured = b.between(a), pair.b_from_a
+        if isinstance(measured, Pose3):
+            e = Pose3.Logmap(measured.between(present))
+        else:
+            e = Rot3.Logmap(measured.between(present.rotation()))
+        return float(e @ np.linalg.solve(pair.cov, e))
+
+    def remove(self, pair_ids: Sequence[str]) -> None:
+        """Take pairs out again; they stay listed, out of use. Raises SurveyError for ids that are not in use."""
+        missing = [p for p in pair_ids if p not in self._factor_of]
+        if missing:
+            raise SurveyError(f"pair {missing[0]!r} is not in use in this session")
+        positions = [self._factor_of.pop(p) for p in pair_ids]
+        self._growth.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), positions)
+        self._removed |= set(pair_ids)
+
+    def _choose(self, touched: int) -> None:
+        """Batch iterations where additions touch so much that these are cheaper; judged again at twice the size."""
+        n = len(self._ids)
+        self._shares = [*self._shares[1 - _WINDOW :], touched / max(1, n)]
+        often = len(self._shares) == _WINDOW and float(np.mean(self._shares)) > self.options.batch_share
+        if isinstance(self._growth, Tree) and often and n >= _LEAST:
+            self._switch(Batch(self.options.wildfire))
+        elif isinstance(self._growth, Batch) and n >= 2 * self._switched_at:
+            self._switch(Tree(self.options.relinearize, self.options.wildfire))
+
+    def _switch(self, growth: Growth) -> None:
+        table = moved_over(self._growth, growth)
+        self._factor_of = {pair: table[n] for pair, n in self._factor_of.items()}
+        self._growth, self._shares, self._switched_at = growth, [], len(self._ids)
+
+    @property
+    def in_batches(self) -> bool:
+        """Whether additions are solved by batch iterations."""
+        return isinstance(self._growth, Batch)
+
+    def network(self) -> PoseNetwork:
+        """The whole network as it stands."""
+        base, g = self._base, self._grown
+        start = {i: _rigid(base.station_rotations[i], base.station_translations[i]) for i in range(base.n_stations)
+                 if np.isfinite(base.station_translations[i]).all()}  # fmt: skip
+        ids = [*base.pair_ids, *g.ids]
+        used = np.array([*base.used.tolist(), *[True] * len(g.ids)]) & ~np.isin(ids, sorted(self._removed))
+        translations = np.concatenate([base.translations, np.array(g.translations).reshape(-1, 3)])
+        cov = np.nan_to_num(np.concatenate([base.cov, np.array(g.cov).reshape(-1, 6, 6)]), posinf=0.0)
+        return pose_network(
+            self._ids, ids, np.concatenate([base.a_idx, np.array(g.a, dtype=np.int64)]),
+            np.concatenate([base.b_idx, np.array(g.b, dtype=np.int64)]),
+            np.concatenate([base.rotations, np.array(g.rotations).reshape(-1, 3, 3)]), translations, cov,
+            held={int(i): start[int(i)] for i in base.held}, start=start,
+            prior={i: (start[i], c) for i, c in base.prior_cov.items()},
+            inner=base.inner.tolist() if base.anchor is not None else None, used=used,
+        )  # fmt: skip
+
+    def poses(self) -> tuple[FloatArray, FloatArray]:
+        """Present rotations (N, 3, 3) and translations (N, 3) of all stations."""
+        n = len(self._ids)
+        R, t = np.empty((n, 3, 3)), np.empty((n, 3))
+        rows = gtsam.utilities.extractPose3(self._growth.values())
+        free = np.array([i for i in range(n) if i not in self._constant], dtype=np.int64)
+        R[free], t[free] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
+        for i, pose in self._constant.items():
+            R[i], t[i] = pose.rotation().matrix(), pose.translation()
+        return R, t
+
+    def finish(self) -> NetworkSolution:
+        """The solution of all pairs: batch Gauss-Newton from the present estimates to the minimum."""
+        network = self.network()
+        return as_solution(network, minimize(network, self.poses(), self.solve_options))
+
+
+def _rigid(R: FloatArray, t: FloatArray) -> FloatArray:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = R, t
+    return out
