@@ -192,5 +192,5 @@ def test_an_epoch_with_too_few_points_is_named(which: slice) -> None:
     blocks = list(survey.image_blocks)
     b = blocks[2]
     blocks[2] = replace(b, point_idx=b.point_idx[which], uv=b.uv[which], cov=b.cov[which], used=None)
-    with pytest.raises(IndeterminateError, match="head.* e2"):
+    with pytest.raises(IndeterminateError, match=r"head.* e2"):
         h.solved(replace(survey, image_blocks=tuple(blocks)), near(truth))
