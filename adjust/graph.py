@@ -67,6 +67,7 @@ class AdjustmentGraph:
     bundle: BundleBatch | None
     image_order: list[tuple[int, bool]]
     others: list[ObservationFactor]
+    others_graph: gtsam.NonlinearFactorGraph
 
     def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
         """Evaluate all batches at ``values``."""
@@ -75,10 +76,15 @@ class AdjustmentGraph:
         if self.bundle is not None:
             self.bundle.prepare(values, jacobians, damping)
 
+    def objective(self, values: gtsam.Values) -> float:
+        """Weighted square sum v'Pv at ``values``, at which everything is prepared."""
+        images = float(self.images.chi.sum()) + (self.bundle.chi_square if self.bundle is not None else 0.0)
+        return images + 2.0 * float(self.others_graph.error(values))
+
     def omega(self, values: gtsam.Values) -> float:
         """Weighted square sum v'Pv at ``values``."""
         self.prepare(values, jacobians=False)
-        return 2.0 * float(self.graph.error(values)) + self.images.constant_chi
+        return self.objective(values)
 
     def _split(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rows (N, ...) in the order of ``Survey.image_blocks``, for the image batch and for the bundle."""
@@ -144,10 +150,11 @@ class GraphBuilder:
         positions, pair_chains = self._chains_of_others()
         state = State(self.survey, self.unknowns)
         self._other_factors(state, positions, pair_chains)
-        graph = gtsam.NonlinearFactorGraph()
+        others = gtsam.NonlinearFactorGraph()
         for item in self.others:
             if item.used:
-                graph.add(item.factor)
+                others.add(item.factor)
+        graph = gtsam.NonlinearFactorGraph(others)
         known = [(i, b) for i, free, b in split if not free]
         images = ImageBatch(
             self.survey, self.unknowns, state, [b for _, b in known], [chains[i] for i, _ in known],
@@ -167,7 +174,8 @@ class GraphBuilder:
             bundle.add_factors(graph)
         order = [(i, free) for i, free, _ in split]
         return AdjustmentGraph(
-            self.survey, self.unknowns, state, graph, self._values(start), images, bundle, order, self.others
+            self.survey, self.unknowns, state, graph, self._values(start), images, bundle, order, self.others,
+            others,
         )
 
     def _register_points(self) -> None:

@@ -249,11 +249,6 @@ class ImageBatch:
             if keys:
                 graph.add(gtsam.CustomFactor(noise[int(self.n_rows[b])], keys, _callback(self, b)))
 
-    @property
-    def constant_chi(self) -> float:
-        """Chi-square of the blocks without any unknown, which have no factor."""
-        return float(sum(self.chi[b] for b, keys in enumerate(self.keys) if not keys))
-
     def local_from_keys(self, b: int) -> FloatArray:
         """Derivative (n_lens + 6 + n_warp, sum of key dims) of the block's local unknowns by its keys."""
         nl, n = int(self.state.lenses.n_free[self.camera[b]]), int(self.n_rows[b]) - 1

@@ -52,13 +52,21 @@ class _Loop:
 
     def _set_datum(self) -> None:
         self.datum = inner_datum(self.graph, self.values)
-        self.full = gtsam.NonlinearFactorGraph(self.graph.graph)
+        self.full, self.datum_graph = gtsam.NonlinearFactorGraph(self.graph.graph), gtsam.NonlinearFactorGraph()
         if self.datum is not None:
-            self.full.add(self.datum.factor())
+            self.datum_graph.add(self.datum.factor())
+            self.full.push_back(self.datum_graph)
 
-    def linearize(self) -> gtsam.GaussianFactorGraph:
-        self.graph.prepare(self.values, True, self.damping)
-        return self.full.linearize(self.values)
+    def evaluate(self, values: gtsam.Values) -> float:
+        """Weighted square sum at ``values``; everything is ready to be linearised there, since most steps are good."""
+        try:
+            self.graph.prepare(values, True, self.damping)
+        except IndeterminateError:
+            if values is self.values:
+                raise
+            return np.inf  # a step that made a point undetermined is no step
+        omega = self.graph.objective(values)
+        return omega + (2.0 * float(self.datum_graph.error(values)) if self.datum is not None else 0.0)
 
     def step(self, linear: gtsam.GaussianFactorGraph) -> gtsam.VectorValues:
         """The (damped) step; raises IndeterminateError by name where there is none."""
@@ -87,13 +95,9 @@ class _Loop:
         keys = [k for k in self.full.keyVector() if k in by_key and by_key[k].name[0] in late]
         return keys if len(keys) < len(list(self.full.keyVector())) else []
 
-    def total(self, values: gtsam.Values) -> float:
-        self.graph.prepare(values, jacobians=False)
-        return 2.0 * float(self.full.error(values))
-
     def run(self) -> Solved:
-        omega = self.total(self.values)
-        linear = self.linearize()
+        omega = self.evaluate(self.values)
+        linear = self.full.linearize(self.values)
         moved = before = np.inf
         for iteration in range(1, self.options.max_iterations + 1):
             delta = self.step(linear)
@@ -104,7 +108,7 @@ class _Loop:
                 self.graph.bundle.complete(delta)
             before, moved = moved, np.sqrt(max(0.0, decrease))
             trial = self.values.retract(delta)
-            new = self.total(trial)
+            used, new = self.damping, self.evaluate(trial)
             behind = self.graph.behind_camera()
             if self._accept(new, omega, moved, bool(behind)):
                 self.values, omega = trial, new
@@ -119,7 +123,9 @@ class _Loop:
                 self.damping = max(self.damping * 10.0, self.options.first_damping)
                 if self.damping > 1e8:
                     raise self._stuck(iteration, moved)
-            linear = self.linearize()
+            if self.damping != used or self.values is not trial:
+                self.graph.prepare(self.values, True, self.damping)
+            linear = self.full.linearize(self.values)
         raise self._stuck(self.options.max_iterations, moved)
 
     @staticmethod
@@ -138,13 +144,11 @@ class _Loop:
     def _finish(self, omega: float, iteration: int, moved: float) -> Solved:
         if self.datum is not None:
             self._set_datum()  # about the solution, where the covariances belong; the solution stays
-        linear = self.linearize()
+            self.graph.prepare(self.values, True)
+        linear = self.full.linearize(self.values)
         if self.ordering is None:
             raise ValueError("no ordering before the first step")
-        return Solved(
-            self.values, linear, self.ordering, self.use_qr, omega + self.graph.images.constant_chi, iteration, moved,
-            self.datum,
-        )  # fmt: skip
+        return Solved(self.values, linear, self.ordering, self.use_qr, omega, iteration, moved, self.datum)
 
 
 def damped(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.GaussianFactorGraph:
@@ -158,9 +162,7 @@ def damped(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, damping: f
     return out
 
 
-def solve(
-    graph: AdjustmentGraph, options: SolveOptions = SolveOptions(), progress: Progress | None = None
-) -> Solved:
+def solve(graph: AdjustmentGraph, options: SolveOptions = SolveOptions(), progress: Progress | None = None) -> Solved:
     """Adjust. Raises IndeterminateError (named), NotConvergedError, SurveyError."""
     nothing = unobserved_unknowns(graph)
     if nothing:

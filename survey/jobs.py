@@ -175,12 +175,16 @@ def adjust_job(
 ) -> AdjustOutcome:
     """The main job: detect where that has not been done, adjust everything, write the results. Raises SurveyError."""
     clock, folder = _Clock(), Path(folder)
-    with clock.step("read"):
-        project = read(folder)
     messages: tuple[str, ...] = ()
-    if project.images and (redetect or not (project.survey.image_blocks or project.spots)):
+    if redetect:
         with clock.step("detect"):
             messages = detect_job(folder, progress=progress).problems
+    with clock.step("read"):
+        project = read(folder)
+    if project.images and not redetect and not (project.survey.image_blocks or project.spots):
+        with clock.step("detect"):
+            messages = detect_job(folder, progress=progress).problems
+        with clock.step("read"):
             project = read(folder)
     with clock.step("adjust"):
         adjustment = _adjust_project(project, progress)
