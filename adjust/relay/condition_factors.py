@@ -5,7 +5,6 @@ nothing of their size, so it loses them in large sets: the loop here takes full 
 refuses more loops than were found safe.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -30,15 +29,6 @@ class FactorSolution:
     cov: FloatArray
     closure: float
     iterations: int
-    marginals: gtsam.Marginals
-
-    def joint(self, pair_idx: Sequence[int]) -> FloatArray:
-        """Joint covariance of several adjusted pairs."""
-        keys = [int(e) for e in pair_idx]
-        if len(keys) == 1:  # GTSAM's joint covariance wants two at least
-            return np.asarray(self.marginals.marginalCovariance(keys[0]))
-        joint = self.marginals.jointMarginalCovariance(keys)
-        return np.block([[joint.at(a, b) for b in keys] for a in keys])
 
 
 def solve_factors(
@@ -63,7 +53,7 @@ def solve_factors(
         if closure < limit and step < max_step:
             marginals = gtsam.Marginals(graph, values)
             cov = np.array([marginals.marginalCovariance(e) for e in range(n)])
-            return FactorSolution(X, cov, closure, iteration, marginals)
+            return FactorSolution(X, cov, closure, iteration)
         if not np.isfinite(step):
             break
     raise NotConvergedError(

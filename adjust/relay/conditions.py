@@ -28,7 +28,7 @@ from adjust.relay.normal_equations import (
     condition_matrix,
     joint_covariance,
 )
-from adjust.relay.result import AdjustedPairs, adjusted_pairs, whitening
+from adjust.relay.result import AdjustedPairs, Joint, adjusted_pairs, whitening
 
 # side of the dense matrix that the spanning tree's way may need
 MAX_TREE_SIDE = 3000
@@ -92,8 +92,9 @@ def adjust_condition_factors(network: Network, options: ConditionOptions = Condi
     basis = loop_basis(network.topology, _loop_kind(network, options))
     limit = options.closure * max(1.0, _reach(network))
     found: FactorSolution = solve_factors(network, basis, limit, options.max_step, options.max_iterations)
+    joint = _precision(network, basis, found.b_from_a)[1]
     total = network.dim * len(basis)
-    pairs = adjusted_pairs(network, found.b_from_a, found.cov, total, found.iterations, found.joint)
+    pairs = adjusted_pairs(network, found.b_from_a, found.cov, total, found.iterations, joint)
     return ConditionAdjustment(pairs, basis, found.closure)
 
 
@@ -126,10 +127,16 @@ def _normals(basis: LoopBasis, blocks: FloatArray, Q: FloatArray) -> NormalEquat
 
 
 def _finish(network: Network, basis: LoopBasis, X: Motions, closure: float, iterations: int) -> ConditionAdjustment:
+    normals, joint = _precision(network, basis, X)
+    cov, total = normals.adjusted_covariances(), network.dim * len(basis)
+    return ConditionAdjustment(adjusted_pairs(network, X, cov, total, iterations, joint), basis, closure)
+
+
+def _precision(network: Network, basis: LoopBasis, X: Motions) -> tuple[NormalEquations, Joint]:
+    """Normal equations at the solution, and the joint covariance of chosen pairs.
+
+    GTSAM's own joint covariance inverts an information matrix, which pairs that close a loop do not have.
+    """
     _, blocks, _, Q = _linearise(network, basis, X)
     B, normals = condition_matrix(basis, blocks), _normals(basis, blocks, Q)
-    pairs = adjusted_pairs(
-        network, X, normals.adjusted_covariances(), network.dim * len(basis), iterations,
-        lambda pair_idx: joint_covariance(normals, B, Q, pair_idx),
-    )  # fmt: skip
-    return ConditionAdjustment(pairs, basis, closure)
+    return normals, lambda pair_idx: joint_covariance(normals, B, Q, pair_idx)

@@ -12,6 +12,9 @@ from adjust.relay.motions import Motions, right_jacobian_inverse
 from adjust.relay.network import Network
 from adjust.result import GlobalTest
 
+# joint covariance of adjusted pairs by their positions
+Joint = Callable[[Sequence[int]], FloatArray]
+
 # eigenvalues of a residual's cofactors (1 where others control it fully) below which it is not tested
 _UNCONTROLLED = 1e-9
 
@@ -60,7 +63,7 @@ class AdjustedPairs:
     omega: float
     redundancy_total: int
     iterations: int
-    joint: Callable[[Sequence[int]], FloatArray]
+    joint: Joint
 
     @property
     def sigma0(self) -> float:
@@ -90,7 +93,7 @@ class AdjustedPairs:
 
 def adjusted_pairs(
     network: Network, b_from_a: Motions, cov: FloatArray, redundancy_total: int, iterations: int,
-    joint: Callable[[Sequence[int]], FloatArray],
+    joint: Joint,
 ) -> AdjustedPairs:  # fmt: skip
     """The statistics that follow from the adjusted pairs and their covariances: Q_vv = Q_ll - Q_adjusted."""
     v = (network.b_from_a.inverse() @ b_from_a).log()
