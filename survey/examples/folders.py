@@ -76,7 +76,14 @@ world_from_station = { treatment = "held" }        # and the bar that of the wor
 
 
 def _targets(draft: Draft) -> str:
-    return "".join(_target(target, draft.kinds[target.target_id]) for target in draft.targets)
+    text = ""
+    for target in draft.targets:
+        seen_by = dict.fromkeys(s.camera_id for s in draft.shots if target.target_id in s.target_ids)
+        text += _target(target, draft.kinds[target.target_id])
+        if len(seen_by) < len(draft.cameras):
+            names = ", ".join(f'"{name}"' for name in seen_by)
+            text += f"cameras = [{names}]    # only their images are searched for it\n"
+    return text
 
 
 def _target(target: Target, kind: TargetKind) -> str:
