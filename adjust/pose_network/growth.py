@@ -35,7 +35,9 @@ class Tree:
         parameters = gtsam.ISAM2Params()
         parameters.setRelinearizeThreshold(relinearize)
         parameters.relinearizeSkip = 1
+        parameters.enablePartialRelinearizationCheck = True  # looks only where the step changed, not at every station
         parameters.setFactorization("QR")
+        parameters.enableAdaptiveReorder = False
         inner = gtsam.ISAM2GaussNewtonParams()
         inner.setWildfireThreshold(wildfire)
         parameters.setOptimizationParams(inner)

@@ -99,7 +99,8 @@ class GaussNewton:
     def run(self, options: NetworkOptions, progress: Progress | None = None) -> tuple[int, float, list[float]]:
         """Iterate to the minimum: steps, last step in sigmas, v'Pv before and after every step."""
         history = [2.0 * float(self.graph.error(self.values))]
-        best, best_values, waited, before = history[0], self.values, 0, np.inf
+        best, best_values, waited = history[0], self.values, 0
+        steps: list[float] = []
         for iteration in range(1, options.max_iterations + 1):
             linear = self.graph.linearize(self.values)
             delta = self.solve(linear)
@@ -108,16 +109,16 @@ class GaussNewton:
             history.append(2.0 * float(self.graph.error(self.values)))
             if progress:
                 progress(iteration, history[-1])
-            if self.damping == 0.0 and self._arrived(moved, before, history, options):
+            steps.append(moved)
+            if self.damping == 0.0 and self._arrived(steps, options):
                 return iteration, moved, history
-            before = moved
             if history[-1] < best:
                 best, best_values, waited = history[-1], self.values, 0
                 self.damping = self.damping / 10.0 if self.damping > 1e-7 else 0.0
                 continue
             waited += 1
             if (self.damping > 0.0 or waited >= options.patience) and not moved < 1e-3:
-                self.values, before = best_values, np.inf
+                self.values, steps = best_values, []
                 self.damping = max(10.0 * self.damping, 1e-5)
             if not np.isfinite(history[-1]) or self.damping > 1e10:
                 break
@@ -127,13 +128,12 @@ class GaussNewton:
         )
 
     @staticmethod
-    def _arrived(moved: float, before: float, history: list[float], options: NetworkOptions) -> bool:
-        ratio = min(1.0, moved / before) if np.isfinite(before) and before > 0.0 else 1.0
-        if moved * ratio < options.max_step:
+    def _arrived(steps: list[float], options: NetworkOptions) -> bool:
+        """Steps shrink at least linearly near the minimum; where rounding alone moves the unknowns they stay small."""
+        ratio = min(1.0, steps[-1] / steps[-2]) if len(steps) > 1 and steps[-2] > 0.0 else 1.0
+        if steps[-1] * ratio < options.max_step:
             return True
-        # in very weak networks rounding alone moves the unknowns: no better point can be told from this one
-        floor = 1e-9 * np.sqrt(max(1.0, history[-1]))
-        return bool(moved < 1e-3 and ratio > 0.3 and abs(history[-1] - history[-2]) <= max(floor, 1e-11 * history[-1]))
+        return len(steps) > 4 and max(steps[-4:]) < 1e-3 and steps[-1] > 0.1 * steps[-4]
 
 
 def minimize(

@@ -1,0 +1,70 @@
+"""Simulated networks of stations, with rotations and noise by SciPy and plain lines."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from adjust.model import FloatArray
+from adjust.pose_network import PoseNetwork, pose_network
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    network: PoseNetwork
+    rotations: FloatArray
+    translations: FloatArray
+    wrong: tuple[str, ...]
+
+
+def exp6(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Motions of tangents (n, 6), rotation first, by the power series of the 4 x 4 matrix."""
+    X = np.zeros((len(x), 4, 4))
+    X[:, 0, 1], X[:, 0, 2], X[:, 1, 2] = -x[:, 2], x[:, 1], -x[:, 0]
+    X[:, :3, :3] -= np.swapaxes(X[:, :3, :3], 1, 2)
+    X[:, :3, 3] = x[:, 3:]
+    out = term = np.tile(np.eye(4), (len(x), 1, 1))
+    for k in range(1, 30):
+        term = term @ X / k
+        out = out + term
+    return out[:, :3, :3], out[:, :3, 3]
+
+
+def grid_edges(nx: int, ny: int) -> list[tuple[int, int]]:
+    """A corridor of width ny that grows along x: every station to its predecessor and to the row before."""
+    n = nx * ny
+    return [(j - s, j) for j in range(n) for s in (1, ny) if (s == 1 and j % ny) or (s == ny and j >= ny)]
+
+
+def simulate(
+    nx: int, ny: int, seed: int = 0, wrong: int = 0, extra: int = 0, sigma_rad: float = 1e-3, sigma_m: float = 1e-2,
+    free: bool = False, rotations_only: bool = False,
+) -> Simulated:
+    """A grid of stations 10 m apart with full covariances, ``extra`` random pairs and ``wrong`` gross errors."""
+    rng = np.random.default_rng(seed)
+    n = nx * ny
+    R = Rotation.from_rotvec(rng.normal(size=(n, 3)) * 0.3).as_matrix()
+    i = np.arange(n)
+    t = np.column_stack([10.0 * (i // ny), 10.0 * (i % ny), rng.normal(size=n)])
+    edges = grid_edges(nx, ny) + [tuple(rng.choice(n, 2, replace=False)) for _ in range(extra)]
+    b, a = np.array(edges).T
+    A = rng.normal(size=(6, 6))
+    s = np.repeat([sigma_rad, sigma_m], 3)
+    cov = (A @ A.T / 6 + 0.5 * np.eye(6)) * s[:, None] * s
+    noise_R, noise_t = exp6(rng.normal(size=(len(a), 6)) @ np.linalg.cholesky(cov).T)
+    back = np.swapaxes(R[b], 1, 2)
+    Z_R, Z_t = back @ R[a], np.einsum("nij,nj->ni", back, t[a] - t[b])
+    Z_t = np.einsum("nij,nj->ni", Z_R, noise_t) + Z_t
+    Z_R = Z_R @ noise_R
+    bad = rng.choice(len(a), wrong, replace=False)
+    for e in bad:
+        Z_R[e] = Rotation.from_rotvec(rng.normal(size=3) * 0.3).as_matrix() @ Z_R[e]
+        Z_t[e] += rng.normal(size=3)
+    first = np.eye(4)
+    first[:3, :3], first[:3, 3] = R[0], t[0]
+    names = [f"p{e}" for e in range(len(a))]
+    network = pose_network(
+        [f"s{k}" for k in range(n)], names, a, b, Z_R, None if rotations_only else Z_t,
+        np.tile(cov[:3, :3] if rotations_only else cov, (len(a), 1, 1)), held=None if free else {0: first},
+    )  # fmt: skip
+    return Simulated(network, R, t, tuple(names[e] for e in bad))

@@ -1,0 +1,339 @@
+import gtsam
+import numpy as np
+import pytest
+from gtsam import Pose3, Rot3
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from adjust.adjustment import adjust
+from adjust.errors import IndeterminateError, SurveyError
+from adjust.model import Datum, PoseParameter, Station, Survey
+from adjust.observations import FrameRef, Pair
+from adjust.pose_network import NetworkOptions, pose_network, solve_network
+from adjust.pose_network.chordal import chordal_cost, minimize_chordal
+from adjust.pose_network.from_survey import network_adjustment, network_from_survey
+from adjust.pose_network.network import PoseNetwork, loop_marks
+from adjust.pose_network.precision import pair_jacobians
+from adjust.pose_network.solve import minimize
+from adjust.relay.motions import Motions
+from tests.adjust.pose_networks import exp6, simulate
+
+PLAIN = NetworkOptions(robust="off")
+
+
+def motions_of(solution) -> Motions:
+    return Motions(solution.rotations, None if solution.network.rotation_only else solution.translations)
+
+
+def dense(network: PoseNetwork, here: Motions) -> np.ndarray:
+    """Whitened Jacobian of the pairs in use by all stations, dense."""
+    _, by_b, by_a, _ = pair_jacobians(network, here)
+    d = network.dim
+    A = np.zeros((network.n_pairs * d, network.n_stations * d))
+    for e in np.flatnonzero(network.used):
+        rows = slice(e * d, e * d + d)
+        for i, J in ((network.b_idx[e], by_b[e]), (network.a_idx[e], by_a[e])):
+            A[rows, i * d : i * d + d] += network.whitening[e] @ J
+    return A
+
+
+def test_exact_measurements_give_the_stations_back() -> None:
+    sim = simulate(4, 3, sigma_rad=1e-12, sigma_m=1e-12)
+    solution = solve_network(sim.network, options=PLAIN)
+    assert solution.rotations == pytest.approx(sim.rotations, abs=1e-9)
+    assert solution.translations == pytest.approx(sim.translations, abs=1e-8)
+
+
+def test_a_triangle_of_turns_spreads_its_misclosure_evenly() -> None:
+    # three equal rotations about one axis that should close but miss by 3 d: each is corrected by d
+    d, third = 1e-3, 2 * np.pi / 3
+    R = Rotation.from_rotvec(np.tile([0, 0, third + d], (3, 1))).as_matrix()
+    net = pose_network("abc", ["ab", "bc", "ca"], [1, 2, 0], [0, 1, 2], R, None, np.tile(np.eye(3) * 1e-6, (3, 1, 1)),
+                       held={0: np.eye(4)})  # fmt: skip
+    solution = solve_network(net)
+    assert solution.precision.pairs.residual == pytest.approx(np.tile([0, 0, -d], (3, 1)), abs=1e-12)
+    assert solution.omega == pytest.approx(3.0)
+    # two thirds of the variance is left, by hand; every pair has redundancy 1/3 in each component
+    assert solution.precision.station_cov[1] == pytest.approx(np.eye(3) * 2e-6 / 3, rel=1e-9)
+    assert solution.precision.pairs.redundancy == pytest.approx(np.full((3, 3), 1 / 3), rel=1e-9)
+
+
+@pytest.mark.parametrize("rotations_only", [False, True])
+def test_jacobians_away_from_zero_error(rotations_only: bool) -> None:
+    sim = simulate(3, 2, sigma_rad=0.3, sigma_m=0.5, rotations_only=rotations_only)
+    net, rng = sim.network, np.random.default_rng(1)
+    turned = sim.rotations @ Rotation.from_rotvec(rng.normal(size=(6, 3)) * 0.2).as_matrix()
+    here = Motions(turned, None if rotations_only else sim.translations + rng.normal(size=(6, 3)))
+    _, by_b, by_a, _ = pair_jacobians(net, here)
+    assert np.abs(pair_jacobians(net, here)[0]).max() > 0.3
+    h = 1e-6
+    for k in range(net.dim):
+        for station, J in ((net.b_idx, by_b), (net.a_idx, by_a)):
+            for e in range(net.n_pairs):
+                r = []
+                for sign in (1, -1):
+                    step = np.zeros((6, 6))
+                    step[station[e], k] = sign * h
+                    dR, dt = exp6(step)
+                    t = None if here.translation is None else (
+                        here.translation + np.einsum("nij,nj->ni", here.rotation, dt)
+                    )
+                    r.append(pair_jacobians(net, Motions(here.rotation @ dR, t))[0][e])
+                assert (r[0] - r[1]) / (2 * h) == pytest.approx(J[e, :, k], abs=1e-7)
+
+
+def test_minimum_is_stationary_and_the_same_from_another_start() -> None:
+    sim = simulate(6, 5, sigma_rad=0.05, sigma_m=0.3)
+    net = sim.network
+    first = minimize(net)
+    rng = np.random.default_rng(0)
+    away = first.rotations @ Rotation.from_rotvec(rng.normal(size=(30, 3)) * 0.2).as_matrix()
+    second = minimize(net, (away, first.translations + rng.normal(size=(30, 3))))
+    assert second.omega == pytest.approx(first.omega, rel=1e-12)
+    assert second.translations == pytest.approx(first.translations, abs=1e-5)
+    for m in (first, second):
+        here = Motions(m.rotations, m.translations)
+        A = dense(net, here)[:, 6:]
+        e = np.einsum("nij,nj->ni", net.whitening, pair_jacobians(net, here)[0]).ravel()
+        # gradient in units of the largest it could be
+        assert np.abs(A.T @ e).max() < 1e-6 * np.linalg.norm(A, axis=0).max() * np.linalg.norm(e)
+
+
+def test_a_wrong_start_is_survived() -> None:
+    sim = simulate(5, 4)
+    R = Rotation.from_rotvec(np.random.default_rng(0).normal(size=(20, 3)) * 0.5).as_matrix() @ sim.rotations
+    good = minimize(sim.network)
+    assert minimize(sim.network, (R, sim.translations + 5.0)).omega == pytest.approx(good.omega, rel=1e-9)
+
+
+@pytest.mark.parametrize("rotations_only", [False, True])
+def test_covariances_and_statistics_equal_dense_algebra(rotations_only: bool) -> None:
+    sim = simulate(5, 3, extra=6, sigma_rad=0.01, sigma_m=0.1, rotations_only=rotations_only)
+    used = np.ones(sim.network.n_pairs, dtype=bool)
+    used[[2, 7]] = False
+    net = sim.network.with_used(used)
+    solution = solve_network(net, options=PLAIN)
+    d, here = net.dim, motions_of(solution)
+    A = dense(net, here)[:, d:]
+    Q = np.zeros((net.n_stations * d,) * 2)
+    Q[d:, d:] = np.linalg.inv(A.T @ A)
+    P = solution.precision
+    for i in range(net.n_stations):
+        assert P.station_cov[i] == pytest.approx(Q[i * d : i * d + d, i * d : i * d + d], rel=1e-7, abs=1e-14)
+    apart = [1, 14, 7, 0]
+    rows = np.concatenate([np.arange(i * d, i * d + d) for i in apart])
+    assert P.joint(apart) == pytest.approx(Q[np.ix_(rows, rows)], rel=1e-6, abs=1e-13)
+    uncontrolled = np.flatnonzero(used & (loop_marks(net, used)[0] == 0))
+    everything = dense(net.with_used(np.ones_like(used)), here)
+    e = np.einsum("nij,nj->ni", net.whitening, pair_jacobians(net, here)[0])
+    for k in range(net.n_pairs):
+        J = everything[k * d : k * d + d]
+        M = J @ Q @ J.T
+        Qvv = np.eye(d) - M if used[k] else np.eye(d) + M
+        if k in uncontrolled:
+            assert P.pairs.freedom[k] == 0
+        else:
+            assert P.pairs.test[k] == pytest.approx(e[k] @ np.linalg.solve(Qvv, e[k]), rel=1e-6)
+        assert P.pairs.redundancy[k] == pytest.approx(np.diag(Qvv) if used[k] else np.zeros(d), abs=1e-8)
+        a, b = net.a_idx[k], net.b_idx[k]
+        _, own = P.relative(a, b)
+        assert P.pairs.adjusted_cov[k] == pytest.approx(own, rel=1e-7, abs=1e-14)
+    assert P.pairs.redundancy.sum() == pytest.approx(solution.redundancy, abs=1e-7)
+
+
+def test_inner_datum_is_the_pseudo_inverse_and_relative_precision_does_not_depend_on_it() -> None:
+    sim = simulate(4, 3, extra=4, free=True, sigma_rad=0.01, sigma_m=0.1)
+    net = sim.network
+    free = solve_network(net, options=PLAIN)
+    A = dense(net, motions_of(free))
+    Q = np.linalg.pinv(A.T @ A, rcond=1e-13, hermitian=True)
+    assert free.precision.station_cov[5] == pytest.approx(Q[30:36, 30:36], rel=1e-6, abs=1e-12)
+    assert free.precision.station_cov[0] == pytest.approx(Q[:6, :6], rel=1e-6, abs=1e-12)
+    rows = np.r_[6:12, 60:66]
+    assert free.precision.joint([1, 10]) == pytest.approx(Q[np.ix_(rows, rows)], rel=1e-6, abs=1e-12)
+    held = solve_network(
+        pose_network(net.station_ids, net.pair_ids, net.a_idx, net.b_idx, net.rotations, net.translations, net.cov,
+                     held={7: np.eye(4)}), options=PLAIN,
+    )  # fmt: skip
+    assert held.omega == pytest.approx(free.omega, rel=1e-10)
+    for one, other in zip(held.relative("s1", "s10"), free.relative("s1", "s10"), strict=True):
+        assert one == pytest.approx(other, rel=1e-6, abs=1e-9)
+
+
+def test_covariance_equals_the_scatter_of_repeated_networks() -> None:
+    total, n = 0.0, 0
+    for seed in range(40):
+        sim = simulate(4, 3, seed=seed)
+        solution = solve_network(sim.network, options=PLAIN)
+        error = (Motions(sim.rotations, sim.translations).inverse() @ motions_of(solution)).log()
+        last = error[-1]
+        total, n = total + last @ np.linalg.solve(solution.precision.station_cov[-1], last), n + 6
+    assert chi2.ppf(1e-4, n) < total < chi2.ppf(1 - 1e-4, n)
+
+
+def test_wrong_pairs_are_found_and_named_in_a_small_network() -> None:
+    for seed in range(6):
+        sim = simulate(6, 5, seed=seed, wrong=3, extra=25)
+        solution = solve_network(sim.network)
+        assert {r.pair_id for r in solution.rejected} == set(sim.wrong)
+        clean = solve_network(sim.network.with_used(~np.isin(sim.network.pair_ids, sim.wrong)), options=PLAIN)
+        assert solution.omega == pytest.approx(clean.omega, rel=1e-9)
+        test = solution.global_test(1e-4)
+        assert test is not None
+        assert test.passed
+        again = solve_network(solution.reinstated(tuple(sim.wrong)), options=PLAIN)
+        assert again.network.used.all()
+        assert again.omega > 100 * solution.omega
+
+
+def test_false_alarms_stay_at_their_rate() -> None:
+    alarms = sum(bool(solve_network(simulate(4, 3, seed=s, extra=8).network).rejected) for s in range(100, 220))
+    # alpha = 0.01 a network: 1.2 expected in 120
+    assert alarms <= 5
+
+
+def test_a_wrong_pair_that_cannot_be_told_from_its_neighbour_says_so() -> None:
+    R = np.tile(np.eye(3), (4, 1, 1))
+    t = np.tile([1.0, 0, 0], (4, 1))
+    t[3] = [-3.0, 0.5, 0.0]
+    ids = ["ab", "bc", "cd", "da"]
+    net = pose_network("abcd", ids, [1, 2, 3, 0], [0, 1, 2, 3], R, t, np.tile(np.eye(6) * 1e-6, (4, 1, 1)),
+                       held={0: np.eye(4)})  # fmt: skip
+    solution = solve_network(net)
+    assert len(solution.rejected) == 1
+    found = solution.rejected[0]
+    assert {found.pair_id, *found.inseparable} == set(ids)
+
+
+def test_loop_marks_name_bridges() -> None:
+    R = np.tile(np.eye(3), (4, 1, 1))
+    net = pose_network("abcd", ["ab", "bc", "ca", "cd"], [0, 1, 2, 2], [1, 2, 0, 3], R, None,
+                       np.tile(np.eye(3), (4, 1, 1)))  # fmt: skip
+    loops, mark = loop_marks(net, net.used)
+    assert loops.tolist() == [1, 1, 1, 0]
+    assert len(set(mark[:3])) == 1
+
+
+def test_what_floats_is_named() -> None:
+    sim = simulate(3, 2)
+    net = sim.network
+    cut = net.with_used((net.a_idx != 5) & (net.b_idx != 5))
+    with pytest.raises(IndeterminateError, match="s5"):
+        solve_network(cut)
+    t = net.translations.copy()
+    t[(net.a_idx == 5) | (net.b_idx == 5)] = np.nan
+    half = pose_network(net.station_ids, net.pair_ids, net.a_idx, net.b_idx, net.rotations, t, net.cov, held={0: np.eye(4)})
+    with pytest.raises(IndeterminateError, match="the position of s5"):
+        solve_network(half)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"a_idx": [0, 9]}, "'p1' names a station that does not exist"),
+        ({"b_idx": [1, 1]}, "'p1' joins a station with itself"),
+        ({"rotations": np.array([np.eye(3), -np.eye(3)])}, "'p1' has a matrix that is no rotation"),
+        ({"cov": np.array([np.eye(6), np.diag([1.0, 1, 1, 1, 1, -1])])}, "'p1' has a covariance"),
+        ({"cov": np.array([np.eye(6), np.full((6, 6), np.nan)])}, "'p1' has a covariance"),
+        ({"pair_ids": ["p0", "p0"]}, "'p0' occurs twice"),
+    ],
+)
+def test_wrong_arrays_are_refused_by_name(change: dict, message: str) -> None:
+    good = {
+        "station_ids": ["a", "b"], "pair_ids": ["p0", "p1"], "a_idx": [0, 1], "b_idx": [1, 0],
+        "rotations": np.tile(np.eye(3), (2, 1, 1)), "translations": np.zeros((2, 3)), "cov": np.tile(np.eye(6), (2, 1, 1)),
+    }  # fmt: skip
+    pose_network(**good, held={0: np.eye(4)})
+    with pytest.raises(SurveyError, match=message):
+        pose_network(**{**good, **change}, held={0: np.eye(4)})
+
+
+def survey_of(sim, inner: bool) -> Survey:
+    net = sim.network
+    first = Pose3(Rot3(sim.rotations[0]), sim.translations[0])
+    mean = Pose3(Rot3(sim.rotations[7]), sim.translations[7])
+    known = {} if inner else {
+        0: PoseParameter(first, "held"), 7: PoseParameter(mean, "prior", np.diag([1e-2] * 3 + [0.01] * 3) ** 2)
+    }
+    stations = tuple(Station(s, "fixed", known.get(i, PoseParameter())) for i, s in enumerate(net.station_ids))
+    pairs = []
+    for e, p in enumerate(net.pair_ids):
+        a, b = (FrameRef("station", net.station_ids[i[e]]) for i in (net.a_idx, net.b_idx))
+        full = e % 7 > 0
+        motion = Pose3(Rot3(net.rotations[e]), net.translations[e]) if full else Rot3(net.rotations[e])
+        pairs.append(Pair(p, a, b, motion, net.cov[e] if full else net.cov[e][:3, :3], used=e != 5))
+    return Survey(stations=stations, pairs=tuple(pairs), datum=Datum("inner") if inner else Datum())
+
+
+@pytest.mark.parametrize("inner", [False, True])
+def test_a_survey_of_pairs_is_adjusted_alike_both_ways(inner: bool) -> None:
+    survey = survey_of(simulate(5, 4, extra=6, sigma_rad=0.01, sigma_m=0.1), inner)
+    general = adjust(survey)
+    network = network_adjustment(survey, solve_network(network_from_survey(survey), options=PLAIN))
+    assert network.omega == pytest.approx(general.omega, rel=1e-9)
+    for field in ("n_observations", "n_unknowns", "datum_defect", "redundancy"):
+        assert getattr(network, field) == getattr(general, field)
+    for name, estimate in general.estimates.items():
+        assert network.estimates[name].value.matrix() == pytest.approx(estimate.value.matrix(), abs=1e-6)
+        assert network.estimates[name].cov == pytest.approx(estimate.cov, rel=1e-5, abs=1e-12)
+    for ours, theirs in zip(network.other_residuals, general.other_residuals, strict=True):
+        assert ours.ids == theirs.ids
+        for field in ("observed", "adjusted", "residual", "sigma", "redundancy", "standardized", "test"):
+            assert getattr(ours, field) == pytest.approx(getattr(theirs, field), rel=1e-5, abs=1e-6, nan_ok=True)
+    names = [("world_from_station", "s3"), ("world_from_station", "s12")]
+    assert network.precision.joint(names) == pytest.approx(general.precision.joint(names), rel=1e-5, abs=1e-12)
+
+
+def test_a_survey_of_pairs_starts_from_nothing_where_a_spanning_tree_fails() -> None:
+    sim = simulate(12, 10, sigma_rad=0.05, sigma_m=0.3, wrong=0)
+    net = sim.network
+    stations = tuple(Station(s, "fixed", PoseParameter(Pose3(), "held") if i == 0 else PoseParameter())
+                     for i, s in enumerate(net.station_ids))  # fmt: skip
+    pairs = tuple(
+        Pair(p, FrameRef("station", net.station_ids[net.a_idx[e]]), FrameRef("station", net.station_ids[net.b_idx[e]]),
+             Pose3(Rot3(net.rotations[e]), net.translations[e]), net.cov[e])
+        for e, p in enumerate(net.pair_ids)
+    )  # fmt: skip
+    general = adjust(Survey(stations=stations, pairs=pairs))
+    assert general.omega == pytest.approx(solve_network(net, options=PLAIN).omega, rel=1e-8)
+    assert general.iterations <= 4
+    with pytest.raises(IndeterminateError, match="datum"):
+        network_from_survey(Survey(stations=tuple(Station(s.station_id) for s in stations), pairs=pairs))
+
+
+def test_chordal_cost_by_hand_and_its_minimum_against_gtsam() -> None:
+    sim = simulate(4, 3, sigma_rad=0.05, sigma_m=0.3)
+    net = sim.network
+    R, t = sim.rotations, sim.translations
+    expected = 0.0
+    for e in range(net.n_pairs):
+        info = np.linalg.inv(net.cov[e])
+        kappa, tau = 1.5 / np.trace(np.linalg.inv(info[:3, :3])), 3.0 / np.trace(np.linalg.inv(info[3:, 3:]))
+        i, j = net.b_idx[e], net.a_idx[e]
+        expected += kappa * np.sum((R[j] - R[i] @ net.rotations[e]) ** 2)
+        expected += tau * np.sum((t[j] - t[i] - R[i] @ net.translations[e]) ** 2)
+    assert chordal_cost(net, R, t) == pytest.approx(expected, rel=1e-12)
+    found = minimize_chordal(net)
+    assert found.cost < expected
+    rng = np.random.default_rng(0)
+    for _ in range(20):  # no way down from there
+        dR = Rotation.from_rotvec(rng.normal(size=(12, 3)) * 1e-4).as_matrix()
+        assert chordal_cost(net, found.rotations @ dR, found.translations + rng.normal(size=(12, 3)) * 1e-4) > found.cost
+
+
+def test_our_least_squares_equals_gtsams_optimiser() -> None:
+    sim = simulate(4, 3)
+    net = sim.network
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for e in range(net.n_pairs):
+        noise = gtsam.noiseModel.Gaussian.Covariance(net.cov[e])
+        z = Pose3(Rot3(net.rotations[e]), net.translations[e])
+        graph.add(gtsam.BetweenFactorPose3(int(net.b_idx[e]), int(net.a_idx[e]), z, noise))
+    for i in range(net.n_stations):
+        values.insert(i, Pose3(Rot3(sim.rotations[i]), sim.translations[i]))
+    graph.add(gtsam.NonlinearEqualityPose3(0, values.atPose3(0)))
+    theirs = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    ours = solve_network(net, options=PLAIN)
+    assert ours.omega == pytest.approx(2 * graph.error(theirs), rel=1e-6)
+    for i, s in enumerate(net.station_ids):
+        assert theirs.atPose3(i).matrix() == pytest.approx(ours.pose(s).matrix(), abs=1e-4)

@@ -1,0 +1,76 @@
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from adjust.errors import SurveyError
+from adjust.pose_network import NetworkOptions, solve_network
+from survey.interop.g2o import read_g2o, write_g2o
+from tests.adjust.pose_networks import simulate
+from tests.data import data_folder
+
+EDGE = "EDGE_SE3:QUAT 0 1 1 2 3 0 0 0.1 1 " + " ".join(["1 0 0 0 0 0", "1 0 0 0 0", "1 0 0 0", "4 0 0", "4 0", "4"])
+VERTEX = "VERTEX_SE3:QUAT {} 0 0 0 0 0 0 1"
+
+
+def test_gtsam_reads_the_same(tmp_path: Path) -> None:
+    path = data_folder("calibration", "pose_graphs") / "smallGrid3D.g2o"
+    net = read_g2o(path, use_vertices=True)
+    graph, values = gtsam.readG2o(str(path), True)
+    assert graph.size() == net.n_pairs
+    assert values.size() == net.n_stations
+    for e in range(0, net.n_pairs, 17):
+        factor = graph.at(e)
+        i, j = factor.keys()
+        assert net.pair_ids[e] == f"{i}-{j}"
+        assert factor.measured().rotation().matrix() == pytest.approx(net.rotations[e], abs=1e-6)
+        assert factor.measured().translation() == pytest.approx(net.translations[e])
+        assert factor.noiseModel().covariance() == pytest.approx(net.cov[e], rel=1e-9, abs=1e-12)
+        assert values.atPose3(i).translation() == pytest.approx(net.station_translations[net.index_of[str(i)]])
+
+
+@pytest.mark.parametrize("information", ["tangent", "quaternion"])
+def test_written_networks_come_back(tmp_path: Path, information) -> None:
+    net = simulate(4, 3).network
+    solution = solve_network(net, options=NetworkOptions(robust="off"))
+    write_g2o(tmp_path / "n.g2o", net, solution.rotations, solution.translations, information)
+    back = read_g2o(tmp_path / "n.g2o", information, use_vertices=True)
+    assert back.cov == pytest.approx(net.cov, rel=1e-9, abs=1e-15)
+    assert back.rotations == pytest.approx(net.rotations, abs=1e-12)
+    assert back.station_translations == pytest.approx(solution.translations, abs=1e-12)
+    assert solve_network(back, options=NetworkOptions(robust="off")).omega == pytest.approx(solution.omega, rel=1e-9)
+
+
+def test_the_two_meanings_of_the_rotation_information_differ_by_four(tmp_path: Path) -> None:
+    path = tmp_path / "n.g2o"
+    path.write_text("\n".join([VERTEX.format(0), VERTEX.format(1), EDGE]))
+    tangent, quaternion = read_g2o(path), read_g2o(path, "quaternion")
+    assert np.diag(tangent.cov[0]) == pytest.approx([0.25] * 3 + [1.0] * 3)
+    assert np.diag(quaternion.cov[0]) == pytest.approx([1.0] * 6)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("EDGE_SE3:QUAT 0 1 1 2 3", "line 3: expected 28"),
+        ("EDGE_SE2 0 1 1 2 3", "line 3: 'EDGE_SE2' is not supported"),
+        (EDGE.replace("0 0 0.1 1", "0 0 0 0"), "line 3: the quaternion is zero"),
+        (EDGE.replace(" 3 ", " x "), "line 3: expected 28 numbers"),
+        (EDGE.replace(" 3 ", " nan "), "line 3: expected 28 finite"),
+        (EDGE[:-1] + "-4", "edge 0 1 is not positive definite"),
+        (EDGE + "\nFIX 9", "FIX 9 names a vertex"),
+        ("VERTEX_SE3:QUAT 2 0 0 0 0 0 0 1", "no EDGE_SE3:QUAT"),
+    ],
+)
+def test_damage_is_named(tmp_path: Path, line: str, message: str) -> None:
+    path = tmp_path / "n.g2o"
+    path.write_text("\n".join([VERTEX.format(0), VERTEX.format(1), line]) + "\n")
+    with pytest.raises(SurveyError, match=message):
+        read_g2o(path)
+
+
+def test_rotations_alone_cannot_be_written(tmp_path: Path) -> None:
+    net = simulate(3, 2, rotations_only=True).network
+    with pytest.raises(SurveyError, match="rotations only"):
+        write_g2o(tmp_path / "n.g2o", net, net.station_rotations, net.station_translations)
