@@ -103,7 +103,8 @@ def _loop_kind(network: Network, options: ConditionOptions) -> Literal["shortest
         return options.loops
     top = network.topology
     side = top.n_stations * network.dim
-    dense = top.n_pairs > 3 * top.n_stations and side <= MAX_TREE_SIDE
+    # plane grids have two pairs a station and stay sparse; with more, short loops overlap too much
+    dense = 2 * top.n_pairs > 5 * top.n_stations and side <= MAX_TREE_SIDE
     return "tree" if dense else "shortest"
 
 
