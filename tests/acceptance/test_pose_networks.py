@@ -1,0 +1,77 @@
+"""Pose networks: real ones with certified optima, large simulated ones, wrong pairs.
+
+The full sizes (10,000 stations one by one, 100,000 in one batch) run by ``python -m tests.benchmarks.networks``, or here
+with LABSURVEY_LONG set.
+"""
+
+import os
+
+import numpy as np
+import pytest
+
+from adjust.pose_network import NetworkOptions, solve_network
+from adjust.pose_network.chordal import chordal_cost, minimize_chordal
+from adjust.pose_network.solve import minimize
+from survey.interop.g2o import read_g2o
+from tests.adjust.pose_networks import exp6, simulate
+from tests.benchmarks.networks import batch, gradient, grow
+from tests.data import data_folder
+
+LONG = bool(os.environ.get("LABSURVEY_LONG"))
+PLAIN = NetworkOptions(robust="off")
+
+# certified optima of the chordal cost to 4 digits: Rosen, Carlone, Bandeira and Leonard, SE-Sync, IJRR 2019, table 1
+CERTIFIED = {"sphere2500": 1.687e3, "torus3D": 2.423e4, "parking-garage": 1.263}
+
+
+@pytest.mark.parametrize("name", CERTIFIED)
+def test_published_optimum_is_met_from_nothing(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    network = read_g2o(data_folder("calibration", "pose_graphs") / f"{name}.g2o")
+    assert np.isnan(network.station_translations[1:]).all()  # neither odometry nor the file's vertices are used
+    chordal = minimize_chordal(network)
+    assert float(f"{chordal.cost:.3e}") == CERTIFIED[name]
+    ours = solve_network(network, options=PLAIN)
+    assert gradient(ours) < 1e-6
+    # the optimum of our own geodesic cost, again from somewhere else
+    rng = np.random.default_rng(0)
+    dR, dt = exp6(rng.normal(size=(network.n_stations, 6)) * 0.05)
+    t = ours.translations + np.einsum("nij,nj->ni", ours.rotations, dt)
+    again = minimize(network, (ours.rotations @ dR, t), PLAIN)
+    assert again.omega == pytest.approx(ours.omega, rel=1e-8)
+    at_ours = chordal_cost(network, ours.rotations, ours.translations)
+    assert at_ours >= chordal.cost
+    with capsys.disabled():
+        print(f"\n{name}: chordal optimum {chordal.cost:.5g} (certified {CERTIFIED[name]:.4g}), v'Pv of the geodesic "
+              f"optimum {ours.omega:.6g}, chordal cost there {at_ours:.5g}")  # fmt: skip
+
+
+def test_stations_are_added_at_a_constant_price(capsys: pytest.CaptureFixture[str]) -> None:
+    done = grow(5000 if LONG else 750, 2)
+    with capsys.disabled():
+        print(f"\n{done}")
+    k = len(done.ms) // 5
+    assert np.median(done.ms[-k:]) < 3.0 * np.median(done.ms[k : 2 * k])
+    assert done.before[1] < 0.05
+    assert done.after[1] < 1e-6
+
+
+@pytest.mark.parametrize(("nx", "ny"), [(10000, 10), (25000, 4)] if LONG else [(500, 10), (1000, 4)])
+def test_large_networks_reach_the_true_minimum(nx: int, ny: int, capsys: pytest.CaptureFixture[str]) -> None:
+    done = batch(nx, ny)
+    with capsys.disabled():
+        print(f"\n{done}")
+    test = done.solution.global_test(1e-3)
+    assert test is not None
+    assert test.passed
+    assert done.gradient < 1e-6
+    assert done.redundancy_sum == pytest.approx(done.solution.redundancy, rel=1e-6)
+
+
+@pytest.mark.parametrize(("nx", "ny", "extra", "wrong"), [(6, 5, 25, 4), (100, 10, 200, 60)])
+def test_planted_wrong_pairs_are_found_and_named(nx: int, ny: int, extra: int, wrong: int) -> None:
+    sim = simulate(nx, ny, seed=5, extra=extra, wrong=wrong)
+    solution = solve_network(sim.network)
+    assert {r.pair_id for r in solution.rejected} == set(sim.wrong)
+    test = solution.global_test(1e-3)
+    assert test is not None
+    assert test.passed

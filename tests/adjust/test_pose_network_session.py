@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+from gtsam import Pose3, Rot3
+
+from adjust.errors import SurveyError
+from adjust.observations import FrameRef, Pair
+from adjust.pose_network import NetworkOptions, solve_network
+from adjust.pose_network.session import NetworkSession
+from tests.adjust.pose_networks import Simulated, simulate
+from tests.benchmarks.networks import additions, difference, first_stations
+
+PLAIN = NetworkOptions(robust="off")
+
+
+def grown(sim: Simulated, group: int = 1) -> NetworkSession:
+    session = NetworkSession(first_stations(sim.network))
+    steps = additions(sim.network)
+    for k in range(0, len(steps), group):
+        session.add([pair for step in steps[k : k + group] for pair in step])
+    return session
+
+
+@pytest.mark.parametrize(("nx", "ny", "group"), [(60, 2, 1), (30, 4, 7), (9, 9, 1)])
+def test_a_grown_network_equals_its_batch_solution(nx: int, ny: int, group: int) -> None:
+    sim = simulate(nx, ny, seed=nx)
+    session = grown(sim, group)
+    batch = solve_network(sim.network, options=PLAIN)
+    metres, sigmas = difference(session.poses(), session.network(), batch)
+    assert sigmas < 0.05
+    finished = session.finish()
+    assert finished.iterations <= 3
+    metres, sigmas = difference((finished.rotations, finished.translations), finished.network, batch)
+    assert sigmas < 1e-6
+    assert metres < 1e-6
+    assert finished.omega == pytest.approx(batch.omega, rel=1e-10)
+
+
+def test_additions_say_what_is_new_and_what_moved() -> None:
+    sim = simulate(40, 2, seed=3)
+    session = NetworkSession(first_stations(sim.network))
+    steps = additions(sim.network)
+    first = session.add(steps[0])
+    assert list(first.new) == ["s2"]
+    for step in steps[1:]:
+        before = {s: session.estimate(s) for s in sim.network.station_ids[: session.n_stations]}
+        done = session.add(step)
+        for station, pose in before.items():
+            far = np.linalg.norm(pose.between(session.estimate(station)).translation())
+            assert (far < 1e-4) or done.moved[station][1] == pytest.approx(far, rel=0.2, abs=1e-4)
+        assert set(done.misfit) == {p.pair_id for p in step}
+        assert max(done.misfit.values()) < 60
+    # a wrong pair shows at once, and can be taken out again
+    wrong = Pair("wrong", FrameRef("station", "s70"), FrameRef("station", "s10"), Pose3(Rot3(), np.zeros(3)), np.eye(6) * 1e-4)
+    before = session.estimate("s40")
+    done = session.add([wrong])
+    assert done.misfit["wrong"] > 1e4
+    assert len(done.moved) > 30
+    session.remove(["wrong"])
+    batch = solve_network(sim.network, options=PLAIN)
+    finished = session.finish()
+    assert not finished.network.used[finished.network.pair_index_of["wrong"]]
+    assert finished.omega == pytest.approx(batch.omega, rel=1e-9)
+    assert finished.pose("s40").translation() == pytest.approx(before.translation(), abs=1e-2)
+
+
+def test_rotations_may_be_added_to_poses() -> None:
+    sim = simulate(5, 3)
+    session = grown(sim)
+    extra = Pair("turn", FrameRef("station", "s1"), FrameRef("station", "s9"),
+                 Rot3(sim.rotations[9].T @ sim.rotations[1]), np.eye(3) * 1e-10)  # fmt: skip
+    session.add([extra])
+    finished = session.finish()
+    assert finished.redundancy == solve_network(sim.network, options=PLAIN).redundancy + 3
+    turn = finished.rotations[9].T @ finished.rotations[1]
+    assert turn == pytest.approx(sim.rotations[9].T @ sim.rotations[1], abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("pair_id", "a", "b", "cov", "message"),
+    [
+        ("p0", "s0", "new", np.eye(6), "exists already"),
+        ("x", "other", "new", np.eye(6), "ties other, new to the network"),
+        ("x", "s0", "s0", np.eye(6), "does not join two stations"),
+        ("x", "s0", "new", -np.eye(6), "covariance"),
+    ],
+)
+def test_what_cannot_be_added_is_refused_and_changes_nothing(pair_id, a, b, cov, message) -> None:
+    session = grown(simulate(4, 2))
+    before = session.n_stations
+    with pytest.raises(SurveyError, match=message):
+        session.add([Pair(pair_id, FrameRef("station", a), FrameRef("station", b), Pose3(), cov)])
+    assert session.n_stations == before
+    assert session.finish().network.n_stations == before
