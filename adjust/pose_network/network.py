@@ -200,8 +200,8 @@ def _check_cov(network: PoseNetwork) -> None:
         at = np.flatnonzero(rows)
         scale = np.sqrt(np.maximum(np.diagonal(C, axis1=1, axis2=2), 1e-300))
         correlation = C / scale[:, :, None] / scale[:, None, :]
-        fine: BoolArray = np.isfinite(correlation).all(axis=(1, 2))
-        whole = np.where(np.expand_dims(fine, (1, 2)), correlation, -1.0)
+        fine = np.asarray(np.isfinite(correlation).all(axis=(1, 2)), dtype=np.bool_)
+        whole = np.where(fine[:, None, None], correlation, -1.0)
         fine = np.asarray(np.linalg.eigvalsh(whole).min(axis=1, initial=1.0) > 1e-12)
         fine = fine & (np.abs(whole - np.swapaxes(whole, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6)
         wrong = np.zeros(network.n_pairs, dtype=np.bool_)

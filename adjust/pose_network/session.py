@@ -33,14 +33,16 @@ class SessionOptions:
 
     relinearize: change (rad, m) from which a station is linearised anew. wildfire: change below which steps do not
     spread. moved_rad, moved_m: what counts as moved. batch_share: share of the network that additions may touch on
-    average before batch iterations take over; 1 never.
+    average before batch iterations take over; 1 never. section: latest stations that are always kept moving; older
+    ones may rest until :meth:`NetworkSession.finish`.
     """
 
     relinearize: float = 1e-3
-    wildfire: float = 1e-4
+    wildfire: float = 1e-5
     moved_rad: float = 1e-6
     moved_m: float = 1e-5
     batch_share: float = _SHARE
+    section: int = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +116,7 @@ class NetworkSession:
             self._factor_of[network.pair_ids[rows[n]]] = first + n
         for i in np.flatnonzero(~network.constants).tolist():
             values.insert(i, self._last[i])
-        self._growth: Growth = Tree(self.options.relinearize, self.options.wildfire)
+        self._growth: Growth = Tree(self.options.relinearize, self.options.wildfire, self.options.section)
         self._growth.update(graph, values)
 
     @property
@@ -280,7 +282,7 @@ class NetworkSession:
         if isinstance(self._growth, Tree) and often and n >= _LEAST:
             self._switch(Batch(self.options.wildfire))
         elif isinstance(self._growth, Batch) and n >= 2 * self._switched_at:
-            self._switch(Tree(self.options.relinearize, self.options.wildfire))
+            self._switch(Tree(self.options.relinearize, self.options.wildfire, self.options.section))
 
     def _switch(self, growth: Growth) -> None:
         table = moved_over(self._growth, growth)

@@ -1,7 +1,7 @@
 """Pose networks: real ones with certified optima, large simulated ones, wrong pairs.
 
-The full sizes (10,000 stations one by one, 100,000 in one batch) run by ``python -m tests.benchmarks.networks``, or here
-with LABSURVEY_LONG set.
+The full sizes (10,000 stations one by one, 100,000 in one batch) run by ``python -m tests.benchmarks.networks``, or
+here with LABSURVEY_LONG set.
 """
 
 import os

@@ -222,7 +222,8 @@ def test_what_floats_is_named() -> None:
         solve_network(cut)
     t = net.translations.copy()
     t[(net.a_idx == 5) | (net.b_idx == 5)] = np.nan
-    half = pose_network(net.station_ids, net.pair_ids, net.a_idx, net.b_idx, net.rotations, t, net.cov, held={0: np.eye(4)})
+    half = pose_network(net.station_ids, net.pair_ids, net.a_idx, net.b_idx, net.rotations, t, net.cov,
+                        held={0: np.eye(4)})  # fmt: skip
     with pytest.raises(IndeterminateError, match="the position of s5"):
         solve_network(half)
 
@@ -241,7 +242,8 @@ def test_what_floats_is_named() -> None:
 def test_wrong_arrays_are_refused_by_name(change: dict, message: str) -> None:
     good = {
         "station_ids": ["a", "b"], "pair_ids": ["p0", "p1"], "a_idx": [0, 1], "b_idx": [1, 0],
-        "rotations": np.tile(np.eye(3), (2, 1, 1)), "translations": np.zeros((2, 3)), "cov": np.tile(np.eye(6), (2, 1, 1)),
+        "rotations": np.tile(np.eye(3), (2, 1, 1)), "translations": np.zeros((2, 3)),
+        "cov": np.tile(np.eye(6), (2, 1, 1)),
     }  # fmt: skip
     pose_network(**good, held={0: np.eye(4)})
     with pytest.raises(SurveyError, match=message):
@@ -318,7 +320,8 @@ def test_chordal_cost_by_hand_and_its_minimum_against_gtsam() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):  # no way down from there
         dR = Rotation.from_rotvec(rng.normal(size=(12, 3)) * 1e-4).as_matrix()
-        assert chordal_cost(net, found.rotations @ dR, found.translations + rng.normal(size=(12, 3)) * 1e-4) > found.cost
+        t = found.translations + rng.normal(size=(12, 3)) * 1e-4
+        assert chordal_cost(net, found.rotations @ dR, t) > found.cost
 
 
 def test_our_least_squares_equals_gtsams_optimiser() -> None:

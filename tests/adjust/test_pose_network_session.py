@@ -5,15 +5,15 @@ from gtsam import Pose3, Rot3
 from adjust.errors import SurveyError
 from adjust.observations import FrameRef, Pair
 from adjust.pose_network import NetworkOptions, solve_network
-from adjust.pose_network.session import NetworkSession
+from adjust.pose_network.session import NetworkSession, SessionOptions
 from tests.adjust.pose_networks import Simulated, simulate
 from tests.benchmarks.networks import additions, difference, first_stations
 
 PLAIN = NetworkOptions(robust="off")
 
 
-def grown(sim: Simulated, group: int = 1) -> NetworkSession:
-    session = NetworkSession(first_stations(sim.network))
+def grown(sim: Simulated, group: int = 1, **options) -> NetworkSession:
+    session = NetworkSession(first_stations(sim.network), SessionOptions(**options))
     steps = additions(sim.network)
     for k in range(0, len(steps), group):
         session.add([pair for step in steps[k : k + group] for pair in step])
@@ -35,6 +35,29 @@ def test_a_grown_network_equals_its_batch_solution(nx: int, ny: int, group: int)
     assert finished.omega == pytest.approx(batch.omega, rel=1e-10)
 
 
+def test_settled_stations_wake_when_they_are_needed() -> None:
+    sim = simulate(100, 2, seed=9)
+    session = grown(sim, section=30)
+    batch = solve_network(sim.network, options=PLAIN)
+    assert difference(session.poses(), session.network(), batch)[1] < 0.5
+    # a loop from the far end to a settled station moves everything, also what had settled
+    R, t = sim.rotations, sim.translations
+    shift = R[199].T @ (t[20] - t[199])
+    loop = Pair("loop", FrameRef("station", "s20"), FrameRef("station", "s199"), Pose3(Rot3(R[199].T @ R[20]), shift),
+                np.diag([1e-3] * 3 + [1e-2] * 3) ** 2)  # fmt: skip
+    done = session.add([loop])
+    assert {"s100", "s150"} <= done.moved.keys()
+    present = session.poses()
+    finished = session.finish()
+    again = solve_network(finished.network, options=PLAIN)
+    assert difference(present, session.network(), again)[1] < 0.2
+    assert finished.omega == pytest.approx(again.omega, rel=1e-9)
+    # the same where a pair between settled stations is taken out
+    session = grown(sim, section=30)
+    session.remove(["p3"])
+    assert session.finish().redundancy == batch.redundancy - 6
+
+
 def test_additions_say_what_is_new_and_what_moved() -> None:
     sim = simulate(40, 2, seed=3)
     session = NetworkSession(first_stations(sim.network))
@@ -50,7 +73,8 @@ def test_additions_say_what_is_new_and_what_moved() -> None:
         assert set(done.misfit) == {p.pair_id for p in step}
         assert max(done.misfit.values()) < 60
     # a wrong pair shows at once, and can be taken out again
-    wrong = Pair("wrong", FrameRef("station", "s70"), FrameRef("station", "s10"), Pose3(Rot3(), np.zeros(3)), np.eye(6) * 1e-4)
+    ends = FrameRef("station", "s70"), FrameRef("station", "s10")
+    wrong = Pair("wrong", *ends, Pose3(Rot3(), np.zeros(3)), np.eye(6) * 1e-4)
     before = session.estimate("s40")
     done = session.add([wrong])
     assert done.misfit["wrong"] > 1e4
