@@ -14,6 +14,7 @@ from adjust.pose_network.chordal import chordal_cost, minimize_chordal
 from adjust.pose_network.from_survey import network_adjustment, network_from_survey
 from adjust.pose_network.network import PoseNetwork, loop_marks
 from adjust.pose_network.precision import pair_jacobians
+from adjust.pose_network.robust import graduated_weights
 from adjust.pose_network.solve import minimize
 from adjust.relay.motions import Motions
 from tests.adjust.pose_networks import exp6, simulate
@@ -184,6 +185,39 @@ def test_wrong_pairs_are_found_and_named_in_a_small_network() -> None:
         again = solve_network(solution.reinstated(tuple(sim.wrong)), options=PLAIN)
         assert again.network.used.all()
         assert again.omega > 100 * solution.omega
+
+
+def test_pairs_sorted_out_by_mistake_are_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    sim = simulate(6, 5, seed=1, wrong=2, extra=25)
+    first = graduated_weights(sim.network)
+    first[[n for n in range(5, 15) if sim.network.pair_ids[n] not in sim.wrong]] = 0.0
+    monkeypatch.setattr("adjust.pose_network.robust.graduated_weights", lambda network: first)
+    solution = solve_network(sim.network, options=NetworkOptions(robust="on"))
+    assert {r.pair_id for r in solution.rejected} == set(sim.wrong)
+    assert solution.network.used.sum() == sim.network.n_pairs - 2
+
+
+def test_wrong_pairs_that_passed_the_first_sorting_are_found_by_their_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    sim = simulate(6, 5, seed=1, wrong=2, extra=25)
+    ones = np.ones(sim.network.n_pairs)
+    monkeypatch.setattr("adjust.pose_network.robust.graduated_weights", lambda network: ones)
+    assert {r.pair_id for r in solve_network(sim.network).rejected} == set(sim.wrong)
+
+
+def test_sigmas_that_are_too_small_throughout_make_no_pair_wrong() -> None:
+    net = simulate(6, 5, seed=4, extra=25).network
+    bold = pose_network(net.station_ids, net.pair_ids, net.a_idx, net.b_idx, net.rotations, net.translations,
+                        net.cov / 25.0, held={0: np.eye(4)})  # fmt: skip
+    solution = solve_network(bold)
+    assert not solution.rejected
+    assert solution.sigma0 == pytest.approx(5.0, rel=0.2)
+
+
+def test_wrong_turns_are_found_among_rotations() -> None:
+    sim = simulate(6, 5, seed=2, wrong=3, extra=25, rotations_only=True)
+    solution = solve_network(sim.network)
+    assert {r.pair_id for r in solution.rejected} == set(sim.wrong)
+    assert "deg" in str(solution.rejected[0])
 
 
 def test_false_alarms_stay_at_their_rate() -> None:

@@ -87,6 +87,17 @@ def test_additions_say_what_is_new_and_what_moved() -> None:
     assert finished.pose("s40").translation() == pytest.approx(before.translation(), abs=1e-2)
 
 
+def test_a_pair_may_start_at_a_held_station() -> None:
+    sim = simulate(4, 3)
+    session = grown(sim, relinearize=1e-6)
+    R, t = sim.rotations, sim.translations
+    cov = np.diag([1e-4, 1e-2, 1.0, 1e-3, 0.1, 1.0]) ** 2  # strong in some directions of a only
+    measured = Pose3(Rot3(R[10].T @ R[0]), R[10].T @ (t[0] - t[10]) + 0.02)
+    session.add([Pair("back", FrameRef("station", "s0"), FrameRef("station", "s10"), measured, cov)])
+    batch = solve_network(session.network(), options=PLAIN)
+    assert difference(session.poses(), session.network(), batch)[1] < 1e-3
+
+
 def test_rotations_may_be_added_to_poses() -> None:
     sim = simulate(5, 3)
     session = grown(sim)
