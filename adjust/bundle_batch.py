@@ -25,12 +25,15 @@ from adjust.errors import IndeterminateError
 from adjust.image_batch import Chains, square_root_information
 from adjust.lens_kernels import MAX_LENS
 from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.motions import motions_of, point_motions
 from adjust.observations import ImageBlock
 from adjust.state import State
 from adjust.unknowns import Chain, Unknowns
 
 ROUNDING_PIVOT = 1e-11
 """Pivot of a scaled normal matrix below which there is nothing but rounding."""
+BLIND_MOTION = 1e-10
+"""Length of the image rows times a motion, in units of its parts by poses and by points, that is none."""
 
 _Rows = TypeVar("_Rows", FloatArray, BoolArray)
 
@@ -196,10 +199,10 @@ class BundleBatch:
         self._rows(values, self.W)
         self.chi_square = float(self.chi.sum())
         if jacobians:
-            self._condense(damping)
+            self._condense(values, damping)
         self._prepared, self._with_jacobians = values, jacobians
 
-    def _condense(self, damping: float) -> None:
+    def _condense(self, values: gtsam.Values, damping: float) -> None:
         s = self.state
         S, g = np.zeros((self.n_local, self.n_local)), np.zeros(self.n_local)
         bad = reduce_points(
@@ -217,7 +220,25 @@ class BundleBatch:
         N = np.asarray(self.G.T @ (self.G.T @ S).T)
         gradient = np.asarray(self.G.T @ g)
         rest = self.chi_square - float(np.einsum("ja,jab,jb->", self.h, self.Vi, self.h))
+        self.blind = self._blind_motions(values) if damping == 0.0 else np.zeros((self.n_keys, 0))
         self._reduce_hidden(0.5 * (N + N.T), gradient, rest, damping)
+
+    def _blind_motions(self, values: gtsam.Values) -> FloatArray:
+        """Motions (n_keys, k) of the whole survey that no image point sees, from its rows before they are condensed."""
+        by_key = self.unknowns.by_key
+        in_world = {"world_from_station", "world_from_table"}
+        Z = np.concatenate([motions_of(by_key[k], values, by_key[k].name[0] in in_world) for k in self.order])
+        of_point = np.zeros((len(self.point_ids), 3, 7))
+        for i in self.point_key:
+            of_point[i] = point_motions(self.world[i])
+        of_pose = np.asarray(self.G @ Z)[self.first_pose : self.first_pose + 6 * len(self.blocks)].reshape(-1, 6, 7)
+        rows = self.A[:, :, MAX_LENS : MAX_LENS + 6]
+        by_pose = (rows @ of_pose[self.block]).reshape(-1, 7)
+        by_point = (rows[:, :, 3:] @ of_point[self.point]).reshape(-1, 7)
+        lengths = np.sqrt((by_pose**2).sum(axis=0) + (by_point**2).sum(axis=0))
+        usable = lengths > 0.0
+        _, s, Vt = np.linalg.svd((by_pose + by_point)[:, usable] / lengths[usable], full_matrices=False)
+        return np.asarray((Z[:, usable] / lengths[usable]) @ Vt[s < BLIND_MOTION].T)
 
     def _undetermined_point(self, bad: int) -> IndeterminateError:
         name = self.point_ids[self.reduced[bad]]
@@ -259,11 +280,15 @@ class BundleBatch:
         )
 
     def _serve(self, A: FloatArray, z: FloatArray, d: FloatArray, rest: float) -> None:
-        """Square root of the interface's normal matrix, which has gauge freedoms: pivoted, rounding pivots left out.
+        """Square root of the interface's normal matrix: pivoted, rounding pivots left out (seen up to 1e-12).
 
-        Rounding pivots were seen up to 1e-12 in networks of 40 images and 200 points.
+        The root of rounding would outweigh a weak datum, so motions that no image point sees are taken out exactly.
         """
         n = len(z)
+        blind = np.linalg.qr(d[:, None] * self.blind[self.n_hidden :])[0]
+        A = A - blind @ (blind.T @ A)
+        A = A - (A @ blind) @ blind.T
+        z = z - blind @ (blind.T @ z)
         U, pivots, rank, _ = lapack.dpstrf(np.asfortranarray(A), tol=ROUNDING_PIVOT, lower=0)
         U = np.triu(U)
         U[rank:] = 0.0
@@ -275,6 +300,7 @@ class BundleBatch:
         self.r[n] = np.sqrt(max(0.0, rest - float(y @ y)))
         R = np.zeros((n + 1, n))
         R[:n, perm] = U
+        R -= (R @ blind) @ blind.T
         R *= d
         self.views = []
         at = 0

@@ -12,38 +12,21 @@ import gtsam
 import numpy as np
 from gtsam import Pose3
 
-from adjust.bundle_batch import ROUNDING_PIVOT
 from adjust.errors import SurveyError
 from adjust.factors import Jacobians, custom
 from adjust.graph import AdjustmentGraph, inner_datum_keys
 from adjust.model import FloatArray, IntArray
+from adjust.motions import motions_of
 from adjust.result import ParameterName
 from adjust.unknowns import Unknown
 
-
-def _skew(x: FloatArray) -> FloatArray:
-    return np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
+BLIND = 1e-8
+"""Length of the whitened Jacobian times a scaled direction that is not seen; rounding reaches 1e-13."""
 
 
 def gauge(graph: AdjustmentGraph, unknown: Unknown, values: gtsam.Values) -> FloatArray:
     """How an unknown moves (dim, 7) with the whole survey: translations, rotations (about the world origin), scale."""
-    out = np.zeros((unknown.dim, 7))
-    if unknown.kind == "point":
-        x = np.asarray(values.atPoint3(unknown.key))
-        out[:, :3], out[:, 3:6], out[:, 6] = np.eye(3), -_skew(x), x
-    elif unknown.kind == "pose":
-        pose = values.atPose3(unknown.key)
-        R, t = pose.rotation().matrix(), pose.translation()
-        if in_world(graph, unknown.name):
-            out[3:, :3], out[:3, 3:6] = R.T, R.T
-            out[3:, 3:6] = -R.T @ _skew(t)
-        out[3:, 6] = R.T @ t
-    elif "axis_offset" in unknown.components:
-        i = unknown.components.index("axis_offset")
-        out[i, 6] = values.atVector(unknown.key)[i]
-    elif unknown.name[0] == "warp":
-        out[:, 6] = values.atVector(unknown.key)
-    return out
+    return motions_of(unknown, values, in_world(graph, unknown.name))
 
 
 def in_world(graph: AdjustmentGraph, name: ParameterName) -> bool:
@@ -139,14 +122,6 @@ class InnerDatum:
         return np.asarray(B @ self.addition @ B.T)
 
 
-def blind(graph: AdjustmentGraph) -> float:
-    """Length of the whitened Jacobian times a scaled direction that the observations do not see.
-
-    Rounding reaches 1e-13; through a bundle's normal equations the square root of its rounding pivots.
-    """
-    return 1e-8 if graph.bundle is None else 3.0 * ROUNDING_PIVOT**0.5
-
-
 def defects(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> FloatArray:
     """Directions (7, k) of the whole-survey motions that the observations do not see."""
     keys = visible_keys(graph)
@@ -157,7 +132,7 @@ def defects(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: g
     usable = lengths > 0.0
     scaled = times(linear, stack, B[:, usable] / lengths[usable])
     _, s, Vt = np.linalg.svd(scaled, full_matrices=False)
-    null = Vt[s < blind(graph)].T
+    null = Vt[s < BLIND].T
     out = np.zeros((7, null.shape[1]))
     out[usable] = null / lengths[usable, None]
     return out

@@ -4,7 +4,8 @@ import gtsam
 import numpy as np
 from scipy.linalg import qr
 
-from adjust.datum import Stacking, blind, gauge, stacking, times, visible_keys
+from adjust.bundle_batch import ROUNDING_PIVOT
+from adjust.datum import BLIND, Stacking, gauge, stacking, times, visible_keys
 from adjust.errors import IndeterminateError
 from adjust.graph import AdjustmentGraph
 from adjust.model import FloatArray
@@ -41,7 +42,7 @@ def readable(unknown: Unknown) -> str:
 
 
 def null_space(
-    linear: gtsam.GaussianFactorGraph, stack: Stacking, limit: float = 1e-8
+    linear: gtsam.GaussianFactorGraph, stack: Stacking, limit: float = BLIND
 ) -> tuple[FloatArray, FloatArray]:
     """Null vectors (n, k) of the normal matrix of the visible unknowns, and its column scale (n,).
 
@@ -76,17 +77,37 @@ def describe_null_space(
             "the observations and the datum leave unknowns undetermined; the survey is too large "
             f"({stack.n} unknowns) to name them: try a part of it"
         )
-    null, scale = null_space(linear, stack, blind(graph))
+    null, scale = null_space(linear, stack, _limit(graph))
     if null.shape[1] == 0:
         return None
-    scaled = np.linalg.qr(null * scale[:, None])[0]
+    scaled = _without_weak_motions(graph, linear, stack, np.linalg.qr(null * scale[:, None])[0], scale, values)
+    if scaled.shape[1] == 0:
+        return None
     lines: list[str] = []
     found = [_gauges(graph, keys, scaled, scale, values, lines)]
-    found += _station_frames(graph, keys, scaled, scale, values, lines)
+    _station_frames(graph, keys, scaled, scale, values, lines, found)
     rest = _complement(scaled, np.hstack(found))
     names = _rest(graph, stack, rest / scale[:, None], lines)
-    head = f"the observations and the datum leave {null.shape[1]} directions undetermined:"
+    head = f"the observations and the datum leave {scaled.shape[1]} directions undetermined:"
     return IndeterminateError("\n  - ".join([head, *lines]), tuple(names) or tuple(lines))
+
+
+def _limit(graph: AdjustmentGraph) -> float:
+    """Length that counts as none: through a bundle's normal equations the root of its rounding pivots."""
+    return BLIND if graph.bundle is None else 3.0 * ROUNDING_PIVOT**0.5
+
+
+def _without_weak_motions(
+    graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, stack: Stacking, null: FloatArray, scale: FloatArray,
+    values: gtsam.Values,
+) -> FloatArray:  # fmt: skip
+    """The null space (n, k) less motions of the whole survey that a weak datum does see: a bundle is blind to them."""
+    B = np.concatenate([gauge(graph, graph.unknowns.by_key[k], values) for k in stack.at]) * scale[:, None]
+    _, common = _intersection(null, B)
+    if common.shape[1] == 0:
+        return null
+    _, s, Vt = np.linalg.svd(times(linear, stack, common / scale[:, None]), full_matrices=False)
+    return _complement(null, common @ Vt[s >= BLIND].T)
 
 
 def _complement(null: FloatArray, found: FloatArray) -> FloatArray:
@@ -158,15 +179,16 @@ def _frame_motion(graph: AdjustmentGraph, keys: list[int], station_id: str, valu
 
 
 def _station_frames(
-    graph: AdjustmentGraph, keys: list[int], null: FloatArray, scale: FloatArray, values: gtsam.Values, lines: list[str]
-) -> list[FloatArray]:
-    found = []
+    graph: AdjustmentGraph, keys: list[int], null: FloatArray, scale: FloatArray, values: gtsam.Values,
+    lines: list[str], found: list[FloatArray],
+) -> None:  # fmt: skip
+    """Name the stations whose own frame is free, and add their directions to ``found`` where they are new."""
     for station in graph.survey.stations:
         motion = _frame_motion(graph, keys, station.station_id, values)
         if motion is None:
             continue
         coefficients, common = _intersection(null, motion * scale[:, None])
-        if coefficients.shape[1]:
+        if coefficients.shape[1] and _rank(np.hstack([*found, common])) > _rank(np.hstack(found)):
             found.append(common)
             what = "the frame" if coefficients.shape[1] == 6 else f"{coefficients.shape[1]} directions of the frame"
             mount = " or its mount" if station.motion == "table" else ""
@@ -174,7 +196,10 @@ def _station_frames(
                 f"{what} of station {station.station_id} is not separated from the poses of its cameras: hold one "
                 f"camera on it{mount}"
             )
-    return found
+
+
+def _rank(basis: FloatArray) -> int:
+    return int(np.linalg.matrix_rank(basis, tol=1e-6)) if basis.shape[1] else 0
 
 
 def _rest(graph: AdjustmentGraph, stack: Stacking, null: FloatArray, lines: list[str]) -> list[str]:
