@@ -577,7 +577,7 @@ def check_statistics(precision: Precision, full: Dense, Q: FloatArray) -> None:
         A, e, used = full.A[rows], full.e[rows], bool(full.used[rows.start])
         Qv = np.eye(len(A)) + (-1.0 if used else 1.0) * A @ Q @ A.T
         inverse_root = np.linalg.inv(full.W[k])
-        sigma_v = np.sqrt(np.diag(inverse_root @ Qv @ inverse_root.T))
+        sigma_v = np.sqrt(np.maximum(0.0, np.diag(inverse_root @ Qv @ inverse_root.T)))
         v = full.v[rows]
         redundancy = np.diag(Qv) if used else np.zeros(len(A))
         sums += redundancy.sum()
