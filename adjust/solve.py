@@ -148,6 +148,11 @@ class _Loop:
         linear = self.full.linearize(self.values)
         if self.ordering is None:
             raise ValueError("no ordering before the first step")
+        # the covariances need this linearisation anyway: its step costs one elimination and brings the last digits
+        delta = self.step(linear)
+        if self.graph.bundle is not None:
+            self.graph.bundle.complete(delta)
+        self.values = self.values.retract(delta)
         return Solved(self.values, linear, self.ordering, self.use_qr, omega, iteration, moved, self.datum)
 
 
