@@ -152,8 +152,13 @@ def test_free_network_equals_the_dense_one(options: dict[str, int], datum: Datum
     assert precision.solved.datum.defect == (6 if options["distances"] else 7)
 
 
-def test_the_defects_of_a_larger_free_network_are_all_found() -> None:
-    """Condensed to a few unknowns, the seven motions drown in rounding unless its pivots are left out."""
+@pytest.mark.parametrize("pivot", [1e-11, 1e-15])
+def test_the_defects_of_a_larger_free_network_are_all_found(pivot: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Condensed to a few unknowns, the seven motions drown in rounding unless they are taken out exactly.
+
+    Whatever pivots are then left out as rounding.
+    """
+    monkeypatch.setattr("adjust.bundle_batch.ROUNDING_PIVOT", pivot)
     survey, truth = h.network(3, n_epochs=40, n_points=200, held=0, distances=0)
     survey = replace(survey, datum=Datum("inner", points=tuple(f"P{i}" for i in range(5))))
     _, done = h.solved(survey, h.shaken(h.start_at(truth), 1, 0.002, 0.002), tight=False)

@@ -122,6 +122,19 @@ def test_weak_but_determined_geometry_is_solved_by_qr(sigma: float) -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(h.covariance_of(precision, name))), sigma, rtol=1e-3)
 
 
+@pytest.mark.parametrize("sigma", [0.1, 1.0])
+def test_a_loose_datum_holds_a_larger_network(sigma: float) -> None:
+    """Closed form: the pose that alone carries the datum has the covariance of its prior, whatever hangs on it."""
+    survey, truth = h.network(3, n_epochs=40, n_points=200, held=0, distances=2)
+    first = truth["world_from_station", "head", "e0"]
+    assert isinstance(first, Pose3)
+    cov = h.random_cov(np.random.default_rng(1), [sigma] * 6)
+    station = replace(survey.stations[0], epochs={"e0": PoseParameter(first, "prior", cov)})
+    graph, done = h.solved(replace(survey, stations=(station,)), h.start_at(truth), tight=False)
+    found = h.covariance_of(h.Precision(graph, done), ("world_from_station", "head", "e0"))
+    assert h.relative(found, cov) < 1e-4
+
+
 def test_two_held_ends_of_a_distance() -> None:
     survey, truth = h.network(1)
     both = Distance("dead", PositionRef("P0"), PositionRef("P1"), 1.0, 1e-3)
