@@ -191,7 +191,8 @@ def _example(arguments: argparse.Namespace) -> int:
         _print_json({"example": arguments.name, "folder": str(arguments.folder), "seed": arguments.seed, "images": n})
     else:
         print(
-            f"{arguments.folder}: example {arguments.name} with {n} images\nNext: labsurvey adjust {arguments.folder}"
+            f"{arguments.folder}: example {arguments.name}{f' with {n} images' if n else ''}\n"
+            f"Next: labsurvey adjust {arguments.folder}"
         )
     return DONE
 

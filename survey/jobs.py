@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from adjust.adjustment import AdjustOptions, adjust
 from adjust.errors import IndeterminateError, SurveyError
 from adjust.model import IntArray, Survey
 from adjust.observations import ImageBlock
+from adjust.pair_screen import PairOptions, adjust_with_pairs
 from adjust.result import Adjustment
 from survey.detection import DetectionTask, ImageReport, SpotOptions, detect_images
 from survey.files import Definition, Project, SpotBlock, read, read_definition, write_image_points, write_spots
@@ -78,7 +80,7 @@ class AdjustOutcome:
 
     def summary(self) -> dict[str, Any]:
         """``summary`` and ``warnings`` of the solution, with the paths written."""
-        solution = solution_dict(self.adjustment, self.run)
+        solution = self.solution
         return {
             "folder": self.run.folder,
             "summary": solution["summary"],
@@ -88,7 +90,12 @@ class AdjustOutcome:
 
     def text(self) -> str:
         """The summary for people."""
-        return summary_text(self.adjustment, self.run)
+        return summary_text(self.adjustment, self.run, self.solution)
+
+    @cached_property
+    def solution(self) -> dict[str, Any]:
+        """All that ``solution.json`` holds."""
+        return solution_dict(self.adjustment, self.run)
 
 
 def detect_job(
@@ -218,7 +225,7 @@ def _adjust_project(project: Project, progress: bool) -> Adjustment:
                 notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
             survey = replace(survey, image_blocks=survey.image_blocks + found.blocks)
             survey = _seen_points(survey)
-        result = adjust(survey, options=options, progress=step)
+        result = adjust_with_pairs(survey, PairOptions(project.options.reject_pairs, options), step)
     return replace(result, warnings=result.warnings + notes)
 
 

@@ -6,14 +6,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from gtsam import Pose3
 from scipy.stats import norm
 
-from adjust.model import FloatArray
-from adjust.observations import FrameRef
+from adjust.model import FloatArray, Survey
 from adjust.result import Adjustment, Estimate, GroupSummary
-from survey.adjusted_frames import AdjustedFrames
-from survey.quantities import Scale, SigmaKind, point_entry, pose_dict, pose_entry, scale_of, vector_entry
+from survey.adjusted_pairs import pairs_dict
+from survey.network_summary import loops_dict, network_dict, pair_loops, pair_network
+from survey.quantities import Scale, SigmaKind, point_entry, pose_entry, scale_of, vector_entry
 from survey.verdict import suspects, verdict
 
 CORRELATION_LIMIT = 0.95
@@ -59,7 +58,8 @@ def solution_dict(adjustment: Adjustment, run: RunInfo) -> dict[str, Any]:
             "points": _points(adjustment, scale),
             "tables": _tables(adjustment, scale),
             "targets": _targets(adjustment, scale),
-            "pairs": _pairs(adjustment),
+            "pairs": pairs_dict(adjustment, scale),
+            **_network(adjustment.survey),
             "groups": {g.group: _group(g) for g in adjustment.groups},
             "warnings": list(adjustment.warnings),
             "inputs": {
@@ -263,26 +263,13 @@ def _targets(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
     return out
 
 
-def _frame_text(frame: FrameRef) -> str:
-    text = frame.kind + (f":{frame.frame_id}" if frame.frame_id else "")
-    return f"{text}@{frame.epoch_id}" if frame.epoch_id else text
-
-
-def _pairs(adjustment: Adjustment) -> dict[str, Any]:
-    """Measured and adjusted ``b_from_a`` of every pair; a rotation keeps no translation."""
-    frames, out = AdjustedFrames(adjustment), {}
-    for pair in adjustment.survey.pairs:
-        a, b = frames.world_from(pair.a), frames.world_from(pair.b)
-        measured = pair.b_from_a if isinstance(pair.b_from_a, Pose3) else Pose3(pair.b_from_a, np.zeros(3))
-        entry: dict[str, Any] = {"a": _frame_text(pair.a), "b": _frame_text(pair.b), "used": pair.used}
-        entry["measured"] = pose_dict(measured)
-        if a is not None and b is not None:
-            entry["adjusted"] = pose_dict(b.between(a))
-        if not isinstance(pair.b_from_a, Pose3):
-            for form in ("measured", "adjusted"):
-                entry.get(form, {}).pop("translation_mm", None)
-        out[pair.pair_id] = entry
-    return out
+def _network(survey: Survey) -> dict[str, Any]:
+    """What the pairs can tell, and how well their loops close; nothing where there are no pairs."""
+    loops = pair_loops(survey)
+    if loops is None:
+        return {}
+    left_out = [p.pair_id for p in survey.pairs if not p.used]
+    return {"network": network_dict(pair_network(survey)), "loops": loops_dict(loops, left_out)}
 
 
 def solution_json(solution: Mapping[str, Any]) -> str:

@@ -14,6 +14,7 @@ EXAMPLES = {
     "full-lab": "three-camera head on a two-axis table, board, wall plates, beacons, relay station of four cameras",
     "stereo": "two cameras and a checkerboard held by hand",
     "one-camera": "one camera and a checkerboard held by hand",
+    "relay": "thirty stations through four rooms and a corridor, joined by measured pairs; no images",
 }
 
 
@@ -28,14 +29,16 @@ def write_example(name: str, folder: Path, *, seed: int = 1, jobs: int | None = 
         raise SurveyError(f"example {name!r}: unknown; choose one of {', '.join(EXAMPLES)}")
     from survey.examples.folders import MAKERS
     from survey.examples.pictures import write_images
+    from survey.examples.relay import relay_files
 
-    draft, files = MAKERS[name](seed)
+    draft, files = MAKERS[name](seed) if name in MAKERS else (None, relay_files(seed))
     with _complete_or_nothing(Path(folder)) as place:
         for path, text in files.items():
             (place / path).parent.mkdir(parents=True, exist_ok=True)
             (place / path).write_text(text, encoding="utf-8")
-        write_images(draft, place / "images", seed, jobs, progress)
-    return len(draft.shots)
+        if draft is not None:
+            write_images(draft, place / "images", seed, jobs, progress)
+    return len(draft.shots) if draft is not None else 0
 
 
 @contextmanager

@@ -43,12 +43,14 @@ class AdjustmentOptions:
     """The table [adjustment].
 
     alpha: error probability of the tests. reject_blocks: leave mis-detected images out of the start, then test them.
-    reject_points: leave gross errors among the image points out, and list them.
+    reject_points: leave gross errors among the image points out, and list them. reject_pairs: the same for whole
+    measured pairs.
     """
 
     alpha: float = 0.05
     reject_blocks: bool = True
     reject_points: bool = True
+    reject_pairs: bool = True
 
 
 @dataclass(frozen=True, eq=False)

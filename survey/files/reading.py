@@ -165,11 +165,12 @@ def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest
 
 
 def _read_options(node: Node) -> AdjustmentOptions:
-    node.allow("alpha", "reject_blocks", "reject_points")
+    node.allow("alpha", "reject_blocks", "reject_points", "reject_pairs")
     alpha = node.number("alpha", 0.05, positive=True)
     if alpha >= 1:
         raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
-    return AdjustmentOptions(alpha, node.flag("reject_blocks", True), node.flag("reject_points", True))
+    flags = {name: node.flag(name, True) for name in ("reject_blocks", "reject_points", "reject_pairs")}
+    return AdjustmentOptions(alpha, **flags)
 
 
 def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:

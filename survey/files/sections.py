@@ -63,6 +63,7 @@ def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, si
     if sigmas.image_px is not None:
         sections.append((("sigmas",), {"image_px": sigmas.image_px}))
     flags = {"reject_blocks": options.reject_blocks, "reject_points": options.reject_points}
+    flags["reject_pairs"] = options.reject_pairs
     return [*sections, (("adjustment",), {"alpha": options.alpha, **flags})]
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from adjust.result import Adjustment
 from survey.quantities import scale_of
-from survey.report import observations, overview, unknowns
+from survey.report import loops, observations, overview, unknowns
 from survey.report.context import Context
 from survey.report.markup import esc
 from survey.residual_tables import image_rows
@@ -20,6 +20,9 @@ _SECTIONS = (
     ("Turntables", "tables", unknowns.tables),
     ("Targets", "targets", unknowns.targets),
     ("Points", "points", unknowns.points),
+    ("Network", "network", loops.network),
+    ("Loops", "loops", loops.loops),
+    ("Pairs", "pairs", loops.pairs),
     ("Observations", "observations", observations.others),
     ("Image points", "image-points", observations.image_points),
     ("Inputs", "inputs", overview.inputs),

@@ -12,13 +12,17 @@ from survey.solution import RunInfo, solution_dict
 _WIDTH = 100
 _WORDS = {"passed": "PASSED", "check": "NEEDS A LOOK", "failed": "FAILED"}
 _MOST_WARNINGS, _MOST_GROUPS, _MOST_CAMERAS, _MOST_OTHER, _MOST_POINTS = 6, 6, 6, 4, 3
+_MOST_LOOPS = 3
 
 
-def summary_text(adjustment: Adjustment, run: RunInfo) -> str:
-    """Verdict, warnings, key figures, groups, cameras, worst observations and points."""
-    solution = solution_dict(adjustment, run)
+def summary_text(adjustment: Adjustment, run: RunInfo, solution: dict[str, Any] | None = None) -> str:
+    """Verdict, warnings, key figures, groups, cameras, network, worst observations and points.
+
+    solution: that of :func:`survey.solution.solution_dict`, made here where it is not given.
+    """
+    solution = solution_dict(adjustment, run) if solution is None else solution
     lines: list[str] = []
-    for part in (_head, _warnings, _figures, _groups, _cameras):
+    for part in (_head, _warnings, _figures, _groups, _cameras, _network, _loops):
         lines += part(solution)
     lines += _observations(adjustment, solution["summary"]["suspects"]["standardized_limit"])
     lines += _points(solution)
@@ -106,6 +110,36 @@ def _lens(lens: dict[str, Any] | None) -> str:
     if strong is not None:
         parts.append(f"{strong['a']}-{strong['b']} correlated {100 * strong['correlation']:.1f} %")
     return ", ".join(parts)
+
+
+def _network(solution: dict[str, Any]) -> Iterator[str]:
+    n = solution.get("network")
+    if n is None:
+        return
+    what = "poses" if n["equations_per_condition"] == 6 else "rotations"
+    yield ""
+    yield (
+        f"  network: {n['n_stations']} stations, {n['measured_pairs']} of {n['measurable_pairs']} pairs measured, "
+        f"{n['independent_unknown_poses']} unknown {what}"
+    )
+    yield (
+        f"  {n['independent_conditions']} independent conditions ({n['redundancy']} equations), "
+        f"{n['conditions_per_pair']:.2f} per pair"
+    )
+    if n["uncontrolled_pairs"]:
+        yield f"  close no loop: {_cut(', '.join(n['uncontrolled_pairs']), _WIDTH - 20)}"
+
+
+def _loops(solution: dict[str, Any]) -> Iterator[str]:
+    found = solution.get("loops")
+    if not found or not found["n_loops"]:
+        return
+    yield ""
+    yield f"  loops: {found['n_loops']}, of which {found['n_failed']} do not close; the worst"
+    for e in found["worst_first"][:_MOST_LOOPS]:
+        size = f"{e['misclosure_arcsec']:.4g}″" + (f" {e['misclosure_mm']:.4g} mm" if "misclosure_mm" in e else "")
+        flag = "" if e["closes"] else "  OPEN"
+        yield f"  {_cut(' '.join(e['stations']), 50):<50}{size:>22}  p {e['p_value']:.2g}{flag}"
 
 
 def _observations(adjustment: Adjustment, limit: float) -> Iterator[str]:

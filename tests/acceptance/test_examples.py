@@ -61,7 +61,7 @@ def test_boards_are_where_the_truth_says(one_camera):
         assert nearest.max() < 0.2
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize("name", MAKERS)
 def test_every_camera_and_image_of_an_example_is_defined(name, tmp_path):
     draft, files = MAKERS[name](1)
     for path, text in files.items():

@@ -1,0 +1,200 @@
+"""The measured pairs of a survey as a network: counts after theorem 1 of the relay paper, and its loops one by one.
+
+Frames are the eyes: stations, cameras, targets. What the datum gives (held stations, stations with a full prior, the
+world) closes loops too, where there is more than one of it: each is then joined to the world.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.model import FloatArray, PoseParameter, Survey
+from adjust.observations import FrameRef, Pair
+from adjust.relay.counts import Counts, count
+from adjust.relay.loops import LoopMisclosures, loop_misclosures
+from adjust.relay.motions import Motions
+from adjust.relay.network import Network, Topology, topology
+from survey.quantities import ARCSEC_PER_RAD
+
+ALPHA = 0.001
+"""Error probability of the test of all loops together."""
+_MOST_LOOPS = 1000
+_GIVEN = "given:"  # no id holds a colon
+_WORLD = "world"
+
+
+@dataclass(frozen=True, eq=False)
+class PairNetwork:
+    """counts: of the pairs in use. shifts: the same of those with a translation, where not all have one.
+
+    given: frames whose pose is known without pairs. uncontrolled: pairs in use that close no loop, not even through
+    given frames. conditions: independent ones, those through given frames included. redundancy: their equations.
+    """
+
+    counts: Counts
+    shifts: Counts | None
+    given: tuple[str, ...]
+    uncontrolled: tuple[str, ...]
+    inseparable: tuple[tuple[str, ...], ...]
+    parts: tuple[tuple[str, ...], ...]
+    conditions: int
+    redundancy: int
+
+
+def frame_name(frame: FrameRef) -> str:
+    """As in tables; a station goes without its kind."""
+    if frame.kind == "world":
+        return _WORLD
+    text = frame.frame_id if frame.kind == "station" else f"{frame.kind}:{frame.frame_id}"
+    return f"{text}@{frame.epoch_id}" if frame.epoch_id else text
+
+
+def pair_network(survey: Survey) -> PairNetwork:
+    """Count what the pairs in use can tell."""
+    used = [p for p in survey.pairs if p.used]
+    bare = _bare_stations(survey)
+    poses = [p for p in used if isinstance(p.b_from_a, Pose3)]
+    dim = 6 if len(poses) == len(used) and used else 3
+    whole = topology(_ends(used), bare)
+    counts = count(whole, dim)
+    tied = _tied(survey, used, bare, 6 if poses else 3)
+    closed = count(tied, dim)
+    conditions, redundancy, shifts = closed.independent_conditions, closed.redundancy, None
+    if dim == 3 and poses:
+        shifts = count(topology(_ends(poses), bare), 3)
+        redundancy += count(_tied(survey, poses, bare, 6), 3).redundancy
+    return PairNetwork(
+        counts, shifts, _given(survey, used, 6 if poses else 3),
+        tuple(p for p in closed.uncontrolled_pairs if not p.startswith(_GIVEN)),
+        tuple(real for g in closed.inseparable_pairs if len(real := _real(g)) > 1),
+        tuple(real for part in closed.parts if (real := tuple(s for s in part if s != _WORLD))),
+        conditions, redundancy,
+    )  # fmt: skip
+
+
+def _real(ids: Sequence[str]) -> tuple[str, ...]:
+    return tuple(i for i in ids if not i.startswith(_GIVEN))
+
+
+def _ends(pairs: Sequence[Pair]) -> list[tuple[str, str, str]]:
+    return [(p.pair_id, frame_name(p.a), frame_name(p.b)) for p in pairs]
+
+
+def _bare_stations(survey: Survey) -> tuple[str, ...]:
+    """Fixed stations that only pairs can determine: they carry neither cameras nor targets."""
+    carriers = {c.station_id for c in survey.cameras} | {t.station_id for t in survey.targets}
+    return tuple(s.station_id for s in survey.stations if s.motion == "fixed" and s.station_id not in carriers)
+
+
+def _is_given(parameter: PoseParameter, dim: int) -> bool:
+    if parameter.treatment == "held":
+        return True
+    cov = parameter.prior_cov
+    return parameter.treatment == "prior" and cov is not None and bool(np.isfinite(np.diag(cov)[:dim]).all())
+
+
+def _given(survey: Survey, pairs: Sequence[Pair], dim: int) -> tuple[str, ...]:
+    ends = {frame_name(r) for p in pairs for r in (p.a, p.b)}
+    fixed = (s for s in survey.stations if s.motion == "fixed" and s.station_id in ends)
+    given = tuple(s.station_id for s in fixed if _is_given(s.world_from_station, dim))
+    return ((_WORLD,) if _WORLD in ends else ()) + given
+
+
+def _tied(survey: Survey, pairs: Sequence[Pair], bare: tuple[str, ...], dim: int) -> Topology:
+    """The pairs, and what is given joined to the world where that closes loops."""
+    return topology(_ends(pairs) + [(_GIVEN + s, s, _WORLD) for s in _joined(survey, pairs, dim)], bare)
+
+
+def _joined(survey: Survey, pairs: Sequence[Pair], dim: int) -> tuple[str, ...]:
+    given = _given(survey, pairs, dim)
+    return tuple(s for s in given if s != _WORLD) if len(given) > 1 else ()
+
+
+def pair_loops(survey: Survey) -> LoopMisclosures | None:
+    """How well every independent loop of all measured pairs closes, used or not; None where there is no pair.
+
+    Of pairs with and without translation the rotations alone.
+    """
+    pairs = list(survey.pairs)
+    if not pairs:
+        return None
+    dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3
+    joined = _joined(survey, pairs, dim)
+    motions = [p.b_from_a for p in pairs]
+    covs = [np.asarray(p.cov)[:dim, :dim] for p in pairs]
+    stations = {s.station_id: s.world_from_station for s in survey.stations}
+    for station in joined:
+        given = stations[station]
+        motions.append(given.value or Pose3())
+        held = given.treatment == "held" or given.prior_cov is None
+        covs.append(np.zeros((dim, dim)) if held else np.asarray(given.prior_cov)[:dim, :dim])
+    network = Network(_tied(survey, pairs, (), dim), _motions(motions, dim), np.array(covs))
+    return loop_misclosures(network)
+
+
+def _motions(motions: Sequence[Pose3 | Rot3], dim: int) -> Motions:
+    rotation = np.array([(m.rotation() if isinstance(m, Pose3) else m).matrix() for m in motions])
+    if dim == 3:
+        return Motions(rotation)
+    return Motions(rotation, np.array([m.translation() for m in motions if isinstance(m, Pose3)]))
+
+
+def network_dict(network: PairNetwork) -> dict[str, Any]:
+    """The counts as plain values."""
+    c = network.counts
+    return {
+        "n_stations": c.n_stations,
+        "n_parts": len(network.parts),
+        "parts": [list(part) for part in network.parts] if len(network.parts) > 1 else [],
+        "independent_unknown_poses": c.independent_unknowns,
+        "measured_pairs": c.n_pairs,
+        "measurable_pairs": c.measurable_pairs,
+        "triangle_conditions": c.triangle_conditions,
+        "independent_conditions": network.conditions,
+        "conditions_through_given_stations": network.conditions - c.independent_conditions,
+        "equations_per_condition": c.loop_equations,
+        "redundancy": network.redundancy,
+        "conditions_per_pair": network.conditions / c.n_pairs if c.n_pairs else 0.0,
+        "given_stations": list(network.given),
+        "uncontrolled_pairs": list(network.uncontrolled),
+        "inseparable_pairs": [list(group) for group in network.inseparable],
+        "isolated_stations": list(c.isolated_stations),
+    }
+
+
+def loops_dict(loops: LoopMisclosures, left_out: Sequence[str] = ()) -> dict[str, Any]:
+    """The loops, worst first, as plain values; left_out: pairs that are not used, named beside the loops they are in.
+
+    sigma_misclosure: along the direction of the misclosure.
+    """
+    failed = set(loops.failed(ALPHA).tolist())
+    order = np.argsort(loops.p_value, kind="stable")[:_MOST_LOOPS].tolist()
+    return {
+        "n_loops": len(loops.test),
+        "n_failed": len(failed),
+        "n_listed": len(order),
+        "minimal": loops.basis.minimal,
+        "note": loops.basis.note,
+        "alpha": ALPHA,
+        "worst_first": [_loop(loops, k, k in failed, set(left_out)) for k in order],
+    }
+
+
+def _loop(loops: LoopMisclosures, k: int, failed: bool, left_out: set[str]) -> dict[str, Any]:
+    w, cov = loops.vector[k], loops.cov[k]
+    pairs = _real(loops.basis.pairs(k))
+    entry: dict[str, Any] = {"stations": list(loops.basis.stations(k)), "pairs": list(pairs)}
+    entry["misclosure_arcsec"], entry["sigma_misclosure_arcsec"] = _along(w[:3], cov[:3, :3], ARCSEC_PER_RAD)
+    if len(w) == 6:
+        entry["misclosure_mm"], entry["sigma_misclosure_mm"] = _along(w[3:], cov[3:, 3:], 1e3)
+    entry |= {"test": loops.test[k], "freedom": len(w), "p_value": loops.p_value[k], "closes": not failed}
+    return entry | {"pairs_not_used": [p for p in pairs if p in left_out]}
+
+
+def _along(w: FloatArray, cov: FloatArray, factor: float) -> tuple[float, float]:
+    size = float(np.linalg.norm(w))
+    sigma = float(np.sqrt(w @ cov @ w)) / size if size > 0.0 else float(np.sqrt(np.trace(cov) / 3.0))
+    return factor * size, factor * sigma

@@ -1,0 +1,181 @@
+"""Sections on measured pairs: what the network can tell, its loops one by one, and the adjusted pairs, worst first."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from survey.report.context import Context
+from survey.report.markup import (
+    count,
+    decimals_for,
+    definition,
+    esc,
+    fixed,
+    general,
+    pill,
+    section,
+    sigma_text,
+    table,
+    value_text,
+    with_sigma,
+)
+
+_MOST_LOOPS = 60
+_MOST_PAIRS = 150
+_MOST_NAMES = 30
+
+
+def network(c: Context) -> str:
+    """The counts of theorem 1, and what is weak by name."""
+    n = c.solution.get("network")
+    if n is None:
+        return ""
+    each = "poses" if n["equations_per_condition"] == 6 else "rotations"
+    facts = [
+        ("stations", count(n["n_stations"])),
+        ("parts", count(n["n_parts"])),
+        (f"independent unknown {each}", count(n["independent_unknown_poses"])),
+        ("pairs measured", f"{count(n['measured_pairs'])} of {count(n['measurable_pairs'])} measurable"),
+        ("triangle conditions", count(n["triangle_conditions"])),
+        ("independent conditions", count(n["independent_conditions"])),
+        ("redundancy", f"{count(n['redundancy'])} equations"),
+        ("conditions per pair", fixed(n["conditions_per_pair"], 2)),
+    ]
+    if n["conditions_through_given_stations"]:
+        facts.insert(6, ("of these through given stations", count(n["conditions_through_given_stations"])))
+    weak = _weak(n)
+    listed = f'<ul class="problems">{"".join(f"<li>{w}</li>" for w in weak)}</ul>' if weak else ""
+    note = (
+        "n stations have n − 1 independent relative poses; every independent loop of pairs adds a condition. A pair "
+        "that closes no loop cannot be checked. Pairs that share all their loops: an error in one is seen, but not "
+        "told from one in the others."
+    )
+    return section("network", "Network of measured pairs", definition(facts) + listed, note)
+
+
+def _weak(n: dict[str, Any]) -> list[str]:
+    out = []
+    for i, part in enumerate(n["parts"][:10]):
+        out.append(f"Part {i + 1}: {_named(part)}")
+    if n["uncontrolled_pairs"]:
+        out.append(f"Close no loop: {_named(n['uncontrolled_pairs'])}")
+    groups = n["inseparable_pairs"]
+    out += [f"Errors seen but not told apart: {_named(group)}" for group in groups[:10]]
+    if len(groups) > 10:
+        out.append(f"{count(len(groups) - 10)} more such groups in solution.json")
+    return out
+
+
+def _named(ids: Sequence[str]) -> str:
+    more = f" and {count(len(ids) - _MOST_NAMES)} more" if len(ids) > _MOST_NAMES else ""
+    return ", ".join(f"<code>{esc(i)}</code>" for i in ids[:_MOST_NAMES]) + more
+
+
+def loops(c: Context) -> str:
+    """Misclosures from the measured pairs alone, before any adjustment."""
+    found = c.solution.get("loops")
+    if found is None or not found["n_loops"]:
+        return ""
+    entries = found["worst_first"][:_MOST_LOOPS]
+    poses = any("misclosure_mm" in e for e in entries)
+    rows = [_loop_row(e, poses) for e in entries]
+    columns = ["<Loop", "<Pairs", "Misclosure", "σ [″]"] + (["[mm]", "σ [mm]"] if poses else [])
+    columns += ["Test", "p", "<"]
+    shown = (
+        f"All {count(found['n_loops'])}"
+        if len(rows) == found["n_loops"]
+        else f"The worst {count(len(rows))} of {count(found['n_loops'])}"
+    )
+    note = (
+        f"{shown} independent loops ({esc(found['note'])}), from the measured pairs alone, before any adjustment. σ: "
+        "of the misclosure, along its direction, from the covariances of the pairs. Test: w′C⁻¹w, chi-square with "
+        f"{6 if poses else 3} degrees of freedom; a loop is open where its p is too small for chance at "
+        f"{100 * found['alpha']:g} % for all loops together ({count(found['n_failed'])} are)."
+    )
+    classes = ["" if e["closes"] else "suspect" for e in entries]
+    return section("loops", "Loop closures", table(columns, rows, "", classes), note)
+
+
+def _loop_row(e: dict[str, Any], poses: bool) -> list[str]:
+    stations = " → ".join(esc(s) for s in _shortened([*e["stations"], e["stations"][0]]))
+    left_out = set(e["pairs_not_used"])
+    pairs = ", ".join(f"<s>{esc(p)}</s>" if p in left_out else esc(p) for p in _shortened(e["pairs"]))
+    cells = [stations, f"<small>{pairs}</small>", angle_text(e["misclosure_arcsec"], e["sigma_misclosure_arcsec"])]
+    cells.append(sigma_text(e["sigma_misclosure_arcsec"]))
+    if poses:
+        cells += [value_text(e["misclosure_mm"], e["sigma_misclosure_mm"]), sigma_text(e["sigma_misclosure_mm"])]
+    cells += [general(e["test"], 4), general(e["p_value"], 2)]
+    flag = "" if e["closes"] else pill("bad", "open")
+    return [*cells, flag + (" " + pill("soft", "has a pair not used") if left_out else "")]
+
+
+def _shortened(names: Sequence[str], most: int = 12) -> list[str]:
+    return list(names) if len(names) <= most else [*names[: most - 2], "…", names[-1]]
+
+
+def angle_text(arcsec: float, sigma: float | None) -> str:
+    """An angle of a few arcminutes or more in those too: 2′ 05″."""
+    if arcsec < 60.0:
+        return f"{value_text(arcsec, sigma)}″"
+    if arcsec >= 3600.0:
+        return f"{arcsec / 3600.0:.4g}°"
+    decimals = min(decimals_for(sigma) or 0, 2)
+    minutes = int(arcsec // 60.0)
+    rest = round(arcsec - 60.0 * minutes, decimals)
+    if rest >= 60.0:
+        minutes, rest = minutes + 1, 0.0
+    return f"{minutes}′ {rest:0{3 + decimals if decimals else 2}.{decimals}f}″"
+
+
+def pairs(c: Context) -> str:
+    """Adjusted pairs: value with sigma, residual, redundancy, test."""
+    every = c.solution["pairs"]
+    if not every:
+        return ""
+    order = sorted(every, key=lambda p: -_size(every[p]))[:_MOST_PAIRS]
+    poses = any("translation_mm" in every[p]["measured"] for p in order)
+    rows = [_pair_row(p, every[p], poses) for p in order]
+    columns = ["<Pair", "<From a to b", "x [°]", "y [°]", "z [°]", "<Quaternion w x y z"]
+    columns += ["x [mm]", "y [mm]", "z [mm]"] if poses else []
+    columns += ["Residual"] + (["[mm]"] if poses else []) + ["Redundancy", "Largest std.", "Test", "p", "<"]
+    more = f" The worst {count(len(rows))} of {count(len(every))}." if len(every) > len(rows) else ""
+    note = (
+        "Adjusted b_from_a: Euler angles of R = Rz(z) Ry(y) Rx(x) with the σ of small rotations about the axes of a, "
+        "translation with its σ along the axes of b. Residual: length of the rotation and of the translation that "
+        "takes the measured pair to the adjusted one; of pairs not used, to its prediction. Redundancy: mean of its "
+        f"components, 0 where nothing checks the pair, 1 where the others alone determine it.{more}"
+    )
+    classes = ["off" if not every[p]["used"] else "" for p in order]
+    return section("pairs", "Adjusted pairs", table(columns, rows, "", classes), note)
+
+
+def _size(entry: dict[str, Any]) -> float:
+    test = entry.get("test")
+    return -1.0 if test is None else float(test)
+
+
+def _pair_row(pair_id: str, e: dict[str, Any], poses: bool) -> list[str]:
+    value = e.get("adjusted", {})
+    cells = [f"<b>{esc(pair_id)}</b>", f"{esc(e['a'])} → {esc(e['b'])}"]
+    sigmas = value.get("sigma_rotation_arcsec", [None] * 3)
+    for angle, sigma in zip(value.get("rotation_euler_xyz_deg", [None] * 3), sigmas, strict=True):
+        shown = value_text(angle, None if not sigma else sigma / 3600.0)
+        cells.append(f'{shown}<span class="s">± {sigma_text(sigma)}″</span>')
+    quaternion = value.get("rotation_quaternion_wxyz", ())
+    cells.append(f"<small>{' '.join(fixed(q, 7) for q in quaternion)}</small>")
+    if poses:
+        shift = value.get("translation_mm", [None] * 3)
+        along = value.get("sigma_translation_mm", [None] * 3)
+        cells += [with_sigma(x, s) if s else value_text(x, None) for x, s in zip(shift, along, strict=True)]
+    cells.append(angle_text(e["misfit_arcsec"], None) if e.get("misfit_arcsec") is not None else "–")
+    cells += [general(e.get("misfit_mm"), 4)] if poses else []
+    redundancy = [r for r in e.get("redundancy", ()) if r is not None]
+    largest = max((abs(s) for s in e.get("standardized", ()) if s is not None), default=None)
+    cells += [fixed(sum(redundancy) / len(redundancy), 2) if redundancy else "–", fixed(largest, 2)]
+    cells += [general(e.get("test"), 4), general(e.get("p_value"), 2), _pair_flag(e)]
+    return cells
+
+
+def _pair_flag(e: dict[str, Any]) -> str:
+    if not e["used"]:
+        return pill("soft", "not used")
+    return "" if e.get("controlled", True) else pill("warn", "uncontrolled")
