@@ -9,6 +9,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.datum import gauge, stacking
@@ -167,9 +168,18 @@ def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
         redundancy = np.diag(Q) if item.used else np.zeros(n)
         out.append(
             ObservationResidual(item.kind, item.group, item.ids, item.components, item.units, item.observed,
-                                item.observed + v, v, sigma, redundancy, standardized, test, item.used)
+                                _adjusted(item, v), v, sigma, redundancy, standardized, test, item.used)
         )  # fmt: skip
     return tuple(out)
+
+
+def _adjusted(item: ObservationFactor, v: FloatArray) -> FloatArray:
+    """Observed plus residual; of a measured pair the logarithm of the adjusted motion."""
+    if item.kind != "pair":
+        return np.asarray(item.observed + v)
+    if len(v) == 3:
+        return np.asarray(Rot3.Logmap(Rot3.Expmap(item.observed) * Rot3.Expmap(v)))
+    return np.asarray(Pose3.Logmap(Pose3.Expmap(item.observed) * Pose3.Expmap(v)))
 
 
 def group_summaries(

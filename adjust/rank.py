@@ -216,7 +216,7 @@ def _rest(graph: AdjustmentGraph, stack: Stacking, null: FloatArray, lines: list
         lines.append(
             f"{'; '.join(texts[:6])}{more}: they move together without changing any observation; measure or hold one"
             if len(texts) > 1
-            else f"{texts[0]}: no observation depends on it; measure or hold it"
+            else f"{texts[0]}: the observations do not determine it; measure or hold it"
         )
     return list(dict.fromkeys(names))
 
