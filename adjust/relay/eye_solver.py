@@ -1,0 +1,295 @@
+"""Eyes of one station from what each of them saw: Gauss-Helmert model of ``A X = Z B`` and ``A X = X B``.
+
+Observed are poses ``world_from_eye`` (or motions of an eye between two epochs), all with covariance. Two eyes k, l of
+one station at one epoch give a condition without station pose,
+
+    Log(X_l^-1 X_k P_k^-1 W_k^-1 W_l P_l) = 0,   X = station_from_eye, W = room_from_world, P = world_from_eye;
+
+for motions the worlds are the eyes themselves, W = X. Every observation gets its residual, and the conditions are
+linearised at the adjusted observations (Koch 1999, section 3.9.2; Helmert 1872), so the minimum is that of the graph
+with all true poses as unknowns.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from adjust.errors import NotConvergedError
+from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.relay.motions import Motions, exp, right_jacobian, right_jacobian_inverse
+
+
+@dataclass(frozen=True, eq=False)
+class EyeConditions:
+    """m conditions between observed poses ``k_idx`` and ``l_idx`` (m,).
+
+    eye_k, eye_l, world_k, world_l: (m,) which unknown each takes; of motions the worlds are the eyes.
+    scale_k, scale_l: (m,) which unknown scale of lengths each takes, -1 for none.
+    """
+
+    k_idx: IntArray
+    l_idx: IntArray
+    eye_k: IntArray
+    eye_l: IntArray
+    world_k: IntArray
+    world_l: IntArray
+    scale_k: IntArray
+    scale_l: IntArray
+
+    def __len__(self) -> int:
+        return len(self.k_idx)
+
+    def __getitem__(self, mask: BoolArray) -> "EyeConditions":
+        return EyeConditions(*(getattr(self, name)[mask] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True, eq=False)
+class KnownMotion:
+    """Unknown ``idx`` is known as ``motion`` (one) with covariance (6, 6)."""
+
+    idx: int
+    motion: Motions
+    cov: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class EyeProblem:
+    """observed: (n,) poses or motions. cov: (n, 6, 6), or the joint one (6n, 6n). free: which of the unknowns (u,) are.
+
+    n_scales: unknown scales of lengths, as exponents.
+    """
+
+    observed: Motions
+    cov: FloatArray
+    conditions: EyeConditions
+    start: Motions
+    free: BoolArray
+    known: tuple[KnownMotion, ...] = ()
+    n_scales: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class EyeSolution:
+    """unknowns: (u,). scales: exponents. cov: (6f + s,) squared, of the free unknowns in order and then the scales.
+
+    residuals: (n, 6) of the observations, adjusted minus observed in their tangents. misclosure: (m, 6) with
+    ``misclosure_cov`` (m, 6, 6) after adjustment; test: (m,) chi-square with 6 degrees of freedom.
+    influence: (6f + s, 6n) derivative of the unknowns by the observations. omega: v'Pv.
+    """
+
+    problem: EyeProblem
+    unknowns: Motions
+    scales: FloatArray
+    cov: FloatArray
+    residuals: FloatArray
+    misclosure: FloatArray
+    misclosure_cov: FloatArray
+    test: FloatArray
+    influence: FloatArray
+    omega: float
+    redundancy: int
+    iterations: int
+
+    def rows(self, idx: int) -> IntArray:
+        """Rows of an unknown in ``cov``; empty where it is held."""
+        return unknown_rows(self.problem.free, idx)
+
+
+def unknown_rows(free: BoolArray, idx: int) -> IntArray:
+    """Rows (6,) of unknown ``idx`` among the free ones, (0,) where it is held."""
+    if not free[idx]:
+        return np.zeros(0, dtype=np.int64)
+    return np.asarray(6 * int(free[:idx].sum()) + np.arange(6), dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """f (m, 6) and its derivatives: by_k, by_l (m, 6, 6) observations, by (6m, 6f + s) unknowns, dense."""
+
+    f: FloatArray
+    by_k: FloatArray
+    by_l: FloatArray
+    by: FloatArray
+
+
+def linearise(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray) -> Linearised:
+    """The conditions at unknowns ``U`` and observations moved by ``v`` (n, 6)."""
+    c = problem.conditions
+    moved = problem.observed.retract(v)
+    Pk, Pl = (_scaled(moved[i], s, scales) for i, s in ((c.k_idx, c.scale_k), (c.l_idx, c.scale_l)))
+    back = Pk.inverse() @ U[c.world_k].inverse() @ U[c.world_l] @ Pl
+    C = U[c.eye_l].inverse() @ U[c.eye_k] @ back
+    f = C.log()
+    J = right_jacobian_inverse(f)
+    by_eye_k = J @ back.inverse().adjoint()
+    by_world_l = J @ Pl.inverse().adjoint()
+    by_world_k = -J @ (U[c.world_k].inverse() @ U[c.world_l] @ Pl).inverse().adjoint()
+    by_pose_k, by_pose_l = -by_eye_k, J
+    by = np.zeros((len(c), 6, 6 * len(U) + problem.n_scales))
+    row = np.arange(len(c))
+    parts = (
+        (c.eye_k, by_eye_k),
+        (c.eye_l, -J @ C.inverse().adjoint()),
+        (c.world_k, by_world_k),
+        (c.world_l, by_world_l),
+    )
+    for idx, D in parts:
+        for j in range(6):
+            by[row, :, 6 * idx + j] += D[:, :, j]  # each row once, so nothing is lost
+    for idx, pose, D in ((c.scale_k, Pk, by_pose_k), (c.scale_l, Pl, by_pose_l)):
+        has = idx >= 0
+        if has.any():
+            by[row[has], :, 6 * len(U) + idx[has]] += (D[has] @ _stretch(pose[has])[..., None])[..., 0]
+    keep = np.concatenate([np.repeat(problem.free, 6), np.ones(problem.n_scales, dtype=np.bool_)])
+    by_v = right_jacobian(v)
+    return Linearised(
+        f,
+        by_pose_k @ _unscaled(c.scale_k, scales) @ by_v[c.k_idx],
+        by_pose_l @ _unscaled(c.scale_l, scales) @ by_v[c.l_idx],
+        by[:, :, keep].reshape(6 * len(c), -1),
+    )
+
+
+def _scaled(poses: Motions, idx: IntArray, scales: FloatArray) -> Motions:
+    if poses.translation is None:
+        raise ValueError("eyes are found from poses, not from rotations alone")
+    return Motions(poses.rotation, poses.translation * _factor(idx, scales)[:, None])
+
+
+def _factor(idx: IntArray, scales: FloatArray) -> FloatArray:
+    return np.asarray(np.exp(np.append(scales, 0.0)[idx]))  # -1 takes the zero at the end
+
+
+def _unscaled(idx: IntArray, scales: FloatArray) -> FloatArray:
+    """How the tangent of a pose changes where its lengths are scaled, (m, 6, 6)."""
+    out = np.zeros((len(idx), 6, 6))
+    out[:, range(3), range(3)] = 1.0
+    out[:, range(3, 6), range(3, 6)] = _factor(idx, scales)[:, None]
+    return out
+
+
+def _stretch(pose: Motions) -> FloatArray:
+    """Derivative (m, 6) of a pose in its tangent by the exponent of its lengths."""
+    if pose.translation is None:
+        raise ValueError("eyes are found from poses, not from rotations alone")
+    turned = (np.swapaxes(pose.rotation, -1, -2) @ pose.translation[..., None])[..., 0]
+    return np.concatenate([np.zeros_like(turned), turned], axis=1)
+
+
+class _Weights:
+    """M = B Q B' of the conditions, factorised, with Q block diagonal or full."""
+
+    def __init__(self, problem: EyeProblem, at: Linearised) -> None:
+        m, n = len(at.f), len(problem.observed)
+        index, ptr = np.arange(m), np.arange(m + 1)
+        shape = (6 * m, 6 * n)
+        order = (problem.conditions.k_idx, problem.conditions.l_idx)
+        parts = [
+            sp.bsr_array((np.ascontiguousarray(D), i, ptr), shape=shape)
+            for D, i in zip((at.by_k, at.by_l), order, strict=True)
+        ]
+        self.B = (parts[0] + parts[1]).tocsr()
+        if problem.cov.ndim == 3:
+            Q = sp.bsr_array((np.ascontiguousarray(problem.cov), np.arange(n), np.arange(n + 1)), shape=(6 * n, 6 * n))
+            self.QBt = (Q @ self.B.T).tocsc()
+            self.M = (self.B @ self.QBt).tocsc()
+            self.factor = splu(
+                self.M, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
+            self.solve = self.factor.solve
+        else:
+            self.QBt = np.asarray(problem.cov @ self.B.T.toarray())
+            self.M = np.asarray(self.B @ self.QBt)
+            root = scipy.linalg.cho_factor(self.M)
+            self.solve = lambda right: scipy.linalg.cho_solve(root, right)
+        self.blocks = _diagonal_blocks(self.M, index)
+
+
+def _diagonal_blocks(M: FloatArray | sp.csc_array, index: IntArray) -> FloatArray:
+    if isinstance(M, np.ndarray):
+        m = len(index)
+        return np.asarray(M.reshape(m, 6, m, 6)[index, :, index, :])
+    rows = np.repeat(np.arange(6), 6)[None] + 6 * index[:, None]
+    cols = np.tile(np.arange(6), 6)[None] + 6 * index[:, None]
+    return np.asarray(M[rows.ravel(), cols.ravel()]).reshape(-1, 6, 6)
+
+
+def solve_eyes(problem: EyeProblem, max_iterations: int = 50, max_step: float = 1e-9) -> EyeSolution:
+    """Least squares. Raises NotConvergedError; the caller has seen to it that everything is determined."""
+    U, scales = problem.start, np.zeros(problem.n_scales)
+    v = np.zeros((len(problem.observed), 6))
+    n_free = 6 * int(problem.free.sum())
+    for iteration in range(1, max_iterations + 1):
+        at = linearise(problem, U, scales, v)
+        weights = _Weights(problem, at)
+        w = at.f.ravel() - weights.B @ v.ravel()
+        MA = weights.solve(at.by)
+        N, right = at.by.T @ MA, MA.T @ w
+        _add_known(problem, U, N, right)
+        root = scipy.linalg.cho_factor(N)
+        step = -scipy.linalg.cho_solve(root, right)
+        v = np.asarray(-(weights.QBt @ weights.solve(w + at.by @ step))).reshape(-1, 6)
+        delta = np.zeros((len(U), 6))
+        delta[problem.free] = step[:n_free].reshape(-1, 6)
+        U, scales = U.retract(delta), scales + step[n_free:]
+        moved = float(np.sqrt(step @ N @ step))
+        if moved < max_step or (iteration > 8 and moved < 1e-6):
+            return _finish(problem, U, scales, v, iteration)
+    raise NotConvergedError(
+        f"the eyes did not settle in {max_iterations} steps (last step {moved:.2g} sigma); look for wrong "
+        "poses or epochs"
+    )
+
+
+def _add_known(problem: EyeProblem, U: Motions, N: FloatArray, right: FloatArray) -> float:
+    """Adds what is known beforehand to the normal equations; gives its share of v'Pv."""
+    omega = 0.0
+    for known in problem.known:
+        r = (known.motion.inverse() @ U[np.array([known.idx])]).log()
+        J, P = right_jacobian_inverse(r)[0], np.linalg.inv(known.cov)
+        rows = unknown_rows(problem.free, known.idx)
+        N[np.ix_(rows, rows)] += J.T @ P @ J
+        right[rows] += J.T @ P @ r[0]
+        omega += float(r[0] @ P @ r[0])
+    return omega
+
+
+def _finish(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray, iterations: int) -> EyeSolution:
+    at = linearise(problem, U, scales, v)
+    weights = _Weights(problem, at)
+    w = at.f.ravel() - weights.B @ v.ravel()
+    MA = np.asarray(weights.solve(at.by))
+    N = at.by.T @ MA
+    omega = _add_known(problem, U, N, np.zeros(len(N)))
+    cov = np.linalg.inv(N)
+    Mw = np.asarray(weights.solve(w))
+    omega += float(w @ Mw)
+    A = at.by.reshape(len(at.f), 6, -1)
+    left = weights.blocks - A @ cov @ np.swapaxes(A, -1, -2)
+    w = w.reshape(-1, 6)
+    test = np.einsum("mi,mij,mj->m", w, np.linalg.pinv(left, rcond=1e-9, hermitian=True), w)
+    influence = -cov @ (weights.B.T @ MA).T
+    redundancy = 6 * len(at.f) + 6 * len(problem.known) - len(cov)
+    return EyeSolution(
+        problem, U, scales, cov, v, w, left, test, np.asarray(influence), omega, redundancy, iterations
+    )  # fmt: skip
+
+
+def one_motion(rotation: FloatArray, translation: FloatArray) -> Motions:
+    """A single motion as the arrays have it."""
+    return Motions(np.asarray(rotation)[None], np.asarray(translation)[None])
+
+
+def stacked(parts: Sequence[Motions]) -> Motions:
+    """Motions one after the other."""
+    shifts = [p.translation for p in parts if p.translation is not None]
+    return Motions(np.concatenate([p.rotation for p in parts]), np.concatenate(shifts))
+
+
+def disturbed(motions: Motions, tangents: FloatArray) -> Motions:
+    """``X Exp(d)``: observed from true with errors (n, 6)."""
+    return motions @ exp(tangents)

@@ -1,0 +1,231 @@
+"""The eyes of a relay station from what each of them saw: cameras without a common view, trackers, marker blocks.
+
+>>> found = adjust_eyes((sequence_of_a, sequence_of_b))   # poses of each eye before its own target, A X = Z B
+>>> found = adjust_eye_motions((motions_of_a, motions_of_b))   # motions between epochs, A X = X B
+>>> found.pair("a", "b")   # Pair a -> b with its covariance (6, 6), for adjust.relay
+
+Two eyes give one pair; more give the whole station at once, with the joint covariance of all eyes.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.errors import SurveyError
+from adjust.model import FloatArray
+from adjust.observations import FrameRef, Pair
+from adjust.precision import global_test
+from adjust.relay.eye_checks import OutlierEpoch, refuse_undetermined
+from adjust.relay.eye_screening import solve_screened
+from adjust.relay.eye_setup import EyeSetup, motion_setup, pose_setup
+from adjust.relay.eye_solver import EyeSolution
+from adjust.relay.motions import Motions
+from adjust.relay.network import gtsam_motion
+from adjust.result import GlobalTest
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSequence:
+    """Poses of one eye in the world that it watches: n epochs.
+
+    world_ids: (n,) name of the frame each pose refers to, a target or the eye's own start. world_from_eye: (n,).
+    cov: (n, 6, 6) in the tangents on the right (frame of the eye), or the joint one (6n, 6n), as from one adjustment.
+    """
+
+    eye: FrameRef
+    epoch_ids: tuple[str, ...]
+    world_ids: tuple[str, ...]
+    world_from_eye: Motions
+    cov: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSequence:
+    """Motions ``before_from_after`` of one eye over n intervals, independent of each other; cov: (n, 6, 6)."""
+
+    eye: FrameRef
+    interval_ids: tuple[str, ...]
+    before_from_after: Motions
+    cov: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class KnownWorlds:
+    """Two targets known to each other: ``a_from_b`` with covariance (6, 6) in frame b, by the names of the worlds."""
+
+    a_id: str
+    b_id: str
+    a_from_b: Pose3
+    cov: FloatArray
+
+
+@dataclass(frozen=True)
+class EyeOptions:
+    """reject: epochs that contradict the others are left out and listed. alpha: of that test, for all epochs together.
+
+    weakest_turn_sigmas: the turns about the second axis must be so many sigmas of a turn, all epochs together.
+    largest_sigma_rad: an eye whose rotation stays more uncertain than this is undetermined.
+    free_scales: of motions, whether each eye but the first has a scale of its own, as visual trackers do.
+    """
+
+    reject: bool = True
+    alpha: float = 0.001
+    weakest_turn_sigmas: float = 10.0
+    largest_sigma_rad: float = 0.1
+    free_scales: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class EyeAdjustment:
+    """Eyes of one station; the first defines the station's frame.
+
+    station_from_eye: (k,) with joint covariance ``cov`` (6k, 6k), zero for the first. world: by name, the poses of the
+    worlds in that of the first. scales: by eye, factor on its lengths. outliers: epochs left out, worst first.
+    by_observation: (6k, 6n) derivative of all eyes by all observations, eye after eye in the order given.
+    """
+
+    eyes: tuple[FrameRef, ...]
+    station_from_eye: Motions
+    cov: FloatArray
+    room_from_world: Mapping[str, Pose3]
+    scales: Mapping[str, float]
+    scale_sigmas: Mapping[str, float]
+    outliers: tuple[OutlierEpoch, ...]
+    n_conditions: int
+    omega: float
+    redundancy: int
+    solution: EyeSolution = field(repr=False)
+    setup: EyeSetup = field(repr=False)
+
+    @property
+    def sigma0(self) -> float:
+        """A posteriori standard deviation of unit weight."""
+        return float(np.sqrt(self.omega / self.redundancy)) if self.redundancy else float("nan")
+
+    def global_test(self, alpha: float = 0.05) -> GlobalTest | None:
+        """Two-sided chi-square test of v'Pv."""
+        return global_test(self.omega, self.redundancy, alpha)
+
+    def pair(self, a_id: str, b_id: str, group: str = "pair") -> Pair:
+        """``b_from_a`` of two eyes with covariance (6, 6). Raises SurveyError for an unknown eye."""
+        a, b = self.eye_idx(a_id), self.eye_idx(b_id)
+        X = self.station_from_eye
+        b_from_a = X[np.array([b])].inverse() @ X[np.array([a])]
+        J = self.pair_jacobian(a_id, b_id)
+        return Pair(
+            f"{a_id}-{b_id}", self.eyes[a], self.eyes[b], as_pose(b_from_a), symmetric(J @ self.cov @ J.T), group
+        )
+
+    def pair_jacobian(self, a_id: str, b_id: str) -> FloatArray:
+        """Derivative (6, 6k) of the pair's tangent by the tangents of all eyes."""
+        a, b = self.eye_idx(a_id), self.eye_idx(b_id)
+        X = self.station_from_eye
+        J = np.zeros((6, 6 * len(self.eyes)))
+        J[:, 6 * b : 6 * b + 6] = -(X[np.array([a])].inverse() @ X[np.array([b])]).adjoint()[0]
+        J[:, 6 * a : 6 * a + 6] += np.eye(6)
+        return J
+
+    def by_observation(self) -> FloatArray:
+        """Derivative (6k, 6n) of the tangents of all eyes by the observations, in the order of the sequences."""
+        out = np.zeros((6 * len(self.eyes), self.solution.influence.shape[1]))
+        for i in range(len(self.eyes)):
+            rows = self.solution.rows(i)
+            if len(rows):
+                out[6 * i : 6 * i + 6] = self.solution.influence[rows]
+        return out
+
+    def eye_idx(self, eye_id: str) -> int:
+        """Position of an eye. Raises SurveyError for an unknown one."""
+        ids = [eye.frame_id for eye in self.eyes]
+        if eye_id not in ids:
+            raise SurveyError(f"eye {eye_id!r} is not on this station; it has {', '.join(ids)}")
+        return ids.index(eye_id)
+
+
+def adjust_eyes(
+    sequences: Sequence[PoseSequence], known: Sequence[KnownWorlds] = (), options: EyeOptions = EyeOptions()
+) -> EyeAdjustment:
+    """The eyes of a station from poses of each in its own world; the worlds stay unmoved, the station moves.
+
+    Epochs are joined by their ids. Worlds of the same name are the same; of ``known`` ones the relation is an
+    observation. Raises SurveyError naming the undetermined direction where the turns do not suffice.
+    """
+    return _adjusted(pose_setup(sequences, known), options)
+
+
+def adjust_eye_motions(sequences: Sequence[MotionSequence], options: EyeOptions = EyeOptions()) -> EyeAdjustment:
+    """The eyes of a station from their motions over the same intervals; errors of different intervals independent.
+
+    For eyes whose worlds drift, as those of trackers. Raises as :func:`adjust_eyes`.
+    """
+    return _adjusted(motion_setup(sequences, options.free_scales), options)
+
+
+def _adjusted(setup: EyeSetup, options: EyeOptions) -> EyeAdjustment:
+    setup = refuse_undetermined(setup, options.weakest_turn_sigmas)
+    solution, outliers = solve_screened(setup, options.reject, options.alpha)
+    k = len(setup.eyes)
+    place = np.concatenate([solution.rows(i) for i in range(k)])
+    target = np.concatenate([6 * i + np.arange(6) for i in range(k) if len(solution.rows(i))])
+    cov = np.zeros((6 * k, 6 * k))
+    cov[np.ix_(target, target)] = solution.cov[np.ix_(place, place)]
+    _refuse_weak(setup, solution, cov, options.largest_sigma_rad)
+    first = solution.cov.shape[0] - len(solution.scales)
+    spread = np.sqrt(np.diag(solution.cov)[first:])
+    factors = np.exp(solution.scales)
+    ids = [eye.frame_id for eye in setup.eyes]
+    return EyeAdjustment(
+        setup.eyes, solution.unknowns[:k], symmetric(cov),
+        {w: as_pose(solution.unknowns[np.array([i])]) for w, i in setup.world_idx.items()},
+        {ids[e]: float(factors[i]) for i, e in enumerate(setup.scaled_eyes)},
+        {ids[e]: float(spread[i] * factors[i]) for i, e in enumerate(setup.scaled_eyes)},
+        outliers, len(solution.problem.conditions), solution.omega, solution.redundancy, solution, setup,
+    )  # fmt: skip
+
+
+def _refuse_weak(setup: EyeSetup, solution: EyeSolution, cov: FloatArray, largest: float) -> None:
+    """The last word: a rotation that stays uncertain is no result."""
+    for i, eye in enumerate(setup.eyes):
+        s, V = np.linalg.eigh(cov[6 * i : 6 * i + 3, 6 * i : 6 * i + 3])
+        if s[-1] > largest**2:
+            text = ", ".join(f"{x:+.3f}" for x in V[:, -1])
+            raise SurveyError(
+                f"eye {eye.frame_id}: its rotation about ({text}) of its own frame is uncertain by "
+                f"{np.degrees(np.sqrt(s[-1])):.1f} deg: undetermined; turn the station about a "
+                "second axis, by 30 deg or more"
+            )
+
+
+def as_pose(motions: Motions) -> Pose3:
+    """The single motion as GTSAM's type."""
+    pose = gtsam_motion(motions, 0)
+    if not isinstance(pose, Pose3):
+        raise ValueError("a rotation alone is no pose")
+    return pose
+
+
+def symmetric(cov: FloatArray) -> FloatArray:
+    """Without the rounding that makes it lopsided."""
+    return np.asarray(0.5 * (cov + cov.T))
+
+
+def pair_from_marker(
+    pair_id: str, camera_from_target: Pose3, cov: FloatArray,
+    carrier: tuple[FrameRef, Pose3, FloatArray], watcher: tuple[FrameRef, Pose3, FloatArray],
+) -> Pair:  # fmt: skip
+    """A camera of one station sees the marker block of another: ``watcher_from_carrier`` with its covariance.
+
+    camera_from_target: as measured, cov (6, 6) in frame target. carrier: frame of the station that carries the block,
+    ``station_from_target`` and its covariance. watcher: frame of the station that looks, ``station_from_camera`` and
+    its covariance. Errors of the three are independent.
+    """
+    a, a_from_target, target_cov = carrier
+    b, b_from_camera, camera_cov = watcher
+    target_from_a = a_from_target.inverse()
+    b_from_a = b_from_camera.compose(camera_from_target).compose(target_from_a)
+    by_camera = camera_from_target.compose(target_from_a).inverse().AdjointMap()
+    by_target = a_from_target.AdjointMap()
+    out = by_camera @ camera_cov @ by_camera.T + by_target @ (cov + target_cov) @ by_target.T
+    return Pair(pair_id, a, b, b_from_a, symmetric(out))
