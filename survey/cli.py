@@ -83,6 +83,8 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_adjust(commands, shaped)
     _add_detect(commands, shaped)
+    _add_plan(commands, shaped)
+    _add_add(commands, shaped)
     _add_example(commands, shaped)
     return parser
 
@@ -128,6 +130,36 @@ def _add_detect(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument("--jobs", type=_positive, metavar="N", help="images at a time; default: one per processor")
     parser.add_argument("--pictures", action="store_true", help="also write every image with what was found in it")
     parser.set_defaults(run=_detect, parser=parser)
+
+
+def _add_plan(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "plan",
+        help="say what a network of pairs will tell, before it is measured",
+        usage="labsurvey plan lab   (labsurvey plan FOLDER)",
+        description="Counts conditions and redundancy from survey.toml and observations/pairs.csv, which needs no "
+        "values yet, only pair_id,a_id,b_id; names the pairs that close no loop.",
+        epilog="Next: labsurvey adjust FOLDER",
+        **shaped,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder with a survey.toml")
+    parser.set_defaults(run=_plan, parser=parser)
+
+
+def _add_add(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "add",
+        help="add stations or observations to an adjusted project",
+        usage="labsurvey add lab lab/more   (labsurvey add FOLDER NEW [--out DIR])",
+        description="NEW holds observations/*.csv and, for new stations, cameras, targets, points or tables, a "
+        "survey.toml with them.\nFOLDER is adjusted with them from its last solution; on any error it stays as it was.",
+        epilog="Next: open FOLDER/results/report.html",
+        **shaped,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="adjusted project folder")
+    parser.add_argument("new", type=Path, metavar="NEW", help="folder with what is new")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the grown project to DIR")
+    parser.set_defaults(run=_add, parser=parser)
 
 
 def _add_example(commands: Any, shaped: dict[str, Any]) -> None:
@@ -195,6 +227,32 @@ def _example(arguments: argparse.Namespace) -> int:
             f"Next: labsurvey adjust {arguments.folder}"
         )
     return DONE
+
+
+def _plan(arguments: argparse.Namespace) -> int:
+    _require_project(arguments.folder)
+    from survey.network import plan_job
+
+    outcome = plan_job(arguments.folder)
+    if _is(arguments, "json"):
+        _print_json(outcome.summary())
+    else:
+        print(f"{outcome.text()}\nNext: labsurvey adjust {arguments.folder}")
+    return DONE
+
+
+def _add(arguments: argparse.Namespace) -> int:
+    _require_project(arguments.folder)
+    from survey.network import add_job
+
+    outcome = add_job(arguments.folder, arguments.new, out=arguments.out, progress=not _is(arguments, "quiet"))
+    if _is(arguments, "json"):
+        _print_json(outcome.summary())
+    else:
+        print(outcome.text())
+        _say(arguments, *(f"written: {path}" for path in outcome.outcome.paths.values()))
+    test = outcome.outcome.adjustment.global_test
+    return DONE if test is None or test.omega <= test.upper else TEST_FAILED
 
 
 def _detect(arguments: argparse.Namespace) -> int:

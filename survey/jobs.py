@@ -194,16 +194,17 @@ def adjust_job(
         with clock.step("read"):
             project = read(folder)
     with clock.step("adjust"):
-        adjustment = _adjust_project(project, progress)
+        adjustment = adjust_project(project, progress)
     notes = tuple(f"detection: {m}" for m in messages)
     adjustment = replace(adjustment, warnings=adjustment.warnings + notes)
-    run = _run_info(project, clock.seconds)
+    run = run_info(project, clock.seconds)
     with clock.step("report"):
         paths = write_results(out if out is not None else folder, adjustment, run)
     return AdjustOutcome(adjustment, run, paths)
 
 
-def _adjust_project(project: Project, progress: bool) -> Adjustment:
+def adjust_project(project: Project, progress: bool) -> Adjustment:
+    """Adjust what was read. Raises SurveyError."""
     survey = project.survey
     if not (survey.image_blocks or project.spots or survey.pairs or survey.distances or survey.coordinates):
         raise SurveyError(
@@ -264,7 +265,8 @@ def _reindexed(survey: Survey, block: ImageBlock, ids: dict[str, int]) -> IntArr
     return np.array([ids[survey.points[int(i)].point_id] for i in block.point_idx], dtype=np.int64)
 
 
-def _run_info(project: Project, seconds: dict[str, float]) -> RunInfo:
+def run_info(project: Project, seconds: dict[str, float]) -> RunInfo:
+    """What was run, for result files."""
     versions = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:

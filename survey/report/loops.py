@@ -5,6 +5,7 @@ from typing import Any
 
 from survey.report.context import Context
 from survey.report.markup import (
+    MISSING,
     count,
     decimals_for,
     definition,
@@ -115,7 +116,7 @@ def _shortened(names: Sequence[str], most: int = 12) -> list[str]:
 def angle_text(arcsec: float, sigma: float | None) -> str:
     """An angle of a few arcminutes or more in those too: 2′ 05″."""
     if arcsec < 60.0:
-        return f"{value_text(arcsec, sigma)}″"
+        return f"{value_text(arcsec, sigma) if sigma else general(arcsec, 3)}″"
     if arcsec >= 3600.0:
         return f"{arcsec / 3600.0:.4g}°"
     decimals = min(decimals_for(sigma) or 0, 2)
@@ -166,11 +167,11 @@ def _pair_row(pair_id: str, e: dict[str, Any], poses: bool) -> list[str]:
         shift = value.get("translation_mm", [None] * 3)
         along = value.get("sigma_translation_mm", [None] * 3)
         cells += [with_sigma(x, s) if s else value_text(x, None) for x, s in zip(shift, along, strict=True)]
-    cells.append(angle_text(e["misfit_arcsec"], None) if e.get("misfit_arcsec") is not None else "–")
+    cells.append(angle_text(e["misfit_arcsec"], None) if e.get("misfit_arcsec") is not None else MISSING)
     cells += [general(e.get("misfit_mm"), 4)] if poses else []
     redundancy = [r for r in e.get("redundancy", ()) if r is not None]
     largest = max((abs(s) for s in e.get("standardized", ()) if s is not None), default=None)
-    cells += [fixed(sum(redundancy) / len(redundancy), 2) if redundancy else "–", fixed(largest, 2)]
+    cells += [fixed(sum(redundancy) / len(redundancy), 2) if redundancy else MISSING, fixed(largest, 2)]
     cells += [general(e.get("test"), 4), general(e.get("p_value"), 2), _pair_flag(e)]
     return cells
 

@@ -10,7 +10,7 @@ import pytest
 
 from adjust.errors import SurveyError
 from survey.cli import main
-from survey.examples import EXAMPLES, write_example
+from survey.examples import write_example
 from survey.examples.folders import MAKERS
 from survey.examples.pictures import picture
 from survey.files import read

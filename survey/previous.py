@@ -1,0 +1,135 @@
+"""What an earlier adjustment of a project left in its results: values to start from, and sigmas to compare with."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.closed_forms import mean_pose
+from adjust.errors import SurveyError
+from adjust.model import FloatArray
+from adjust.result import Adjustment, ParameterName
+from survey.files import Project
+from survey.files.poses import rotation_from_quaternion
+from survey.quantities import ARCSEC_PER_RAD
+from survey.results import RESULTS, read_covariances
+
+_POSES = {
+    "cameras": ("station_from_camera",),
+    "stations": ("world_from_station", "mount_from_station"),
+    "tables": ("world_from_table",),
+    "targets": ("world_from_target", "station_from_target"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Previous:
+    """A solution that was written: poses and points by parameter name; covs as written, by the same names.
+
+    factor: by which sigmas were multiplied. clean: whether every observation was used.
+    """
+
+    poses: Mapping[ParameterName, Pose3]
+    points: Mapping[str, FloatArray]
+    covs: Mapping[ParameterName, FloatArray]
+    factor: float
+    summary: Mapping[str, Any]
+    clean: bool
+
+
+@dataclass(frozen=True)
+class Move:
+    """How far a station or point went: mm, arcsec, and the largest component in its sigmas of before (a priori)."""
+
+    name: str
+    mm: float
+    arcsec: float
+    sigmas: float
+
+
+def read_previous(project: Project) -> Previous:
+    """The results of a project. Raises SurveyError where it was not adjusted, or has changed since."""
+    path = project.folder / RESULTS / "solution.json"
+    again = f"run 'labsurvey adjust {project.folder}' first"
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        covs = read_covariances(path.with_name("covariance.npz"))
+    except FileNotFoundError as error:
+        raise SurveyError(f"{error.filename}: is not there, the project is not adjusted yet; {again}") from error
+    except (ValueError, KeyError, OSError) as error:
+        raise SurveyError(f"{path}: cannot be read as a solution ({error}); {again}") from error
+    hashes = found["inputs"]["hashes"]
+    changed = sorted(k for k in {*hashes, *project.inputs} if hashes.get(k) != project.inputs.get(k))
+    if changed:
+        raise SurveyError(f"{project.folder}: {', '.join(changed)} changed since the project was adjusted; {again}")
+    summary = found["summary"]
+    return Previous(
+        dict(_poses(found)), {p: 1e-3 * np.array([e[f"{a}_mm"] for a in "xyz"]) for p, e in found["points"].items()},
+        {tuple(k.split("/")): v for k, v in covs.items()}, float(summary["sigma_factor"]), summary,
+        summary["suspects"]["n_not_used"] == 0,
+    )  # fmt: skip
+
+
+def _poses(found: Mapping[str, Any]) -> list[tuple[ParameterName, Pose3]]:
+    out: list[tuple[ParameterName, Pose3]] = []
+    for section, names in _POSES.items():
+        for owner, entry in found[section].items():
+            for name in names:
+                kind = "carrier_from_target" if section == "targets" else name
+                if name in entry:
+                    out.append(((kind, owner), _pose(entry[name])))
+                for epoch, moved in entry.get("epochs", {}).items():
+                    if name in moved:
+                        out.append(((kind, owner, epoch), _pose(moved[name])))
+    return out
+
+
+def _pose(entry: Mapping[str, Any]) -> Pose3:
+    rotation = rotation_from_quaternion(np.array(entry["rotation_quaternion_wxyz"]))
+    if rotation is None:
+        raise SurveyError("solution.json: a quaternion is not of unit length; adjust the project again")
+    return Pose3(rotation, 1e-3 * np.array(entry["translation_mm"]))
+
+
+def moves(previous: Previous, adjustment: Adjustment) -> tuple[Move, ...]:
+    """How far stations and points went since, most sigmas first; those that were held are left out.
+
+    In a free network the datum may have moved too: the new solution is first laid onto the old one.
+    """
+    old, new = previous.poses, adjustment.estimates
+    names = [n for n in old if n[0] == "world_from_station" and n in new]
+    onto = _fit(previous, adjustment, names) if adjustment.survey.datum.kind == "inner" else Pose3()
+    out = []
+    for name in names:
+        value = new[name].value
+        if isinstance(value, Pose3):
+            d = np.asarray(Pose3.Logmap(old[name].between(onto.compose(value))))
+            out.append(_move(previous, name, d, float(ARCSEC_PER_RAD * np.linalg.norm(d[:3])), d[3:]))
+    for point, x in previous.points.items():
+        estimate = new.get(("point", point))
+        if estimate is not None and not isinstance(estimate.value, Pose3):
+            d = np.asarray(onto.transformFrom(np.asarray(estimate.value))) - x
+            out.append(_move(previous, ("point", point), d, 0.0, d))
+    return tuple(sorted((m for m in out if m is not None), key=lambda m: -m.sigmas))
+
+
+def _move(previous: Previous, name: ParameterName, d: FloatArray, arcsec: float, shift: FloatArray) -> Move | None:
+    cov = previous.covs.get(name)
+    if cov is None:
+        return None
+    sigma = np.sqrt(np.clip(np.diag(cov), 0.0, None)) / previous.factor
+    known = sigma > 0.0
+    if not known.any():
+        return None
+    text = "@".join(name[1:]) if name[0] == "world_from_station" else f"point {name[1]}"
+    return Move(text, float(1e3 * np.linalg.norm(shift)), arcsec, float(np.abs(d[known] / sigma[known]).max()))
+
+
+def _fit(previous: Previous, adjustment: Adjustment, names: list[ParameterName]) -> Pose3:
+    """What takes the new world to the old one."""
+    offers = [previous.poses[n].compose(v.inverse()).matrix() for n in names
+              if isinstance(v := adjustment.estimates[n].value, Pose3)]  # fmt: skip
+    return Pose3(mean_pose(np.array(offers), 1.0)[0]) if offers else Pose3()
