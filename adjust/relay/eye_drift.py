@@ -1,0 +1,177 @@
+"""How trackers err: variance components of their drift from the eyes' own misclosures.
+
+A tracker's pose is a sum of small errors, so the errors of poses are correlated over the whole time and those of
+motions over intervals one after the other are not. What the intervals are, the data say: misclosures at growing intervals grow
+with the root of time where the world drifts, and not at all where poses have white noise.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+from adjust.errors import NotConvergedError, SurveyError
+from adjust.model import FloatArray
+from adjust.relay.eye_solver import EyeProblem, EyeSolution, linearise
+from adjust.relay.eye_trajectories import CommonMotions, Trajectory, common_motions
+from adjust.relay.eyes import EyeAdjustment, EyeOptions, MotionSequence, adjust_eye_motions
+from adjust.relay.motions import Motions
+
+_PARTS = (slice(0, 3), slice(3, 6))
+
+
+@dataclass(frozen=True, eq=False)
+class DriftModel:
+    """Random walk of each tracker: sigmas per root second, rotation (k,) rad and position (k,) m.
+
+    autocorrelation: of misclosures one interval apart, mean over all components, with its sigma where there is none.
+    redundancy: (k, 2) of the variance components.
+    """
+
+    interval_s: float
+    rotation: FloatArray
+    position: FloatArray
+    autocorrelation: float
+    autocorrelation_sigma: float
+    redundancy: FloatArray
+
+    def cov(self, eye: int, n: int, interval_s: float) -> FloatArray:
+        """Covariances (n, 6, 6) of motions of an eye over an interval."""
+        variance = np.repeat([self.rotation[eye] ** 2, self.position[eye] ** 2], 3) * interval_s
+        return np.asarray(np.broadcast_to(np.diag(variance), (n, 6, 6)).copy())
+
+
+def sequences(common: CommonMotions, model: DriftModel) -> tuple[MotionSequence, ...]:
+    """Motions with the covariances of their drift."""
+    length = float(common.times_s[0, 1] - common.times_s[0, 0])
+    ids = common.interval_ids
+    return tuple(
+        MotionSequence(eye, ids, m, model.cov(i, len(m), length))
+        for i, (eye, m) in enumerate(zip(common.eyes, common.motions, strict=True))
+    )
+
+
+_FIT = EyeOptions(reject=False, free_scales=True)
+
+
+def fit_drift(
+    common: CommonMotions, options: EyeOptions = _FIT, max_iterations: int = 60
+) -> tuple[DriftModel, EyeAdjustment]:
+    """Variance components of rotation and position of every tracker, estimated until they reproduce themselves.
+
+    Foerstner (1979): each component is v'Pv over the redundancy of its group. Needs three eyes, since two cannot tell
+    whose errors they are. Raises SurveyError for fewer, NotConvergedError.
+    """
+    k = len(common.eyes)
+    if k < 3:
+        raise SurveyError(f"{k} trackers cannot tell whose errors are whose; give three or more, or sigmas")
+    length = float(common.times_s[0, 1] - common.times_s[0, 0])
+    model = DriftModel(length, np.full(k, 3e-3), np.full(k, 1e-2), 0.0, 0.0, np.zeros((k, 2)))
+    for _ in range(max_iterations):
+        adjusted = adjust_eye_motions(sequences(common, model), options)
+        factor, redundancy = _components(adjusted.solution, k)
+        model = DriftModel(
+            length, model.rotation * np.sqrt(factor[:, 0]), model.position * np.sqrt(factor[:, 1]),
+            *_autocorrelation(adjusted.solution, k), redundancy,
+        )  # fmt: skip
+        if np.abs(factor - 1.0).max() < 0.02:
+            return model, adjust_eye_motions(sequences(common, model), options)
+    raise NotConvergedError(
+        f"the variance components of {k} trackers did not settle; one of them may have no errors that the others see"
+    )
+
+
+def _components(solution: EyeSolution, k: int) -> tuple[FloatArray, FloatArray]:
+    """Variance factors (k, 2) and redundancies (k, 2) of rotation and position of each eye."""
+    problem = solution.problem
+    n = len(problem.observed) // k
+    Qv = residual_covariance(problem, solution)
+    factor, redundancy = np.ones((k, 2)), np.zeros((k, 2))
+    variance = np.diagonal(problem.cov, axis1=1, axis2=2)
+    own = np.diag(Qv).reshape(-1, 6) / variance
+    square = solution.residuals**2 / variance
+    for eye in range(k):
+        rows = slice(eye * n, (eye + 1) * n)
+        for j, part in enumerate(_PARTS):
+            redundancy[eye, j] = own[rows, part].sum()
+            factor[eye, j] = square[rows, part].sum() / redundancy[eye, j]
+    return factor, redundancy
+
+
+def residual_covariance(problem: EyeProblem, solution: EyeSolution) -> FloatArray:
+    """Q_vv (6n, 6n) of the observations' residuals, dense."""
+    at = linearise(problem, solution.unknowns, solution.scales, np.zeros((len(problem.observed), 6)))
+    m, n = len(at.f), len(problem.observed)
+    B = np.zeros((m, 6, n, 6))
+    row = np.arange(m)
+    B[row, :, problem.conditions.k_idx] += at.by_k
+    B[row, :, problem.conditions.l_idx] += at.by_l
+    flat = B.reshape(6 * m, 6 * n)
+    Q = np.zeros((n, 6, n, 6))
+    Q[np.arange(n), :, np.arange(n)] = problem.cov
+    QBt = Q.reshape(6 * n, 6 * n) @ flat.T
+    inverse = np.linalg.inv(flat @ QBt)
+    MA = inverse @ at.by
+    return np.asarray(QBt @ (inverse - MA @ solution.cov @ MA.T) @ QBt.T)
+
+
+def _autocorrelation(solution: EyeSolution, k: int) -> tuple[float, float]:
+    """Of misclosures one interval apart: mean over components and eyes, and its sigma without any."""
+    w = solution.misclosure.reshape(-1, k - 1, 6)
+    shared = (w[1:] * w[:-1]).sum(axis=0) / (w * w).sum(axis=0)
+    # the eyes share the first one's errors: k - 1 series count as half as many, not fewer than one
+    independent = 6.0 * max(1.0, 0.5 * (k - 1))
+    return float(shared.mean()), float(1.0 / np.sqrt(len(w) * independent))
+
+
+def choose_interval(
+    trajectories: Sequence[Trajectory], offsets_s: Sequence[float], intervals_s: Sequence[float], alpha: float = 0.05
+) -> tuple[DriftModel, EyeAdjustment, CommonMotions]:
+    """The shortest interval whose misclosures are not positively correlated with their neighbours (one-sided test).
+
+    Raises SurveyError where they are at all intervals.
+    """
+    limit = float(norm.isf(alpha))
+    seen = []
+    for interval in intervals_s:
+        common = common_motions(trajectories, offsets_s, interval)
+        model, adjusted = fit_drift(common)
+        seen.append(f"{interval:g} s: {model.autocorrelation:+.2f}")
+        if model.autocorrelation < limit * model.autocorrelation_sigma:
+            return model, adjusted, common
+    raise SurveyError(
+        f"the misclosures of neighbouring intervals are correlated at all intervals ({', '.join(seen)}); "
+        "give longer ones"
+    )
+
+
+def growth(
+    trajectories: Sequence[Trajectory],
+    offsets_s: Sequence[float],
+    adjusted: EyeAdjustment,
+    intervals_s: Sequence[float],
+) -> FloatArray:
+    """Root mean square misclosures (L, k - 1, 2) of rotation (rad) and position (m) against the first eye, by interval.
+
+    Constant where poses have white noise, growing with the root of the interval where they drift.
+    """
+    out = []
+    for interval in intervals_s:
+        common = common_motions(trajectories, offsets_s, interval, step_s=min(interval, 0.3))
+        rows = []
+        for eye in range(1, len(common.eyes)):
+            X = adjusted.station_from_eye[np.array([eye])]
+            A = common.motions[0]
+            B = rescaled(common.motions[eye], adjusted.scales.get(common.eyes[eye].frame_id, 1.0))
+            miss = (X.inverse() @ A.inverse() @ X @ B).log()
+            rows.append([np.sqrt(np.mean(miss[:, part] ** 2)) for part in _PARTS])
+        out.append(rows)
+    return np.array(out)
+
+
+def rescaled(motions: Motions, factor: float) -> Motions:
+    """Lengths times a factor."""
+    if motions.translation is None:
+        raise ValueError("rotations alone have no lengths")
+    return Motions(motions.rotation, factor * motions.translation)

@@ -1,0 +1,136 @@
+"""Eyes that are cameras: from images of targets to poses of every camera by itself, with their joint covariance."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from gtsam import Pose3
+
+from adjust.adjustment import AdjustOptions, adjust
+from adjust.errors import SurveyError
+from adjust.model import Camera, PoseParameter, Station, Survey, Target
+from adjust.observations import FrameRef, ImageBlock, Pair
+from adjust.relay.eye_pairs import EyePairs, pairs_of
+from adjust.relay.eye_setup import from_matrix
+from adjust.relay.eye_solver import stacked
+from adjust.relay.eyes import EyeOptions, PoseSequence, symmetric
+from adjust.result import Adjustment
+
+ROOM = "room"  # the world of targets that the survey holds
+
+
+def camera_sequence(survey: Survey, camera_id: str, options: AdjustOptions = AdjustOptions()) -> PoseSequence:
+    """Poses of one camera before the targets it saw, adjusted by itself, with the joint covariance of all epochs.
+
+    Targets seen together in an epoch make one world, named after the first of them; targets that the survey holds stand
+    in the world "room". The lens is treated as in the survey. Raises SurveyError for targets that move.
+    """
+    camera = next((c for c in survey.cameras if c.camera_id == camera_id), None)
+    if camera is None:
+        raise SurveyError(f"camera {camera_id!r} is not part of the survey; correct the id")
+    blocks = tuple(b for b in survey.image_blocks if b.camera_id == camera_id and b.target_id and len(b.uv))
+    if not blocks:
+        raise SurveyError(f"camera {camera_id!r} has no image of a target; it cannot be an eye")
+    targets = _unmoved(survey, blocks)
+    world_of = _worlds(blocks, targets)
+    epochs = tuple(dict.fromkeys(b.epoch_id for b in blocks))
+    alone = adjust(_alone(camera, blocks, targets, world_of), options=options)
+    names = [("world_from_station", camera_id, epoch) for epoch in epochs if _seen(alone, camera_id, epoch)]
+    if alone.precision is None or not names:
+        raise SurveyError(f"camera {camera_id!r}: no epoch is left after adjusting it by itself")
+    poses = [alone.estimates[name].value for name in names]
+    first = {b.epoch_id: world_of[b.target_id] for b in blocks if b.target_id}
+    return PoseSequence(
+        FrameRef("camera", camera_id), tuple(name[2] for name in names), tuple(first[name[2]] for name in names),
+        stacked([from_matrix(p.matrix()) for p in poses if isinstance(p, Pose3)]), symmetric(alone.precision.joint(names)),
+    )  # fmt: skip
+
+
+def _seen(alone: Adjustment, camera_id: str, epoch_id: str) -> bool:
+    return ("world_from_station", camera_id, epoch_id) in alone.estimates
+
+
+def _unmoved(survey: Survey, blocks: tuple[ImageBlock, ...]) -> dict[str, Target]:
+    seen = {b.target_id for b in blocks}
+    targets = {t.target_id: t for t in survey.targets if t.target_id in seen}
+    moving = [t.target_id for t in targets.values() if t.motion == "epoch" or t.station_id is not None]
+    if moving:
+        raise SurveyError(
+            f"target {moving[0]!r} moves between epochs; pairs from station motions need targets that stand still"
+        )
+    return targets
+
+
+def _worlds(blocks: tuple[ImageBlock, ...], targets: Mapping[str, Target]) -> dict[str, str]:
+    """World of each target: those seen together hang together."""
+    world = {t: t for t in targets}
+    held = [t for t, target in targets.items() if target.carrier_from_target.treatment == "held"]
+    by_epoch: dict[str, list[str]] = {}
+    for b in blocks:
+        if b.target_id:
+            by_epoch.setdefault(b.epoch_id, []).append(b.target_id)
+    for group in [held, *by_epoch.values()]:
+        for other in group[1:]:
+            old, new = world[other], world[group[0]]
+            world = {t: new if w == old else w for t, w in world.items()}
+    rooms = {world[t] for t in held}
+    return {t: ROOM if w in rooms else w for t, w in world.items()}
+
+
+def _alone(
+    camera: Camera, blocks: tuple[ImageBlock, ...], targets: Mapping[str, Target], world_of: Mapping[str, str]
+) -> Survey:
+    """The camera as a station of its own; the first target of each world stands at its origin."""
+    free = PoseParameter()
+    origins = {w for w in world_of.values() if w != ROOM}
+    placed = []
+    for target_id, target in targets.items():
+        if world_of[target_id] == ROOM:
+            placed.append(target)
+            continue
+        origin = world_of[target_id] in origins
+        origins.discard(world_of[target_id])
+        parameter = PoseParameter(Pose3(), "held") if origin else free
+        placed.append(replace(target, carrier_from_target=parameter))
+    own = replace(camera, station_id=camera.camera_id, station_from_camera=PoseParameter(Pose3(), "held"))
+    return Survey(
+        cameras=(own,), stations=(Station(camera.camera_id, "epoch"),), targets=tuple(placed), image_blocks=blocks
+    )
+
+
+def camera_sequences(
+    survey: Survey | Adjustment, station_id: str | None = None, options: AdjustOptions = AdjustOptions()
+) -> tuple[PoseSequence, ...]:
+    """One sequence for each camera of a station (None: of the one station with two or more cameras).
+
+    Raises SurveyError for an unknown station, and where the station is not named and there are several.
+    """
+    found = survey.survey if isinstance(survey, Adjustment) else survey
+    by_station: dict[str, list[str]] = {}
+    for camera in found.cameras:
+        by_station.setdefault(camera.station_id, []).append(camera.camera_id)
+    if station_id is None:
+        several = [s for s, cameras in by_station.items() if len(cameras) > 1]
+        if len(several) != 1:
+            raise SurveyError(f"stations with two or more cameras: {', '.join(several) or 'none'}; name one of them")
+        station_id = several[0]
+    if station_id not in by_station:
+        raise SurveyError(
+            f"station {station_id!r} has no camera; the stations with cameras are {', '.join(by_station)}"
+        )
+    return tuple(camera_sequence(found, camera_id, options) for camera_id in by_station[station_id])
+
+
+def image_pairs(
+    survey: Survey | Adjustment, station_id: str | None = None,
+    adjust_options: AdjustOptions = AdjustOptions(), eye_options: EyeOptions = EyeOptions(),
+) -> EyePairs:  # fmt: skip
+    """All pairs of a station's cameras with what they share, and the reasons for those that cannot be found."""
+    return pairs_of(camera_sequences(survey, station_id, adjust_options), eye_options)
+
+
+def pairs_from_images(survey: Survey | Adjustment, station_id: str | None = None) -> tuple[Pair, ...]:
+    """Pairs of a station's cameras with their covariances, from its images of unmoved targets.
+
+    Each camera is adjusted by itself, then every two of them; see :func:`image_pairs` for what was refused.
+    """
+    return image_pairs(survey, station_id).pairs

@@ -1,0 +1,126 @@
+"""All pairs of a station's eyes, each from the two eyes alone, and what they share because they share an eye's errors."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+import scipy.linalg
+
+from adjust.errors import SurveyError
+from adjust.model import FloatArray
+from adjust.observations import Pair
+from adjust.relay.eyes import (
+    EyeAdjustment,
+    EyeOptions,
+    MotionSequence,
+    PoseSequence,
+    adjust_eye_motions,
+    adjust_eyes,
+    symmetric,
+)
+from adjust.relay.network import network_from_pairs
+from adjust.relay.parametric import ParametricAdjustment, ParametricOptions, adjust_parametric
+
+
+@dataclass(frozen=True, eq=False)
+class EyePairs:
+    """pairs: with their own covariances. joint_cov: (6p, 6p) with what they share. refused: pairs that cannot be found.
+
+    adjustments: of each pair, in the same order.
+    """
+
+    pairs: tuple[Pair, ...]
+    joint_cov: FloatArray
+    refused: tuple[str, ...]
+    adjustments: tuple[EyeAdjustment, ...] = field(repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopedPairs:
+    """Pairs after their loops were closed as if they were independent.
+
+    claimed_cov: (p, 6, 6) of that adjustment. actual_cov: (p, 6, 6) that the same estimate really has, since pairs of
+    one eye share its errors.
+    """
+
+    adjusted: ParametricAdjustment
+    claimed_cov: FloatArray
+    actual_cov: FloatArray
+
+
+def pairs_of(
+    sequences: Sequence[PoseSequence] | Sequence[MotionSequence], options: EyeOptions = EyeOptions()
+) -> EyePairs:
+    """Every two eyes by themselves. Raises SurveyError where no pair can be found."""
+    found: list[tuple[Pair, EyeAdjustment, FloatArray]] = []
+    refused = []
+    covs = [s.cov for s in sequences]
+    size = [6 * len(s.cov) if s.cov.ndim == 3 else len(s.cov) for s in sequences]
+    at = np.cumsum([0, *size])
+    for i, j in combinations(range(len(sequences)), 2):
+        a, b = sequences[i], sequences[j]
+        try:
+            adjusted = _two(a, b, options)
+        except SurveyError as error:
+            refused.append(f"pair {a.eye.frame_id}-{b.eye.frame_id}: {error}")
+            continue
+        ids = (a.eye.frame_id, b.eye.frame_id)
+        by = adjusted.pair_jacobian(*ids) @ adjusted.by_observation()
+        row = np.zeros((6, int(at[-1])))
+        row[:, at[i] : at[i + 1]], row[:, at[j] : at[j + 1]] = by[:, : size[i]], by[:, size[i] :]
+        found.append((adjusted.pair(*ids), adjusted, row))
+    if not found:
+        raise SurveyError("no two eyes make a pair: " + "; ".join(refused))
+    Q = scipy.linalg.block_diag(*(scipy.linalg.block_diag(*c) if c.ndim == 3 else c for c in covs))
+    G = np.concatenate([row for _, _, row in found])
+    return EyePairs(
+        tuple(p for p, _, _ in found), symmetric(G @ Q @ G.T), tuple(refused), tuple(x for _, x, _ in found)
+    )
+
+
+def _two(a: PoseSequence | MotionSequence, b: PoseSequence | MotionSequence, options: EyeOptions) -> EyeAdjustment:
+    if isinstance(a, PoseSequence) and isinstance(b, PoseSequence):
+        return adjust_eyes((a, b), (), options)
+    if isinstance(a, MotionSequence) and isinstance(b, MotionSequence):
+        return adjust_eye_motions((a, b), options)
+    raise ValueError("poses of one eye and motions of the other make no pair")
+
+
+def close_loops(found: EyePairs) -> LoopedPairs:
+    """Adjust the pairs with their loops as a network, each pair independent of the others, as measured pairs are."""
+    network = network_from_pairs(found.pairs)
+    adjusted = adjust_parametric(network, ParametricOptions(max_step=1e-8))
+    top, X = network.topology, adjusted.world_from_station
+    p, n = top.n_pairs, top.n_stations
+    D = np.zeros((p, 6, n, 6))
+    back = -(X[top.a_idx].inverse() @ X[top.b_idx]).adjoint()
+    D[np.arange(p), :, top.b_idx] += back
+    D[np.arange(p), :, top.a_idx] += np.eye(6)
+    A = D.reshape(6 * p, 6 * n)[:, 6:]  # the first station is the datum
+    P = np.linalg.inv(scipy.linalg.block_diag(*network.cov))
+    claimed = np.linalg.inv(A.T @ P @ A)
+    H = A @ claimed @ A.T @ P
+    at = np.arange(p)
+    cut = [C.reshape(p, 6, p, 6)[at, :, at, :] for C in (A @ claimed @ A.T, H @ found.joint_cov @ H.T)]
+    return LoopedPairs(adjusted, cut[0], cut[1])
+
+
+def triangle_misclosure(found: EyePairs, a_id: str, b_id: str, c_id: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Misclosure (6,) of c-a, b-c, a-b in frame a, its covariance as if the pairs were independent, and the true one.
+
+    Raises SurveyError where a pair is missing.
+    """
+    ids = [p.pair_id for p in found.pairs]
+    names = (f"{a_id}-{b_id}", f"{b_id}-{c_id}", f"{a_id}-{c_id}")
+    for name in names:
+        if name not in ids:
+            raise SurveyError(f"pair {name} is missing; the triangle is not closed")
+    at = [ids.index(name) for name in names]
+    ab, bc, ac = (network_from_pairs([found.pairs[i]]).b_from_a for i in at)
+    f = ac.inverse() @ bc @ ab
+    J = np.zeros((6, 6 * len(ids)))
+    for i, D in zip(at, (np.eye(6), ab.inverse().adjoint()[0], -f.inverse().adjoint()[0]), strict=True):
+        J[:, 6 * i : 6 * i + 6] = D
+    own = scipy.linalg.block_diag(*(p.cov for p in found.pairs))
+    return f.log()[0], J @ own @ J.T, J @ found.joint_cov @ J.T
