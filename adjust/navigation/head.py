@@ -1,0 +1,125 @@
+"""The calibrated head and its beacons, out of an adjustment, with their joint covariance."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.errors import SurveyError
+from adjust.lens import camera_constants
+from adjust.model import TABLE_GEOMETRY, FloatArray, PoseParameter, Survey
+from adjust.navigation.model import Beacons, Head, HeadCamera, HeadTable
+from adjust.result import Adjustment, ParameterName
+
+
+def head_and_beacons(
+    adjustment: Adjustment, station_id: str, known: Beacons | None = None, factor: float = 1.0
+) -> tuple[Head, Beacons]:
+    """Head ``station_id`` and the beacons of an adjustment (or those given), values and joint covariance.
+
+    factor: sigma0 where the covariance is to be scaled with it. Raises SurveyError where the station carries no camera,
+    or there is no beacon.
+    """
+    survey = adjustment.survey
+    cameras = tuple(_camera(adjustment, c.camera_id) for c in survey.cameras if c.station_id == station_id)
+    if not cameras:
+        stations = sorted({c.station_id for c in survey.cameras})
+        raise SurveyError(f"station {station_id!r} carries no camera; stations with cameras: {', '.join(stations)}")
+    table = _table(adjustment, station_id)
+    names: list[ParameterName] = []
+    for camera in cameras:
+        names += [("lens", camera.camera_id), ("station_from_camera", camera.camera_id)]
+    if table is not None:
+        table_id = str(next(s for s in survey.stations if s.station_id == station_id).table_id)
+        names += [("world_from_table", table_id), ("table_geometry", table_id), ("mount_from_station", station_id)]
+    points = [("point", p.point_id) for p in survey.points] if known is None else []
+    cov, sizes = _joint(adjustment, [*names, *points], _full_sizes(cameras, table, len(points)))
+    cov = factor**2 * cov
+    p = sum(sizes[: len(names)])
+    head = Head(cameras, cov[:p, :p], table)
+    if known is not None:
+        return head, known
+    if not points:
+        raise SurveyError("the survey has no beacons: name them under [points] in survey.toml, with their coordinates")
+    x = np.array([_vector(adjustment, name) for name in points])
+    return head, Beacons(tuple(name[1] for name in points), x, cov[p:, p:], cov[:p, p:])
+
+
+def _full_sizes(cameras: Sequence[HeadCamera], table: HeadTable | None, n_points: int) -> list[int]:
+    sizes = [size for c in cameras for size in (len(c.lens), 6)]
+    return sizes + ([6, 4, 6] if table is not None else []) + [3] * n_points
+
+
+def _camera(adjustment: Adjustment, camera_id: str) -> HeadCamera:
+    camera = next(c for c in adjustment.survey.cameras if c.camera_id == camera_id)
+    lens = _vector(adjustment, ("lens", camera_id))
+    pose = _pose(adjustment, ("station_from_camera", camera_id), camera.station_from_camera)
+    if pose is None:
+        raise SurveyError(f"camera {camera_id}: the adjustment does not tell how it sits on its station")
+    return HeadCamera(camera_id, camera.image_size, camera.lens.model, lens, camera_constants(camera), pose)
+
+
+def _table(adjustment: Adjustment, station_id: str) -> HeadTable | None:
+    survey: Survey = adjustment.survey
+    station = next((s for s in survey.stations if s.station_id == station_id), None)
+    if station is None or station.motion != "table" or station.table_id is None:
+        return None
+    table = next(t for t in survey.tables if t.table_id == station.table_id)
+    base = _pose(adjustment, ("world_from_table", table.table_id), table.world_from_table)
+    mount = _pose(adjustment, ("mount_from_station", station_id), station.mount_from_station)
+    if base is None or mount is None:
+        return None
+    values = dict(zip(table.geometry.names, table.geometry.values.tolist(), strict=True))
+    found = adjustment.estimates.get(("table_geometry", table.table_id))
+    if found is not None and not isinstance(found.value, Pose3):
+        values |= dict(zip(found.components, found.value.tolist(), strict=True))
+    return HeadTable(table.axes, base, np.array([values.get(n, 0.0) for n in TABLE_GEOMETRY]), mount)
+
+
+def _pose(adjustment: Adjustment, name: ParameterName, parameter: PoseParameter) -> Pose3 | None:
+    found = adjustment.estimates.get(name)
+    if found is not None and isinstance(found.value, Pose3):
+        return found.value
+    if parameter.value is None and parameter.treatment == "held":
+        return Pose3()
+    return parameter.value
+
+
+def _vector(adjustment: Adjustment, name: ParameterName) -> FloatArray:
+    value = adjustment.estimates[name].value
+    if isinstance(value, Pose3):
+        raise SurveyError(f"{'/'.join(name)} is a pose where numbers were expected")
+    return np.asarray(value, dtype=float)
+
+
+def _joint(
+    adjustment: Adjustment, names: Sequence[ParameterName], sizes: Sequence[int]
+) -> tuple[FloatArray, Sequence[int]]:
+    """Joint covariance with the full components of every parameter; zero where one is held."""
+    unknowns = adjustment.precision.graph.unknowns
+    free = [name for name in names if name in unknowns.by_name]
+    joint = adjustment.precision.joint(free) if free else np.zeros((0, 0))
+    starts = dict(zip(names, np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(int), strict=True))
+    spread = np.zeros((sum(sizes), len(joint)))
+    column = 0
+    for name in free:
+        dim = unknowns.by_name[name].dim
+        spread[starts[name] : starts[name] + _full(unknowns.vectors, name, dim).shape[0], column : column + dim] = _full(
+            unknowns.vectors, name, dim
+        )
+        column += dim
+    return np.asarray(spread @ joint @ spread.T), sizes
+
+
+def _full(vectors: Mapping[ParameterName, object], name: ParameterName, dim: int) -> FloatArray:
+    """From free components to all of a parameter (n, dim), in navigation's order."""
+    vector = vectors.get(name)
+    if vector is None:
+        return np.eye(dim)
+    matrix: FloatArray = np.asarray(vector.matrix)  # type: ignore[attr-defined]  # a VectorMap of adjust.unknowns
+    if name[0] != "table_geometry":
+        return matrix
+    out = np.zeros((4, dim))
+    for row, component in zip(matrix, vector.names, strict=True):  # type: ignore[attr-defined]  # the same
+        out[TABLE_GEOMETRY.index(component)] = row
+    return out

@@ -1,0 +1,261 @@
+"""Which spot is which beacon, and all poses that explain an epoch.
+
+Without a prior: three spots are named at a time in all ways that the distances of the beacons allow, each naming gives
+all its poses, and the poses are judged by how many other spots they explain and which beacons they miss. With a prior:
+only the beacons that it predicts near a spot are tried. The candidates are adjusted, their spots tested, and compared
+by their evidence: what cannot be told apart is reported, all of it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import numpy as np
+from scipy.stats import chi2
+
+from adjust.closed_forms.rigid import rigid
+from adjust.lens import MODELS, focal_length_px
+from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers, local, log_evidence
+from adjust.navigation.model import NavigateOptions
+from adjust.navigation.search_kernels import search
+from adjust.navigation.system import Sightings, System, evaluate, visible
+
+_KEPT = 400
+_ADJUSTED = 60
+_HOPELESS = 40.0  # difference in -2 ln evidence beyond which a candidate is of no interest
+_GATE = float(chi2.isf(1e-4, 2))
+_MOST_NAMINGS = 128
+_MOST_TRIPLES = 400
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A pose that explains an epoch: its fit, what was rejected (spots), -2 ln evidence and posterior probability."""
+
+    fit: PoseFit
+    rejected: tuple[int, ...]
+    score: float
+    probability: float = 1.0
+
+
+def allowed_namings(system: System, seen: Sightings) -> BoolArray:
+    """(n, m): all beacons for a spot without a name, its own for one with a name."""
+    m = len(system.beacons.beacon_ids)
+    out = np.ones((len(seen.uv), m), dtype=np.bool_)
+    for row, label in zip(out, seen.label, strict=True):
+        if label >= 0:
+            row[:] = False
+            row[label] = True
+    return out
+
+
+def without_prior(system: System, seen: Sightings, options: NavigateOptions) -> tuple[Candidate, ...]:
+    """All explanations of an epoch that are worth naming, best first; empty where fewer than three spots are there."""
+    if len(seen.uv) < 3:
+        return ()
+    poses, matches = _hypotheses(system, seen, allowed_namings(system, seen), options)
+    return _judged(system, seen, list(zip(poses, matches, strict=True)), None, options)
+
+
+def _hypotheses(
+    system: System, seen: Sightings, allowed: BoolArray, options: NavigateOptions
+) -> tuple[FloatArray, IntArray]:
+    """Poses (k, 4, 4) and namings (k, n) by the coarse consensus, best first."""
+    n, x = len(seen.uv), np.ascontiguousarray(system.beacons.x_in_world, dtype=float)
+    farthest = options.farthest_m
+    if farthest is None:
+        farthest = 10.0 * float(np.linalg.norm(np.ptp(x, axis=0)))
+    R, t = np.empty((_KEPT, 3, 3)), np.empty((_KEPT, 3))
+    score, match = np.full(_KEPT, -np.inf), np.empty((_KEPT, n), dtype=np.int64)
+    missed = np.where(seen.present, -np.log(1.0 - options.detection), 0.0)
+    named = np.log(_sky(system) / np.radians(options.gate_deg) ** 2)[seen.camera]
+    kept, _ = search(
+        seen.origin, seen.ray, seen.camera, allowed, _triples(seen), x, system.camera_R, system.camera_t, system.field,
+        np.radians(options.gate_deg), named, missed, options.nearest_m, farthest, options.max_hypotheses,
+        R, t, score, match,
+    )  # fmt: skip
+    order = np.argsort(-score[:kept], kind="stable")
+    return rigid(R[order], t[order]), match[order]
+
+
+def _sky(system: System) -> FloatArray:
+    """Solid angle (c,) of each camera's image, about."""
+    out = []
+    for camera in system.head.cameras:
+        focal = focal_length_px(MODELS[camera.model], camera.lens, camera.constants)
+        out.append(camera.image_size[0] * camera.image_size[1] / focal**2)
+    return np.array(out)
+
+
+def _triples(seen: Sightings) -> IntArray:
+    """Triples of spots: those that determine a pose best (widest between their rays) mixed with others, no order."""
+    every = np.array(list(combinations(range(len(seen.uv)), 3)), dtype=np.int64)
+    a, b, c = (seen.ray[every[:, i]] for i in range(3))
+    width = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    # quality in steps, and inside a step an order that does not favour any spot
+    rng = np.random.default_rng(len(every))
+    rank = np.lexsort((rng.random(len(every)), -np.floor(np.log2(np.maximum(width, 1e-9)))))
+    return np.ascontiguousarray(every[rank][:_MOST_TRIPLES])
+
+
+def with_prior(system: System, seen: Sightings, prior: Prior, options: NavigateOptions) -> tuple[Candidate, ...]:
+    """Explanations near a prior, best first. One that leaves components open needs names, or three spots."""
+    if len(prior.rows) < 6:
+        return _with_partial_prior(system, seen, prior, options)
+    distance = gate_distances(system, seen, prior)
+    near = (distance < _GATE) & allowed_namings(system, seen)
+    namings = _namings(seen, near, distance)
+    trial = [(prior.pose, match) for match in namings]
+    return _judged(system, seen, trial, prior, options)
+
+
+def _with_partial_prior(
+    system: System, seen: Sightings, prior: Prior, options: NavigateOptions
+) -> tuple[Candidate, ...]:
+    if len(seen.uv) >= 3:
+        poses, matches = _hypotheses(system, seen, allowed_namings(system, seen), options)
+        return _judged(system, seen, list(zip(poses, matches, strict=True)), prior, options)
+    if np.any(seen.label < 0):
+        return ()
+    return _judged(system, seen, [(prior.pose, seen.label)], prior, options)
+
+
+def gate_distances(system: System, seen: Sightings, prior: Prior) -> FloatArray:
+    """Squared distance (n, m) of every spot from where the prior expects every beacon, in sigmas; inf behind."""
+    n, m = len(seen.uv), len(system.beacons.beacon_ids)
+    camera, beacon = np.repeat(seen.camera, m), np.tile(np.arange(m), n)
+    residual, H, M, _ = evaluate(system, prior.pose, camera, beacon, np.repeat(seen.uv, m, axis=0))
+    ahead = _ahead(system, prior.pose)[camera, beacon]
+    H, M = H.reshape(-1, 2, 6), M.reshape(-1, 2, M.shape[-1])
+    common = H @ prior.B + M
+    S = np.repeat(seen.cov, m, axis=0) + H @ prior.cov @ H.swapaxes(1, 2) + common @ common.swapaxes(1, 2)
+    r = residual.reshape(-1, 2)
+    d2 = np.einsum("ni,ni->n", r, np.linalg.solve(S, r[:, :, None])[..., 0])
+    return np.asarray(np.where(ahead, d2, np.inf).reshape(n, m))
+
+
+def _ahead(system: System, pose: FloatArray) -> BoolArray:
+    """Which beacons (c, m) lie in front of each camera (anywhere, for a fisheye)."""
+    q = (system.beacons.x_in_world - pose[:3, 3]) @ pose[:3, :3]
+    depth = np.einsum("ck,cmk->cm", system.camera_R[:, :, 2], q[None] - system.camera_t[:, None, :])
+    return np.asarray((depth > 1e-3) | (system.field[:, 4:] < 1.5), dtype=np.bool_)
+
+
+def _namings(seen: Sightings, near: BoolArray, distance: FloatArray) -> list[IntArray]:
+    """Namings (n,) that use a beacon once a camera: free choice where spots and beacons compete, up to a limit."""
+    options: list[list[int]] = []
+    for i in range(len(near)):
+        beacons = sorted(np.flatnonzero(near[i]).tolist(), key=lambda b, i=i: float(distance[i, b]))
+        rivals = any(near[j, b] for b in beacons for j in np.flatnonzero(seen.camera == seen.camera[i]) if j != i)
+        options.append(beacons if len(beacons) == 1 and not rivals else [*beacons[:3], -1])
+    while np.prod([len(o) for o in options], dtype=float) > _MOST_NAMINGS:
+        longest = max(options, key=len)
+        if len(longest) <= 1:
+            break
+        # the farthest beacon goes first, 'none of them' goes last
+        longest.pop(-2 if len(longest) > 2 else -1)
+    out = []
+    for choice in product(*options):
+        named = [(int(c), b) for c, b in zip(seen.camera, choice, strict=True) if b >= 0]
+        if len(set(named)) == len(named):
+            out.append(np.array(choice, dtype=np.int64))
+    return out
+
+
+def _judged(
+    system: System, seen: Sightings, trials: Sequence[tuple[FloatArray, IntArray]], prior: Prior | None,
+    options: NavigateOptions,
+) -> tuple[Candidate, ...]:  # fmt: skip
+    """Adjust the trials, compare their evidence, and give each its probability."""
+    found: list[Candidate] = []
+    for pose, match in trials[: _ADJUSTED if prior is None else _MOST_NAMINGS]:
+        candidate = _adjusted(system, seen, pose, match, prior, options)
+        if candidate is not None and not any(_same(candidate, other) for other in found):
+            found.append(candidate)
+    found.sort(key=lambda c: c.score)
+    if not found:
+        return ()
+    weights = np.exp(-0.5 * (np.array([c.score for c in found]) - found[0].score))
+    weights /= weights.sum()
+    kept = [
+        Candidate(c.fit, c.rejected, c.score, float(w))
+        for c, w in zip(found, weights, strict=True)
+        if c.score < found[0].score + _HOPELESS
+    ]
+    return tuple(kept)
+
+
+def _same(a: Candidate, b: Candidate) -> bool:
+    """Whether two candidates are one: the same spots have the same beacons, and the poses agree."""
+    if not np.array_equal(a.fit.used, b.fit.used) or not np.array_equal(a.fit.beacon, b.fit.beacon):
+        return False
+    return bool(np.linalg.norm(local(a.fit.pose, b.fit.pose)) < 1e-3)
+
+
+def _adjusted(
+    system: System, seen: Sightings, pose: FloatArray, match: IntArray, prior: Prior | None, options: NavigateOptions
+) -> Candidate | None:
+    used = np.flatnonzero(match >= 0)
+    if prior is None and len(used) < 3:
+        return None
+    fit, rejected = fit_without_outliers(system, seen, used, match[used], pose, prior, options.alpha)
+    if fit is None or not fit.in_front:
+        return None
+    if prior is None:
+        fit = _grown(system, seen, fit, rejected)
+    if fit.redundancy > 0 and fit.chi_square > chi2.isf(1e-6, fit.redundancy):
+        return None
+    return Candidate(fit, rejected, score_of(system, seen, fit, prior, options))
+
+
+def _grown(system: System, seen: Sightings, fit: PoseFit, rejected: tuple[int, ...]) -> PoseFit:
+    """Name the spots that the pose explains and the coarse consensus left out."""
+    for _ in range(len(seen.uv)):
+        prior = Prior(fit.pose, fit.G @ _spot_noise(seen, fit) @ fit.G.T, fit.B, np.arange(6))
+        distance = gate_distances(system, seen, prior)
+        distance[~allowed_namings(system, seen)] = np.inf
+        distance[fit.used] = np.inf
+        distance[list(rejected)] = np.inf
+        for i, b in zip(fit.used, fit.beacon, strict=True):
+            distance[seen.camera == seen.camera[i], b] = np.inf
+        i, b = np.unravel_index(int(np.argmin(distance)), distance.shape)
+        if distance[i, b] > _GATE:
+            return fit
+        order = np.argsort(np.append(fit.used, i), kind="stable")
+        more = fit_pose(system, seen, np.append(fit.used, i)[order], np.append(fit.beacon, b)[order], fit.pose)
+        if more is None:
+            return fit
+        fit = more
+    return fit
+
+
+def _spot_noise(seen: Sightings, fit: PoseFit) -> FloatArray:
+    out = np.zeros((2 * len(fit.used),) * 2)
+    for i, cov in enumerate(seen.cov[fit.used]):
+        out[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = cov
+    return out
+
+
+def score_of(
+    system: System, seen: Sightings, fit: PoseFit, prior: Prior | None, options: NavigateOptions
+) -> float:
+    """-2 ln of the evidence of an explanation: fit, spots it calls false, beacons it should have seen and did not.
+
+    A false spot may be anywhere in its image; what no prior knows of the pose is uniform over all rotations (8 pi^2)
+    and the room.
+    """
+    areas = np.array([c.image_size[0] * c.image_size[1] for c in system.head.cameras], dtype=float)
+    used = set(fit.used.tolist())
+    false = [i for i in range(len(seen.uv)) if i not in used]
+    score = log_evidence(fit)
+    known = set() if prior is None else set(prior.rows.tolist())
+    score += 2.0 * np.log(8.0 * np.pi**2) * len({0, 1, 2} - known) / 3.0
+    score += 2.0 * np.log(options.room_m) * len({3, 4, 5} - known)
+    score -= 2.0 * float(np.log(options.false_spots / areas[seen.camera[false]]).sum())
+    score -= 2.0 * len(used) * np.log(options.detection)
+    taken = {(int(seen.camera[i]), int(b)) for i, b in zip(fit.used, fit.beacon, strict=True)}
+    # only cameras that took part: the others may not have been triggered
+    view = visible(system, fit.pose) & seen.present[:, None]
+    missing = sum((int(c), int(b)) not in taken for c, b in np.argwhere(view))
+    return float(score - 2.0 * missing * np.log(1.0 - options.detection))

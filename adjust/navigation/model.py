@@ -1,0 +1,211 @@
+"""What navigation works with and what it gives back, as frozen values.
+
+The head is a station that carries calibrated cameras; ``world_from_station`` is its pose. Lengths are metres, angles
+radians, images pixels. Covariances of poses are in GTSAM's tangent: rotation, then translation, in the station frame.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.model import FloatArray
+
+Status = Literal["fixed", "bridged", "ambiguous", "undetermined", "none"]
+Bridge = Literal["", "prior", "table", "motion"]
+
+
+@dataclass(frozen=True, eq=False)
+class HeadCamera:
+    """A calibrated camera of the head: ``lens`` (n,) and ``constants`` (4,) as ``adjust.lens`` has them."""
+
+    camera_id: str
+    image_size: tuple[int, int]
+    model: str
+    lens: FloatArray
+    constants: FloatArray
+    station_from_camera: Pose3
+
+
+@dataclass(frozen=True, eq=False)
+class HeadTable:
+    """A calibrated turntable that carries the head; ``geometry`` (4,) in the order of ``TABLE_GEOMETRY``."""
+
+    axes: tuple[str, ...]
+    world_from_table: Pose3
+    geometry: FloatArray
+    mount_from_station: Pose3
+
+
+@dataclass(frozen=True, eq=False)
+class Head:
+    """The calibrated head.
+
+    cov: joint covariance (p, p) of the calibration: camera after camera its lens (n,) and ``station_from_camera`` (6),
+    then, where there is a table, ``world_from_table`` (6), its geometry (4) and ``mount_from_station`` (6).
+    """
+
+    cameras: tuple[HeadCamera, ...]
+    cov: FloatArray
+    table: HeadTable | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Beacons:
+    """Known beacons: m names, ``x_in_world`` (m, 3) m and their joint covariance (3m, 3m) m^2.
+
+    cross_cov: (p, 3m) with the calibration of the head, where both come from one adjustment.
+    """
+
+    beacon_ids: tuple[str, ...]
+    x_in_world: FloatArray
+    cov: FloatArray
+    cross_cov: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Spots:
+    """Spots of one camera: uv (n, 2) px, cov (n, 2, 2) px^2; beacon_ids where they are known, None where not."""
+
+    camera_id: str
+    uv: FloatArray
+    cov: FloatArray
+    beacon_ids: tuple[str | None, ...] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """What is known of a pose beforehand; ``np.inf`` on the diagonal of cov (6, 6): nothing of that component."""
+
+    world_from_station: Pose3
+    cov: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class NavigationEpoch:
+    """What was observed at one epoch.
+
+    time_s: None where epochs are a second apart. table_angles (k,) rad with table_cov (k, k), where they were read.
+    """
+
+    epoch_id: str
+    spots: tuple[Spots, ...]
+    time_s: float | None = None
+    table_angles: FloatArray | None = None
+    table_cov: FloatArray | None = None
+    prior: PosePrior | None = None
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Constant velocity between epochs: white accelerations of these spectral densities (SI, per root second)
+    and the sigmas of the rates at the start."""
+
+    sigma_angular_acceleration: float = 0.05
+    sigma_acceleration: float = 0.05
+    sigma_angular_rate: float = 0.5
+    sigma_speed: float = 0.5
+
+
+@dataclass(frozen=True)
+class NavigateOptions:
+    """How poses are found.
+
+    motion: bridges and identifies by constant velocity; None: every epoch stands alone. use_table: whether table
+    angles identify and bridge.
+    detection: probability that a beacon in the field of view gives a spot. false_spots: expected number of false spots
+    an image. Both weigh hypotheses against each other.
+    probability: what a solution needs to be taken for the only one. alpha: level of the outlier test of an epoch.
+    gate_deg: how far a beacon may be from a spot in a hypothesis of three. nearest_m, farthest_m: distances of beacons;
+    farthest None: ten times their extent. room_m: edge of the cube in which the head is, where no prior says more.
+    max_hypotheses: three-point problems solved for one epoch at most.
+    """
+
+    motion: Motion | None = field(default_factory=Motion)
+    use_table: bool = True
+    detection: float = 0.9
+    false_spots: float = 0.3
+    probability: float = 0.999
+    alpha: float = 1e-3
+    gate_deg: float = 0.8
+    nearest_m: float = 0.05
+    farthest_m: float | None = None
+    room_m: float = 3.0
+    max_hypotheses: int = 200_000
+    max_alternatives: int = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Shares:
+    """The covariance (6, 6) of a pose by where it comes from; ``correlation`` between beacons and calibration."""
+
+    spots: FloatArray
+    beacons: FloatArray
+    calibration: FloatArray
+    prior: FloatArray
+    correlation: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """One pose that explains an epoch.
+
+    labels: one tuple per ``NavigationEpoch.spots``, the beacon of each spot or None.
+    score: -2 ln of its evidence; differences are what the test of solutions against each other uses.
+    """
+
+    world_from_station: Pose3
+    cov: FloatArray
+    labels: tuple[tuple[str | None, ...], ...]
+    chi_square: float
+    redundancy: int
+    score: float
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class EpochPose:
+    """The pose of one epoch and how far it can be trusted.
+
+    status: ``fixed`` by its own spots alone; ``bridged`` with the help of ``bridge``; ``ambiguous``: the best of
+    several solutions that cannot be told apart, all in ``alternatives``; ``undetermined``: some directions are open,
+    named in ``undetermined`` (their variances are infinite); ``none``: nothing is known (no pose).
+    labels: per ``NavigationEpoch.spots`` the beacon of each spot, None for a false spot or one that was rejected.
+    rejected: (camera, spot) that had a beacon and failed the outlier test.
+    """
+
+    epoch_id: str
+    status: Status
+    bridge: Bridge
+    world_from_station: Pose3 | None
+    cov: FloatArray
+    labels: tuple[tuple[str | None, ...], ...]
+    rejected: tuple[tuple[str, int], ...] = ()
+    chi_square: float = float("nan")
+    redundancy: int = 0
+    probability: float = 1.0
+    shares: Shares | None = None
+    alternatives: tuple[Solution, ...] = ()
+    undetermined: tuple[str, ...] = ()
+
+    @property
+    def n_beacons(self) -> int:
+        """Number of different beacons that were used."""
+        return len({b for labels in self.labels for b in labels if b is not None})
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(6,) rad and m, in the station frame; infinite where open."""
+        return np.asarray(np.sqrt(np.diag(self.cov)))
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """The poses of a sequence. Errors of beacons and calibration are common to all epochs and do not average out."""
+
+    epochs: tuple[EpochPose, ...]
+
+    def count(self, status: Status) -> int:
+        """Number of epochs of that status."""
+        return sum(e.status == status for e in self.epochs)

@@ -1,0 +1,169 @@
+"""Precision of a pose: what each source of error contributes, what stays open, and what to expect beforehand."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.lens import MODELS, project
+from adjust.model import FloatArray, IntArray
+from adjust.navigation.fit import PoseFit, Prior, fit_pose, retract
+from adjust.navigation.model import Beacons, Head, Shares
+from adjust.navigation.system import Sightings, System, evaluate, make_system, visible
+
+_OPEN = 1e-8  # of the largest eigenvalue of the scaled information
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What a pose would have: covariance (6, 6), shares, the beacons seen, and the open directions by name.
+
+    redundancy: observations minus unknowns. cov has infinite variances where a direction is open.
+    """
+
+    world_from_station: Pose3
+    cov: FloatArray
+    shares: Shares | None
+    beacon_ids: tuple[str, ...]
+    redundancy: int
+    undetermined: tuple[str, ...]
+
+
+def own_covariance(seen: Sightings, fit: PoseFit, prior: Prior | None) -> FloatArray:
+    """Covariance (6, 6) without the errors common to all epochs: of the spots and of the prior's own error."""
+    out = fit.G @ spot_noise(seen, fit.used) @ fit.G.T
+    if prior is not None:
+        out = out + fit.G_prior @ prior.cov[np.ix_(prior.rows, prior.rows)] @ fit.G_prior.T
+    return np.asarray(out)
+
+
+def spot_noise(seen: Sightings, used: IntArray) -> FloatArray:
+    """Covariance (2n, 2n) px^2 of the used spots."""
+    out = np.zeros((2 * len(used),) * 2)
+    for i, cov in enumerate(seen.cov[used]):
+        out[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = cov
+    return out
+
+
+def shares(system: System, seen: Sightings, fit: PoseFit, prior: Prior | None) -> Shares:
+    """The covariance of a fit by source; the parts add up to it.
+
+    Of a prior by motion the part that beacons and calibration had in it is counted with them.
+    """
+    own = fit.G @ spot_noise(seen, fit.used) @ fit.G.T
+    rest = own_covariance(seen, fit, prior) - own
+    # B = S F with S (6, p + 3m) unknown where F is rank deficient: split by the rows of F through its pseudo-inverse
+    S = fit.B @ np.linalg.pinv(system.F)
+    at = system.beacon_at
+    calibration, beacons = S[:, :at] @ system.F[:at], S[:, at:] @ system.F[at:]
+    cross = calibration @ beacons.T
+    return Shares(own, beacons @ beacons.T, calibration @ calibration.T, rest, cross + cross.T)
+
+
+def open_directions(
+    system: System, seen: Sightings, used: IntArray, beacon: IntArray, pose: FloatArray, prior: Prior | None = None
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Covariance (6, 6) with infinite variances where observations leave a pose (4, 4) open, and those directions."""
+    residual, H, M, _ = evaluate(system, pose, seen.camera[used], beacon, seen.uv[used])
+    W = np.linalg.inv(spot_noise(seen, used) + M @ M.T) if len(used) else np.zeros((0, 0))
+    N = H.T @ W @ H
+    if prior is not None:
+        rows = prior.rows
+        N[np.ix_(rows, rows)] += np.linalg.inv(prior.total[np.ix_(rows, rows)])
+    x = system.beacons.x_in_world
+    lever = float(np.linalg.norm(x - pose[:3, 3], axis=1).mean())
+    scale = np.array([1.0 / lever] * 3 + [1.0] * 3)  # a turn of so much moves the beacons by a metre
+    values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
+    is_open = values <= _OPEN * max(float(values[-1]), 1e-300)
+    V = vectors[:, ~is_open] * scale[:, None]
+    cov = (V / values[~is_open]) @ V.T
+    null = vectors[:, is_open]
+    touched = np.flatnonzero(np.sum(null**2, axis=1) > 1e-6)
+    cov[touched], cov[:, touched] = 0.0, 0.0
+    cov[touched, touched] = np.inf
+    return cov, tuple(_named(v * scale, i + 1, null.shape[1]) for i, v in enumerate(_readable(null).T))
+
+
+def _readable(null: FloatArray) -> FloatArray:
+    """A basis of the same space with as many zeros as elimination gives, each vector of unit length."""
+    basis = null.copy()
+    for k in range(basis.shape[1]):
+        row = int(np.argmax(np.abs(basis[:, k])))
+        basis[:, k] /= basis[row, k]
+        for j in range(basis.shape[1]):
+            if j != k:
+                basis[:, j] -= basis[row, j] * basis[:, k]
+    size = np.linalg.norm(basis, axis=0)
+    return np.asarray(basis / np.where(size > 0, size, 1.0))
+
+
+def _named(direction: FloatArray, number: int, of: int) -> str:
+    turn, shift = float(np.linalg.norm(direction[:3])), float(np.linalg.norm(direction[3:]))
+
+    def vector(v: FloatArray) -> str:
+        return "(" + " ".join(f"{c + 0.0:.2f}" for c in v / np.linalg.norm(v)) + ")"
+
+    if turn < 1e-3 * shift:
+        what = f"shift along {vector(direction[3:])}"
+    elif shift < 1e-3 * turn:
+        what = f"turn about {vector(direction[:3])}"
+    else:
+        per_degree = 1e3 * shift / np.degrees(turn)
+        what = f"turn about {vector(direction[:3])} with a shift of {per_degree:.1f} mm/deg along {vector(direction[3:])}"
+    return f"open direction {number} of {of} (axes of the head): {what}"
+
+
+def some_pose(system: System, seen: Sightings, used: IntArray, beacon: IntArray, start: FloatArray) -> FloatArray:
+    """One of the many poses (4, 4) that explain too few spots, nearest to a start in a way (damped steps)."""
+    pose, damping = start, 1e-3
+    residual, H, _, _ = evaluate(system, pose, seen.camera[used], beacon, seen.uv[used])
+    for _ in range(60):
+        step = -H.T @ np.linalg.solve(H @ H.T + damping * np.eye(len(H)) * np.trace(H @ H.T) / len(H), residual)
+        step *= min(1.0, 0.3 / max(float(np.linalg.norm(step)), 1e-12))
+        trial = retract(pose, step)
+        new, new_H, _, in_front = evaluate(system, trial, seen.camera[used], beacon, seen.uv[used])
+        if in_front and new @ new < residual @ residual:
+            pose, residual, H, damping = trial, new, new_H, damping * 0.3
+        else:
+            damping *= 10.0
+    return pose
+
+
+def expected_precision(
+    head: Head, beacons: Beacons, poses: Sequence[Pose3], sigma_px: float, *, hidden: Sequence[str] = ()
+) -> tuple[Expected, ...]:
+    """Precision at poses ``world_from_station`` before anything is measured: all beacons in view but ``hidden``."""
+    system = make_system(head, beacons)
+    out = []
+    for pose in poses:
+        view = visible(system, pose.matrix())
+        view[:, [beacons.beacon_ids.index(b) for b in hidden]] = False
+        camera, beacon = (a.astype(np.int64) for a in np.nonzero(view))
+        out.append(_expected(system, pose, camera, beacon, sigma_px))
+    return tuple(out)
+
+
+def _images(system: System, pose: FloatArray, camera: IntArray, beacon: IntArray) -> FloatArray:
+    """Image points (n, 2) px of beacons in view."""
+    uv = np.zeros((len(camera), 2))
+    q = (system.beacons.x_in_world[beacon] - pose[:3, 3]) @ pose[:3, :3]
+    for c, own in enumerate(system.head.cameras):
+        rows = camera == c
+        if rows.any():
+            p = (q[rows] - system.camera_t[c]) @ system.camera_R[c]
+            uv[rows] = project(MODELS[own.model], own.lens, own.constants, p)
+    return uv
+
+
+def _expected(system: System, pose: Pose3, camera: IntArray, beacon: IntArray, sigma_px: float) -> Expected:
+    n, ids = len(camera), system.beacons.beacon_ids
+    zeros = np.zeros(n, dtype=np.int64)
+    seen = Sightings(camera, _images(system, pose.matrix(), camera, beacon), np.tile(np.eye(2) * sigma_px**2, (n, 1, 1)), np.zeros((n, 3)),
+                     np.zeros((n, 3)), beacon, zeros, zeros, np.ones(len(system.kinds), dtype=np.bool_))  # fmt: skip
+    names = tuple(ids[b] for b in sorted(set(beacon.tolist())))
+    fit = fit_pose(system, seen, np.arange(n), beacon, pose.matrix()) if n >= 3 else None
+    if fit is None:
+        cov, undetermined = open_directions(system, seen, np.arange(n), beacon, pose.matrix())
+        return Expected(pose, cov, None, names, 2 * n - 6, undetermined)
+    return Expected(pose, fit.cov, shares(system, seen, fit, None), names, fit.redundancy, ())

@@ -1,0 +1,197 @@
+"""Head and beacons as the arrays that the compiled code takes, checked once."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.errors import SurveyError
+from adjust.lens import MODELS, unit_rays
+from adjust.lens_kernels import FISHEYE, MAX_LENS
+from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.navigation.model import Beacons, Head, NavigationEpoch, Spots
+from adjust.navigation.row_kernels import spot_rows
+
+_BORDER_PX = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """The calibrated head and the beacons.
+
+    F: (p + 3m, r) square root of the joint covariance of calibration and beacons: errors are ``F @ eta`` with eta
+    uncorrelated of unit variance. The errors eta are common to all epochs. field: (c, 5) what a camera surely sees:
+    smallest and largest x/z and y/z, and the cosine of the widest angle for a fisheye (2 elsewhere).
+    """
+
+    head: Head
+    beacons: Beacons
+    kinds: IntArray
+    lenses: FloatArray
+    constants: FloatArray
+    camera_R: FloatArray
+    camera_t: FloatArray
+    lens_at: IntArray
+    n_lens: IntArray
+    table_at: int
+    F: FloatArray
+    field: FloatArray
+
+    @property
+    def beacon_at(self) -> int:
+        """Row of F at which the beacons begin."""
+        return len(self.F) - 3 * len(self.beacons.beacon_ids)
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """The spots of an epoch, camera after camera.
+
+    camera: (n,). uv: (n, 2) px. cov: (n, 2, 2). origin, ray: (n, 3) in the station. label: (n,) beacon, -1 unknown.
+    block: (n,) which of the epoch's ``spots``. row: (n,) position there. present: (c,) whether a camera took part.
+    """
+
+    camera: IntArray
+    uv: FloatArray
+    cov: FloatArray
+    origin: FloatArray
+    ray: FloatArray
+    label: IntArray
+    block: IntArray
+    row: IntArray
+    present: BoolArray
+
+
+def make_system(head: Head, beacons: Beacons) -> System:
+    """Check head and beacons against each other. Raises SurveyError."""
+    sizes = [len(c.lens) + 6 for c in head.cameras]
+    p = sum(sizes) + (16 if head.table is not None else 0)
+    m = len(beacons.beacon_ids)
+    _check_shapes(head, beacons, p, m)
+    models = [MODELS[c.model] for c in head.cameras]
+    lenses = np.zeros((len(models), MAX_LENS))
+    for row, camera in zip(lenses, head.cameras, strict=True):
+        row[: len(camera.lens)] = camera.lens
+    joint = np.zeros((p + 3 * m,) * 2)
+    joint[:p, :p], joint[p:, p:] = head.cov, beacons.cov
+    if beacons.cross_cov is not None:
+        joint[:p, p:], joint[p:, :p] = beacons.cross_cov, beacons.cross_cov.T
+    return System(
+        head, beacons, np.array([k.kind for k in models], dtype=np.int64), lenses,
+        np.array([c.constants for c in head.cameras], dtype=float),
+        np.array([c.station_from_camera.rotation().matrix() for c in head.cameras]),
+        np.array([c.station_from_camera.translation() for c in head.cameras]),
+        np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64), np.array([len(c.lens) for c in head.cameras]),
+        sum(sizes), square_root(joint), np.array([_field(head, i) for i in range(len(models))]),
+    )  # fmt: skip
+
+
+def _check_shapes(head: Head, beacons: Beacons, p: int, m: int) -> None:
+    if not head.cameras:
+        raise SurveyError("the head has no camera: name the station that carries the calibrated cameras")
+    if m == 0 or np.shape(beacons.x_in_world) != (m, 3) or not np.isfinite(beacons.x_in_world).all():
+        raise SurveyError(f"navigation needs beacons with coordinates; found {m} names: survey the beacons first")
+    if len(set(beacons.beacon_ids)) < m:
+        raise SurveyError("a beacon is named twice: give every beacon a name of its own")
+    for what, cov, n in (("calibration", head.cov, p), ("beacons", beacons.cov, 3 * m)):
+        if np.shape(cov) != (n, n):
+            raise SurveyError(f"the covariance of the {what} is {np.shape(cov)}; it must be ({n}, {n})")
+
+
+def square_root(cov: FloatArray) -> FloatArray:
+    """F (n, r) with ``F F' = cov``, r its rank; raises SurveyError where the matrix is not a covariance."""
+    scale = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    used = np.flatnonzero(scale > 0)
+    out = np.zeros((len(cov), len(used)))
+    if not len(used):
+        return np.zeros((len(cov), 0))
+    values, vectors = np.linalg.eigh(cov[np.ix_(used, used)] / np.outer(scale[used], scale[used]))
+    if not np.isfinite(values).all() or values[0] < -1e-6 * len(used):
+        raise SurveyError(
+            f"the joint covariance of calibration and beacons has a negative eigenvalue ({values[0]:.2e} of the "
+            "correlation matrix): it is not a covariance; adjust the survey again"
+        )
+    out[used] = scale[used, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.ascontiguousarray(out[:, values > 1e-12])
+
+
+def _field(head: Head, index: int) -> FloatArray:
+    """The field of view of a camera from the rays of its border."""
+    camera = head.cameras[index]
+    width, height = camera.image_size
+    u, v = np.array([_BORDER_PX, (width - 1) / 2, width - 1 - _BORDER_PX]), np.array([_BORDER_PX, (height - 1) / 2,
+                                                                                     height - 1 - _BORDER_PX])  # fmt: skip
+    model = MODELS[camera.model]
+    border = np.array([[u[0], v[1]], [u[2], v[1]], [u[1], v[0]], [u[1], v[2]]])
+    rays = unit_rays(model, camera.lens, camera.constants, border)
+    if model.kind == FISHEYE:
+        return np.array([0.0, 0.0, 0.0, 0.0, float(rays[:, 2].max())])
+    xy = rays[:, :2] / rays[:, 2:]
+    return np.array([xy[0, 0], xy[1, 0], xy[2, 1], xy[3, 1], 2.0])
+
+
+def make_sightings(system: System, epoch: NavigationEpoch) -> Sightings:
+    """The spots of an epoch with their rays. Raises SurveyError naming what is not known."""
+    where = {c.camera_id: i for i, c in enumerate(system.head.cameras)}
+    names = {b: i for i, b in enumerate(system.beacons.beacon_ids)}
+    camera, label, block, row = [], [], [], []
+    origins, rays = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for k, spots in enumerate(epoch.spots):
+        if spots.camera_id not in where:
+            raise SurveyError(f"epoch {epoch.epoch_id}: camera {spots.camera_id!r} is not on the head ({', '.join(where)})")
+        c = where[spots.camera_id]
+        camera += [c] * len(spots.uv)
+        block += [k] * len(spots.uv)
+        row += list(range(len(spots.uv)))
+        label += _labels(spots, names, epoch.epoch_id)
+        if len(spots.uv):
+            given = system.head.cameras[c]
+            rays.append(unit_rays(MODELS[given.model], given.lens, given.constants, spots.uv) @ system.camera_R[c].T)
+            origins.append(np.broadcast_to(system.camera_t[c], (len(spots.uv), 3)))
+    uv = np.concatenate([np.zeros((0, 2)), *(s.uv for s in epoch.spots)])
+    cov = np.concatenate([np.zeros((0, 2, 2)), *(s.cov for s in epoch.spots)])
+    integers = (np.array(x, dtype=np.int64) for x in (camera, label, block, row))
+    camera_, label_, block_, row_ = integers
+    present = np.array([any(s.camera_id == c for s in epoch.spots) for c in where], dtype=np.bool_)
+    return Sightings(camera_, uv, cov, np.concatenate(origins), np.concatenate(rays), label_, block_, row_, present)
+
+
+def _labels(spots: Spots, names: dict[str, int], epoch_id: str) -> list[int]:
+    if spots.beacon_ids is None:
+        return [-1] * len(spots.uv)
+    unknown = {b for b in spots.beacon_ids if b is not None and b not in names}
+    if unknown:
+        raise SurveyError(
+            f"epoch {epoch_id}, camera {spots.camera_id}: {', '.join(sorted(unknown))} is no beacon with known "
+            "coordinates; survey it, or leave its spot without a name"
+        )
+    return [names[b] if b is not None else -1 for b in spots.beacon_ids]
+
+
+def evaluate(
+    system: System, pose: FloatArray, camera: IntArray, beacon: IntArray, uv: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
+    """Residual (2n,) px, H (2n, 6), M (2n, r), and whether all beacons are in front; pose (4, 4) world_from_station."""
+    n = len(camera)
+    residual, H, M = np.empty(2 * n), np.empty((2 * n, 6)), np.empty((2 * n, system.F.shape[1]))
+    in_front = spot_rows(
+        np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3]), camera, beacon,
+        np.ascontiguousarray(uv), system.kinds, system.lenses, system.constants, system.camera_R, system.camera_t,
+        np.ascontiguousarray(system.beacons.x_in_world, dtype=float), system.lens_at, system.n_lens, system.beacon_at,
+        system.F, residual, H, M,
+    )  # fmt: skip
+    return residual, H, M, bool(in_front)
+
+
+def visible(system: System, pose: FloatArray, beacons: Sequence[int] | None = None) -> BoolArray:
+    """Which beacons (c, m) lie in the field of view of each camera at a pose (4, 4); hidden ones count too."""
+    x = np.asarray(system.beacons.x_in_world if beacons is None else system.beacons.x_in_world[list(beacons)])
+    q = (x - pose[:3, 3]) @ pose[:3, :3]
+    p = np.einsum("cka,cmk->cma", system.camera_R, q[None] - system.camera_t[:, None, :])
+    f = system.field[:, None, :]
+    fisheye = f[..., 4] < 1.5
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = p[..., 0] / p[..., 2], p[..., 1] / p[..., 2]
+        inside = (p[..., 2] > 0) & (a > f[..., 0]) & (a < f[..., 1]) & (b > f[..., 2]) & (b < f[..., 3])
+        cone = p[..., 2] > f[..., 4] * np.linalg.norm(p, axis=-1)
+    return np.asarray(np.where(fisheye, cone, inside), dtype=np.bool_)
