@@ -1,8 +1,8 @@
 """How trackers err: variance components of their drift from the eyes' own misclosures.
 
 A tracker's pose is a sum of small errors, so the errors of poses are correlated over the whole time and those of
-motions over intervals one after the other are not. What the intervals are, the data say: misclosures at growing intervals grow
-with the root of time where the world drifts, and not at all where poses have white noise.
+motions over intervals one after the other are not. What the intervals are, the data say: misclosures at growing
+intervals grow with the root of time where the world drifts, and not at all where poses have white noise.
 """
 
 from collections.abc import Sequence

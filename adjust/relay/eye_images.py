@@ -16,9 +16,10 @@ from adjust.relay.eyes import EyeOptions, PoseSequence, symmetric
 from adjust.result import Adjustment
 
 ROOM = "room"  # the world of targets that the survey holds
+_ADJUST, _EYES = AdjustOptions(), EyeOptions()
 
 
-def camera_sequence(survey: Survey, camera_id: str, options: AdjustOptions = AdjustOptions()) -> PoseSequence:
+def camera_sequence(survey: Survey, camera_id: str, options: AdjustOptions = _ADJUST) -> PoseSequence:
     """Poses of one camera before the targets it saw, adjusted by itself, with the joint covariance of all epochs.
 
     Targets seen together in an epoch make one world, named after the first of them; targets that the survey holds stand
@@ -39,10 +40,10 @@ def camera_sequence(survey: Survey, camera_id: str, options: AdjustOptions = Adj
         raise SurveyError(f"camera {camera_id!r}: no epoch is left after adjusting it by itself")
     poses = [alone.estimates[name].value for name in names]
     first = {b.epoch_id: world_of[b.target_id] for b in blocks if b.target_id}
-    return PoseSequence(
-        FrameRef("camera", camera_id), tuple(name[2] for name in names), tuple(first[name[2]] for name in names),
-        stacked([from_matrix(p.matrix()) for p in poses if isinstance(p, Pose3)]), symmetric(alone.precision.joint(names)),
-    )  # fmt: skip
+    found = stacked([from_matrix(p.matrix()) for p in poses if isinstance(p, Pose3)])
+    ids = tuple(name[2] for name in names)
+    cov = symmetric(alone.precision.joint(names))
+    return PoseSequence(FrameRef("camera", camera_id), ids, tuple(first[e] for e in ids), found, cov)
 
 
 def _seen(alone: Adjustment, camera_id: str, epoch_id: str) -> bool:
@@ -98,7 +99,7 @@ def _alone(
 
 
 def camera_sequences(
-    survey: Survey | Adjustment, station_id: str | None = None, options: AdjustOptions = AdjustOptions()
+    survey: Survey | Adjustment, station_id: str | None = None, options: AdjustOptions = _ADJUST
 ) -> tuple[PoseSequence, ...]:
     """One sequence for each camera of a station (None: of the one station with two or more cameras).
 
@@ -114,15 +115,13 @@ def camera_sequences(
             raise SurveyError(f"stations with two or more cameras: {', '.join(several) or 'none'}; name one of them")
         station_id = several[0]
     if station_id not in by_station:
-        raise SurveyError(
-            f"station {station_id!r} has no camera; the stations with cameras are {', '.join(by_station)}"
-        )
+        raise SurveyError(f"station {station_id!r} has no camera; those with cameras are {', '.join(by_station)}")
     return tuple(camera_sequence(found, camera_id, options) for camera_id in by_station[station_id])
 
 
 def image_pairs(
     survey: Survey | Adjustment, station_id: str | None = None,
-    adjust_options: AdjustOptions = AdjustOptions(), eye_options: EyeOptions = EyeOptions(),
+    adjust_options: AdjustOptions = _ADJUST, eye_options: EyeOptions = _EYES,
 ) -> EyePairs:  # fmt: skip
     """All pairs of a station's cameras with what they share, and the reasons for those that cannot be found."""
     return pairs_of(camera_sequences(survey, station_id, adjust_options), eye_options)

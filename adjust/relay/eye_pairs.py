@@ -1,4 +1,4 @@
-"""All pairs of a station's eyes, each from the two eyes alone, and what they share because they share an eye's errors."""
+"""All pairs of a station's eyes, each from its two eyes alone, and what pairs share because they share an eye."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,6 +21,8 @@ from adjust.relay.eyes import (
 )
 from adjust.relay.network import network_from_pairs
 from adjust.relay.parametric import ParametricAdjustment, ParametricOptions, adjust_parametric
+
+_EYES = EyeOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +51,7 @@ class LoopedPairs:
     actual_cov: FloatArray
 
 
-def pairs_of(
-    sequences: Sequence[PoseSequence] | Sequence[MotionSequence], options: EyeOptions = EyeOptions()
-) -> EyePairs:
+def pairs_of(sequences: Sequence[PoseSequence] | Sequence[MotionSequence], options: EyeOptions = _EYES) -> EyePairs:
     """Every two eyes by themselves. Raises SurveyError where no pair can be found."""
     found: list[tuple[Pair, EyeAdjustment, FloatArray]] = []
     refused = []
