@@ -209,6 +209,12 @@ def _print_json(value: Mapping[str, Any]) -> None:
 
 
 def _require_project(folder: Path) -> None:
+    if (folder / ".before").is_dir():
+        from survey.replacing import recover, unfinished
+
+        if unfinished(folder):  # a mixture of old and new must not be taken for a project
+            recover(folder)
+            print(f"labsurvey: {folder}: an 'add' that was killed has been undone", file=sys.stderr)
     if not folder.is_dir():
         hint = "; 'labsurvey example full-lab lab' writes a ready one"
         raise SurveyError(f"{folder}: no such folder{hint}")

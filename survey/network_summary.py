@@ -4,7 +4,7 @@ Frames are the eyes: stations, cameras, targets. What the datum gives (held stat
 world) closes loops too, where there is more than one of it: each is then joined to the world.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from adjust.relay.counts import Counts, count
 from adjust.relay.loops import LoopMisclosures, loop_misclosures
 from adjust.relay.motions import Motions
 from adjust.relay.network import Network, Topology, topology
+from survey.files.text import natural_key
 from survey.quantities import ARCSEC_PER_RAD
 
 ALPHA = 0.001
@@ -68,11 +69,20 @@ def pair_network(survey: Survey) -> PairNetwork:
         redundancy += count(_tied(survey, poses, bare, 6), 3).redundancy
     return PairNetwork(
         counts, shifts, _given(survey, used, 6 if poses else 3),
-        tuple(p for p in closed.uncontrolled_pairs if not p.startswith(_GIVEN)),
-        tuple(real for g in closed.inseparable_pairs if len(real := _real(g)) > 1),
-        tuple(real for part in closed.parts if (real := tuple(s for s in part if s != _WORLD))),
+        _ordered(_real(closed.uncontrolled_pairs)), _groups(_real(g) for g in closed.inseparable_pairs),
+        tuple(real for part in closed.parts if (real := _ordered(s for s in part if s != _WORLD))),
         conditions, redundancy,
     )  # fmt: skip
+
+
+def _ordered(ids: Iterable[str]) -> tuple[str, ...]:
+    """In natural order, whatever the order of the rows."""
+    return tuple(sorted(ids, key=natural_key))
+
+
+def _groups(groups: Iterable[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
+    found = [_ordered(g) for g in groups if len(g) > 1]
+    return tuple(sorted(found, key=lambda g: natural_key(g[0])))
 
 
 def _real(ids: Sequence[str]) -> tuple[str, ...]:

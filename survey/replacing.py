@@ -1,8 +1,9 @@
 """Replacing parts of a project folder by new ones: all of them, or none.
 
-The new parts are made in ``FOLDER/.adding``. They are moved to their places one by one, the old ones into
-``FOLDER/.before``; whatever goes wrong on the way, everything is moved back. A run that was killed on the way leaves
-``FOLDER/.before`` with the list of what was to be moved: :func:`recover` then restores the old state.
+The new parts are made in ``FOLDER/.adding``. They are moved to their places one by one; the old ones are kept in
+``FOLDER/.before`` (files copied, so that they are never missing, folders moved). Whatever goes wrong on the way, the
+old ones come back. A run that was killed on the way leaves ``FOLDER/.before`` with the list of what was to be moved:
+:func:`recover` then restores the old state.
 """
 
 import json
@@ -10,6 +11,8 @@ import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+
+from survey.files.text import atomic_write
 
 ADDING, BEFORE, LIST = ".adding", ".before", "entries.json"
 
@@ -19,11 +22,14 @@ def replace_parts(folder: Path, entries: Sequence[str]) -> None:
     adding, before = folder / ADDING, folder / BEFORE
     before.mkdir()
     had = {entry: (folder / entry).exists() for entry in entries}
-    (before / LIST).write_text(json.dumps(had), encoding="utf-8")
+    for entry in entries:
+        (before / entry).parent.mkdir(parents=True, exist_ok=True)
+        if (folder / entry).is_file():
+            shutil.copy2(folder / entry, before / entry)
+    atomic_write(before / LIST, json.dumps(had))
     try:
         for entry in entries:
-            if had[entry]:
-                (before / entry).parent.mkdir(parents=True, exist_ok=True)
+            if (folder / entry).is_dir():
                 os.rename(folder / entry, before / entry)
             (folder / entry).parent.mkdir(parents=True, exist_ok=True)
             os.rename(adding / entry, folder / entry)
@@ -35,21 +41,28 @@ def replace_parts(folder: Path, entries: Sequence[str]) -> None:
     shutil.rmtree(adding)
 
 
+def unfinished(folder: Path) -> bool:
+    """Whether a replacement was begun and neither finished nor undone."""
+    return (folder / BEFORE / LIST).is_file()
+
+
 def recover(folder: Path) -> bool:
     """Restore the state before a replacement that was not finished; whether there was one."""
     adding, before = folder / ADDING, folder / BEFORE
-    unfinished = (before / LIST).is_file()
-    if unfinished:
+    found = unfinished(folder)
+    if found:
         had: dict[str, bool] = json.loads((before / LIST).read_text(encoding="utf-8"))
         for entry, was_there in had.items():
-            if (before / entry).exists():
+            if (before / entry).is_file():
+                os.replace(before / entry, folder / entry)
+            elif (before / entry).exists():
                 _remove(folder / entry)
                 os.rename(before / entry, folder / entry)
             elif not was_there:
                 _remove(folder / entry)
     shutil.rmtree(before, ignore_errors=True)
     shutil.rmtree(adding, ignore_errors=True)
-    return unfinished
+    return found
 
 
 def _remove(path: Path) -> None:
