@@ -1,0 +1,279 @@
+"""Networks of measured pairs: counts against the theorem, loops and tests against closed forms."""
+
+import json
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from gtsam import Pose3, Rot3
+from scipy.stats import chi2
+
+from adjust.adjustment import AdjustOptions, adjust
+from adjust.errors import SurveyError
+from adjust.model import Datum, Point, PointParameter, PoseParameter, Station, Survey
+from adjust.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
+from adjust.pair_screen import PairOptions, adjust_with_pairs, is_pure
+from survey.cli import main
+from survey.files import write_project
+from survey.merging import merge
+from survey.network_summary import loops_dict, network_dict, pair_loops, pair_network
+from survey.quantities import ARCSEC_PER_RAD, scale_of
+from survey.solution import RunInfo, solution_dict
+
+HELD = PoseParameter(Pose3(), "held")
+SIGMAS = np.array([1e-4] * 3 + [1e-3] * 3)
+COV = np.diag(SIGMAS**2)
+
+
+FREE = PoseParameter()
+
+
+def _station(name, parameter=FREE):
+    return Station(name, world_from_station=parameter)
+
+
+def _pair(name, a, b, motion, cov=None):
+    n = 6 if isinstance(motion, Pose3) else 3
+    return Pair(name, FrameRef("station", a), FrameRef("station", b), motion, COV[:n, :n] if cov is None else cov)
+
+
+def _poses(n, seed=1):
+    rng = np.random.default_rng(seed)
+    return [Pose3()] + [Pose3(Rot3.Expmap(rng.normal(0, 1, 3)), rng.uniform(-5, 5, 3)) for _ in range(n - 1)]
+
+
+def _network(n, ends, noise=0.0, seed=1, rotations=False):
+    """Stations S0 ..., the first held, and pairs between them with noise in sigmas."""
+    rng, poses = np.random.default_rng(seed + 100), _poses(n, seed)
+    pairs = []
+    for i, j in ends:
+        true = poses[j].between(poses[i]).retract(noise * SIGMAS * rng.standard_normal(6))
+        pairs.append(_pair(f"p{i}-{j}", f"S{i}", f"S{j}", true.rotation() if rotations else true))
+    stations = tuple(_station(f"S{i}", HELD if i == 0 else PoseParameter()) for i in range(n))
+    return Survey(stations=stations, pairs=tuple(pairs)), poses
+
+
+@pytest.mark.parametrize("n", [3, 4, 5, 8])
+def test_a_complete_network_has_the_papers_counts(n):
+    survey, _ = _network(n, combinations(range(n), 2), rotations=True)
+    found = network_dict(pair_network(survey))
+    assert found["measured_pairs"] == found["measurable_pairs"] == n * (n - 1) // 2
+    assert found["independent_unknown_poses"] == n - 1
+    assert found["triangle_conditions"] == n * (n - 1) * (n - 2) // 6
+    assert found["independent_conditions"] == (n - 1) * (n - 2) // 2
+    assert found["redundancy"] == 3 * (n - 1) * (n - 2) // 2
+    assert found["conditions_per_pair"] == pytest.approx((n - 2) / n)
+    assert found["uncontrolled_pairs"] == []
+
+
+def test_a_ring_with_a_tail_names_the_tail():
+    survey, _ = _network(5, [(0, 1), (1, 2), (2, 0), (2, 3), (3, 4)])
+    found = pair_network(survey)
+    assert found.uncontrolled == ("p2-3", "p3-4")
+    assert found.inseparable == (("p0-1", "p1-2", "p2-0"),)
+    assert found.redundancy == 6
+
+
+def test_two_held_stations_control_the_way_between_them():
+    survey, poses = _network(3, [(0, 1), (1, 2)])
+    assert pair_network(survey).uncontrolled == ("p0-1", "p1-2")
+    known = PoseParameter(poses[2], "held")
+    survey = replace(survey, stations=(*survey.stations[:2], _station("S2", known)))
+    found = network_dict(pair_network(survey))
+    assert found["uncontrolled_pairs"] == []
+    assert (found["redundancy"], found["conditions_through_given_stations"]) == (6, 1)
+    assert adjust_with_pairs(survey).redundancy == 6
+    # the loop is that from one held station over the pairs to the other
+    off = Pose3(Rot3.Rz(3e-4), np.zeros(3))
+    pairs = (survey.pairs[0], replace(survey.pairs[1], b_from_a=survey.pairs[1].b_from_a.compose(off)))
+    loops = loops_dict(pair_loops(replace(survey, pairs=pairs)))
+    assert loops["n_loops"] == 1
+    assert loops["worst_first"][0]["pairs"] == ["p0-1", "p1-2"]
+    assert loops["worst_first"][0]["misclosure_arcsec"] == pytest.approx(3e-4 * ARCSEC_PER_RAD, rel=1e-6)
+
+
+def test_a_prior_without_position_gives_no_pose():
+    cov = np.diag([1e-6] * 3 + [np.inf] * 3)
+    survey, poses = _network(3, [(0, 1), (1, 2)])
+    survey = replace(survey, stations=(*survey.stations[:2], _station("S2", PoseParameter(poses[2], "prior", cov))))
+    assert pair_network(survey).uncontrolled == ("p0-1", "p1-2")
+
+
+def test_rotations_among_poses_are_counted_by_themselves():
+    survey, _ = _network(3, [(0, 1), (1, 2), (2, 0)])
+    turned = replace(survey.pairs[0], b_from_a=survey.pairs[0].b_from_a.rotation(), cov=COV[:3, :3])
+    survey = replace(survey, pairs=(turned, *survey.pairs[1:]))
+    # three equations of the loop of rotations, none of positions: two pairs of them close no loop
+    assert pair_network(survey).redundancy == 3
+    assert adjust_with_pairs(survey).redundancy == 3
+
+
+def test_a_station_without_pairs_is_a_part_of_its_own():
+    survey, _ = _network(4, [(0, 1), (1, 2), (2, 0)])
+    found = network_dict(pair_network(survey))
+    assert found["parts"] == [["S0", "S1", "S2"], ["S3"]]
+    assert found["isolated_stations"] == ["S3"]
+    with pytest.raises(SurveyError, match="no measured pair ties S3 to the datum"):
+        adjust_with_pairs(survey)
+
+
+def test_a_loop_closes_as_its_product_says():
+    survey, _ = _network(3, [(0, 1), (1, 2), (2, 0)])
+    wrong = survey.pairs[2].b_from_a.compose(Pose3(Rot3.Rx(1e-3), np.array([0.0, 4e-3, 0.0])))
+    survey = replace(survey, pairs=(*survey.pairs[:2], replace(survey.pairs[2], b_from_a=wrong)))
+    loop = loops_dict(pair_loops(survey))["worst_first"][0]
+    assert loop["misclosure_arcsec"] == pytest.approx(1e-3 * ARCSEC_PER_RAD, rel=1e-9)
+    # three independent rotations of equal sigma about every axis
+    assert loop["sigma_misclosure_arcsec"] == pytest.approx(np.sqrt(3) * 1e-4 * ARCSEC_PER_RAD, rel=1e-3)
+    assert loop["p_value"] == pytest.approx(chi2.sf(loop["test"], 6))
+    assert not loop["closes"]
+    assert loop["stations"][0] in ("S0", "S1", "S2")
+
+
+def test_tests_of_loops_are_distributed_as_they_claim():
+    tests = []
+    for seed in range(60):
+        survey, _ = _network(3, [(0, 1), (1, 2), (0, 2)], 1.0, seed)
+        tests.append(loops_dict(pair_loops(survey))["worst_first"][0]["test"])
+    # the sum of 60 chi-square (6) is chi-square (360): 360 +- 27; five sigmas
+    assert abs(sum(tests) - 360) < 135
+
+
+def test_both_ways_of_adjusting_a_pure_network_agree():
+    survey, _ = _network(6, combinations(range(6), 2), 1.0)
+    assert is_pure(survey)
+    one, two = adjust_with_pairs(survey), adjust(survey, options=AdjustOptions())
+    assert one.omega == pytest.approx(two.omega, rel=1e-9)
+    assert (one.redundancy, one.n_unknowns, one.n_observations) == (two.redundancy, two.n_unknowns, two.n_observations)
+    for name, estimate in two.estimates.items():
+        np.testing.assert_allclose(one.estimates[name].value.matrix(), estimate.value.matrix(), atol=1e-10)
+        np.testing.assert_allclose(one.estimates[name].cov, estimate.cov, rtol=1e-6, atol=1e-16)
+    mine, theirs = (solution_dict(x, RunInfo("", ""))["pairs"] for x in (one, two))
+    for pair in mine:
+        for key in ("sigma_rotation_arcsec", "sigma_translation_mm"):
+            # in the tangents at the adjusted and at the measured pair, half a residual (1e-4 rad) apart
+            np.testing.assert_allclose(mine[pair]["adjusted"][key], theirs[pair]["adjusted"][key], rtol=1e-4)
+        assert mine[pair]["test"] == pytest.approx(theirs[pair]["test"], rel=1e-5)
+
+
+def test_sigmas_of_an_adjusted_pair_in_a_ring_follow_from_its_redundancy():
+    survey, _ = _network(3, [(0, 1), (1, 2), (2, 0)], 1.0, rotations=True)
+    result = adjust_with_pairs(survey)
+    pairs = solution_dict(result, RunInfo("", "", sigmas="a_priori"))["pairs"]
+    # three equal rotations share the misclosure: each keeps two thirds of its variance
+    for entry in pairs.values():
+        expected = np.sqrt(2 / 3) * 1e-4 * ARCSEC_PER_RAD
+        np.testing.assert_allclose(entry["adjusted"]["sigma_rotation_arcsec"], expected, rtol=1e-3)
+        np.testing.assert_allclose(entry["redundancy"], 1 / 3, rtol=1e-3)
+    assert scale_of(result, "a_priori").factor == 1.0
+
+
+def test_a_wrong_pair_in_a_survey_with_other_observations_is_left_out():
+    survey, poses = _network(5, combinations(range(5), 2), 1.0)
+    wrong = survey.pairs[3].b_from_a.compose(Pose3(Rot3.Rz(0.02), np.array([0.05, 0.0, 0.0])))
+    pairs = (*survey.pairs[:3], replace(survey.pairs[3], b_from_a=wrong), *survey.pairs[4:])
+    origin = [PositionRef(None, FrameRef("station", f"S{i}")) for i in range(5)]
+    length = float(np.linalg.norm(poses[1].translation() - poses[2].translation()))
+    survey = replace(survey, pairs=pairs, distances=(Distance("d", origin[1], origin[2], length, 1e-3),))
+    assert not is_pure(survey)
+    result = adjust_with_pairs(survey)
+    assert [p.pair_id for p in result.survey.pairs if not p.used] == [survey.pairs[3].pair_id]
+    assert result.global_test.passed
+    assert [w for w in result.warnings if w.startswith("left out: pair p0-4: off by ")]
+    kept = adjust_with_pairs(survey, PairOptions(reject_pairs=False))
+    assert all(p.used for p in kept.survey.pairs)
+    assert not kept.global_test.passed
+
+
+def test_sigmas_too_small_throughout_reject_no_pair():
+    survey, _ = _network(12, combinations(range(12), 2), 5.0)
+    point = Point("B", PointParameter())
+    seen = Coordinates((PositionRef("B"),), np.zeros((1, 3)), np.eye(3) * 1e-6)
+    mixed = replace(survey, points=(point,), coordinates=(seen,))
+    for each in (survey, mixed):
+        result = adjust_with_pairs(each)
+        assert all(p.used for p in result.survey.pairs)
+        assert result.sigma0 == pytest.approx(5.0, rel=0.15)
+
+
+def test_networks_of_rotations_go_through_the_command(tmp_path, capsys):
+    survey, poses = _network(6, combinations(range(6), 2), 1.0, rotations=True)
+    write_project(tmp_path / "lab", survey, title="Rotations")
+    assert main(["plan", str(tmp_path / "lab")]) == 0
+    assert "independent unknown rotations        5" in capsys.readouterr().out
+    assert main(["adjust", str(tmp_path / "lab"), "--quiet"]) == 0
+    assert "10 independent conditions (30 equations)" in capsys.readouterr().out
+    more = Survey(stations=survey.stations, pairs=(
+        _pair("n1", "S1", "new", poses[1].rotation()), _pair("n2", "S2", "new", poses[2].rotation())))  # fmt: skip
+    (tmp_path / "more" / "observations").mkdir(parents=True)
+    (tmp_path / "more" / "survey.toml").write_text("[stations.new]\n")
+    rows = [f"{p.pair_id},{p.a.frame_id},new,{','.join(map(str, _wxyz(p.b_from_a)))},20" for p in more.pairs]
+    (tmp_path / "more" / "observations" / "pairs.csv").write_text(
+        "pair_id,a_id,b_id,qw,qx,qy,qz,sigma_rotation_arcsec\n" + "\n".join(rows) + "\n"
+    )
+    assert main(["add", str(tmp_path / "lab"), str(tmp_path / "more"), "--quiet"]) == 0
+    assert "redundancy 30 -> 33" in capsys.readouterr().out
+
+
+def _wxyz(rotation):
+    q = rotation.toQuaternion()
+    return q.w(), q.x(), q.y(), q.z()
+
+
+def test_surveys_with_more_than_pairs_grow_from_their_last_solution(tmp_path, capsys):
+    survey, poses = _network(5, combinations(range(4), 2), 1.0)
+    origin = [PositionRef(None, FrameRef("station", f"S{i}")) for i in range(5)]
+
+    def taped(i, j):
+        return float(np.linalg.norm(poses[i].translation() - poses[j].translation())) + 2e-4
+
+    tape = Distance("d1", origin[0], origin[3], taped(0, 3), 1e-3)
+    first = replace(survey, stations=survey.stations[:4], distances=(tape,))
+    write_project(tmp_path / "lab", first)
+    assert main(["adjust", str(tmp_path / "lab"), "--quiet"]) == 0
+    everything = _network(5, combinations(range(5), 2), 1.0)[0]
+    later = [p for p in everything.pairs if p.b.frame_id == "S4"]
+    second = Survey(stations=everything.stations, pairs=tuple(later),
+                    distances=(Distance("d2", origin[1], origin[4], taped(1, 4), 1e-3),))  # fmt: skip
+    write_project(tmp_path / "more", second)
+    (tmp_path / "more" / "survey.toml").write_text("format = 1\n[stations.S4]\n")
+    capsys.readouterr()
+    assert main(["add", str(tmp_path / "lab"), str(tmp_path / "more"), "--quiet"]) == 0
+    assert "from the previous solution" in capsys.readouterr().out
+    grown = adjust_with_pairs(replace(
+        first, stations=everything.stations, pairs=(*first.pairs, *later), distances=first.distances + second.distances
+    ))  # fmt: skip
+    found = json.loads((tmp_path / "lab" / "results" / "solution.json").read_text())
+    assert found["summary"]["omega"] == pytest.approx(grown.omega, rel=1e-7)
+    for name, entry in found["stations"].items():
+        expected = 1e3 * grown.estimates["world_from_station", name].value.translation()
+        np.testing.assert_allclose(entry["world_from_station"]["translation_mm"], expected, atol=1e-7)
+
+
+def test_tables_with_other_columns_are_merged_under_one_header(tmp_path):
+    survey, _ = _network(3, [(0, 1), (1, 2)])
+    write_project(tmp_path / "lab", survey)
+    more = tmp_path / "more"
+    (more / "observations").mkdir(parents=True)
+    (more / "observations" / "pairs.csv").write_text(
+        "b_id,a_id,pair_id,euler_x_deg,euler_y_deg,euler_z_deg,sigma_rotation_deg\n\nS0,S2,late,1,2,3,0.01\n"
+    )
+    (tmp_path / "place").mkdir()
+    merged = merge(tmp_path / "lab", more, tmp_path / "place")
+    lines = (tmp_path / "place" / "observations" / "pairs.csv").read_text().splitlines()
+    old = (tmp_path / "lab" / "observations" / "pairs.csv").read_text().splitlines()
+    assert lines[0] == old[0] + ",euler_x_deg,euler_y_deg,euler_z_deg,sigma_rotation_deg"
+    assert lines[1] == old[1] + ",,,,"
+    assert lines[3].startswith("late,S2,S0,,")
+    assert lines[3].endswith(",1,2,3,0.01")
+    assert merged.origins["observations/pairs.csv"][3] == (more / "observations" / "pairs.csv", 3)
+    name = "observations/pairs.csv"
+    error = merged.translated(SurveyError(f"{tmp_path}/place/{name}:4: wrong, stands already in line 2"))
+    assert str(error) == f"{more}/{name}:3: wrong, stands already in {tmp_path}/lab/{name}:2"
+
+
+def test_a_free_network_needs_no_held_station():
+    survey, _ = _network(4, combinations(range(4), 2), 1.0)
+    free = replace(survey, stations=tuple(_station(s.station_id) for s in survey.stations), datum=Datum("inner"))
+    assert adjust_with_pairs(free).omega == pytest.approx(adjust_with_pairs(survey).omega, rel=1e-8)
