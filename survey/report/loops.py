@@ -104,9 +104,9 @@ def _loop_row(e: dict[str, Any], poses: bool) -> list[str]:
     cells.append(sigma_text(e["sigma_misclosure_arcsec"]))
     if poses:
         cells += [value_text(e["misclosure_mm"], e["sigma_misclosure_mm"]), sigma_text(e["sigma_misclosure_mm"])]
-    cells += [general(e["test"], 4), general(e["p_value"], 2)]
+    cells += [general(e["test"], 4), p_text(e["p_value"])]
     flag = "" if e["closes"] else pill("bad", "open")
-    return [*cells, flag + (" " + pill("soft", "has a pair not used") if left_out else "")]
+    return [*cells, flag + (" " + pill("soft", "pair not used") if left_out else "")]
 
 
 def _shortened(names: Sequence[str], most: int = 12) -> list[str]:
@@ -135,14 +135,13 @@ def pairs(c: Context) -> str:
     order = sorted(every, key=lambda p: -_size(every[p]))[:_MOST_PAIRS]
     poses = any("translation_mm" in every[p]["measured"] for p in order)
     rows = [_pair_row(p, every[p], poses) for p in order]
-    columns = ["<Pair", "<From a to b", "x [°]", "y [°]", "z [°]", "<Quaternion w x y z"]
-    columns += ["x [mm]", "y [mm]", "z [mm]"] if poses else []
-    columns += ["Residual"] + (["[mm]"] if poses else []) + ["Redundancy", "Largest std.", "Test", "p", "<"]
+    columns = ["<Pair, from a to b", "Residual", *(["[mm]"] if poses else []), "Redundancy", "Largest std."]
+    columns += ["Test", "p", "<", "x [°]", "y [°]", "z [°]", *(["x [mm]", "y [mm]", "z [mm]"] if poses else [])]
     more = f" The worst {count(len(rows))} of {count(len(every))}." if len(every) > len(rows) else ""
     note = (
-        "Adjusted b_from_a: Euler angles of R = Rz(z) Ry(y) Rx(x) with the σ of small rotations about the axes of a, "
-        "translation with its σ along the axes of b. Residual: length of the rotation and of the translation that "
-        "takes the measured pair to the adjusted one; of pairs not used, to its prediction. Redundancy: mean of its "
+        "Adjusted b_from_a: quaternion w x y z, Euler angles of R = Rz(z) Ry(y) Rx(x) with the σ of small rotations "
+        "about the axes of a, translation with its σ along the axes of b. Residual: length of the rotation and of the "
+        "translation that takes the measured pair to the adjusted one; of pairs not used, to its prediction. Redundancy: mean of its "
         f"components, 0 where nothing checks the pair, 1 where the others alone determine it.{more}"
     )
     classes = ["off" if not every[p]["used"] else "" for p in order]
@@ -156,24 +155,29 @@ def _size(entry: dict[str, Any]) -> float:
 
 def _pair_row(pair_id: str, e: dict[str, Any], poses: bool) -> list[str]:
     value = e.get("adjusted", {})
-    cells = [f"<b>{esc(pair_id)}</b>", f"{esc(e['a'])} → {esc(e['b'])}"]
-    sigmas = value.get("sigma_rotation_arcsec", [None] * 3)
-    for angle, sigma in zip(value.get("rotation_euler_xyz_deg", [None] * 3), sigmas, strict=True):
-        shown = value_text(angle, None if not sigma else sigma / 3600.0)
-        cells.append(f'{shown}<span class="s">± {sigma_text(sigma)}″</span>')
-    quaternion = value.get("rotation_quaternion_wxyz", ())
-    cells.append(f"<small>{' '.join(fixed(q, 7) for q in quaternion)}</small>")
-    if poses:
-        shift = value.get("translation_mm", [None] * 3)
-        along = value.get("sigma_translation_mm", [None] * 3)
-        cells += [with_sigma(x, s) if s else value_text(x, None) for x, s in zip(shift, along, strict=True)]
+    quaternion = " ".join(fixed(q, 7) for q in value.get("rotation_quaternion_wxyz", ()))
+    ends = " → ".join(esc(e[end].removeprefix("station:")) for end in "ab")
+    cells = [f'<b>{esc(pair_id)}</b> {ends}<span class="s">{quaternion}</span>']
     cells.append(angle_text(e["misfit_arcsec"], None) if e.get("misfit_arcsec") is not None else MISSING)
     cells += [general(e.get("misfit_mm"), 4)] if poses else []
     redundancy = [r for r in e.get("redundancy", ()) if r is not None]
     largest = max((abs(s) for s in e.get("standardized", ()) if s is not None), default=None)
     cells += [fixed(sum(redundancy) / len(redundancy), 2) if redundancy else MISSING, fixed(largest, 2)]
-    cells += [general(e.get("test"), 4), general(e.get("p_value"), 2), _pair_flag(e)]
+    cells += [general(e.get("test"), 4), p_text(e.get("p_value")), _pair_flag(e)]
+    sigmas = value.get("sigma_rotation_arcsec", [None] * 3)
+    for angle, sigma in zip(value.get("rotation_euler_xyz_deg", [None] * 3), sigmas, strict=True):
+        shown = value_text(angle, None if not sigma else sigma / 3600.0)
+        cells.append(f'{shown}<span class="s">± {sigma_text(sigma)}″</span>')
+    if poses:
+        shift = value.get("translation_mm", [None] * 3)
+        along = value.get("sigma_translation_mm", [None] * 3)
+        cells += [with_sigma(x, s) if s else value_text(x, None) for x, s in zip(shift, along, strict=True)]
     return cells
+
+
+def p_text(p: float | None) -> str:
+    """A probability; what underflows is not zero."""
+    return "&lt; 1e−300" if p is not None and p < 1e-300 else general(p, 2)
 
 
 def _pair_flag(e: dict[str, Any]) -> str:
