@@ -79,8 +79,8 @@ def loops(c: Context) -> str:
     entries = found["worst_first"][:_MOST_LOOPS]
     poses = any("misclosure_mm" in e for e in entries)
     rows = [_loop_row(e, poses) for e in entries]
-    columns = ["<Loop", "<Pairs", "Misclosure", "σ [″]"] + (["[mm]", "σ [mm]"] if poses else [])
-    columns += ["Test", "p", "<"]
+    columns = ["<Loop", "<", "Misclosure", "σ [″]"] + (["[mm]", "σ [mm]"] if poses else [])
+    columns += ["Test", "p", "<Pairs"]
     shown = (
         f"All {count(found['n_loops'])}"
         if len(rows) == found["n_loops"]
@@ -100,13 +100,14 @@ def _loop_row(e: dict[str, Any], poses: bool) -> list[str]:
     stations = " → ".join(esc(s) for s in _shortened([*e["stations"], e["stations"][0]]))
     left_out = set(e["pairs_not_used"])
     pairs = ", ".join(f"<s>{esc(p)}</s>" if p in left_out else esc(p) for p in _shortened(e["pairs"]))
-    cells = [stations, f"<small>{pairs}</small>", angle_text(e["misclosure_arcsec"], e["sigma_misclosure_arcsec"])]
-    cells.append(sigma_text(e["sigma_misclosure_arcsec"]))
+    flag = "" if e["closes"] else pill("bad", "open")
+    flag += " " + pill("soft", "pair not used") if left_out else ""
+    sigma = e["sigma_misclosure_arcsec"]
+    cells = [stations, flag, angle_text(e["misclosure_arcsec"], sigma), sigma_text(sigma)]
     if poses:
         cells += [value_text(e["misclosure_mm"], e["sigma_misclosure_mm"]), sigma_text(e["sigma_misclosure_mm"])]
     cells += [general(e["test"], 4), p_text(e["p_value"])]
-    flag = "" if e["closes"] else pill("bad", "open")
-    return [*cells, flag + (" " + pill("soft", "pair not used") if left_out else "")]
+    return [*cells, f"<small>{pairs}</small>"]
 
 
 def _shortened(names: Sequence[str], most: int = 12) -> list[str]:
@@ -141,8 +142,8 @@ def pairs(c: Context) -> str:
     note = (
         "Adjusted b_from_a: quaternion w x y z, Euler angles of R = Rz(z) Ry(y) Rx(x) with the σ of small rotations "
         "about the axes of a, translation with its σ along the axes of b. Residual: length of the rotation and of the "
-        "translation that takes the measured pair to the adjusted one; of pairs not used, to its prediction. Redundancy: mean of its "
-        f"components, 0 where nothing checks the pair, 1 where the others alone determine it.{more}"
+        "translation that takes the measured pair to the adjusted one; of pairs not used, to its prediction. "
+        f"Redundancy: mean of its components, 0 where nothing checks the pair, 1 where the others alone determine it.{more}"
     )
     classes = ["off" if not every[p]["used"] else "" for p in order]
     return section("pairs", "Adjusted pairs", table(columns, rows, "", classes), note)
