@@ -8,7 +8,7 @@ by their evidence: what cannot be told apart is reported, all of it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import combinations
 
 import numpy as np
 from scipy.stats import chi2
@@ -19,13 +19,14 @@ from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers, local, log_evidence
 from adjust.navigation.model import NavigateOptions
 from adjust.navigation.search_kernels import search
-from adjust.navigation.system import Sightings, System, evaluate, visible
+from adjust.navigation.system import Sightings, System, evaluate, station_rays, visible
 
 _KEPT = 400
 _ADJUSTED = 60
 _HOPELESS = 40.0  # difference in -2 ln evidence beyond which a candidate is of no interest
 _GATE = float(chi2.isf(1e-4, 2))
-_MOST_NAMINGS = 128
+_MOST_NAMINGS = 24
+_CROWDED = 3.0  # beacons near a spot beyond which naming in turn is hopeless
 _MOST_TRIPLES = 400
 
 
@@ -70,8 +71,9 @@ def _hypotheses(
     score, match = np.full(_KEPT, -np.inf), np.empty((_KEPT, n), dtype=np.int64)
     missed = np.where(seen.present, -np.log(1.0 - options.detection), 0.0)
     named = np.log(_sky(system) / np.radians(options.gate_deg) ** 2)[seen.camera]
+    origin, ray = station_rays(system, seen)
     kept, _ = search(
-        seen.origin, seen.ray, seen.camera, allowed, _triples(seen), x, system.camera_R, system.camera_t, system.field,
+        origin, ray, seen.camera, allowed, _triples(ray), x, system.camera_R, system.camera_t, system.field,
         np.radians(options.gate_deg), named, missed, options.nearest_m, farthest, options.max_hypotheses,
         R, t, score, match,
     )  # fmt: skip
@@ -88,10 +90,10 @@ def _sky(system: System) -> FloatArray:
     return np.array(out)
 
 
-def _triples(seen: Sightings) -> IntArray:
+def _triples(ray: FloatArray) -> IntArray:
     """Triples of spots: those that determine a pose best (widest between their rays) mixed with others, no order."""
-    every = np.array(list(combinations(range(len(seen.uv)), 3)), dtype=np.int64)
-    a, b, c = (seen.ray[every[:, i]] for i in range(3))
+    every = np.array(list(combinations(range(len(ray)), 3)), dtype=np.int64)
+    a, b, c = (ray[every[:, i]] for i in range(3))
     width = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     # quality in steps, and inside a step an order that does not favour any spot
     rng = np.random.default_rng(len(every))
@@ -105,9 +107,13 @@ def with_prior(system: System, seen: Sightings, prior: Prior, options: NavigateO
         return _with_partial_prior(system, seen, prior, options)
     distance = gate_distances(system, seen, prior)
     near = (distance < _GATE) & allowed_namings(system, seen)
-    namings = _namings(seen, near, distance)
-    trial = [(prior.pose, match) for match in namings]
-    return _judged(system, seen, trial, prior, options)
+    if len(seen.uv) >= 3 and near.sum() > _CROWDED * near.any(axis=1).sum():
+        poses, matches = _hypotheses(system, seen, near, options)
+        found = _judged(system, seen, list(zip(poses, matches, strict=True)), prior, options)
+        if found:
+            return found
+    trials = _in_turn(system, seen, prior, near, distance)
+    return _judged(system, seen, trials, prior, options)
 
 
 def _with_partial_prior(
@@ -142,25 +148,76 @@ def _ahead(system: System, pose: FloatArray) -> BoolArray:
     return np.asarray((depth > 1e-3) | (system.field[:, 4:] < 1.5), dtype=np.bool_)
 
 
-def _namings(seen: Sightings, near: BoolArray, distance: FloatArray) -> list[IntArray]:
-    """Namings (n,) that use a beacon once a camera: free choice where spots and beacons compete, up to a limit."""
-    options: list[list[int]] = []
-    for i in range(len(near)):
-        beacons = sorted(np.flatnonzero(near[i]).tolist(), key=lambda b, i=i: float(distance[i, b]))
-        rivals = any(near[j, b] for b in beacons for j in np.flatnonzero(seen.camera == seen.camera[i]) if j != i)
-        options.append(beacons if len(beacons) == 1 and not rivals else [*beacons[:3], -1])
-    while np.prod([len(o) for o in options], dtype=float) > _MOST_NAMINGS:
-        longest = max(options, key=len)
-        if len(longest) <= 1:
-            break
-        # the farthest beacon goes first, 'none of them' goes last
-        longest.pop(-2 if len(longest) > 2 else -1)
+@dataclass(frozen=True, eq=False)
+class _Partial:
+    """A naming under way: match (n,) beacons, -1 not (yet) named; which spots are decided; the pose so far."""
+
+    match: IntArray
+    decided: BoolArray
+    prior: Prior
+
+
+def _in_turn(
+    system: System, seen: Sightings, prior: Prior, near: BoolArray, distance: FloatArray
+) -> list[tuple[FloatArray, IntArray]]:
+    """Poses (4, 4) and namings (n,): first what has no rival, each naming narrowing the choice of the next.
+
+    Where only rivals are left the spot with the fewest is tried with each of them, and with none.
+    """
+    allowed = allowed_namings(system, seen)
+    start = _Partial(np.full(len(near), -1, dtype=np.int64), ~near.any(axis=1), prior)
+    open_ones, done = [(start, near, distance)], []
+    while open_ones and len(done) < _MOST_NAMINGS:
+        partial, near, distance = open_ones.pop()
+        if partial.decided.all():
+            done.append((partial.prior.pose, partial.match))
+            continue
+        for match, decided in reversed(_extensions(seen, partial, near, distance)):
+            posterior = _posterior(system, seen, match, prior) if np.any(match != partial.match) else partial.prior
+            if posterior is None:
+                continue
+            new = gate_distances(system, seen, posterior)
+            free = (new < _GATE) & allowed & ~decided[:, None]
+            for i in np.flatnonzero(match >= 0):
+                free[seen.camera == seen.camera[i], match[i]] = False
+            decided = decided | ~free.any(axis=1)
+            open_ones.append((_Partial(match, decided, posterior), free, new))
+    return done
+
+
+def _extensions(
+    seen: Sightings, partial: _Partial, near: BoolArray, distance: FloatArray
+) -> list[tuple[IntArray, BoolArray]]:
+    """Next namings and what they decide: all pairs without rivals at once, else each choice of one spot."""
+    by_beacon = np.zeros_like(near, dtype=np.int64)
+    for c in np.unique(seen.camera):
+        rows = seen.camera == c
+        by_beacon[rows] = near[rows].sum(axis=0)
+    alone = near & (near.sum(axis=1) == 1)[:, None] & (by_beacon == 1) & ~partial.decided[:, None]
+    match, decided = partial.match.copy(), partial.decided.copy()
+    if alone.any():
+        for i, b in np.argwhere(alone):
+            match[i], decided[i] = b, True
+        return [(match, decided)]
+    waiting = np.flatnonzero(~decided)
+    i = int(waiting[np.argmin(near[waiting].sum(axis=1))])
+    decided[i] = True
     out = []
-    for choice in product(*options):
-        named = [(int(c), b) for c, b in zip(seen.camera, choice, strict=True) if b >= 0]
-        if len(set(named)) == len(named):
-            out.append(np.array(choice, dtype=np.int64))
-    return out
+    for b in sorted(np.flatnonzero(near[i]).tolist(), key=lambda b: float(distance[i, b]))[:3]:
+        named = match.copy()
+        named[i] = b
+        out.append((named, decided.copy()))
+    return [*out, (match, decided)]
+
+
+def _posterior(system: System, seen: Sightings, match: IntArray, prior: Prior) -> Prior | None:
+    """The pose after these namings, as the prior of the next."""
+    used = np.flatnonzero(match >= 0)
+    fit = fit_pose(system, seen, used, match[used], prior.pose, prior)
+    if fit is None:
+        return None
+    own = fit.G @ _spot_noise(seen, fit) @ fit.G.T + fit.G_prior @ prior.cov @ fit.G_prior.T
+    return Prior(fit.pose, own, fit.B, np.arange(6))
 
 
 def _judged(

@@ -132,7 +132,7 @@ class NavigateOptions:
     nearest_m: float = 0.05
     farthest_m: float | None = None
     room_m: float = 3.0
-    max_hypotheses: int = 200_000
+    max_hypotheses: int = 40_000
     max_alternatives: int = 8
 
 

@@ -54,7 +54,7 @@ def shares(system: System, seen: Sightings, fit: PoseFit, prior: Prior | None) -
     own = fit.G @ spot_noise(seen, fit.used) @ fit.G.T
     rest = own_covariance(seen, fit, prior) - own
     # B = S F with S (6, p + 3m) unknown where F is rank deficient: split by the rows of F through its pseudo-inverse
-    S = fit.B @ np.linalg.pinv(system.F)
+    S = fit.B @ system.F_inverse
     at = system.beacon_at
     calibration, beacons = S[:, :at] @ system.F[:at], S[:, at:] @ system.F[at:]
     cross = calibration @ beacons.T
@@ -159,8 +159,7 @@ def _images(system: System, pose: FloatArray, camera: IntArray, beacon: IntArray
 def _expected(system: System, pose: Pose3, camera: IntArray, beacon: IntArray, sigma_px: float) -> Expected:
     n, ids = len(camera), system.beacons.beacon_ids
     zeros = np.zeros(n, dtype=np.int64)
-    seen = Sightings(camera, _images(system, pose.matrix(), camera, beacon), np.tile(np.eye(2) * sigma_px**2, (n, 1, 1)), np.zeros((n, 3)),
-                     np.zeros((n, 3)), beacon, zeros, zeros, np.ones(len(system.kinds), dtype=np.bool_))  # fmt: skip
+    seen = Sightings(camera, _images(system, pose.matrix(), camera, beacon), np.tile(np.eye(2) * sigma_px**2, (n, 1, 1)), beacon, zeros, zeros, np.ones(len(system.kinds), dtype=np.bool_))  # fmt: skip
     names = tuple(ids[b] for b in sorted(set(beacon.tolist())))
     fit = fit_pose(system, seen, np.arange(n), beacon, pose.matrix()) if n >= 3 else None
     if fit is None:

@@ -22,7 +22,7 @@ from adjust.navigation.model import (
 )
 from adjust.navigation.motion import MotionState, given_prior, predicted, started, table_prior, updated
 from adjust.navigation.precision import open_directions, own_covariance, shares, some_pose, spot_noise
-from adjust.navigation.system import Sightings, System, make_sightings, make_system, visible
+from adjust.navigation.system import Sightings, System, make_sightings, make_system, station_rays, visible
 
 _AGREES = 1e-6
 _WEAKEST_RAD = 0.2  # a covariance from first derivatives means nothing beyond
@@ -253,5 +253,6 @@ def _facing(system: System, seen: Sightings, used: IntArray) -> FloatArray:
     i = int(used[0])
     depth = max(0.5 * float(np.linalg.norm(np.ptp(x, axis=0))), 0.1)
     pose = np.eye(4)
-    pose[:3, 3] = x[seen.label[i]] - seen.origin[i] - depth * seen.ray[i]
+    origin, ray = station_rays(system, seen)
+    pose[:3, 3] = x[seen.label[i]] - origin[i] - depth * ray[i]
     return pose

@@ -20,7 +20,7 @@ class System:
     """The calibrated head and the beacons.
 
     F: (p + 3m, r) square root of the joint covariance of calibration and beacons: errors are ``F @ eta`` with eta
-    uncorrelated of unit variance. The errors eta are common to all epochs. field: (c, 5) what a camera surely sees:
+    uncorrelated of unit variance. The errors eta are common to all epochs. F_inverse: (r, p + 3m) its pseudo-inverse. field: (c, 5) what a camera surely sees:
     smallest and largest x/z and y/z, and the cosine of the widest angle for a fisheye (2 elsewhere).
     """
 
@@ -35,6 +35,7 @@ class System:
     n_lens: IntArray
     table_at: int
     F: FloatArray
+    F_inverse: FloatArray
     field: FloatArray
 
     @property
@@ -47,15 +48,13 @@ class System:
 class Sightings:
     """The spots of an epoch, camera after camera.
 
-    camera: (n,). uv: (n, 2) px. cov: (n, 2, 2). origin, ray: (n, 3) in the station. label: (n,) beacon, -1 unknown.
+    camera: (n,). uv: (n, 2) px. cov: (n, 2, 2). label: (n,) beacon, -1 unknown.
     block: (n,) which of the epoch's ``spots``. row: (n,) position there. present: (c,) whether a camera took part.
     """
 
     camera: IntArray
     uv: FloatArray
     cov: FloatArray
-    origin: FloatArray
-    ray: FloatArray
     label: IntArray
     block: IntArray
     row: IntArray
@@ -76,13 +75,14 @@ def make_system(head: Head, beacons: Beacons) -> System:
     joint[:p, :p], joint[p:, p:] = head.cov, beacons.cov
     if beacons.cross_cov is not None:
         joint[:p, p:], joint[p:, :p] = beacons.cross_cov, beacons.cross_cov.T
+    F = square_root(joint)
     return System(
         head, beacons, np.array([k.kind for k in models], dtype=np.int64), lenses,
         np.array([c.constants for c in head.cameras], dtype=float),
         np.array([c.station_from_camera.rotation().matrix() for c in head.cameras]),
         np.array([c.station_from_camera.translation() for c in head.cameras]),
         np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64), np.array([len(c.lens) for c in head.cameras]),
-        sum(sizes), square_root(joint), np.array([_field(head, i) for i in range(len(models))]),
+        sum(sizes), F, np.linalg.pinv(F), np.array([_field(head, i) for i in range(len(models))]),
     )  # fmt: skip
 
 
@@ -131,11 +131,10 @@ def _field(head: Head, index: int) -> FloatArray:
 
 
 def make_sightings(system: System, epoch: NavigationEpoch) -> Sightings:
-    """The spots of an epoch with their rays. Raises SurveyError naming what is not known."""
+    """The spots of an epoch. Raises SurveyError naming what is not known."""
     where = {c.camera_id: i for i, c in enumerate(system.head.cameras)}
     names = {b: i for i, b in enumerate(system.beacons.beacon_ids)}
     camera, label, block, row = [], [], [], []
-    origins, rays = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for k, spots in enumerate(epoch.spots):
         if spots.camera_id not in where:
             raise SurveyError(f"epoch {epoch.epoch_id}: camera {spots.camera_id!r} is not on the head ({', '.join(where)})")
@@ -144,16 +143,23 @@ def make_sightings(system: System, epoch: NavigationEpoch) -> Sightings:
         block += [k] * len(spots.uv)
         row += list(range(len(spots.uv)))
         label += _labels(spots, names, epoch.epoch_id)
-        if len(spots.uv):
-            given = system.head.cameras[c]
-            rays.append(unit_rays(MODELS[given.model], given.lens, given.constants, spots.uv) @ system.camera_R[c].T)
-            origins.append(np.broadcast_to(system.camera_t[c], (len(spots.uv), 3)))
     uv = np.concatenate([np.zeros((0, 2)), *(s.uv for s in epoch.spots)])
     cov = np.concatenate([np.zeros((0, 2, 2)), *(s.cov for s in epoch.spots)])
     integers = (np.array(x, dtype=np.int64) for x in (camera, label, block, row))
     camera_, label_, block_, row_ = integers
     present = np.array([any(s.camera_id == c for s in epoch.spots) for c in where], dtype=np.bool_)
-    return Sightings(camera_, uv, cov, np.concatenate(origins), np.concatenate(rays), label_, block_, row_, present)
+    return Sightings(camera_, uv, cov, label_, block_, row_, present)
+
+
+def station_rays(system: System, seen: Sightings) -> tuple[FloatArray, FloatArray]:
+    """Origins and unit rays (n, 3) of the spots in the station. Raises SurveyError for pixels that have no ray."""
+    ray = np.zeros((len(seen.uv), 3))
+    for c, given in enumerate(system.head.cameras):
+        rows = seen.camera == c
+        if rows.any():
+            own = unit_rays(MODELS[given.model], given.lens, given.constants, seen.uv[rows])
+            ray[rows] = own @ system.camera_R[c].T
+    return np.ascontiguousarray(system.camera_t[seen.camera]), ray
 
 
 def _labels(spots: Spots, names: dict[str, int], epoch_id: str) -> list[int]:

@@ -73,6 +73,18 @@ def mfns_head():
     return Head(tuple(cameras), block_diagonal(blocks))
 
 
+def wide_head(focal_px=600.0):
+    """The same mounts behind shorter lenses without distortion: more beacons in view."""
+    head = mfns_head()
+    lens = np.zeros(13)
+    lens[[0, 1, 3, 4]] = focal_px, focal_px, 640.0, 512.0
+    cov = head.cov.copy()
+    for at in (0, 19, 38):
+        cov[at : at + 13] = cov[:, at : at + 13] = 0.0
+        cov[[at, at + 1, at + 3, at + 4], [at, at + 1, at + 3, at + 4]] = 0.3**2
+    return replace(head, cameras=tuple(replace(c, lens=lens) for c in head.cameras), cov=cov)
+
+
 def with_table(head, sigma_deg=0.0, sigma_mm=0.0):
     """The head on a two-axis table whose axes meet in the world's origin."""
     extra = [np.diag([np.radians(sigma_deg) ** 2] * 3 + [(sigma_mm * MM) ** 2] * 3), np.zeros((10, 10))]
