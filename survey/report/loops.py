@@ -143,7 +143,8 @@ def pairs(c: Context) -> str:
         "Adjusted b_from_a: quaternion w x y z, Euler angles of R = Rz(z) Ry(y) Rx(x) with the σ of small rotations "
         "about the axes of a, translation with its σ along the axes of b. Residual: length of the rotation and of the "
         "translation that takes the measured pair to the adjusted one; of pairs not used, to its prediction. "
-        f"Redundancy: mean of its components, 0 where nothing checks the pair, 1 where the others alone determine it.{more}"
+        "Redundancy: mean of its components, 0 where nothing checks the pair, 1 where the others alone determine it."
+        f"{more}"
     )
     classes = ["off" if not every[p]["used"] else "" for p in order]
     return section("pairs", "Adjusted pairs", table(columns, rows, "", classes), note)

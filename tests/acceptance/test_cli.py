@@ -82,7 +82,7 @@ def test_help_opens_with_a_real_command_and_names_the_next():
     assert "Next: labsurvey example full-lab lab" in result.stdout
 
 
-@pytest.mark.parametrize("command", ["adjust", "detect", "example"])
+@pytest.mark.parametrize("command", ["adjust", "detect", "plan", "add", "example"])
 def test_help_of_commands_does_the_same(command, capsys):
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])
