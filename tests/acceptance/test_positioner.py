@@ -11,6 +11,7 @@ from adjust.positioner import (
     POSITIONER,
     PoseWeights,
     axis_tests,
+    blockwise_covariance,
     pose_fit,
     positioner_survey,
     weights_from_residuals,
@@ -103,6 +104,24 @@ def test_both_defects_of_the_axes_are_significant(recorded):
     assert perfect.omega - result.omega == pytest.approx(2.0 * both.statistic, rel=0.02)
 
 
+def test_they_stay_so_although_neighbouring_poses_err_alike(recorded):
+    result, weights = weights_from_residuals(*recorded)
+    v = np.array([o.residual / o.sigma for o in result.other_residuals if o.kind == "pair"])
+    alike = [np.corrcoef(v[:-1, i], v[1:, i])[0, 1] for i in range(6)]
+    assert min(alike) > 0.4
+    blocks = blockwise_covariance(*recorded, weights)
+    skewness, offset, both = axis_tests(result, blocks=blocks)
+    white = axis_tests(result)
+    # the offset's sigma is three times that of white noise
+    assert offset.sigmas[0] > 2.0 * white[1].sigmas[0]
+    assert np.degrees(skewness.sigmas[0]) == pytest.approx(0.004, abs=0.001)
+    assert offset.sigmas[0] == pytest.approx(0.15e-3, abs=0.03e-3)
+    assert skewness.significant
+    assert offset.significant
+    assert both.significant
+    assert both.degrees == (2, 18)
+
+
 @pytest.fixture(scope="module")
 def perfect_machine(recorded):
     joints = recorded[0][::4]
@@ -121,11 +140,18 @@ def test_perfect_axes_pass(perfect_machine):
     assert weights.position_m == pytest.approx(2e-4, rel=0.15)
     assert weights.rotation_rad == pytest.approx(5e-4, rel=0.15)
     assert not any(t.significant for t in axis_tests(result))
+    # white noise: the blocks say the same as the residuals
+    blocks = blockwise_covariance(*perfect_machine, weights, n_blocks=13)
+    assert not any(t.significant for t in axis_tests(result, blocks=blocks))
+    for a, b in zip(axis_tests(result, blocks=blocks), axis_tests(result), strict=True):
+        assert 0.4 < a.sigmas[0] / b.sigmas[0] < 2.0
 
 
 def test_what_cannot_be_tested_or_read_is_refused(perfect_machine):
     joints, poses = perfect_machine
     with pytest.raises(SurveyError, match="perfect_axes=False"):
         axis_tests(adjust(positioner_survey(joints, poses, PoseWeights(), perfect_axes=True)))
+    with pytest.raises(SurveyError, match="30 blocks of 52 poses"):
+        blockwise_covariance(joints, poses, PoseWeights(), n_blocks=30)
     with pytest.raises(SurveyError, match=r"\(52, 2\) joint angles and \(3, 4, 4\) poses"):
         positioner_survey(joints, poses[:3])

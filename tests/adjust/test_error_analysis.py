@@ -88,6 +88,15 @@ def test_large_errors_need_the_second_order():
     curve = error_curve("beacon position", sizes, FAR, n_trials=1_000_000, seed=11)
     assert np.all(curve.monte_carlo_px[1:] > 1.005 * curve.first_order_px[1:])
     np.testing.assert_allclose(curve.monte_carlo_px, curve.second_order_px, rtol=0.01)
+    # what the first order leaves, beacon by beacon, each with errors of either sign: only even orders remain
+    rng = np.random.default_rng(12)
+    beacons, errors = FAR.sample(1_000_000, rng), 5 * MM * rng.standard_normal((1_000_000, 3))
+    linear = np.sum(u_jacobian("beacon position", beacons) * errors, axis=1)
+    both = [pixel_errors("beacon position", beacons, sign * errors)[:, 0] ** 2 for sign in (1, -1)]
+    left = np.mean(np.mean(both, axis=0) - linear**2)
+    first = 5 * MM * expected_slope("beacon position", FAR)
+    whole = second_order("beacon position", FAR, np.array([5 * MM]))[0]
+    assert left == pytest.approx(whole**2 - first**2, rel=0.1)
     assert np.isinf(second_order("camera position", BeaconField(), sizes)).all()
 
 
