@@ -20,9 +20,9 @@ from tests.benchmarks.data import calibration, rough_start, survey
 PARTS: list[tuple[str, Any, str]] = [
     ("load values", State, "load"),
     ("prepare (kernels)", AdjustmentGraph, "prepare"),
-    ("linearise (GTSAM)", _Loop, "linearize"),
+    ("linearise (GTSAM)", gtsam.NonlinearFactorGraph, "linearize"),
     ("eliminate (GTSAM)", _Loop, "step"),
-    ("error (GTSAM)", _Loop, "total"),
+    ("weighted square sum", AdjustmentGraph, "objective"),
     ("retract", gtsam.Values, "retract"),
     ("Bayes tree and its covariances", Precision, "__init__"),
     ("redundancy of image points", adjustment, "image_residuals"),
