@@ -49,7 +49,7 @@ def motion_setup(sequences: "Sequence[MotionSequence]", free_scales: bool) -> Ey
     for a, b in _walk(len(eyes), eye_k, eye_l):
         mine: BoolArray = ((eye_k == a) & (eye_l == b)) | ((eye_k == b) & (eye_l == a))
         of_a, of_b = np.where(eye_k == a, k, other)[mine], np.where(eye_k == a, other, k)[mine]
-        X = solve_ax_xb(matrices(observed[of_a]), matrices(observed[of_b]))[0]
+        X = _hand_eye(matrices(observed[of_a]), matrices(observed[of_b]), eyes[a], eyes[b])
         start = _placed(start, b, start[np.array([a])] @ from_matrix(X))
     free = np.arange(len(eyes)) > 0
     return EyeSetup(eyes, EyeProblem(observed, cov, conditions, start, free, (), len(scaled)), names, True, {}, scaled)
@@ -113,7 +113,9 @@ def _pose_start(
         turned = (c.eye_k == b)[mine]
         of_a, of_b = np.where(turned, c.l_idx[mine], c.k_idx[mine]), np.where(turned, c.k_idx[mine], c.l_idx[mine])
         wa, wb = np.where(turned, c.world_l[mine], c.world_k[mine]), np.where(turned, c.world_k[mine], c.world_l[mine])
-        U = _placed(U, b, U[np.array([a])] @ _eye_from_eye(observed[of_a], observed[of_b], wa, wb, known))
+        U = _placed(
+            U, b, U[np.array([a])] @ _eye_from_eye(observed[of_a], observed[of_b], wa, wb, known, (eyes[a], eyes[b]))
+        )
     set_worlds = {int(i) for i in np.flatnonzero(~free) if i >= n_eyes}
     for a, b, relation in known:
         if a in set_worlds and b not in set_worlds:
@@ -125,8 +127,21 @@ def _pose_start(
     return _worlds_started(c, observed, U, set_worlds), free
 
 
+def _hand_eye(a: FloatArray, b: FloatArray, eye_a: FrameRef, eye_b: FrameRef) -> FloatArray:
+    """``a_from_b`` (4, 4) from motions; what is undetermined is named with the eyes."""
+    try:
+        return solve_ax_xb(a, b)[0]
+    except SurveyError as error:
+        raise SurveyError(f"eyes {eye_a.frame_id} and {eye_b.frame_id}: {error}") from None
+
+
 def _eye_from_eye(
-    A: Motions, B: Motions, wa: IntArray, wb: IntArray, known: "list[tuple[int, int, KnownWorlds]]"
+    A: Motions,
+    B: Motions,
+    wa: IntArray,
+    wb: IntArray,
+    known: "list[tuple[int, int, KnownWorlds]]",
+    eyes: tuple[FrameRef, FrameRef],
 ) -> Motions:
     """``a_from_b`` of two eyes: directly where their worlds are the same or known, else from the motions."""
     relation = {(a, b): from_matrix(r.a_from_b.matrix()) for a, b, r in known}
@@ -150,7 +165,7 @@ def _eye_from_eye(
             "two eyes never saw the same two worlds twice: nothing turns; take several epochs before unmoved targets"
         )
     a, b = (np.concatenate([m[j] for m in motions]) for j in (0, 1))
-    return from_matrix(solve_ax_xb(a, b)[0])
+    return from_matrix(_hand_eye(a, b, *eyes))
 
 
 def _worlds_started(c: EyeConditions, observed: Motions, U: Motions, done: set[int]) -> Motions:

@@ -29,6 +29,12 @@ def motions(matrices: FloatArray) -> Motions:
     return Motions(matrices[:, :3, :3].copy(), matrices[:, :3, 3].copy())
 
 
+def poses(found: Motions) -> list[Pose3]:
+    """As GTSAM's type, one by one."""
+    assert found.translation is not None
+    return [Pose3(rigid(r, t)) for r, t in zip(found.rotation, found.translation, strict=True)]
+
+
 def random_rigid(rng: np.random.Generator, n: int, turn: float, shift: float) -> FloatArray:
     """(n, 4, 4), rotation vectors and shifts uniform in a cube."""
     rotation = Rotation.from_rotvec(rng.uniform(-turn, turn, (n, 3))).as_matrix()
@@ -70,19 +76,17 @@ class Station4:
                 )
         lens = LensParameter("brown", free_lens, LENS)
         assert len(LENS) == len(BROWN)
-        first = Pose3(self.room_from_target[0])
+        eye = PoseParameter(Pose3(self.station_from_eye[0]), "held")
+        plate = PoseParameter(Pose3(self.room_from_target[0]), "held")
+        free = PoseParameter()
         return Survey(
-            cameras=tuple(
-                Camera(e, "relay", SIZE, lens, PoseParameter(Pose3(self.station_from_eye[0]), "held") if e == "a" else PoseParameter())
-                for e in EYES
-            ),
+            cameras=tuple(Camera(e, "relay", SIZE, lens, eye if e == "a" else free) for e in EYES),
             stations=(Station("relay", "epoch"),),
             targets=tuple(
-                Target(f"T{e}", names, self.x_in_target, carrier_from_target=PoseParameter(first, "held") if e == "a" else PoseParameter())
-                for e in EYES
+                Target(f"T{e}", names, self.x_in_target, carrier_from_target=plate if e == "a" else free) for e in EYES
             ),
             image_blocks=tuple(blocks),
-        )  # fmt: skip
+        )
 
     def pair(self, a: str, b: str) -> Pose3:
         """True ``b_from_a``."""
@@ -101,7 +105,9 @@ class Trackers:
 
     def poses(self, eye: int) -> FloatArray:
         """True ``world_from_eye`` (n, 4, 4)."""
-        return np.asarray(np.linalg.inv(self.room_from_world[eye]) @ self.room_from_station @ self.station_from_eye[eye])
+        return np.asarray(
+            np.linalg.inv(self.room_from_world[eye]) @ self.room_from_station @ self.station_from_eye[eye]
+        )
 
     def measured(self, sigma_rad: float = 1e-4, sigma_m: float = 1e-3) -> list[PoseSequence]:
         """Poses with noise of full, different covariances."""
