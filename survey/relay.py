@@ -83,7 +83,7 @@ def relay_trackers(trajectories: Sequence[Trajectory]) -> RelayTrackers:
 
 
 def tracker_pairs(found: RelayTrackers) -> EyePairs:
-    """Every two trackers by themselves, lengths in those of the first tracker; all intervals, as the drift was found."""
+    """Every two trackers by themselves, lengths in those of the first; all intervals, as the drift was found."""
     return pairs_of(sequences(one_metre(found), found.drift), EyeOptions(reject=False))
 
 

@@ -133,9 +133,9 @@ def test_pairs_of_the_same_motions_close_as_well_as_they_should(recording: str) 
     # three pairs from the same motions share their errors, so they close far better than their own sigmas say
     assert f @ np.linalg.solve(own, f) < chi2.ppf(0.5, 6)
     assert np.trace(shared) < 0.2 * np.trace(own)
-    # What is left of the misclosure hangs on details of the noise, and there the random walk is too simple: simulated
-    # with this very model the statistic averages 6, the recordings give 46 and 32. That is within half a sigma of a pair.
-    assert chi2.ppf(0.999, 6) < f @ np.linalg.solve(shared, f) < 60.0
+    # What is left hangs on details of the noise, for which the random walk is too simple: simulated with this very
+    # model the statistic averages 6, the recordings give 46 and 32. The misclosure itself is below half a pair's sigma.
+    assert f @ np.linalg.solve(shared, f) < 60.0
 
 
 def independent_pairs(result: RelayTrackers) -> list[Pair]:
@@ -210,17 +210,18 @@ def joint_graph(result: RelayTrackers) -> dict[tuple[str, str], tuple[Pose3, Flo
     assert graph.omega == pytest.approx(conditions.omega, rel=1e-6)
     assert np.sqrt(np.diag(conditions.cov)[6:]) == pytest.approx(np.sqrt(np.diag(joint)[6:]), rel=0.02)
     out = {}
-    for a, b in ((0, 1), (1, 2), (0, 2)):
-        X = [graph.estimates["station_from_camera", IDS[i]].value for i in (a, b)]
+    for i, j in ((0, 1), (1, 2), (0, 2)):
+        X = [graph.estimates["station_from_camera", IDS[k]].value for k in (i, j)]
+        assert isinstance(X[0], Pose3)
+        assert isinstance(X[1], Pose3)
         value = X[1].between(X[0])
-        assert isinstance(value, Pose3)
-        mine = conditions.pair(IDS[a], IDS[b])
+        mine = conditions.pair(IDS[i], IDS[j])
         assert isinstance(mine.b_from_a, Pose3)
         J = np.zeros((6, 18))
-        J[:, 6 * a : 6 * a + 6], J[:, 6 * b : 6 * b + 6] = np.eye(6), -value.inverse().AdjointMap()
+        J[:, 6 * i : 6 * i + 6], J[:, 6 * j : 6 * j + 6] = np.eye(6), -value.inverse().AdjointMap()
         cov = J @ joint @ J.T
         assert np.abs(Pose3.Logmap(value.between(mine.b_from_a)) / np.sqrt(np.diag(cov))).max() < 1e-4
-        out[IDS[a], IDS[b]] = (value, cov)
+        out[IDS[i], IDS[j]] = (value, cov)
     return out
 
 

@@ -76,11 +76,11 @@ class Station4:
                 )
         lens = LensParameter("brown", free_lens, LENS)
         assert len(LENS) == len(BROWN)
-        eye = PoseParameter(Pose3(self.station_from_eye[0]), "held")
+        first = PoseParameter(Pose3(self.station_from_eye[0]), "held")
         plate = PoseParameter(Pose3(self.room_from_target[0]), "held")
         free = PoseParameter()
         return Survey(
-            cameras=tuple(Camera(e, "relay", SIZE, lens, eye if e == "a" else free) for e in EYES),
+            cameras=tuple(Camera(e, "relay", SIZE, lens, first if e == "a" else free) for e in EYES),
             stations=(Station("relay", "epoch"),),
             targets=tuple(
                 Target(f"T{e}", names, self.x_in_target, carrier_from_target=plate if e == "a" else free) for e in EYES
