@@ -85,6 +85,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_detect(commands, shaped)
     _add_plan(commands, shaped)
     _add_add(commands, shaped)
+    _add_navigate(commands, shaped)
     _add_example(commands, shaped)
     return parser
 
@@ -160,6 +161,26 @@ def _add_add(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument("new", type=Path, metavar="NEW", help="folder with what is new")
     parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the grown project to DIR")
     parser.set_defaults(run=_add, parser=parser)
+
+
+def _add_navigate(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "navigate",
+        help="find the pose of the head at every epoch from beacons, named or not",
+        usage="labsurvey navigate lab   (labsurvey navigate FOLDER [--epochs E ...] [--station S] [--interval S])",
+        description="Calibrates from the epochs that show targets, then gives the others a pose with covariance from\n"
+        "their beacons; writes FOLDER/results/trajectory.csv and .json.",
+        epilog="Next: open FOLDER/results/trajectory.csv",
+        **shaped,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder with a survey.toml")
+    parser.add_argument("--station", metavar="S", help="the head; default: the one that a table carries")
+    parser.add_argument("--epochs", nargs="+", metavar="E", help="default: all that show beacons and no target")
+    parser.add_argument("--interval", type=float, metavar="SECONDS", help="epochs follow each other: bridge by motion")
+    parser.add_argument("--no-table", action="store_true", help="make no use of the table's angles")
+    parser.add_argument("--unnamed", action="store_true", help="forget the names that spots have")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
+    parser.set_defaults(run=_navigate, parser=parser)
 
 
 def _add_example(commands: Any, shaped: dict[str, Any]) -> None:
@@ -277,6 +298,25 @@ def _detect(arguments: argparse.Namespace) -> int:
         _print_json(outcome.summary())
     else:
         print(f"{outcome.text()}\nNext: labsurvey adjust {arguments.folder}")
+    return DONE
+
+
+def _navigate(arguments: argparse.Namespace) -> int:
+    _require_project(arguments.folder)
+    from survey.navigation import NavigateRequest, navigate_job
+
+    epochs = None if arguments.epochs is None else tuple(arguments.epochs)
+    request = NavigateRequest(
+        arguments.station, epochs, arguments.interval, not arguments.no_table, arguments.unnamed
+    )
+    outcome = navigate_job(arguments.folder, request, out=arguments.out, progress=not _is(arguments, "quiet"))
+    if _is(arguments, "verbose"):
+        _say(arguments, *(f"{step}: {seconds:.2f} s" for step, seconds in outcome.seconds.items()))
+    if _is(arguments, "json"):
+        _print_json(outcome.summary())
+    else:
+        print(outcome.text())
+        _say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
     return DONE
 
 

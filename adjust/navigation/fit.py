@@ -134,7 +134,8 @@ def fit_pose(
         step, _, factor = solved
         size = float(np.sqrt(max(step @ (rows.H.T @ cho_solve(factor, rows.H @ step)), 0.0)))
         length = float(np.linalg.norm(step[:3]))
-        pose, rows, moved = _shortened(system, seen, used, beacon, prior, pose, rows, step * min(1.0, 0.5 / max(length, 0.5)), factor)
+        step = step * min(1.0, 0.5 / max(length, 0.5))
+        pose, rows, moved = _shortened(system, seen, used, beacon, prior, pose, rows, step, factor)
         if size < _SETTLED or not moved:
             converged = size < 1e-2
             break

@@ -104,9 +104,8 @@ def _joint(
     column = 0
     for name in free:
         dim = unknowns.by_name[name].dim
-        spread[starts[name] : starts[name] + _full(unknowns.vectors, name, dim).shape[0], column : column + dim] = _full(
-            unknowns.vectors, name, dim
-        )
+        full = _full(unknowns.vectors, name, dim)
+        spread[starts[name] : starts[name] + len(full), column : column + dim] = full
         column += dim
     return np.asarray(spread @ joint @ spread.T), sizes
 

@@ -165,8 +165,9 @@ def _in_turn(
     Where only rivals are left the spot with the fewest is tried with each of them, and with none.
     """
     allowed = allowed_namings(system, seen)
-    start = _Partial(np.full(len(near), -1, dtype=np.int64), ~near.any(axis=1), prior)
-    open_ones, done = [(start, near, distance)], []
+    start = _Partial(np.full(len(near), -1, dtype=np.int64), np.logical_not(near.any(axis=1)), prior)
+    open_ones = [(start, near, distance)]
+    done: list[tuple[FloatArray, IntArray]] = []
     while open_ones and len(done) < _MOST_NAMINGS:
         partial, near, distance = open_ones.pop()
         if partial.decided.all():
@@ -294,9 +295,7 @@ def _spot_noise(seen: Sightings, fit: PoseFit) -> FloatArray:
     return out
 
 
-def score_of(
-    system: System, seen: Sightings, fit: PoseFit, prior: Prior | None, options: NavigateOptions
-) -> float:
+def score_of(system: System, seen: Sightings, fit: PoseFit, prior: Prior | None, options: NavigateOptions) -> float:
     """-2 ln of the evidence of an explanation: fit, spots it calls false, beacons it should have seen and did not.
 
     A false spot may be anywhere in its image; what no prior knows of the pose is uniform over all rotations (8 pi^2)

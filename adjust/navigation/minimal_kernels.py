@@ -72,7 +72,9 @@ def real_roots(c: FloatArray, lo: float, hi: float, out: FloatArray) -> int:
             fa = _value(chain[k], k, stops[i])
             fb = _value(chain[k], k, stops[i + 1])
             if fa == 0.0 or (fa > 0.0) != (fb > 0.0):
-                found[last] = stops[i] if fa == 0.0 else _bracketed(chain[k], chain[k - 1], k, stops[i], stops[i + 1], fa)
+                found[last] = stops[i]
+                if fa != 0.0:
+                    found[last] = _bracketed(chain[k], chain[k - 1], k, stops[i], stops[i + 1], fa)
                 last += 1
         if k == n:
             total = 0
@@ -202,10 +204,10 @@ def _triad(a: FloatArray, b: FloatArray, c: FloatArray, out: FloatArray) -> floa
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _known(solutions: FloatArray, n: int, depths: FloatArray) -> bool:
+    closest = np.inf
     for i in range(n):
-        if np.max(np.abs(solutions[i] - depths)) < 1e-6 * (1.0 + np.max(np.abs(depths))):
-            return True
-    return False
+        closest = min(closest, np.max(np.abs(solutions[i] - depths)))
+    return bool(closest < 1e-6 * (1.0 + np.max(np.abs(depths))))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

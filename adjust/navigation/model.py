@@ -99,8 +99,10 @@ class NavigationEpoch:
 
 @dataclass(frozen=True)
 class Motion:
-    """Constant velocity between epochs: white accelerations of these spectral densities (SI, per root second)
-    and the sigmas of the rates at the start."""
+    """Constant velocity between epochs.
+
+    White accelerations of these densities (rad/s and m/s per root second), and the sigmas of the rates at the start.
+    """
 
     sigma_angular_acceleration: float = 0.05
     sigma_acceleration: float = 0.05

@@ -65,7 +65,7 @@ def open_directions(
     system: System, seen: Sightings, used: IntArray, beacon: IntArray, pose: FloatArray, prior: Prior | None = None
 ) -> tuple[FloatArray, tuple[str, ...]]:
     """Covariance (6, 6) with infinite variances where observations leave a pose (4, 4) open, and those directions."""
-    residual, H, M, _ = evaluate(system, pose, seen.camera[used], beacon, seen.uv[used])
+    _, H, M, _ = evaluate(system, pose, seen.camera[used], beacon, seen.uv[used])
     W = np.linalg.inv(spot_noise(seen, used) + M @ M.T) if len(used) else np.zeros((0, 0))
     N = H.T @ W @ H
     if prior is not None:
@@ -110,7 +110,8 @@ def _named(direction: FloatArray, number: int, of: int) -> str:
         what = f"turn about {vector(direction[:3])}"
     else:
         per_degree = 1e3 * shift / np.degrees(turn)
-        what = f"turn about {vector(direction[:3])} with a shift of {per_degree:.1f} mm/deg along {vector(direction[3:])}"
+        what = f"turn about {vector(direction[:3])} with a shift of {per_degree:.1f} mm/deg"
+        what += f" along {vector(direction[3:])}"
     return f"open direction {number} of {of} (axes of the head): {what}"
 
 
@@ -159,7 +160,8 @@ def _images(system: System, pose: FloatArray, camera: IntArray, beacon: IntArray
 def _expected(system: System, pose: Pose3, camera: IntArray, beacon: IntArray, sigma_px: float) -> Expected:
     n, ids = len(camera), system.beacons.beacon_ids
     zeros = np.zeros(n, dtype=np.int64)
-    seen = Sightings(camera, _images(system, pose.matrix(), camera, beacon), np.tile(np.eye(2) * sigma_px**2, (n, 1, 1)), beacon, zeros, zeros, np.ones(len(system.kinds), dtype=np.bool_))  # fmt: skip
+    uv, cov = _images(system, pose.matrix(), camera, beacon), np.tile(np.eye(2) * sigma_px**2, (n, 1, 1))
+    seen = Sightings(camera, uv, cov, beacon, zeros, zeros, np.ones(len(system.kinds), dtype=np.bool_))
     names = tuple(ids[b] for b in sorted(set(beacon.tolist())))
     fit = fit_pose(system, seen, np.arange(n), beacon, pose.matrix()) if n >= 3 else None
     if fit is None:

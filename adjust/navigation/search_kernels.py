@@ -39,8 +39,11 @@ def consensus(
     field: FloatArray, camera: IntArray, ray: FloatArray, allowed: BoolArray, gate: float, named: FloatArray,
     missed: FloatArray, match: IntArray,
 ) -> float:  # fmt: skip
-    """Coarse score of a pose: ``named`` for every spot with a beacon within ``gate`` (rad), less for distance, and
-    ``missed`` (c,) off for every beacon that a camera should have seen. match (n,) receives the beacons, -1 for none."""
+    """Coarse score of a pose.
+
+    ``named`` (n,) for every spot with a beacon within ``gate`` (rad), less for its distance, and ``missed`` (c,) off
+    for every beacon that a camera should have seen. match (n,) receives the beacons, -1 for none.
+    """
     n, m = camera.size, x_in_world.shape[0]
     score = 0.0
     best = np.full(n, gate * gate)
@@ -126,10 +129,10 @@ def search(
             if not allowed[i, a]:
                 continue
             for b in range(m):
-                if b == a or not allowed[j, b] or not (gaps[0, 0] <= apart[a, b] <= gaps[0, 1]):
+                if b == a or not (allowed[j, b] and gaps[0, 0] <= apart[a, b] <= gaps[0, 1]):
                     continue
                 for c in range(m):
-                    if c == a or c == b or not allowed[k, c] or not (gaps[1, 0] <= apart[b, c] <= gaps[1, 1]):
+                    if c in (a, b) or not (allowed[k, c] and gaps[1, 0] <= apart[b, c] <= gaps[1, 1]):
                         continue
                     if not (gaps[2, 0] <= apart[a, c] <= gaps[2, 1]):
                         continue

@@ -41,13 +41,13 @@ def navigate(
     head: Head,
     beacons: Beacons,
     epochs: Sequence[NavigationEpoch],
-    options: NavigateOptions = NavigateOptions(),
+    options: NavigateOptions = NavigateOptions(),  # noqa: B008  frozen
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
     """Poses of the head at all epochs, in their order, which is that of time.
 
     Spots without names are identified. Epochs whose spots do not determine the pose are bridged by their own prior, the
-    table, or the motion from the epochs before; the first ones, until a pose is certain, by the motion from those after.
+    table, or the motion from the epochs before; the first ones, until a pose is certain, by the motion from later ones.
     progress: called with (epochs done, epochs). Raises SurveyError.
     """
     system = make_system(head, beacons)

@@ -20,8 +20,8 @@ class System:
     """The calibrated head and the beacons.
 
     F: (p + 3m, r) square root of the joint covariance of calibration and beacons: errors are ``F @ eta`` with eta
-    uncorrelated of unit variance. The errors eta are common to all epochs. F_inverse: (r, p + 3m) its pseudo-inverse. field: (c, 5) what a camera surely sees:
-    smallest and largest x/z and y/z, and the cosine of the widest angle for a fisheye (2 elsewhere).
+    uncorrelated of unit variance. The errors eta are common to all epochs. F_inverse: (r, p + 3m), its pseudo-inverse.
+    field: (c, 5) what a camera surely sees: smallest and largest x/z and y/z, and the cosine of the widest angle for a fisheye (2 elsewhere).
     """
 
     head: Head
@@ -29,7 +29,7 @@ class System:
     kinds: IntArray
     lenses: FloatArray
     constants: FloatArray
-    camera_R: FloatArray
+    camera_R: FloatArray  # noqa: N815  matrices are capital letters
     camera_t: FloatArray
     lens_at: IntArray
     n_lens: IntArray
@@ -77,13 +77,20 @@ def make_system(head: Head, beacons: Beacons) -> System:
         joint[:p, p:], joint[p:, :p] = beacons.cross_cov, beacons.cross_cov.T
     F = square_root(joint)
     return System(
-        head, beacons, np.array([k.kind for k in models], dtype=np.int64), lenses,
-        np.array([c.constants for c in head.cameras], dtype=float),
-        np.array([c.station_from_camera.rotation().matrix() for c in head.cameras]),
-        np.array([c.station_from_camera.translation() for c in head.cameras]),
-        np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64), np.array([len(c.lens) for c in head.cameras]),
-        sum(sizes), F, np.linalg.pinv(F), np.array([_field(head, i) for i in range(len(models))]),
-    )  # fmt: skip
+        head=head,
+        beacons=beacons,
+        kinds=np.array([k.kind for k in models], dtype=np.int64),
+        lenses=lenses,
+        constants=np.array([c.constants for c in head.cameras], dtype=np.float64),
+        camera_R=np.array([c.station_from_camera.rotation().matrix() for c in head.cameras]),
+        camera_t=np.array([c.station_from_camera.translation() for c in head.cameras]),
+        lens_at=np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
+        n_lens=np.array([len(c.lens) for c in head.cameras], dtype=np.int64),
+        table_at=sum(sizes),
+        F=F,
+        F_inverse=np.asarray(np.linalg.pinv(F), dtype=np.float64),
+        field=np.array([_field(head, i) for i in range(len(models))]),
+    )
 
 
 def _check_shapes(head: Head, beacons: Beacons, p: int, m: int) -> None:
@@ -119,8 +126,7 @@ def _field(head: Head, index: int) -> FloatArray:
     """The field of view of a camera from the rays of its border."""
     camera = head.cameras[index]
     width, height = camera.image_size
-    u, v = np.array([_BORDER_PX, (width - 1) / 2, width - 1 - _BORDER_PX]), np.array([_BORDER_PX, (height - 1) / 2,
-                                                                                     height - 1 - _BORDER_PX])  # fmt: skip
+    u, v = (np.array([_BORDER_PX, (n - 1) / 2, n - 1 - _BORDER_PX]) for n in (width, height))
     model = MODELS[camera.model]
     border = np.array([[u[0], v[1]], [u[2], v[1]], [u[1], v[0]], [u[1], v[2]]])
     rays = unit_rays(model, camera.lens, camera.constants, border)
@@ -137,7 +143,8 @@ def make_sightings(system: System, epoch: NavigationEpoch) -> Sightings:
     camera, label, block, row = [], [], [], []
     for k, spots in enumerate(epoch.spots):
         if spots.camera_id not in where:
-            raise SurveyError(f"epoch {epoch.epoch_id}: camera {spots.camera_id!r} is not on the head ({', '.join(where)})")
+            known = ", ".join(where)
+            raise SurveyError(f"epoch {epoch.epoch_id}: camera {spots.camera_id!r} is not on the head ({known})")
         c = where[spots.camera_id]
         camera += [c] * len(spots.uv)
         block += [k] * len(spots.uv)

@@ -56,10 +56,8 @@ def mfns_head():
     for name, (values, sigmas) in LENSES.items():
         lens, lens_sigma = np.zeros(13), np.zeros(13)
         lens[list(_LENS_PLACES)], lens_sigma[list(_LENS_PLACES)] = values, sigmas
-        cameras.append(
-            HeadCamera(name, SIZE, "brown", lens, lens_constants("brown", SIZE), station_from_camera(name))
-        )
-        phi, theta, psi = np.radians(MOUNTS[name][0])
+        cameras.append(HeadCamera(name, SIZE, "brown", lens, lens_constants("brown", SIZE), station_from_camera(name)))
+        phi, theta, _ = np.radians(MOUNTS[name][0])
         # columns of the tangent (in the camera) by psi, phi, theta, which turn one after the other
         turn = np.column_stack([
             -(about("x", -phi) @ about("y", -theta)).T @ [0, 0, 1], -about("y", -theta).T @ [1, 0, 0], [0, -1, 0]
@@ -121,7 +119,9 @@ def drawn(head, beacons, rng):
     step = _draw(head.cov, rng)
     for c in head.cameras:
         n = len(c.lens)
-        pose = c.station_from_camera.compose(Pose3(Rot3(cv2.Rodrigues(step[at + n : at + n + 3])[0]), step[at + n + 3 : at + n + 6]))
+        pose = c.station_from_camera.compose(
+            Pose3(Rot3(cv2.Rodrigues(step[at + n : at + n + 3])[0]), step[at + n + 3 : at + n + 6])
+        )
         cameras.append(replace(c, lens=c.lens + step[at : at + n], station_from_camera=pose))
         at += n + 6
     x = beacons.x_in_world + _draw(beacons.cov, rng).reshape(-1, 3)

@@ -1,0 +1,112 @@
+"""The job behind ``labsurvey navigate``, on a simulated laboratory written to a folder."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from gtsam import Pose3, Rot3
+
+from adjust.errors import SurveyError
+from survey.cli import main
+from survey.files import SpotBlock, write_project
+from survey.navigation import NavigateRequest, navigate_job
+from survey.simulate import Scene, beacons
+
+
+@pytest.fixture(scope="module")
+def lab():
+    return beacons(seed=4, n_table_epochs=5, n_free_epochs=4, n_night_epochs=8)
+
+
+@pytest.fixture
+def folder(lab, tmp_path):
+    write_project(tmp_path / "lab", lab[0])
+    return tmp_path / "lab"
+
+
+@pytest.fixture
+def unnamed(lab, tmp_path):
+    survey, _ = lab
+    blocks = [b for b in survey.image_blocks if b.target_id is not None]
+    spots = [
+        SpotBlock(b.camera_id, b.epoch_id, tuple(f"s{i}" for i in range(len(b.uv))), b.uv[::-1], b.cov[::-1])
+        for b in survey.image_blocks
+        if b.target_id is None
+    ]
+    write_project(tmp_path / "dark", type(survey)(**{**vars(survey), "image_blocks": tuple(blocks)}), spots=spots)
+    return tmp_path / "dark"
+
+
+def _distances(outcome, lab):
+    """Squared error in sigmas of every pose against the truth."""
+    scene, out = Scene(*lab), []
+    for epoch in outcome.trajectory.epochs:
+        true = Pose3(scene.world_from_station("head", epoch.epoch_id))
+        between = epoch.world_from_station.between(true)
+        d = np.concatenate([Rot3.Logmap(between.rotation()), between.translation()])
+        out.append(d @ np.linalg.solve(epoch.cov, d))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("use_table", [True, False])
+def test_named_spots(folder, lab, use_table):
+    outcome = navigate_job(folder, NavigateRequest(use_table=use_table), progress=False)
+    assert len(outcome.trajectory.epochs) == 8
+    if use_table:
+        # 8 poses of six components that share one calibration
+        assert {e.status for e in outcome.trajectory.epochs} <= {"fixed", "bridged"}
+        assert _distances(outcome, lab).max() < 30.0
+    else:
+        assert all(e.status != "bridged" for e in outcome.trajectory.epochs)
+        assert any(e.undetermined for e in outcome.trajectory.epochs if e.n_beacons < 3) or all(
+            e.n_beacons >= 3 for e in outcome.trajectory.epochs
+        )
+
+
+def test_table_names_the_spots(unnamed, lab):
+    outcome = navigate_job(unnamed, progress=False)
+    truth = {(b.camera_id, b.epoch_id): b for b in lab[0].image_blocks if b.target_id is None}
+    names = [p.point_id for p in lab[0].points]
+    known = {b.point_id for b in outcome.calibration.survey.points}
+    checked = 0
+    for epoch in outcome.trajectory.epochs:
+        cameras = [c for c, e in truth if e == epoch.epoch_id]
+        for camera, labels in zip(cameras, epoch.labels, strict=True):
+            expected = [names[i] for i in truth[camera, epoch.epoch_id].point_idx[::-1]]
+            assert all(a in (None, b) for a, b in zip(labels, expected, strict=True))
+            checked += sum(a == b for a, b in zip(labels, expected, strict=True) if b in known)
+    assert checked > 10
+    assert _distances(outcome, lab).max() < 30.0
+
+
+def test_files_and_summary(folder, capsys):
+    assert main(["navigate", str(folder), "--quiet", "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    with open(folder / "results/trajectory.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == summary["epochs"] == 8
+    assert float(rows[0]["sigma_x_mm"]) > 0 and rows[0]["labels"].count(":") >= 1
+    entries = json.loads((folder / "results/trajectory.json").read_text())["epochs"]
+    cov = np.array(entries[rows[0]["epoch_id"]]["covariance"])
+    assert np.linalg.eigvalsh(cov)[0] > 0
+    sigma = np.degrees(np.sqrt(np.diag(cov)[:3])) * 3600
+    assert float(rows[0]["sigma_rx_arcsec"]) == pytest.approx(sigma[0])
+
+
+def test_quiet_says_nothing_and_text_counts(folder, capsys):
+    assert main(["navigate", str(folder), "--quiet"]) == 0
+    found = capsys.readouterr()
+    assert found.err == "" and "8 poses of head" in found.out
+
+
+@pytest.mark.parametrize(
+    ("request_", "words"),
+    [
+        (NavigateRequest(epochs=("nowhere",)), "no beacon was observed at epoch nowhere"),
+        (NavigateRequest(station="cellar"), "no camera is on station 'cellar'"),
+    ],
+)
+def test_what_is_not_there_is_named(folder, request_, words):
+    with pytest.raises(SurveyError, match=words):
+        navigate_job(folder, request_, progress=False)
