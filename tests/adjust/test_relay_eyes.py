@@ -80,7 +80,8 @@ def test_derivatives_away_from_zero_error(scaled: bool) -> None:
     if not scaled:
         problems.append(pose_setup(trackers.measured(0.02, 0.05), ()).problem)
     for problem in problems:
-        _check_derivatives(problem, trackers.rng)
+        everything = np.ones(len(problem.free), dtype=np.bool_)
+        _check_derivatives(replace(problem, free=everything), trackers.rng)
 
 
 def _check_derivatives(problem: EyeProblem, rng: np.random.Generator) -> None:
@@ -193,6 +194,32 @@ def test_joint_covariance_given_as_a_whole_is_the_same() -> None:
     a, b = adjust_eyes(blocks), adjust_eyes(full)
     assert np.allclose(a.cov, b.cov, rtol=1e-6, atol=1e-16)
     assert np.allclose(a.solution.test, b.solution.test, rtol=1e-5)
+
+
+def test_eyes_that_see_several_worlds_and_not_at_all_epochs() -> None:
+    """Eye a is blind at first, so that eye b leads there; eye c looks at another target from the middle on."""
+    tests = []
+    for seed in range(30):
+        trackers = Trackers(200 + seed, n=14)
+        a, b, c = trackers.measured()
+        late = slice(5, None)
+        a = replace(
+            a,
+            epoch_ids=a.epoch_ids[5:],
+            world_ids=a.world_ids[5:],
+            world_from_eye=a.world_from_eye[late],
+            cov=a.cov[late],
+        )
+        other = motions(random_rigid(trackers.rng, 1, 2.0, 3.0))
+        seen = c.world_from_eye.where(np.arange(14) < 7, other @ c.world_from_eye)
+        c = replace(c, world_ids=("wc",) * 7 + ("wd",) * 7, world_from_eye=seen)
+        found = adjust_eyes((a, b, c))
+        assert found.redundancy == 6 * (9 + 14 - 2 - 3)
+        d = error(found.station_from_eye, trackers.station_from_eye)[1:].ravel()
+        tests.append(d @ np.linalg.solve(found.cov[6:, 6:], d))
+        between = found.room_from_world["wd"].inverse().compose(found.room_from_world["wc"])
+        assert between.equals(poses(other)[0], 0.02)
+    assert chi2.ppf(0.0005, 30 * 12) < np.sum(tests) < chi2.ppf(0.9995, 30 * 12)
 
 
 def test_influence_is_the_derivative() -> None:
