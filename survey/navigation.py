@@ -236,9 +236,12 @@ def _observed(
     spots = [Spots(s.camera_id, s.uv, s.cov) for s in project.spots if s.camera_id in own and s.epoch_id == epoch_id]
     for b in survey.image_blocks:
         if b.target_id is None and b.camera_id in own and b.epoch_id == epoch_id:
-            ids = tuple(survey.points[int(i)].point_id for i in b.point_idx)
-            known = None if request.unnamed else tuple(p if p in named else None for p in ids)
-            spots.append(Spots(b.camera_id, b.uv, b.cov, known))
+            ids = [survey.points[int(i)].point_id for i in b.point_idx]
+            if request.unnamed:
+                spots.append(Spots(b.camera_id, b.uv, b.cov))
+                continue
+            rows = [i for i, p in enumerate(ids) if p in named]
+            spots.append(Spots(b.camera_id, b.uv[rows], b.cov[rows], tuple(ids[i] for i in rows)))
     carried = next(s for s in survey.stations if s.station_id == station).table_id
     reading = next((r for r in survey.table_readings if (r.table_id, r.epoch_id) == (carried, epoch_id)), None)
     time_s = None if request.interval_s is None else number * request.interval_s

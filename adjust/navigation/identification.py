@@ -24,6 +24,7 @@ from adjust.navigation.system import Sightings, System, evaluate, station_rays, 
 _KEPT = 400
 _ADJUSTED = 60
 _HOPELESS = 40.0  # difference in -2 ln evidence beyond which a candidate is of no interest
+_MARGIN = 0.05  # tangent of an angle; a beacon just outside may be the one of a spot at the border
 _GATE = float(chi2.isf(1e-4, 2))
 _MOST_NAMINGS = 24
 _CROWDED = 3.0  # beacons near a spot beyond which naming in turn is hopeless
@@ -105,14 +106,14 @@ def with_prior(system: System, seen: Sightings, prior: Prior, options: NavigateO
     """Explanations near a prior, best first. One that leaves components open needs names, or three spots."""
     if len(prior.rows) < 6:
         return _with_partial_prior(system, seen, prior, options)
-    distance = gate_distances(system, seen, prior)
-    near = (distance < _GATE) & allowed_namings(system, seen)
+    distance, likely = gate_distances(system, seen, prior, options)
+    near = (distance < _GATE) & allowed_namings(system, seen) & likely
     if len(seen.uv) >= 3 and near.sum() > _CROWDED * near.any(axis=1).sum():
         poses, matches = _hypotheses(system, seen, near, options)
         found = _judged(system, seen, list(zip(poses, matches, strict=True)), prior, options)
         if found:
             return found
-    trials = _in_turn(system, seen, prior, near, distance)
+    trials = _in_turn(system, seen, prior, near, distance, options)
     return _judged(system, seen, trials, prior, options)
 
 
@@ -127,25 +128,30 @@ def _with_partial_prior(
     return _judged(system, seen, [(prior.pose, seen.label)], prior, options)
 
 
-def gate_distances(system: System, seen: Sightings, prior: Prior) -> FloatArray:
-    """Squared distance (n, m) of every spot from where the prior expects every beacon, in sigmas; inf behind."""
+def gate_distances(
+    system: System, seen: Sightings, prior: Prior, options: NavigateOptions
+) -> tuple[FloatArray, BoolArray]:
+    """Squared distance (n, m) of every spot from where the prior expects every beacon, in sigmas.
+
+    Infinite for a beacon far outside the field of view, where the distortion may fold it back into the image.
+
+    The second (n, m): whether the beacon is a likelier origin of the spot than chance. A beacon of vague position may
+    be near everything and explains nothing. A spot that came with its name needs no such proof.
+    """
     n, m = len(seen.uv), len(system.beacons.beacon_ids)
     camera, beacon = np.repeat(seen.camera, m), np.tile(np.arange(m), n)
     residual, H, M, _ = evaluate(system, prior.pose, camera, beacon, np.repeat(seen.uv, m, axis=0))
-    ahead = _ahead(system, prior.pose)[camera, beacon]
+    margin = _MARGIN + 4.0 * float(np.sqrt(np.diag(prior.total)[:3].max()))
+    ahead = visible(system, prior.pose, margin)[camera, beacon]
     H, M = H.reshape(-1, 2, 6), M.reshape(-1, 2, M.shape[-1])
     common = H @ prior.B + M
     S = np.repeat(seen.cov, m, axis=0) + H @ prior.cov @ H.swapaxes(1, 2) + common @ common.swapaxes(1, 2)
     r = residual.reshape(-1, 2)
     d2 = np.einsum("ni,ni->n", r, np.linalg.solve(S, r[:, :, None])[..., 0])
-    return np.asarray(np.where(ahead, d2, np.inf).reshape(n, m))
-
-
-def _ahead(system: System, pose: FloatArray) -> BoolArray:
-    """Which beacons (c, m) lie in front of each camera (anywhere, for a fisheye)."""
-    q = (system.beacons.x_in_world - pose[:3, 3]) @ pose[:3, :3]
-    depth = np.einsum("ck,cmk->cm", system.camera_R[:, :, 2], q[None] - system.camera_t[:, None, :])
-    return np.asarray((depth > 1e-3) | (system.field[:, 4:] < 1.5), dtype=np.bool_)
+    area = np.array([c.image_size[0] * c.image_size[1] for c in system.head.cameras], dtype=float)[camera]
+    vague = d2 + np.linalg.slogdet(2.0 * np.pi * S)[1] - 2.0 * np.log(options.detection / (1.0 - options.detection))
+    likely = (vague < 2.0 * np.log(area / options.false_spots)) | (np.repeat(seen.label, m) >= 0)
+    return np.where(ahead, d2, np.inf).reshape(n, m), likely.reshape(n, m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +164,7 @@ class _Partial:
 
 
 def _in_turn(
-    system: System, seen: Sightings, prior: Prior, near: BoolArray, distance: FloatArray
+    system: System, seen: Sightings, prior: Prior, near: BoolArray, distance: FloatArray, options: NavigateOptions
 ) -> list[tuple[FloatArray, IntArray]]:
     """Poses (4, 4) and namings (n,): first what has no rival, each naming narrowing the choice of the next.
 
@@ -177,8 +183,8 @@ def _in_turn(
             posterior = _posterior(system, seen, match, prior) if np.any(match != partial.match) else partial.prior
             if posterior is None:
                 continue
-            new = gate_distances(system, seen, posterior)
-            free = (new < _GATE) & allowed & ~decided[:, None]
+            new, likely = gate_distances(system, seen, posterior, options)
+            free = (new < _GATE) & allowed & likely & ~decided[:, None]
             for i in np.flatnonzero(match >= 0):
                 free[seen.camera == seen.camera[i], match[i]] = False
             decided = decided | ~free.any(axis=1)
@@ -261,18 +267,20 @@ def _adjusted(
     if fit is None or not fit.in_front:
         return None
     if prior is None:
-        fit = _grown(system, seen, fit, rejected)
+        fit = _grown(system, seen, fit, rejected, options)
     if fit.redundancy > 0 and fit.chi_square > chi2.isf(1e-6, fit.redundancy):
         return None
     return Candidate(fit, rejected, score_of(system, seen, fit, prior, options))
 
 
-def _grown(system: System, seen: Sightings, fit: PoseFit, rejected: tuple[int, ...]) -> PoseFit:
+def _grown(
+    system: System, seen: Sightings, fit: PoseFit, rejected: tuple[int, ...], options: NavigateOptions
+) -> PoseFit:
     """Name the spots that the pose explains and the coarse consensus left out."""
     for _ in range(len(seen.uv)):
         prior = Prior(fit.pose, fit.G @ _spot_noise(seen, fit) @ fit.G.T, fit.B, np.arange(6))
-        distance = gate_distances(system, seen, prior)
-        distance[~allowed_namings(system, seen)] = np.inf
+        distance, likely = gate_distances(system, seen, prior, options)
+        distance[~(allowed_namings(system, seen) & likely)] = np.inf
         distance[fit.used] = np.inf
         distance[list(rejected)] = np.inf
         for i, b in zip(fit.used, fit.beacon, strict=True):

@@ -1,6 +1,5 @@
 """Head and beacons as the arrays that the compiled code takes, checked once."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -196,15 +195,19 @@ def evaluate(
     return residual, H, M, bool(in_front)
 
 
-def visible(system: System, pose: FloatArray, beacons: Sequence[int] | None = None) -> BoolArray:
-    """Which beacons (c, m) lie in the field of view of each camera at a pose (4, 4); hidden ones count too."""
-    x = np.asarray(system.beacons.x_in_world if beacons is None else system.beacons.x_in_world[list(beacons)])
+def visible(system: System, pose: FloatArray, margin: float = 0.0) -> BoolArray:
+    """Which beacons (c, m) lie in the field of view of each camera at a pose (4, 4); hidden ones count too.
+
+    margin: how far outside its border (tangent of the angle) counts as inside.
+    """
+    x = np.asarray(system.beacons.x_in_world)
     q = (x - pose[:3, 3]) @ pose[:3, :3]
     p = np.einsum("cka,cmk->cma", system.camera_R, q[None] - system.camera_t[:, None, :])
     f = system.field[:, None, :]
     fisheye = f[..., 4] < 1.5
     with np.errstate(divide="ignore", invalid="ignore"):
         a, b = p[..., 0] / p[..., 2], p[..., 1] / p[..., 2]
-        inside = (p[..., 2] > 0) & (a > f[..., 0]) & (a < f[..., 1]) & (b > f[..., 2]) & (b < f[..., 3])
-        cone = p[..., 2] > f[..., 4] * np.linalg.norm(p, axis=-1)
+        inside = (p[..., 2] > 0) & (a > f[..., 0] - margin) & (a < f[..., 1] + margin)
+        inside &= (b > f[..., 2] - margin) & (b < f[..., 3] + margin)
+        cone = p[..., 2] > (f[..., 4] - margin) * np.linalg.norm(p, axis=-1)
     return np.asarray(np.where(fisheye, cone, inside), dtype=np.bool_)
