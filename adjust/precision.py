@@ -166,20 +166,19 @@ def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
             standardized = np.where(own > 1e-6 * sigma, v / own, np.nan)
         test = float(e @ np.linalg.pinv(Q, rcond=1e-9) @ e)
         redundancy = np.diag(Q) if item.used else np.zeros(n)
+        adjusted = adjusted_motion(item.observed, v) if item.kind == "pair" else np.asarray(item.observed + v)
         out.append(
             ObservationResidual(item.kind, item.group, item.ids, item.components, item.units, item.observed,
-                                _adjusted(item, v), v, sigma, redundancy, standardized, test, item.used)
+                                adjusted, v, sigma, redundancy, standardized, test, item.used)
         )  # fmt: skip
     return tuple(out)
 
 
-def _adjusted(item: ObservationFactor, v: FloatArray) -> FloatArray:
-    """Observed plus residual; of a measured pair the logarithm of the adjusted motion."""
-    if item.kind != "pair":
-        return np.asarray(item.observed + v)
+def adjusted_motion(observed: FloatArray, v: FloatArray) -> FloatArray:
+    """Logarithm (3 or 6,) of an adjusted rotation or pose: that of ``observed`` times that of the residual."""
     if len(v) == 3:
-        return np.asarray(Rot3.Logmap(Rot3.Expmap(item.observed) * Rot3.Expmap(v)))
-    return np.asarray(Pose3.Logmap(Pose3.Expmap(item.observed) * Pose3.Expmap(v)))
+        return np.asarray(Rot3.Logmap(Rot3.Expmap(observed) * Rot3.Expmap(v)))
+    return np.asarray(Pose3.Logmap(Pose3.Expmap(observed) * Pose3.Expmap(v)))
 
 
 def group_summaries(

@@ -9,7 +9,7 @@ from adjust.observations import FrameRef
 from adjust.pose_network.network import PoseNetwork, pose_network
 from adjust.pose_network.precision import UNCONTROLLED
 from adjust.pose_network.solution import NetworkSolution
-from adjust.precision import global_test
+from adjust.precision import adjusted_motion, global_test
 from adjust.relay.motions import Motions, right_jacobian_inverse
 from adjust.result import Adjustment, Estimate, GroupSummary, ImageResiduals, ObservationResidual, ParameterName
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
@@ -144,7 +144,7 @@ def _pair_residuals(survey: Survey, solution: NetworkSolution) -> tuple[Observat
         observed = motion.log()[0]
         out.append(
             ObservationResidual("pair", pair.group, (pair.pair_id, _text(pair.a), _text(pair.b)), POSE_COMPONENTS[:k],
-                                POSE_UNITS[:k], observed, observed + v, v, sigma, stats.redundancy[e, :k],
+                                POSE_UNITS[:k], observed, adjusted_motion(observed, v), v, sigma, stats.redundancy[e, :k],
                                 standardized, float(stats.test[e]), bool(network.used[e]))
         )  # fmt: skip
     return tuple(out)
