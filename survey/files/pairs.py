@@ -3,8 +3,10 @@
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray
 from adjust.observations import Pair
+from adjust.rotation_forms import euler_from_matrix, tangent_cov_from_euler
 from survey.files.covariance import covariance_from_sigmas, covariance_problem
 from survey.files.poses import rotation_from_euler, rotation_from_quaternion
 from survey.files.project import Sigmas
@@ -25,9 +27,11 @@ def covariance_column(i: int, j: int) -> str:
     return f"cov_{_TANGENT[i]}_{_TANGENT[j]}_{unit}"
 
 
+EULER_SIGMAS = [tuple(f"sigma_euler_{a}_{unit}" for a in "xyz") for unit in ("deg", "arcsec")]
 SIGMA_COLUMNS = {
     "rotation": [("sigma_rotation_deg",) * 3, ("sigma_rotation_arcsec",) * 3]
-    + [tuple(f"sigma_{a}_{unit}" for a in _TANGENT[:3]) for unit in ("deg", "arcsec")],
+    + [tuple(f"sigma_{a}_{unit}" for a in _TANGENT[:3]) for unit in ("deg", "arcsec")]
+    + EULER_SIGMAS,
     "translation": [("sigma_translation_mm",) * 3, tuple(f"sigma_{a}_mm" for a in _TANGENT[3:])],
 }
 COVARIANCE_COLUMNS = tuple(covariance_column(i, j) for i in range(6) for j in range(6))
@@ -48,9 +52,9 @@ def read_pairs(table: Table, names: Names, sigmas: Sigmas) -> tuple[Pair, ...]:
     """Measured pairs sorted by id: poses where there is a translation, else rotations."""
     pair_ids = table.unique_ids("pair_id")
     is_pose = _all_or_none(table, TRANSLATION)
-    cov = _pair_covariances(table, is_pose)
-    groups, used = group_names(table, "pair"), table.flags("used").tolist()
     rotations = _pair_rotations(table)
+    cov = _pair_covariances(table, is_pose, rotations)
+    groups, used = group_names(table, "pair"), table.flags("used").tolist()
     translation = to_si(np.stack([table.numbers(name) for name in TRANSLATION], axis=1), "mm")
     ends = list(zip(table.text("a_id").values(), table.text("b_id").values(), strict=True))
     pairs = []
@@ -88,7 +92,7 @@ def _pair_rotations(table: Table) -> list[Rot3]:
     return rotations
 
 
-def _pair_covariances(table: Table, is_pose: BoolArray) -> FloatArray:
+def _pair_covariances(table: Table, is_pose: BoolArray, rotations: list[Rot3]) -> FloatArray:
     """Covariances (n, 6, 6) in rad and m, of rotations only in the upper left (3, 3)."""
     cov = np.zeros((len(table), 6, 6))
     full = np.stack([table.numbers(name) for name in COVARIANCE_COLUMNS], axis=1)
@@ -103,9 +107,10 @@ def _pair_covariances(table: Table, is_pose: BoolArray) -> FloatArray:
             if bad.any():
                 row = first_row(bad)
                 surplus = "the pair has a sigma of the translation but no translation; remove it"
-                missing = f"the pair has no sigma of the {name}; fill in {SIGMA_COLUMNS[name][-1][0]} or the like"
+                missing = f"the pair has no sigma of the {name}; fill in {SIGMA_COLUMNS[name][1][0]} or the like"
                 raise table.error(row, surplus if np.isinf(part[row]).any() else missing)
         cov[~given] = covariance_from_sigmas(sigma[~given])
+        _turn_euler_covariances(table, rotations, cov)
     cov[~is_pose, 3:, :] = 0.0
     cov[~is_pose, :, 3:] = 0.0
     for mask, k in ((is_pose, 6), (~is_pose, 3)):
@@ -113,6 +118,17 @@ def _pair_covariances(table: Table, is_pose: BoolArray) -> FloatArray:
         if problem:
             raise table.error(int(np.flatnonzero(mask)[problem[0]]), f"{problem[1]}; correct the cov columns")
     return cov
+
+
+def _turn_euler_covariances(table: Table, rotations: list[Rot3], cov: FloatArray) -> None:
+    """Where the sigmas are those of Euler angles (R = Rz Ry Rx), turn their covariance into the tangent, in place."""
+    sigmas = np.stack([table.numbers(name) for columns in EULER_SIGMAS for name in columns], axis=1)
+    for row in np.flatnonzero((~np.isnan(sigmas)).any(axis=1)):
+        try:
+            angles = euler_from_matrix(rotations[row].matrix())
+        except SurveyError as error:
+            raise table.error(int(row), f"sigma_euler: {error}; give sigma_rx_arcsec and the like instead") from error
+        cov[row, :3, :3] = tangent_cov_from_euler(angles, cov[row, :3, :3])
 
 
 def _full_covariances(table: Table, given: BoolArray, is_pose: BoolArray) -> FloatArray:
