@@ -8,7 +8,7 @@ calibration (see :class:`System`) do to them. The pose is the generalised least-
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.stats import chi2
 
 from adjust.closed_forms.rigid import inverse, rigid, rotation_exp, rotation_log
@@ -66,6 +66,19 @@ class PoseFit:
     converged: bool
 
 
+def cho_factor(matrix: FloatArray) -> FloatArray:
+    """Lower Cholesky factor; raises LinAlgError. SciPy's own spends most of its time on checks of such small ones."""
+    factor, info = dpotrf(matrix, lower=1)
+    if info != 0:
+        raise np.linalg.LinAlgError("not positive definite")
+    return np.asarray(factor)
+
+
+def cho_solve(factor: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve by the factor of :func:`cho_factor`; right (n,) or (n, k)."""
+    return np.asarray(dpotrs(factor, right, lower=1)[0]).reshape(right.shape) if len(right) else right
+
+
 @dataclass(frozen=True, eq=False)
 class _Rows:
     residual: FloatArray
@@ -105,8 +118,10 @@ def _rows(
     residual, H, M, in_front = evaluate(system, pose, seen.camera[used], beacon, seen.uv[used])
     n, k = 2 * len(used), 0 if prior is None else len(prior.rows)
     R = np.zeros((n + k, n + k))
-    for i, cov in enumerate(seen.cov[used]):
-        R[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = cov
+    even = np.arange(0, n, 2)
+    cov = seen.cov[used]
+    R[even, even], R[even, even + 1] = cov[:, 0, 0], cov[:, 0, 1]
+    R[even + 1, even], R[even + 1, even + 1] = cov[:, 1, 0], cov[:, 1, 1]
     if prior is not None:
         step = local(prior.pose, pose)
         residual = np.concatenate([residual, step[prior.rows]])
@@ -142,10 +157,10 @@ def fit_pose(
     return _finished(pose, rows, used, beacon, converged) if converged else None
 
 
-def _step(rows: _Rows) -> tuple[FloatArray, FloatArray, tuple[FloatArray, bool]] | None:
+def _step(rows: _Rows) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     try:
-        factor = cho_factor(rows.R + rows.M @ rows.M.T, check_finite=False)
-        PH = cho_solve(factor, rows.H, check_finite=False)
+        factor = cho_factor(rows.R + rows.M @ rows.M.T)
+        PH = cho_solve(factor, rows.H)
         normal = rows.H.T @ PH
         scale = 1.0 / np.sqrt(np.diag(normal))
         values, vectors = np.linalg.eigh(normal * np.outer(scale, scale))
@@ -159,7 +174,7 @@ def _step(rows: _Rows) -> tuple[FloatArray, FloatArray, tuple[FloatArray, bool]]
 
 def _shortened(
     system: System, seen: Sightings, used: IntArray, beacon: IntArray, prior: Prior | None, pose: FloatArray,
-    rows: _Rows, step: FloatArray, factor: tuple[FloatArray, bool],
+    rows: _Rows, step: FloatArray, factor: FloatArray,
 ) -> tuple[FloatArray, _Rows, bool]:  # fmt: skip
     """The step, halved until it lowers the weighted squares; the last is whether there was such a step."""
     before = float(rows.residual @ cho_solve(factor, rows.residual))
@@ -182,7 +197,7 @@ def _finished(pose: FloatArray, rows: _Rows, used: IntArray, beacon: IntArray, c
     n = 2 * len(used)
     Sigma = rows.R + rows.M @ rows.M.T
     chi_square = float(rows.residual @ cho_solve(factor, rows.residual))
-    log_det = 2.0 * float(np.log(np.diag(factor[0])).sum())
+    log_det = 2.0 * float(np.log(np.diag(factor)).sum())
     return PoseFit(
         pose, used, beacon, C, gain[:, :n], gain[:, n:], gain @ rows.M, chi_square, len(rows.residual) - 6, log_det,
         rows.residual, Sigma, rows.H, rows.M, rows.in_front, converged,

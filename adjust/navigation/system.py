@@ -106,7 +106,9 @@ def _check_shapes(head: Head, beacons: Beacons, p: int, m: int) -> None:
 
 def square_root(cov: FloatArray) -> FloatArray:
     """F (n, r) with ``F F' = cov``, r its rank; raises SurveyError where the matrix is not a covariance."""
-    scale = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    if not np.isfinite(cov).all() or np.any(np.diag(cov) < 0):
+        raise SurveyError("a variance of calibration or beacons is negative or not finite: adjust the survey again")
+    scale = np.sqrt(np.diag(cov))
     used = np.flatnonzero(scale > 0)
     out = np.zeros((len(cov), len(used)))
     if not len(used):
