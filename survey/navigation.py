@@ -189,7 +189,8 @@ def _calibrate(project: Project, station: str, epochs: Sequence[str]) -> Adjustm
     except IndeterminateError as error:
         raise SurveyError(
             f"{project.folder}: the head is not calibrated without the epochs to navigate ({', '.join(epochs[:5])}"
-            f"{', ...' if len(epochs) > 5 else ''}); navigate fewer with --epochs, or calibrate with a target\n({error})"
+            f"{', ...' if len(epochs) > 5 else ''}); navigate fewer with --epochs, or calibrate with a target"
+            f"\n({error})"
         ) from error
 
 
@@ -250,9 +251,9 @@ def _observed(
     return NavigationEpoch(epoch_id, tuple(spots), time_s, reading.angles, reading.cov)
 
 
-_POSE_COLUMNS = tuple(
-    "x_mm y_mm z_mm qw qx qy qz euler_x_deg euler_y_deg euler_z_deg sigma_x_mm sigma_y_mm sigma_z_mm sigma_rx_arcsec "
-    "sigma_ry_arcsec sigma_rz_arcsec".split()
+_POSE_COLUMNS = (
+    *("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "euler_x_deg", "euler_y_deg", "euler_z_deg"),
+    *("sigma_x_mm", "sigma_y_mm", "sigma_z_mm", "sigma_rx_arcsec", "sigma_ry_arcsec", "sigma_rz_arcsec"),
 )
 
 

@@ -147,7 +147,7 @@ def fit_pose(
         if solved is None:
             return None
         step, _, factor = solved
-        size = float(np.sqrt(max(step @ (rows.H.T @ cho_solve(factor, rows.H @ step)), 0.0)))
+        size = float(np.sqrt(max(float(step @ (rows.H.T @ cho_solve(factor, rows.H @ step))), 0.0)))
         length = float(np.linalg.norm(step[:3]))
         step = step * min(1.0, 0.5 / max(length, 0.5))
         pose, rows, moved = _shortened(system, seen, used, beacon, prior, pose, rows, step, factor)

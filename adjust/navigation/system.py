@@ -19,8 +19,9 @@ class System:
     """The calibrated head and the beacons.
 
     F: (p + 3m, r) square root of the joint covariance of calibration and beacons: errors are ``F @ eta`` with eta
-    uncorrelated of unit variance. The errors eta are common to all epochs. F_inverse: (r, p + 3m), its pseudo-inverse.
-    field: (c, 5) what a camera surely sees: smallest and largest x/z and y/z, and the cosine of the widest angle for a fisheye (2 elsewhere).
+    uncorrelated of unit variance; they are common to all epochs. F_inverse: (r, p + 3m), its pseudo-inverse.
+    field: (c, 5) what a camera surely sees: smallest and largest x/z and y/z, and the cosine of the widest angle for a
+    fisheye (2 elsewhere).
     """
 
     head: Head

@@ -103,7 +103,7 @@ def counts(runs):
 def test_table_5(which, joint_head, capsys):
     head = mfns_head() if which == "printed" else joint_head
     # one angle that shows three beacons well per draw: draws are independent, epochs of one draw are not
-    expected = [e for e in expected_precision(head, printed_beacons(), [turned(a) for a in EVERY_3_DEG], SIGMA_PX)]
+    expected = list(expected_precision(head, printed_beacons(), [turned(a) for a in EVERY_3_DEG], SIGMA_PX))
     sharp = [e for e in expected if not e.undetermined and np.sqrt(e.cov[0, 0]) < 0.2]
     sigmas = PEOPLE * np.sqrt(np.mean([np.diag(e.cov) for e in sharp], axis=0))
     lines = [f"{which} calibration: {len(sharp)} of {len(expected)} positions of the table determine the pose",
@@ -178,11 +178,13 @@ def test_two_beacons_bridged_and_not():
     assert counts(loose)["fixed"] == counts(loose)["bridged"] == 0
     for result, _, _ in loose:
         if result.n_beacons == 2:
-            assert len(result.undetermined) == 2 and "turn about" in result.undetermined[0]
+            assert len(result.undetermined) == 2
+            assert "turn about" in result.undetermined[0]
             assert np.isinf(result.sigmas).any()
     head = with_table(mfns_head(), 0.02, 0.2)
     held = turn_table(head, printed_beacons(), angles, replace(sight, only=("B1", "B10")), draws=3)
-    assert counts(held)["bridged"] == len(held) and all(r.bridge == "table" for r, _, _ in held)
+    assert counts(held)["bridged"] == len(held)
+    assert all(r.bridge == "table" for r, _, _ in held)
     assert wrong_poses(held) == 0
 
 

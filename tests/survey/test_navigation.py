@@ -86,7 +86,8 @@ def test_files_and_summary(folder, capsys):
     with open(folder / "results/trajectory.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == summary["epochs"] == 8
-    assert float(rows[0]["sigma_x_mm"]) > 0 and rows[0]["labels"].count(":") >= 1
+    assert float(rows[0]["sigma_x_mm"]) > 0
+    assert rows[0]["labels"].count(":") >= 1
     entries = json.loads((folder / "results/trajectory.json").read_text())["epochs"]
     cov = np.array(entries[rows[0]["epoch_id"]]["covariance"])
     assert np.linalg.eigvalsh(cov)[0] > 0
@@ -97,7 +98,8 @@ def test_files_and_summary(folder, capsys):
 def test_quiet_says_nothing_and_text_counts(folder, capsys):
     assert main(["navigate", str(folder), "--quiet"]) == 0
     found = capsys.readouterr()
-    assert found.err == "" and "8 poses of head" in found.out
+    assert found.err == ""
+    assert "8 poses of head" in found.out
 
 
 @pytest.mark.parametrize(
