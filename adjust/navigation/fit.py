@@ -11,8 +11,9 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.stats import chi2
 
-from adjust.closed_forms.rigid import inverse, rigid, rotation_exp, rotation_log
+from adjust.closed_forms.rigid import rotation_exp
 from adjust.model import FloatArray, IntArray
+from adjust.navigation.pose_kernels import retracted, step_between
 from adjust.navigation.system import Sightings, System, evaluate
 
 MAX_ITERATIONS = 30
@@ -90,13 +91,12 @@ class _Rows:
 
 def retract(pose: FloatArray, step: FloatArray) -> FloatArray:
     """``pose * Exp(step)``: rotation and translation are stepped apart, exact to first order at ``step = 0``."""
-    return np.asarray(pose @ rigid(rotation_exp(step[:3]), step[3:]))
+    return np.asarray(retracted(pose, step))
 
 
 def local(a: FloatArray, b: FloatArray) -> FloatArray:
     """The step (6,) with ``retract(a, step) = b``."""
-    between = inverse(a) @ b
-    return np.concatenate([rotation_log(between[:3, :3]), between[:3, 3]])
+    return np.asarray(step_between(a, b))
 
 
 def local_derivative(step: FloatArray) -> FloatArray:

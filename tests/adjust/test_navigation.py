@@ -92,6 +92,17 @@ def _moved(head, beacons, step):
     )
 
 
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 1.0, 3.1])
+def test_steps_are_those_of_the_closed_forms(size):
+    rng = np.random.default_rng(4)
+    a = rigid(rotation_exp(rng.normal(size=3)), rng.normal(size=3))
+    w = rng.normal(size=3)
+    step = np.concatenate([size * w / np.linalg.norm(w), rng.normal(size=3)])
+    b = a @ rigid(rotation_exp(step[:3]), step[3:])
+    np.testing.assert_allclose(retract(a, step), b, atol=1e-14)
+    np.testing.assert_allclose(local(a, b), step, rtol=1e-9, atol=1e-14)
+
+
 def test_derivative_of_the_step_between_poses():
     rng = np.random.default_rng(1)
     a, b = (rigid(rotation_exp(rng.normal(size=3) * 0.8), rng.normal(size=3)) for _ in range(2))
