@@ -86,6 +86,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_plan(commands, shaped)
     _add_add(commands, shaped)
     _add_navigate(commands, shaped)
+    _add_compare(commands, shaped)
     _add_example(commands, shaped)
     return parser
 
@@ -181,6 +182,21 @@ def _add_navigate(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument("--unnamed", action="store_true", help="forget the names that spots have")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
     parser.set_defaults(run=_navigate, parser=parser)
+
+
+def _add_compare(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "compare",
+        help="say how stations have turned and moved between two epochs",
+        usage="labsurvey compare spring autumn   (labsurvey compare A B)",
+        description="Adjusts both project folders, writes nothing, and tests the motion of every station against the\n"
+        "next one of the same id in both.",
+        epilog="Next: labsurvey adjust B",
+        **shaped,
+    )
+    parser.add_argument("first", type=Path, metavar="A", help="project folder of the first epoch")
+    parser.add_argument("second", type=Path, metavar="B", help="project folder of the second epoch")
+    parser.set_defaults(run=_compare, parser=parser)
 
 
 def _add_example(commands: Any, shaped: dict[str, Any]) -> None:
@@ -306,9 +322,7 @@ def _navigate(arguments: argparse.Namespace) -> int:
     from survey.navigation import NavigateRequest, navigate_job
 
     epochs = None if arguments.epochs is None else tuple(arguments.epochs)
-    request = NavigateRequest(
-        arguments.station, epochs, arguments.interval, not arguments.no_table, arguments.unnamed
-    )
+    request = NavigateRequest(arguments.station, epochs, arguments.interval, not arguments.no_table, arguments.unnamed)
     outcome = navigate_job(arguments.folder, request, out=arguments.out, progress=not _is(arguments, "quiet"))
     if _is(arguments, "verbose"):
         _say(arguments, *(f"{step}: {seconds:.2f} s" for step, seconds in outcome.seconds.items()))
@@ -317,6 +331,19 @@ def _navigate(arguments: argparse.Namespace) -> int:
     else:
         print(outcome.text())
         _say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+    return DONE
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    _require_project(arguments.first)
+    _require_project(arguments.second)
+    from survey.comparison import compare_job
+
+    outcome = compare_job(arguments.first, arguments.second, progress=not _is(arguments, "quiet"))
+    if _is(arguments, "json"):
+        _print_json(outcome.summary())
+    else:
+        print(outcome.text())
     return DONE
 
 
