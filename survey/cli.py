@@ -85,6 +85,9 @@ def build_parser() -> argparse.ArgumentParser:
     _add_detect(commands, shaped)
     _add_plan(commands, shaped)
     _add_add(commands, shaped)
+    _add_remove(commands, shaped)
+    _add_convert(commands, shaped)
+    _add_trackers(commands, shaped)
     _add_navigate(commands, shaped)
     _add_compare(commands, shaped)
     _add_example(commands, shaped)
@@ -162,6 +165,56 @@ def _add_add(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument("new", type=Path, metavar="NEW", help="folder with what is new")
     parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the grown project to DIR")
     parser.set_defaults(run=_add, parser=parser)
+
+
+def _add_remove(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "remove",
+        help="adjust a project again without some observations",
+        usage="labsurvey remove lab p3   (labsurvey remove FOLDER ID [ID ...] [--out DIR])",
+        description="Writes used = false beside pairs, distances and coordinates, adjusts again and says what moved.\n"
+        "Refuses what the rest cannot do without; on any error FOLDER stays as it was.",
+        epilog="Next: open FOLDER/results/report.html",
+        **shaped,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="project folder, adjusted or not")
+    parser.add_argument("ids", nargs="+", metavar="ID", help="pair, distance, point or set; pairs:ID where it is twice")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the new project to DIR")
+    parser.set_defaults(run=_remove, parser=parser)
+
+
+def _add_convert(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "convert",
+        help="pose networks between g2o files and project folders",
+        usage="labsurvey convert garage.g2o garage   (labsurvey convert FROM TO [--format g2o|project])",
+        description="A g2o file becomes a project whose first station (or what FIX names) is held; the pairs of a\n"
+        "project become a g2o file, with adjusted poses where there are results. TO must be new.",
+        epilog="Next: labsurvey adjust TO",
+        **shaped,
+    )
+    parser.add_argument("source", type=Path, metavar="FROM", help="g2o file, or project folder")
+    parser.add_argument("target", type=Path, metavar="TO", help="new project folder, or new file ending with .g2o")
+    parser.add_argument("--format", choices=("g2o", "project"), help="of TO; default: by its ending")
+    parser.add_argument(
+        "--information", choices=("tangent", "quaternion"), default="tangent",
+        help="rotation part of g2o's information: of the rotation vector, or of the quaternion as g2o itself means it",
+    )  # fmt: skip
+    parser.set_defaults(run=_convert, parser=parser)
+
+
+def _add_trackers(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "trackers",
+        help="clocks, drift and relative poses of trackers on one station, from their trajectories",
+        usage="labsurvey trackers a.csv b.csv c.csv   (labsurvey trackers FILE FILE FILE ... [--out DIR])",
+        description="Files have lines t,x,y,z,qx,qy,qz,qw (s, m, world_from_eye); a file's name is its tracker's.",
+        epilog="Next: labsurvey trackers FILE FILE FILE --out DIR",
+        **shaped,
+    )
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="trajectories, three or more")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write the pairs to DIR/pairs.csv")
+    parser.set_defaults(run=_trackers, parser=parser)
 
 
 def _add_navigate(commands: Any, shaped: dict[str, Any]) -> None:
@@ -296,6 +349,54 @@ def _add(arguments: argparse.Namespace) -> int:
         _say(arguments, *(f"written: {path}" for path in outcome.outcome.paths.values()))
     test = outcome.outcome.adjustment.global_test
     return DONE if test is None or test.omega <= test.upper else TEST_FAILED
+
+
+def _remove(arguments: argparse.Namespace) -> int:
+    _require_project(arguments.folder)
+    from survey.removing import remove_job
+
+    progress = not _is(arguments, "quiet")
+    outcome = remove_job(arguments.folder, arguments.ids, out=arguments.out, progress=progress)
+    if _is(arguments, "json"):
+        _print_json(outcome.summary())
+    else:
+        print(outcome.text())
+        _say(arguments, *(f"written: {path}" for path in outcome.outcome.paths.values()))
+    test = outcome.outcome.adjustment.global_test
+    return DONE if test is None or test.omega <= test.upper else TEST_FAILED
+
+
+def _convert(arguments: argparse.Namespace) -> int:
+    if arguments.source.is_dir():
+        _require_project(arguments.source)
+    from survey.converting import convert_job
+
+    outcome = convert_job(
+        arguments.source, arguments.target, format=arguments.format, information=arguments.information
+    )
+    if _is(arguments, "json"):
+        _print_json(outcome.summary())
+    else:
+        print(outcome.text() + (f"\nNext: labsurvey adjust {outcome.target}" if outcome.format == "project" else ""))
+    return DONE
+
+
+def _trackers(arguments: argparse.Namespace) -> int:
+    files: dict[str, Path] = {path.stem: path for path in arguments.files}
+    if len(files) < len(arguments.files):
+        arguments.parser.error("two FILEs have the same name, but it names their trackers")
+    from survey.relay import read_trajectories, relay_trackers, tracker_pairs, trackers_text, write_relay_pairs
+
+    found = relay_trackers(read_trajectories(files))
+    written = None
+    if arguments.out is not None:
+        written = write_relay_pairs(arguments.out, tracker_pairs(found).pairs)
+    if _is(arguments, "json"):
+        _print_json({"trackers": list(files), "report": trackers_text(found), "written": written and str(written)})
+    else:
+        print(trackers_text(found), end="")
+        _say(arguments, *([f"written: {written}"] if written else []))
+    return DONE
 
 
 def _detect(arguments: argparse.Namespace) -> int:

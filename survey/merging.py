@@ -142,7 +142,7 @@ def _merge_tables(merged: Merged) -> None:
     if old.is_dir():
         shutil.copytree(old, target)
     target.mkdir(exist_ok=True)
-    for path in sorted((merged.folder / name for name in _point_files(merged.folder)), key=str):
+    for path in sorted((merged.folder / name for name in point_files(merged.folder)), key=str):
         _link_into(path, merged)
     source = merged.new / OBSERVATIONS_FOLDER
     for path in sorted(source.iterdir()) if source.is_dir() else []:
@@ -157,7 +157,7 @@ def _merge_tables(merged: Merged) -> None:
     merged.entries.append(OBSERVATIONS_FOLDER)
 
 
-def _point_files(folder: Path) -> list[str]:
+def point_files(folder: Path) -> list[str]:
     """Point lists that the old survey.toml names; the merged project is read with them."""
     definition = tomllib.loads(decode(folder / DEFINITION_FILE, read_bytes(folder / DEFINITION_FILE)[0]))
     targets = definition.get("targets", {})
@@ -172,8 +172,8 @@ def _link_into(path: Path, merged: Merged) -> None:
 
 
 def _merge_table(merged: Merged, old: Path, new: Path, target: Path) -> None:
-    new_header, new_rows = _rows(new)
-    old_header, old_rows = _rows(old) if old.is_file() else (new_header, [])
+    new_header, new_rows = table_rows(new)
+    old_header, old_rows = table_rows(old) if old.is_file() else (new_header, [])
     header = [*old_header, *(name for name in new_header if name not in old_header)]
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
@@ -190,7 +190,7 @@ def _merge_table(merged: Merged, old: Path, new: Path, target: Path) -> None:
     atomic_write(target, stream.getvalue())
 
 
-def _rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+def table_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Header, and the rows with their lines; what is there was read as a table before."""
     reader = csv.reader(io.StringIO(decode(path, read_bytes(path)[0]), newline=""), strict=True)
     header = next(reader)

@@ -2,8 +2,7 @@
 
 import shutil
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from survey.jobs import AdjustOutcome, adjust_project, run_info
 from survey.merging import Merged, merge
 from survey.network_summary import network_dict, pair_network
 from survey.previous import Move, Previous, moves, read_previous
-from survey.replacing import ADDING, recover, replace_parts
+from survey.replacing import complete, place_for, recover, replace_parts
 from survey.results import RESULTS, write_results
 from survey.warm_start import warm_adjustment
 
@@ -196,7 +195,7 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
     recover(folder)
     project = read(folder)
     before = read_previous(project)
-    with _place(folder, out) as place:
+    with place_for(folder, out) as place:
         merged = merge(folder, new, place)
         grown = _read_merged(merged)
         grown = replace(grown, folder=out or folder, title=project.title)
@@ -208,48 +207,11 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
         if out is None:
             replace_parts(folder, [*merged.entries, RESULTS])
         else:
-            _complete(folder, place)
+            complete(folder, place)
     target = out or folder
     outcome = replace(outcome, paths={name: target / RESULTS / name for name in outcome.paths})
     added = {**merged.new_ids, **merged.rows}
     return AddOutcome(outcome, added, moves(before, adjustment), before, start, time.perf_counter() - begin)
-
-
-@contextmanager
-def _place(folder: Path, out: Path | None) -> Iterator[Path]:
-    """Where the new state is made: inside the project, or beside ``out``, which it becomes when all is complete."""
-    if out is None:
-        place = folder / ADDING
-        place.mkdir()
-        try:
-            yield place
-        finally:
-            shutil.rmtree(place, ignore_errors=True)
-        return
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise SurveyError(f"{out}: is there already and not empty; give the name of a new folder")
-    place = out.absolute().with_name(f".{out.absolute().name}.partial")
-    shutil.rmtree(place, ignore_errors=True)  # left by a run that was killed
-    place.mkdir(parents=True)
-    try:
-        yield place
-        if out.exists():
-            out.rmdir()
-        place.rename(out)
-    finally:
-        shutil.rmtree(place, ignore_errors=True)
-
-
-def _complete(folder: Path, place: Path) -> None:
-    """Everything of the project that is not new."""
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder)
-        if name.parts[0] in (RESULTS, OBSERVATIONS_FOLDER) or name.parts[0].startswith(".") or (place / name).exists():
-            continue
-        if path.is_dir():
-            (place / name).mkdir()
-        else:
-            shutil.copy2(path, place / name)
 
 
 def _read_merged(merged: Merged) -> Project:

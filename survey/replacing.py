@@ -9,10 +9,14 @@ old ones come back. A run that was killed on the way leaves ``FOLDER/.before`` w
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
+from adjust.errors import SurveyError
+from survey.files.project import OBSERVATIONS_FOLDER
 from survey.files.text import atomic_write
+from survey.results import RESULTS
 
 ADDING, BEFORE, LIST = ".adding", ".before", "entries.json"
 
@@ -70,3 +74,43 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+@contextmanager
+def place_for(folder: Path, out: Path | None) -> Iterator[Path]:
+    """Where the new state is made: inside the project, or beside ``out``, which it becomes when all is complete.
+
+    Raises SurveyError where ``out`` is there already and not empty.
+    """
+    if out is None:
+        place = folder / ADDING
+        place.mkdir()
+        try:
+            yield place
+        finally:
+            shutil.rmtree(place, ignore_errors=True)
+        return
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise SurveyError(f"{out}: is there already and not empty; give the name of a new folder")
+    place = out.absolute().with_name(f".{out.absolute().name}.partial")
+    shutil.rmtree(place, ignore_errors=True)  # left by a run that was killed
+    place.mkdir(parents=True)
+    try:
+        yield place
+        if out.exists():
+            out.rmdir()
+        place.rename(out)
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def complete(folder: Path, place: Path) -> None:
+    """Put everything of the project that is not new into ``place``."""
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder)
+        if name.parts[0] in (RESULTS, OBSERVATIONS_FOLDER) or name.parts[0].startswith(".") or (place / name).exists():
+            continue
+        if path.is_dir():
+            (place / name).mkdir()
+        else:
+            shutil.copy2(path, place / name)
