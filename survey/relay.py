@@ -5,8 +5,6 @@
 >>> found = relay_trackers([read_trajectory(path, eye_id) for ...])
 """
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -97,11 +95,13 @@ def one_metre(found: RelayTrackers) -> CommonMotions:
 def read_trajectory(text: str, eye_id: str, name: str = "trajectory") -> Trajectory:
     """A trajectory from lines ``t, x, y, z, qx, qy, qz, qw`` (s, m, unit quaternion of ``world_from_eye``).
 
+    The values stand between commas or, as in TUM's files, between blanks.
     Poses repeated with the same time and value are kept once. Raises SurveyError naming the line for anything else
     that is not a trajectory.
     """
     rows: list[list[float]] = []
-    for line, row in enumerate(csv.reader(io.StringIO(text)), 1):
+    for line, words in enumerate(text.splitlines(), 1):
+        row = words.split(",") if "," in words else words.split()
         if not row or row[0].lstrip().startswith("#"):
             continue
         if len(row) != len(_COLUMNS):

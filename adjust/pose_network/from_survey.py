@@ -144,8 +144,8 @@ def _pair_residuals(survey: Survey, solution: NetworkSolution) -> tuple[Observat
         observed = motion.log()[0]
         out.append(
             ObservationResidual("pair", pair.group, (pair.pair_id, _text(pair.a), _text(pair.b)), POSE_COMPONENTS[:k],
-                                POSE_UNITS[:k], observed, adjusted_motion(observed, v), v, sigma, stats.redundancy[e, :k],
-                                standardized, float(stats.test[e]), bool(network.used[e]))
+                                POSE_UNITS[:k], observed, adjusted_motion(observed, v), v, sigma,
+                                stats.redundancy[e, :k], standardized, float(stats.test[e]), bool(network.used[e]))
         )  # fmt: skip
     return tuple(out)
 

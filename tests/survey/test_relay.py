@@ -77,3 +77,10 @@ def test_trajectory_keeps_repeated_poses_once(tmp_path: Path) -> None:
 def test_bad_trajectories_are_named(text: str, match: str) -> None:
     with pytest.raises(SurveyError, match=match):
         read_trajectory(text, "x", "f")
+
+
+def test_blanks_separate_as_commas_do() -> None:
+    lines = ["0.0 1 2 3 0 0 0 1", "0.5 1 2 4 0 0 0 1", "1.0 1 2 5 0 0 0 1"]
+    blanks, commas = (read_trajectory("\n".join(t), "a") for t in (lines, [x.replace(" ", ",") for x in lines]))
+    assert np.array_equal(blanks.times_s, commas.times_s)
+    assert np.array_equal(blanks.world_from_eye.translation, commas.world_from_eye.translation)
