@@ -155,12 +155,16 @@ def test_networks_of_rotations_know_no_displacement():
 
 def test_scaling_multiplies_with_sigma0_squared_of_its_epoch():
     rng = np.random.default_rng(9)
-    first, second = (adjusted(measured(chain(), rng)) for _ in range(2))
-    plain, scaled, only = (station_deformations(first, second, scale=s)[0].cov
-                           for s in ((False, False), (True, True), (True, False)))  # fmt: skip
-    part = (only - plain) / (first.sigma0**2 - 1.0)
-    expected = first.sigma0**2 * part + second.sigma0**2 * (plain - part)
-    np.testing.assert_allclose(scaled, expected, rtol=1e-6, atol=1e-18)
+    epochs = [adjusted(measured(chain(), rng)) for _ in range(2)]
+    plain, both = (station_deformations(*epochs, scale=(s, s))[0].cov for s in (False, True))
+    unit, total = np.outer(SIGMAS, SIGMAS), plain
+    for epoch, scale in zip(epochs, ((True, False), (False, True)), strict=True):
+        more = station_deformations(*epochs, scale=scale)[0].cov - plain
+        # hardly deformed: what an epoch adds is the covariance of its own relative pose, but for the noise's rotation
+        own = (epoch.sigma0**2 - 1.0) * relative_pose(epoch, "S0", "S1")[1]
+        np.testing.assert_allclose(more / unit, own / unit, atol=1e-3)
+        total = total + more
+    np.testing.assert_allclose(both / unit, total / unit, atol=1e-9)
 
 
 def test_held_stations_have_no_error_and_no_test():
