@@ -170,7 +170,7 @@ class AddOutcome:
         far = [m for m in self.moved if m.sigmas > 1.0]
         lines.append(
             f"{len(far)} of {len(self.moved)} old stations and points moved by more than one of their sigmas"
-            + ("" if far else "; the most")
+            + ("; the most" if self.moved and not far else "")
         )
         for m in (far or self.moved)[:_MOST_SHOWN]:
             lines.append(f"  {m.name:<20}{m.mm:>10.3f} mm{m.arcsec:>9.1f} arcsec{m.sigmas:>8.2f} sigmas")
