@@ -48,8 +48,9 @@ def adjust(
     solved = solve(graph, options.solve, progress)
     if options.reject_points:
         screened = screen(graph, solved, options.solve)
-        solved, survey = screened.solved, with_used(survey, screened.used)
-        return replace(assemble(graph, solved, options, rejections(survey) + notes), survey=survey)
+        survey = with_used(survey, screened.used)
+        notes = rejections(survey) + notes
+        return replace(assemble(graph, screened.solved, options, notes, screened.precision), survey=survey)
     return assemble(graph, solved, options, notes)
 
 
@@ -112,9 +113,15 @@ def _without(survey: Survey, excluded: Sequence[int]) -> Survey:
     return replace(survey, image_blocks=tuple(blocks))
 
 
-def assemble(graph: AdjustmentGraph, solved: Solved, options: AdjustOptions, notes: tuple[str, ...] = ()) -> Adjustment:
-    """Everything a report needs, from the solution."""
-    precision = Precision(graph, solved)
+def assemble(
+    graph: AdjustmentGraph,
+    solved: Solved,
+    options: AdjustOptions,
+    notes: tuple[str, ...] = (),
+    precision: Precision | None = None,
+) -> Adjustment:
+    """Everything a report needs, from the solution; ``precision`` where it is known already."""
+    precision = precision or Precision(graph, solved)
     images = image_residuals(precision)
     others = other_residuals(precision)
     groups = group_summaries(graph, images, others)

@@ -22,11 +22,11 @@ _ROUNDS = 6
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """A clean solution, and which image points (N,), in the order of ``Survey.image_blocks``, it uses."""
+    """A clean solution with its precision, and which image points (N,), in the order of the blocks, it uses."""
 
     solved: Solved
+    precision: Precision
     used: BoolArray
-    rejected: int
 
 
 def limit(n: int) -> float:
@@ -44,19 +44,22 @@ def screen(graph: AdjustmentGraph, solved: Solved, options: SolveOptions) -> Scr
     """Look for gross errors; ends in a least squares of the points that are left. The graph keeps them."""
     given = graph.used()
     used = given.copy()
-    test = image_residuals(Precision(graph, solved)).test
-    if _suspects(test, used).any():
+    precision = Precision(graph, solved)
+    if _suspects(image_residuals(precision).test, used).any():
         graph.start = _reweighted(graph, solved, used, options)
         for _ in range(_ROUNDS):
             solved = solve(graph, options)
-            test = image_residuals(Precision(graph, solved)).test
-            now = given & ~_suspects(test, given)
+            precision = Precision(graph, solved)
+            now = given & ~_suspects(image_residuals(precision).test, given)
             if (now == used).all():
                 break
             used = now
             graph.set_weights(used.astype(np.float64))
             graph.start = solved.values
-    return Screened(solved, used, int(given.sum() - used.sum()))
+        else:  # still changing its mind: what is returned is the least squares of what it says is used
+            solved = solve(graph, options)
+            precision = Precision(graph, solved)
+    return Screened(solved, precision, used)
 
 
 def _suspects(test: FloatArray, used: BoolArray) -> BoolArray:
