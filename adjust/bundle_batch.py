@@ -83,9 +83,7 @@ class BundleBatch:
         self.reduced = sorted(i for i in key_of if i not in tied)
         pose_keys: list[int] = []
         for slot in self.chains.slot:
-            table = self.unknowns.table_slots.get(int(slot))
-            found = [self.unknowns.slot_key[int(slot)]] if table is None else [table.angles_key, table.geometry.key]
-            pose_keys += [k for k in found if k is not None and k not in pose_keys]
+            pose_keys += [k for k in self.unknowns.link_keys(int(slot)) if k not in pose_keys]
         may_hide = [
             k
             for k in pose_keys
@@ -164,17 +162,8 @@ class BundleBatch:
         for b in range(len(self.blocks)):
             row = self.first_pose + 6 * b
             for link in range(self.chains.ptr[b], self.chains.ptr[b + 1]):
-                slot = int(self.chains.slot[link])
-                table, C = self.unknowns.table_slots.get(slot), self.chains.C[link]
-                if table is None:
-                    if (key := self.unknowns.slot_key[slot]) is not None:
-                        entries.append((row, self.key_at[key], C))
-                    continue
-                k, D = len(table.axes), self.state.D[self.state.table_index[slot]]
-                entries.append((row, self.key_at[table.angles_key], C @ D[:, :k]))
-                if table.geometry.key is not None:
-                    n_free = len(table.geometry.free)
-                    entries.append((row, self.key_at[table.geometry.key], C @ D[:, k : k + n_free]))
+                by_key = self.state.by_keys(int(self.chains.slot[link]), self.chains.C[link])
+                entries += [(row, self.key_at[key], J) for key, J in by_key]
         for i, at in self.tied_at.items():
             entries.append((at, self.key_at[self.point_key[i]], np.eye(3)))
         r = np.concatenate([np.repeat(row + np.arange(m.shape[0]), m.shape[1]) for row, _, m in entries])
@@ -367,6 +356,14 @@ class BundleBatch:
         for j, i in enumerate(self.reduced):
             delta.insert(self.point_key[i], dX[j])
 
+    def _hidden_poses_given_interface(self) -> tuple[FloatArray, FloatArray]:
+        """Hidden poses by the interface (n_hidden, n_interface), and their covariance when that is known."""
+        nh = self.n_hidden
+        T = -lapack.dtrtrs(self.C, np.asfortranarray(self.Y[:, :-1]), lower=0)[0]
+        P = lapack.dpotri(self.C.copy(order="F"), lower=0)[0]
+        scale = self.scale[:nh]
+        return T / scale[:, None] * self.scale[nh:], (np.triu(P) + np.triu(P, 1).T) / scale[:, None] / scale
+
     def covariances(self, Q_interface: FloatArray, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Covariances of everything hidden, from the interface's joint covariance (order ``interface``).
 
@@ -377,10 +374,7 @@ class BundleBatch:
         Q = np.zeros((n, n))
         Q[nh:, nh:] = Q_interface
         if nh:
-            T = -lapack.dtrtrs(self.C, np.asfortranarray(self.Y[:, :-1]), lower=0)[0]
-            T = T / self.scale[:nh, None] * self.scale[nh:]
-            P = lapack.dpotri(self.C.copy(order="F"), lower=0)[0]
-            P = (np.triu(P) + np.triu(P, 1).T) / self.scale[:nh, None] / self.scale[:nh]
+            T, P = self._hidden_poses_given_interface()
             Q[:nh, nh:] = T @ Q_interface
             Q[nh:, :nh] = Q[:nh, nh:].T
             Q[:nh, :nh] = P + Q[:nh, nh:] @ T.T
@@ -408,10 +402,7 @@ class BundleBatch:
         T, own = np.zeros((n, n - nh)), np.zeros((n, n))
         T[nh:] = np.eye(n - nh)
         if nh:
-            from_interface = -lapack.dtrtrs(self.C, np.asfortranarray(self.Y[:, :-1]), lower=0)[0]
-            T[:nh] = from_interface / self.scale[:nh, None] * self.scale[nh:]
-            P = lapack.dpotri(self.C.copy(order="F"), lower=0)[0]
-            own[:nh, :nh] = (np.triu(P) + np.triu(P, 1).T) / self.scale[:nh, None] / self.scale[:nh]
+            T[:nh], own[:nh, :nh] = self._hidden_poses_given_interface()
         reduced = {self.point_key[i]: j for j, i in enumerate(self.reduced)}
         rows, V = [], []
         for key in keys:

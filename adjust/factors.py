@@ -49,29 +49,19 @@ class ChainPose:
     """The pose of a chain at given values, and its derivative (tangent on the right) by every unknown in it."""
 
     def __init__(self, unknowns: Unknowns, state: State, chain: Chain) -> None:
-        self.unknowns, self.state, self.chains = unknowns, state, Chains([chain])
+        self.state, self.chains = state, Chains([chain])
         self.keys: list[int] = []
         for link in chain:
-            table = unknowns.table_slots.get(link.slot)
-            found = [unknowns.slot_key[link.slot]] if table is None else [table.angles_key, table.geometry.key]
-            self.keys += [k for k in found if k is not None and k not in self.keys]
+            self.keys += [k for k in unknowns.link_keys(link.slot) if k not in self.keys]
 
     def __call__(self, values: gtsam.Values) -> tuple[Pose3, Jacobians]:
         """Pose and Jacobians (6, dim)."""
-        c, u = self.chains, self.unknowns
+        c = self.chains
         self.state.load(values, [int(s) for s in c.slot], lenses=False)
         c.evaluate(self.state)
         jacobians: Jacobians = []
         for i, slot in enumerate(c.slot):
-            table = u.table_slots.get(int(slot))
-            if table is None:
-                if (key := u.slot_key[int(slot)]) is not None:
-                    jacobians.append((key, c.C[i].copy()))
-                continue
-            k, D = len(table.axes), self.state.D[self.state.table_index[slot]]
-            jacobians.append((table.angles_key, c.C[i] @ D[:, :k]))
-            if table.geometry.key is not None:
-                jacobians.append((table.geometry.key, c.C[i] @ D[:, k : k + len(table.geometry.free)]))
+            jacobians += self.state.by_keys(int(slot), c.C[i].copy())
         return Pose3(Rot3(c.R[0]), c.t[0]), jacobians
 
 

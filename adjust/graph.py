@@ -201,12 +201,7 @@ class GraphBuilder:
 
     def block_keys(self, block: ImageBlock) -> set[int]:
         """Keys of the pose and table unknowns that an image block depends on."""
-        keys: set[int] = set()
-        for link in self._image_chain(block):
-            table = self.unknowns.table_slots.get(link.slot)
-            found = [self.unknowns.slot_key[link.slot]] if table is None else [table.angles_key, table.geometry.key]
-            keys |= {k for k in found if k is not None}
-        return keys
+        return {key for link in self._image_chain(block) for key in self.unknowns.link_keys(link.slot)}
 
     def table_keys(self) -> set[int]:
         """Keys of the table angles, which are always read."""

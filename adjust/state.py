@@ -102,6 +102,17 @@ class State:
             if warp_map is not None:
                 self.warp[i] = warp_map.full(values)
 
+    def by_keys(self, slot: int, by_slot: FloatArray) -> list[tuple[int, FloatArray]]:
+        """From a derivative (n, 6) by a slot's pose to those by the unknowns behind it (none where it is held)."""
+        table = self.unknowns.table_slots.get(slot)
+        if table is None:
+            return [(key, by_slot) for key in self.unknowns.link_keys(slot)]
+        k, D = len(table.axes), self.D[self.table_index[slot]]
+        out = [(table.angles_key, by_slot @ D[:, :k])]
+        if table.geometry.key is not None:
+            out.append((table.geometry.key, by_slot @ D[:, k : k + len(table.geometry.free)]))
+        return out
+
     def _move_table(self, values: gtsam.Values, table: TableSlot) -> None:
         angles = values.atVector(table.angles_key)
         geometry = dict(zip(table.geometry.names, table.geometry.full(values), strict=True))

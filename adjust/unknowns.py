@@ -117,6 +117,12 @@ class Unknowns:
         self.parameters[name] = parameter
         return self.slot_of[name]
 
+    def link_keys(self, slot: int) -> list[int]:
+        """The unknowns that a slot depends on: its pose, or a table's angles and geometry; none where all is held."""
+        table = self.table_slots.get(slot)
+        found = [self.slot_key[slot]] if table is None else [table.angles_key, table.geometry.key]
+        return [key for key in found if key is not None]
+
     def tidy(self, chain: list[Link]) -> Chain:
         """Leave out identities and links that meet their own inverse."""
         out: list[Link] = []

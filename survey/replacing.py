@@ -13,10 +13,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from adjust.errors import SurveyError
 from survey.files.project import OBSERVATIONS_FOLDER
 from survey.files.text import atomic_write
 from survey.results import RESULTS
+from survey.whole_folder import whole_folder
 
 ADDING, BEFORE, LIST = ".adding", ".before", "entries.json"
 
@@ -90,18 +90,8 @@ def place_for(folder: Path, out: Path | None) -> Iterator[Path]:
         finally:
             shutil.rmtree(place, ignore_errors=True)
         return
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise SurveyError(f"{out}: is there already and not empty; give the name of a new folder")
-    place = out.absolute().with_name(f".{out.absolute().name}.partial")
-    shutil.rmtree(place, ignore_errors=True)  # left by a run that was killed
-    place.mkdir(parents=True)
-    try:
+    with whole_folder(out) as place:
         yield place
-        if out.exists():
-            out.rmdir()
-        place.rename(out)
-    finally:
-        shutil.rmtree(place, ignore_errors=True)
 
 
 def complete(folder: Path, place: Path) -> None:

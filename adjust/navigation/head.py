@@ -10,6 +10,7 @@ from adjust.lens import camera_constants
 from adjust.model import TABLE_GEOMETRY, FloatArray, PoseParameter, Survey
 from adjust.navigation.model import Beacons, Head, HeadCamera, HeadTable
 from adjust.result import Adjustment, ParameterName
+from adjust.unknowns import VectorMap
 
 
 def head_and_beacons(
@@ -110,15 +111,15 @@ def _joint(
     return np.asarray(spread @ joint @ spread.T), sizes
 
 
-def _full(vectors: Mapping[ParameterName, object], name: ParameterName, dim: int) -> FloatArray:
+def _full(vectors: Mapping[ParameterName, VectorMap], name: ParameterName, dim: int) -> FloatArray:
     """From free components to all of a parameter (n, dim), in navigation's order."""
     vector = vectors.get(name)
     if vector is None:
         return np.eye(dim)
-    matrix: FloatArray = np.asarray(vector.matrix)  # type: ignore[attr-defined]  # a VectorMap of adjust.unknowns
+    matrix: FloatArray = vector.matrix
     if name[0] != "table_geometry":
         return matrix
     out = np.zeros((4, dim))
-    for row, component in zip(matrix, vector.names, strict=True):  # type: ignore[attr-defined]  # the same
+    for row, component in zip(matrix, vector.names, strict=True):
         out[TABLE_GEOMETRY.index(component)] = row
     return out

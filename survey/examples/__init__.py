@@ -3,12 +3,10 @@
 ``truth.json`` is for people and tests; no command reads it.
 """
 
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from adjust.errors import SurveyError
+from survey.whole_folder import whole_folder
 
 EXAMPLES = {
     "full-lab": "three-camera head on a two-axis table, board, wall plates, beacons, relay station of four cameras",
@@ -32,27 +30,10 @@ def write_example(name: str, folder: Path, *, seed: int = 1, jobs: int | None = 
     from survey.examples.relay import relay_files
 
     draft, files = MAKERS[name](seed) if name in MAKERS else (None, relay_files(seed))
-    with _complete_or_nothing(Path(folder)) as place:
+    with whole_folder(Path(folder)) as place:
         for path, text in files.items():
             (place / path).parent.mkdir(parents=True, exist_ok=True)
             (place / path).write_text(text, encoding="utf-8")
         if draft is not None:
             write_images(draft, place / "images", seed, jobs, progress)
     return len(draft.shots) if draft is not None else 0
-
-
-@contextmanager
-def _complete_or_nothing(folder: Path) -> Iterator[Path]:
-    """A temporary place beside ``folder`` that takes its name in the end."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise SurveyError(f"{folder}: is there already and not empty; give the name of a new folder")
-    place = folder.absolute().with_name(f".{folder.absolute().name}.partial")
-    shutil.rmtree(place, ignore_errors=True)  # left by a run that was killed
-    place.mkdir(parents=True)
-    try:
-        yield place
-        if folder.exists():
-            folder.rmdir()
-        place.rename(folder)
-    finally:
-        shutil.rmtree(place, ignore_errors=True)
