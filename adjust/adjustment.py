@@ -126,7 +126,7 @@ def assemble(
     others = other_residuals(precision)
     groups = group_summaries(graph, images, others)
     n_observations = sum(g.n_observations for g in groups)
-    n_unknowns = sum(u.dim for u in graph.unknowns.by_name.values())
+    n_unknowns = graph.unknowns.n_unknowns
     defect = solved.datum.defect if solved.datum else 0
     redundancy = n_observations - n_unknowns + defect
     omega = sum(g.omega for g in groups)
@@ -149,7 +149,8 @@ def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
         key = u.slot_key[slot]
         pose = u.slot_pose[slot] if key is None else values.atPose3(key)
         cov = np.zeros((6, 6)) if key is None else precision.cov(key)
-        out[name] = Estimate(name, pose, POSE_COMPONENTS, POSE_UNITS, cov, (u.parameters[name].treatment,) * 6)
+        status = u.status(key, u.parameters[name].treatment, 6)
+        out[name] = Estimate(name, pose, POSE_COMPONENTS, POSE_UNITS, cov, status)
     for name, vector in u.vectors.items():
         cov = np.zeros((len(vector.names),) * 2)
         if vector.key is not None:
@@ -161,7 +162,8 @@ def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
         free = u.by_name.get(name)
         x = u.held_points[point.point_id] if free is None else np.asarray(values.atPoint3(free.key))
         cov = np.zeros((3, 3)) if free is None else precision.cov(free.key)
-        out[name] = Estimate(name, x, ("x", "y", "z"), ("m",) * 3, cov, (treatment,) * 3)
+        status = u.status(free.key if free else None, treatment, 3)
+        out[name] = Estimate(name, x, ("x", "y", "z"), ("m",) * 3, cov, status)
     for name, unknown in u.by_name.items():
         if name[0] == "table_angles":
             n = unknown.dim

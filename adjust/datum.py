@@ -159,7 +159,8 @@ def inner_datum(graph: AdjustmentGraph, base: gtsam.Values) -> InnerDatum | None
     if np.abs(np.diag(triangular)).min() < 1e-9 * np.abs(triangular).max():
         raise SurveyError("the points and stations named for the inner datum cannot carry it; name three points")
     stack = stacking(graph, visible_keys(graph))
-    mine = normal_diagonal(linear, stack)[stack.index(keys)]
+    held = {stack.at[k].start + i for k in keys for i in graph.unknowns.held.get(k, ())}
+    mine = normal_diagonal(linear, stack)[[int(i) for i in stack.index(keys) if int(i) not in held]]
     sigma = float(1.0 / np.sqrt(np.median(mine)))
     rows, o = {}, 0
     for key in keys:

@@ -14,7 +14,7 @@ from adjust.image_batch import Chains
 from adjust.model import FloatArray, PoseParameter, VectorPrior
 from adjust.observations import Coordinates, Distance, Pair
 from adjust.state import State
-from adjust.unknowns import Chain, Unknowns, VectorMap
+from adjust.unknowns import Chain, Unknown, Unknowns, VectorMap
 
 Jacobians = list[tuple[int, FloatArray]]
 Residual = Callable[[gtsam.Values], tuple[FloatArray, Jacobians]]
@@ -211,3 +211,29 @@ def pose_prior_factor(parameter: PoseParameter, key: int) -> gtsam.NonlinearFact
         return np.asarray(r)[known], [(key, D[known])]
 
     return custom([key], cov[np.ix_(known, known)], residual)
+
+
+HOLD = 1e-9
+"""Standard deviation (m, rad) of a component that keeps its value. It is no observation: it is counted nowhere, and
+its variance is reported as zero. What the observations pull it by, about 1e-12 of this, is far below rounding."""
+
+
+def hold_factor(unknown: Unknown, held: Sequence[int], value: Pose3 | FloatArray) -> gtsam.NonlinearFactor:
+    """Keeps some components of a pose or a point at ``value``."""
+    rows = list(held)
+    cov = np.eye(len(rows)) * HOLD**2
+    key = unknown.key
+    if isinstance(value, Pose3):
+
+        def pose_residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+            D = np.zeros((6, 6), order="F")
+            r = Pose3.Logmap(value.between(values.atPose3(key)), D)
+            return np.asarray(r)[rows], [(key, D[rows])]
+
+        return custom([key], cov, pose_residual)
+    wanted, select = np.asarray(value, dtype=float)[rows], np.eye(unknown.dim)[rows]
+
+    def point_residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+        return np.asarray(values.atPoint3(key))[rows] - wanted, [(key, select)]
+
+    return custom([key], cov, point_residual)

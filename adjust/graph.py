@@ -16,6 +16,7 @@ from adjust.factors import (
     coordinates_factor,
     distance_factor,
     gaussian,
+    hold_factor,
     pair_factor,
     pose_prior_factor,
     vector_prior_factor,
@@ -154,6 +155,8 @@ class GraphBuilder:
         for item in self.others:
             if item.used:
                 others.add(item.factor)
+        for factor in self._holds():
+            others.add(factor)
         graph = gtsam.NonlinearFactorGraph(others)
         known = [(i, b) for i, free, b in split if not free]
         images = ImageBatch(
@@ -164,7 +167,7 @@ class GraphBuilder:
         # unused observations too: they are predicted with the joint covariance of their unknowns
         outside = {k for item in self.others for k in list(item.factor.keys())}
         outside |= {k for keys in images.keys for k in keys}
-        outside |= self._datum_keys()
+        outside |= self._datum_keys() | set(self.unknowns.held)
         unknown = [(i, b) for i, free, b in split if free]
         bundle = None
         if unknown:
@@ -186,7 +189,8 @@ class GraphBuilder:
                     raise SurveyError(f"point {point.point_id!r} is held but has no coordinates; give x_mm")
                 self.unknowns.held_points[point.point_id] = np.asarray(parameter.value, dtype=float)
             else:
-                self.unknowns.add(("point", point.point_id), "point", ("x", "y", "z"), ("m", "m", "m"))
+                unknown = self.unknowns.add(("point", point.point_id), "point", ("x", "y", "z"), ("m", "m", "m"))
+                self.unknowns.hold(unknown, parameter.held)
 
     def _block(self, i: int, block: ImageBlock) -> tuple[int, bool, ImageBlock]:
         free = block.target_id is None and any(
@@ -308,6 +312,21 @@ class GraphBuilder:
             if prior is not None and vector is not None and vector.key is not None:
                 units = tuple(vector.units[vector.names.index(x)] for x in prior.names)
                 self._other(vector_prior_factor(prior, vector), "prior", "prior", name, prior.names, units, prior.mean)
+
+    def _holds(self) -> list[gtsam.NonlinearFactor]:
+        """What keeps single components of poses and points at their values. Raises SurveyError where there is none."""
+        u = self.unknowns
+        values = {name: parameter.value for name, parameter in u.parameters.items()}
+        points = {("point", p.point_id): p.x_in_world.value for p in self.survey.points}
+        factors = []
+        for key, held in u.held.items():
+            unknown = u.by_key[key]
+            value = points[unknown.name] if unknown.kind == "point" else values[unknown.name]
+            if value is None:
+                names = ", ".join(unknown.components[i] for i in held)
+                raise SurveyError(f"{' '.join(unknown.name)}: {names} held without a value; give it one")
+            factors.append(hold_factor(unknown, held, value))
+        return factors
 
     def _other(
         self, factor: gtsam.NonlinearFactor, kind: str, group: str, ids: tuple[str, ...], components: tuple[str, ...],

@@ -26,20 +26,26 @@ class PoseParameter:
     value: start value when free (None: found by the program), the constant when held, the mean when prior.
     prior_cov: (6, 6), in the tangent at ``value``; ``np.inf`` on the diagonal means nothing is known of that component
     (its row and column are then ignored).
+    held: components (rx ry rz tx ty tz, of the tangent at ``value``) of a free or prior pose that keep their value.
     """
 
     value: Pose3 | None = None
     treatment: Treatment = "free"
     prior_cov: FloatArray | None = None
+    held: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class PointParameter:
-    """Coordinates of a point in the world, (3,) m, and how they are treated; ``prior_cov`` is (3, 3)."""
+    """Coordinates of a point in the world, (3,) m, and how they are treated; ``prior_cov`` is (3, 3).
+
+    held: axes (x y z) of a free or prior point that keep their value: z in a plane network, x and y in a levelling.
+    """
 
     value: FloatArray | None = None
     treatment: Treatment = "free"
     prior_cov: FloatArray | None = None
+    held: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +180,116 @@ class Point:
     x_in_world: PointParameter = PointParameter()
 
 
+TILT = ("tilt_1", "tilt_2")
+
+
+def tilt_axes(direction: FloatArray) -> FloatArray:
+    """Two unit vectors (2, 3) that make a right-handed frame with a unit ``direction`` (3,): e1 x e2 = direction.
+
+    For z they are x and y; near any other axis the two next ones in cyclic order, made perpendicular.
+    """
+    first = np.roll(np.eye(3)[int(np.argmax(np.abs(direction)))], 1)
+    e1 = first - direction * (first @ direction)
+    e1 /= np.linalg.norm(e1)
+    return np.array([e1, np.cross(direction, e1)])
+
+
+@dataclass(frozen=True, eq=False)
+class Vertical:
+    """The direction of the plumb line in the world, for levels and for instruments that are set up level.
+
+    up_in_world: (3,) unit vector, upwards, before the tilt. tilt: names as in ``TILT`` (rad), small turns of it about
+    ``tilt_axes(up_in_world)``; held at zero unless freed. radius: of the level surfaces (m), whose plumb lines meet at
+    ``origin - radius * up``; None where the surfaces are planes.
+    """
+
+    up_in_world: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    tilt: VectorParameter = field(default_factory=lambda: VectorParameter(TILT, np.zeros(2)))
+    radius: float | None = None
+
+
+@dataclass(frozen=True)
+class Bearings:
+    """How horizontal angles are counted: from the world's axis ``zero``, and clockwise seen from above or not.
+
+    Geodesists in (east, north): zero "y", clockwise. Directions, angles, azimuths and orientations all follow it.
+    """
+
+    zero: Literal["x", "y"] = "y"
+    clockwise: bool = True
+
+
+INSTRUMENT = ("distance_offset", "distance_scale", "refraction", "vertical_index")
+
+
+@dataclass(frozen=True, eq=False)
+class Instrument:
+    """A total station, theodolite or level.
+
+    parameters: names as in ``INSTRUMENT`` (m, 1, 1, rad): an observed distance is ``offset + (1 + scale) * true``; the
+    coefficient of refraction bends zenith angles (with ``Vertical.radius``); the index is added to zenith angles.
+    """
+
+    instrument_id: str
+    parameters: VectorParameter = field(default_factory=lambda: VectorParameter(INSTRUMENT, np.zeros(4)))
+
+
+@dataclass(frozen=True)
+class Setup:
+    """An instrument set up once: its readings of kind "direction" share one orientation unknown.
+
+    levelled: its vertical axis is the plumb line; else readings are in the axes of the frame it stands on, which must
+    be a station (as of a tilted scanner or tracker). centring_sigma, height_sigma: m, of the offset of the instrument
+    from the point it stands on, one unknown with a prior for all its readings where positive.
+    """
+
+    setup_id: str
+    instrument_id: str | None = None
+    levelled: bool = True
+    centring_sigma: float = 0.0
+    height_sigma: float = 0.0
+
+
+BEAM = ("offset_1", "offset_2", "slope_1", "slope_2")
+
+
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """A laser beam fixed on a body (a mount, a station): the line ``offset + s * (e + slope)`` in that body's frame.
+
+    axis: the axis e ("x", "y", "z") of the body that it runs along; 1 and 2 are the next axes in cyclic order.
+    parameters: names as in ``BEAM`` (m, m, 1, 1).
+    """
+
+    beam_id: str
+    carrier_kind: Literal["mount", "station"]
+    carrier_id: str
+    axis: Literal["x", "y", "z"] = "z"
+    parameters: VectorParameter = field(default_factory=lambda: VectorParameter(BEAM, np.zeros(4), free=BEAM))
+
+
+SURFACES: Mapping[str, tuple[str, ...]] = {
+    "plane": ("normal_1", "normal_2", "distance"),
+    "line": ("direction_1", "direction_2", "offset_1", "offset_2"),
+    "sphere": ("x", "y", "z", "radius"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A plane, line or sphere in the world on which positions lie (see ``OnSurface``).
+
+    parameters: names as in ``SURFACES``. A plane is ``n . x = distance``, a line passes ``offset`` along ``n``: n is
+    ``reference`` (3,) turned by the small angles _1, _2 about ``tilt_axes(reference)``, and the two offsets are along
+    those axes. None in ``reference`` or ``parameters``: found by the program.
+    """
+
+    surface_id: str
+    kind: Literal["plane", "line", "sphere"]
+    reference: FloatArray | None = None
+    parameters: VectorParameter | None = None
+
+
 @dataclass(frozen=True)
 class Datum:
     """Where origin, directions and scale come from.
@@ -202,3 +318,16 @@ class Survey:
     distances: tuple[Any, ...] = ()
     coordinates: tuple[Any, ...] = ()
     datum: Datum = Datum()
+    vertical: Vertical = field(default_factory=Vertical)
+    bearings: Bearings = Bearings()
+    instruments: tuple[Instrument, ...] = ()
+    setups: tuple[Setup, ...] = ()
+    beams: tuple[Beam, ...] = ()
+    surfaces: tuple[Surface, ...] = ()
+    readings: tuple[Any, ...] = ()
+    reading_covariances: tuple[Any, ...] = ()
+    coordinate_differences: tuple[Any, ...] = ()
+    levels: tuple[Any, ...] = ()
+    alignments: tuple[Any, ...] = ()
+    laser_spots: tuple[Any, ...] = ()
+    on_surfaces: tuple[Any, ...] = ()

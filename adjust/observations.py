@@ -7,7 +7,10 @@ from gtsam import Pose3, Rot3
 
 from adjust.model import BoolArray, FloatArray, IntArray
 
-FrameKind = Literal["world", "station", "camera", "target", "table"]
+FrameKind = Literal["world", "station", "camera", "target", "table", "mount"]
+ReadingKind = Literal[
+    "direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance", "height_difference"
+]
 
 
 @dataclass(frozen=True)
@@ -84,10 +87,125 @@ class Distance:
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """World coordinates (n, 3) m of n positions, with their joint covariance (3n, 3n)."""
+    """World coordinates (n, 3) m of n positions, with their joint covariance (3n, 3n).
+
+    ``np.inf`` on the diagonal of cov: that coordinate was not observed (its row and column are then ignored).
+    """
 
     positions: tuple[PositionRef, ...]
     values: FloatArray
     cov: FloatArray
     group: str = "coordinates"
+    used: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One reading of a total station, theodolite, level or GNSS-free instrument, from one position to another.
+
+    value, sigma: rad for direction, angle, zenith and azimuth; else m. Horizontal angles count as ``Survey.bearings``
+    says. setup_id: needed by directions; names the instrument and the shared orientation and centring of the others.
+    second: the right-hand target of an angle (``to`` is the left-hand one: value = bearing of second - bearing of to).
+    instrument_height, target_height, second_height: m, along the plumb line, above the positions.
+    target_centring_sigma: m, of the target's plumbing, for this reading alone.
+    """
+
+    reading_id: str
+    kind: ReadingKind
+    at: PositionRef
+    to: PositionRef
+    value: float
+    sigma: float
+    setup_id: str = ""
+    second: PositionRef | None = None
+    instrument_height: float = 0.0
+    target_height: float = 0.0
+    second_height: float = 0.0
+    target_centring_sigma: float = 0.0
+    group: str = "reading"
+    used: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingCovariance:
+    """Joint covariance (n, n) of n readings, in rad^2, rad m, m^2; it replaces their sigmas. All used, or none."""
+
+    reading_ids: tuple[str, ...]
+    cov: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class CoordinateDifferences:
+    """World coordinates of ``to`` minus those of ``at``, (n, 3) m of n baselines, with joint covariance (3n, 3n)."""
+
+    at: tuple[PositionRef, ...]
+    to: tuple[PositionRef, ...]
+    values: FloatArray
+    cov: FloatArray
+    group: str = "coordinate_difference"
+    used: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Inclination (rad) of a body's axis above the horizontal, from a spirit level or an accelerometer (asin f/g).
+
+    axis_in_frame: (3,) unit vector along which the instrument was laid.
+    """
+
+    level_id: str
+    frame: FrameRef
+    axis_in_frame: FloatArray
+    value: float
+    sigma: float
+    group: str = "level"
+    used: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Two axes of two bodies are parallel: the components (2,) rad of ``axis_in_a`` seen from b, across ``axis_in_b``.
+
+    axis_in_a, axis_in_b: (3,) unit vectors. value: (2,) along ``tilt_axes(axis_in_b)``, usually zero; cov (2, 2) rad^2,
+    ``np.inf`` on the diagonal where that component was not observed.
+    """
+
+    alignment_id: str
+    a: FrameRef
+    axis_in_a: FloatArray
+    b: FrameRef
+    axis_in_b: FloatArray
+    value: FloatArray
+    cov: FloatArray
+    group: str = "alignment"
+    used: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class LaserSpot:
+    """Where a beam meets the plane of a target at an epoch: (2,) m, x and y in the target, covariance (2, 2)."""
+
+    spot_id: str
+    beam_id: str
+    epoch_id: str
+    target_id: str
+    xy: FloatArray
+    cov: FloatArray
+    group: str = "laser"
+    used: bool = True
+
+
+@dataclass(frozen=True)
+class OnSurface:
+    """A position lies at ``offset`` (m) from a surface, with sigma (m): a feeler, a rail, a ball bar.
+
+    offset: along the normal of a plane, beyond the radius of a sphere, from the axis of a line (0: on it; then the
+    observation has two components, across).
+    """
+
+    surface_id: str
+    position: PositionRef
+    sigma: float
+    offset: float = 0.0
+    group: str = "surface"
     used: bool = True

@@ -58,7 +58,10 @@ class Precision:
     def cov(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
         Q = self.hidden[key] if key in self.hidden else self.tree.marginal(key)
-        return np.asarray(Q - self._excess([key]))
+        Q = np.array(Q - self._excess([key]))
+        held = list(self.graph.unknowns.held.get(key, ()))
+        Q[held], Q[:, held] = 0.0, 0.0
+        return Q
 
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:
         """Joint covariance of several unknowns, stacked in this order (of vectors their free components).

@@ -10,7 +10,8 @@ from adjust.model import BoolArray, FloatArray, IntArray, Survey
 
 # ("lens", camera) ("station_from_camera", camera) ("world_from_station", station[, epoch])
 # ("mount_from_station", station) ("world_from_table", table) ("table_geometry", table) ("table_angles", table, epoch)
-# ("carrier_from_target", target[, epoch]) ("warp", target) ("point", point)
+# ("carrier_from_target", target[, epoch]) ("warp", target) ("point", point) ("vertical",) ("instrument", instrument)
+# ("orientation", setup) ("centring", setup) ("beam", beam) ("surface", surface)
 ParameterName = tuple[str, ...]
 
 
@@ -54,7 +55,8 @@ class ImageResiduals:
 class ObservationResidual:
     """One observation that is not an image point: (k,) components in SI units.
 
-    kind: table, pair, distance, coordinates, prior. ids: what it joins, for people.
+    kind: table, pair, distance, coordinates, prior, a kind of reading, coordinate_difference, level, alignment, laser,
+    surface. ids: what it joins, for people.
     """
 
     kind: str

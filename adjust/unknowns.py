@@ -94,6 +94,27 @@ class Unknowns:
     vectors: dict[ParameterName, VectorMap] = field(default_factory=dict)
     held_points: dict[str, FloatArray] = field(default_factory=dict)
     parameters: dict[ParameterName, PoseParameter] = field(default_factory=dict)
+    held: dict[int, tuple[int, ...]] = field(default_factory=dict)
+    """By key: the components of an unknown that keep their value; the others are estimated."""
+
+    @property
+    def n_unknowns(self) -> int:
+        """Number of components that are estimated."""
+        return sum(u.dim for u in self.by_name.values()) - sum(len(held) for held in self.held.values())
+
+    def hold(self, unknown: Unknown, names: tuple[str, ...]) -> None:
+        """Keep some components. Raises SurveyError for a component that there is not, or where none is left free."""
+        wrong = [x for x in names if x not in unknown.components]
+        if wrong or len(set(names)) == unknown.dim:
+            what = f"no component {wrong[0]!r}" if wrong else "all components held; treat the whole as 'held'"
+            raise SurveyError(f"{' '.join(unknown.name)}: {what} (components: {', '.join(unknown.components)})")
+        if names:
+            self.held[unknown.key] = tuple(i for i, x in enumerate(unknown.components) if x in names)
+
+    def status(self, key: int | None, treatment: str, dim: int) -> tuple[str, ...]:
+        """Per component: the treatment of the whole, or "held"."""
+        held = self.held.get(key, ()) if key is not None else ()
+        return tuple("held" if i in held else treatment for i in range(dim))
 
     def add(self, name: ParameterName, kind: str, components: tuple[str, ...], units: tuple[str, ...]) -> Unknown:
         """Register a variable under the next key of its letter."""
@@ -109,7 +130,11 @@ class Unknowns:
             return self.slot_of[name]
         held = parameter.treatment == "held"
         pose = parameter.value if parameter.value is not None else Pose3()
-        key = None if held else self.add(name, "pose", POSE_COMPONENTS, POSE_UNITS).key
+        key = None
+        if not held:
+            unknown = self.add(name, "pose", POSE_COMPONENTS, POSE_UNITS)
+            self.hold(unknown, parameter.held)
+            key = unknown.key
         self.slot_of[name] = len(self.slot_key)
         self.slot_key.append(key)
         self.slot_pose.append(pose)
@@ -189,6 +214,8 @@ class FrameTree:
         if frame.kind == "target":
             return self._target(self._get(self.targets, "target", frame.frame_id), frame.epoch_id)
         table: Table = self._get(self.tables, "table", frame.frame_id)
+        if frame.kind == "mount":
+            return self._mount(table, frame.epoch_id)
         return [Link(self.unknowns.slot(("world_from_table", table.table_id), table.world_from_table))]
 
     def relative(self, a: FrameRef, b: FrameRef) -> Chain:
@@ -213,13 +240,17 @@ class FrameTree:
             raise SurveyError(f"station {station.station_id!r} moves between epochs: name the observation's epoch")
         if station.motion == "table" and (station.table_id, epoch_id) in self.on_table:
             table = self._get(self.tables, "table", station.table_id or "")
-            return [
-                Link(self.unknowns.slot(("world_from_table", table.table_id), table.world_from_table)),
-                Link(self._table_motion(table, epoch_id)),
-                Link(self.unknowns.slot(("mount_from_station", station.station_id), station.mount_from_station)),
-            ]
+            slot = self.unknowns.slot(("mount_from_station", station.station_id), station.mount_from_station)
+            return [*self._mount(table, epoch_id), Link(slot)]
         parameter = station.epochs.get(epoch_id, station.world_from_station)
         return [Link(self.unknowns.slot(("world_from_station", station.station_id, epoch_id), parameter))]
+
+    def _mount(self, table: Table, epoch_id: str | None) -> list[Link]:
+        if epoch_id is None or (table.table_id, epoch_id) not in self.on_table:
+            found = f"no reading at epoch {epoch_id!r}" if epoch_id else "no epoch named"
+            raise SurveyError(f"mount of table {table.table_id!r}: {found}; name an epoch at which its axes are read")
+        base = Link(self.unknowns.slot(("world_from_table", table.table_id), table.world_from_table))
+        return [base, Link(self._table_motion(table, epoch_id))]
 
     def _target(self, target: Target, epoch_id: str | None) -> list[Link]:
         name: ParameterName = ("carrier_from_target", target.target_id)
