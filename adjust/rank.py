@@ -8,7 +8,7 @@ from adjust.bundle_batch import ROUNDING_PIVOT
 from adjust.datum import BLIND, Stacking, gauge, stacking, times, visible_keys
 from adjust.errors import IndeterminateError
 from adjust.graph import AdjustmentGraph
-from adjust.model import FloatArray
+from adjust.model import FloatArray, Station
 from adjust.unknowns import Unknown
 
 _MOST_DIMS = 6000
@@ -190,12 +190,29 @@ def _station_frames(
         coefficients, common = _intersection(null, motion * scale[:, None])
         if coefficients.shape[1] and _rank(np.hstack([*found, common])) > _rank(np.hstack(found)):
             found.append(common)
-            what = "the frame" if coefficients.shape[1] == 6 else f"{coefficients.shape[1]} directions of the frame"
-            mount = " or its mount" if station.motion == "table" else ""
-            lines.append(
-                f"{what} of station {station.station_id} is not separated from the poses of its cameras: hold one "
-                f"camera on it{mount}"
-            )
+            length = np.linalg.norm(motion * scale[:, None], axis=0)
+            lines.append(_frame_text(station, coefficients * length[:, None]))
+
+
+def _frame_text(station: Station, coefficients: FloatArray) -> str:
+    """Which directions of a station's own frame float, and what would tell them; coefficients (6, k), tangent."""
+    k = coefficients.shape[1]
+    share = np.abs(coefficients).max(axis=1)
+    involved = [i for i in range(6) if share[i] > 1e-3 * share.max()]
+    count = "" if len(involved) == k else f"{k} directions of "
+    turns, shifts = ([f"{'xyz'[i % 3]}" for i in involved if (i < 3) == first] for first in (True, False))
+    parts, remedies = [], []
+    if shifts:
+        parts.append(f"where its origin lies along its own {', '.join(shifts)}")
+        remedies.append("a caliper or tape distance from its origin to a known point or camera (in distances.csv)")
+    if turns:
+        parts.append(f"how it is turned about its own {', '.join(turns)}")
+        remedies.append("an alignment of its axes (a prior on the rotation)")
+    carried = "its mount on the table" if station.motion == "table" else "its pose"
+    return (
+        f"the frame of station {station.station_id}: {count}{' and '.join(parts)}: nothing tells it, because the poses "
+        f"of its cameras and {carried} move along; measure {' and '.join(remedies)}, or hold one camera on it or {carried}"
+    )
 
 
 def _rank(basis: FloatArray) -> int:
