@@ -317,7 +317,9 @@ class GraphBuilder:
         """What keeps single components of poses and points at their values. Raises SurveyError where there is none."""
         u = self.unknowns
         values = {name: parameter.value for name, parameter in u.parameters.items()}
-        points = {("point", p.point_id): p.x_in_world.value for p in self.survey.points}
+        points: dict[ParameterName, FloatArray | None] = {
+            ("point", p.point_id): p.x_in_world.value for p in self.survey.points
+        }
         factors = []
         for key, held in u.held.items():
             unknown = u.by_key[key]

@@ -1,0 +1,1 @@
+"""The commands of ``labsurvey``: each module declares its arguments and runs the job. Heavy imports happen inside."""

@@ -1,0 +1,72 @@
+"""What all commands share: exit codes, flags, output, and the check of a project folder."""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from adjust.errors import SurveyError
+
+DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
+
+
+def message(error: SurveyError | OSError) -> str:
+    """An error as its reader should see it."""
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}; check the name, the permissions and the free space"
+    return str(error)
+
+
+def positive(text: str) -> int:
+    """A count from the command line, 1 or more."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"found {value}; expected 1 or more")
+    return value
+
+
+def not_negative(text: str) -> int:
+    """A number from the command line, 0 or more."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"found {value}; expected 0 or more")
+    return value
+
+
+def is_set(arguments: argparse.Namespace, flag: str) -> bool:
+    """Whether a flag that may stand before or after the command is set."""
+    return bool(getattr(arguments, flag, False))
+
+
+def say(arguments: argparse.Namespace, *lines: str) -> None:
+    """Messages beside the results."""
+    if not is_set(arguments, "quiet"):
+        for line in lines:
+            print(line, file=sys.stderr)
+
+
+def print_json(value: Mapping[str, Any]) -> None:
+    """The summary as one JSON object on stdout."""
+    print(json.dumps(value, indent=1, allow_nan=False))
+
+
+def require_project(folder: Path) -> None:
+    """Raises SurveyError where a folder is no project; undoes an ``add`` that was killed half way."""
+    if (folder / ".before").is_dir():
+        from survey.replacing import recover, unfinished
+
+        if unfinished(folder):  # a mixture of old and new must not be taken for a project
+            recover(folder)
+            print(f"labsurvey: {folder}: an 'add' that was killed has been undone", file=sys.stderr)
+    if not folder.is_dir():
+        hint = "; 'labsurvey example full-lab lab' writes a ready one"
+        raise SurveyError(f"{folder}: no such folder{hint}")
+    if not (folder / "survey.toml").is_file():
+        raise SurveyError(f"{folder}: there is no survey.toml in it; give the folder that holds one")
+
+
+def tested(omega_test: Any) -> int:
+    """Exit code by the global test: residuals that are too small mean cautious sigmas, which mislead nobody."""
+    return DONE if omega_test is None or omega_test.omega <= omega_test.upper else TEST_FAILED

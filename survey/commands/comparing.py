@@ -1,0 +1,36 @@
+"""The command ``compare``."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from survey.commands.common import DONE, is_set, print_json, require_project
+
+
+def declare_compare(commands: Any, shaped: dict[str, Any]) -> None:
+    """Add ``compare`` to the commands."""
+    parser = commands.add_parser(
+        "compare",
+        help="say how stations have turned and moved between two epochs",
+        usage="labsurvey compare spring autumn   (labsurvey compare A B)",
+        description="Adjusts both project folders, writes nothing, and tests the motion of every station against the\n"
+        "next one of the same id in both.",
+        epilog="Next: labsurvey adjust B",
+        **shaped,
+    )
+    parser.add_argument("first", type=Path, metavar="A", help="project folder of the first epoch")
+    parser.add_argument("second", type=Path, metavar="B", help="project folder of the second epoch")
+    parser.set_defaults(run=_compare, parser=parser)
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    require_project(arguments.first)
+    require_project(arguments.second)
+    from survey.comparison import compare_job
+
+    outcome = compare_job(arguments.first, arguments.second, progress=not is_set(arguments, "quiet"))
+    if is_set(arguments, "json"):
+        print_json(outcome.summary())
+    else:
+        print(outcome.text())
+    return DONE

@@ -1,0 +1,42 @@
+"""The command ``detect``."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from survey.commands.common import DONE, is_set, positive, print_json, require_project, say
+
+
+def declare_detect(commands: Any, shaped: dict[str, Any]) -> None:
+    """Add ``detect`` to the commands."""
+    parser = commands.add_parser(
+        "detect",
+        help="find the targets and beacons in the images of a project folder",
+        usage="labsurvey detect lab   (labsurvey detect FOLDER [--jobs N] [--pictures])",
+        description="Writes FOLDER/observations/image_points.csv, and spots.csv where beacons are asked for.",
+        epilog="Next: labsurvey adjust FOLDER",
+        **shaped,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder with a survey.toml and images/")
+    parser.add_argument("--jobs", type=positive, metavar="N", help="images at a time; default: one per processor")
+    parser.add_argument("--pictures", action="store_true", help="also write every image with what was found in it")
+    parser.set_defaults(run=_detect, parser=parser)
+
+
+def _detect(arguments: argparse.Namespace) -> int:
+    require_project(arguments.folder)
+    from survey.jobs import detect_job
+
+    outcome = detect_job(
+        arguments.folder,
+        jobs=arguments.jobs,
+        pictures=arguments.pictures,
+        progress=not is_set(arguments, "quiet"),
+    )
+    if is_set(arguments, "verbose"):
+        say(arguments, *outcome.messages)
+    if is_set(arguments, "json"):
+        print_json(outcome.summary())
+    else:
+        print(f"{outcome.text()}\nNext: labsurvey adjust {arguments.folder}")
+    return DONE

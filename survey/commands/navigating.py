@@ -1,0 +1,45 @@
+"""The command ``navigate``."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from survey.commands.common import DONE, is_set, print_json, require_project, say
+
+
+def declare_navigate(commands: Any, shaped: dict[str, Any]) -> None:
+    """Add ``navigate`` to the commands."""
+    parser = commands.add_parser(
+        "navigate",
+        help="find the pose of the head at every epoch from beacons, named or not",
+        usage="labsurvey navigate lab   (labsurvey navigate FOLDER [--epochs E ...] [--station S] [--interval S])",
+        description="Calibrates from the epochs that show targets, then gives the others a pose with covariance from\n"
+        "their beacons; writes FOLDER/results/trajectory.csv and .json.",
+        epilog="Next: open FOLDER/results/trajectory.csv",
+        **shaped,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder with a survey.toml")
+    parser.add_argument("--station", metavar="S", help="the head; default: the one that a table carries")
+    parser.add_argument("--epochs", nargs="+", metavar="E", help="default: all that show beacons and no target")
+    parser.add_argument("--interval", type=float, metavar="SECONDS", help="epochs follow each other: bridge by motion")
+    parser.add_argument("--no-table", action="store_true", help="make no use of the table's angles")
+    parser.add_argument("--unnamed", action="store_true", help="forget the names that spots have")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
+    parser.set_defaults(run=_navigate, parser=parser)
+
+
+def _navigate(arguments: argparse.Namespace) -> int:
+    require_project(arguments.folder)
+    from survey.navigation import NavigateRequest, navigate_job
+
+    epochs = None if arguments.epochs is None else tuple(arguments.epochs)
+    request = NavigateRequest(arguments.station, epochs, arguments.interval, not arguments.no_table, arguments.unnamed)
+    outcome = navigate_job(arguments.folder, request, out=arguments.out, progress=not is_set(arguments, "quiet"))
+    if is_set(arguments, "verbose"):
+        say(arguments, *(f"{step}: {seconds:.2f} s" for step, seconds in outcome.seconds.items()))
+    if is_set(arguments, "json"):
+        print_json(outcome.summary())
+    else:
+        print(outcome.text())
+        say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+    return DONE

@@ -1,0 +1,101 @@
+"""The commands ``add``, ``remove`` and ``trackers``."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from survey.commands.common import DONE, is_set, print_json, require_project, say, tested
+
+
+def declare_add(commands: Any, shaped: dict[str, Any]) -> None:
+    """Add ``add`` to the commands."""
+    parser = commands.add_parser(
+        "add",
+        help="add stations or observations to an adjusted project",
+        usage="labsurvey add lab lab/more   (labsurvey add FOLDER NEW [--out DIR])",
+        description="NEW holds observations/*.csv and, for new stations, cameras, targets, points or tables, a "
+        "survey.toml with them.\nFOLDER is adjusted with them from its last solution; on any error it stays as it was.",
+        epilog="Next: open FOLDER/results/report.html",
+        **shaped,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="adjusted project folder")
+    parser.add_argument("new", type=Path, metavar="NEW", help="folder with what is new")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the grown project to DIR")
+    parser.set_defaults(run=_add, parser=parser)
+
+
+def declare_remove(commands: Any, shaped: dict[str, Any]) -> None:
+    """Add ``remove`` to the commands."""
+    parser = commands.add_parser(
+        "remove",
+        help="adjust a project again without some observations",
+        usage="labsurvey remove lab p3   (labsurvey remove FOLDER ID [ID ...] [--out DIR])",
+        description="Writes used = false beside pairs, distances and coordinates, adjusts again and says what moved.\n"
+        "Refuses what the rest cannot do without; on any error FOLDER stays as it was.",
+        epilog="Next: open FOLDER/results/report.html",
+        **shaped,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="project folder, adjusted or not")
+    parser.add_argument("ids", nargs="+", metavar="ID", help="pair, distance, point or set; pairs:ID where it is twice")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the new project to DIR")
+    parser.set_defaults(run=_remove, parser=parser)
+
+
+def declare_trackers(commands: Any, shaped: dict[str, Any]) -> None:
+    """Add ``trackers`` to the commands."""
+    parser = commands.add_parser(
+        "trackers",
+        help="clocks, drift and relative poses of trackers on one station, from their trajectories",
+        usage="labsurvey trackers a.csv b.csv c.csv   (labsurvey trackers FILE FILE FILE ... [--out DIR])",
+        description="Files have lines t,x,y,z,qx,qy,qz,qw (s, m, world_from_eye); a file's name is its tracker's.",
+        epilog="Next: labsurvey trackers FILE FILE FILE --out DIR",
+        **shaped,
+    )
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="trajectories, three or more")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write the pairs to DIR/pairs.csv")
+    parser.set_defaults(run=_trackers, parser=parser)
+
+
+def _add(arguments: argparse.Namespace) -> int:
+    require_project(arguments.folder)
+    from survey.network import add_job
+
+    outcome = add_job(arguments.folder, arguments.new, out=arguments.out, progress=not is_set(arguments, "quiet"))
+    if is_set(arguments, "json"):
+        print_json(outcome.summary())
+    else:
+        print(outcome.text())
+        say(arguments, *(f"written: {path}" for path in outcome.outcome.paths.values()))
+    return tested(outcome.outcome.adjustment.global_test)
+
+
+def _remove(arguments: argparse.Namespace) -> int:
+    require_project(arguments.folder)
+    from survey.removing import remove_job
+
+    progress = not is_set(arguments, "quiet")
+    outcome = remove_job(arguments.folder, arguments.ids, out=arguments.out, progress=progress)
+    if is_set(arguments, "json"):
+        print_json(outcome.summary())
+    else:
+        print(outcome.text())
+        say(arguments, *(f"written: {path}" for path in outcome.outcome.paths.values()))
+    return tested(outcome.outcome.adjustment.global_test)
+
+
+def _trackers(arguments: argparse.Namespace) -> int:
+    files: dict[str, Path] = {path.stem: path for path in arguments.files}
+    if len(files) < len(arguments.files):
+        arguments.parser.error("two FILEs have the same name, but it names their trackers")
+    from survey.relay import read_trajectories, relay_trackers, tracker_pairs, trackers_text, write_relay_pairs
+
+    found = relay_trackers(read_trajectories(files))
+    written = None
+    if arguments.out is not None:
+        written = write_relay_pairs(arguments.out, tracker_pairs(found).pairs)
+    if is_set(arguments, "json"):
+        print_json({"trackers": list(files), "report": trackers_text(found), "written": written and str(written)})
+    else:
+        print(trackers_text(found), end="")
+        say(arguments, *([f"written: {written}"] if written else []))
+    return DONE
