@@ -211,7 +211,8 @@ def _frame_text(station: Station, coefficients: FloatArray) -> str:
     carried = "its mount on the table" if station.motion == "table" else "its pose"
     return (
         f"the frame of station {station.station_id}: {count}{' and '.join(parts)}: nothing tells it, because the poses "
-        f"of its cameras and {carried} move along; measure {' and '.join(remedies)}, or hold one camera on it or {carried}"
+        f"of its cameras and {carried} move along; measure {' and '.join(remedies)}, or hold one camera on it or "
+        f"{carried}"
     )
 
 
