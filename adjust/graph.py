@@ -23,6 +23,7 @@ from adjust.factors import (
 )
 from adjust.image_batch import ImageBatch, warp_shape
 from adjust.model import BoolArray, FloatArray, Survey
+from adjust.observation_factor import ObservationFactor, frame_text, position_text
 from adjust.observations import FrameRef, ImageBlock, Pair, PositionRef
 from adjust.result import ParameterName
 from adjust.state import State, collect_vectors
@@ -39,20 +40,6 @@ class StartValues:
     poses: Mapping[ParameterName, Pose3]
     points: Mapping[str, FloatArray]
     vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class ObservationFactor:
-    """A factor that is not an image batch, with what a report needs to know of it. ``observed``: (k,)."""
-
-    factor: gtsam.NonlinearFactor
-    kind: str
-    group: str
-    ids: tuple[str, ...]
-    components: tuple[str, ...]
-    units: tuple[str, ...]
-    observed: FloatArray
-    used: bool = True
 
 
 @dataclass(eq=False)
@@ -268,12 +255,12 @@ class GraphBuilder:
         for d in self.survey.distances:
             if not at[d.a].keys and not at[d.b].keys:
                 raise SurveyError(f"distance {d.distance_id!r} joins two held positions; it can adjust nothing")
-            ids = (d.distance_id, text(d.a), text(d.b))
+            ids = (d.distance_id, position_text(d.a), position_text(d.b))
             self._other(distance_factor(d, at[d.a], at[d.b]), "distance", d.group, ids, ("distance",), ("m",),
                         np.array([d.value]), d.used)  # fmt: skip
         for c in self.survey.coordinates:
-            names = tuple(f"{text(p)} {axis}" for p in c.positions for axis in "xyz")
-            owners = tuple(text(p) for p in c.positions)
+            names = tuple(f"{position_text(p)} {axis}" for p in c.positions for axis in "xyz")
+            owners = tuple(position_text(p) for p in c.positions)
             self._other(coordinates_factor(c, [at[p] for p in c.positions]), "coordinates", c.group, owners, names,
                         ("m",) * len(names), c.values.ravel(), c.used)  # fmt: skip
         self._priors()
@@ -391,15 +378,3 @@ def inner_datum_keys(survey: Survey, unknowns: Unknowns) -> list[int]:
         stations = tuple(s.station_id for s in survey.stations)
     keys += [u.key for name, u in by_name.items() if name[0] == "world_from_station" and name[1] in stations]
     return keys
-
-
-def frame_text(ref: FrameRef) -> str:
-    """``kind:id@epoch``, as in the tables of the project folder."""
-    return f"{ref.kind}:{ref.frame_id}" + (f"@{ref.epoch_id}" if ref.epoch_id else "")
-
-
-def text(ref: PositionRef) -> str:
-    """A position as people write it."""
-    if ref.frame is None:
-        return str(ref.point_id)
-    return frame_text(ref.frame) + (f"/{ref.point_id}" if ref.point_id else "")

@@ -13,8 +13,9 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.datum import gauge, stacking
-from adjust.graph import AdjustmentGraph, ObservationFactor
+from adjust.graph import AdjustmentGraph
 from adjust.model import BoolArray, FloatArray
+from adjust.observation_factor import ObservationFactor
 from adjust.result import GlobalTest, GroupSummary, ImageResiduals, ObservationResidual, ParameterName
 from adjust.solve import Solved
 from adjust.tree_covariance import TreeCovariance

@@ -14,8 +14,8 @@ from gtsam import Pose3, Rot3
 
 from adjust.errors import SurveyError
 from adjust.factors import gaussian
-from adjust.graph import frame_text
 from adjust.model import FloatArray, IntArray
+from adjust.observation_factor import frame_text
 from adjust.observations import Pair
 from adjust.relay.motions import Motions
 
