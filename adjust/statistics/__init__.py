@@ -1,0 +1,1 @@
+"""Statistics of an adjusted survey: tests, reliability, variance components, outliers, precision, error budget."""

@@ -1,0 +1,325 @@
+"""What the statistics of an adjustment give back: tables for a report, all values in SI units, angles in radians."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.result import ParameterName
+
+Method = Literal["b", "sidak"]
+
+
+@dataclass(frozen=True)
+class TestOptions:
+    """How observations are tested.
+
+    method: "b" (Baarda's B-method: ``alpha0`` is the level of a test of one component; tests of several components get
+    the level at which they find the same non-centrality with the same power) or "sidak" (``family_alpha`` is the error
+    probability of all tests together, each of them has the same level). power: probability 1 - beta with which a
+    minimal detectable bias is found.
+    """
+
+    method: Method = "sidak"
+    family_alpha: float = 0.05
+    alpha0: float = 0.001
+    power: float = 0.80
+
+
+@dataclass(frozen=True, eq=False)
+class Criteria:
+    """Levels, critical values of chi-square and non-centralities of tests with 1 ... 6 components; all (6,)."""
+
+    options: TestOptions
+    n_tests: int
+    alpha: FloatArray
+    critical: FloatArray
+    lambda0: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationTests:
+    """Tests and reliability of every observation: image points first, then ``Adjustment.other_residuals``, M in all.
+
+    n_image: rows of image points, in the order of ``ImageResiduals``. ptr: (M + 1,) ranges of an observation's
+    components in the arrays of length K. group: (M,) into ``group_names``. used: (M,).
+
+    n_components: (M,). freedom: (M,) controlled directions, the degrees of freedom of the test; 0: uncontrolled.
+    redundancy: (M,) sum of the redundancy numbers, 0 where not used. least: (M,) the smallest share of an error of
+    this observation, in any direction, that shows in its own residuals (the redundancy number where it has one
+    component); above 1 for what is not used. statistic: (M,) v' inv(Q_vv) v over the controlled directions. p: (M,) a
+    priori (chi-square). p_posterior: (M,) with sigma0 estimated (F; the tau-test where there is one component).
+    fails, fails_posterior: (M,) below the level of the criteria.
+    detectable: (M,) length of the least detectable bias in sigmas of the observation, sqrt(lambda0 / least), inf where
+    something is uncontrolled. external: (M,) lambda-bar, how far that bias moves the unknowns: no unknown, and no
+    function of them, moves by more than this many of its sigmas.
+
+    w: (K,) Baarda's w of the single components, positive where the observed value is too large; nan where
+    uncontrolled. tau: (K,) Pope's. p_w, p_tau: (K,) two-sided. error: (K,) estimated gross error (observed minus
+    true) in the component's unit. detectable_component: (K,) minimal detectable bias of the component alone, in its
+    unit. bias: (K,) the least detectable bias as a vector, in units.
+    """
+
+    n_image: int
+    ptr: IntArray
+    group: IntArray
+    group_names: tuple[str, ...]
+    used: BoolArray
+    n_components: IntArray
+    freedom: IntArray
+    redundancy: FloatArray
+    least: FloatArray
+    statistic: FloatArray
+    p: FloatArray
+    p_posterior: FloatArray
+    fails: BoolArray
+    fails_posterior: BoolArray
+    detectable: FloatArray
+    external: FloatArray
+    w: FloatArray
+    tau: FloatArray
+    p_w: FloatArray
+    p_tau: FloatArray
+    error: FloatArray
+    detectable_component: FloatArray
+    bias: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ImageEllipses:
+    """Minimal detectable biases of image points (N,): semi-axes (px) and the direction (rad, x to y) of the major."""
+
+    major: FloatArray
+    minor: FloatArray
+    direction: FloatArray
+
+
+@dataclass(frozen=True)
+class Influence:
+    """What an undetected bias of the least detectable size does.
+
+    row: of ``ObservationTests``. name, component, unit: the unknown that moves most in its sigmas; shift in that unit,
+    ratio = shift / sigma. position, position_shift: the point or station whose origin moves furthest, m ("" and 0.0
+    where there is none).
+    """
+
+    row: int
+    name: ParameterName
+    component: str
+    unit: str
+    shift: float
+    ratio: float
+    position: ParameterName
+    position_shift: float
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """Tests of all observations, what they could not find, and what is not controlled.
+
+    influences: worst external reliability first. uncontrolled: for people, observations of which some direction shows
+    in no residual. sigma0, redundancy: of the a posteriori tests.
+    """
+
+    criteria: Criteria
+    tests: ObservationTests
+    ellipses: ImageEllipses
+    influences: tuple[Influence, ...]
+    uncontrolled: tuple[str, ...]
+    sigma0: float
+    redundancy: int
+
+
+@dataclass(frozen=True)
+class Component:
+    """The variance component of one group.
+
+    factor: estimated variance factor, on top of the a priori variances (1: they were right); sigma: its standard
+    deviation. n: observed components. redundancy, omega: of the group, with the estimated factors. freedom: equivalent
+    degrees of freedom 2 factor^2 / sigma^2. p: of a factor as far from 1 where the a priori variances are right;
+    lower, upper: confidence limits. status: "estimated", "fixed" (not asked for, or a prior), "vanished" (its residuals
+    are smaller than any variance explains), "unseparable", "no redundancy".
+    """
+
+    group: str
+    factor: float
+    sigma: float
+    n: int
+    redundancy: float
+    omega: float
+    freedom: float
+    p: float
+    lower: float
+    upper: float
+    status: str
+
+
+@dataclass(frozen=True, eq=False)
+class VarianceComponents:
+    """Variance components of all groups. correlation: (k, k) between those in ``estimated``, in that order.
+
+    unseparable: sets of groups of which the observations tell only a mixture. iterations: solutions of the survey.
+    """
+
+    components: tuple[Component, ...]
+    estimated: tuple[str, ...]
+    correlation: FloatArray
+    unseparable: tuple[tuple[str, ...], ...]
+    iterations: int
+    converged: bool
+    method: str
+
+    def factor(self, group: str) -> float:
+        """The factor of a group, 1 where there is none."""
+        return next((c.factor for c in self.components if c.group == group), 1.0)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One step of an outlier search: what was left out or taken back, why and when.
+
+    kind, ids: as ``ObservationResidual``; of image points kind "image", ids (camera, epoch, target or "points",
+    point). statistic, freedom, p, limit: the test that decided. error: estimated gross error in sigmas of the
+    observation. round: of the non-linear solutions, counted from 1. how: "test", "robust".
+    """
+
+    action: Literal["rejected", "readmitted"]
+    kind: str
+    group: str
+    ids: tuple[str, ...]
+    statistic: float
+    freedom: int
+    p: float
+    limit: float
+    error: float
+    round: int
+    how: str
+
+    def text(self) -> str:
+        """For people."""
+        did = "left out" if self.action == "rejected" else "taken back"
+        return (
+            f"{did}: {self.kind} {' '.join(self.ids)}: off by {self.error:.1f} sigma, test {self.statistic:.1f} "
+            f"(limit {self.limit:.1f}), p {self.p:.2g}"
+        )
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Two components of unknowns with their correlation coefficient."""
+
+    a: ParameterName
+    a_component: str
+    b: ParameterName
+    b_component: str
+    coefficient: float
+
+
+@dataclass(frozen=True)
+class WeakPart:
+    """A component that moves in a weak direction: by ``amount`` (its unit) for one sigma of the direction."""
+
+    name: ParameterName
+    component: str
+    unit: str
+    amount: float
+
+
+@dataclass(frozen=True)
+class WeakDirection:
+    """A combination of unknowns that the survey determines badly.
+
+    inflation: how much larger the sigma along it is than if nothing else were unknown. parts: largest share first.
+    """
+
+    inflation: float
+    parts: tuple[WeakPart, ...]
+
+    def text(self, most: int = 6) -> str:
+        """For people."""
+        named = ", ".join(f"{' '.join(p.name)} {p.component} {p.amount:+.2g} {p.unit}" for p in self.parts[:most])
+        more = f" and {len(self.parts) - most} more" if len(self.parts) > most else ""
+        return f"{self.inflation:.3g} times weaker together than alone: {named}{more}"
+
+
+@dataclass(frozen=True, eq=False)
+class PrincipalComponent:
+    """The direction in which all coordinates together are weakest. share: of the trace of their covariance.
+
+    shifts: (n, 3) m, one sigma, of ``names``.
+    """
+
+    sigma: float
+    share: float
+    names: tuple[ParameterName, ...]
+    shifts: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoid:
+    """A confidence region: semi_axes (k,) m, largest first, axes (3, k) unit vectors in the world, at ``level``.
+
+    dimension k: of what is not held. scaled: by sigma0 a posteriori (F), else a priori (chi-square).
+    """
+
+    semi_axes: FloatArray
+    axes: FloatArray
+    level: float
+    scaled: bool
+
+    @property
+    def dimension(self) -> int:
+        """Number of axes."""
+        return len(self.semi_axes)
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePrecision:
+    """Precision of b relative to a, whatever the datum of position.
+
+    difference: (3,) m, b minus a in the world; cov (3, 3) m^2. distance, sigma_distance: m. ellipsoid: relative.
+    horizontal: the relative ellipse of x and y (None where they are held). rotation_cov: (3, 3) rad^2 of b's rotation
+    relative to a, in the tangent of b; None for points.
+    """
+
+    a: ParameterName
+    b: ParameterName
+    difference: FloatArray
+    cov: FloatArray
+    distance: float
+    sigma_distance: float
+    ellipsoid: Ellipsoid
+    horizontal: Ellipsoid | None
+    rotation_cov: FloatArray | None
+
+
+@dataclass(frozen=True)
+class BudgetLine:
+    """What one source contributes to the standard uncertainty: u (unit of the parameter), share of the variance.
+
+    kind: "A" (from the scatter of the residuals: its variance component was estimated) or "B" (taken from elsewhere).
+    freedom: degrees of freedom of its variance, inf for type B.
+    """
+
+    source: str
+    kind: Literal["A", "B"]
+    u: float
+    share: float
+    freedom: float
+
+
+@dataclass(frozen=True)
+class BudgetEntry:
+    """Uncertainty budget of one component of a parameter (GUM, 8.1): largest source first.
+
+    freedom: effective (Welch-Satterthwaite). coverage: factor k at ``level``. expanded: k u.
+    """
+
+    name: ParameterName
+    component: str
+    unit: str
+    u: float
+    freedom: float
+    level: float
+    coverage: float
+    expanded: float
+    lines: tuple[BudgetLine, ...]
