@@ -6,6 +6,7 @@ import numpy as np
 
 from adjust.model import BoolArray, FloatArray
 from survey.report import drawing as d
+from survey.report.language import t
 from survey.report.markup import MINUS, count
 
 WIDTH = 316.0
@@ -55,7 +56,7 @@ def _bar(y: float, scale: float) -> str:
 
 def vector_field(c: CameraResiduals) -> str:
     """Residual vectors at the observed points; suspects red and all drawn, not used ones orange."""
-    scale, height, parts = _frame(c.size, "Residuals")
+    scale, height, parts = _frame(c.size, t("Residuals"))
     rank = np.random.default_rng(0).permutation(len(c.uv))
     ordinary = c.used & ~c.suspect
     shown = ordinary & np.isin(np.arange(len(c.uv)), rank[np.isin(rank, np.flatnonzero(ordinary))][:_MOST_ARROWS])
@@ -70,17 +71,17 @@ def vector_field(c: CameraResiduals) -> str:
         parts.append(d.arrows(start[few], capped, colour, 1.4, 4.0))
         parts += [d.dot(x, y, 1.8, colour) for x, y in start[few]]
     note = (
-        f"{count(int(shown.sum()))} of {count(int(ordinary.sum()))} shown"
+        t("{shown} of {n} shown", shown=count(int(shown.sum())), n=count(int(ordinary.sum())))
         if shown.sum() < ordinary.sum()
-        else f"all {count(int(ordinary.sum()))}"
+        else t("all {n}", n=count(int(ordinary.sum())))
     )
     parts += [_bar(_TOP + height + 14, grow), d.text(WIDTH, _TOP + height + 18, note, "end")]
-    return d.svg(WIDTH, _TOP + height + _BOTTOM, parts, f"Residual vectors of camera {c.camera_id}")
+    return d.svg(WIDTH, _TOP + height + _BOTTOM, parts, t("Residual vectors of camera {name}", name=c.camera_id))
 
 
 def mean_field(c: CameraResiduals) -> str:
     """Mean residual per cell over the number of points per cell: what the lens model leaves over shows here."""
-    scale, height, parts = _frame(c.size, "Mean per cell, over the coverage")
+    scale, height, parts = _frame(c.size, t("Mean per cell, over the coverage"))
     nx = _CELLS_ACROSS
     ny = max(1, round(nx * c.size[1] / c.size[0]))
     cell = np.array([c.size[0] / nx, c.size[1] / ny])
@@ -99,9 +100,10 @@ def mean_field(c: CameraResiduals) -> str:
     centre = np.column_stack([enough % nx + 0.5, enough // nx + 0.5]) * size + (0.0, _TOP)
     grow = _arrow_scale(np.hypot(*mean.T), 0.9 * size[0])
     parts.append(d.arrows(centre, centre + grow * mean, d.INK, 1.1, 3.5))
-    filled = f"{np.count_nonzero(n)} of {nx * ny} cells hold points"
+    filled = t("{k} of {n} cells hold points", k=np.count_nonzero(n), n=nx * ny)
     parts += [_bar(_TOP + height + 14, grow), d.text(WIDTH, _TOP + height + 18, filled, "end")]
-    return d.svg(WIDTH, _TOP + height + _BOTTOM, parts, f"Mean residuals and coverage of camera {c.camera_id}")
+    title = t("Mean residuals and coverage of camera {name}", name=c.camera_id)
+    return d.svg(WIDTH, _TOP + height + _BOTTOM, parts, title)
 
 
 def histogram(c: CameraResiduals) -> str:
@@ -115,7 +117,7 @@ def histogram(c: CameraResiduals) -> str:
     normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
     unit = np.array([WIDE / (2 * reach), -(height - 4) / (1.08 * max(float(heights.max()), float(normal.max())))])
     origin, base = np.array([0.5 * WIDE, _TOP + height]), _TOP + height
-    parts = [d.text(0, 11, "Standardized residuals, u and v", colour=d.INK, size=11.5)]
+    parts = [d.text(0, 11, t("Standardized residuals, u and v"), colour=d.INK, size=11.5)]
     for left, tall in zip(edges[:-1], heights, strict=True):
         if tall > 0.0:
             at = origin + unit * (left, tall)
@@ -127,7 +129,8 @@ def histogram(c: CameraResiduals) -> str:
         parts += [d.line(at, base, at, base + 3), d.text(at, base + 14, f"{tick}".replace("-", MINUS), "middle", 10)]
     outside = int(np.count_nonzero(np.abs(w) > reach))
     if outside:
-        parts.append(d.text(WIDE, _TOP + 12, f"{count(outside)} beyond ±5", "end", colour=d.RED))
+        parts.append(d.text(WIDE, _TOP + 12, t("{n} beyond ±5", n=count(outside)), "end", colour=d.RED))
     label = origin + unit * (0.98, 0.27)
-    parts.append(d.text(label[0], label[1], "normal", colour=d.INK, size=10))
-    return d.svg(WIDE, base + _BOTTOM, parts, f"Histogram of standardized residuals of camera {c.camera_id}")
+    parts.append(d.text(label[0], label[1], t("normal"), colour=d.INK, size=10))
+    title = t("Histogram of standardized residuals of camera {name}", name=c.camera_id)
+    return d.svg(WIDE, base + _BOTTOM, parts, title)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from survey.report.context import Context
+from survey.report.language import t
 from survey.report.markup import (
     MISSING,
     count,
@@ -30,22 +31,23 @@ def network(c: Context) -> str:
     n = c.solution.get("network")
     if n is None:
         return ""
-    each = "poses" if n["equations_per_condition"] == 6 else "rotations"
+    each = t("poses") if n["equations_per_condition"] == 6 else t("rotations")
+    measured = t("{n} of {most} measurable", n=count(n["measured_pairs"]), most=count(n["measurable_pairs"]))
     facts = [
-        ("stations", count(n["n_stations"])),
-        ("parts", count(n["n_parts"])),
-        (f"independent unknown {each}", count(n["independent_unknown_poses"])),
-        ("pairs measured", f"{count(n['measured_pairs'])} of {count(n['measurable_pairs'])} measurable"),
-        ("triangle conditions", count(n["triangle_conditions"])),
-        ("independent conditions", count(n["independent_conditions"])),
-        ("redundancy", f"{count(n['redundancy'])} equations"),
-        ("conditions per pair", fixed(n["conditions_per_pair"], 2)),
+        (t("stations"), count(n["n_stations"])),
+        (t("parts"), count(n["n_parts"])),
+        (t("independent unknown {each}", each=each), count(n["independent_unknown_poses"])),
+        (t("pairs measured"), measured),
+        (t("triangle conditions"), count(n["triangle_conditions"])),
+        (t("independent conditions"), count(n["independent_conditions"])),
+        (t("redundancy"), t("{n} equations", n=count(n["redundancy"]))),
+        (t("conditions per pair"), fixed(n["conditions_per_pair"], 2)),
     ]
     if n["conditions_through_given_stations"]:
-        facts.insert(6, ("of these through given stations", count(n["conditions_through_given_stations"])))
+        facts.insert(6, (t("of these through given stations"), count(n["conditions_through_given_stations"])))
     weak = _weak(n)
     listed = f'<ul class="problems">{"".join(f"<li>{w}</li>" for w in weak)}</ul>' if weak else ""
-    note = (
+    note = t(
         "n stations have n − 1 independent relative poses; every independent loop of pairs adds a condition. A pair "
         "that closes no loop cannot be checked. Pairs that share all their loops: an error in one is seen, but not "
         "told from one in the others."
@@ -56,18 +58,18 @@ def network(c: Context) -> str:
 def _weak(n: dict[str, Any]) -> list[str]:
     out = []
     for i, part in enumerate(n["parts"][:10]):
-        out.append(f"Part {i + 1}: {_named(part)}")
+        out.append(t("Part {i}: {names}", i=i + 1, names=_named(part)))
     if n["uncontrolled_pairs"]:
-        out.append(f"Close no loop: {_named(n['uncontrolled_pairs'])}")
+        out.append(t("Close no loop: {names}", names=_named(n["uncontrolled_pairs"])))
     groups = n["inseparable_pairs"]
-    out += [f"Errors seen but not told apart: {_named(group)}" for group in groups[:10]]
+    out += [t("Errors seen but not told apart: {names}", names=_named(group)) for group in groups[:10]]
     if len(groups) > 10:
-        out.append(f"{count(len(groups) - 10)} more such groups in solution.json")
+        out.append(t("{n} more such groups in solution.json", n=count(len(groups) - 10)))
     return out
 
 
 def _named(ids: Sequence[str]) -> str:
-    more = f" and {count(len(ids) - _MOST_NAMES)} more" if len(ids) > _MOST_NAMES else ""
+    more = t(" and {n} more", n=count(len(ids) - _MOST_NAMES)) if len(ids) > _MOST_NAMES else ""
     return ", ".join(f"<code>{esc(i)}</code>" for i in ids[:_MOST_NAMES]) + more
 
 
@@ -82,16 +84,18 @@ def loops(c: Context) -> str:
     columns = ["<Loop", "<", "Misclosure", "σ [″]"] + (["[mm]", "σ [mm]"] if poses else [])
     columns += ["Test", "p", "<Pairs"]
     shown = (
-        f"All {count(found['n_loops'])}"
+        t("All {n}", n=count(found["n_loops"]))
         if len(rows) == found["n_loops"]
-        else f"The worst {count(len(rows))} of {count(found['n_loops'])}"
+        else t("The worst {shown} of {n}", shown=count(len(rows)), n=count(found["n_loops"]))
     )
-    note = (
-        f"{shown} independent loops ({esc(found['note'])}), from the measured pairs alone, before any adjustment. σ: "
+    note = t(
+        "{shown} independent loops ({note}), from the measured pairs alone, before any adjustment. σ: "
         "of the misclosure, along its direction, from the covariances of the pairs. Test: w′C⁻¹w, chi-square with "
-        f"{6 if poses else 3} degrees of freedom; a loop is open where its p is too small for chance at "
-        f"{100 * found['alpha']:g} % for all loops together ({count(found['n_failed'])} are)."
-    )
+        "{freedom} degrees of freedom; a loop is open where its p is too small for chance at {alpha} % for all loops "
+        "together ({failed} are).",
+        shown=shown, note=esc(found["note"]), freedom=6 if poses else 3, alpha=general(100 * found["alpha"]),
+        failed=count(found["n_failed"]),
+    )  # fmt: skip
     classes = ["" if e["closes"] else "suspect" for e in entries]
     return section("loops", "Loop closures", table(columns, rows, "", classes), note)
 
@@ -100,8 +104,8 @@ def _loop_row(e: dict[str, Any], poses: bool) -> list[str]:
     stations = " → ".join(esc(s) for s in _shortened([*e["stations"], e["stations"][0]]))
     left_out = set(e["pairs_not_used"])
     pairs = ", ".join(f"<s>{esc(p)}</s>" if p in left_out else esc(p) for p in _shortened(e["pairs"]))
-    flag = "" if e["closes"] else pill("bad", "open")
-    flag += " " + pill("soft", "pair not used") if left_out else ""
+    flag = "" if e["closes"] else pill("bad", t("open"))
+    flag += " " + pill("soft", t("pair not used")) if left_out else ""
     sigma = e["sigma_misclosure_arcsec"]
     cells = [stations, flag, angle_text(e["misclosure_arcsec"], sigma), sigma_text(sigma)]
     if poses:
@@ -138,14 +142,14 @@ def pairs(c: Context) -> str:
     rows = [_pair_row(p, every[p], poses) for p in order]
     columns = ["<Pair, from a to b", "Residual", *(["[mm]"] if poses else []), "Redundancy", "Largest std."]
     columns += ["Test", "p", "<", "x [°]", "y [°]", "z [°]", *(["x [mm]", "y [mm]", "z [mm]"] if poses else [])]
-    more = f" The worst {count(len(rows))} of {count(len(every))}." if len(every) > len(rows) else ""
-    note = (
+    more = " " + t("The worst {shown} of {n}", shown=count(len(rows)), n=count(len(every))) + "."
+    more = more if len(every) > len(rows) else ""
+    note = t(
         "Adjusted b_from_a: quaternion w x y z, Euler angles of R = Rz(z) Ry(y) Rx(x) with the σ of small rotations "
         "about the axes of a, translation with its σ along the axes of b. Residual: length of the rotation and of the "
         "translation that takes the measured pair to the adjusted one; of pairs not used, to its prediction. "
         "Redundancy: mean of its components, 0 where nothing checks the pair, 1 where the others alone determine it."
-        f"{more}"
-    )
+    ) + more
     classes = ["off" if not every[p]["used"] else "" for p in order]
     return section("pairs", "Adjusted pairs", table(columns, rows, "", classes), note)
 
@@ -184,5 +188,5 @@ def p_text(p: float | None) -> str:
 
 def _pair_flag(e: dict[str, Any]) -> str:
     if not e["used"]:
-        return pill("soft", "not used")
-    return "" if e.get("controlled", True) else pill("warn", "uncontrolled")
+        return pill("soft", t("not used"))
+    return "" if e.get("controlled", True) else pill("warn", t("uncontrolled"))

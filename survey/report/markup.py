@@ -5,6 +5,8 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from survey.report.language import known, localised, t
+
 MISSING = "–"
 MINUS = "−"
 
@@ -21,14 +23,15 @@ def fixed(value: float | None, decimals: int) -> str:
     text = f"{value:.{decimals}f}"
     if float(text) == 0.0:
         text = text.lstrip("-")
-    return text.replace("-", MINUS)
+    return localised(text.replace("-", MINUS))
 
 
 def general(value: float | None, digits: int = 4) -> str:
     """A number of unknown size with its significant digits."""
     if value is None or not math.isfinite(value):
         return MISSING
-    return f"{value + 0.0:.{digits}g}".replace("-", MINUS)  # adding zero takes the sign off a negative one
+    # adding zero takes the sign off a negative one
+    return localised(f"{value + 0.0:.{digits}g}".replace("-", MINUS))
 
 
 def decimals_for(sigma: float | None, most: int = 7) -> int | None:
@@ -54,7 +57,7 @@ def with_sigma(value: float | None, sigma: float | None, typical: float | None =
     """A cell of two lines: the value, and its sigma below; ``typical`` sets the decimals of a column or row."""
     decimals = decimals_for(sigma)
     if decimals is None:
-        return f'{value_text(value, typical)}<span class="s">held</span>'
+        return f'{value_text(value, typical)}<span class="s">{t("held")}</span>'
     decimals = max(decimals_for(typical) or 0, 0 if typical else decimals)
     below = fixed(sigma, decimals) if sigma and sigma >= 2 * 10.0**-decimals else sigma_text(sigma)
     return f'{fixed(value, decimals)}<span class="s">± {below}</span>'
@@ -76,7 +79,7 @@ def table(
     """A table of ready cells. A column whose heading starts with ``<`` holds text and is set left, the others right."""
     left = [c.startswith("<") for c in columns]
     heads = "".join(
-        f'<th class="{"l" if a else "r"}">{c.removeprefix("<")}</th>' for c, a in zip(columns, left, strict=True)
+        f'<th class="{"l" if a else "r"}">{known(c.removeprefix("<"))}</th>' for c, a in zip(columns, left, strict=True)
     )
     body = []
     for i, row in enumerate(rows):
@@ -88,11 +91,11 @@ def table(
 
 
 def section(anchor: str, title: str, body: str, note: str = "") -> str:
-    """A section of the page; empty where there is nothing to show."""
+    """A section of the page; empty where there is nothing to show. ``title`` is English, ``note`` ready."""
     if not body:
         return ""
     lead = f'<p class="note">{note}</p>' if note else ""
-    return f'<section id="{anchor}"><h2>{esc(title)}</h2>{lead}{body}</section>'
+    return f'<section id="{anchor}"><h2>{esc(t(title))}</h2>{lead}{body}</section>'
 
 
 def definition(pairs: Iterable[tuple[str, Any]]) -> str:

@@ -5,6 +5,7 @@ import numpy as np
 from adjust.result import ObservationResidual
 from survey.quantities import sigma_unit_for_people, unit_for_people
 from survey.report.context import Context
+from survey.report.language import t
 from survey.report.markup import count, esc, fixed, general, pill, section, sigma_text, table, value_text
 
 _MOST_OTHER = 200
@@ -14,8 +15,8 @@ _MOST_IMAGES = 10
 
 def _flag(used: bool, suspect: bool) -> str:
     if not used:
-        return pill("soft", "not used")
-    return pill("bad", "suspect") if suspect else ""
+        return pill("soft", t("not used"))
+    return pill("bad", t("suspect")) if suspect else ""
 
 
 def _row_class(used: bool, suspect: bool) -> str:
@@ -35,12 +36,12 @@ def others(c: Context) -> str:
         "<Kind", "<Between", "<Component", "Observed", "Adjusted", "<Unit", "Residual", "σ", "<Unit", "Redundancy",
         "Standardized", "<",
     )  # fmt: skip
-    more = (
-        f" The worst {count(len(rows))} of {count(len(every))} rows; all in residuals_other.csv."
-        if len(every) > len(rows)
-        else ""
+    shown = {"shown": count(len(rows)), "n": count(len(every))}
+    note = t(
+        "Suspect: |standardized residual| above {limit}. Sigmas are those given to the program.", limit=fixed(limit, 2)
     )
-    note = f"Suspect: |standardized residual| above {fixed(limit, 2)}. Sigmas are those given to the program.{more}"
+    if len(every) > len(rows):
+        note += " " + t("The worst {shown} of {n} rows; all in residuals_other.csv.", **shown)
     return section("observations", "Other observations", table(columns, rows, "", classes) if rows else "", note)
 
 
@@ -50,7 +51,7 @@ def _other_row(o: ObservationResidual, i: int, suspect: bool) -> list[str]:
     shown_sigma = float(o.sigma[i] * factor)
     residual, sigma = float(o.residual[i] * sigma_factor), float(o.sigma[i] * sigma_factor)
     # an r of zero means that nothing controls the observation: its residual says nothing
-    redundancy = fixed(o.redundancy[i], 2) + ("" if o.redundancy[i] > 0.05 else " " + pill("warn", "uncontrolled"))
+    redundancy = fixed(o.redundancy[i], 2) + ("" if o.redundancy[i] > 0.05 else " " + pill("warn", t("uncontrolled")))
     kind = esc(o.kind) if o.group == o.kind else f"{esc(o.kind)} <small>{esc(o.group)}</small>"
     return [
         kind, esc(" · ".join(o.ids)), f"<code>{esc(o.components[i])}</code>",
@@ -80,11 +81,11 @@ def image_points(c: Context) -> str:
         "red. u", "red. v", "Test", "<",
     )  # fmt: skip
     s = c.solution["summary"]["suspects"]
-    note = (
-        f"The {len(rows)} largest of {count(len(test))}. Test: chi-square with 2 degrees of freedom, suspect above "
-        f"{fixed(s['image_test_limit'], 1)} ({100 * s['alpha']:g} % together). The others are in "
-        "residuals.csv."
-    )
+    note = t(
+        "The {shown} largest of {n}. Test: chi-square with 2 degrees of freedom, suspect above {limit} ({alpha} % "
+        "together). The others are in residuals.csv.",
+        shown=len(rows), n=count(len(test)), limit=fixed(s["image_test_limit"], 1), alpha=general(100 * s["alpha"]),
+    )  # fmt: skip
     body = table(columns, rows, "", classes) + _images(c) if rows else ""
     return section("image-points", "Image points", body, note)
 
@@ -99,4 +100,4 @@ def _images(c: Context) -> str:
     worst = sorted(every, key=lambda x: -x[2])[:_MOST_IMAGES]
     rows = [[esc(camera), esc(epoch), count(n), fixed(rms, 3)] for camera, epoch, rms, n in worst]
     columns = ("<Camera", "<Epoch", "Points", "RMS residual [px]")
-    return f"<h3>Images with the largest residuals</h3>{table(columns, rows)}" if rows else ""
+    return f"<h3>{t('Images with the largest residuals')}</h3>{table(columns, rows)}" if rows else ""

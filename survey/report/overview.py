@@ -4,6 +4,7 @@ from typing import Any
 
 from survey.report import drawing as d
 from survey.report.context import Context
+from survey.report.language import message, t
 from survey.report.markup import count, definition, esc, fixed, general, pill, section, table
 from survey.report.picture import pictures
 from survey.report.scene import scene_of
@@ -20,25 +21,28 @@ def header(c: Context) -> str:
     meta = " · ".join(esc(x) for x in (c.run.folder, c.run.date, f"labsurvey {version}".strip()) if x)
     found = s["suspects"]
     warnings = c.solution["warnings"]
-    problems = [esc(w) for w in warnings[:_MOST_WARNINGS]]
+    problems = [esc(message(w)) for w in warnings[:_MOST_WARNINGS]]
     if len(warnings) > _MOST_WARNINGS:
-        problems.append(f"{count(len(warnings) - _MOST_WARNINGS)} more warnings in solution.json.")
+        problems.append(t("{n} more warnings in solution.json.", n=count(len(warnings) - _MOST_WARNINGS)))
     if found["n_image_points"]:
-        problems.append(f'<a href="#image-points">{count(found["n_image_points"])} image points</a> are suspect.')
+        n = count(found["n_image_points"])
+        problems.append(t('<a href="#image-points">{n} image points</a> are suspect.', n=n))
     if found["n_other"]:
-        problems.append(f'<a href="#observations">{count(found["n_other"])} other observations</a> are suspect.')
+        n = count(found["n_other"])
+        problems.append(t('<a href="#observations">{n} other observations</a> are suspect.', n=n))
     if found["n_not_used"]:
-        problems.append(f"{count(found['n_not_used'])} observations were not used.")
+        problems.append(t("{n} observations were not used.", n=count(found["n_not_used"])))
     items = "".join(f"<li>{p}</li>" for p in problems)
     listed = (
         f'<ul class="problems">{items}</ul>'
         if items
-        else '<p class="calm">No warnings, nothing suspect, nothing left out.</p>'
+        else f'<p class="calm">{t("No warnings, nothing suspect, nothing left out.")}</p>'
     )
     return (
-        f'<header><p class="meta">Adjustment report</p><h1>{esc(s["title"] or c.run.folder)}</h1>'
+        f'<header><p class="meta">{t("Adjustment report")}</p><h1>{esc(s["title"] or c.run.folder)}</h1>'
         f'<p class="meta">{meta}</p></header>'
-        f'<div class="verdict {s["verdict"]}"><b>{_WORDS[s["verdict"]]}</b><span>{esc(s["reason"])}</span></div>'
+        f'<div class="verdict {s["verdict"]}"><b>{t(_WORDS[s["verdict"]])}</b>'
+        f"<span>{esc(message(s['reason']))}</span></div>"
         f"{listed}"
     )
 
@@ -47,30 +51,31 @@ def summary(c: Context) -> str:
     """Key figures and the global test."""
     s = c.solution["summary"]
     figures = (
-        ("sigma0 (a priori 1)", fixed(s["sigma0"], 3)),
-        ("observations", count(s["n_observations"])),
-        ("unknowns", count(s["n_unknowns"])),
-        ("redundancy", count(s["redundancy"])),
-        ("iterations", f"{s['iterations']}" + ("" if s["converged"] else " (not converged)")),
-        ("last step", f"{general(s['last_step_sigmas'], 2)} σ"),
-        ("datum", f"{esc(s['datum'])}, defect {s['datum_defect']}"),
+        (t("sigma0 (a priori 1)"), fixed(s["sigma0"], 3)),
+        (t("observations"), count(s["n_observations"])),
+        (t("unknowns"), count(s["n_unknowns"])),
+        (t("redundancy"), count(s["redundancy"])),
+        (t("iterations"), f"{s['iterations']}" + ("" if s["converged"] else t(" (not converged)"))),
+        (t("last step"), f"{general(s['last_step_sigmas'], 2)} σ"),
+        (t("datum"), t("{kind}, defect {n}", kind=esc(t(s["datum"])), n=s["datum_defect"])),
     )
     cards = (
         '<div class="cards">' + "".join(f"<div><b>{v}</b><span>{esc(k)}</span></div>" for k, v in figures) + "</div>"
     )
     if s["sigmas"] == "a_posteriori":
-        said = f"Sigmas of unknowns here are <b>a posteriori</b>: multiplied by sigma0 = {fixed(s['sigma_factor'], 4)}."
+        factor = fixed(s["sigma_factor"], 4)
+        said = t("Sigmas of unknowns here are <b>a posteriori</b>: multiplied by sigma0 = {factor}.", factor=factor)
     else:
-        said = "Sigmas of unknowns here are <b>a priori</b>: they follow from the sigmas of the observations alone."
-    said += (
-        " Sigmas of observations, standardized residuals and tests are a priori. Residuals are adjusted minus observed."
+        said = t("Sigmas of unknowns here are <b>a priori</b>: they follow from the sigmas of the observations alone.")
+    said += " " + t(
+        "Sigmas of observations, standardized residuals and tests are a priori. Residuals are adjusted minus observed."
     )
     return section("summary", "Summary", cards + _global_test(s["global_test"]) + f'<p class="note">{said}</p>')
 
 
 def _global_test(test: dict[str, Any] | None) -> str:
     if test is None:
-        return '<p class="note">No global test: there is no redundancy.</p>'
+        return f'<p class="note">{t("No global test: there is no redundancy.")}</p>'
     width, height, left = 700.0, 58.0, 20.0
     r = test["redundancy"]
     # the scale is the variance factor omega / r; its interval and the value always fit
@@ -86,20 +91,20 @@ def _global_test(test: dict[str, Any] | None) -> str:
         d.rect(x["lower"], 22, x["upper"] - x["lower"], 12, d.GREEN, ' fill-opacity="0.22" rx="2"'),
         d.line(x["one"], 20, x["one"], 36, d.GREY),
         d.dot(x["omega"], 28, 5.5, colour),
-        d.text(x["omega"], 14, f"omega / r = {marks['omega']:.4g}", "middle", 11.5, colour),
+        d.text(x["omega"], 14, f"omega / r = {general(marks['omega'])}", "middle", 11.5, colour),
     ]
     if x["upper"] - x["lower"] > 110:
-        parts += [d.text(x[k], 50, f"{marks[k]:.4g}", "middle") for k in ("lower", "upper")]
+        parts += [d.text(x[k], 50, general(marks[k]), "middle") for k in ("lower", "upper")]
     else:
-        parts.append(
-            d.text(0.5 * (x["lower"] + x["upper"]), 50, f"{marks['lower']:.4g} to {marks['upper']:.4g}", "middle")
-        )
-    word = pill("good", "passed") if test["passed"] else pill("bad", "failed")
-    sentence = (
-        f"Global test {word} omega = {general(test['omega'], 6)}, redundancy {count(r)}, accepted between "
-        f"{general(test['lower'], 6)} and {general(test['upper'], 6)} at {100 * (1 - test['alpha']):g} %"
-    )
-    return f'<p class="lead">{sentence}</p>{d.svg(width, height, parts, "Global test")}'
+        words = t("{low} to {high}", low=general(marks["lower"]), high=general(marks["upper"]))
+        parts.append(d.text(0.5 * (x["lower"] + x["upper"]), 50, words, "middle"))
+    word = pill("good", t("passed")) if test["passed"] else pill("bad", t("failed"))
+    sentence = t(
+        "Global test {word} omega = {omega}, redundancy {r}, accepted between {lower} and {upper} at {level} %",
+        word=word, omega=general(test["omega"], 6), r=count(r), lower=general(test["lower"], 6),
+        upper=general(test["upper"], 6), level=general(100 * (1 - test["alpha"])),
+    )  # fmt: skip
+    return f'<p class="lead">{sentence}</p>{d.svg(width, height, parts, t("Global test"))}'
 
 
 def groups(c: Context) -> str:
@@ -113,7 +118,7 @@ def groups(c: Context) -> str:
         rows.append(
             (esc(name), count(g["n_observations"]), fixed(g["redundancy"], 1), general(g["omega"], 6), *numbers)
         )
-    note = (
+    note = t(
         "The variance factor is the weighted square sum omega over the redundancy of the group; its root is the number "
         "by which the sigmas given for the group would have to be multiplied to agree with its residuals. Deviation: "
         "of omega from the redundancy, in sigmas of chi-square."
@@ -126,12 +131,13 @@ def picture(c: Context) -> str:
     """Plan and perspective."""
     scene = scene_of(c.adjustment, c.scale)
     drawn, enlarged = pictures(scene, c.scale.ellipsoid)
-    left_out = f" {count(scene.n_left_out)} points are left out for clarity." if scene.n_left_out else ""
-    note = (
-        f"95 % confidence ellipsoids of points (red) and stations (green), enlarged {general(enlarged, 3)} times. "
-        "Cameras are drawn at the first epoch; thin lines are their axes at others, dash-dotted lines those of tables."
-        f"{left_out}"
-    )
+    n = count(scene.n_left_out)
+    left_out = " " + t("{n} points are left out for clarity.", n=n) if scene.n_left_out else ""
+    note = t(
+        "95 % confidence ellipsoids of points (red) and stations (green), enlarged {n} times. "
+        "Cameras are drawn at the first epoch; thin lines are their axes at others, dash-dotted lines those of tables.",
+        n=general(enlarged, 3),
+    ) + left_out
     return section("picture", "The survey", f'<div class="figures">{drawn}</div>' if drawn else "", note)
 
 
@@ -142,5 +148,5 @@ def inputs(c: Context) -> str:
     parts = [files] if i["hashes"] else []
     for title, entries in (("Options", i["options"]), ("Versions", i["versions"])):
         if entries:
-            parts.append(f"<h3>{title}</h3>" + definition((k, esc(v)) for k, v in entries.items()))
+            parts.append(f"<h3>{t(title)}</h3>" + definition((k, esc(v)) for k, v in entries.items()))
     return section("inputs", "Inputs", "".join(parts))

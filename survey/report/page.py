@@ -7,6 +7,7 @@ from adjust.result import Adjustment
 from survey.quantities import scale_of
 from survey.report import loops, observations, overview, unknowns
 from survey.report.context import Context
+from survey.report.language import language, t
 from survey.report.markup import esc
 from survey.residual_tables import image_rows
 from survey.solution import RunInfo, solution_dict
@@ -39,12 +40,12 @@ def report_html(adjustment: Adjustment, run: RunInfo, solution: dict[str, Any] |
         found.used & (found.test > limit),
     )  # fmt: skip
     made = [(name, anchor, make(c)) for name, anchor, make in _SECTIONS]
-    nav = "".join(f'<a href="#{anchor}">{esc(name)}</a>' for name, anchor, body in made if body)
+    nav = "".join(f'<a href="#{anchor}">{esc(t(name))}</a>' for name, anchor, body in made if body)
     style = Path(__file__).with_name("style.css").read_text(encoding="utf-8")
     title = esc(solution["summary"]["title"] or run.folder)
     return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<!doctype html>\n<html lang="{language()}"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title} – adjustment report</title><style>{style}</style></head>\n<body><main>"
+        f"<title>{title} – {t('Adjustment report')}</title><style>{style}</style></head>\n<body><main>"
         f"{overview.header(c)}<nav>{nav}</nav>" + "\n".join(body for _, _, body in made) + "</main></body></html>\n"
     )

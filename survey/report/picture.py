@@ -7,6 +7,7 @@ import numpy as np
 
 from adjust.model import FloatArray
 from survey.report import drawing as d
+from survey.report.language import t
 from survey.report.scene import Scene, Shot
 
 WIDTH, HEIGHT, MARGIN = 540.0, 450.0, 36.0
@@ -20,6 +21,7 @@ class View:
     to_picture: Callable[[FloatArray], FloatArray]
     unit: float
     name: str
+    stands: bool = False  # shows heights, as the perspective does
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         """Derivative (2, 3) of the picture at a point."""
@@ -37,19 +39,21 @@ def _fit(xy: FloatArray) -> tuple[float, FloatArray]:
     return scale, 0.5 * (low + high)
 
 
-def _placed(flat: Callable[[FloatArray], FloatArray], everything: FloatArray, name: str) -> View:
+def _placed(
+    flat: Callable[[FloatArray], FloatArray], everything: FloatArray, name: str, stands: bool = False
+) -> View:
     scale, middle = _fit(flat(everything))
 
     def to_picture(x: FloatArray) -> FloatArray:
         xy = (flat(np.atleast_2d(x)) - middle) * scale
         return np.column_stack([0.5 * WIDTH + xy[:, 0], 0.5 * HEIGHT + 2 - xy[:, 1]])
 
-    return View(to_picture, scale, name)
+    return View(to_picture, scale, name, stands)
 
 
 def plan(everything: FloatArray) -> View:
     """Along -z on the world's x (right) and y (up)."""
-    return _placed(lambda x: x[:, :2], everything, "Plan (world x to the right, y up)")
+    return _placed(lambda x: x[:, :2], everything, t("Plan (world x to the right, y up)"))
 
 
 def perspective(everything: FloatArray) -> View:
@@ -68,7 +72,7 @@ def perspective(everything: FloatArray) -> View:
         flat_x = np.column_stack([(x - middle) @ right, (x - middle) @ up])
         return np.asarray(flat_x * (distance / np.maximum(depth, 0.1 * distance))[:, None])
 
-    return _placed(flat, np.concatenate([everything, floor]), "Perspective (world z up)")
+    return _placed(flat, np.concatenate([everything, floor]), t("Perspective (world z up)"), stands=True)
 
 
 def enlargement(scene: Scene, ellipsoid: float, extent: float) -> float:
@@ -168,7 +172,7 @@ def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, elli
         *_ground(view, everything),
         *_world_axes(view, 0.07 * extent),
     ]
-    if view.name.startswith("Persp"):
+    if view.stands:
         floor = everything[:, 2].min()
         for spot in scene.spots:
             foot = view.to_picture(np.array([spot.x, (*spot.x[:2], floor)]))

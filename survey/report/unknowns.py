@@ -7,6 +7,7 @@ import numpy as np
 
 from survey.report import camera_plots
 from survey.report.context import Context
+from survey.report.language import known, t
 from survey.report.markup import (
     count,
     esc,
@@ -33,7 +34,7 @@ def status_pill(status: Any) -> str:
     """The status of a component, or of a whole parameter."""
     if isinstance(status, dict):
         return " ".join(f"{esc(k)} {status_pill(v)}" for k, v in status.items())
-    return pill({"free": "quiet", "held": "plain", "prior": "soft", "tied": "soft"}.get(status, "quiet"), status)
+    return pill({"free": "quiet", "held": "plain", "prior": "soft", "tied": "soft"}.get(status, "quiet"), known(status))
 
 
 def _components(entry: dict[str, Any]) -> Iterator[tuple[str, float | None, str, float | None, str, str]]:
@@ -68,7 +69,7 @@ def vector_table(entry: dict[str, Any], ratios: dict[str, float] | None = None) 
             row.append(pill("warn", fixed(ratio, 1)) if weak else fixed(ratio, 1))
         rows.append(row)
     columns = ["<Parameter", "Value", "σ", "<Unit", "<Status"] + ([] if ratios is None else ["|value| / σ"])
-    note = f'<p class="note">Held at zero: {", ".join(idle)}.</p>' if idle else ""
+    note = f'<p class="note">{t("Held at zero: {names}.", names=", ".join(idle))}</p>' if idle else ""
     return (table(columns, rows) if rows else "") + note
 
 
@@ -80,7 +81,7 @@ def pose_row(name: str, epoch: str, entry: dict[str, Any]) -> list[str]:
     ]
     least = min((s for s in entry["sigma_rotation_arcsec"] if s), default=None)
     for angle, sigma in zip(entry["rotation_euler_xyz_deg"], entry["sigma_rotation_arcsec"], strict=True):
-        below = f"± {sigma_text(sigma)}″" if sigma else "held"
+        below = f"± {sigma_text(sigma)}″" if sigma else t("held")
         cells.append(f'{_value_in("deg", angle, least, "arcsec")}<span class="s">{below}</span>')
     return [name, esc(epoch), *cells, status_pill(entry["status"])]
 
@@ -100,9 +101,8 @@ def _pose_rows(thing_id: str, entry: dict[str, Any]) -> Iterator[list[str]]:
 def _limited(columns: tuple[str, ...], rows: list[list[str]]) -> str:
     if not rows:
         return ""
-    more = (
-        f'<p class="note">{count(len(rows) - _MOST_ROWS)} more in solution.json.</p>' if len(rows) > _MOST_ROWS else ""
-    )
+    n = count(len(rows) - _MOST_ROWS)
+    more = f'<p class="note">{t("{n} more in solution.json.", n=n)}</p>' if len(rows) > _MOST_ROWS else ""
     return table(columns, rows[:_MOST_ROWS]) + more
 
 
@@ -120,7 +120,7 @@ def cameras(c: Context) -> str:
             found.used[mine], c.suspect[mine],
         )  # fmt: skip
         parts.append(_camera(camera.camera_id, entry, residuals))
-    note = (
+    note = t(
         "Residual vectors point from the observed to the adjusted position. Red: suspect, orange: not used. "
         "A pattern in the mean per cell is what the lens model leaves over; white cells hold no points."
     )
@@ -129,11 +129,13 @@ def cameras(c: Context) -> str:
 
 def _camera(camera_id: str, entry: dict[str, Any], residuals: camera_plots.CameraResiduals) -> str:
     width, height = entry["image_size_px"]
-    facts = f"{width} × {height} px on station {esc(entry['station'])} · "
-    facts += f"{count(entry['n_images'])} images, {count(entry['n_image_points'])} points"
-    facts += f" · lens model {esc(entry['lens']['model'])}" if "lens" in entry else ""
-    facts += f" · RMS residual {fixed(entry['rms_residual_px'], 3)} px"
-    parts = [f'<h3>Camera {esc(camera_id)}</h3><p class="note">{facts}</p><div class="panes">']
+    facts = t(
+        "{width} × {height} px on station {station} · {images} images, {points} points", width=width, height=height,
+        station=esc(entry["station"]), images=count(entry["n_images"]), points=count(entry["n_image_points"]),
+    )  # fmt: skip
+    facts += " · " + t("lens model {model}", model=esc(entry["lens"]["model"])) if "lens" in entry else ""
+    facts += " · " + t("RMS residual {rms} px", rms=fixed(entry["rms_residual_px"], 3))
+    parts = [f'<h3>{t("Camera")} {esc(camera_id)}</h3><p class="note">{facts}</p><div class="panes">']
     if "lens" in entry:
         lens = entry["lens"]
         parts.append('<div class="pane">' + vector_table(lens, lens["value_over_sigma"]) + _remarks(lens) + "</div>")
@@ -154,18 +156,21 @@ def _remarks(lens: dict[str, Any]) -> str:
     """What is weak about a lens: parameters that could as well be zero, correlations."""
     strong, weak = lens["correlations_over_95_percent"], lens["not_significant"]
     named = ", ".join(
-        f"<code>{esc(p['a'])}</code> with <code>{esc(p['b'])}</code> {fixed(100 * p['correlation'], 1)} %"
+        f"<code>{esc(p['a'])}</code> {t('with')} <code>{esc(p['b'])}</code> {fixed(100 * p['correlation'], 1)} %"
         for p in strong
     )
     # fx and fy of a camera always go together; alone they are no warning
     kind = "warn" if any({p["a"], p["b"]} != {"fx", "fy"} for p in strong) else "quiet"
     correlation = (
-        f"{pill(kind, 'correlated above 95 %')} {named}" if strong else "No correlation above 95 % within the lens."
+        f"{pill(kind, t('correlated above 95 %'))} {named}"
+        if strong
+        else t("No correlation above 95 % within the lens.")
     )
     remarks = [correlation]
     if weak:
         names = ", ".join(f"<code>{esc(name)}</code>" for name in weak)
-        remarks.append(f"{pill('warn', 'not significant')} {names}: not distinguishable from zero at 95 %.")
+        said = t("{names}: not distinguishable from zero at 95 %.", names=names)
+        remarks.append(f"{pill('warn', t('not significant'))} {said}")
     return "".join(f'<p class="note">{r}</p>' for r in remarks)
 
 
@@ -181,16 +186,17 @@ def stations(c: Context) -> str:
     body = _limited(_POSE_COLUMNS, rows)
     if len(by_epoch) > _MANY_EPOCHS:
         body = _limited(_POSE_COLUMNS, [row for row in rows if not row[1]])
-        title = f"{count(len(by_epoch))} poses by epoch"
+        title = t("{n} poses by epoch", n=count(len(by_epoch)))
         body += f"<details><summary>{title}</summary>{_limited(_POSE_COLUMNS, by_epoch)}</details>"
-    return section("poses", "Poses of stations, tables and targets", body, _POSE_NOTE)
+    return section("poses", "Poses of stations, tables and targets", body, t(_POSE_NOTE))
 
 
 def tables(c: Context) -> str:
     """Geometry and angles of every table."""
     parts = []
     for table_id, entry in c.solution["tables"].items():
-        body = f"<h3>{esc(table_id)}, axes {esc(' then '.join(entry['axes']))}</h3>"
+        axes = t(" then ").join(entry["axes"])
+        body = f"<h3>{esc(table_id)}, {t('axes {axes}', axes=esc(axes))}</h3>"
         if "geometry" in entry:
             body += vector_table(entry["geometry"])
         if entry["epochs"]:
@@ -202,7 +208,7 @@ def tables(c: Context) -> str:
                 for epoch, angles in entry["epochs"].items()
             ]
             opened = " open" if len(rows) <= _MANY_EPOCHS else ""
-            title = f"{count(len(rows))} epochs: adjusted angles"
+            title = t("{n} epochs: adjusted angles", n=count(len(rows)))
             body += f"<details{opened}><summary>{title}</summary>{_limited(columns, rows)}</details>"
         parts.append(body)
     return section("tables", "Turntables", "".join(parts))
@@ -213,18 +219,18 @@ def targets(c: Context) -> str:
     rows = []
     warps = ""
     for target_id, entry in c.solution["targets"].items():
-        carrier = f"station {esc(entry['station'])}" if "station" in entry else "the world"
+        carrier = t("station {name}", name=esc(entry["station"])) if "station" in entry else t("the world")
         rows.append(
             [
                 esc(target_id),
                 count(entry["n_points"]),
                 carrier,
-                esc(entry["motion"]),
+                esc(known(entry["motion"])),
                 count(len(entry.get("epochs", {}))),
             ]
         )
         if "warp" in entry:
-            warps += f"<h3>Warp of {esc(target_id)}</h3>" + vector_table(entry["warp"])
+            warps += f"<h3>{t('Warp of {name}', name=esc(target_id))}</h3>" + vector_table(entry["warp"])
     columns = ("<Target", "Points", "<Stands on", "<Motion", "Poses per epoch")
     return section("targets", "Targets", table(columns, rows) + warps if rows else "")
 
@@ -243,8 +249,9 @@ def points(c: Context) -> str:
         row = [f"<b>{esc(point_id)}</b>", *(with_sigma(p[f"{a}_mm"], p[f"sigma_{a}_mm"], typical) for a in "xyz")]
         rows.append([*row, *(sigma_text(a) for a in axes), bar, status_pill(p["status"])])
     columns = ("<Point", "x [mm]", "y [mm]", "z [mm]", "a [mm]", "b [mm]", "c [mm]", "<", "<Status")
-    note = (
-        "World coordinates with sigmas below; a, b, c: semi-axes of the 95 % confidence ellipsoid "
-        f"({general(c.scale.ellipsoid, 4)} sigmas). Least precise first."
+    note = t(
+        "World coordinates with sigmas below; a, b, c: semi-axes of the 95 % confidence ellipsoid ({k} sigmas). "
+        "Least precise first.",
+        k=general(c.scale.ellipsoid, 4),
     )
     return section("points", "Points", _limited(columns, rows), note)

@@ -1,0 +1,295 @@
+"""The report in German: texts by their English form, and patterns of messages that the adjustment makes."""
+
+GERMAN = {
+    # page and summary
+    "Adjustment report": "Ausgleichungsbericht",
+    "Summary": "Übersicht",
+    "Groups": "Gruppen",
+    "Picture": "Bild",
+    "Cameras": "Kameras",
+    "Poses": "Lagen",
+    "Turntables": "Drehtische",
+    "Targets": "Zieltafeln",
+    "Points": "Punkte",
+    "Network": "Netz",
+    "Loops": "Schleifen",
+    "Pairs": "Paare",
+    "Observations": "Beobachtungen",
+    "Image points": "Bildpunkte",
+    "Inputs": "Eingangsdaten",
+    "Options": "Einstellungen",
+    "Versions": "Programmstände",
+    "Passed": "Bestanden",
+    "Needs a look": "Bitte prüfen",
+    "Failed": "Nicht bestanden",
+    "passed": "bestanden",
+    "failed": "nicht bestanden",
+    "{n} more warnings in solution.json.": "{n} weitere Warnungen in solution.json.",
+    '<a href="#image-points">{n} image points</a> are suspect.': (
+        '<a href="#image-points">{n} Bildpunkte</a> sind verdächtig.'
+    ),
+    '<a href="#observations">{n} other observations</a> are suspect.': (
+        '<a href="#observations">{n} andere Beobachtungen</a> sind verdächtig.'
+    ),
+    "{n} observations were not used.": "{n} Beobachtungen wurden nicht verwendet.",
+    "No warnings, nothing suspect, nothing left out.": "Keine Warnungen, nichts verdächtig, nichts ausgelassen.",
+    "sigma0 (a priori 1)": "sigma0 (a priori 1)",
+    "observations": "Beobachtungen",
+    "unknowns": "Unbekannte",
+    "redundancy": "Redundanz",
+    "iterations": "Iterationen",
+    " (not converged)": " (nicht konvergiert)",
+    "last step": "letzter Schritt",
+    "datum": "Datum",
+    "given": "gegeben",
+    "inner": "innere Bedingungen",
+    "{kind}, defect {n}": "{kind}, Defekt {n}",
+    "Sigmas of unknowns here are <b>a posteriori</b>: multiplied by sigma0 = {factor}.": (
+        "Die Standardabweichungen der Unbekannten sind <b>a posteriori</b>: multipliziert mit sigma0 = {factor}."
+    ),
+    "Sigmas of unknowns here are <b>a priori</b>: they follow from the sigmas of the observations alone.": (
+        "Die Standardabweichungen der Unbekannten sind <b>a priori</b>: sie folgen allein aus denen der Beobachtungen."
+    ),
+    "Sigmas of observations, standardized residuals and tests are a priori. Residuals are adjusted minus observed.": (
+        "Standardabweichungen der Beobachtungen, standardisierte Verbesserungen und Tests sind a priori. "
+        "Verbesserungen sind ausgeglichen minus beobachtet."
+    ),
+    "Global test": "Globaltest",
+    "No global test: there is no redundancy.": "Kein Globaltest: es gibt keine Redundanz.",
+    "Global test {word} omega = {omega}, redundancy {r}, accepted between {lower} and {upper} at {level} %": (
+        "Globaltest {word} Omega = {omega}, Redundanz {r}, angenommen zwischen {lower} und {upper} bei {level} %"
+    ),
+    "{low} to {high}": "{low} bis {high}",
+    # groups
+    "Groups of observations": "Beobachtungsgruppen",
+    "Group": "Gruppe",
+    "Omega": "Omega",
+    "Variance factor": "Varianzfaktor",
+    "Scale of sigmas": "Faktor der Sigmas",
+    "Deviation [σ]": "Abweichung [σ]",
+    "The variance factor is the weighted square sum omega over the redundancy of the group; its root is the number "
+    "by which the sigmas given for the group would have to be multiplied to agree with its residuals. Deviation: "
+    "of omega from the redundancy, in sigmas of chi-square.": (
+        "Der Varianzfaktor ist die gewichtete Quadratsumme Omega durch die Redundanz der Gruppe; mit seiner Wurzel "
+        "wären die angegebenen Sigmas der Gruppe zu multiplizieren, damit sie zu den Verbesserungen passen. "
+        "Abweichung: von Omega gegen die Redundanz, in Sigmas der Chi-Quadrat-Verteilung."
+    ),
+    # pictures
+    "The survey": "Die Vermessung",
+    "95 % confidence ellipsoids of points (red) and stations (green), enlarged {n} times. "
+    "Cameras are drawn at the first epoch; thin lines are their axes at others, dash-dotted lines those of tables.": (
+        "95-%-Konfidenzellipsoide der Punkte (rot) und Standpunkte (grün), {n}-fach vergrößert. Kameras sind in der "
+        "ersten Epoche gezeichnet; dünne Linien sind ihre Achsen in anderen, strichpunktierte die der Drehtische."
+    ),
+    "{n} points are left out for clarity.": "{n} Punkte sind der Übersicht halber weggelassen.",
+    "Plan (world x to the right, y up)": "Grundriss (Welt-x nach rechts, y nach oben)",
+    "Perspective (world z up)": "Perspektive (Welt-z nach oben)",
+    # unknowns
+    "held": "fest",
+    "free": "frei",
+    "prior": "Vorwissen",
+    "tied": "gekoppelt",
+    "fixed": "fest",
+    "epoch": "je Epoche",
+    "table": "Drehtisch",
+    "Camera": "Kamera",
+    "Parameter": "Parameter",
+    "Value": "Wert",
+    "σ": "σ",
+    "Unit": "Einheit",
+    "Status": "Status",
+    "|value| / σ": "|Wert| / σ",
+    "Held at zero: {names}.": "Auf null gehalten: {names}.",
+    "Residual vectors point from the observed to the adjusted position. Red: suspect, orange: not used. "
+    "A pattern in the mean per cell is what the lens model leaves over; white cells hold no points.": (
+        "Die Vektoren zeigen von der beobachteten zur ausgeglichenen Lage. Rot: verdächtig, orange: nicht verwendet. "
+        "Ein Muster in den Zellmitteln ist, was das Objektivmodell übrig lässt; weiße Zellen haben keine Punkte."
+    ),
+    "{width} × {height} px on station {station} · {images} images, {points} points": (
+        "{width} × {height} px auf Standpunkt {station} · {images} Bilder, {points} Punkte"
+    ),
+    "lens model {model}": "Objektivmodell {model}",
+    "RMS residual {rms} px": "RMS der Verbesserungen {rms} px",
+    "with": "mit",
+    "correlated above 95 %": "über 95 % korreliert",
+    "No correlation above 95 % within the lens.": "Keine Korrelation über 95 % innerhalb des Objektivs.",
+    "not significant": "nicht signifikant",
+    "{names}: not distinguishable from zero at 95 %.": "{names}: bei 95 % nicht von null zu unterscheiden.",
+    "Poses of stations, tables and targets": "Lagen von Standpunkten, Drehtischen und Zieltafeln",
+    "Pose": "Lage",
+    "Epoch": "Epoche",
+    "A pose a_from_b is the origin of b in a and R = Rz Ry Rx. Below each coordinate its sigma along the axes of a in "
+    "mm, below each angle the sigma of a small rotation about the same axis of b in arcseconds.": (
+        "Eine Lage a_from_b ist der Ursprung von b in a und R = Rz Ry Rx. Unter jeder Koordinate ihre "
+        "Standardabweichung längs der Achsen von a in mm, unter jedem Winkel die einer kleinen Drehung um dieselbe "
+        "Achse von b in Bogensekunden."
+    ),
+    "{n} poses by epoch": "{n} Lagen je Epoche",
+    "{n} more in solution.json.": "{n} weitere in solution.json.",
+    "axes {axes}": "Achsen {axes}",
+    " then ": ", dann ",
+    "{n} epochs: adjusted angles": "{n} Epochen: ausgeglichene Winkel",
+    "station {name}": "Standpunkt {name}",
+    "the world": "der Welt",
+    "Target": "Zieltafel",
+    "Stands on": "Steht auf",
+    "Motion": "Bewegung",
+    "Poses per epoch": "Lagen je Epoche",
+    "Warp of {name}": "Verbiegung von {name}",
+    "Point": "Punkt",
+    "World coordinates with sigmas below; a, b, c: semi-axes of the 95 % confidence ellipsoid ({k} sigmas). "
+    "Least precise first.": (
+        "Weltkoordinaten, darunter ihre Standardabweichungen; a, b, c: Halbachsen des 95-%-Konfidenzellipsoids ({k} "
+        "Sigmas). Die ungenauesten zuerst."
+    ),
+    # pictures of a camera
+    "Residuals": "Verbesserungen",
+    "Residual vectors of camera {name}": "Verbesserungsvektoren der Kamera {name}",
+    "{shown} of {n} shown": "{shown} von {n} gezeigt",
+    "all {n}": "alle {n}",
+    "Mean per cell, over the coverage": "Mittel je Zelle, über der Belegung",
+    "{k} of {n} cells hold points": "{k} von {n} Zellen mit Punkten",
+    "Mean residuals and coverage of camera {name}": "Mittlere Verbesserungen und Belegung der Kamera {name}",
+    "Standardized residuals, u and v": "Standardisierte Verbesserungen, u und v",
+    "{n} beyond ±5": "{n} jenseits ±5",
+    "normal": "normal",
+    "Histogram of standardized residuals of camera {name}": (
+        "Histogramm der standardisierten Verbesserungen der Kamera {name}"
+    ),
+    # pairs and loops
+    "Network of measured pairs": "Netz der gemessenen Paare",
+    "poses": "Lagen",
+    "rotations": "Drehungen",
+    "stations": "Standpunkte",
+    "parts": "Teile",
+    "independent unknown {each}": "unabhängige unbekannte {each}",
+    "pairs measured": "gemessene Paare",
+    "{n} of {most} measurable": "{n} von {most} messbaren",
+    "triangle conditions": "Dreiecksbedingungen",
+    "independent conditions": "unabhängige Bedingungen",
+    "{n} equations": "{n} Gleichungen",
+    "conditions per pair": "Bedingungen je Paar",
+    "of these through given stations": "davon über gegebene Standpunkte",
+    "n stations have n − 1 independent relative poses; every independent loop of pairs adds a condition. A pair "
+    "that closes no loop cannot be checked. Pairs that share all their loops: an error in one is seen, but not "
+    "told from one in the others.": (
+        "n Standpunkte haben n − 1 unabhängige relative Lagen; jede unabhängige Schleife aus Paaren gibt eine "
+        "Bedingung. Ein Paar, das keine Schleife schließt, ist unkontrolliert. Bei Paaren mit denselben Schleifen "
+        "wird ein Fehler bemerkt, aber nicht dem einen oder anderen zugeordnet."
+    ),
+    "Part {i}: {names}": "Teil {i}: {names}",
+    "Close no loop: {names}": "Schließen keine Schleife: {names}",
+    "Errors seen but not told apart: {names}": "Fehler bemerkbar, aber nicht zu trennen: {names}",
+    "{n} more such groups in solution.json": "{n} weitere solche Gruppen in solution.json",
+    " and {n} more": " und {n} weitere",
+    "Loop closures": "Schleifenschlüsse",
+    "Loop": "Schleife",
+    "Misclosure": "Widerspruch",
+    "Test": "Test",
+    "All {n}": "Alle {n}",
+    "The worst {shown} of {n}": "Die {shown} schlechtesten von {n}",
+    "open": "offen",
+    "pair not used": "Paar nicht verwendet",
+    "{shown} independent loops ({note}), from the measured pairs alone, before any adjustment. σ: "
+    "of the misclosure, along its direction, from the covariances of the pairs. Test: w′C⁻¹w, chi-square with "
+    "{freedom} degrees of freedom; a loop is open where its p is too small for chance at {alpha} % for all loops "
+    "together ({failed} are).": (
+        "{shown} unabhängige Schleifen ({note}), allein aus den gemessenen Paaren, vor jeder Ausgleichung. σ: des "
+        "Widerspruchs in seiner Richtung, aus den Kovarianzen der Paare. Test: w′C⁻¹w, Chi-Quadrat mit {freedom} "
+        "Freiheitsgraden; offen ist eine Schleife, deren p bei {alpha} % für alle zusammen zu klein für Zufall ist "
+        "({failed} sind es)."
+    ),
+    "Adjusted pairs": "Ausgeglichene Paare",
+    "Pair, from a to b": "Paar, von a nach b",
+    "Residual": "Verbesserung",
+    "Redundancy": "Redundanz",
+    "Largest std.": "Größte stand.",
+    "Adjusted b_from_a: quaternion w x y z, Euler angles of R = Rz(z) Ry(y) Rx(x) with the σ of small rotations "
+    "about the axes of a, translation with its σ along the axes of b. Residual: length of the rotation and of the "
+    "translation that takes the measured pair to the adjusted one; of pairs not used, to its prediction. "
+    "Redundancy: mean of its components, 0 where nothing checks the pair, 1 where the others alone determine it.": (
+        "Ausgeglichenes b_from_a: Quaternion w x y z, Eulerwinkel von R = Rz(z) Ry(y) Rx(x) mit dem σ kleiner "
+        "Drehungen um die Achsen von a, Translation mit ihrem σ längs der Achsen von b. Verbesserung: Betrag der Drehung und der "
+        "Translation vom gemessenen zum ausgeglichenen Paar; bei nicht verwendeten zu ihrer Vorhersage. Redundanz: "
+        "Mittel der Komponenten, 0 wo nichts das Paar prüft, 1 wo die anderen allein es bestimmen."
+    ),
+    # observations
+    "Other observations": "Weitere Beobachtungen",
+    "Kind": "Art",
+    "Between": "Zwischen",
+    "Component": "Komponente",
+    "Observed": "Beobachtet",
+    "Adjusted": "Ausgeglichen",
+    "Standardized": "Standardisiert",
+    "not used": "nicht verwendet",
+    "suspect": "verdächtig",
+    "uncontrolled": "unkontrolliert",
+    "Suspect: |standardized residual| above {limit}. Sigmas are those given to the program.": (
+        "Verdächtig: |standardisierte Verbesserung| über {limit}. Die Sigmas sind die dem Programm angegebenen."
+    ),
+    "The worst {shown} of {n} rows; all in residuals_other.csv.": (
+        "Die {shown} schlechtesten von {n} Zeilen; alle in residuals_other.csv."
+    ),
+    "The {shown} largest of {n}. Test: chi-square with 2 degrees of freedom, suspect above {limit} ({alpha} % "
+    "together). The others are in residuals.csv.": (
+        "Die {shown} größten von {n}. Test: Chi-Quadrat mit 2 Freiheitsgraden, verdächtig über {limit} ({alpha} % "
+        "zusammen). Die anderen stehen in residuals.csv."
+    ),
+    "Images with the largest residuals": "Bilder mit den größten Verbesserungen",
+    "RMS residual [px]": "RMS der Verbesserungen [px]",
+    "res. u [px]": "Verb. u [px]",
+    "res. v [px]": "Verb. v [px]",
+    "std. u": "stand. u",
+    "std. v": "stand. v",
+    "red. u": "Red. u",
+    "red. v": "Red. v",
+}
+
+_WHERE = r"camera (\S+) at epoch (\S+), target (\S+)"
+GERMAN_MESSAGES = (
+    (
+        r"global test failed: sigma0 = ([\d.]+), the residuals are larger than the a priori sigmas say "
+        r"\(v'Pv = ([\d.]+), expected ([\d.]+) to ([\d.]+)\)",
+        "Globaltest nicht bestanden: sigma0 = {}, die Verbesserungen sind größer, als die Sigmas a priori sagen "
+        "(v'Pv = {}, erwartet {} bis {})",
+    ),
+    (
+        r"global test failed: sigma0 = ([\d.]+), the residuals are smaller than the a priori sigmas say "
+        r"\(v'Pv = ([\d.]+), expected ([\d.]+) to ([\d.]+)\)",
+        "Globaltest nicht bestanden: sigma0 = {}, die Verbesserungen sind kleiner, als die Sigmas a priori sagen "
+        "(v'Pv = {}, erwartet {} bis {})",
+    ),
+    (_WHERE + ": not used", "Kamera {}, Epoche {}, Zieltafel {}: nicht verwendet"),
+    (
+        _WHERE + r": (\d+) of (\d+) image points do not fit \(probable gross errors\)",
+        "Kamera {}, Epoche {}, Zieltafel {}: {} von {} Bildpunkten passen nicht (wahrscheinlich grobe Fehler)",
+    ),
+    (
+        _WHERE + r": left out as gross errors: (.*)",
+        "Kamera {}, Epoche {}, Zieltafel {}: als grobe Fehler ausgelassen: {}",
+    ),
+    (
+        r"Global test failed: residuals are ([\d.]+) times what the sigmas of the observations allow\. .*",
+        "Globaltest nicht bestanden: die Verbesserungen sind das {}-fache dessen, was die Sigmas der Beobachtungen "
+        "erlauben. Nach groben Fehlern, falschen Sigmas oder einem lückenhaften Modell suchen, zuerst bei den Gruppen.",
+    ),
+    (
+        r"Global test failed on the low side: residuals are only ([\d.]+) times the sigmas of the observations\. .*",
+        "Globaltest nach unten nicht bestanden: die Verbesserungen sind nur das {}-fache der Sigmas der Beobachtungen. "
+        "Die angegebenen Sigmas sind zu groß.",
+    ),
+    (
+        r"The adjustment did not converge: the numbers below are no solution\.",
+        "Die Ausgleichung ist nicht konvergiert: die Zahlen unten sind keine Lösung.",
+    ),
+    (
+        r"Nothing was tested: the survey has no redundant observations\.",
+        "Nichts wurde geprüft: die Vermessung hat keine überzähligen Beobachtungen.",
+    ),
+    (
+        r"Global test passed, but some observations disagree with the others; see the suspects\.",
+        "Globaltest bestanden, aber einige Beobachtungen widersprechen den anderen; siehe die verdächtigen.",
+    ),
+    (r"Global test passed; please read the warnings\.", "Globaltest bestanden; bitte die Warnungen lesen."),
+    (r"Observations, sigmas and model agree\.", "Beobachtungen, Sigmas und Modell stimmen überein."),
+)
