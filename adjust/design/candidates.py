@@ -1,0 +1,175 @@
+"""Observations that could be added to a design, and what each of them tells about the unknowns that are there."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import qr
+
+from adjust.design.exact import exact
+from adjust.design.rows import DesignMatrix, Rows, design_matrix
+from adjust.errors import SurveyError
+from adjust.graph import GraphBuilder, StartValues
+from adjust.model import BoolArray, FloatArray, IntArray, Point, Survey
+from adjust.observations import Coordinates, Distance, ImageBlock, Pair, TableReading
+from adjust.result import ParameterName
+
+_RANK = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Something to measure in addition: an epoch with its images and reading, a beacon, a distance, a pair.
+
+    image_blocks of world points count the survey's points first, then ``points``, which are new. What only this
+    candidate observes (a new beacon, the angles of a new epoch) comes with it as new unknowns.
+    """
+
+    name: str
+    kind: str
+    image_blocks: tuple[ImageBlock, ...] = ()
+    table_readings: tuple[TableReading, ...] = ()
+    pairs: tuple[Pair, ...] = ()
+    distances: tuple[Distance, ...] = ()
+    coordinates: tuple[Coordinates, ...] = ()
+    points: tuple[Point, ...] = ()
+
+
+def with_candidates(survey: Survey, candidates: Sequence[Candidate]) -> Survey:
+    """The survey with all of these measured too."""
+    n, blocks, points = len(survey.points), list(survey.image_blocks), list(survey.points)
+    for c in candidates:
+        shift = len(points) - n
+        points += c.points
+        for b in c.image_blocks:
+            moved = np.where(b.point_idx >= n, b.point_idx + shift, b.point_idx) if b.target_id is None else b.point_idx
+            blocks.append(replace(b, point_idx=moved))
+    return replace(
+        survey,
+        points=tuple(points),
+        image_blocks=tuple(blocks),
+        table_readings=survey.table_readings + tuple(r for c in candidates for r in c.table_readings),
+        pairs=survey.pairs + tuple(p for c in candidates for p in c.pairs),
+        distances=survey.distances + tuple(d for c in candidates for d in c.distances),
+        coordinates=survey.coordinates + tuple(x for c in candidates for x in c.coordinates),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Informed:
+    """What candidates tell about the unknowns of the design: whitened rows, their own new unknowns eliminated.
+
+    names: the unknowns that any of them touches or that are wanted, n components in all. J: of every candidate (k, n);
+    its information on them is J' J.
+    """
+
+    names: tuple[ParameterName, ...]
+    J: tuple[FloatArray, ...]
+
+
+def inform(
+    survey: Survey, start: StartValues, candidates: Sequence[Candidate], wanted: Sequence[ParameterName]
+) -> Informed:
+    """Rows of all candidates at ``start``, which has a value for what they bring along.
+
+    Raises SurveyError where two candidates share a new unknown, so that neither can be judged alone.
+    """
+    whole = with_candidates(survey, candidates)
+    design = design_matrix(exact(whole, start), start)
+    base = set(_names_of(survey, start))
+    owners = _owners(survey, candidates, design)
+    own: list[list[Rows]] = [[] for _ in candidates]
+    for rows, owner in zip(design.rows, owners, strict=True):
+        if owner is not None:
+            own[owner].append(rows)
+    private = np.ones(design.n, dtype=np.bool_)
+    for name in base & set(design.at):
+        private[design.at[name]] = False
+    _check_apart(design, own, private, candidates)
+    touched = np.zeros(design.n, dtype=np.bool_)
+    for rows in (r for group in own for r in group):
+        touched[rows.columns] = True
+    names = tuple(n for n in design.names if n in base and (touched[design.at[n]].any() or n in set(wanted)))
+    columns = design.columns(names)
+    return Informed(names, tuple(_eliminated(design.n, group, columns, private) for group in own))
+
+
+def _names_of(survey: Survey, start: StartValues) -> tuple[ParameterName, ...]:
+    return tuple(GraphBuilder(survey, start.lenses).build(start).unknowns.by_name)
+
+
+def _owners(survey: Survey, candidates: Sequence[Candidate], design: DesignMatrix) -> list[int | None]:
+    """For each of the design's rows the candidate that brings it, None for what is planned anyway."""
+    images: list[int | None] = [None] * len(survey.image_blocks)
+    ordered: dict[str, list[int | None]] = {
+        "pair": [None] * len(survey.pairs),
+        "distance": [None] * len(survey.distances),
+        "coordinates": [None] * len(survey.coordinates),
+    }
+    readings: dict[tuple[str, ...], int] = {}
+    points: dict[tuple[str, ...], int] = {}
+    for i, c in enumerate(candidates):
+        images += [i] * len(c.image_blocks)
+        ordered["pair"] += [i] * len(c.pairs)
+        ordered["distance"] += [i] * len(c.distances)
+        ordered["coordinates"] += [i] * len(c.coordinates)
+        readings |= {(r.table_id, r.epoch_id): i for r in c.table_readings}
+        points |= {("point", p.point_id): i for p in c.points}
+    others = design.predictor.graph.others
+    first = {kind: next((k for k, o in enumerate(others) if o.kind == kind), 0) for kind in ordered}
+    out: list[int | None] = []
+    for rows in design.rows:
+        if rows.kind == "image":
+            out.append(images[rows.number])
+        elif rows.kind == "table":
+            out.append(readings.get(others[rows.number].ids))
+        elif rows.kind == "prior":
+            out.append(points.get(others[rows.number].ids))
+        else:
+            out.append(ordered[rows.kind][rows.number - first[rows.kind]])
+    return out
+
+
+def _check_apart(
+    design: DesignMatrix, own: Sequence[Sequence[Rows]], private: BoolArray, candidates: Sequence[Candidate]
+) -> None:
+    holder = np.full(design.n, -1)
+    for i, group in enumerate(own):
+        for rows in group:
+            mine = rows.columns[private[rows.columns]]
+            if (taken := mine[(holder[mine] >= 0) & (holder[mine] != i)]).size:
+                name = next(n for n, at in design.at.items() if at.start <= taken[0] < at.stop)
+                raise SurveyError(
+                    f"candidates {candidates[int(holder[taken[0]])].name!r} and {candidates[i].name!r} both bring the "
+                    f"new unknown {' '.join(name)}; make one candidate of them, or give them ids of their own"
+                )
+            holder[mine] = i
+
+
+def _eliminated(n: int, group: Sequence[Rows], columns: IntArray, private: BoolArray) -> FloatArray:
+    """Rows over ``columns`` that are left when the candidate's own unknowns are eliminated, at most as many as these.
+
+    The rows are turned so that the own unknowns appear in the first ones alone (orthogonal elimination, by rank where
+    the candidate does not determine them).
+    """
+    if not group:
+        return np.zeros((0, len(columns)))
+    A = np.zeros((sum(len(r.A) for r in group), n))
+    at = 0
+    for r in group:
+        A[at : at + len(r.A), r.columns] = r.A
+        at += len(r.A)
+    own = np.flatnonzero(private & (A != 0).any(axis=0))
+    both = np.hstack([A[:, own], A[:, columns]])
+    used = np.flatnonzero((both != 0).any(axis=0))
+    if len(both) > len(used):
+        small = qr(both[:, used], mode="r")[0][: len(used)]
+        both = np.zeros((len(small), both.shape[1]))
+        both[:, used] = small
+    J = both[:, len(own) :]
+    if len(own):
+        scale = np.linalg.norm(both[:, : len(own)], axis=0)
+        U, R, _ = qr(both[:, : len(own)] / scale, pivoting=True)
+        diagonal = np.abs(np.diag(R))
+        J = U[:, int(np.sum(diagonal > _RANK * diagonal[0])) :].T @ J
+    return np.asarray(J)

@@ -1,0 +1,107 @@
+"""The precision of a survey before it is measured: its adjustment without the observations' values."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adjust.adjustment import AdjustOptions, assemble
+from adjust.design.exact import exact
+from adjust.graph import GraphBuilder, StartValues
+from adjust.model import FloatArray, Survey
+from adjust.rank import readable
+from adjust.result import Adjustment, ParameterName
+from adjust.solve import SolveOptions, solve
+
+_PART = 0.25  # of the largest share: what is named of a direction
+
+
+@dataclass(frozen=True)
+class WeakDirection:
+    """A combination of unknowns that the design determines badly.
+
+    factor: how many times its sigma is larger than if the other directions were known; parts: (unknown, component,
+    share), the largest first, shares in sigmas.
+    """
+
+    factor: float
+    parts: tuple[tuple[str, str, float], ...]
+
+    def text(self) -> str:
+        """For people: what moves together."""
+        moving = ", ".join(f"{owner} {component} {share:+.2f}" for owner, component, share in self.parts)
+        return f"{self.factor:.0f} times weaker than its parts alone: {moving}"
+
+
+def expect(survey: Survey, start: StartValues) -> Adjustment:
+    """Covariances and redundancy numbers of a survey whose unknowns have the values ``start``.
+
+    The values of the observations in it do not matter. sigma0 is not known (nan), omega 0, no test is made. Raises
+    IndeterminateError naming what observations and datum leave open.
+    """
+    ideal = exact(survey, start)
+    graph = GraphBuilder(ideal, start.lenses).build(start)
+    result = assemble(graph, solve(graph, SolveOptions()), AdjustOptions())
+    kept = tuple(w for w in result.warnings if not w.startswith("global test"))
+    return replace(result, sigma0=float("nan"), global_test=None, omega=0.0, warnings=kept)
+
+
+def shared_names(adjustment: Adjustment) -> tuple[ParameterName, ...]:
+    """The unknowns that do not belong to one epoch alone."""
+    return tuple(n for n in adjustment.precision.graph.unknowns.by_name if not of_one_epoch(n))
+
+
+def of_one_epoch(name: ParameterName) -> bool:
+    """Whether an unknown exists at one epoch alone: table angles, a pose by hand."""
+    return len(name) > 2
+
+
+def component_names(adjustment: Adjustment, names: tuple[ParameterName, ...]) -> list[tuple[str, str]]:
+    """(unknown as people say it, component) of every row of ``precision.joint(names)``."""
+    by_name = adjustment.precision.graph.unknowns.by_name
+    return [(readable(by_name[n]), c) for n in names for c in by_name[n].components]
+
+
+def weak_directions(adjustment: Adjustment, n: int = 5, least: float = 10.0) -> tuple[WeakDirection, ...]:
+    """The weakest combinations of the unknowns that are common to several epochs, the weakest first.
+
+    Eigenvectors of their covariance, each unknown scaled by the sigma it would have if all others were known; an
+    eigenvalue is then an inflation of variance (Belsley, Kuh and Welsch 1980, chapter 3, for the columns of a design).
+    """
+    names = shared_names(adjustment)
+    if not names:
+        return ()
+    Q = adjustment.precision.joint(names)
+    s = np.sqrt(np.diag(Q))
+    held = s <= 0.0
+    s[held] = 1.0
+    C = Q / np.outer(s, s)
+    # the sigma of each unknown alone: 1 / N_ii, N the pseudo-inverse where a datum leaves the covariance singular
+    alone = 1.0 / np.sqrt(np.maximum(np.diag(np.linalg.pinv(C, rcond=1e-13, hermitian=True)), 1.0))
+    values, vectors = np.linalg.eigh(C / np.outer(alone, alone))
+    labels = component_names(adjustment, names)
+    out = []
+    for k in np.argsort(values)[::-1][:n]:
+        if values[k] < least**2:
+            break
+        moves = vectors[:, k] * alone  # back to sigmas of the unknowns
+        moves = moves / np.abs(moves).max()
+        order = [i for i in np.argsort(-np.abs(moves), kind="stable") if abs(moves[i]) > _PART][:6]
+        out.append(WeakDirection(float(np.sqrt(values[k])), tuple((*labels[i], float(moves[i])) for i in order)))
+    return tuple(out)
+
+
+def group_redundancy(adjustment: Adjustment) -> dict[str, tuple[int, float, FloatArray]]:
+    """By group: number of observations, redundancy, and its smallest, median and largest redundancy number."""
+    numbers: dict[str, list[FloatArray]] = {}
+    images = adjustment.image_residuals
+    for i, block in enumerate(adjustment.survey.image_blocks):
+        rows = slice(images.block_ptr[i], images.block_ptr[i + 1])
+        numbers.setdefault(block.group, []).append(images.redundancy[rows][images.used[rows]].ravel())
+    for item in adjustment.other_residuals:
+        if item.used:
+            numbers.setdefault(item.group, []).append(item.redundancy)
+    out = {}
+    for group, parts in numbers.items():
+        r = np.concatenate(parts)
+        out[group] = (len(r), float(r.sum()), np.quantile(r, [0.0, 0.5, 1.0]) if len(r) else np.zeros(3))
+    return out

@@ -1,0 +1,174 @@
+"""What a planned survey would observe: everything projected through the model at the planned values."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.errors import SurveyError
+from adjust.factors import ChainPose
+from adjust.graph import GraphBuilder, StartValues
+from adjust.image_batch import warp_shape
+from adjust.lens import MODELS, camera_constants, lens_residuals, project
+from adjust.lens_kernels import FISHEYE
+from adjust.model import BoolArray, Camera, FloatArray, Point, Survey, Target
+from adjust.observations import FrameRef, ImageBlock, PositionRef, TableReading
+
+_STEPS = np.linspace(1.0 / 16.0, 1.0, 16)
+_NEAREST_M = 1e-3
+
+
+@dataclass(frozen=True)
+class Seeing:
+    """When an image point counts as seen.
+
+    margin_px: from the border of the image. nearest_m, farthest_m: depth along the optical axis. widest_incidence:
+    rad between the line of sight and the normal of a flat target, which is seen from its front (z < 0) alone unless it
+    is named in ``two_sided``. fewest_points: of a target in one image; with fewer it is not detected.
+    """
+
+    margin_px: float = 5.0
+    nearest_m: float = 0.05
+    farthest_m: float = float("inf")
+    widest_incidence: float = float(np.radians(70.0))
+    fewest_points: int = 4
+    two_sided: tuple[str, ...] = ()
+
+
+class Predictor:
+    """A survey at given values: where its frames are and what its instruments would read. Built once, then read."""
+
+    def __init__(self, survey: Survey, start: StartValues) -> None:
+        builder = GraphBuilder(survey, start.lenses)
+        self.survey, self.graph, self.frames = survey, builder.build(start), builder.frames
+        self.values = self.graph.start
+        self.cameras = {c.camera_id: c for c in survey.cameras}
+        self.targets = {t.target_id: t for t in survey.targets}
+
+    def b_from_a(self, a: FrameRef, b: FrameRef) -> Pose3:
+        """The motion between two frames."""
+        return ChainPose(self.graph.unknowns, self.graph.state, self.frames.relative(a, b))(self.values)[0]
+
+    def lens(self, camera: Camera) -> FloatArray:
+        """Full lens vector (n,)."""
+        return self.graph.unknowns.vectors["lens", camera.camera_id].full(self.values)
+
+    def points_in_frame(self, target_id: str | None) -> FloatArray:
+        """All points of a target in its frame, its warp included, or all world points; (n, 3) m."""
+        if target_id is None:
+            return np.array([self._point(p) for p in self.survey.points]).reshape(-1, 3)
+        target = self.targets[target_id]
+        x = np.array(target.x_in_target, dtype=float)
+        vector = self.graph.unknowns.vectors.get(("warp", target_id))
+        if vector is not None:
+            x[:, 2] += warp_shape(target.x_in_target) @ vector.full(self.values)
+        return x
+
+    def _point(self, point: Point) -> FloatArray:
+        unknown = self.graph.unknowns.by_name.get(("point", point.point_id))
+        held = self.graph.unknowns.held_points.get(point.point_id)
+        return np.asarray(held if unknown is None else self.values.atPoint3(unknown.key))
+
+    def image(self, block: ImageBlock) -> tuple[FloatArray, FloatArray]:
+        """Image points (n, 2) px of a block, nan where there is none, and the points (n, 3) m in the camera."""
+        camera = self.cameras[block.camera_id]
+        ref = FrameRef("target", block.target_id, block.epoch_id) if block.target_id else FrameRef("world")
+        pose = self.b_from_a(ref, FrameRef("camera", block.camera_id, block.epoch_id))
+        x = self.points_in_frame(block.target_id)[block.point_idx]
+        q = x @ pose.rotation().matrix().T + pose.translation()
+        return projected(camera, self.lens(camera), q), q
+
+    def seen(self, block: ImageBlock, seeing: Seeing) -> ImageBlock | None:
+        """The block with what is visible of it, at its predicted place; None where that is too little."""
+        uv, q = self.image(block)
+        camera = self.cameras[block.camera_id]
+        keep = _inside(camera, uv, seeing.margin_px) & (q[:, 2] >= seeing.nearest_m) & (q[:, 2] <= seeing.farthest_m)
+        if keep.any():
+            keep[keep] = grows_outwards(camera, self.lens(camera), q[keep])
+        if block.target_id is not None:
+            keep &= self._facing(block, seeing)
+        fewest = seeing.fewest_points if block.target_id is not None else 1
+        if int(keep.sum()) < fewest:
+            return None
+        used = None if block.used is None else block.used[keep]
+        return replace(block, point_idx=block.point_idx[keep], uv=uv[keep], cov=block.cov[keep], used=used)
+
+    def _facing(self, block: ImageBlock, seeing: Seeing) -> BoolArray:
+        target = self.targets[str(block.target_id)]
+        camera_in_target = self.b_from_a(
+            FrameRef("camera", block.camera_id, block.epoch_id), FrameRef("target", target.target_id, block.epoch_id)
+        )
+        if not _is_flat(target):
+            return np.ones(len(block.point_idx), dtype=np.bool_)
+        sight = self.points_in_frame(target.target_id)[block.point_idx] - camera_in_target.translation()
+        cosine = sight[:, 2] / np.linalg.norm(sight, axis=1)
+        if target.target_id in seeing.two_sided:
+            cosine = np.abs(cosine)
+        return np.asarray(cosine >= np.cos(seeing.widest_incidence))
+
+    def reading(self, reading: TableReading) -> FloatArray:
+        """Angles (k,) rad of a table at an epoch."""
+        unknown = self.graph.unknowns.by_name.get(("table_angles", reading.table_id, reading.epoch_id))
+        return reading.angles if unknown is None else np.asarray(self.values.atVector(unknown.key))
+
+    def position(self, ref: PositionRef) -> FloatArray:
+        """World coordinates (3,) m."""
+        if ref.frame is None:
+            index = [p.point_id for p in self.survey.points].index(str(ref.point_id))
+            return self._point(self.survey.points[index])
+        pose = self.b_from_a(ref.frame, FrameRef("world"))
+        if ref.point_id is None:
+            return np.asarray(pose.translation())
+        target = self.targets[ref.frame.frame_id]
+        x = self.points_in_frame(target.target_id)[target.point_ids.index(ref.point_id)]
+        return np.asarray(pose.transformFrom(x))
+
+
+def predict(survey: Survey, start: StartValues, wanted: Sequence[ImageBlock], seeing: Seeing) -> tuple[ImageBlock, ...]:
+    """Of the blocks wanted (their points may be anywhere) what the cameras would see, with predicted image points."""
+    predictor = Predictor(replace(survey, image_blocks=tuple(wanted)), start)
+    found = (predictor.seen(block, seeing) for block in wanted)
+    return tuple(block for block in found if block is not None)
+
+
+def projected(camera: Camera, lens: FloatArray, q: FloatArray) -> FloatArray:
+    """Image points (n, 2) px of points (n, 3) m in the camera; nan where there is no image."""
+    model = MODELS[camera.lens.model]
+    uv = np.full((len(q), 2), np.nan)
+    ahead = np.ones(len(q), dtype=np.bool_) if model.kind == FISHEYE else q[:, 2] > _NEAREST_M
+    if not ahead.any():
+        return uv
+    try:
+        uv[ahead] = project(model, lens, camera_constants(camera), q[ahead])
+    except SurveyError:
+        if int(ahead.sum()) == 1:
+            return uv
+        for i in np.flatnonzero(ahead):  # some point lies outside what a backward model can reach: one by one
+            uv[i] = projected(camera, lens, q[i : i + 1])[0]
+    return uv
+
+
+def grows_outwards(camera: Camera, lens: FloatArray, q: FloatArray) -> BoolArray:
+    """Whether (n,) the image runs outwards all the way from the axis to each point: no fold of a polynomial."""
+    model = MODELS[camera.lens.model]
+    if model.backward or not len(q):
+        return np.ones(len(q), dtype=np.bool_)
+    path = np.repeat(q[None], len(_STEPS), axis=0)
+    path[..., :2] *= _STEPS[:, None, None]
+    constants = camera_constants(camera)
+    centre = lens_residuals(model, lens, constants, np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 2)))
+    uv = lens_residuals(model, lens, constants, path.reshape(-1, 3), np.zeros((path.size // 3, 2)))
+    radius = np.linalg.norm(uv - centre, axis=1).reshape(len(_STEPS), -1)
+    return np.asarray((np.diff(radius, axis=0) > 0.0).all(axis=0) | (radius[-1] < 1.0))
+
+
+def _inside(camera: Camera, uv: FloatArray, margin: float) -> BoolArray:
+    size = np.array(camera.image_size, dtype=float)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.all((uv >= margin) & (uv <= size - 1.0 - margin), axis=1))
+
+
+def _is_flat(target: Target) -> bool:
+    extent = np.ptp(target.x_in_target, axis=0)
+    return bool(extent[2] < 1e-3 * max(float(extent.max()), 1e-9))

@@ -1,0 +1,94 @@
+"""From required precision back to tolerances: how large each group of observations may be.
+
+With the weights fixed, the covariance of the unknowns is a sum over the groups g of observations,
+
+    Q = sum_g C_g,   C_g = Q N_g Q,   N_g = A_g' P_g A_g,
+
+and making the sigmas of a group f_g times larger multiplies its C_g by f_g^2 (Koch 1999, section 3.2.4, propagation
+through the estimator). Where the adjustment is told the new sigmas it weighs anew and does better, never worse.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.design.exact import exact
+from adjust.design.rows import design_matrix
+from adjust.design.selection import Component
+from adjust.errors import SurveyError
+from adjust.graph import StartValues
+from adjust.model import FloatArray, Survey
+from adjust.result import Adjustment
+
+
+@dataclass(frozen=True, eq=False)
+class Budget:
+    """Where the variance of wanted components comes from: ``variances`` (g, p) of every group, which add up."""
+
+    groups: tuple[str, ...]
+    wanted: tuple[Component, ...]
+    variances: FloatArray
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(p,) of all groups together."""
+        return np.asarray(np.sqrt(self.variances.sum(axis=0)))
+
+
+@dataclass(frozen=True, eq=False)
+class Tolerance:
+    """How much larger (or smaller) the sigmas of a group may be: factors on the planned ones.
+
+    alone: while the other groups stay as planned; nan where those alone are too much already. together: where every
+    group may use up an equal share of the required variance. limiting: the component that decides ``alone``.
+    """
+
+    group: str
+    alone: float
+    together: float
+    limiting: str
+
+
+def budget(survey: Survey, start: StartValues, expected: Adjustment, wanted: Sequence[Component]) -> Budget:
+    """The variance of the wanted components by group of observations. ``expected``: of the same survey and values."""
+    design = design_matrix(exact(survey, start), start)
+    names = tuple(dict.fromkeys(c.name for c in wanted))
+    by_name = expected.precision.graph.unknowns.by_name
+    if expected.datum_defect:
+        raise SurveyError("a budget by groups needs a given datum; hold something instead of inner constraints")
+    N = design.normal()
+    columns = design.columns(names)
+    s = 1.0 / np.sqrt(np.diag(N))
+    unit = np.zeros((design.n, len(columns)))
+    unit[columns, np.arange(len(columns))] = 1.0
+    Q = s[:, None] * np.linalg.solve(N * np.outer(s, s), s[:, None] * unit)
+    at = {(n, c): k for k, (n, c) in enumerate((n, c) for n in names for c in by_name[n].components)}
+    pick = [at[c.name, c.component] for c in wanted]
+    groups = tuple(dict.fromkeys(r.group for r in design.rows))
+    variances = np.zeros((len(groups), len(wanted)))
+    for r in design.rows:
+        variances[groups.index(r.group)] += np.sum((r.A @ Q[r.columns][:, pick]) ** 2, axis=0)
+    return Budget(groups, tuple(wanted), variances)
+
+
+def tolerances(found: Budget, required: Mapping[int, float]) -> tuple[Tolerance, ...]:
+    """Tolerances of every group; ``required``: sigma (rad, m, px) by index of a wanted component.
+
+    Raises SurveyError where nothing is required.
+    """
+    if not required:
+        raise SurveyError("no precision is required of anything; name it under [required] in plan.toml")
+    index = np.array(list(required))
+    limit = np.array(list(required.values())) ** 2
+    own, total = found.variances[:, index], found.variances[:, index].sum(axis=0)
+    out = []
+    for g, group in enumerate(found.groups):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            alone = np.where(own[g] > 0, (limit - (total - own[g])) / own[g], np.inf)
+            equal = np.where(own[g] > 0, limit / (len(found.groups) * own[g]), np.inf)
+        worst = int(np.argmin(alone))
+        least = float(alone[worst])
+        out.append(Tolerance(group, float(np.sqrt(least)) if least > 0 else float("nan"),
+                             float(np.sqrt(equal.min())), found.wanted[int(index[worst])].text))  # fmt: skip
+    return tuple(out)
