@@ -40,9 +40,14 @@ DRIVERS = {
             "gentl",
         ),
         DriverDescription("pylon", "Basler, through pypylon", "pylon:SERIAL", ("pypylon",), "pylon"),
-        DriverDescription("v4l2", "webcams and other Video4Linux devices", "v4l2:/dev/video0"),
+        DriverDescription("opencv", "webcams (V4L2, UVC) and films", "opencv:/dev/video0 or opencv:FILM.avi"),
         DriverDescription("images", "a sequence of image files, played back", "images:FOLDER or images:FOLDER/*.png"),
-        DriverDescription("simulated", "a camera in this process, for tests", "simulated:NAME"),
+        DriverDescription("simulated", "a camera in this process that can be told to fail", "simulated:NAME"),
+        DriverDescription(
+            "lab",
+            "a camera of the simulated laboratory, in this process or through pylon's emulator",
+            "lab:FOLDER/CAMERA or lab:FOLDER/CAMERA?via=pylon:SERIAL",
+        ),
     )
 }
 
@@ -90,10 +95,7 @@ def load_driver(name: str) -> ModuleType:
     with needed_software(driver):
         for package in driver.packages:
             importlib.import_module(package)
-    return importlib.import_module(f"capture.drivers.cameras.{_MODULES.get(name, name)}")
-
-
-_MODULES = {"gige": "genicam_client", "u3v": "genicam_client"}
+    return importlib.import_module(f"capture.drivers.cameras.{name}")
 
 
 @contextmanager

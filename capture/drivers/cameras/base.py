@@ -1,0 +1,184 @@
+"""What all drivers share: opening by ``with``, the armed state, triggers, and frames with the host's time."""
+
+import time
+from abc import ABC, abstractmethod
+from contextlib import suppress
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from capture.camera import (
+    CameraError,
+    FeatureValue,
+    FetchTimeoutError,
+    Frame,
+    GrayImage,
+    IncompleteFrameError,
+    InUseError,
+    UnknownFeatureError,
+)
+from survey.detection.gray import AnyImage, gray_values
+
+# names of SFNC's first edition, which many cameras still use, in the same units. Not Gain: GainRaw has none
+OLDER_NAMES = {
+    "ExposureTime": "ExposureTimeAbs",
+    "Gain": "GainAbs",
+    "DeviceSerialNumber": "DeviceID",
+    "AcquisitionFrameRate": "AcquisitionFrameRateAbs",
+}
+# SFNC locks them while images are sent; not every camera does
+LOCKED_WHILE_ARMED = ("Width", "Height", "OffsetX", "OffsetY", "PixelFormat")
+_LATE_S = 0.3  # how long after its exposure an image may still arrive
+
+
+class DriverCamera(ABC):
+    """A camera of one driver; the drivers fill in what begins with an underscore."""
+
+    def __init__(self, driver: str, place: str) -> None:
+        self._address = f"{driver}:{place}"
+        self._serial = place
+        self._armed = False
+        self._unanswered = False
+
+    @property
+    def address(self) -> str:
+        """``driver:place``."""
+        return self._address
+
+    @property
+    def serial(self) -> str:
+        """The serial number; known after ``open``."""
+        return self._serial
+
+    @property
+    def last_block_id(self) -> int | None:
+        """See ``Camera``; most cameras count on."""
+        return None
+
+    @property
+    def triggered(self) -> bool:
+        """TriggerMode is On; False where the camera has none."""
+        try:
+            return self.get("TriggerMode") == "On"
+        except UnknownFeatureError:
+            return False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @abstractmethod
+    def open(self) -> None:
+        """See ``Camera``."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """See ``Camera``."""
+
+    @abstractmethod
+    def get(self, name: str) -> FeatureValue:
+        """See ``Camera``."""
+
+    @abstractmethod
+    def set(self, name: str, value: FeatureValue) -> None:
+        """See ``Camera``."""
+
+    @abstractmethod
+    def arm(self) -> None:
+        """See ``Camera``."""
+
+    @abstractmethod
+    def disarm(self) -> None:
+        """See ``Camera``."""
+
+    @abstractmethod
+    def fetch(self, timeout_s: float) -> Frame:
+        """See ``Camera``."""
+
+    @abstractmethod
+    def _execute_trigger(self) -> None:
+        """Execute TriggerSoftware."""
+
+    @abstractmethod
+    def _skip_pending(self) -> None:
+        """Forget images whose exposure may have begun already; for cameras that run freely."""
+
+    def trigger(self) -> None:
+        """See ``Camera``."""
+        self._require_armed("trigger")
+        if not self.triggered:
+            self._skip_pending()
+            return
+        source = self.get("TriggerSource")
+        if source != "Software":
+            raise CameraError(
+                self.address,
+                f"its trigger comes from {source}, not from software",
+                "fire that line, or set TriggerSource to Software",
+            )
+        self._unanswered = True
+        self._execute_trigger()
+
+    def _drain(self) -> None:
+        """After arming: a trigger that was given before, and never answered, may still bring an image."""
+        if not self._unanswered:
+            return
+        self._unanswered = False
+        if self.triggered:
+            with suppress(FetchTimeoutError, IncompleteFrameError):
+                self.fetch(_LATE_S + float(self.get("ExposureTime")) * 1e-6)
+
+    def _require_armed(self, what: str) -> None:
+        if not self._armed:
+            raise CameraError(self.address, f"{what} while it is not armed", "arm it first")
+
+    def _unknown(self, name: str) -> UnknownFeatureError:
+        return UnknownFeatureError(
+            self.address, f"it has no feature {name}", "correct the name, or leave the feature out for this camera"
+        )
+
+    def _locked(self, name: str) -> InUseError:
+        found = f"{name} cannot be written now"
+        return InUseError(self.address, found, "disarm the camera first; if it is disarmed, the feature is read-only")
+
+    def _frame(
+        self,
+        image: GrayImage,
+        block_id: int,
+        device_time_ns: int | None,
+        bits: int | None = None,
+        complete: bool = True,
+    ) -> Frame:
+        self._unanswered = False
+        return Frame(
+            image,
+            block_id,
+            time.time_ns(),
+            time.monotonic_ns(),
+            self.serial,
+            bits or 8 * image.dtype.itemsize,
+            device_time_ns or None,  # a camera without a clock says 0
+            complete,
+        )
+
+
+def gray_copy(image: AnyImage) -> GrayImage:
+    """A copy of its own, (h, w) uint8 or uint16; colour (B G R) becomes grey of the same depth."""
+    gray = np.rint(gray_values(image)) if image.ndim == 3 else image
+    return np.array(gray, np.uint8) if image.dtype == np.uint8 else np.array(gray, np.uint16)
+
+
+def bits_of(pixel_format: str) -> int:
+    """Depth of a format of GenICam's PFNC: 12 for Mono12, Mono12p, Mono12Packed; 8 where the name holds no depth."""
+    digits = "".join(c if c.isdigit() else " " for c in pixel_format).split()
+    return int(digits[0]) if digits else 8
+
+
+def is_mosaic_or_gray(pixel_format: str) -> bool:
+    """Whether one value a pixel is sent: grey, or a colour mosaic, which is kept as it is."""
+    return pixel_format.startswith(("Mono", "Bayer"))
