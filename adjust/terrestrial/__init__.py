@@ -1,0 +1,1 @@
+"""Readings of total stations, theodolites and levels: observation equations, start values, statistics."""

@@ -1,0 +1,268 @@
+"""All readings of a survey: evaluated by one compiled kernel, served to GTSAM chunk by chunk."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from adjust.errors import SurveyError
+from adjust.factors import Jacobians
+from adjust.model import BoolArray, FloatArray, IntArray, Survey
+from adjust.terrestrial import kernels as k
+from adjust.terrestrial.layout import Chunk, Layout
+from adjust.terrestrial.parameters import TerrestrialParameters
+from adjust.unknowns import VectorMap
+from adjust.vertical import Plumb
+
+
+class TerrestrialBatch:
+    """Readings with their predicted values and derivatives at the values last prepared.
+
+    residual (N,): predicted minus observed, horizontal angles in (-pi, pi]. A (N, 22): derivatives by what
+    :mod:`adjust.terrestrial.kernels` lists. e (N,): residuals over their sigmas (not decorrelated). Arrays are in the
+    order of ``Survey.readings``.
+    """
+
+    def __init__(self, survey: Survey, parameters: TerrestrialParameters, layout: Layout) -> None:
+        self.parameters, self.layout = parameters, layout
+        self.ids = [r.reading_id for r in survey.readings]
+        self.sign = -1.0 if survey.bearings.clockwise else 1.0
+        radius = survey.vertical.radius
+        if radius is not None and not radius > 0.0:
+            raise SurveyError(f"vertical: the radius of the level surfaces is {radius} m; give a positive one, or none")
+        self.curve = 0.5 / radius if radius else 0.0
+        a = layout.arrays
+        n, p = len(a.kind), len(layout.positions)
+        self.X, self.axes, self.by_x = np.zeros((p, 3)), np.zeros((p, 3, 3)), np.zeros((p, 3, 3))
+        self.by_tilt, self.level, self.level_by_tilt = np.zeros((p, 3, 2)), np.zeros(p), np.zeros((p, 2))
+        self.body_axes = np.zeros((max(1, len(layout.bodies)), 3, 3))
+        self.orientation = np.zeros(max(1, len(parameters.orientations)))
+        self.centring = np.zeros((max(1, len(parameters.centrings)), 3))
+        self.instrument = np.zeros((1 + len(parameters.instruments), 4))
+        self.predicted, self.residual, self.A = np.zeros(n), np.zeros(n), np.zeros((n, k.N_COLUMNS))
+        self.chain_jacobians: dict[int, Jacobians] = {}
+        self.sigma = a.sigma.copy()
+        self.weights = a.used.astype(np.float64)
+        self.J = np.zeros(layout.size)
+        self.e = np.zeros(n)
+        self._all = np.arange(n, dtype=np.int64)
+        self._all_positions = np.arange(p, dtype=np.int64)
+        self._orientation_maps: list[VectorMap] = list(parameters.orientations.values())
+        self._centring_maps: list[VectorMap] = list(parameters.centrings.values())
+        self._instrument_maps: list[VectorMap] = list(parameters.instruments.values())
+        for i, position in enumerate(layout.positions):
+            if position.point_key is None and position.chain is None:
+                self.X[i] = position.x_in_frame
+        self._point_keys = [(i, p.point_key) for i, p in enumerate(layout.positions) if p.point_key is not None]
+        self._chained = [i for i, p in enumerate(layout.positions) if p.point_key is None and p.chain is not None]
+        self._correlated = [c for c, chunk in enumerate(layout.chunks) if chunk.whitener is not None]
+        self._views = [_blocks(chunk, self.J) for chunk in layout.chunks]
+        self._prepared: gtsam.Values | None = None
+        self._with_jacobians = False
+        self.chi_square = 0.0
+
+    @property
+    def used(self) -> BoolArray:
+        """Which readings (N,) take part."""
+        return np.asarray(self.weights > 0.0)
+
+    @property
+    def keys(self) -> set[int]:
+        """All unknowns that a reading depends on, used or not."""
+        return {key for chunk in self.layout.chunks for key in chunk.keys}
+
+    def set_weights(self, weights: FloatArray) -> None:
+        """Weights (N,) on top of the covariances; zero leaves a reading out."""
+        self._prepared = None
+        self.weights = np.array(weights, dtype=float)
+
+    # -- evaluation --------------------------------------------------------------------------------------------------
+
+    def _load(self, values: gtsam.Values, positions: IntArray | None, bodies: Sequence[int]) -> None:
+        plumb = self.parameters.vertical.at(values)
+        for i, key in self._point_keys if positions is None else self._points_of(positions):
+            self.X[i] = values.atPoint3(key)
+        chained = self._chained if positions is None else [i for i in self._chained if i in set(positions.tolist())]
+        for i in chained:
+            self.X[i], self.chain_jacobians[i] = self.layout.positions[i](values)
+        for b in bodies:
+            pose, jacobians = self.layout.bodies[b](values)
+            self.body_axes[b] = pose.rotation().matrix().T
+            self.chain_jacobians[len(self.X) + b] = [(key, J[:3]) for key, J in jacobians]
+        for i, vector in enumerate(self._instrument_maps):
+            self.instrument[i + 1] = vector.full(values)
+        self._horizons(self._all_positions if positions is None else positions, plumb)
+
+    def _points_of(self, positions: IntArray) -> list[tuple[int, int]]:
+        found = [(int(i), self.layout.positions[int(i)].point_key) for i in positions]
+        return [(i, key) for i, key in found if key is not None]
+
+    def _horizons(self, positions: IntArray, plumb: Plumb) -> None:
+        k.horizons(positions, self.X, plumb.up, plumb.zero, plumb.turns, plumb.radius, self.axes, self.by_x,
+                   self.by_tilt, self.level, self.level_by_tilt)  # fmt: skip
+
+    def _predict(self, rows: IntArray) -> None:
+        a = self.layout.arrays
+        k.predict(
+            rows, a.kind, a.at, a.to, a.second, a.orientation, a.centring, a.instrument, a.body, a.heights, self.sign,
+            self.curve, self.X, self.axes, self.by_x, self.by_tilt, self.level, self.level_by_tilt, self.body_axes,
+            self.orientation, self.centring, self.instrument, self.predicted, self.A,
+        )  # fmt: skip
+
+    def evaluate(self, values: gtsam.Values) -> None:
+        """Predicted values, residuals and derivatives of all readings at ``values``."""
+        for i, vector in enumerate(self._orientation_maps):
+            self.orientation[i] = values.atVector(vector.key)[0] if vector.key is not None else 0.0
+        for i, vector in enumerate(self._centring_maps):
+            self.centring[i] = vector.full(values)
+        self._load(values, None, range(len(self.layout.bodies)))
+        self._predict(self._all)
+        k.wrapped(self.layout.arrays.kind, self.predicted, self.layout.arrays.observed, self.residual)
+
+    def prepare(self, values: gtsam.Values, jacobians: bool) -> None:
+        """Evaluate everything at ``values``. Raises SurveyError where the first values give a reading no direction."""
+        self.evaluate(values)
+        self.chi_square = self._whiten(np.sqrt(self.weights))
+        if not np.isfinite(self.chi_square):
+            self.chi_square = np.inf
+            if self._prepared is None:
+                bad = int(np.flatnonzero(~np.isfinite(self.residual))[0])
+                raise SurveyError(
+                    f"reading {self.ids[bad]!r}: its positions coincide, or are one above the other, at the start "
+                    "values; give better coordinates"
+                )
+        if jacobians:
+            self._serve(np.sqrt(self.weights))
+        self._prepared, self._with_jacobians = values, jacobians
+
+    def _whiten(self, root: FloatArray) -> float:
+        """Whitened residuals e (N,), of correlated readings jointly, times ``root``; returns their square sum."""
+        self.e = self.residual / self.sigma
+        for c in self._correlated:
+            chunk = self.layout.chunks[c]
+            self.e[chunk.rows] = self._whitener(chunk) @ self.residual[chunk.rows]
+        self.e *= root
+        self.e[root == 0.0] = 0.0
+        return float(self.e @ self.e)
+
+    @staticmethod
+    def _whitener(chunk: Chunk) -> FloatArray:
+        if chunk.whitener is None:
+            raise ValueError("only chunks with a joint covariance have a whitener")
+        return chunk.whitener
+
+    def _serve(self, root: FloatArray) -> None:
+        """Jacobian blocks of all chunks, whitened and times ``root`` (N,)."""
+        layout = self.layout
+        self.J[:] = 0.0
+        scale = root / self.sigma
+        for c in self._correlated:
+            scale[layout.chunks[c].rows] = 1.0
+        k.scatter(layout.goal, layout.row, layout.column, layout.factor, scale, self.A, self.J)
+        for c in layout.chain_rows:
+            self._chain_blocks(c, scale)
+        for c in self._correlated:
+            self._decorrelate(c, root)
+
+    def _chain_blocks(self, c: int, scale: FloatArray) -> None:
+        for item in self.layout.chain_rows[c]:
+            by_position = scale[item.row] * self.A[item.row, item.column : item.column + 3]
+            for key, J in self.chain_jacobians[item.chain]:
+                at = item.goal[key]
+                self.J[at : at + J.shape[1]] += by_position @ J
+
+    def _decorrelate(self, c: int, root: FloatArray) -> None:
+        chunk = self.layout.chunks[c]
+        W = root[chunk.rows][:, None] * self._whitener(chunk)
+        for block in self._views[c]:
+            block[:] = W @ block
+
+    # -- GTSAM -------------------------------------------------------------------------------------------------------
+
+    def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """One factor per chunk of which anything is used."""
+        used = self.layout.arrays.used
+        noise = {}
+        for c, chunk in enumerate(self.layout.chunks):
+            m = len(chunk.rows)
+            if used[chunk.rows].any():
+                noise.setdefault(m, gtsam.noiseModel.Unit.Create(m))
+                graph.add(gtsam.CustomFactor(noise[m], list(chunk.keys), _callback(self, c)))
+
+    def residual_of(self, c: int, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        """What GTSAM's custom factor of chunk ``c`` returns."""
+        rows = self.layout.chunks[c].rows
+        if values is not self._prepared or (jacobians is not None and not self._with_jacobians):
+            self._alone(c, values)
+        if jacobians is not None:
+            for i, block in enumerate(self._views[c]):
+                jacobians[i] = block
+        return np.asarray(self.e[rows])
+
+    def _alone(self, c: int, values: gtsam.Values) -> None:
+        """Evaluate one chunk, for a caller that did not prepare the batch."""
+        self._prepared = None
+        layout, a = self.layout, self.layout.arrays
+        chunk = layout.chunks[c]
+        rows = chunk.rows
+        for i in np.unique(a.orientation[rows][a.kind[rows] == k.DIRECTION]):
+            self.orientation[i] = values.atVector(self._orientation_maps[i].key)[0]
+        for i in np.unique(a.centring[rows]):
+            if i >= 0:
+                self.centring[i] = self._centring_maps[i].full(values)
+        positions = np.unique(np.concatenate([a.at[rows], a.to[rows], a.second[rows]]))
+        self._load(values, positions[positions >= 0], [int(b) for b in np.unique(a.body[rows]) if b >= 0])
+        self._predict(rows)
+        k.wrapped(a.kind[rows], self.predicted[rows], a.observed[rows], out := np.zeros(len(rows)))
+        self.residual[rows] = out
+        root = np.sqrt(self.weights)
+        scale = root / self.sigma
+        if chunk.whitener is not None:
+            scale[rows] = 1.0
+        self.e[rows] = scale[rows] * out
+        self.J[chunk.start : chunk.start + len(rows) * chunk.width] = 0.0
+        at = slice(layout.entry_ptr[c], layout.entry_ptr[c + 1])
+        k.scatter(layout.goal[at], layout.row[at], layout.column[at], layout.factor[at], scale, self.A, self.J)
+        if c in layout.chain_rows:
+            self._chain_blocks(c, scale)
+        if chunk.whitener is not None:
+            self.e[rows] = root[rows] * (chunk.whitener @ out)
+            self._decorrelate(c, root)
+
+    def orient(self, values: gtsam.Values, known: set[str]) -> gtsam.Values:
+        """Values with the orientations not ``known`` set to what their directions say at the other values."""
+        self.evaluate(values)
+        self._prepared = None
+        a, out = self.layout.arrays, gtsam.Values(values)
+        for i, (setup_id, vector) in enumerate(self.parameters.orientations.items()):
+            rows = np.flatnonzero((a.orientation == i) & (a.kind == k.DIRECTION))
+            if setup_id not in known and vector.key is not None:
+                turn = self.residual[rows]
+                out.update(vector.key, self.orientation[i : i + 1] + _circular_median(turn[np.isfinite(turn)]))
+        return out
+
+
+def _circular_median(angles: FloatArray) -> float:
+    """The angle nearest to all others (least sum of absolute differences), of those given; zero of none."""
+    if len(angles) == 0:
+        return 0.0
+    some = angles[:: max(1, len(angles) // 64)]
+    turns = (angles[None, :] - some[:, None] + np.pi) % (2.0 * np.pi) - np.pi
+    best = int(np.argmin(np.abs(turns).sum(axis=1)))
+    return float(some[best] + np.median(turns[best]))
+
+
+def _blocks(chunk: Chunk, J: FloatArray) -> list[FloatArray]:
+    out, at, m = [], chunk.start, len(chunk.rows)
+    for dim in chunk.dims:
+        out.append(J[at : at + m * dim].reshape(m, dim))
+        at += m * dim
+    return out
+
+
+def _callback(batch: TerrestrialBatch, c: int) -> Callable[..., Any]:
+    def residual(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
+        return batch.residual_of(c, values, jacobians)
+
+    return residual
