@@ -21,6 +21,7 @@ from adjust.model import IntArray, Survey
 from adjust.observations import ImageBlock
 from adjust.pair_screen import PairOptions, adjust_with_pairs
 from adjust.result import Adjustment
+from survey.checked import checked
 from survey.detection import DetectionTask, ImageReport, SpotOptions, detect_images
 from survey.files import Definition, Project, SpotBlock, read, read_definition, write_image_points, write_spots
 from survey.identify import Identification, identify_spots, without_points
@@ -226,7 +227,8 @@ def adjust_project(project: Project, progress: bool) -> Adjustment:
                 notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
             survey = replace(survey, image_blocks=survey.image_blocks + found.blocks)
             survey = _seen_points(survey)
-        result = adjust_with_pairs(survey, PairOptions(project.options.reject_pairs, options), step)
+        pairs = PairOptions(project.options.reject_pairs, options)
+        result = checked(survey, lambda: adjust_with_pairs(survey, pairs, step))
     return replace(result, warnings=result.warnings + notes)
 
 
