@@ -14,6 +14,7 @@ from gtsam import Pose3
 
 from adjust.errors import SurveyError
 from adjust.factors import Jacobians, custom
+from adjust.geometry.motions import MOVED, vector_motions
 from adjust.graph import AdjustmentGraph, inner_datum_keys
 from adjust.model import FloatArray, IntArray
 from adjust.motions import motions_of
@@ -26,6 +27,8 @@ BLIND = 1e-8
 
 def gauge(graph: AdjustmentGraph, unknown: Unknown, values: gtsam.Values) -> FloatArray:
     """How an unknown moves (dim, 7) with the whole survey: translations, rotations (about the world origin), scale."""
+    if unknown.name[0] in MOVED:
+        return vector_motions(graph.survey, graph.unknowns, unknown, values)
     return motions_of(unknown, values, in_world(graph, unknown.name))
 
 

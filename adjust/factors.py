@@ -128,8 +128,12 @@ def distance_factor(observation: Distance, a: Position, b: Position) -> gtsam.No
 
 
 def coordinates_factor(observation: Coordinates, positions: Sequence[Position]) -> gtsam.NonlinearFactor:
-    """GTSAM's prior for one world point, or coordinates of several positions with their joint covariance."""
-    if len(positions) == 1 and positions[0].point_key is not None:
+    """GTSAM's prior for one world point, or coordinates of several positions with their joint covariance.
+
+    Coordinates with an infinite variance were not observed.
+    """
+    known = np.isfinite(np.diag(observation.cov))
+    if len(positions) == 1 and positions[0].point_key is not None and known.all():
         return gtsam.PriorFactorPoint3(positions[0].point_key, observation.values[0], gaussian(observation.cov))
 
     def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
@@ -140,11 +144,11 @@ def coordinates_factor(observation: Coordinates, positions: Sequence[Position]) 
             for key, J in jacobians:
                 block = np.zeros((len(out), J.shape[1]))
                 block[3 * i : 3 * i + 3] = J
-                blocks.append((key, block))
-        return out, blocks
+                blocks.append((key, block[known]))
+        return out[known], blocks
 
     keys = list(dict.fromkeys(k for p in positions for k in p.keys))
-    return custom(keys, observation.cov, residual)
+    return custom(keys, observation.cov[np.ix_(known, known)], residual)
 
 
 def pair_factor(observation: Pair, unknowns: Unknowns, state: State, chain: Chain) -> gtsam.NonlinearFactor:

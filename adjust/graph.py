@@ -21,12 +21,16 @@ from adjust.factors import (
     pose_prior_factor,
     vector_prior_factor,
 )
+from adjust.geometry.building import GeometryFactors, position_refs
 from adjust.image_batch import ImageBatch, warp_shape
-from adjust.model import BoolArray, FloatArray, Survey
+from adjust.model import BoolArray, FloatArray, Survey, VectorPrior
 from adjust.observation_factor import ObservationFactor, frame_text, position_text
 from adjust.observations import FrameRef, ImageBlock, Pair, PositionRef
 from adjust.result import ParameterName
 from adjust.state import State, collect_vectors
+from adjust.terrestrial.batch import TerrestrialBatch
+from adjust.terrestrial.building import build_batch, reading_refs
+from adjust.terrestrial.parameters import collect_terrestrial, full_start
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
 
 _Rows = TypeVar("_Rows", FloatArray, BoolArray)
@@ -56,18 +60,22 @@ class AdjustmentGraph:
     image_order: list[tuple[int, bool]]
     others: list[ObservationFactor]
     others_graph: gtsam.NonlinearFactorGraph
+    terrestrial: TerrestrialBatch | None = None
 
     def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
         """Evaluate all batches at ``values``."""
         self.state.load(values)
         self.images.prepare(values, jacobians)
+        if self.terrestrial is not None:
+            self.terrestrial.prepare(values, jacobians)
         if self.bundle is not None:
             self.bundle.prepare(values, jacobians, damping)
 
     def objective(self, values: gtsam.Values) -> float:
         """Weighted square sum v'Pv at ``values``, at which everything is prepared."""
         images = float(self.images.chi.sum()) + (self.bundle.chi_square if self.bundle is not None else 0.0)
-        return images + 2.0 * float(self.others_graph.error(values))
+        readings = self.terrestrial.chi_square if self.terrestrial is not None else 0.0
+        return images + readings + 2.0 * float(self.others_graph.error(values))
 
     def omega(self, values: gtsam.Values) -> float:
         """Weighted square sum v'Pv at ``values``."""
@@ -125,10 +133,12 @@ class GraphBuilder:
     def __init__(self, survey: Survey, lenses: Mapping[str, FloatArray]) -> None:
         self.survey, self.unknowns = survey, Unknowns()
         collect_vectors(survey, self.unknowns, dict(lenses))
+        self.terrestrial = collect_terrestrial(survey, self.unknowns)
         self.frames = FrameTree(survey, self.unknowns)
         self.point_ids = [p.point_id for p in survey.points]
         self.targets = {t.target_id: t for t in survey.targets}
         self.others: list[ObservationFactor] = []
+        self.vector_starts: dict[ParameterName, FloatArray] = {}
 
     def build(self, start: StartValues) -> AdjustmentGraph:
         """The whole graph. Raises SurveyError naming what is missing or contradictory."""
@@ -136,8 +146,18 @@ class GraphBuilder:
         split = [self._block(i, block) for i, block in enumerate(self.survey.image_blocks)]
         chains = {i: self._image_chain(block) for i, _, block in split}
         positions, pair_chains = self._chains_of_others()
+        geometry = GeometryFactors(self.survey, self.unknowns, self.frames)
+        self.vector_starts |= geometry.starts
         state = State(self.survey, self.unknowns)
-        self._other_factors(state, positions, pair_chains)
+        at = {ref: self._position(state, ref, chain) for ref, chain in positions.items()}
+        values = self._values(start)
+        readings = build_batch(self.survey, self.unknowns, self.terrestrial, self.frames, state, at)
+        if readings is not None:
+            readings.orient(values, {name[1] for name in start.vectors if name[0] == "orientation"})
+        survey = geometry.find_starts(state, at, values, start.vectors)
+        self._other_factors(state, at, pair_chains)
+        self.others += geometry.factors(state, at, values)
+        self._priors()
         others = gtsam.NonlinearFactorGraph()
         for item in self.others:
             if item.used:
@@ -151,9 +171,11 @@ class GraphBuilder:
             [self._known_points(b) for _, b in known], [self._n_warp(b) for _, b in known],
         )  # fmt: skip
         images.add_factors(graph)
+        if readings is not None:
+            readings.add_factors(graph)
         # unused observations too: they are predicted with the joint covariance of their unknowns
         outside = {k for item in self.others for k in list(item.factor.keys())}
-        outside |= {k for keys in images.keys for k in keys}
+        outside |= {k for keys in images.keys for k in keys} | (readings.keys if readings is not None else set())
         outside |= self._datum_keys() | set(self.unknowns.held)
         unknown = [(i, b) for i, free, b in split if free]
         bundle = None
@@ -164,9 +186,9 @@ class GraphBuilder:
             bundle.add_factors(graph)
         order = [(i, free) for i, free, _ in split]
         return AdjustmentGraph(
-            self.survey, self.unknowns, state, graph, self._values(start), images, bundle, order, self.others,
-            others,
-        )
+            survey, self.unknowns, state, graph, values, images, bundle, order, self.others,
+            others, readings,
+        )  # fmt: skip
 
     def _register_points(self) -> None:
         for point in self.survey.points:
@@ -221,6 +243,7 @@ class GraphBuilder:
     def _chains_of_others(self) -> tuple[dict[PositionRef, Chain | None], list[Chain]]:
         refs = [r for d in self.survey.distances for r in (d.a, d.b)]
         refs += [r for c in self.survey.coordinates for r in c.positions]
+        refs += position_refs(self.survey) + reading_refs(self.survey)
         positions = {ref: self._position_chain(ref) for ref in refs}
         return positions, [self.frames.relative(p.a, p.b) for p in self.survey.pairs]
 
@@ -241,7 +264,7 @@ class GraphBuilder:
         return Position(pose, target.x_in_target[i], None, warp, (float(sag[0]), float(sag[1])))
 
     def _other_factors(
-        self, state: State, positions: Mapping[PositionRef, Chain | None], pair_chains: list[Chain]
+        self, state: State, at: Mapping[PositionRef, Position], pair_chains: list[Chain]
     ) -> None:
         for reading in self.survey.table_readings:
             unknown = self.unknowns.by_name.get(("table_angles", reading.table_id, reading.epoch_id))
@@ -251,7 +274,6 @@ class GraphBuilder:
                             unknown.units, reading.angles)  # fmt: skip
         for pair, chain in zip(self.survey.pairs, pair_chains, strict=True):
             self._pair(state, pair, chain)
-        at = {ref: self._position(state, ref, chain) for ref, chain in positions.items()}
         for d in self.survey.distances:
             if not at[d.a].keys and not at[d.b].keys:
                 raise SurveyError(f"distance {d.distance_id!r} joins two held positions; it can adjust nothing")
@@ -259,11 +281,12 @@ class GraphBuilder:
             self._other(distance_factor(d, at[d.a], at[d.b]), "distance", d.group, ids, ("distance",), ("m",),
                         np.array([d.value]), d.used)  # fmt: skip
         for c in self.survey.coordinates:
+            known = np.isfinite(np.diag(c.cov))
             names = tuple(f"{position_text(p)} {axis}" for p in c.positions for axis in "xyz")
+            names = tuple(np.array(names)[known].tolist())
             owners = tuple(position_text(p) for p in c.positions)
             self._other(coordinates_factor(c, [at[p] for p in c.positions]), "coordinates", c.group, owners, names,
-                        ("m",) * len(names), c.values.ravel(), c.used)  # fmt: skip
-        self._priors()
+                        ("m",) * len(names), c.values.ravel()[known], c.used)  # fmt: skip
 
     def _pair(self, state: State, pair: Pair, chain: Chain) -> None:
         factor = pair_factor(pair, self.unknowns, state, chain)
@@ -291,9 +314,14 @@ class GraphBuilder:
                 name = ("point", point.point_id)
                 factor = gtsam.PriorFactorPoint3(u.by_name[name].key, p.value, gaussian(p.prior_cov))
                 self._other(factor, "prior", "prior", name, ("x", "y", "z"), ("m",) * 3, p.value)
+        owners: list[tuple[ParameterName, VectorPrior | None]]
         owners = [(("lens", c.camera_id), c.lens.prior) for c in self.survey.cameras]
         owners += [(("table_geometry", t.table_id), t.geometry.prior) for t in self.survey.tables]
         owners += [(("warp", t.target_id), t.warp.prior) for t in self.survey.targets if t.warp]
+        owners += [(("beam", b.beam_id), b.parameters.prior) for b in self.survey.beams]
+        owners += [(("surface", s.surface_id), s.parameters.prior) for s in self.survey.surfaces if s.parameters]
+        owners += [(("vertical",), self.survey.vertical.tilt.prior)]
+        owners += self.terrestrial.priors.items()
         for name, prior in owners:
             vector = u.vectors.get(name)
             if prior is not None and vector is not None and vector.key is not None:
@@ -361,6 +389,10 @@ class GraphBuilder:
             full = start.lenses[name[1]]
         elif name in start.vectors:
             full = start.vectors[name]
+        elif name in self.vector_starts:
+            full = self.vector_starts[name]
+        elif name[0] in ("vertical", "instrument", "orientation", "centring"):
+            full = full_start(name, self.survey)
         elif name[0] == "table_geometry":
             full = next(t.geometry.values for t in self.survey.tables if t.table_id == name[1])
         else:

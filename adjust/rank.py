@@ -37,7 +37,13 @@ def readable(unknown: Unknown) -> str:
         "carrier_from_target": "pose of target {}",
         "warp": "warp of target {}",
         "point": "point {}",
-    }[kind].format(ids[0])
+        "vertical": "direction of the vertical",
+        "instrument": "instrument {}",
+        "orientation": "orientation of setup {}",
+        "centring": "centring of setup {}",
+        "beam": "laser beam {}",
+        "surface": "surface {}",
+    }[kind].format(*ids)
     return owner + (f" at epoch {ids[1]}" if len(ids) > 1 else "")
 
 

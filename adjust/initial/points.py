@@ -64,8 +64,9 @@ def point_field(survey: Survey) -> PointField:
     x = np.full((len(survey.points), 3), np.nan)
     index = {p.point_id: i for i, p in enumerate(survey.points)}
     for observed in survey.coordinates:
-        for ref, value in zip(observed.positions, observed.values, strict=True):
-            if ref.frame is None and ref.point_id in index and observed.used:
+        finite = np.all(np.isfinite(np.diag(observed.cov)).reshape(-1, 3), axis=1).tolist()
+        for ref, value, whole in zip(observed.positions, observed.values, finite, strict=True):
+            if ref.frame is None and ref.point_id in index and observed.used and whole:
                 x[index[ref.point_id]] = value
     for i, point in enumerate(survey.points):
         if point.x_in_world.value is not None:

@@ -5,6 +5,7 @@ from gtsam import Pose3
 
 from adjust.closed_forms import align, rigid
 from adjust.errors import SurveyError
+from adjust.geometry.building import frame_refs, position_refs
 from adjust.initial.gauge import fix_one_gauge, frames_of, world_is_free
 from adjust.initial.lenses import Sighting, start_lens
 from adjust.initial.motion import solve_motion
@@ -93,9 +94,9 @@ class _Search:
             (self.network.observations if pair.used else self.doubtful).append(observation)
         refs = [ref for d in self.survey.distances for ref in (d.a, d.b)]
         refs += [ref for c in self.survey.coordinates for ref in c.positions]
-        for ref in refs:
-            if ref.frame is not None:
-                self.network.frames.world_from(ref.frame)
+        refs += position_refs(self.survey)
+        for frame in [*frame_refs(self.survey), *(ref.frame for ref in refs if ref.frame is not None)]:
+            self.network.frames.world_from(frame)
 
     def find_lenses(self) -> None:
         """Lens values of every camera, given or from its images of known points."""
@@ -233,8 +234,9 @@ class _Search:
         """Observed coordinates (m, 3) and where their positions are at present (m, 3)."""
         rows = []
         for item in self.survey.coordinates:
-            for ref, value in zip(item.positions, item.values, strict=True):
-                place = self._place(ref) if item.used else None
+            finite = np.all(np.isfinite(np.diag(item.cov)).reshape(-1, 3), axis=1).tolist()
+            for ref, value, whole in zip(item.positions, item.values, finite, strict=True):
+                place = self._place(ref) if item.used and whole else None
                 if place is not None:
                     rows.append((value, place))
         return np.array([r[0] for r in rows]).reshape(-1, 3), np.array([r[1] for r in rows]).reshape(-1, 3)

@@ -1,0 +1,1 @@
+"""Observations of geometry: levels, parallel axes, laser spots, surfaces, coordinate differences."""
