@@ -1,0 +1,275 @@
+"""GNU Gama's input files (.gkf): local networks of one, two and three dimensions.
+
+Coordinates stay as they are in the file, whatever ``axes-xy`` calls the axes; a frame that is left-handed in nature
+(x north, y east) then has bearings that count the other way round. Angles are gon, or degrees where written
+``d-m-s``; deviations are mm, and cc (1e-4 gon) or arc seconds; Gama's weights do not depend on ``sigma-apr``, but a
+height difference without deviation has sigma-apr times the root of its length in km.
+"""
+
+import re
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from adjust.model import Bearings, FloatArray
+from adjust.observations import ReadingKind
+from survey.files.text import suggestion
+from survey.interop.draft import AXES, DraftPoint, NetworkDraft, Vectors
+from survey.interop.foreign import ARCSEC, CC, GON, MM, ForeignNetwork, check_cov, number, positive, sexagesimal
+from survey.interop.safe_xml import Element, read_xml
+
+_DMS = re.compile(r"\s*([+-]?)(\d+)-(\d+)-(\d+\.?\d*)\s*")
+_COMMON = ("from", "to", "val", "stdev", "from_dh", "to_dh", "extern")
+KINDS: dict[str, ReadingKind] = {
+    "direction": "direction",
+    "distance": "horizontal_distance",
+    "angle": "angle",
+    "s-distance": "slope_distance",
+    "z-angle": "zenith",
+    "azimuth": "azimuth",
+    "dh": "height_difference",
+}
+_DEVIATIONS = {
+    "direction": "direction-stdev",
+    "distance": "distance-stdev",
+    "s-distance": "distance-stdev",
+    "angle": "angle-stdev",
+    "z-angle": "zenith-angle-stdev",
+    "azimuth": "azimuth-stdev",
+}
+_ANGULAR = ("direction", "angle", "z-angle", "azimuth")
+RIGHT_HANDED = ("en", "nw", "ws", "se")
+AXES_XY = (*RIGHT_HANDED, "ne", "sw", "es", "wn")
+
+
+def read_gama(path: Path) -> ForeignNetwork:
+    """A network from a .gkf file. Raises SurveyError with file and line for what cannot be read."""
+    root = read_xml(path, "gama-local")
+    networks = [e for e in root.children if e.tag == "network"]
+    if len(networks) != 1 or len(root.children) != 1:
+        raise root.error(f"expected one <network>, found {[e.tag for e in root.children][:5]}")
+    return _Reader(networks[0]).network()
+
+
+def bearings_of(network: Element) -> tuple[Bearings, float]:
+    """How the file's angles count in its own coordinates, and what is to be added to azimuths (rad)."""
+    network.allow("axes-xy", "angles", "epoch")
+    axes, angles = network.get("axes-xy", "ne"), network.get("angles", "left-handed")
+    if axes not in AXES_XY:
+        raise network.error(f"axes-xy is {axes!r}; {suggestion(axes, AXES_XY)}")
+    if angles not in ("left-handed", "right-handed"):
+        raise network.error(f"angles is {angles!r}; write left-handed (clockwise) or right-handed")
+    zero: Literal["x", "y"] = "x" if axes[0] in "ns" else "y"
+    clockwise = (angles == "left-handed") == (axes in RIGHT_HANDED)
+    return Bearings(zero, clockwise), np.pi if "s" in axes else 0.0
+
+
+class _Reader:
+    """One pass over <network>."""
+
+    def __init__(self, network: Element) -> None:
+        self.root, self.draft = network, NetworkDraft()
+        self.bearings, self.azimuth_zero = bearings_of(network)
+        self.title = ""
+        self.parameters = Element("parameters", {}, network.where)
+        self.defaults = network
+
+    def network(self) -> ForeignNetwork:
+        bodies = []
+        for child in self.root.children:
+            if child.tag == "description":
+                self.title = next((line.strip() for line in child.text.splitlines() if line.strip()), "")
+            elif child.tag == "parameters":
+                self.parameters = child
+            elif child.tag == "points-observations":
+                bodies.append(child)
+            else:
+                raise child.error("is not known here; description, parameters and points-observations are")
+        for body in bodies:
+            self._body(body)
+        parameters = self.parameters
+        level = parameters.number("conf-pr", 0.95)
+        if not 0.0 < level < 1.0:
+            raise parameters.error(f"conf-pr is {level:g}; it is a probability between 0 and 1")
+        scaled = parameters.get("sigma-act", "aposteriori") != "apriori"
+        survey = self.draft.survey(self.bearings)
+        sigma0 = self._sigma0()
+        return ForeignNetwork(survey, self.title, sigma0, scaled, 1.0 - level, notes=tuple(self.draft.notes))
+
+    def _sigma0(self) -> float:
+        return positive(self.parameters.get("sigma-apr", "10"), "sigma-apr", self.parameters.where)
+
+    def _body(self, body: Element) -> None:
+        body.allow(*set(_DEVIATIONS.values()))
+        self.defaults = body
+        for child in body.children:
+            match child.tag:
+                case "point":
+                    self._point(child)
+                case "obs" | "height-differences":
+                    self._cluster(child)
+                case "vectors":
+                    self._vectors(child)
+                case "coordinates":
+                    self._coordinates(child)
+                case _:
+                    raise child.error("is not known; point, obs, height-differences, vectors and coordinates are")
+
+    def _point(self, element: Element) -> None:
+        element.allow("id", "x", "y", "z", "fix", "adj", "extern")
+        name = element.get("id")
+        if not name:
+            raise element.error("the id is empty; give the point a name")
+        point = self.draft.points.setdefault(name, DraftPoint(name, element.where))
+        for axis in AXES:
+            if element.has(axis):
+                point.start[axis] = element.number(axis)
+        for key in ("fix", "adj"):
+            axes = element.get(key, "")
+            if set(axes.lower()) - set(AXES):
+                raise element.error(f"{key} is {axes!r}; it names axes: xy, z, xyz, XYZ")
+            for axis in axes:
+                status = "fixed" if key == "fix" else ("constrained" if axis.isupper() else "free")
+                point.status[axis.lower()] = status
+        for axis, status in point.status.items():
+            if status == "fixed" and axis not in point.start:
+                raise element.error(f"{axis} of point {name!r} is fixed but not given; add {axis}=")
+
+    def _cluster(self, cluster: Element) -> None:
+        cluster.allow("from", "orientation", "from_dh", "extern")
+        cov, names, units, setup = None, [], [], ""
+        if any(child.tag == "direction" for child in cluster.children):
+            setup = self.draft.setup(self._directions_from(cluster))
+        for child in cluster.children:
+            if child.tag == "cov-mat":
+                cov = child
+            elif child.tag in KINDS:
+                name, unit = self._observation(cluster, child, setup, any(c.tag == "cov-mat" for c in cluster.children))
+                names.append(name)
+                units.append(unit)
+            else:
+                raise child.error(f"is not known here; {suggestion(child.tag, (*KINDS, 'cov-mat'))}")
+        if cov is not None:
+            scale = np.array(units)
+            matrix = covariance(cov, len(names)) * np.outer(scale, scale)
+            check_cov(matrix, "cov-mat", cov.where)
+            self.draft.covariances.append((names, matrix))
+
+    def _directions_from(self, cluster: Element) -> str:
+        stations = {c.get("from", cluster.attributes.get("from")) for c in cluster.children if c.tag == "direction"}
+        if len(stations) != 1:
+            raise cluster.error(f"directions of one set start at one point, found {sorted(stations)[:4]}; split it")
+        return stations.pop()
+
+    def _observation(self, cluster: Element, e: Element, setup: str, has_cov: bool) -> tuple[str, float]:
+        """Add one reading; its id and the unit of its covariances in SI."""
+        angle = e.tag == "angle"
+        ends = ("bs", "fs", "bs_dh", "fs_dh") if angle else ("to", "dist")
+        e.allow(*_COMMON, *ends)
+        at = e.get("from", cluster.attributes.get("from"))
+        to, second = (e.get("bs"), e.get("fs")) if angle else (e.get("to"), None)
+        if at == to or second in (at, to):
+            raise e.error(f"the points {at!r}, {to!r} of an observation must differ")
+        value, unit = self._value(e)
+        if e.tag == "azimuth":
+            value += self.azimuth_zero
+        sigma = unit if has_cov and not e.has("stdev") else self._sigma(e, value, unit)
+        first_height = e.number("from_dh", cluster.number("from_dh", 0.0))
+        heights = (first_height, e.number("bs_dh" if angle else "to_dh", 0.0), e.number("fs_dh", 0.0))
+        own_setup = setup if cluster.attributes.get("from") in (None, at) or e.tag == "direction" else ""
+        extern = e.get("extern", "")
+        name = self.draft.reading(
+            KINDS[e.tag], at, to, value, sigma, setup_id=own_setup, second=second, heights=heights, name=extern
+        )
+        return name, unit
+
+    def _value(self, e: Element) -> tuple[float, float]:
+        """The value in SI, and the unit of its deviation in SI."""
+        text = e.get("val")
+        if e.tag not in _ANGULAR:
+            value = number(text, "val", e.where)
+            if value <= 0.0 and e.tag != "dh":
+                raise e.error(f"a distance of {text} m; distances are above zero")
+            return value, MM
+        found = _DMS.fullmatch(text)
+        if found is None:
+            return number(text, "val", e.where) * GON, CC
+        return sexagesimal(found[1], (found[2], found[3], found[4]), "val", e.where), ARCSEC
+
+    def _sigma(self, e: Element, value: float, unit: float) -> float:
+        """From the element, the default of its kind (cc or mm, whatever the value is written in), or the length."""
+        if e.has("stdev"):
+            return positive(e.get("stdev"), "stdev", e.where) * unit
+        if e.tag == "dh":
+            if not e.has("dist"):
+                raise e.error("has neither stdev (mm) nor dist (km); add one")
+            return self._sigma0() * float(np.sqrt(positive(e.get("dist"), "dist", e.where))) * MM
+        key = _DEVIATIONS[e.tag]
+        if not self.defaults.has(key):
+            raise e.error(f"has no stdev and <points-observations> no {key}; add one")
+        words = self.defaults.get(key).split()
+        a, *rest = (number(word, key, self.defaults.where) for word in words)
+        if e.tag in _ANGULAR:
+            sigma = a * CC
+        else:
+            b, power = (*rest, 0.0, 1.0)[:2] if len(rest) != 1 else (rest[0], 1.0)
+            sigma = (a + b * (value / 1000.0) ** power) * MM
+        if not 0.0 < sigma < np.inf:
+            raise self.defaults.error(f"{key} gives a deviation that is not above zero; correct it")
+        return float(sigma)
+
+    def _vectors(self, element: Element) -> None:
+        vectors = [e for e in element.children if e.tag == "vec"]
+        for e in vectors:
+            e.allow("from", "to", "dx", "dy", "dz", "from_dh", "to_dh", "extern")
+        values = np.array([[e.number(f"d{a}") for a in AXES] for e in vectors]).reshape(-1, 3)
+        # the file's heights are of instrument and antenna above the points
+        values[:, 2] += [e.number("from_dh", 0.0) - e.number("to_dh", 0.0) for e in vectors]
+        cov = covariance(self._matrix(element, "vec"), 3 * len(vectors)) * MM**2
+        at, to = [e.get("from") for e in vectors], [e.get("to") for e in vectors]
+        self.draft.differences.append(Vectors(element.where, at, to, values, cov))
+
+    def _coordinates(self, element: Element) -> None:
+        points = [e for e in element.children if e.tag == "point"]
+        values, rows = np.zeros((len(points), 3)), []
+        for k, e in enumerate(points):
+            e.allow("id", "x", "y", "z", "extern")
+            for i, axis in enumerate(AXES):
+                if e.has(axis):
+                    values[k, i] = e.number(axis)
+                    rows.append(3 * k + i)
+                    point = self.draft.points.get(e.get("id"))
+                    if point is not None:
+                        point.start.setdefault(axis, values[k, i])
+        cov = np.diag(np.full(3 * len(points), np.inf))
+        cov[np.ix_(rows, rows)] = covariance(self._matrix(element, "point"), len(rows)) * MM**2
+        self.draft.coordinates.append(Vectors(element.where, [], [e.get("id") for e in points], values, cov))
+
+    def _matrix(self, element: Element, what: str) -> Element:
+        matrices = [e for e in element.children if e.tag == "cov-mat"]
+        others = [e for e in element.children if e.tag not in ("cov-mat", what)]
+        if others:
+            raise others[0].error(f"is not known here; {what} and cov-mat are")
+        if len(matrices) != 1 or len(element.children) < 2:
+            raise element.error(f"expected some <{what}> and one <cov-mat>, found {len(matrices)} of these; correct it")
+        return matrices[0]
+
+
+def covariance(element: Element, n: int) -> FloatArray:
+    """A symmetric matrix (n, n) from the upper part of its band, by rows."""
+    element.allow("dim", "band")
+    dim, band = element.number("dim"), element.number("band")
+    if dim != n or band not in range(n):
+        raise element.error(f"dim is {dim:g} and band {band:g}; expected dim {n} and a band from 0 to {n - 1}")
+    words = element.text.split()
+    width = int(band) + 1
+    lengths = [min(width, n - i) for i in range(n)]
+    if len(words) != sum(lengths):
+        raise element.error(f"found {len(words)} numbers, a band of {width - 1} needs {sum(lengths)}; correct it")
+    numbers = np.array([number(word, "cov-mat", element.where) for word in words])
+    out, first = np.zeros((n, n)), 0
+    for i, length in enumerate(lengths):
+        out[i, i : i + length] = out[i : i + length, i] = numbers[first : first + length]
+        first += length
+    return out
