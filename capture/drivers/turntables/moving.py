@@ -54,6 +54,11 @@ class MovingTable:
         return self._axes
 
     @property
+    def address(self) -> str:
+        """How the controller is reached."""
+        return self._controller.address
+
+    @property
     def limits(self) -> tuple[tuple[float, float], ...]:
         """Lower and upper limit of every axis, rad."""
         return tuple((axis.lower, axis.upper) for axis in self._axes)

@@ -1,0 +1,282 @@
+"""The command ``labcapture``: arguments in, exit code out, as ``survey.cli`` does it.
+
+Exit codes: 0 done, 1 something its owner can mend, 2 wrong usage, 130 interrupted. Results go to stdout, progress and
+messages to stderr. Heavy imports happen inside the commands.
+"""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from adjust.errors import SurveyError
+
+DONE, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+
+_OPENING = "labcapture run plan.toml"
+_DESCRIPTION = """\
+Takes the images of a survey with real cameras and a real turntable, ready for 'labsurvey adjust'.
+
+  labcapture cameras                   what cameras there are
+  labcapture run plan.toml --dry-run   the poses, the limits, the time it will take
+  labcapture run plan.toml             turn, take images, write them down; the same command goes on after a crash
+"""
+_EPILOG = """\
+Next: labcapture run plan.toml --dry-run
+Help for one command: labcapture run --help
+Exit codes: 0 done, 1 error, 2 wrong usage, 130 interrupted.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command line; the exit code."""
+    try:
+        try:
+            arguments = build_parser().parse_args(argv)
+            return int(arguments.run(arguments))
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # whoever read our output has left; a second complaint at exit would be noise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except SurveyError as error:
+        print(f"labcapture: error: {error}", file=sys.stderr)
+        return FAILED
+    except OSError as error:
+        if error.filename is None:
+            raise  # not about a file of the user
+        advice = "check the name, the permissions and the free space"
+        print(f"labcapture: error: {error.filename}: {error.strerror}; {advice}", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print("\nlabcapture: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All commands and flags."""
+    shared = argparse.ArgumentParser(add_help=False)
+    # SUPPRESS: a flag before the command is not reset by the command's own default
+    shared.add_argument(
+        "--json", action="store_true", default=argparse.SUPPRESS, help="print the summary as one JSON object"
+    )
+    shared.add_argument(
+        "--quiet", action="store_true", default=argparse.SUPPRESS, help="no progress and no messages on stderr"
+    )
+    shaped: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "parents": [shared]}
+    parser = argparse.ArgumentParser(
+        "labcapture", usage=f"{_OPENING}   (labcapture COMMAND ...)", description=_DESCRIPTION, epilog=_EPILOG, **shaped
+    )
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    _add_run(commands, shaped)
+    _add_cameras(commands, shaped)
+    _add_table(commands, shaped)
+    _add_view(commands, shaped)
+    _add_export(commands, shaped)
+    return parser
+
+
+def _add_run(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "run",
+        help="take the images of a plan (the main job)",
+        usage=f"{_OPENING}   (labcapture run PLAN [--dry-run])",
+        description="Turns the table to every pose of the plan, takes one image with every camera, writes them to the\n"
+        "project folder with a journal. Epochs that are recorded already are not taken again.\n"
+        "While it runs: p pauses and goes on (or: kill -USR1 PID), Ctrl-C stops table and session at once.",
+        epilog="Next: labsurvey adjust FOLDER   (the folder that the plan names)",
+        **shaped,
+    )
+    parser.add_argument("plan", type=Path, metavar="PLAN", help="capture plan, a TOML file")
+    parser.add_argument("--dry-run", action="store_true", help="print poses and time, check limits; move nothing")
+    parser.set_defaults(run=_run, parser=parser)
+
+
+def _add_cameras(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "cameras",
+        help="list the cameras that can be reached",
+        usage="labcapture cameras   (labcapture cameras [DRIVER])",
+        description="Asks every driver whose software is installed; the first column is the address for a plan.",
+        epilog="Next: labcapture run plan.toml --dry-run",
+        **shaped,
+    )
+    parser.add_argument("driver", nargs="?", default="all", metavar="DRIVER", help="ask this driver only")
+    parser.set_defaults(run=_cameras, parser=parser)
+
+
+def _add_table(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "table",
+        help="list drivers; show, turn, home or stop the table of a plan",
+        usage="labcapture table plan.toml   (labcapture table [PLAN] [--jog AXIS=DEG ...] [--home] [--stop])",
+        description="Without a plan: the drivers and dialects. With one: where its table is.\n"
+        "The plan's limits hold for --jog as for a session.",
+        epilog="Next: labcapture run plan.toml --dry-run",
+        **shaped,
+    )
+    parser.add_argument("plan", nargs="?", type=Path, metavar="PLAN", help="capture plan whose table is meant")
+    parser.add_argument(
+        "--jog", nargs="+", metavar="AXIS=DEG", help="turn to an angle (axis1=12.5) or by one (axis1=+0.5, axis1=-0.5r)"
+    )
+    parser.add_argument("--home", action="store_true", help="look for the references")
+    parser.add_argument("--stop", action="store_true", help="stop all axes")
+    parser.set_defaults(run=_table, parser=parser)
+
+
+def _add_view(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "view",
+        help="watch a session on a local web page",
+        usage="labcapture view plan.toml   (labcapture view PLAN [--port N] [--live] [--allow-move])",
+        description="Serves a page on this machine only: the last images with the targets found in them, what of each\n"
+        "camera's image is covered, progress. --live shows what the cameras see now, while no session runs.",
+        epilog="Next: open the address that it prints",
+        **shaped,
+    )
+    parser.add_argument("plan", type=Path, metavar="PLAN", help="capture plan")
+    parser.add_argument("--port", type=int, default=8780, metavar="N", help="on loopback; 0 takes a free one")
+    parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="a loopback address; others are refused")
+    parser.add_argument("--live", action="store_true", help="open the cameras and show what they see")
+    parser.add_argument(
+        "--allow-move", action="store_true", help="let the page turn and stop the table, with the token that is printed"
+    )
+    parser.set_defaults(run=_view, parser=parser)
+
+
+def _add_export(commands: Any, shaped: dict[str, Any]) -> None:
+    parser = commands.add_parser(
+        "export",
+        help="write a recorded run as NeXus/HDF5",
+        usage="labcapture export lab lab.nxs   (labcapture export FOLDER FILE.nxs)",
+        description="Images, setpoints, readbacks and times of all recorded epochs in one NXentry.",
+        epilog="Next: labsurvey adjust FOLDER",
+        **shaped,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="project folder that was captured")
+    parser.add_argument("file", type=Path, metavar="FILE.nxs", help="new file")
+    parser.set_defaults(run=_export, parser=parser)
+
+
+def _is(arguments: argparse.Namespace, flag: str) -> bool:
+    return bool(getattr(arguments, flag, False))
+
+
+def _say(arguments: argparse.Namespace, line: str) -> None:
+    if not _is(arguments, "quiet"):
+        print(line, file=sys.stderr)
+
+
+def _print_json(value: Mapping[str, Any]) -> None:
+    print(json.dumps(value, indent=1, allow_nan=False))
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from capture.plan import read_plan
+
+    plan = read_plan(arguments.plan)
+    if arguments.dry_run:
+        from capture.plan_report import plan_summary, plan_text
+
+        if _is(arguments, "json"):
+            _print_json(plan_summary(plan))
+        else:
+            print(f"{plan_text(plan)}\nNext: labcapture run {arguments.plan}")
+        return DONE
+    from capture.session_quality import make_judge
+    from capture.session_run import run_plan
+
+    outcome = run_plan(plan, shown=not _is(arguments, "quiet"), judge=make_judge(plan))
+    if _is(arguments, "json"):
+        _print_json(outcome.summary())
+        return DONE
+    now = f"{outcome.taken} of {outcome.planned} epochs taken"
+    now += f", {outcome.before} were there" if outcome.before else ""
+    retries = ", ".join(f"{n} x {kind}" for kind, n in sorted(outcome.retries.items()))
+    again = " --redetect" if outcome.taken and (plan.project / "observations" / "image_points.csv").exists() else ""
+    print(f"{plan.project}: {now} in {outcome.seconds:.1f} s" + (f"; retried: {retries}" if retries else ""))
+    print(f"Next: labsurvey adjust {plan.project}{again}")
+    return DONE
+
+
+def _cameras(arguments: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from capture.drivers.cameras import DRIVERS, describe_driver, discover
+
+    found = []
+    for name in DRIVERS if arguments.driver == "all" else [describe_driver(arguments.driver).name]:
+        try:
+            found += discover(name)
+        except SurveyError as error:
+            if arguments.driver != "all":
+                raise
+            _say(arguments, f"{name}: {error}")
+        except Exception as error:  # one maker's library that fails must not hide the cameras of the others
+            _say(arguments, f"{name}: its library failed: {type(error).__name__}: {error}")
+    if _is(arguments, "json"):
+        _print_json({"cameras": [asdict(info) for info in found]})
+        return DONE
+    for info in found:
+        use = "  in use" if info.in_use else ""
+        print(f"{info.address:<32}  {info.vendor} {info.model}  {info.serial}{use}")
+    if not found:
+        print("no camera answered")
+        for driver in DRIVERS.values():
+            extra = f"  (pip install 'labsurvey[{driver.extra}]')" if driver.extra else ""
+            _say(arguments, f"  {driver.name:<10}{driver.reaches}: {driver.address}{extra}")
+    return DONE
+
+
+def _table(arguments: argparse.Namespace) -> int:
+    from capture.table_jobs import driver_list, table_job
+
+    if arguments.plan is None:
+        if arguments.jog or arguments.home or arguments.stop:
+            arguments.parser.error("name the PLAN whose table is meant")
+        print(driver_list())
+        return DONE
+    if (arguments.jog is not None) + arguments.home + arguments.stop > 1:
+        arguments.parser.error("--jog, --home and --stop exclude each other")
+    status = table_job(arguments.plan, jog=arguments.jog, home=arguments.home, stop=arguments.stop)
+    if _is(arguments, "json"):
+        _print_json(status)
+        return DONE
+    print(f"{status['table']} at {status['address']}")
+    for axis in status["axes"]:
+        low, high = axis["limits_deg"]
+        state = axis["fault"] or ("moving" if axis["moving"] else "at rest")
+        print(f"  {axis['name']:<8}{axis['readback_deg']:12.5f} deg   limits {low:g} to {high:g} deg   {state}")
+    return DONE
+
+
+def _view(arguments: argparse.Namespace) -> int:
+    from capture.web.serve import serve
+
+    return serve(
+        arguments.plan,
+        host=arguments.host,
+        port=arguments.port,
+        live=arguments.live,
+        allow_move=arguments.allow_move,
+        say=lambda line: _say(arguments, line),
+    )
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from capture.nexus import export
+
+    summary = export(arguments.folder, arguments.file)
+    if _is(arguments, "json"):
+        _print_json(summary)
+    else:
+        print(f"{arguments.file}: {summary['epochs']} epochs, {summary['images']} images")
+    return DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())
