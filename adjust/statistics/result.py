@@ -10,7 +10,7 @@ Method = Literal["b", "sidak"]
 
 
 @dataclass(frozen=True)
-class TestOptions:
+class LevelOptions:
     """How observations are tested.
 
     method: "b" (Baarda's B-method: ``alpha0`` is the level of a test of one component; tests of several components get
@@ -27,9 +27,9 @@ class TestOptions:
 
 @dataclass(frozen=True, eq=False)
 class Criteria:
-    """Levels, critical values of chi-square and non-centralities of tests with 1 ... 6 components; all (6,)."""
+    """Levels, critical values of chi-square and non-centralities of tests with 1, 2, ... components; (q,), q >= 6."""
 
-    options: TestOptions
+    options: LevelOptions
     n_tests: int
     alpha: FloatArray
     critical: FloatArray
@@ -46,12 +46,13 @@ class ObservationTests:
     n_components: (M,). freedom: (M,) controlled directions, the degrees of freedom of the test; 0: uncontrolled.
     redundancy: (M,) sum of the redundancy numbers, 0 where not used. least: (M,) the smallest share of an error of
     this observation, in any direction, that shows in its own residuals (the redundancy number where it has one
-    component); above 1 for what is not used. statistic: (M,) v' inv(Q_vv) v over the controlled directions. p: (M,) a
-    priori (chi-square). p_posterior: (M,) with sigma0 estimated (F; the tau-test where there is one component).
-    fails, fails_posterior: (M,) below the level of the criteria.
-    detectable: (M,) length of the least detectable bias in sigmas of the observation, sqrt(lambda0 / least), inf where
-    something is uncontrolled. external: (M,) lambda-bar, how far that bias moves the unknowns: no unknown, and no
-    function of them, moves by more than this many of its sigmas.
+    component); of what is not used how certain its prediction is, 1 / (1 + variance of the prediction / its own).
+    statistic: (M,) v' inv(Q_vv) v over the controlled directions. p: (M,) a priori (chi-square). p_posterior: (M,)
+    with sigma0 estimated (F; the tau-test where there is one component). fails, fails_posterior: (M,) below the level
+    of the criteria.
+    detectable: (M,) length of the least detectable bias in sigmas of the observation, over the controlled directions;
+    inf where there is none. external: (M,) lambda-bar, how far that bias moves the unknowns: no unknown, and no
+    function of them, moves by more than this many of its sigmas; 0 where not used.
 
     w: (K,) Baarda's w of the single components, positive where the observed value is too large; nan where
     uncontrolled. tau: (K,) Pope's. p_w, p_tau: (K,) two-sided. error: (K,) estimated gross error (observed minus

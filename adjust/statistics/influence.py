@@ -1,0 +1,62 @@
+"""What an undetected bias does to the unknowns: ``dx = Q A' P bias``, each unknown in its own sigmas (Baarda 1968)."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from adjust.datum import in_world
+from adjust.model import FloatArray
+from adjust.result import ParameterName
+from adjust.statistics.result import Influence
+from adjust.statistics.system import LinearSystem
+
+_CHUNK = 256
+
+
+def shifts(system: LinearSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]) -> FloatArray:
+    """How all unknowns (n, k) move with a bias of each of k observations; biases (c,) in sigmas, observed too large."""
+    right = np.zeros((len(system.columns), len(rows)))
+    for i, row in enumerate(rows):
+        right[:, i] = system.A[system.ptr[row] : system.ptr[row + 1]].T @ bias[row]
+    return system.normal.solve(right)
+
+
+def influences(system: LinearSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]) -> tuple[Influence, ...]:
+    """The unknown and the position that each bias moves most; in the order of ``rows``."""
+    out: list[Influence] = []
+    sigmas = np.where(system.sigmas > 0.0, system.sigmas, np.inf)
+    places = _positions(system)
+    for first in range(0, len(rows), _CHUNK):
+        part = rows[first : first + _CHUNK]
+        dx = shifts(system, part, bias)
+        ratio = np.abs(dx) / sigmas[:, None]
+        worst = ratio.argmax(axis=0)
+        length, furthest = _furthest(dx, places)
+        for i, row in enumerate(part):
+            j = int(worst[i])
+            name = places[int(furthest[i])][0] if places else ()
+            out.append(
+                Influence(row, system.columns.names[j], system.columns.components[j], system.columns.units[j],
+                          float(dx[j, i]), float(ratio[j, i]), name, float(length[i]))
+            )  # fmt: skip
+    return tuple(out)
+
+
+def _positions(system: LinearSystem) -> list[tuple[ParameterName, list[int]]]:
+    """Unknowns that are positions in the world, with the columns of their coordinates."""
+    out = []
+    for name, at in system.columns.at.items():
+        if name[0] == "point" or in_world(system.precision.graph, name):
+            mine = [int(c) for c in at if system.columns.components[c] in ("x", "y", "z", "tx", "ty", "tz")]
+            if mine:
+                out.append((name, mine))
+    return out
+
+
+def _furthest(
+    dx: FloatArray, places: Sequence[tuple[ParameterName, list[int]]]
+) -> tuple[FloatArray, FloatArray]:
+    if not places:
+        return np.zeros(dx.shape[1]), np.zeros(dx.shape[1])
+    lengths = np.stack([np.linalg.norm(dx[columns], axis=0) for _, columns in places])
+    return lengths.max(axis=0), lengths.argmax(axis=0)

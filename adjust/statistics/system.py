@@ -1,0 +1,310 @@
+"""A solved survey as one linear system: the whitened row of every observation over every unknown, sparse.
+
+The solver condenses image points and hides unknowns; what compares observations with each other (variance components,
+influences, the search for outliers) needs them apart. Rows are linearised at the solution: ``e(x + dx) = e + A dx``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from gtsam import Values
+from scipy import sparse
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse.linalg import splu
+
+from adjust.datum import gauge
+from adjust.errors import SurveyError
+from adjust.graph import AdjustmentGraph, GraphBuilder
+from adjust.lens_kernels import MAX_LENS
+from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.pair_screen import values_of
+from adjust.precision import Precision, noise_of
+from adjust.result import Adjustment, ParameterName
+from adjust.solve import solve
+from adjust.statistics.row_kernels import block_rows
+
+DENSE = 3000
+"""Unknowns up to which the normal matrix is inverted as a full one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """The free components of all unknowns, n in all, in the order of the graph's unknowns.
+
+    names, components, units: (n,). at: columns of an unknown's free components. free: which components these are.
+    """
+
+    names: tuple[ParameterName, ...]
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    at: dict[ParameterName, IntArray]
+    free: dict[ParameterName, IntArray]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def of(self, names: Sequence[ParameterName]) -> IntArray:
+        """Columns of these unknowns, one after the other."""
+        return np.concatenate([self.at[n] for n in names] or [np.zeros(0, dtype=np.int64)])
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSystem:
+    """All observations at the solution, image points first, then ``Adjustment.other_residuals``; M in all.
+
+    A: (m, n) whitened. e: (m,) whitened predicted minus observed. ptr: (M + 1,) rows of an observation. used: (M,).
+    group: (M,) into group_names. datum: (d, n) rows that decide on what the observations leave open; motions: (n, d')
+    that these are. n_image: image points.
+    """
+
+    precision: Precision
+    columns: Columns
+    A: sparse.csr_matrix
+    e: FloatArray
+    ptr: IntArray
+    used: BoolArray
+    group: IntArray
+    group_names: tuple[str, ...]
+    datum: sparse.csr_matrix
+    motions: FloatArray
+    n_image: int
+
+    @cached_property
+    def row_of(self) -> IntArray:
+        """Observation (m,) of every row."""
+        return np.repeat(np.arange(len(self.used)), np.diff(self.ptr))
+
+    @cached_property
+    def normal(self) -> "Normal":
+        """The normal matrix of the used observations and the datum."""
+        return self.normal_of(self.used[self.row_of].astype(float))
+
+    def normal_of(self, weights: FloatArray) -> "Normal":
+        """The normal matrix with weights (m,) of the rows."""
+        kept = weights > 0.0
+        A = self.A[kept]
+        return Normal((A.T @ A.multiply(weights[kept][:, None]) + self.datum.T @ self.datum).tocsc(), self.motions)
+
+    @cached_property
+    def sigmas(self) -> FloatArray:
+        """A priori sigmas (n,) of the unknowns, in the survey's datum."""
+        by_name, out = self.precision.graph.unknowns.by_name, np.zeros(len(self.columns))
+        for name, at in self.columns.at.items():
+            out[at] = np.sqrt(np.diag(self.precision.cov(by_name[name].key)))[self.columns.free[name]]
+        return out
+
+
+class Normal:
+    """A normal matrix (n, n), factored: solutions, and its inverse in the datum of the survey."""
+
+    def __init__(self, N: sparse.csc_matrix, motions: FloatArray) -> None:
+        self.N, self.motions = N, motions
+        self.scale = 1.0 / np.sqrt(np.maximum(N.diagonal(), 1e-300))
+        S = sparse.diags(self.scale)
+        scaled = (S @ N @ S).tocsc()
+        self.n = scaled.shape[0]
+        self._dense = cho_factor(scaled.toarray()) if self.n <= DENSE else None
+        self._sparse = None if self.n <= DENSE else splu(scaled, permc_spec="MMD_AT_PLUS_A",
+                                                         options={"SymmetricMode": True})  # fmt: skip
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """The solution (n, k) or (n,) of N x = right, with the datum's rows fulfilled where ``right`` is seen."""
+        scale = self.scale if right.ndim == 1 else self.scale[:, None]
+        b = scale * right
+        if self._dense is not None:
+            return np.asarray(scale * cho_solve(self._dense, b))
+        if self._sparse is None:
+            raise ValueError("a normal matrix without factors")
+        return np.asarray(scale * self._sparse.solve(b))
+
+    @cached_property
+    def inverse(self) -> FloatArray:
+        """Inverse (n, n) of the matrix with its datum rows."""
+        return self.solve(np.eye(self.n))
+
+    def covariance(self, datum: sparse.csr_matrix) -> FloatArray:
+        """Covariance (n, n) of the unknowns: the inverse less what the datum's own rows add (S-transformation)."""
+        if self.motions.shape[1] == 0:
+            return self.inverse
+        seen = datum @ self.motions
+        return np.asarray(self.inverse - self.motions @ np.linalg.inv(seen.T @ seen) @ self.motions.T)
+
+
+def linear_system(adjustment: Adjustment) -> LinearSystem:
+    """The system of an adjustment; one that was solved as a pose network is built anew. Raises SurveyError."""
+    precision = precision_of(adjustment)
+    graph, values = precision.graph, precision.solved.values
+    graph.prepare(values, jacobians=True)
+    columns = _columns(graph)
+    key_columns = {graph.unknowns.by_name[name].key: _all_columns(graph, columns, name) for name in columns.at}
+    n = len(columns)
+    images = _image_rows(graph, n, key_columns, values)
+    others = _other_rows(precision, n, key_columns)
+    n_image = images[0].shape[0] // 2
+    A = sparse.vstack([images[0], others[0]]).tocsr()
+    ptr = np.concatenate([2 * np.arange(n_image + 1), 2 * n_image + np.cumsum(others[2])]).astype(np.int64)
+    used = np.concatenate([graph.used(), np.array([o.used for o in graph.others], dtype=np.bool_)])
+    groups = [b.group for b in graph.survey.image_blocks for _ in range(len(b.uv))] + [o.group for o in graph.others]
+    names = tuple(dict.fromkeys(groups))
+    number = {g: i for i, g in enumerate(names)}
+    group = np.array([number[g] for g in groups], dtype=np.int64)
+    datum, motions = _datum(precision, n, key_columns)
+    e = np.concatenate([images[1], others[1]])
+    return LinearSystem(precision, columns, A, e, ptr, used, group, names, datum, motions, n_image)
+
+
+def precision_of(adjustment: Adjustment) -> Precision:
+    """The precision with its graph; solved once more from the adjusted values where the adjustment has none."""
+    found = adjustment.precision
+    if isinstance(found, Precision):
+        return found
+    start = values_of(adjustment)
+    graph = GraphBuilder(adjustment.survey, start.lenses).build(start)
+    if [o.ids for o in graph.others] != [o.ids for o in adjustment.other_residuals]:
+        raise SurveyError("the adjustment does not fit its survey; adjust the survey again")
+    return Precision(graph, solve(graph))
+
+
+def _columns(graph: AdjustmentGraph) -> Columns:
+    names: list[ParameterName] = []
+    components: list[str] = []
+    units: list[str] = []
+    at, free = {}, {}
+    for name, unknown in graph.unknowns.by_name.items():
+        held = graph.unknowns.held.get(unknown.key, ())
+        kept = [i for i in range(unknown.dim) if i not in held]
+        at[name] = np.arange(len(names), len(names) + len(kept))
+        free[name] = np.array(kept, dtype=np.int64)
+        names += [name] * len(kept)
+        components += [unknown.components[i] for i in kept]
+        units += [unknown.units[i] for i in kept]
+    return Columns(tuple(names), tuple(components), tuple(units), at, free)
+
+
+def _all_columns(graph: AdjustmentGraph, columns: Columns, name: ParameterName) -> IntArray:
+    """Column (dim,) of every component of an unknown, -1 for held ones."""
+    out = np.full(graph.unknowns.by_name[name].dim, -1, dtype=np.int64)
+    out[columns.free[name]] = columns.at[name]
+    return out
+
+
+class _Entries:
+    """Dense blocks gathered into one sparse matrix; columns of -1 are left out."""
+
+    def __init__(self) -> None:
+        self.parts: list[tuple[IntArray, IntArray, FloatArray]] = []
+
+    def add(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
+        kept = columns >= 0
+        c = columns[kept]
+        v = values[:, kept]
+        self.parts.append((np.repeat(rows, len(c)), np.tile(c, len(rows)), v.ravel()))
+
+    def matrix(self, shape: tuple[int, int]) -> sparse.csr_matrix:
+        if not self.parts:
+            return sparse.csr_matrix(shape)
+        r, c, v = (np.concatenate(x) for x in zip(*self.parts, strict=True))
+        return sparse.csr_matrix((v, (r, c)), shape=shape)
+
+
+Rows = tuple[sparse.csr_matrix, FloatArray]
+
+
+def _image_rows(graph: AdjustmentGraph, n: int, key_columns: dict[int, IntArray], values: Values) -> Rows:
+    """Rows of all image points in the order of ``Survey.image_blocks``."""
+    parts = [_known_rows(graph, n, key_columns)]
+    n_known = parts[0][0].shape[0] // 2
+    if graph.bundle is not None:
+        parts.append(_bundle_rows(graph, n, key_columns, values))
+    A, e = sparse.vstack([p[0] for p in parts]).tocsr(), np.concatenate([p[1] for p in parts])
+    source, at = [], [0, n_known]
+    for i, free in graph.image_order:
+        k = len(graph.survey.image_blocks[i].uv)
+        source.append(np.arange(at[int(free)], at[int(free)] + k))
+        at[int(free)] += k
+    if not source or len(parts) == 1:
+        return A, e
+    order = (2 * np.concatenate(source)[:, None] + np.arange(2)).ravel()
+    return A[order], e[order]
+
+
+def _known_rows(graph: AdjustmentGraph, n: int, key_columns: dict[int, IntArray]) -> Rows:
+    images, entries = graph.images, _Entries()
+    s, c = images.state, images.chains
+    e = np.zeros(2 * len(images.X))
+    for b, keys in enumerate(images.keys):
+        rows = np.arange(2 * int(images.ptr[b]), 2 * int(images.ptr[b + 1]))
+        local = np.zeros((len(rows), int(images.n_rows[b])))
+        block_rows(b, images.arrays, images.points, images.W_all, s.lenses, c.R, c.t, s.warp, local)
+        e[rows] = local[:, -1]
+        if keys:
+            columns = np.concatenate([key_columns[k] for k in keys])
+            entries.add(rows, columns, local[:, :-1] @ images.local_from_keys(b))
+    return entries.matrix((len(e), n)), e
+
+
+def _bundle_rows(graph: AdjustmentGraph, n: int, key_columns: dict[int, IntArray], values: Values) -> Rows:
+    bundle = graph.bundle
+    if bundle is None:
+        raise ValueError("a survey without unknown points has no such rows")
+    bundle.whitened_squares(values)  # leaves the rows of all points, used or not, with their own weights
+    k = len(bundle.point)
+    local, rows = _Entries(), np.arange(2 * k).reshape(k, 2)
+    n_free = bundle.state.lenses.n_free
+    of_point = {int(i): key_columns[key] for i, key in bundle.point_key.items()}
+    points = _Entries()
+    reduced = set(bundle.reduced)
+    for j in range(k):
+        A, lens = bundle.A[j], int(n_free[bundle.camera_of[j]])
+        at = int(bundle.lens_at[bundle.camera_of[j]])
+        local.add(rows[j], np.arange(at, at + lens), A[:, :lens])
+        pose = int(bundle.pose_at[j])
+        local.add(rows[j], np.arange(pose, pose + 6), A[:, MAX_LENS : MAX_LENS + 6])
+        by_point, i = A[:, MAX_LENS + 3 : MAX_LENS + 6], int(bundle.point[j])
+        if bundle.point_at[j] >= 0:
+            local.add(rows[j], np.arange(bundle.point_at[j], bundle.point_at[j] + 3), by_point)
+        elif i in reduced:
+            points.add(rows[j], of_point[i], by_point)
+    columns = np.concatenate([key_columns[key] for key in bundle.order])
+    kept = columns >= 0
+    select = sparse.csr_matrix((np.ones(int(kept.sum())), (np.flatnonzero(kept), columns[kept])), (len(columns), n))
+    A_keys = local.matrix((2 * k, bundle.n_local)) @ bundle.G @ select + points.matrix((2 * k, n))
+    back = np.empty(k, dtype=np.int64)
+    back[bundle.sorted] = np.arange(k)
+    order = (2 * back[:, None] + np.arange(2)).ravel()
+    return A_keys.tocsr()[order], bundle.A[:, :, MAX_LENS + 6].ravel()[order]
+
+
+def _other_rows(
+    precision: Precision, n: int, key_columns: dict[int, IntArray]
+) -> tuple[sparse.csr_matrix, FloatArray, IntArray]:
+    entries, residuals, lengths, at = _Entries(), [np.zeros(0)], [], 0
+    for item in precision.graph.others:
+        linear = item.factor.linearize(precision.solved.values)
+        A, b = linear.jacobian()
+        columns = np.concatenate([key_columns[k] for k in list(linear.keys())])
+        entries.add(np.arange(at, at + len(b)), columns, A)
+        residuals.append(-b)
+        lengths.append(len(b))
+        at += len(b)
+    return entries.matrix((at, n)), np.concatenate(residuals), np.array(lengths, dtype=np.int64)
+
+
+def _datum(precision: Precision, n: int, key_columns: dict[int, IntArray]) -> tuple[sparse.csr_matrix, FloatArray]:
+    datum = precision.solved.datum
+    if datum is None:
+        return sparse.csr_matrix((0, n)), np.zeros((n, 0))
+    entries, motions = _Entries(), np.zeros((n, datum.defect))
+    for key, rows in datum.rows.items():
+        entries.add(np.arange(datum.defect), key_columns[key], rows / datum.sigma)
+    for key, columns in key_columns.items():
+        moved = gauge(precision.graph, precision.graph.unknowns.by_key[key], precision.solved.values) @ datum.directions
+        motions[columns[columns >= 0]] = moved[columns >= 0]
+    return entries.matrix((datum.defect, n)), motions
+
+
+def root_of(precision: Precision, row: int) -> FloatArray:
+    """Inverse (k, k) of the square root information of the ``row``-th of the graph's other observations."""
+    return np.asarray(np.linalg.inv(noise_of(precision.graph.others[row]).R()))

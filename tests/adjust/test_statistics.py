@@ -1,0 +1,207 @@
+"""Tests, reliability and influences against one dense matrix and textbook formulas."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, ncx2, norm
+from scipy.stats import f as fisher
+from scipy.stats import t as student
+
+from adjust.adjustment import AdjustOptions, assemble
+from adjust.graph import StartValues
+from adjust.model import Datum, FloatArray, PointParameter, Survey
+from adjust.result import Adjustment
+from adjust.statistics.criteria import criteria, noncentrality, sidak
+from adjust.statistics.influence import shifts
+from adjust.statistics.reliability import observation_name, reliability
+from adjust.statistics.result import LevelOptions
+from adjust.statistics.system import linear_system
+from survey.simulate import head_on_table, resample, stereo
+from tests.adjust import helpers as h
+
+
+def both(survey: Survey, start: StartValues) -> tuple[Adjustment, h.Dense, FloatArray]:
+    """The adjustment, the whole survey in one matrix, and its inverse."""
+    graph, done = h.solved(survey, start)
+    full = h.dense(graph, dict(start.lenses), done.values)
+    Q = full.inverse(h.inner_rows(graph, full, done))
+    return assemble(graph, done, AdjustOptions()), full, Q
+
+
+def known_targets() -> tuple[Survey, StartValues]:
+    survey, truth = stereo(1, n_pairs=3)
+    rng = np.random.default_rng(1)
+    blocks = [replace(b, point_idx=b.point_idx[::4], uv=b.uv[::4], cov=h.point_covs(rng, len(b.uv[::4])),
+                      used=np.arange(len(b.uv[::4])) % 5 != 2) for b in survey.image_blocks]  # fmt: skip
+    return resample(replace(survey, image_blocks=tuple(blocks)), truth, 3), h.start_at(truth)
+
+
+def bundle() -> tuple[Survey, StartValues]:
+    survey, truth = h.network(4, n_epochs=4, n_points=10, coordinates=2, unused=0.1)
+    return survey, h.start_at(truth)
+
+
+def free_network() -> tuple[Survey, StartValues]:
+    survey, start = bundle()
+    points = tuple(replace(p, x_in_world=PointParameter()) for p in survey.points)
+    return replace(survey, points=points, coordinates=(), datum=Datum("inner")), start
+
+
+def table() -> tuple[Survey, StartValues]:
+    survey, truth = head_on_table(1, n_cameras=1, n_table_epochs=3, n_free_epochs=1)
+    blocks = tuple(replace(b, point_idx=b.point_idx[::9], uv=b.uv[::9], cov=b.cov[::9]) for b in survey.image_blocks)
+    return replace(survey, image_blocks=blocks), h.start_at(truth)
+
+
+@pytest.mark.parametrize("case", [known_targets, bundle, free_network, table])
+def test_the_whole_reliability_against_one_dense_matrix(case: Callable[[], tuple[Survey, StartValues]]) -> None:
+    survey, start = case()
+    adjustment, full, Q = both(survey, start)
+    system = linear_system(adjustment)
+    columns = np.concatenate([np.arange(full.place[n].start, full.place[n].stop) for n in system.columns.at])
+    length = np.linalg.norm(full.A, axis=0)
+    np.testing.assert_allclose(system.A.toarray() / length[columns], full.A[:, columns] / length[columns], atol=2e-7)
+    np.testing.assert_allclose(system.e, full.e, atol=1e-6)
+    mine = system.normal.covariance(system.datum)
+    assert h.relative(mine, Q[np.ix_(columns, columns)]) < 1e-6
+    np.testing.assert_allclose(system.sigmas, np.sqrt(np.diag(mine)), rtol=1e-6)
+    found = reliability(adjustment, most_influences=10**6, system=system)
+    check_tests(adjustment, full, Q, found)
+    check_influences(adjustment, full, Q, found, columns, system.columns.names)
+
+
+def check_tests(adjustment: Adjustment, full: h.Dense, Q: FloatArray, found) -> None:  # type: ignore[no-untyped-def]
+    t, at, sigma0, f = found.tests, 0, adjustment.sigma0, adjustment.redundancy
+    checked = 0
+    for k in range(len(t.used)):
+        rows = slice(at, at + len(full.W[k]))
+        at = rows.stop
+        assert (t.ptr[k], t.ptr[k + 1]) == (rows.start, rows.stop)
+        used, n = bool(full.used[rows.start]), rows.stop - rows.start
+        assert t.used[k] == used
+        root = np.linalg.inv(full.W[k])
+        v, P = full.v[rows], full.W[k].T @ full.W[k]
+        Ql, Qx = root @ root.T, root @ full.A[rows] @ Q @ full.A[rows].T @ root.T
+        # the model with a bias in the observation itself (Teunissen 2006): its normal matrix and right-hand side
+        N = P @ (Ql - Qx) @ P if used else np.linalg.inv(Ql + Qx)
+        b = -P @ v if used else -N @ v
+        lengths = np.linalg.eigvalsh(root.T @ N @ root)
+        if lengths[0] < 1e-5:
+            continue
+        checked += 1
+        estimate = np.linalg.solve(N, b)
+        T = b @ estimate
+        parts = slice(t.ptr[k], t.ptr[k + 1])
+        tolerance = {"rtol": 2e-5, "atol": 1e-6}
+        assert t.freedom[k] == n
+        np.testing.assert_allclose(t.statistic[k], T, **tolerance)
+        np.testing.assert_allclose(t.p[k], chi2.sf(T, n), rtol=1e-3, atol=1e-12)
+        np.testing.assert_allclose(t.least[k], lengths[0], rtol=1e-4, atol=1e-7)
+        size = np.sqrt(np.abs(estimate) + np.sqrt(np.diag(np.linalg.inv(N))))
+        np.testing.assert_allclose(t.error[parts] / size, estimate / size, rtol=1e-4, atol=1e-5)
+        w = b / np.sqrt(np.diag(N))
+        np.testing.assert_allclose(t.w[parts], w, **tolerance)
+        np.testing.assert_allclose(t.tau[parts], w / sigma0, **tolerance)
+        np.testing.assert_allclose(t.p_w[parts], 2.0 * norm.sf(np.abs(w)), rtol=1e-3, atol=1e-12)
+        lambda0 = found.criteria.lambda0
+        np.testing.assert_allclose(t.detectable_component[parts], np.sqrt(lambda0[0] / np.diag(N)), rtol=1e-5)
+        bias = t.bias[parts]
+        np.testing.assert_allclose(bias @ N @ bias, lambda0[n - 1], rtol=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(full.W[k] @ bias), t.detectable[k], rtol=1e-5)
+        omega, left = (adjustment.omega - T, f - n) if used else (adjustment.omega, f)
+        np.testing.assert_allclose(t.p_posterior[k], fisher.sf(T / n / (omega / left), n, left), rtol=1e-3, atol=1e-12)
+        moved = Q @ full.A[rows].T @ full.W[k] @ bias
+        expected = np.sqrt(moved @ full.normal @ moved) if used else 0.0
+        np.testing.assert_allclose(t.external[k], expected, rtol=1e-4, atol=1e-6)
+        if k < t.n_image:
+            check_ellipse(found.ellipses, k, N, lambda0[1])
+    assert checked > 0.5 * len(t.used)
+
+
+def check_ellipse(ellipses, k: int, N: FloatArray, lambda0: float) -> None:  # type: ignore[no-untyped-def]
+    for axis, turned in ((ellipses.major[k], 0.0), (ellipses.minor[k], np.pi / 2)):
+        angle = ellipses.direction[k] + turned
+        b = axis * np.array([np.cos(angle), np.sin(angle)])
+        assert b @ N @ b == pytest.approx(lambda0, rel=1e-5)
+    assert ellipses.major[k] ** 2 == pytest.approx(lambda0 * np.linalg.eigvalsh(np.linalg.inv(N))[1], rel=1e-4)
+
+
+def check_influences(adjustment, full, Q, found, columns, names) -> None:  # type: ignore[no-untyped-def]
+    t = found.tests
+    sigma = np.sqrt(np.diag(Q))
+    assert len(found.influences) == np.count_nonzero(t.used & (t.freedom > 0) & (t.external > 0))
+    worst = [t.external[i.row] for i in found.influences]
+    assert worst == sorted(worst, reverse=True)
+    for i in found.influences[:: max(1, len(found.influences) // 40)]:
+        rows = slice(t.ptr[i.row], t.ptr[i.row + 1])
+        W = full.W[i.row]
+        moved = Q @ full.A[rows].T @ W @ t.bias[rows]
+        ratio = (np.abs(moved) / sigma)[columns]
+        assert i.ratio == pytest.approx(ratio.max(), rel=1e-3)
+        assert i.ratio <= t.external[i.row] * (1 + 1e-6)
+        near = [names[j] for j in np.flatnonzero(ratio > ratio.max() * (1 - 1e-3))]
+        assert i.name in near
+
+
+def test_unused_observations_and_names() -> None:
+    survey, start = bundle()
+    adjustment, _, _ = both(survey, start)
+    found = reliability(adjustment).tests
+    assert not found.used.all()
+    assert found.external[~found.used].max() == 0.0
+    assert found.redundancy[~found.used].max() == 0.0
+    assert found.redundancy.sum() == pytest.approx(adjustment.redundancy, abs=1e-6)
+    block = survey.image_blocks[1]
+    row = len(survey.image_blocks[0].uv) + 2
+    assert observation_name(adjustment, row) == (
+        "image", (block.camera_id, block.epoch_id, "points", survey.points[int(block.point_idx[2])].point_id)
+    )  # fmt: skip
+    assert observation_name(adjustment, found.n_image)[0] == "distance"
+
+
+def test_tau_is_student_of_the_rest() -> None:
+    """Pope's tau against its definition: the distance's t-test with sigma0 from the adjustment without it."""
+    survey, start = bundle()
+    adjustment, _, _ = both(survey, start)
+    found = reliability(adjustment).tests
+    row = found.n_image
+    without, _, _ = both(replace(survey, distances=(replace(survey.distances[0], used=False), *survey.distances[1:])),
+                         start)  # fmt: skip
+    d = without.other_residuals[0]
+    t = d.standardized[0] / without.sigma0
+    p = 2.0 * student.sf(abs(t), without.redundancy)
+    assert found.p_tau[found.ptr[row]] == pytest.approx(found.p_posterior[row], rel=1e-9)
+    assert found.p_tau[found.ptr[row]] == pytest.approx(p, rel=0.05)  # the images are not quite linear
+
+
+def test_levels_and_noncentralities() -> None:
+    """Baarda's nomogram (1968): alpha0 0.1 %, power 80 % gives lambda0 17.075, so 4.13 sigmas / sqrt(r)."""
+    assert noncentrality(0.001, 0.80, 1) == pytest.approx(17.075, abs=1e-3)
+    assert np.sqrt(noncentrality(0.001, 0.80, 1)) == pytest.approx(norm.isf(0.0005) + norm.isf(0.2), abs=1e-3)
+    b = criteria(LevelOptions("b", alpha0=0.001, power=0.8), 100)
+    np.testing.assert_allclose(b.lambda0, b.lambda0[0])
+    np.testing.assert_allclose(ncx2.sf(b.critical, np.arange(1, 7), b.lambda0), 0.8, rtol=1e-9)
+    assert b.alpha[0] == pytest.approx(0.001)
+    assert np.all(np.diff(b.alpha) > 0)
+    s = criteria(LevelOptions("sidak", family_alpha=0.05), 100)
+    assert 1.0 - (1.0 - s.alpha[2]) ** 100 == pytest.approx(0.05)
+    assert sidak(0.05, 1) == pytest.approx(0.05)
+    np.testing.assert_allclose(ncx2.sf(s.critical, np.arange(1, 7), s.lambda0), s.options.power, rtol=1e-9)
+
+
+def test_a_bias_moves_the_unknowns_as_predicted() -> None:
+    """Against a second adjustment with the bias put in; curvature times residuals makes some percent."""
+    survey, start = bundle()
+    adjustment, _, _ = both(survey, start)
+    system = linear_system(adjustment)
+    row = system.n_image + 1
+    d = survey.distances[1]
+    moved = shifts(system, [row], {row: np.array([0.1])})[:, 0]
+    wrong = (survey.distances[0], replace(d, value=d.value + 0.1 * d.sigma))
+    after, _, _ = both(replace(survey, distances=wrong), start)
+    for point in ("P9", "P8"):
+        at = system.columns.at["point", point]
+        change = np.asarray(after.estimates["point", point].value) - adjustment.estimates["point", point].value
+        np.testing.assert_allclose(change, moved[at], atol=0.06 * np.abs(moved[at]).max())
