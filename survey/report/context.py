@@ -8,11 +8,15 @@ from adjust.result import Adjustment
 from survey.quantities import Scale
 from survey.residual_tables import ImageRows
 from survey.solution import RunInfo
+from survey.statistics import Statistics
 
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """The adjustment, its solution as plain values, and the image points row by row; ``suspect`` (N,)."""
+    """The adjustment, its solution as plain values, and the image points row by row; ``suspect`` (N,).
+
+    statistics: None where only the adjustment itself is to be reported.
+    """
 
     adjustment: Adjustment
     run: RunInfo
@@ -20,3 +24,4 @@ class Context:
     scale: Scale
     rows: ImageRows
     suspect: BoolArray
+    statistics: Statistics | None = None

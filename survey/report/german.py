@@ -209,7 +209,8 @@ GERMAN = {
     "translation that takes the measured pair to the adjusted one; of pairs not used, to its prediction. "
     "Redundancy: mean of its components, 0 where nothing checks the pair, 1 where the others alone determine it.": (
         "Ausgeglichenes b_from_a: Quaternion w x y z, Eulerwinkel von R = Rz(z) Ry(y) Rx(x) mit dem σ kleiner "
-        "Drehungen um die Achsen von a, Translation mit ihrem σ längs der Achsen von b. Verbesserung: Betrag der Drehung und der "
+        "Drehungen um die Achsen von a, Translation mit ihrem σ längs der Achsen von b. "
+        "Verbesserung: Betrag der Drehung und der "
         "Translation vom gemessenen zum ausgeglichenen Paar; bei nicht verwendeten zu ihrer Vorhersage. Redundanz: "
         "Mittel der Komponenten, 0 wo nichts das Paar prüft, 1 wo die anderen allein es bestimmen."
     ),
@@ -243,6 +244,110 @@ GERMAN = {
     "std. v": "stand. v",
     "red. u": "Red. u",
     "red. v": "Red. v",
+    # all observations
+    "All observations": "Alle Beobachtungen",
+    "Where": "Wo",
+    "Unit of σ": "Einheit von σ",
+    "σ adj.": "σ ausgegl.",
+    "Gross error": "Grober Fehler",
+    "MDB": "Grenzwert",
+    "image point": "Bildpunkt",
+    "The worst {shown} of {n}; all in residuals.csv and residuals_other.csv.": (
+        "Die {shown} schlechtesten von {n}; alle in residuals.csv und residuals_other.csv."
+    ),
+    "Every observation, one row per component, largest |w| first. w: Baarda's standardized residual. Gross error: "
+    "estimated. MDB: the bias of this component alone that its test finds with the stated power; λ̄: how many of "
+    "its sigmas an undetected bias can at most move any function of the unknowns. Click a heading to sort.": (
+        "Jede Beobachtung, eine Zeile je Komponente, größtes |w| zuerst. w: standardisierte Verbesserung nach Baarda. "
+        "Grober Fehler: geschätzt. Grenzwert: der Fehler dieser Komponente allein, den ihr Test mit der genannten "
+        "Macht findet; λ̄: um wie viele seiner Sigmas ein unentdeckter Fehler eine Funktion der Unbekannten höchstens "
+        "verschiebt. Ein Klick auf eine Überschrift sortiert."
+    ),
+    "Power {power} %.": "Macht {power} %.",
+    "On the screen this table can be searched and sorted.": (
+        "Am Bildschirm lässt sich diese Tabelle durchsuchen und sortieren."
+    ),
+    "filter": "filtern",
+    "only suspect or not used": "nur verdächtige oder nicht verwendete",
+    "first page": "erste Seite",
+    "page before": "vorige Seite",
+    "next page": "nächste Seite",
+    "last page": "letzte Seite",
+    "page {{page}} of {{pages}}, {{n}} rows": "Seite {{page}} von {{pages}}, {{n}} Zeilen",
+    "The survey in space": "Die Vermessung im Raum",
+    "Drag to turn, wheel to zoom, arrow keys turn too. Ellipsoids enlarged": (
+        "Ziehen dreht, das Rad vergrößert, auch Pfeiltasten drehen. Ellipsoide vergrößert"
+    ),
+    "times": "mal",
+    # statistics
+    "Variance components": "Varianzkomponenten",
+    "Factor of variance": "Varianzfaktor",
+    "σ of it": "σ davon",
+    "Factor of σ": "Faktor der σ",
+    "p of 1": "p für 1",
+    "estimated": "geschätzt",
+    "vanished": "verschwunden",
+    "unseparable": "nicht trennbar",
+    "no redundancy": "ohne Redundanz",
+    "not converged": "nicht konvergiert",
+    "Estimated variance factor of every group, on top of the sigmas given ({method}, {n} solutions of the survey). "
+    "p of 1: probability of a factor as far from 1 where the given sigmas are right. All sigmas and tests in this "
+    "report use these factors.": (
+        "Geschätzter Varianzfaktor jeder Gruppe, zusätzlich zu den angegebenen Sigmas ({method}, {n} Lösungen). p für "
+        "1: Wahrscheinlichkeit eines ebenso weit von 1 entfernten Faktors, wenn die Sigmas stimmen. Alle Sigmas und "
+        "Tests in diesem Bericht verwenden diese Faktoren."
+    ),
+    "Not separable, only their mixture is known: {names}": "Nicht trennbar, nur die Mischung ist bekannt: {names}",
+    "Reliability": "Zuverlässigkeit",
+    "Not controlled": "Unkontrolliert",
+    "Observation": "Beobachtung",
+    "MDB [σ]": "Grenzwert [σ]",
+    "Moves most": "Verschiebt am meisten",
+    "by": "um",
+    "in its σ": "in dessen σ",
+    "Position": "Position",
+    "by [mm]": "um [mm]",
+    "Šidák's family-wise control": "Kontrolle aller Tests zusammen nach Šidák",
+    "Baarda's B-method": "Baardas B-Methode",
+    "External reliability: what the least detectable bias (power {power} %, {method}, level of a single test {level}) "
+    "of an observation would do to the unknowns if it stayed undetected. Worst first.": (
+        "Äußere Zuverlässigkeit: was der kleinste auffindbare Fehler einer Beobachtung (Macht {power} %, {method}, "
+        "Niveau des Einzeltests {level}) unentdeckt an den Unbekannten anrichtet. Das Schlimmste zuerst."
+    ),
+    "Relative precision": "Relative Genauigkeit",
+    "From": "Von",
+    "To": "Nach",
+    "Distance [mm]": "Strecke [mm]",
+    "Rotation σ [″]": "Drehung σ [″]",
+    "Relative precision of neighbours, independent of where the datum is: sigma of the distance, semi-axes of the "
+    "relative {level} % ellipsoid, and of stations the largest sigma of their relative rotation.": (
+        "Genauigkeit von Nachbarn gegeneinander, unabhängig von der Lage des Datums: Sigma der Strecke, Halbachsen des "
+        "relativen {level}-%-Ellipsoids, bei Standpunkten das größte Sigma der gegenseitigen Drehung."
+    ),
+    "Budget": "Unsicherheit",
+    "Uncertainty budget": "Unsicherheitsbudget",
+    "Result": "Ergebnis",
+    "Standard uncertainty u of every result and the share of each source in its variance (GUM, JCGM 100:2008). "
+    "Type A: from the scatter of this survey's own residuals; type B: given. ν: effective degrees of freedom; "
+    "U = k u is the expanded uncertainty at {level} %.": (
+        "Standardunsicherheit u jedes Ergebnisses und der Anteil jeder Quelle an seiner Varianz (GUM, JCGM 100:2008). "
+        "Typ A: aus der Streuung der eigenen Verbesserungen; Typ B: gegeben. ν: effektive Freiheitsgrade; U = k u ist "
+        "die erweiterte Unsicherheit bei {level} %."
+    ),
+    "Correlations": "Korrelationen",
+    "Correlated above 95 %": "Über 95 % korreliert",
+    "Weak directions": "Schwache Richtungen",
+    "Blue: positive, red: negative; white: none. Lines separate the parameters.": (
+        "Blau: positiv, rot: negativ, weiß: keine. Linien trennen die Parameter."
+    ),
+    "Distribution": "Verteilung",
+    "Distribution of residuals": "Verteilung der Verbesserungen",
+    "Quantiles of group {name}": "Quantile der Gruppe {name}",
+    "Standardized residuals of each group in order, against the quantiles that as many normally distributed ones "
+    "would have. The band holds 95 % of such points one by one.": (
+        "Standardisierte Verbesserungen jeder Gruppe der Größe nach, gegen die Quantile ebenso vieler "
+        "normalverteilter. Das Band enthält je Punkt 95 % davon."
+    ),
 }
 
 _WHERE = r"camera (\S+) at epoch (\S+), target (\S+)"

@@ -8,6 +8,7 @@ from survey.report.language import message, t
 from survey.report.markup import count, definition, esc, fixed, general, pill, section, table
 from survey.report.picture import pictures
 from survey.report.scene import scene_of
+from survey.report.space import space
 
 _WORDS = {"passed": "Passed", "check": "Needs a look", "failed": "Failed"}
 _MOST_WARNINGS = 25
@@ -138,7 +139,8 @@ def picture(c: Context) -> str:
         "Cameras are drawn at the first epoch; thin lines are their axes at others, dash-dotted lines those of tables.",
         n=general(enlarged, 3),
     ) + left_out
-    return section("picture", "The survey", f'<div class="figures">{drawn}</div>' if drawn else "", note)
+    turning = space(scene, c.scale.ellipsoid)
+    return section("picture", "The survey", f'<div class="figures">{drawn}</div>{turning}' if drawn else "", note)
 
 
 def inputs(c: Context) -> str:

@@ -5,15 +5,18 @@ from typing import Any
 
 from adjust.result import Adjustment
 from survey.quantities import scale_of
-from survey.report import loops, observations, overview, unknowns
+from survey.report import every, loops, observations, overview, statistics, unknowns
 from survey.report.context import Context
-from survey.report.language import language, t
+from survey.report.embedding import json_script
+from survey.report.language import language, localised, speaking, t
 from survey.report.markup import esc
 from survey.residual_tables import image_rows
 from survey.solution import RunInfo, solution_dict
+from survey.statistics import Statistics
 
 _SECTIONS = (
     ("Summary", "summary", overview.summary),
+    ("Variance components", "components", statistics.components),
     ("Groups", "groups", overview.groups),
     ("Picture", "picture", overview.picture),
     ("Cameras", "cameras", unknowns.cameras),
@@ -26,26 +29,60 @@ _SECTIONS = (
     ("Pairs", "pairs", loops.pairs),
     ("Observations", "observations", observations.others),
     ("Image points", "image-points", observations.image_points),
+    ("All observations", "all-observations", every.every_observation),
+    ("Distribution", "normality", statistics.normality),
+    ("Reliability", "reliability", statistics.reliability),
+    ("Relative precision", "relative", statistics.relative),
+    ("Budget", "budget", statistics.budget),
+    ("Correlations", "correlations", statistics.correlations),
     ("Inputs", "inputs", overview.inputs),
 )
 
 
-def report_html(adjustment: Adjustment, run: RunInfo, solution: dict[str, Any] | None = None) -> str:
-    """The page; ``solution`` is that of :func:`survey.solution.solution_dict`, made here where it is not given."""
+def report_html(
+    adjustment: Adjustment,
+    run: RunInfo,
+    solution: dict[str, Any] | None = None,
+    found: Statistics | None = None,
+    in_language: str = "en",
+) -> str:
+    """The page; ``solution`` is that of :func:`survey.solution.solution_dict`, made here where it is not given.
+
+    found: the statistics, where they are to be shown. in_language: "en" or "de"; raises SurveyError for others.
+    """
     solution = solution_dict(adjustment, run) if solution is None else solution
     limit = solution["summary"]["suspects"]["image_test_limit"]
-    found = adjustment.image_residuals
+    images = adjustment.image_residuals
     c = Context(
         adjustment, run, solution, scale_of(adjustment, run.sigmas), image_rows(adjustment),
-        found.used & (found.test > limit),
+        images.used & (images.test > limit), found,
     )  # fmt: skip
+    with speaking(in_language):
+        return _page(c)
+
+
+def _page(c: Context) -> str:
     made = [(name, anchor, make(c)) for name, anchor, make in _SECTIONS]
     nav = "".join(f'<a href="#{anchor}">{esc(t(name))}</a>' for name, anchor, body in made if body)
-    style = Path(__file__).with_name("style.css").read_text(encoding="utf-8")
-    title = esc(solution["summary"]["title"] or run.folder)
+    here = Path(__file__)
+    style = here.with_name("style.css").read_text(encoding="utf-8")
+    script = here.with_name("script.js").read_text(encoding="utf-8")
+    title = esc(c.solution["summary"]["title"] or c.run.folder)
     return (
         f'<!doctype html>\n<html lang="{language()}"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{title} – {t('Adjustment report')}</title><style>{style}</style></head>\n<body><main>"
-        f"{overview.header(c)}<nav>{nav}</nav>" + "\n".join(body for _, _, body in made) + "</main></body></html>\n"
+        f"{overview.header(c)}<nav>{nav}</nav>"
+        + "\n".join(body for _, _, body in made)
+        + f"</main>{json_script('words', _words())}<script>{script}</script></body></html>\n"
     )
+
+
+def _words() -> dict[str, Any]:
+    """What the script says."""
+    return {
+        "decimal": localised("."),
+        "filter": t("filter"),
+        "flags": ["", t("suspect"), t("not used")],
+        "where": t("page {{page}} of {{pages}}, {{n}} rows").replace("{{", "{").replace("}}", "}"),
+    }

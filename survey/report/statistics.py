@@ -1,0 +1,265 @@
+"""Sections on the statistics: variance components, reliability, relative precision, budget, correlations."""
+
+import numpy as np
+
+from adjust.model import FloatArray
+from adjust.result import ParameterName
+from adjust.statistics.result import BudgetEntry, Component, Influence, RelativePrecision
+from survey.quantities import sigma_unit_for_people
+from survey.report import drawing as d
+from survey.report.context import Context
+from survey.report.language import known, t
+from survey.report.markup import (
+    MISSING,
+    count,
+    esc,
+    fixed,
+    general,
+    pill,
+    section,
+    sigma_text,
+    table,
+    value_text,
+)
+from survey.statistics import CorrelationMatrix
+
+_MOST_ROWS = 120
+_MOST_WEAK = 30
+
+
+def name_text(name: ParameterName) -> str:
+    """A parameter as people write it: kind in words, then ids."""
+    kind = known(name[0].replace("_", " "))
+    return esc(" ".join((kind, *name[1:])))
+
+
+def components(c: Context) -> str:
+    """Variance components with their own sigma and test; nothing where they were not estimated."""
+    found = c.statistics and c.statistics.components
+    if not found:
+        return ""
+    rows = [_component_row(x) for x in found.components]
+    columns = ("<Group", "Factor of variance", "σ of it", "Factor of σ", "n", "Redundancy", "p of 1", "<")
+    said = t(
+        "Estimated variance factor of every group, on top of the sigmas given ({method}, {n} solutions of the survey). "
+        "p of 1: probability of a factor as far from 1 where the given sigmas are right. All sigmas and tests in this "
+        "report use these factors.",
+        method=esc(found.method), n=found.iterations,
+    )  # fmt: skip
+    if not found.converged:
+        said += " " + pill("bad", t("not converged"))
+    mixed = "".join(
+        f"<li>{t('Not separable, only their mixture is known: {names}', names=esc(', '.join(group)))}</li>"
+        for group in found.unseparable
+    )
+    listed = f'<ul class="problems">{mixed}</ul>' if mixed else ""
+    return section("components", "Variance components", table(columns, rows) + listed, said)
+
+
+def _component_row(x: Component) -> tuple[str, ...]:
+    kind = "warn" if x.status == "estimated" and x.p < 0.01 else "quiet" if x.status == "estimated" else "soft"
+    return (
+        esc(x.group), value_text(x.factor, x.sigma), sigma_text(x.sigma), fixed(float(np.sqrt(max(x.factor, 0.0))), 3),
+        count(x.n), fixed(x.redundancy, 1), general(x.p, 2), pill(kind, known(x.status)),
+    )  # fmt: skip
+
+
+def reliability(c: Context) -> str:
+    """What a gross error that no test finds could do, worst first, and what is not controlled at all."""
+    if c.statistics is None:
+        return ""
+    r = c.statistics.reliability
+    free = "".join(f"<li>{esc(x)}</li>" for x in r.uncontrolled[:_MOST_WEAK])
+    if len(r.uncontrolled) > _MOST_WEAK:
+        free += f"<li>{t('{n} more in solution.json.', n=count(len(r.uncontrolled) - _MOST_WEAK))}</li>"
+    uncontrolled = f"<h3>{t('Not controlled')}</h3><ul>{free}</ul>" if free else ""
+    rows = [_influence_row(c, x) for x in r.influences[:_MOST_WEAK]]
+    columns = ("<Observation", "MDB [σ]", "λ̄", "<Moves most", "by", "<Unit", "in its σ", "<Position", "by [mm]")
+    o = r.criteria.options
+    method = t("Šidák's family-wise control") if o.method == "sidak" else t("Baarda's B-method")
+    said = t(
+        "External reliability: what the least detectable bias (power {power} %, {method}, level of a single test "
+        "{level}) of an observation would do to the unknowns if it stayed undetected. Worst first.",
+        power=fixed(100 * o.power, 0), method=method, level=general(float(r.criteria.alpha[0]), 2),
+    )  # fmt: skip
+    return section("reliability", "Reliability", uncontrolled + (table(columns, rows) if rows else ""), said)
+
+
+def _influence_row(c: Context, x: Influence) -> tuple[str, ...]:
+    tests = c.statistics.reliability.tests if c.statistics is not None else None
+    row = observation_text(c, x.row)
+    unit, factor = sigma_unit_for_people(x.unit)
+    detectable = float(tests.detectable[x.row]) if tests is not None else float("nan")
+    external = float(tests.external[x.row]) if tests is not None else float("nan")
+    place = name_text(x.position) if x.position else MISSING
+    return (
+        esc(row), fixed(detectable, 1), fixed(external, 2), f"{name_text(x.name)} <code>{esc(x.component)}</code>",
+        general(x.shift * factor, 2), esc(unit), fixed(x.ratio, 2), place,
+        general(1e3 * x.position_shift, 2) if x.position else MISSING,
+    )  # fmt: skip
+
+
+def observation_text(c: Context, row: int) -> str:
+    """An observation by its row in the tests: image points first, then the others."""
+    n_image = len(c.adjustment.image_residuals.test)
+    if row < n_image:
+        block = c.adjustment.survey.image_blocks[int(c.rows.block[row])]
+        return f"{block.camera_id} · {block.epoch_id} · {c.rows.point_ids[c.rows.point[row]]}"
+    o = c.adjustment.other_residuals[row - n_image]
+    return f"{known(o.kind)} {' · '.join(o.ids)}"
+
+
+def relative(c: Context) -> str:
+    """Precision of neighbours relative to each other, least precise first."""
+    if c.statistics is None or not c.statistics.relative:
+        return ""
+    found = sorted(c.statistics.relative, key=lambda r: -float(r.ellipsoid.semi_axes[0]))
+    rows = [_relative_row(r) for r in found[:_MOST_ROWS]]
+    columns = ("<From", "<To", "Distance [mm]", "σ [mm]", "a [mm]", "b [mm]", "c [mm]", "Rotation σ [″]")
+    level = fixed(100 * found[0].ellipsoid.level, 0)
+    said = t(
+        "Relative precision of neighbours, independent of where the datum is: sigma of the distance, semi-axes of the "
+        "relative {level} % ellipsoid, and of stations the largest sigma of their relative rotation.",
+        level=level,
+    )
+    return section("relative", "Relative precision", table(columns, rows), said)
+
+
+def _relative_row(r: RelativePrecision) -> list[str]:
+    axes = [sigma_text(1e3 * float(a)) for a in r.ellipsoid.semi_axes] + [MISSING] * (3 - r.ellipsoid.dimension)
+    turn = MISSING
+    if r.rotation_cov is not None:
+        turn = sigma_text(float(np.degrees(np.sqrt(np.linalg.eigvalsh(r.rotation_cov)[-1]))) * 3600.0)
+    distance, sigma = 1e3 * r.distance, 1e3 * r.sigma_distance
+    return [name_text(r.a), name_text(r.b), value_text(distance, sigma), sigma_text(sigma), *axes, turn]
+
+
+def budget(c: Context) -> str:
+    """Uncertainty budget of the results: standard uncertainty, its sources, expanded uncertainty."""
+    if c.statistics is None or not c.statistics.budget:
+        return ""
+    entries = c.statistics.budget
+    sources = list(dict.fromkeys(line.source for e in entries for line in e.lines))
+    kinds = {line.source: line.kind for e in entries for line in e.lines}
+    rows = [_budget_row(e, sources) for e in entries[:_MOST_ROWS]]
+    heads = [f"{esc(s)} ({kinds[s]}) [%]" for s in sources]
+    columns = ["<Result", "<", "u", "<Unit", *heads, "ν", "k", "U"]
+    left_out = len(entries) - _MOST_ROWS
+    more = " " + t("{n} more in solution.json.", n=count(left_out)) if left_out > 0 else ""
+    said = t(
+        "Standard uncertainty u of every result and the share of each source in its variance (GUM, JCGM 100:2008). "
+        "Type A: from the scatter of this survey's own residuals; type B: given. ν: effective degrees of freedom; "
+        "U = k u is the expanded uncertainty at {level} %.",
+        level=general(100 * entries[0].level),
+    )
+    return section("budget", "Uncertainty budget", table(columns, rows), said + more)
+
+
+def _budget_row(e: BudgetEntry, sources: list[str]) -> list[str]:
+    unit, factor = sigma_unit_for_people(e.unit)
+    share = {line.source: line.share for line in e.lines}
+    shares = [fixed(100 * share[s], 1) if s in share else MISSING for s in sources]
+    freedom = "∞" if not np.isfinite(e.freedom) else fixed(e.freedom, 0)
+    return [
+        name_text(e.name), f"<code>{esc(e.component)}</code>", sigma_text(e.u * factor), esc(unit), *shares, freedom,
+        fixed(e.coverage, 2), sigma_text(e.expanded * factor),
+    ]  # fmt: skip
+
+
+def correlations(c: Context) -> str:
+    """The correlation matrix as a picture, pairs above 95 % and weak directions by name."""
+    if c.statistics is None:
+        return ""
+    s = c.statistics
+    drawn = f"<figure>{heat_map(s.correlations)}</figure>" if s.correlations is not None else ""
+    pairs = "".join(
+        f"<li>{name_text(x.a)} <code>{esc(x.a_component)}</code> {t('with')} {name_text(x.b)} "
+        f"<code>{esc(x.b_component)}</code>: {fixed(100 * x.coefficient, 1)} %</li>"
+        for x in s.correlated[:_MOST_WEAK]
+    )
+    if len(s.correlated) > _MOST_WEAK:
+        pairs += f"<li>{t('{n} more in solution.json.', n=count(len(s.correlated) - _MOST_WEAK))}</li>"
+    strong = f"<h3>{t('Correlated above 95 %')}</h3><ul>{pairs}</ul>" if pairs else ""
+    weak = "".join(f"<li>{esc(x.text())}</li>" for x in s.weak[:10])
+    weakly = f"<h3>{t('Weak directions')}</h3><ul>{weak}</ul>" if weak else ""
+    note = t("Blue: positive, red: negative; white: none. Lines separate the parameters.")
+    return section("correlations", "Correlations", drawn + strong + weakly, note)
+
+
+def heat_map(m: CorrelationMatrix) -> str:
+    """The matrix as cells; labels where there is room for them."""
+    n, left = len(m.labels), 150.0
+    cell = min(18.0, 620.0 / max(n, 1))
+    size = n * cell
+    parts = [d.rect(left, 4, size, size, "#fff", f' stroke="{d.FAINT}"')]
+    # one path per shade keeps a matrix of a hundred rows small
+    shade = np.clip(np.round(20.0 * m.matrix), -20, 20).astype(int)
+    for value in np.unique(shade[shade != 0]).tolist():
+        cells = "".join(
+            f"M{left + j * cell:.1f} {4 + i * cell:.1f}h{cell:.1f}v{cell:.1f}h-{cell:.1f}z"
+            for i, j in np.argwhere(shade == value).tolist()
+        )
+        colour = d.BLUE if value > 0 else d.RED
+        parts.append(f'<path d="{cells}" fill="{colour}" fill-opacity="{abs(value) / 20.0:.2f}"/>')
+    for at in (*m.starts, n):
+        parts.append(d.line(left + at * cell, 4, left + at * cell, 4 + size, d.GREY, 0.6))
+        parts.append(d.line(left, 4 + at * cell, left + size, 4 + at * cell, d.GREY, 0.6))
+    ends = (*m.starts[1:], n)
+    for name, start, end in zip(m.names, m.starts, ends, strict=True):
+        if (end - start) * cell >= 9.0:
+            y = 4 + 0.5 * (start + end) * cell + 3.5
+            parts.append(d.text(left - 6, y, " ".join((known(name[0].replace("_", " ")), *name[1:])), "end", 9.5))
+    return d.svg(left + size + 4, size + 8, parts, t("Correlations"))
+
+
+def normality(c: Context) -> str:
+    """Quantiles of the standardized residuals of every group against those of the normal distribution."""
+    groups: dict[str, list[FloatArray]] = {}
+    found = c.adjustment.image_residuals
+    for i, block in enumerate(c.adjustment.survey.image_blocks):
+        rows = slice(found.block_ptr[i], found.block_ptr[i + 1])
+        groups.setdefault(block.group, []).append(found.standardized[rows][found.used[rows]].ravel())
+    for o in c.adjustment.other_residuals:
+        if o.used:
+            groups.setdefault(o.group, []).append(o.standardized)
+    drawn = []
+    for name, parts in groups.items():
+        w = np.concatenate(parts)
+        w = np.sort(w[np.isfinite(w)])
+        if len(w) >= 8:
+            drawn.append(f"<figure>{quantiles(name, w)}</figure>")
+    note = t(
+        "Standardized residuals of each group in order, against the quantiles that as many normally distributed ones "
+        "would have. The band holds 95 % of such points one by one."
+    )
+    body = f'<div class="figures">{"".join(drawn[:12])}</div>' if drawn else ""
+    return section("normality", "Distribution of residuals", body, note)
+
+
+def quantiles(name: str, w: FloatArray) -> str:
+    """A Q-Q plot of sorted values; the band is that of order statistics (beta distribution)."""
+    from scipy.stats import beta, norm
+
+    n, side, pad = len(w), 240.0, 26.0
+    keep = np.unique(np.concatenate([np.arange(min(n, 40)), np.linspace(0, n - 1, 160).astype(int),
+                                     np.arange(max(0, n - 40), n)]))  # fmt: skip
+    rank = keep + 1.0
+    x = norm.ppf((rank - 0.375) / (n + 0.25))
+    low, high = norm.ppf(beta.ppf([[0.025], [0.975]], rank, n + 1 - rank))
+    reach = max(3.0, float(np.ceil(max(abs(x[0]), min(6.0, float(np.abs(w).max()))))))
+    unit, middle = (side - 2 * pad) / (2 * reach), 0.5 * side
+
+    def at(a: FloatArray, b: FloatArray) -> FloatArray:
+        return np.column_stack([middle + unit * a, middle + 8 - unit * np.clip(b, -reach, reach)])
+
+    band = np.concatenate([at(x, low), at(x, high)[::-1]])
+    parts = [
+        d.text(0, 11, name, colour=d.INK, size=11.5),
+        d.polygon(band, "#e3ebf3", "none"),
+        d.polyline(at(np.array([-reach, reach]), np.array([-reach, reach])), d.GREY, 0.9),
+    ]
+    parts += [d.dot(a, b, 1.7, d.BLUE) for a, b in at(x, w[keep])]
+    for tick in range(-int(reach) + 1, int(reach), 2 if reach > 4 else 1):
+        parts.append(d.text(middle + unit * tick, side - 4, f"{tick}".replace("-", "−"), "middle", 9))
+        parts.append(d.text(4, middle + 11 - unit * tick, f"{tick}".replace("-", "−"), "start", 9))
+    return d.svg(side, side, parts, t("Quantiles of group {name}", name=name))
