@@ -14,6 +14,7 @@ LIMIT = float(chi2_distribution.isf(1e-9, 6))
 _MOST_SPLITS = 40
 _CAPPED = 100.0  # a view counts at most so many times the limit's share in comparing explanations
 _LEAST = 2  # views of a second place
+_VAGUE = 10.0  # a lens that is not yet well known gives no larger scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,7 @@ def find_places(views: TableViews) -> Places | None:
     one = fit_table(views, views.outer)
     if one is None:
         return None
-    if not len(outlying(one)) and one.scale < 4.0:
+    if not len(outlying(one)) and one.scale < _VAGUE:
         return Places(views.outer, one)
     trials = [p for o in range(len(views.outer_ids)) for p in _splits(views, o)]
     fits = [(p, f) for p in trials if (f := fit_table(views, p, None, 6)) is not None]
