@@ -64,12 +64,14 @@ def discover() -> tuple[CameraInfo, ...]:
 def camera(place: str, source: ImageSource | None = None, faults: Sequence[Fault] = ()) -> "SimulatedCamera":
     """The camera of that name, not opened."""
     name, _, query = place.partition("?")
-    return SimulatedCamera(name, source, (*faults, *_faults(query)))
+    told = ",".join(parse_qs(query).get("faults", ()))
+    return SimulatedCamera(name, source, (*faults, *parsed_faults(told)))
 
 
-def _faults(query: str) -> list[Fault]:
+def parsed_faults(text: str) -> list[Fault]:
+    """Faults from ``timeout@5,incomplete@9``. Raises SurveyError for another form."""
     faults = []
-    for item in ",".join(parse_qs(query).get("faults", ())).split(","):
+    for item in text.split(","):
         kind, at, number = item.partition("@")
         if item and (kind not in get_args(FaultKind) or not at or not number.isdigit()):
             kinds = ", ".join(get_args(FaultKind))
@@ -82,8 +84,10 @@ def _faults(query: str) -> list[Fault]:
 class SimulatedCamera(DriverCamera):
     """See the module."""
 
-    def __init__(self, name: str, source: ImageSource | None = None, faults: Sequence[Fault] = ()) -> None:
-        super().__init__("simulated", name)
+    def __init__(
+        self, name: str, source: ImageSource | None = None, faults: Sequence[Fault] = (), driver: str = "simulated"
+    ) -> None:
+        super().__init__(driver, name)
         self._source = source or self._gradient
         self._faults = {fault.at: fault.kind for fault in faults}
         self._features: dict[str, FeatureValue] = {

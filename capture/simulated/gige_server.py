@@ -1,0 +1,159 @@
+"""A camera of the simulated laboratory as a GigE Vision camera, in a process of its own.
+
+``python -m capture.simulated.gige_server FOLDER/X`` serves camera X of the laboratory in FOLDER on 127.0.0.1; a client
+reaches it as ``gige:127.0.0.1``. ``GigeServer`` starts and ends such a process.
+"""
+
+import argparse
+import logging
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from adjust.errors import SurveyError
+from capture.simulated.angles import AnglesFile
+from capture.simulated.aravis import AravisCamera
+from capture.simulated.folder import ANGLES, read_lab
+from capture.simulated.laboratory import ROOM_EXPOSURE_US, SimulatedLab
+from survey.rendering import GrayImage
+
+_READY = "ready"
+_START_S = 60.0  # the renderer may have to be compiled
+_LOOK_S = 0.02
+GRADIENT = "gradient"
+
+
+class GigeServer:
+    """The process: ``with GigeServer(folder / "X"): ...``; on entry it waits until the camera answers.
+
+    camera: FOLDER/CAMERA of a laboratory, or ``gradient`` for a test picture with the image's number in its first
+    four pixels. Raises SurveyError where it cannot start.
+    """
+
+    def __init__(
+        self,
+        camera: Path | str,
+        interface: str = "127.0.0.1",
+        serial: str = "LAB-1",
+        lost_ratio: float = 0.0,
+        angles: Path | None = None,
+    ) -> None:
+        self._command = [sys.executable, "-m", "capture.simulated.gige_server", str(camera)]
+        self._command += ["--interface", interface, "--serial", serial, "--lost-ratio", str(lost_ratio)]
+        self._command += ["--angles", str(angles)] if angles is not None else []
+        self.process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> Self:
+        process = subprocess.Popen(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.process = process
+        alarm = threading.Timer(_START_S, process.kill)
+        alarm.start()
+        try:
+            line = process.stdout.readline() if process.stdout else ""
+        finally:
+            alarm.cancel()
+        if line.strip() != _READY:
+            self.end()
+            raise SurveyError(f"simulated camera: {' '.join(self._command)} did not start; run it by hand to see why")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end()
+
+    def kill(self) -> None:
+        """As if its plug were pulled."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+
+    def end(self) -> None:
+        """End the process; may be called twice."""
+        if self.process is None:
+            return
+        self.process.kill()
+        self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe is not None:
+                pipe.close()
+        self.process = None
+
+
+class _Follower:
+    """Renders ahead: as soon as the table stands still, the image without noise is made and kept."""
+
+    def __init__(self, lab: SimulatedLab, camera_id: str, angles: AnglesFile) -> None:
+        self._lab, self._camera_id, self._angles = lab, camera_id, angles
+        self._lock = threading.Lock()
+
+    def __call__(self, exposure_us: float, gain_db: float) -> GrayImage:
+        with self._lock:
+            return self._lab.image(self._camera_id, self._angles(), exposure_us, gain_db)
+
+    def follow(self) -> None:
+        before = None
+        while True:
+            try:
+                now = self._angles()
+            except SurveyError:
+                now = None
+            if now is not None and now == before:
+                self(ROOM_EXPOSURE_US, 0.0)
+            before = now
+            threading.Event().wait(_LOOK_S)
+
+
+def _gradient() -> Callable[[float, float], GrayImage]:
+    numbers = iter(range(1, 2**32))
+    rows, columns = np.arange(2048) // 8, np.arange(2048) // 8
+    base = np.asarray((rows[:, None] + columns[None, :]) % 256, np.uint8)
+
+    def image(exposure_us: float, gain_db: float) -> GrayImage:
+        base[0, :4] = np.frombuffer(next(numbers).to_bytes(4, "big"), np.uint8)
+        return base
+
+    return image
+
+
+def main() -> None:
+    """Serve until the standard input ends."""
+    parser = argparse.ArgumentParser(description="A camera of the simulated laboratory, by GigE Vision.")
+    parser.add_argument("camera", help="FOLDER/CAMERA, or gradient")
+    parser.add_argument("--interface", default="127.0.0.1")
+    parser.add_argument("--serial", default="LAB-1")
+    parser.add_argument("--lost-ratio", type=float, default=0.0)
+    parser.add_argument("--angles", type=Path, help="by default FOLDER/angles.json")
+    options = parser.parse_args()
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    try:
+        source = _gradient() if options.camera == GRADIENT else _lab_source(Path(options.camera), options.angles)
+        camera = AravisCamera(source, options.interface, options.serial, options.lost_ratio, _complain)
+    except SurveyError as error:
+        sys.exit(str(error))
+    sys.stdout.write(_READY + "\n")
+    sys.stdout.flush()
+    sys.stdin.read()
+    del camera
+
+
+def _lab_source(camera: Path, angles: Path | None) -> _Follower:
+    lab = read_lab(camera.parent)
+    source = _Follower(lab, camera.name, AnglesFile(angles or camera.parent / ANGLES))
+    source(ROOM_EXPOSURE_US, 0.0)  # compiled before anyone waits for it
+    threading.Thread(target=source.follow, daemon=True).start()
+    return source
+
+
+def _complain(error: Exception) -> None:
+    logging.getLogger(__name__).error("no image: %s", error)
+
+
+if __name__ == "__main__":
+    main()
