@@ -18,7 +18,7 @@ _ESSENTIAL = {
     "brown_backward_dbat": ("c", "px", "py"),
     "aicon": ("ck",),
 }
-_KEYS = ("model", "free", "values", "prior", "prior_covariance", "tie", "pixel_size_mm")
+_KEYS = ("model", "free", "values", "prior", "prior_covariance", "tie", "pixel_size_mm", "balance_radius_mm")
 
 
 def read_lens(node: Node) -> LensParameter:
@@ -32,7 +32,14 @@ def read_lens(node: Node) -> LensParameter:
     pixel_size_mm = node.number("pixel_size_mm", positive=True) if node.has("pixel_size_mm") else None
     if MODELS[model].in_mm and pixel_size_mm is None:
         raise node.error(f"pixel_size_mm is missing; the model {model} is in millimetres", "pixel_size_mm")
-    return LensParameter(model, free, values, _prior(node, names, free), ties, pixel_size_mm)
+    return LensParameter(model, free, values, _prior(node, names, free), ties, pixel_size_mm, _balance(node, model))
+
+
+def _balance(node: Node, model: str) -> float:
+    """The radius where AICON's radial distortion is zero, mm."""
+    if node.has("balance_radius_mm") and model != "aicon":
+        raise node.error('only the model "aicon" has a balance radius; remove it', "balance_radius_mm")
+    return node.number("balance_radius_mm", 0.0)
 
 
 def _known(node: Node, names: tuple[str, ...]) -> None:
@@ -119,4 +126,6 @@ def lens_to_toml(lens: LensParameter) -> dict[str, Any]:
         table["tie"] = {tie.name: {"to": tie.to, "factor": tie.factor} for tie in lens.ties}
     if lens.pixel_size_mm is not None:
         table["pixel_size_mm"] = lens.pixel_size_mm
+    if lens.balance_radius_mm:
+        table["balance_radius_mm"] = lens.balance_radius_mm
     return table
