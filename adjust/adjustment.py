@@ -14,6 +14,7 @@ from adjust.precision import Precision, global_test, group_summaries, image_resi
 from adjust.result import Adjustment, Estimate, ParameterName
 from adjust.robust import limit, screen
 from adjust.solve import Solved, SolveOptions, solve
+from adjust.terrestrial.statistics import JoinedResiduals, reading_residuals
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
 
 
@@ -124,7 +125,11 @@ def assemble(
     precision = precision or Precision(graph, solved)
     images = image_residuals(precision)
     others = other_residuals(precision)
-    groups = group_summaries(graph, images, others)
+    readings = None
+    if graph.terrestrial is not None:
+        readings = reading_residuals(graph.terrestrial, precision.tree, solved.values)
+    every = others if readings is None else JoinedResiduals(others, graph.survey, readings)
+    groups = group_summaries(graph, images, others, readings)
     n_observations = sum(g.n_observations for g in groups)
     n_unknowns = graph.unknowns.n_unknowns
     defect = solved.datum.defect if solved.datum else 0
@@ -132,9 +137,9 @@ def assemble(
     omega = sum(g.omega for g in groups)
     test = global_test(omega, redundancy, options.alpha)
     result = Adjustment(
-        graph.survey, estimates(precision), images, others, groups, n_observations, n_unknowns, defect, redundancy,
+        graph.survey, estimates(precision), images, every, groups, n_observations, n_unknowns, defect, redundancy,
         omega, float(np.sqrt(omega / redundancy)) if redundancy > 0 else float("nan"), test, solved.iterations,
-        solved.max_step, True, (), precision,
+        solved.max_step, True, (), precision, readings,
     )  # fmt: skip
     return replace(result, warnings=warnings(graph, result) + notes)
 
@@ -175,7 +180,7 @@ def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
 def warnings(graph: AdjustmentGraph, result: Adjustment) -> tuple[str, ...]:
     """What its owner should know first."""
     out = []
-    total = float(result.image_residuals.redundancy.sum() + sum(o.redundancy.sum() for o in result.other_residuals))
+    total = float(sum(g.redundancy for g in result.groups))
     if abs(total - result.redundancy) > 1e-4 * max(1.0, result.redundancy):
         out.append(
             f"the redundancy numbers add up to {total:.4f} instead of {result.redundancy}: the survey is so weak that "

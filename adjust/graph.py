@@ -154,6 +154,7 @@ class GraphBuilder:
         readings = build_batch(self.survey, self.unknowns, self.terrestrial, self.frames, state, at)
         if readings is not None:
             readings.orient(values, {name[1] for name in start.vectors if name[0] == "orientation"})
+            readings.update_sigmas(values)
         survey = geometry.find_starts(state, at, values, start.vectors)
         self._other_factors(state, at, pair_chains)
         self.others += geometry.factors(state, at, values)

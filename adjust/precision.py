@@ -16,7 +16,14 @@ from adjust.datum import gauge, stacking
 from adjust.graph import AdjustmentGraph
 from adjust.model import BoolArray, FloatArray
 from adjust.observation_factor import ObservationFactor
-from adjust.result import GlobalTest, GroupSummary, ImageResiduals, ObservationResidual, ParameterName
+from adjust.result import (
+    GlobalTest,
+    GroupSummary,
+    ImageResiduals,
+    ObservationResidual,
+    ParameterName,
+    ReadingResiduals,
+)
 from adjust.solve import Solved
 from adjust.tree_covariance import TreeCovariance
 
@@ -156,7 +163,7 @@ def _merge(graph: AdjustmentGraph, parts: list[tuple[Any, ...]]) -> ImageResidua
 
 
 def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
-    """The same for every observation that is not an image point."""
+    """The same for every observation that is neither an image point nor a reading."""
     out = []
     for item in precision.graph.others:
         e, M, root = precision.influence(item)
@@ -186,7 +193,10 @@ def adjusted_motion(observed: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def group_summaries(
-    graph: AdjustmentGraph, images: ImageResiduals, others: Sequence[ObservationResidual]
+    graph: AdjustmentGraph,
+    images: ImageResiduals,
+    others: Sequence[ObservationResidual],
+    readings: ReadingResiduals | None = None,
 ) -> tuple[GroupSummary, ...]:
     """Observations, redundancy and weighted square sum of every group, in order of appearance."""
     sums: dict[str, list[float]] = {}
@@ -205,6 +215,14 @@ def group_summaries(
         if item.used:
             e = noise_of(factor).whiten(item.residual)
             add(item.group, len(item.residual), float(item.redundancy.sum()), float(e @ e))
+    if readings is not None:
+        of_group: dict[str, list[int]] = {}
+        for i, reading in enumerate(graph.survey.readings):
+            of_group.setdefault(reading.group, []).append(i)
+        for group, mine in of_group.items():
+            taken = np.array(mine)[readings.used[mine]]
+            squares = float(readings.weighted_square[taken].sum())
+            add(group, len(taken), float(readings.redundancy[taken].sum()), squares)
     return tuple(GroupSummary(g, int(n), r, omega) for g, (n, r, omega) in sums.items())
 
 

@@ -1,6 +1,6 @@
 """What an adjustment gives back. Every estimated quantity is one ``Estimate`` under its ``ParameterName``."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,6 +48,27 @@ class ImageResiduals:
     redundancy: FloatArray
     standardized: FloatArray
     test: FloatArray
+    used: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingResiduals:
+    """Residuals of all readings (N,), in the order of ``Survey.readings``; rad or m.
+
+    sigma: a priori, with the target's centring. residual: adjusted minus observed. residual_sigma: of the residual.
+    redundancy: diag(Q_vv P). test: w^2 with w = (P v)_i / sqrt((P Q_vv P)_ii), chi-square with one degree of freedom,
+    the square of ``standardized`` but for readings with a joint covariance. weighted_square: shares of v'Pv.
+    """
+
+    observed: FloatArray
+    adjusted: FloatArray
+    residual: FloatArray
+    sigma: FloatArray
+    residual_sigma: FloatArray
+    redundancy: FloatArray
+    standardized: FloatArray
+    test: FloatArray
+    weighted_square: FloatArray
     used: BoolArray
 
 
@@ -111,13 +132,14 @@ class Adjustment:
 
     sigma0: a posteriori standard deviation of unit weight (a priori is 1). omega: v'Pv. iterations: steps taken.
     max_step: the last step in sigmas of the unknowns. warnings: for people, worst first.
+    other_residuals: of all that are not image points, the readings last, also as arrays in ``reading_residuals``.
     precision: gives joint covariances, ``precision.joint([name, ...])``.
     """
 
     survey: Survey
     estimates: Mapping[ParameterName, Estimate]
     image_residuals: ImageResiduals
-    other_residuals: tuple[ObservationResidual, ...]
+    other_residuals: Sequence[ObservationResidual]
     groups: tuple[GroupSummary, ...]
     n_observations: int
     n_unknowns: int
@@ -131,3 +153,4 @@ class Adjustment:
     converged: bool
     warnings: tuple[str, ...]
     precision: Any = None
+    reading_residuals: ReadingResiduals | None = None

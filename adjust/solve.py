@@ -15,6 +15,9 @@ from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.graph import AdjustmentGraph
 from adjust.rank import describe_null_space, unobserved_unknowns
 
+_SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
+"""Sigmas that depend on distances (target centring) follow the solution until they change by no more than this."""
+
 Progress = Callable[[int, float], None]
 
 
@@ -174,4 +177,10 @@ def solve(graph: AdjustmentGraph, options: SolveOptions = SolveOptions(), progre
         raise IndeterminateError(
             "nothing observes " + ", ".join(nothing) + "; leave them out or hold them", tuple(nothing)
         )
-    return _Loop(graph, options, progress).run()
+    found = _Loop(graph, options, progress).run()
+    for _ in range(_SIGMA_ROUNDS):
+        if graph.terrestrial is None or graph.terrestrial.update_sigmas(found.values) < _SIGMA_CHANGE:
+            break
+        graph.start = found.values
+        found = _Loop(graph, options, progress).run()
+    return found

@@ -60,6 +60,10 @@ class TreeCovariance:
                            self._cov, out)  # fmt: skip
         return out if found else None
 
+    def arrays(self) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray, IntArray, IntArray, FloatArray]:
+        """What :func:`adjust.tree_kernels.fill_block` needs beside the numbers of two keys, in its order."""
+        return (self._home, self._key_ptr, self._keys, self._dims, self._front, self._width, self._at, self._cov)
+
     def marginal(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
         block = self._block(self.number[key], self.number[key])

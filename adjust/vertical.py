@@ -24,6 +24,12 @@ VERTICAL = ("vertical",)
 
 
 @njit(cache=True, nogil=True)
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The vector a x b."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@njit(cache=True, nogil=True)
 def horizon_at(
     x: FloatArray, up: FloatArray, zero: FloatArray, turns: FloatArray, radius: float, axes: FloatArray,
     by_x: FloatArray, by_tilt: FloatArray,
@@ -52,7 +58,7 @@ def horizon_at(
     h0 = zero - dot * v
     n = np.sqrt(h0[0] * h0[0] + h0[1] * h0[1] + h0[2] * h0[2])
     h0 /= n
-    h1 = np.array([v[1] * h0[2] - v[2] * h0[1], v[2] * h0[0] - v[0] * h0[2], v[0] * h0[1] - v[1] * h0[0]])
+    h1 = cross(v, h0)
     axes[0], axes[1], axes[2] = h0, h1, v
     # a change dv of the plumb line and dz of the zero axis turn the axes by v x dv + v (h1.dz - (zero.v) h1.dv) / n
     if radius > 0.0:
@@ -60,22 +66,17 @@ def horizon_at(
             dv = -v[j] * v / length
             dv[j] += 1.0 / length
             twist = -dot * (h1[0] * dv[0] + h1[1] * dv[1] + h1[2] * dv[2]) / n
-            by_x[0, j] = v[1] * dv[2] - v[2] * dv[1] + twist * v[0]
-            by_x[1, j] = v[2] * dv[0] - v[0] * dv[2] + twist * v[1]
-            by_x[2, j] = v[0] * dv[1] - v[1] * dv[0] + twist * v[2]
+            by_x[:, j] = cross(v, dv) + twist * v
     for j in range(2):
         w = turns[:, j]
-        dz = np.array([w[1] * zero[2] - w[2] * zero[1], w[2] * zero[0] - w[0] * zero[2], w[0] * zero[1] - w[1] * zero[0]])
-        dv = np.array([w[1] * up[2] - w[2] * up[1], w[2] * up[0] - w[0] * up[2], w[0] * up[1] - w[1] * up[0]])
+        dz, dv = cross(w, zero), cross(w, up)
         if radius > 0.0:
             dv *= radius / length
             dv -= (v[0] * dv[0] + v[1] * dv[1] + v[2] * dv[2]) * v
         twist = (
             h1[0] * dz[0] + h1[1] * dz[1] + h1[2] * dz[2] - dot * (h1[0] * dv[0] + h1[1] * dv[1] + h1[2] * dv[2])
         ) / n
-        by_tilt[0, j] = v[1] * dv[2] - v[2] * dv[1] + twist * v[0]
-        by_tilt[1, j] = v[2] * dv[0] - v[0] * dv[2] + twist * v[1]
-        by_tilt[2, j] = v[0] * dv[1] - v[1] * dv[0] + twist * v[2]
+        by_tilt[:, j] = cross(v, dv) + twist * v
     return height
 
 

@@ -10,7 +10,7 @@ from adjust.errors import SurveyError
 from adjust.factors import Jacobians
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.terrestrial import kernels as k
-from adjust.terrestrial.layout import Chunk, Layout
+from adjust.terrestrial.layout import Chunk, Layout, ReadingArrays
 from adjust.terrestrial.parameters import TerrestrialParameters
 from adjust.unknowns import VectorMap
 from adjust.vertical import Plumb
@@ -56,7 +56,7 @@ class TerrestrialBatch:
                 self.X[i] = position.x_in_frame
         self._point_keys = [(i, p.point_key) for i, p in enumerate(layout.positions) if p.point_key is not None]
         self._chained = [i for i, p in enumerate(layout.positions) if p.point_key is None and p.chain is not None]
-        self._correlated = [c for c, chunk in enumerate(layout.chunks) if chunk.whitener is not None]
+        self.correlated = [c for c, chunk in enumerate(layout.chunks) if chunk.whitener is not None]
         self._views = [_blocks(chunk, self.J) for chunk in layout.chunks]
         self._prepared: gtsam.Values | None = None
         self._with_jacobians = False
@@ -139,7 +139,7 @@ class TerrestrialBatch:
     def _whiten(self, root: FloatArray) -> float:
         """Whitened residuals e (N,), of correlated readings jointly, times ``root``; returns their square sum."""
         self.e = self.residual / self.sigma
-        for c in self._correlated:
+        for c in self.correlated:
             chunk = self.layout.chunks[c]
             self.e[chunk.rows] = self._whitener(chunk) @ self.residual[chunk.rows]
         self.e *= root
@@ -157,12 +157,12 @@ class TerrestrialBatch:
         layout = self.layout
         self.J[:] = 0.0
         scale = root / self.sigma
-        for c in self._correlated:
+        for c in self.correlated:
             scale[layout.chunks[c].rows] = 1.0
         k.scatter(layout.goal, layout.row, layout.column, layout.factor, scale, self.A, self.J)
         for c in layout.chain_rows:
             self._chain_blocks(c, scale)
-        for c in self._correlated:
+        for c in self.correlated:
             self._decorrelate(c, root)
 
     def _chain_blocks(self, c: int, scale: FloatArray) -> None:
@@ -178,12 +178,36 @@ class TerrestrialBatch:
         for block in self._views[c]:
             block[:] = W @ block
 
+    def unweighted(self, values: gtsam.Values) -> FloatArray:
+        """Whitened residuals (N,) of all readings at ``values``, whatever their weight; J holds rows to match."""
+        self.evaluate(values)
+        self._prepared = None
+        root = np.ones(len(self.weights))
+        self._whiten(root)
+        self._serve(root)
+        return self.e
+
+    def jacobian(self, c: int) -> FloatArray:
+        """Whitened Jacobian (m, n) of chunk ``c`` as last served, keys in the chunk's order."""
+        return np.hstack(self._views[c])
+
+    def update_sigmas(self, values: gtsam.Values) -> float:
+        """Sigmas with the target's centring at these distances; returns the largest relative change."""
+        if not self.layout.arrays.target_centring.any():
+            return 0.0
+        self.evaluate(values)
+        self._prepared = None
+        joint = [r for c in self.correlated for r in self.layout.chunks[c].rows]
+        before, self.sigma = self.sigma, sigmas(self.layout.arrays, self.axes, self.A)
+        self.sigma[joint] = before[joint]
+        return float(np.max(np.abs(self.sigma / before - 1.0)))
+
     # -- GTSAM -------------------------------------------------------------------------------------------------------
 
     def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
         """One factor per chunk of which anything is used."""
         used = self.layout.arrays.used
-        noise = {}
+        noise: dict[int, gtsam.noiseModel.Base] = {}
         for c, chunk in enumerate(self.layout.chunks):
             m = len(chunk.rows)
             if used[chunk.rows].any():
@@ -230,17 +254,30 @@ class TerrestrialBatch:
             self.e[rows] = root[rows] * (chunk.whitener @ out)
             self._decorrelate(c, root)
 
-    def orient(self, values: gtsam.Values, known: set[str]) -> gtsam.Values:
-        """Values with the orientations not ``known`` set to what their directions say at the other values."""
+    def orient(self, values: gtsam.Values, known: set[str]) -> None:
+        """Set the orientations not ``known`` (setups) to what their directions say at the other ``values``."""
         self.evaluate(values)
         self._prepared = None
-        a, out = self.layout.arrays, gtsam.Values(values)
+        a = self.layout.arrays
         for i, (setup_id, vector) in enumerate(self.parameters.orientations.items()):
             rows = np.flatnonzero((a.orientation == i) & (a.kind == k.DIRECTION))
             if setup_id not in known and vector.key is not None:
                 turn = self.residual[rows]
-                out.update(vector.key, self.orientation[i : i + 1] + _circular_median(turn[np.isfinite(turn)]))
-        return out
+                values.update(vector.key, self.orientation[i : i + 1] + _circular_median(turn[np.isfinite(turn)]))
+
+
+def sigmas(a: ReadingArrays, axes: FloatArray, A: FloatArray) -> FloatArray:
+    """Sigmas (N,) of readings with targets off by ``target_centring`` in any horizontal direction.
+
+    A (N, 22): their derivatives; those by the targets' horizontal movements carry the error over.
+    """
+    variance = a.sigma**2
+    for column, target in ((k.TO, a.to), (k.SECOND, a.second)):
+        rows = np.flatnonzero((target >= 0) & (a.target_centring > 0.0) & (a.kind != k.HEIGHT))
+        horizontal = axes[target[rows], :2]
+        by_target = np.einsum("nij,nj->ni", horizontal, A[rows, column : column + 3])
+        variance[rows] += a.target_centring[rows] ** 2 * (by_target**2).sum(axis=1)
+    return np.sqrt(variance)
 
 
 def _circular_median(angles: FloatArray) -> float:

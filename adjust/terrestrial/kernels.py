@@ -23,7 +23,7 @@ N_COLUMNS = 22
 
 @njit(cache=True, nogil=True)
 def cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """a x b."""
+    """Put a x b into ``out``."""
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]
@@ -31,7 +31,7 @@ def cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 @njit(cache=True, nogil=True)
 def add_transposed(J: FloatArray, w: FloatArray, out: FloatArray) -> None:
-    """out += J' w."""
+    """Add J' w to ``out``."""
     for j in range(J.shape[1]):
         out[j] += J[0, j] * w[0] + J[1, j] * w[1] + J[2, j] * w[2]
 
@@ -42,27 +42,27 @@ def shape(kind: int, sign: float, q: FloatArray, g: FloatArray) -> float:
     h2 = q[0] * q[0] + q[1] * q[1]
     h = np.sqrt(h2)
     g[:] = 0.0
-    if kind == DIRECTION or kind == ANGLE or kind == AZIMUTH:
+    if kind in (DIRECTION, ANGLE, AZIMUTH):
         if h2 == 0.0:
             return np.nan
         g[0], g[1] = -sign * q[1] / h2, sign * q[0] / h2
-        return sign * np.arctan2(q[1], q[0])
+        return float(sign * np.arctan2(q[1], q[0]))
     s2 = h2 + q[2] * q[2]
     if kind == ZENITH:
         if h2 == 0.0:
             return np.nan
         g[0], g[1], g[2] = q[0] * q[2] / (h * s2), q[1] * q[2] / (h * s2), -h / s2
-        return np.arctan2(h, q[2])
+        return float(np.arctan2(h, q[2]))
     if kind == SLOPE:
         s = np.sqrt(s2)
         if s == 0.0:
             return np.nan
         g[:] = q / s
-        return s
+        return float(s)
     if h2 == 0.0:
         return np.nan
     g[0], g[1] = q[0] / h, q[1] / h
-    return h
+    return float(h)
 
 
 @njit(cache=True, nogil=True)
@@ -190,7 +190,7 @@ def wrapped(kind: IntArray, predicted: FloatArray, observed: FloatArray, out: Fl
     """Predicted minus observed; those of horizontal angles to (-pi, pi]."""
     for r in range(len(kind)):
         v = predicted[r] - observed[r]
-        if kind[r] == DIRECTION or kind[r] == ANGLE or kind[r] == AZIMUTH:
+        if kind[r] in (DIRECTION, ANGLE, AZIMUTH):
             v -= 2.0 * np.pi * np.ceil((v - np.pi) / (2.0 * np.pi))
         out[r] = v
 
@@ -200,7 +200,7 @@ def scatter(
     goal: IntArray, row: IntArray, column: IntArray, factor: FloatArray, root: FloatArray, A: FloatArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
-    """out[goal] += root[row] A[row, column] factor, entry by entry."""
+    """Add to out[goal]: root[row] A[row, column] factor, entry by entry."""
     for e in range(len(goal)):
         out[goal[e]] += root[row[e]] * A[row[e], column[e]] * factor[e]
 

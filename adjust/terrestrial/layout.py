@@ -12,7 +12,7 @@ from scipy.linalg import solve_triangular
 
 from adjust.errors import SurveyError
 from adjust.factors import ChainPose, Position
-from adjust.model import BoolArray, FloatArray, IntArray, Survey
+from adjust.model import BoolArray, FloatArray, IntArray, Setup, Survey
 from adjust.observations import PositionRef, Reading
 from adjust.terrestrial import kernels as k
 from adjust.terrestrial.parameters import TerrestrialParameters, check_reading
@@ -93,8 +93,8 @@ class Layout:
 
 
 def reading_arrays(
-    survey: Survey, parameters: TerrestrialParameters, index: Mapping[PositionRef, int], bodies: Mapping[PositionRef, int],
-    flat: Mapping[PositionRef, bool],
+    survey: Survey, parameters: TerrestrialParameters, index: Mapping[PositionRef, int],
+    bodies: Mapping[PositionRef, int], flat: Mapping[PositionRef, int],
 ) -> ReadingArrays:  # fmt: skip
     """The readings as arrays. Raises SurveyError for those that cannot be."""
     readings: Sequence[Reading] = survey.readings
@@ -106,15 +106,20 @@ def reading_arrays(
     rows, heights = np.zeros((len(readings), 8), dtype=np.int64), np.zeros((len(readings), 3))
     numbers, used = np.zeros((len(readings), 3)), np.zeros(len(readings), dtype=np.bool_)
     for n, r in enumerate(readings):
-        o, c, i, setup = setups[r.setup_id] if r.setup_id else (-1, -1, 0, None)
+        own: tuple[int, int, int, Setup | None] = setups[r.setup_id] if r.setup_id else (-1, -1, 0, None)
+        setup = own[3]
         check_reading(r, setup, flat)
         body = bodies[r.at] if setup is not None and not setup.levelled else -1
-        second = index[r.second] if r.second is not None else -1
-        rows[n] = KINDS[r.kind], index[r.at], index[r.to], second, o, c, i, body
+        right = index[r.second] if r.second is not None else -1
+        rows[n] = KINDS[r.kind], index[r.at], index[r.to], right, *own[:3], body
         heights[n] = r.instrument_height, r.target_height, r.second_height
         numbers[n] = r.value, r.sigma, r.target_centring_sigma
         used[n] = r.used
-    return ReadingArrays(*(rows[:, i].copy() for i in range(8)), heights, *(numbers[:, i].copy() for i in range(3)), used)
+    kind, at, to, second, turn, offset, instruments, body_of = rows.T.copy()
+    observed, sigma, plumbing = numbers.T.copy()
+    return ReadingArrays(
+        kind, at, to, second, turn, offset, instruments, body_of, heights, observed, sigma, plumbing, used
+    )
 
 
 @dataclass(eq=False)
@@ -141,7 +146,8 @@ class LayoutBuilder:
 
     def build(self) -> Layout:
         """The layout."""
-        chunks, counts = [], [(0, 0)]
+        chunks: list[Chunk] = []
+        counts = [(0, 0)]
         for rows, whitener in self._groups():
             chunks.append(self._chunk(len(chunks), rows, whitener))
             counts.append((len(self.blocks), len(self.singles)))

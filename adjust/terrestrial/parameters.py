@@ -105,7 +105,7 @@ def _centring(setup: Setup, unknowns: Unknowns, out: TerrestrialParameters) -> N
     out.priors[name] = prior
 
 
-def full_start(parameters: TerrestrialParameters, name: ParameterName, survey: Survey) -> FloatArray:
+def full_start(name: ParameterName, survey: Survey) -> FloatArray:
     """The values (n,) that a vector has before anything is adjusted."""
     if name[0] == "instrument":
         return np.asarray(next(i for i in survey.instruments if i.instrument_id == name[1]).parameters.values)
@@ -114,8 +114,8 @@ def full_start(parameters: TerrestrialParameters, name: ParameterName, survey: S
     return np.zeros(3 if name[0] == "centring" else 1)
 
 
-def check_reading(reading: Reading, setup: Setup | None, flat: Mapping[PositionRef, bool]) -> None:
-    """Raises SurveyError for a reading that cannot be what it says. flat: positions whose height is held alone."""
+def check_reading(reading: Reading, setup: Setup | None, flat: Mapping[PositionRef, int]) -> None:
+    """Raises SurveyError for a reading that cannot be what it says. flat: 0 free height, 1 all held, 2 height held."""
     where = f"reading {reading.reading_id!r} ({reading.kind})"
     if not np.isfinite(reading.value) or not reading.sigma > 0.0 or not np.isfinite(reading.sigma):
         raise SurveyError(f"{where}: value {reading.value}, sigma {reading.sigma}; give a number and a positive sigma")
@@ -124,7 +124,7 @@ def check_reading(reading: Reading, setup: Setup | None, flat: Mapping[PositionR
         raise SurveyError(f"{where}: {what}")
     if reading.at in (reading.to, reading.second) or reading.to == reading.second:
         raise SurveyError(f"{where}: two of its positions are the same; correct the ids")
-    if reading.kind in HEIGHTS and flat[reading.at] and flat[reading.to]:
+    if reading.kind in HEIGHTS and flat[reading.at] * flat[reading.to] > 1:
         raise SurveyError(
             f"{where}: the heights of both its points are held, as in a plane network, where it says nothing: free "
             "their z, or leave it out (a slope distance becomes a horizontal_distance)"
