@@ -125,8 +125,8 @@ def _owners(survey: Survey, candidates: Sequence[Candidate], design: DesignMatri
             out.append(readings.get(others[rows.number].ids))
         elif rows.kind == "prior":
             out.append(points.get(others[rows.number].ids))
-        else:
-            out.append(ordered[rows.kind][rows.number - first[rows.kind]])
+        else:  # kinds that no candidate brings are of the design
+            out.append(ordered[rows.kind][rows.number - first[rows.kind]] if rows.kind in ordered else None)
     return out
 
 
