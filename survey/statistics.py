@@ -13,6 +13,7 @@ from adjust.statistics.result import (
     VarianceComponents,
     WeakDirection,
 )
+from survey.tolerances import Verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,8 @@ class Statistics:
     """Tests and reliability, variance components where they were asked for, and what else a report shows.
 
     correlated: pairs of components above 95 %. weak: directions that the survey determines badly. relative: between
-    neighbouring points and stations. budget: of points, stations and lenses. rejected: the log of the outlier search.
+    neighbouring points and stations. budget: of points, stations and lenses. decisions: the log of the outlier search.
+    verdicts: on the tolerances of the project.
     """
 
     reliability: Reliability
@@ -41,3 +43,4 @@ class Statistics:
     budget: tuple[BudgetEntry, ...]
     correlations: CorrelationMatrix | None
     decisions: tuple[Decision, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()

@@ -149,7 +149,7 @@
       const right = -sa * d[0] + ca * d[1];
       const up = -se * (ca * d[0] + sa * d[1]) + ce * d[2];
       const near = ce * (ca * d[0] + sa * d[1]) + se * d[2];
-      const scale = ((zoom * Math.min(view.width, view.height) * 0.52) / reach) * (2.4 * reach) / Math.max(2.4 * reach - near, 0.3 * reach);
+      const scale = ((zoom * Math.min(view.width, view.height) * 0.8) / reach) * (2.4 * reach) / Math.max(2.4 * reach - near, 0.3 * reach);
       return [view.width / 2 + scale * right, view.height / 2 - scale * up];
     };
     const path = (points, colour, width, alpha = 1) => {
