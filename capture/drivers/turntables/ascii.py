@@ -7,9 +7,9 @@ import contextlib
 import re
 import time
 from collections.abc import Sequence
-from typing import Any
 
 from capture.drivers.turntables.dialect import Command, Dialect
+from capture.drivers.turntables.ports import Port, open_port
 from capture.turntable import AxisState, ControllerError, TableDisconnectedError, TurntableError
 
 
@@ -21,7 +21,7 @@ class AsciiController:
     ) -> None:
         self._url, self._dialect = url, dialect
         self._channels, self._signs, self._zeros = tuple(channels), tuple(signs), tuple(zeros)
-        self._port: Any = None
+        self._port: Port | None = None
 
     @property
     def address(self) -> str:
@@ -35,15 +35,12 @@ class AsciiController:
 
     def open(self) -> None:
         """Connect and send what the dialect wants first."""
-        serial = _pyserial()
         try:
-            self._port = serial.serial_for_url(
-                self._url, timeout=self._dialect.reply_timeout_s, write_timeout=1.0, **self._dialect.serial
-            )
+            self._port = open_port(self._url, self._dialect.reply_timeout_s, self._dialect.serial)
         except (OSError, ValueError) as error:  # SerialException is an OSError
             raise TableDisconnectedError(f"{self._url}: cannot be opened ({error}); check cable and address") from error
         for line in self._dialect.init:
-            self._send(line)
+            self._send(self._port, line)
 
     def close(self) -> None:
         """Disconnect."""
@@ -127,17 +124,17 @@ class AsciiController:
     def _error(self, problem: str) -> ControllerError:
         return ControllerError(f"{self._url}: the controller {problem}; see its manual or the dialect's file")
 
-    def _send(self, line: str) -> None:
-        self._port.write((line + self._dialect.send_end).encode(self._dialect.encoding))
+    def _send(self, port: Port, line: str) -> None:
+        port.write((line + self._dialect.send_end).encode(self._dialect.encoding))
 
     def _exchange(self, line: str, answered: bool) -> str:
         if self._port is None:
             raise TableDisconnectedError(f"{self._url}: not connected; open it first")
-        end = self._dialect.reply_end.encode(self._dialect.encoding)
+        port, end = self._port, self._dialect.reply_end.encode(self._dialect.encoding)
         try:
-            self._port.reset_input_buffer()  # a reply that came too late must not answer this question
-            self._send(line)
-            reply = self._port.read_until(end) if answered else b""
+            port.reset_input_buffer()  # a reply that came too late must not answer this question
+            self._send(port, line)
+            reply = port.read_until(end) if answered else b""
         except OSError as error:
             raise TableDisconnectedError(f"{self._url}: connection lost ({error}); check cable and power") from error
         if self._dialect.pause_s:
@@ -147,11 +144,3 @@ class AsciiController:
             raise TableDisconnectedError(f"{self._url}: no reply to {line!r} within {waited}; check cable and power")
         return str(reply[: len(reply) - len(end)].decode(self._dialect.encoding, "replace")) if answered else ""
 
-
-def _pyserial() -> Any:
-    try:
-        import serial
-    except ImportError as error:
-        advice = "pip install 'labsurvey[serial]'"
-        raise TurntableError(f"ASCII controllers need pyserial, which is not installed; {advice}") from error
-    return serial

@@ -75,7 +75,8 @@ class EpicsController:
     def move(self, axis: int, angle: float, delta: float) -> None:
         """Write VAL."""
         value = self._signs[axis] * (angle - self._zeros[axis]) / self._units[axis]
-        low, high = self._call(axis, lambda m: m.limits)
+        low = self._call(axis, lambda m: m.low_limit_travel.get())
+        high = self._call(axis, lambda m: m.high_limit_travel.get())
         if low < high and not low <= value <= high:  # equal limits mean none, by the record's own rule
             raise ControllerError(
                 f"{self._prefixes[axis]}: {value:.6g} is outside the record's own limits {low:g} to {high:g}; "

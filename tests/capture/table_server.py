@@ -1,0 +1,62 @@
+"""The simulated controller as a process of its own, for tests: where it is, what it received, what is true."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class TableServer:
+    """A running controller."""
+
+    port: int
+    pid: int
+    log: Path
+    truth_file: Path
+
+    @property
+    def url(self) -> str:
+        return f"socket://127.0.0.1:{self.port}"
+
+    def received(self) -> list[tuple[int, str]]:
+        """Every line that arrived, with its monotonic time in ns."""
+        lines = self.log.read_text().splitlines() if self.log.exists() else []
+        return [(int(line.split(" ", 1)[0]), line.split(" ", 1)[1]) for line in lines]
+
+    def commands(self) -> list[tuple[int, str]]:
+        """The lines that ask for motion or its end, in either language."""
+        return [row for row in self.received() if row[1].startswith(("MA", "ST", "HM")) or row[1][1:3] in ("PA", "OR")]
+
+    def truth(self) -> dict[str, object]:
+        return dict(json.loads(self.truth_file.read_text()))
+
+    def inject(self, words: str) -> int:
+        """Send a SIM line on a connection of its own; the monotonic time (ns) just before."""
+        with socket.create_connection(("127.0.0.1", self.port), timeout=5.0) as connection:
+            connection.sendall(b"")
+            before = time.monotonic_ns()
+            connection.sendall(f"SIM {words}\r\n".encode())
+            connection.recv(100)
+        return before
+
+
+@contextmanager
+def table_server(folder: Path, *options: str, port: int = 0) -> Iterator[TableServer]:
+    """Start it, wait for its port, and kill it at the end."""
+    log, truth = folder / "controller.log", folder / "truth_angles.json"
+    command = [sys.executable, "-m", "capture.simulated.controller", "--port", str(port)]
+    command += ["--log", str(log), "--truth", str(truth), "--speed", "200", "--acceleration", "4000", *options]
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        try:
+            assert process.stdout is not None
+            yield TableServer(int(process.stdout.readline()), process.pid, log, truth)
+        finally:
+            process.kill()
