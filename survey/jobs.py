@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.errors import IndeterminateError, SurveyError
+from adjust.lost_points import without_lost_points
 from adjust.model import IntArray, Survey
 from adjust.observations import ImageBlock
 from adjust.pair_screen import PairOptions, adjust_with_pairs
@@ -228,7 +229,9 @@ def adjust_project(project: Project, progress: bool) -> Adjustment:
             survey = replace(survey, image_blocks=survey.image_blocks + found.blocks)
             survey = _seen_points(survey)
         pairs = PairOptions(project.options.reject_pairs, options)
-        result = checked(survey, lambda: adjust_with_pairs(survey, pairs, step))
+        result = checked(
+            survey, lambda: without_lost_points(survey, lambda part: adjust_with_pairs(part, pairs, step))
+        )
     return replace(result, warnings=result.warnings + notes)
 
 
