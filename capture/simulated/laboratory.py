@@ -25,7 +25,7 @@ IMAGE_SIZE = (640, 512)
 ROOM_EXPOSURE_US, BEACON_EXPOSURE_US = 10000.0, 250.0
 _BEACON_DIAMETER_M = 0.010
 _BEACON_GRAY = 200.0  # of a large source like a beacon, at the beacons' exposure
-_NOISE_GRAY = 2.0
+_NOISE_GRAY = 4.0
 _BLUR_PX = 0.8
 _ROOM = Imaging(blur_px=_BLUR_PX, noise_gray=0.0, background_gray=105.0, bits=16)
 _DARK = Imaging(blur_px=_BLUR_PX, noise_gray=0.0, background_gray=0.0, oversampling=1, samples=21, bits=16)
