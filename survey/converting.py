@@ -1,43 +1,76 @@
-"""The job ``convert``: pose networks between g2o files and project folders.
+"""The job ``convert``: files of other programs to project folders, and projects or their results to other formats.
 
 >>> outcome = convert_job(Path("garage.g2o"), Path("garage"))  # a project; adjust it
 >>> outcome = convert_job(Path("garage"), Path("adjusted.g2o"))
+>>> outcome = convert_job(Path("tunnel.gkf"), Path("tunnel"))
+>>> outcome = convert_job(Path("tunnel"), Path("tunnel.snx"))
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from gtsam import Pose3
 
 from adjust.errors import SurveyError
-from adjust.model import PoseParameter, Station, Survey
-from adjust.observations import FrameRef, Pair
-from adjust.pair_screen import is_pure
-from adjust.pose_network.from_survey import network_from_survey
-from survey.files import read, write_project
+from adjust.model import FloatArray
+from survey.converting_g2o import project_to_g2o, survey_from_g2o
+from survey.files import AdjustmentOptions, Project, atomic_write, read, write_project
 from survey.files.project import DEFINITION_FILE
-from survey.files.text import id_problem
-from survey.interop.g2o import Information, read_g2o, write_g2o
+from survey.files.text import suggestion
+from survey.interop.aicon import ENDINGS as AICON_ENDINGS
+from survey.interop.aicon import read_aicon
+from survey.interop.dbat import read_dbat
+from survey.interop.foreign import ForeignNetwork
+from survey.interop.g2o import Information
+from survey.interop.gama import read_gama
+from survey.interop.gama_writer import gama_text
+from survey.interop.krumm import read_krumm
+from survey.interop.lgc import read_lgc
+from survey.interop.names import with_safe_ids
+from survey.interop.network_json import network_json
+from survey.interop.network_values import NetworkValues, left_out, require_network
+from survey.interop.plain_csv import correlated, plain_csv, read_plain_csv
+from survey.interop.sinex import sinex_text
+from survey.jobs import adjust_project
 from survey.previous import read_previous
+from survey.quantities import scale_of
 from survey.results import RESULTS
-from survey.warm_start import network_start
 
-Format = Literal["g2o", "project"]
-FORMATS: tuple[Format, ...] = ("g2o", "project")
+READERS: dict[str, Callable[[Path], ForeignNetwork]] = {
+    "gama": read_gama,
+    "krumm": read_krumm,
+    "lgc": read_lgc,
+    "csv": read_plain_csv,
+    "dbat": read_dbat,
+    "aicon": read_aicon,
+}
+WRITERS = ("g2o", "gama", "csv", "json", "sinex")
+_ENDINGS = {
+    ".g2o": "g2o",
+    ".gkf": "gama",
+    ".dat": "krumm",
+    ".lgc": "lgc",
+    ".csv": "csv",
+    ".xml": "dbat",
+    ".htm": "aicon",
+    **dict.fromkeys(AICON_ENDINGS, "aicon"),
+    ".json": "json",
+    ".snx": "sinex",
+}
+FORMATS = tuple(dict.fromkeys((*READERS, *WRITERS, "project")))
 
 
 @dataclass(frozen=True)
 class ConvertOutcome:
-    """What was written. left_out: what the format cannot hold, for people."""
+    """What was written. counts: by what they count. values: which poses or coordinates. left_out: for people."""
 
     source: Path
     target: Path
-    format: Format
-    n_stations: int
-    n_pairs: int
-    poses: str
+    format: str
+    counts: dict[str, int] = field(default_factory=dict)
+    values: str = ""
     left_out: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
@@ -46,116 +79,125 @@ class ConvertOutcome:
             "from": str(self.source),
             "to": str(self.target),
             "format": self.format,
-            "stations": self.n_stations,
-            "pairs": self.n_pairs,
-            "poses": self.poses,
+            **self.counts,
+            "poses": self.values,
             "left_out": list(self.left_out),
         }
 
     def text(self) -> str:
         """For people."""
-        head = f"{self.target}: {self.n_stations} stations ({self.poses}) and {self.n_pairs} pairs from {self.source}"
-        return "\n".join([*(f"  ! {line}" for line in self.left_out), head])
+        first, *rest = (f"{n} {what.replace('_', ' ')}" for what, n in self.counts.items())
+        counts = f"{first} ({self.values})" + "".join(f" and {r}" if r == rest[-1] else f", {r}" for r in rest)
+        return "\n".join([*(f"  ! {line}" for line in self.left_out), f"{self.target}: {counts} from {self.source}"])
 
 
 def convert_job(
-    source: Path, target: Path, *, format: Format | None = None, information: Information = "tangent"
+    source: Path, target: Path, *, format: str | None = None, information: Information = "tangent"
 ) -> ConvertOutcome:
-    """Write the network of ``source`` to ``target``, the one a g2o file, the other a project folder.
+    """Write ``source`` in another format at ``target``: the one a project folder, the other a file.
 
-    format: of ``target``; by default g2o where its name ends so, else a project. information: what the rotation part
-    of g2o's information matrices refers to. Raises SurveyError for what the other format cannot hold, and where there
-    is something at ``target`` already.
+    format: of the file; by default by its ending. information: what the rotation part of g2o's information matrices
+    refers to. Raises SurveyError for what the other format cannot hold, and where there is something at ``target``.
     """
     source, target = Path(source), Path(target)
-    to = format or ("g2o" if target.suffix.lower() == ".g2o" else "project")
-    if to == "g2o":
-        if not source.is_dir():
-            raise SurveyError(f"{source}: is no project folder; only a project is converted to g2o")
-        if target.exists():
-            raise SurveyError(f"{target}: is there already; give another name")
-        return _to_g2o(source, target, information)
     if source.is_dir():
-        raise SurveyError(f"{source}: is a folder; end the name of the new file with .g2o, or give a g2o file")
+        return _to_file(source, target, _file_format(target, format, WRITERS), information)
+    if format in (None, "project") and target.suffix.lower() in _ENDINGS and not target.is_dir():
+        known = _ENDINGS[target.suffix.lower()]
+        if known in WRITERS:
+            raise SurveyError(f"{source}: is no project folder; only a project is converted to {known}")
     if not source.is_file():
-        raise SurveyError(f"{source}: there is no such file; give a g2o file")
-    return _to_project(source, target, information)
+        raise SurveyError(f"{source}: there is no such file; give a file of another program, or a project folder")
+    if format in ("json", "sinex"):
+        raise SurveyError(f"{source}: the format {format} is only written; give a project folder")
+    chosen = None if format == "project" else format
+    return _to_project(source, target, _file_format(source, chosen, (*READERS, "g2o")), information)
 
 
-def _to_project(source: Path, target: Path, information: Information) -> ConvertOutcome:
+def _file_format(path: Path, given: str | None, known: tuple[str, ...]) -> str:
+    found = given or _ENDINGS.get(path.suffix.lower())
+    if found == "project" or found is None:
+        endings = ", ".join(sorted(e for e, f in _ENDINGS.items() if f in known))
+        raise SurveyError(f"{path}: the ending tells no format; end the name with {endings} or give --format")
+    if found not in known:
+        raise SurveyError(f"{path}: the format {found!r} does not go this way; {suggestion(found, known)}")
+    return found
+
+
+def _to_project(source: Path, target: Path, format: str, information: Information) -> ConvertOutcome:
     if target.exists() and not target.is_dir():
         raise SurveyError(f"{target}: is a file; give the name of a new folder")
     if (target / DEFINITION_FILE).exists():
         raise SurveyError(f"{target}: there is a project already; choose another folder")
-    network = read_g2o(source, information, use_vertices=True)
-    for station in network.station_ids:
-        if (problem := id_problem(station)) is not None:
-            raise SurveyError(f"{source}: vertex {station}: {problem}")
-    held = set(network.held.tolist())
-    stations = []
-    for i, station in enumerate(network.station_ids):
-        known = bool(np.isfinite(network.station_translations[i]).all())
-        value = _pose(network.station_rotations[i], network.station_translations[i]) if known else None
-        pose = PoseParameter(value, "held" if i in held else "free")
-        stations.append(Station(station, world_from_station=pose))
-    frames = [FrameRef("station", s) for s in network.station_ids]
-    pairs = tuple(
-        Pair(network.pair_ids[e], frames[int(network.a_idx[e])], frames[int(network.b_idx[e])],
-             _pose(network.rotations[e], network.translations[e]), network.cov[e])
-        for e in range(network.n_pairs)
-    )  # fmt: skip
-    write_project(target, Survey(stations=tuple(stations), pairs=pairs), title=source.stem)
-    return ConvertOutcome(source, target, "project", len(stations), len(pairs), "as in the file")
-
-
-def _pose(rotation: Any, translation: Any) -> Pose3:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    return Pose3(matrix)
-
-
-def _to_g2o(source: Path, target: Path, information: Information) -> ConvertOutcome:
-    project = read(source)
-    survey = project.survey
-    if not is_pure(survey):
-        raise SurveyError(
-            f"{source}: g2o holds nothing but poses of fixed stations and pairs between them; this project has more, "
-            "or has no pairs"
-        )
-    network = network_from_survey(survey, any_datum=True)
-    adjusted = (source / RESULTS / "solution.json").is_file()
-    known = dict(read_previous(project).poses) if adjusted else _given(survey)
-    start = network_start(survey, known)
-    if start is None:
-        raise SurveyError(f"{source}: pairs leave stations without a pose; give them a start")
-    write_g2o(target, network, *start, information=information)
-    poses = "adjusted" if adjusted else "start values, not adjusted"
-    left_out = _left_out(survey, network.station_ids)
-    return ConvertOutcome(source, target, "g2o", network.n_stations, int(network.used.sum()), poses, left_out)
-
-
-def _given(survey: Survey) -> dict[tuple[str, ...], Pose3]:
-    """Poses that survey.toml gives."""
-    return {
-        ("world_from_station", s.station_id): s.world_from_station.value
-        for s in survey.stations
-        if s.world_from_station.value is not None
+    if format == "g2o":
+        survey = survey_from_g2o(source, information)
+        write_project(target, survey, title=source.stem)
+        counts = {"stations": len(survey.stations), "pairs": len(survey.pairs)}
+        return ConvertOutcome(source, target, "project", counts, "as in the file")
+    network = READERS[format](source)
+    survey, renamed = with_safe_ids(network.survey)
+    reject = network.reject
+    options = AdjustmentOptions(network.alpha or AdjustmentOptions.alpha, reject, reject, reject)
+    write_project(target, survey, title=network.title or source.stem, options=options)
+    counts = {
+        "points": len(survey.points),
+        "readings": len(survey.readings),
+        "baselines": sum(len(o.to) for o in survey.coordinate_differences),
+        "coordinates": sum(len(o.positions) for o in survey.coordinates),
+        "image_points": sum(len(b.uv) for b in survey.image_blocks),
+        "distances": len(survey.distances),
     }
+    shown = {what: n for what, n in counts.items() if n or what == "points"}
+    return ConvertOutcome(source, target, "project", shown, "as in the file", (*network.notes, *renamed))
 
 
-def _left_out(survey: Survey, ids: tuple[str, ...]) -> tuple[str, ...]:
-    """What the file does not say, for people."""
-    out = []
-    priors = [s.station_id for s in survey.stations if s.world_from_station.treatment == "prior"]
-    unused = [p.pair_id for p in survey.pairs if not p.used]
-    alone = [s.station_id for s in survey.stations if s.station_id not in ids]
-    for what, names in (("priors of stations", priors), ("pairs not in use", unused), ("stations without pair", alone)):
-        if names:
-            out.append(f"left out, {what}: {', '.join(names[:8])}{' and more' if len(names) > 8 else ''}")
-    if not all(s.isascii() and s.isdigit() for s in ids):
-        out.append(f"g2o knows only numbers: stations are written as 0 to {len(ids) - 1}, in the order {_order(ids)}")
-    return tuple(out)
+def _to_file(source: Path, target: Path, format: str, information: Information) -> ConvertOutcome:
+    if target.exists():
+        raise SurveyError(f"{target}: is there already; give another name")
+    if format == "g2o":
+        n_stations, n_pairs, poses, rest = project_to_g2o(source, target, information)
+        return ConvertOutcome(source, target, "g2o", {"stations": n_stations, "pairs": n_pairs}, poses, rest)
+    project = read(source)
+    require_network(project.survey, str(source), format)
+    network = _adjusted(project) if format == "sinex" else _as_it_stands(project)
+    rest = left_out(project.survey)
+    if format == "csv":
+        rest += correlated(network)
+    text = {"gama": gama_text, "csv": plain_csv, "json": network_json, "sinex": sinex_text}[format](network)
+    atomic_write(target, text)
+    counts = {"points": len(project.survey.points), "readings": len(project.survey.readings)}
+    values = "adjusted" if network.adjusted else "start values, not adjusted"
+    return ConvertOutcome(source, target, format, counts, values, () if format == "sinex" else rest)
 
 
-def _order(ids: tuple[str, ...]) -> str:
-    return ", ".join(ids[:12]) + (", ..." if len(ids) > 12 else "")
+def _as_it_stands(project: Project) -> NetworkValues:
+    """Adjusted points where the project has results, else its start values."""
+    start = {p.point_id: p.x_in_world.value for p in project.survey.points if p.x_in_world.value is not None}
+    if not (project.folder / RESULTS / "solution.json").is_file():
+        return NetworkValues(project.survey, project.title, start)
+    previous = read_previous(project)
+    covs = {name[1]: cov for name, cov in previous.covs.items() if name[0] == "point"}
+    return NetworkValues(project.survey, project.title, start | dict(previous.points), True, covs, previous.factor)
+
+
+def _adjusted(project: Project) -> NetworkValues:
+    """The project adjusted anew, because its result files hold no covariances between points."""
+    result = adjust_project(project, progress=False)
+    scale = scale_of(result, "a_posteriori")
+    x: dict[str, FloatArray] = {}
+    names: list[tuple[str, str]] = []
+    points = []
+    for point in project.survey.points:
+        estimate = result.estimates[("point", point.point_id)]
+        x[point.point_id] = np.asarray(estimate.value)
+        free = [a for a, s in zip("xyz", estimate.status, strict=True) if s != "held"]
+        names += [(point.point_id, a) for a in free]
+        points += [estimate.name] if free else []
+    joint = result.precision.joint(points) if points else np.zeros((0, 0))
+    place = {name[1]: k for k, name in enumerate(points)}
+    rows = [3 * place[point] + "xyz".index(axis) for point, axis in names]
+    return NetworkValues(
+        project.survey, project.title, x, True, {}, scale.factor, tuple(names),
+        scale.factor**2 * joint[np.ix_(rows, rows)], result.n_observations, result.n_unknowns, result.redundancy,
+        result.omega,
+    )  # fmt: skip

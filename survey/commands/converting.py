@@ -6,21 +6,25 @@ from typing import Any
 
 from survey.commands.common import DONE, is_set, print_json, require_project
 
+FORMATS = ("gama", "krumm", "lgc", "csv", "dbat", "aicon", "g2o", "json", "sinex", "project")
+
 
 def declare_convert(commands: Any, shaped: dict[str, Any]) -> None:
     """Add ``convert`` to the commands."""
     parser = commands.add_parser(
         "convert",
-        help="pose networks between g2o files and project folders",
-        usage="labsurvey convert garage.g2o garage   (labsurvey convert FROM TO [--format g2o|project])",
-        description="A g2o file becomes a project whose first station (or what FIX names) is held; the pairs of a\n"
-        "project become a g2o file, with adjusted poses where there are results. TO must be new.",
+        help="files of other programs to project folders, and projects to files of other programs",
+        usage="labsurvey convert tunnel.gkf tunnel   (labsurvey convert FROM TO [--format NAME])",
+        description="FROM a file: it becomes a project folder. Read are GNU Gama's .gkf, Krumm's .dat, LGC's .lgc, a\n"
+        "plain .csv, DBAT's .xml, AICON's .phc .ior .eor .obc .scale (any of them, or the report .htm), and g2o.\n"
+        "FROM a project: TO ends with .gkf .csv .json .snx or .g2o, with adjusted values where there are results;\n"
+        ".snx (SINEX) holds the full covariance and adjusts for it. TO must be new.",
         epilog="Next: labsurvey adjust TO",
         **shaped,
     )
-    parser.add_argument("source", type=Path, metavar="FROM", help="g2o file, or project folder")
-    parser.add_argument("target", type=Path, metavar="TO", help="new project folder, or new file ending with .g2o")
-    parser.add_argument("--format", choices=("g2o", "project"), help="of TO; default: by its ending")
+    parser.add_argument("source", type=Path, metavar="FROM", help="file of another program, or project folder")
+    parser.add_argument("target", type=Path, metavar="TO", help="new project folder, or new file")
+    parser.add_argument("--format", choices=FORMATS, help="of the file; default: by its ending")
     parser.add_argument(
         "--information", choices=("tangent", "quaternion"), default="tangent",
         help="rotation part of g2o's information: of the rotation vector, or of the quaternion as g2o itself means it",

@@ -1,0 +1,65 @@
+"""Names that a project folder can hold, for points and setups of other programs that are freer with them."""
+
+from dataclasses import replace
+from typing import Any
+
+from adjust.model import Survey
+from adjust.observations import PositionRef
+from survey.files.text import _FORBIDDEN_IN_IDS as FORBIDDEN
+from survey.files.text import id_problem
+
+
+def safe_ids(names: list[str], taken: set[str] | None = None) -> dict[str, str]:
+    """For every name that cannot be an id one that can: forbidden characters become "_"; all stay different."""
+    used = {name for name in names if id_problem(name) is None} | (taken or set())
+    out = {}
+    for name in names:
+        if id_problem(name) is None and name not in (taken or set()):
+            continue
+        plain = "".join("_" if c in FORBIDDEN or not c.isprintable() else c for c in name).strip().lstrip(".") or "_"
+        new, count = plain, 2
+        while new in used:
+            new, count = f"{plain}_{count}", count + 1
+        used.add(new)
+        out[name] = new
+    return out
+
+
+def with_safe_ids(survey: Survey) -> tuple[Survey, tuple[str, ...]]:
+    """The survey with names that a project can hold, and what was renamed, for people."""
+    points = safe_ids([p.point_id for p in survey.points], {"world"})
+    setups = safe_ids([s.setup_id for s in survey.setups])
+    readings = safe_ids([r.reading_id for r in survey.readings])
+    if not (points or setups or readings):
+        return survey, ()
+
+    def ref(position: PositionRef) -> PositionRef:
+        return PositionRef(points[position.point_id]) if position.point_id in points else position
+
+    def refs(positions: tuple[PositionRef, ...]) -> tuple[PositionRef, ...]:
+        return tuple(ref(p) for p in positions)
+
+    changed: dict[str, Any] = {
+        "points": tuple(replace(p, point_id=points.get(p.point_id, p.point_id)) for p in survey.points),
+        "setups": tuple(replace(s, setup_id=setups.get(s.setup_id, s.setup_id)) for s in survey.setups),
+        "readings": tuple(
+            replace(
+                r, reading_id=readings.get(r.reading_id, r.reading_id), at=ref(r.at), to=ref(r.to),
+                second=ref(r.second) if r.second else None, setup_id=setups.get(r.setup_id, r.setup_id),
+            )
+            for r in survey.readings
+        ),
+        "reading_covariances": tuple(
+            replace(c, reading_ids=tuple(readings.get(i, i) for i in c.reading_ids)) for c in survey.reading_covariances
+        ),
+        "coordinate_differences": tuple(
+            replace(d, at=refs(d.at), to=refs(d.to)) for d in survey.coordinate_differences
+        ),
+        "coordinates": tuple(replace(c, positions=refs(c.positions)) for c in survey.coordinates),
+        "distances": tuple(replace(d, a=ref(d.a), b=ref(d.b)) for d in survey.distances),
+        "datum": replace(survey.datum, points=tuple(points.get(p, p) for p in survey.datum.points)),
+    }  # fmt: skip
+    shown = [f"{old} -> {new}" for old, new in points.items()]
+    more = f" and {len(shown) - 6} more" if len(shown) > 6 else ""
+    note = f"renamed, because a project's ids have none of / \\ : @ , ;: {', '.join(shown[:6])}{more}" if shown else ""
+    return replace(survey, **changed), (note,) if note else ()
