@@ -7,7 +7,8 @@ import numpy as np
 
 from adjust.model import FloatArray
 from adjust.observations import Coordinates, Distance, PositionRef, TableReading
-from survey.files.covariance import covariance_from_sigmas, covariance_problem
+from survey.files.blank_coordinates import joint_problem, read_triples
+from survey.files.covariance import covariance_from_sigmas
 from survey.files.project import Sigmas
 from survey.files.references import (
     NameProblemError,
@@ -28,7 +29,8 @@ ANGLES = Layout(
 )
 DISTANCES = Layout("distances", ("distance_id", "from_id", "to_id"), (), FLAGS, ("value_mm", "value_m", "sigma_mm"))
 XYZ_SIGMAS, XYZ_RHO = ("sigma_x_mm", "sigma_y_mm", "sigma_z_mm"), ("rho_xy", "rho_xz", "rho_yz")
-COORDINATES = Layout("coordinates", ("point_id",), ("x_mm", "y_mm", "z_mm", *XYZ_SIGMAS), ("set_id", *FLAGS), XYZ_RHO)
+XYZ = ("x_mm", "y_mm", "z_mm")
+COORDINATES = Layout("coordinates", ("point_id",), (), ("set_id", *FLAGS), (*XYZ, *XYZ_SIGMAS, *XYZ_RHO))
 COORDINATES_COVARIANCE = Layout(
     "coordinates_covariance", ("set_id", "a_id", "a_axis", "b_id", "b_axis"), ("covariance_mm2",)
 )
@@ -143,8 +145,7 @@ def read_coordinates(table: Table, extra: Table | None, names: Names, sigmas: Si
         sets.setdefault(name, _CoordinateSet(set_id)).rows.append(row)
     if extra is not None:
         _add_entries(extra, sets, members)
-    values = to_si(np.stack([table.numbers(name) for name in ("x_mm", "y_mm", "z_mm")], axis=1), "mm")
-    own = _own_covariances(table)
+    values, own = read_triples(table, XYZ, XYZ_SIGMAS, XYZ_RHO)
     groups, used = group_names(table, "coordinates"), table.flags("used").tolist()
     result = []
     for name in sorted(sets, key=natural_key):
@@ -152,7 +153,8 @@ def read_coordinates(table: Table, extra: Table | None, names: Names, sigmas: Si
         for row in rows:
             if (groups[row], used[row]) != (groups[rows[0]], used[rows[0]]):
                 raise table.error(row, f"set {sets[name].name!r} has different 'group' or 'used'; make them the same")
-        cov = _joint_covariance(table, rows, own, sets[name]) * sigmas.scale.get(groups[rows[0]], 1.0) ** 2
+        cov = _joint_covariance(table, rows, own, sets[name])
+        cov[np.isfinite(cov)] *= sigmas.scale.get(groups[rows[0]], 1.0) ** 2
         refs = tuple(positions[row] for row in rows)
         result.append(Coordinates(refs, values[rows], cov, groups[rows[0]], used[rows[0]]))
     return tuple(result)
@@ -165,20 +167,6 @@ def _coordinate_position(table: Table, row: int, text: str, names: Names) -> Pos
     except NameProblemError as problem:
         raise table.error(row, f"point_id: {problem}") from problem
     return position
-
-
-def _own_covariances(table: Table) -> FloatArray:
-    """Covariances (n, 3, 3) m^2 of the rows, from sigmas and correlations."""
-    sigma = to_si(np.stack([table.positive(name) for name in XYZ_SIGMAS], axis=1), "mm")
-    rho = np.nan_to_num(np.stack([table.numbers(name) for name in XYZ_RHO], axis=1))
-    wrong = (np.abs(rho) >= 1).any(axis=1)
-    if wrong.any():
-        raise table.error(first_row(wrong), f"{','.join(XYZ_RHO)}: a correlation lies between -1 and 1")
-    cov = covariance_from_sigmas(sigma, rho)
-    problem = covariance_problem(cov)
-    if problem:
-        raise table.error(problem[0], f"{problem[1]}; correct {','.join(XYZ_RHO)}")
-    return cov
 
 
 def _add_entries(extra: Table, sets: Mapping[str, _CoordinateSet], members: Mapping[tuple[str, str], int]) -> None:
@@ -211,7 +199,7 @@ def _joint_covariance(table: Table, rows: list[int], own: FloatArray, members: _
     at = {3 * row + axis: 3 * i + axis for i, row in enumerate(rows) for axis in range(3)}
     for (a, b), value in members.entries.items():
         cov[at[a], at[b]] = cov[at[b], at[a]] = to_si(value, "mm2")
-    problem = covariance_problem(cov[None]) if members.entries else None
+    problem = joint_problem(cov) if members.entries else None
     if problem:
-        raise table.error(rows[0], f"set {members.name!r}: {problem[1]}; correct coordinates_covariance")
+        raise table.error(rows[0], f"set {members.name!r}: {problem}; correct coordinates_covariance")
     return cov

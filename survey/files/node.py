@@ -120,11 +120,13 @@ class Node:
             raise self.error(f"found {value}; it must be positive", key)
         return value
 
-    def numbers(self, key: str, shape: tuple[int, ...], default: Any = _REQUIRED, infinite: bool = False) -> FloatArray:
-        """Numbers of the given shape; ``infinite`` also allows ``inf``, also written "inf"."""
+    def numbers(
+        self, key: str, shape: tuple[int, ...], default: Any = _REQUIRED, infinite: bool = False, blank: bool = False
+    ) -> FloatArray:
+        """Numbers of the given shape; ``infinite`` allows ``inf``, also written "inf", ``blank`` allows ``nan``."""
         array = np.empty(shape)
         self._fill(array, self.value(key, default), (key,))
-        if np.isnan(array).any() or (not infinite and np.isinf(array).any()):
+        if (not blank and np.isnan(array).any()) or (not infinite and np.isinf(array).any()):
             raise self.error("found a number that is not finite; give finite numbers", key)
         return array
 

@@ -14,6 +14,7 @@ from survey.files.poses import quaternion_wxyz
 from survey.files.project import SpotBlock
 from survey.files.references import frame_text, position_text
 from survey.files.table_writing import Columns
+from survey.files.terrestrial_columns import triple_rows
 from survey.files.units import from_si
 
 
@@ -124,8 +125,7 @@ def coordinate_columns(coordinates: Sequence[Coordinates]) -> tuple[Columns, Col
         set_id = f"set{number}" if len(names) > 1 or names[0] in alone else ""
         alone.update(names if not set_id else ())
         for i, values in enumerate(observation.values):
-            sigma, rho = sigmas_and_correlations(observation.cov[None, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3])
-            rows.append(np.concatenate([from_si(values, "mm"), from_si(sigma[0], "mm"), rho[0]]))
+            rows.append(triple_rows(values, observation.cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]))
             set_ids.append(set_id)
             groups.append(observation.group)
             used.append(observation.used)

@@ -25,10 +25,13 @@ POSE_KEYS = (
     "sigma_rotation_deg",
     "sigma_rotation_arcsec",
     "covariance_rad_m",
+    "held",
 )
-POINT_KEYS = ("x_mm", "treatment", "sigma_mm", "covariance_mm2")
+POINT_KEYS = ("x_mm", "treatment", "held", "sigma_mm", "covariance_mm2")
+_COMPONENTS = ("rx", "ry", "rz", "tx", "ty", "tz")
+_FLAT = {1: ("x", "y"), 2: ("z",)}  # what keeps its value in a network of so many dimensions
 _ROTATIONS = ("rotation_quaternion_wxyz", "rotation_euler_xyz_deg")
-_SIGMAS = POSE_KEYS[4:]
+_SIGMAS = POSE_KEYS[4:-1]
 
 
 def rotation_from_quaternion(wxyz: FloatArray) -> Rot3 | None:
@@ -56,11 +59,14 @@ def read_pose(node: Node) -> PoseParameter:
     """A pose with its treatment; an absent table is a free pose without start."""
     node.allow(*POSE_KEYS)
     treatment = _treatment(node)
+    held = _held(node, treatment, _COMPONENTS)
     cov = _pose_cov(node) if treatment == "prior" else None
     if treatment != "prior":
         _refuse_sigmas(node, treatment, _SIGMAS)
     rotation, translation = _rotation(node), _translation(node)
     if rotation is None and translation is None and treatment == "free":
+        if held:
+            raise node.error("components are held but the pose has no value; give rotation and translation", "held")
         return PoseParameter()
     vague = np.isinf(np.diagonal(cov)) if cov is not None else np.full(6, treatment == "held")
     if rotation is None and not vague[:3].all():
@@ -68,19 +74,53 @@ def read_pose(node: Node) -> PoseParameter:
     if translation is None and not vague[3:].all():
         raise node.error("translation_mm is missing; add it")
     value = Pose3(rotation or Rot3(), np.zeros(3) if translation is None else translation)
-    return PoseParameter(value, treatment, cov)
+    return PoseParameter(value, treatment, cov, held)
 
 
-def read_point(node: Node) -> PointParameter:
-    """A world point with its treatment."""
+def read_point(node: Node, dimensions: int = 3) -> PointParameter:
+    """A world point with its treatment. In two dimensions z keeps its value (0), in one x and y do."""
     node.allow(*POINT_KEYS)
     treatment = _treatment(node)
-    value = to_si(node.numbers("x_mm", (3,)), "mm") if node.has("x_mm") else None
+    held = _held(node, treatment, tuple("xyz")) or (_FLAT.get(dimensions, ()) if treatment != "held" else ())
+    value = _coordinates(node, dimensions, held)
     if treatment != "prior":
-        _refuse_sigmas(node, treatment, POINT_KEYS[2:])
-    if treatment != "free" and value is None:
+        _refuse_sigmas(node, treatment, POINT_KEYS[3:])
+    if treatment != "free" and (value is None or np.isnan(value).any()):
         raise node.error(f"x_mm is missing; a point that is {treatment} needs its coordinates")
-    return PointParameter(value, treatment, _point_cov(node) if treatment == "prior" else None)
+    return PointParameter(value, treatment, _point_cov(node) if treatment == "prior" else None, held)
+
+
+def flat_point(dimensions: int) -> PointParameter:
+    """A point of which nothing is known, in a network of one, two or three dimensions."""
+    held = _FLAT.get(dimensions, ())
+    return PointParameter(np.where([a in held for a in "xyz"], 0.0, np.nan) if held else None, held=held)
+
+
+def _coordinates(node: Node, dimensions: int, held: tuple[str, ...]) -> FloatArray | None:
+    """Coordinates (3,) m, nan for those that are not known; as many as there are dimensions will do."""
+    if not node.has("x_mm"):
+        value = np.where([a in held for a in "xyz"], 0.0, np.nan) if dimensions < 3 else np.full(3, np.nan)
+    else:
+        given = node.values["x_mm"]
+        if dimensions < 3 and isinstance(given, list) and len(given) == dimensions:
+            free = [i for i, a in enumerate("xyz") if a not in _FLAT[dimensions]]
+            value = np.zeros(3)
+            value[free] = to_si(node.numbers("x_mm", (dimensions,)), "mm")
+        else:
+            value = to_si(node.numbers("x_mm", (3,), blank=True), "mm")
+    for axis in held:
+        if np.isnan(value["xyz".index(axis)]):
+            raise node.error(f"{axis} is held but has no value; give x_mm (nan for the coordinates not known)", "held")
+    return None if np.isnan(value).all() else value
+
+
+def _held(node: Node, treatment: Treatment, components: tuple[str, ...]) -> tuple[str, ...]:
+    held = node.references("held", components, "component", ())
+    if held and treatment == "held":
+        raise node.error('treatment = "held" holds everything; remove one of the two', "held")
+    if len(held) == len(components):
+        raise node.error('all components are held; write treatment = "held"', "held")
+    return tuple(name for name in components if name in held)
 
 
 def _treatment(node: Node) -> Treatment:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from adjust.model import FloatArray, IntArray, Survey
 from survey.targets import TargetKind
+from survey.tolerances import Tolerance
 
 FORMAT = 1
 DEFINITION_FILE = "survey.toml"
@@ -40,17 +41,42 @@ class SpotBlock:
 
 @dataclass(frozen=True)
 class AdjustmentOptions:
-    """The table [adjustment].
+    """How the project is adjusted and reported: the tables [adjustment], [tolerances.NAME] and [identification].
 
     alpha: error probability of the tests. reject_blocks: leave mis-detected images out of the start, then test them.
     reject_points: leave gross errors among the image points out, and list them. reject_pairs: the same for whole
-    measured pairs.
+    measured pairs. tolerances: what is demanded of the results. identification: who measured what, where and with
+    what, printed in the report as it is.
     """
 
     alpha: float = 0.05
     reject_blocks: bool = True
     reject_points: bool = True
     reject_pairs: bool = True
+    tolerances: tuple[Tolerance, ...] = ()
+    identification: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """What an instrument's readings are worth where the table gives no sigma, in SI; None where not given.
+
+    angle: of an angle between two directions; sqrt(2) that of a direction where it is not given. distance, slope: the
+    sigma of a distance d is ``distance + slope * d``. levelling: m per square root of a kilometre of levelled line.
+    target_centring: of targets set up over points. centring, height: of the instrument, for its setups.
+    """
+
+    direction: float | None = None
+    angle: float | None = None
+    zenith: float | None = None
+    azimuth: float | None = None
+    distance: float | None = None
+    distance_slope: float = 0.0
+    height_difference: float | None = None
+    levelling: float | None = None
+    target_centring: float = 0.0
+    centring: float = 0.0
+    height: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +84,13 @@ class Sigmas:
     """A priori sigmas where the tables give none, in SI.
 
     image_px: of image points, None where not given. scale: factor on all sigmas of a group.
-    tables: (axes,) rad by table id.
+    tables: (axes,) rad by table id. instruments: by instrument id.
     """
 
     image_px: float | None = None
     scale: Mapping[str, float] = field(default_factory=dict)
     tables: Mapping[str, FloatArray] = field(default_factory=dict)
+    instruments: Mapping[str, Accuracy] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,11 +2,25 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 from adjust.errors import SurveyError
-from adjust.model import Datum, FloatArray, Point, Survey
+from adjust.model import Datum, FloatArray, Point, PointParameter, Survey
+from survey.files.bodies import read_beams, read_surfaces
+from survey.files.differences import DIFFERENCES, DIFFERENCES_COVARIANCE, read_differences
+from survey.files.geometric import (
+    ALIGNMENTS,
+    LASER_SPOTS,
+    LEVELS,
+    ON_SURFACES,
+    read_alignments,
+    read_laser_spots,
+    read_levels,
+    read_on_surfaces,
+)
 from survey.files.image_points import IMAGE_POINTS, SPOTS, read_image_blocks, read_spots, world_names
 from survey.files.images import find_images
+from survey.files.instruments import read_bearings, read_instruments, read_setups, read_vertical
 from survey.files.kinds import read_targets
 from survey.files.measurements import (
     ANGLES,
@@ -20,7 +34,7 @@ from survey.files.measurements import (
 from survey.files.node import Node, read_toml
 from survey.files.owners import read_cameras, read_stations, read_tables
 from survey.files.pairs import PAIRS, read_pairs
-from survey.files.poses import read_point
+from survey.files.poses import flat_point, read_point
 from survey.files.project import (
     DEFINITION_FILE,
     FORMAT,
@@ -35,13 +49,26 @@ from survey.files.project import (
 )
 from survey.files.references import Names
 from survey.files.tables import Layout, Table, read_table
+from survey.files.terrestrial import KINDS, TERRESTRIAL, TERRESTRIAL_COVARIANCE, read_reading_covariances, read_readings
 from survey.files.text import id_problem, natural_key, suggestion
+from survey.files.tolerances import read_tolerances
 
 LAYOUTS = {
     layout.name: layout
-    for layout in (IMAGE_POINTS, SPOTS, ANGLES, PAIRS, DISTANCES, COORDINATES, COORDINATES_COVARIANCE)
+    for layout in (
+        IMAGE_POINTS, SPOTS, ANGLES, PAIRS, DISTANCES, COORDINATES, COORDINATES_COVARIANCE, TERRESTRIAL,
+        TERRESTRIAL_COVARIANCE, DIFFERENCES, DIFFERENCES_COVARIANCE, LEVELS, ALIGNMENTS, LASER_SPOTS, ON_SURFACES,
+    )
+}  # fmt: skip
+_GROUPS = (
+    "image", "table", "pair", "distance", "coordinates", *KINDS, "coordinate_difference", "level", "alignment",
+    "laser", "surface",
+)  # fmt: skip
+_EXTRA = {  # tables that only make sense beside another
+    "coordinates_covariance": "coordinates",
+    "terrestrial_covariance": "terrestrial",
+    "coordinate_differences_covariance": "coordinate_differences",
 }
-_GROUPS = ("image", "table", "pair", "distance", "coordinates")
 _TOP_LEVEL = (
     "format",
     "title",
@@ -51,10 +78,19 @@ _TOP_LEVEL = (
     "tables",
     "targets",
     "points",
+    "dimensions",
+    "vertical",
+    "bearings",
+    "instruments",
+    "setups",
+    "beams",
+    "surfaces",
     "spots",
     "sigmas",
     "datum",
     "adjustment",
+    "tolerances",
+    "identification",
 )
 
 
@@ -68,15 +104,16 @@ def read(folder: Path) -> Project:
     definition, root = _read_definition(Path(folder))
     tables = _read_tables(definition.folder / OBSERVATIONS_FOLDER)
     _check_scales(root, definition.sigmas, tables)
-    survey = _with_tie_points(definition, tables)
+    survey = _with_tie_points(definition, tables, flat_point(root.integer("dimensions", 1, 3)))
     _check_datum_points(root, survey)
     names, sigmas = Names.of(survey), definition.sigmas
     points = tables.get("image_points")
     blocks, where = read_image_blocks(points, names, sigmas) if points is not None else ((), ImagePointsWhere())
-    extra = tables.get("coordinates_covariance")
-    if extra is not None and "coordinates" not in tables:
-        raise extra.error(0, "there is no table of coordinates beside it; add coordinates.csv or remove this file")
-    coordinates = tables.get("coordinates")
+    for extra_name, main in _EXTRA.items():
+        if extra_name in tables and main not in tables:
+            problem = f"there is no table of {main} beside it; add {main}.csv or remove this file"
+            raise tables[extra_name].error(0, problem)
+    extra, coordinates = tables.get("coordinates_covariance"), tables.get("coordinates")
     survey = dataclasses.replace(
         survey,
         image_blocks=blocks,
@@ -85,11 +122,31 @@ def read(folder: Path) -> Project:
         distances=read_distances(tables["distances"], names, sigmas) if "distances" in tables else (),
         coordinates=read_coordinates(coordinates, extra, names, sigmas) if coordinates is not None else (),
     )
+    survey = dataclasses.replace(survey, **_terrestrial_and_geometric(tables, Names.of(survey), sigmas))
     fields = {field.name: getattr(definition, field.name) for field in dataclasses.fields(Definition)}
     hashes = {table.path.relative_to(definition.folder).as_posix(): table.digest for table in tables.values()}
     fields |= {"survey": survey, "inputs": dict(sorted(({**definition.inputs, **hashes}).items()))}
     spots = read_spots(tables["spots"], names, sigmas) if "spots" in tables else ()
     return Project(**fields, spots=spots, image_points_where=where)
+
+
+def _terrestrial_and_geometric(tables: dict[str, Table], names: Names, sigmas: Sigmas) -> dict[str, Any]:
+    """The fields of the survey that these tables fill; ``names`` know the readings of the turntables already."""
+    found: dict[str, Any] = {}
+    if "terrestrial" in tables:
+        found["readings"] = read_readings(tables["terrestrial"], names, sigmas)
+    if "terrestrial_covariance" in tables:
+        found["reading_covariances"] = read_reading_covariances(
+            tables["terrestrial_covariance"], found["readings"]
+        )
+    if "coordinate_differences" in tables:
+        extra = tables.get("coordinate_differences_covariance")
+        found["coordinate_differences"] = read_differences(tables["coordinate_differences"], extra, names, sigmas)
+    for name, read_one in (("levels", read_levels), ("alignments", read_alignments), ("laser_spots", read_laser_spots),
+                           ("on_surfaces", read_on_surfaces)):  # fmt: skip
+        if name in tables:
+            found[name] = read_one(tables[name], names, sigmas)
+    return found
 
 
 def _read_definition(folder: Path) -> tuple[Definition, Node]:
@@ -106,9 +163,19 @@ def _read_definition(folder: Path) -> tuple[Definition, Node]:
     cameras = read_cameras(root, station_ids)
     camera_ids = tuple(camera.camera_id for camera in cameras)
     targets, kinds, seen_by = read_targets(root, station_ids, camera_ids, inputs)
-    points = tuple(Point(point_id, read_point(node)) for point_id, node in root.tables("points"))
+    dimensions = root.integer("dimensions", 1, 3)
+    if dimensions > 3:
+        raise root.error(f"found {dimensions}; a network has 1 (levelling), 2 (plane) or 3 dimensions", "dimensions")
+    points = tuple(Point(point_id, read_point(node, dimensions)) for point_id, node in root.tables("points"))
     datum = _read_datum(root.table("datum"), station_ids)
-    survey = Survey(cameras, stations, tables, targets, points, datum=datum)
+    instruments, accuracies = read_instruments(root)
+    table_ids = tuple(table.table_id for table in tables)
+    survey = Survey(
+        cameras, stations, tables, targets, points, datum=datum, vertical=read_vertical(root.table("vertical")),
+        bearings=read_bearings(root.table("bearings")), instruments=instruments,
+        setups=read_setups(root, tuple(i.instrument_id for i in instruments), accuracies),
+        beams=read_beams(root, station_ids, table_ids), surfaces=read_surfaces(root),
+    )  # fmt: skip
     tie_points = root.flag("tie_points", False)
     if not tie_points:
         _check_datum_points(root, survey)
@@ -120,8 +187,8 @@ def _read_definition(folder: Path) -> tuple[Definition, Node]:
         target_kinds=kinds,
         images=find_images(folder / IMAGES_FOLDER, camera_ids),
         spots_request=_read_spots_request(root.table("spots"), camera_ids) if root.has("spots") else None,
-        options=_read_options(root.table("adjustment")),
-        sigmas=_read_sigmas(root.table("sigmas"), table_sigmas),
+        options=_read_options(root),
+        sigmas=dataclasses.replace(_read_sigmas(root.table("sigmas"), table_sigmas), instruments=accuracies),
         inputs=inputs,
         target_cameras=seen_by,
     )
@@ -164,13 +231,16 @@ def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest
     return SpotsRequest(cameras, epochs, (smallest, largest), node.number("gate_px", 15.0, positive=True))
 
 
-def _read_options(node: Node) -> AdjustmentOptions:
+def _read_options(root: Node) -> AdjustmentOptions:
+    """The tables [adjustment], [tolerances] and [identification]."""
+    node, said = root.table("adjustment"), root.table("identification")
     node.allow("alpha", "reject_blocks", "reject_points", "reject_pairs")
     alpha = node.number("alpha", 0.05, positive=True)
     if alpha >= 1:
         raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
     flags = {name: node.flag(name, True) for name in ("reject_blocks", "reject_points", "reject_pairs")}
-    return AdjustmentOptions(alpha, **flags)
+    identification = tuple((key, said.text(key)) for key in said.values)
+    return AdjustmentOptions(alpha, **flags, tolerances=read_tolerances(root), identification=identification)
 
 
 def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:
@@ -204,15 +274,18 @@ def _read_tables(folder: Path) -> dict[str, Table]:
     return tables
 
 
-def _with_tie_points(definition: Definition, tables: dict[str, Table]) -> Survey:
+def _with_tie_points(definition: Definition, tables: dict[str, Table], unknown: PointParameter) -> Survey:
     """The survey with the world points that only the observations name, where the project allows that."""
     survey = definition.survey
     if not definition.tie_points:
         return survey
     found = world_names(tables["image_points"]) if "image_points" in tables else set()
-    for table, columns in (("distances", ("from_id", "to_id")), ("coordinates", ("point_id",))):
+    for table, columns in (
+        ("distances", ("from_id", "to_id")), ("coordinates", ("point_id",)), ("on_surfaces", ("point_id",)),
+        ("terrestrial", ("from_id", "to_id", "second_id")), ("coordinate_differences", ("from_id", "to_id")),
+    ):  # fmt: skip
         for column in columns if table in tables else ():
             found |= {name for name in tables[table].text(column).names if name and not set(name) & set(":@/")}
     new = found - {point.point_id for point in survey.points} - {"world"}
     ordered = sorted((name for name in new if not id_problem(name)), key=natural_key)
-    return dataclasses.replace(survey, points=(*survey.points, *(Point(name) for name in ordered)))
+    return dataclasses.replace(survey, points=(*survey.points, *(Point(name, unknown) for name in ordered)))

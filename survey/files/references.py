@@ -12,7 +12,7 @@ from adjust.model import Survey
 from adjust.observations import FrameKind, FrameRef, PositionRef
 from survey.files.text import id_problem, suggestion
 
-_KINDS: tuple[FrameKind, ...] = ("station", "camera", "target", "table")
+_KINDS: tuple[FrameKind, ...] = ("station", "camera", "target", "table", "mount")
 
 
 class NameProblemError(Exception):
@@ -43,6 +43,7 @@ class Names:
             bodies["target", target.target_id] = f"target:{target.target_id}" if moves else carrier
         for table in survey.tables:
             bodies["table", table.table_id] = ""
+            bodies["mount", table.table_id] = f"mount:{table.table_id}"
         return cls(survey, bodies)
 
     @functools.cached_property

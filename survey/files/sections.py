@@ -17,13 +17,17 @@ from adjust.model import (
     Target,
     VectorParameter,
 )
+from survey.files.bodies import body_sections
+from survey.files.instruments import instrument_sections, vertical_sections
 from survey.files.kinds import WARP
 from survey.files.lenses import lens_to_toml
 from survey.files.owners import GEOMETRY_UNITS, geometry_key
 from survey.files.poses import quaternion_wxyz
 from survey.files.project import FORMAT, AdjustmentOptions, Sigmas, SpotsRequest
+from survey.files.tolerances import tolerance_sections
 from survey.files.toml_text import Section
 from survey.files.units import from_si
+from survey.files.vectors import check_vector
 from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind
 
 
@@ -40,6 +44,9 @@ def survey_sections(survey: Survey, kinds: Mapping[str, TargetKind], sigmas: Sig
         sections += _target(target, kinds[target.target_id])
     if survey.points:
         sections.append((("points",), {point.point_id: _point(point.x_in_world) for point in survey.points}))
+    sections += vertical_sections(survey.vertical, survey.bearings)
+    sections += instrument_sections(survey.instruments, survey.setups, sigmas.instruments)
+    sections += body_sections(survey.beams, survey.surfaces)
     datum: dict[str, Any] = {"kind": survey.datum.kind}
     datum |= {"points": survey.datum.points} if survey.datum.points else {}
     datum |= {"stations": survey.datum.stations} if survey.datum.stations else {}
@@ -52,7 +59,7 @@ def head_section(title: str, tie_points: bool) -> Section:
 
 
 def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, sigmas: Sigmas) -> list[Section]:
-    """The sections [spots], [sigmas] and [adjustment]."""
+    """The sections [spots], [sigmas], [adjustment] and [tolerances]."""
     sections: list[Section] = []
     if request is not None:
         spots: dict[str, Any] = {"cameras": request.cameras, "diameter_px": request.diameter_px}
@@ -64,12 +71,17 @@ def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, si
         sections.append((("sigmas",), {"image_px": sigmas.image_px}))
     flags = {"reject_blocks": options.reject_blocks, "reject_points": options.reject_points}
     flags["reject_pairs"] = options.reject_pairs
-    return [*sections, (("adjustment",), {"alpha": options.alpha, **flags})]
+    sections.append((("adjustment",), {"alpha": options.alpha, **flags}))
+    if options.identification:
+        sections.append((("identification",), dict(options.identification)))
+    return sections + tolerance_sections(options.tolerances)
 
 
 def pose_to_toml(pose: PoseParameter, where: str) -> dict[str, Any]:
     """The table that ``read_pose`` reads; empty for a free pose without start."""
     result: dict[str, Any] = {} if pose.treatment == "free" else {"treatment": pose.treatment}
+    if pose.held:
+        result["held"] = pose.held
     if pose.value is not None:
         result["translation_mm"] = from_si(pose.value.translation(), "mm").tolist()
         result["rotation_quaternion_wxyz"] = quaternion_wxyz(pose.value.rotation())
@@ -131,7 +143,7 @@ def _table(table: Table, sigma: FloatArray | None) -> dict[str, Any]:
         values["sigma_arcsec"] = from_si(sigma, "arcsec").tolist()
     values |= _poses({"world_from_table": table.world_from_table}, f"tables.{table.table_id}")
     geometry, where = table.geometry, f"tables.{table.table_id}.geometry"
-    _check_vector(geometry, where)
+    check_vector(geometry, where)
     numbers = {
         geometry_key(name): float(from_si(value, GEOMETRY_UNITS[name]))
         for name, value in zip(geometry.names, geometry.values, strict=True)
@@ -141,22 +153,6 @@ def _table(table: Table, sigma: FloatArray | None) -> dict[str, Any]:
         sigmas = zip(geometry.prior.names, np.sqrt(np.diagonal(geometry.prior.cov)), strict=True)
         values["geometry_sigma"] = {geometry_key(n): float(from_si(s, GEOMETRY_UNITS[n])) for n, s in sigmas}
     return values
-
-
-def _check_vector(vector: VectorParameter, where: str) -> None:
-    """Raise for what the format has no words for."""
-    prior = vector.prior
-    if vector.ties:
-        raise SurveyError(f"{where}: ties cannot be written to a project; hold the parameter instead")
-    if prior is None:
-        return
-    if np.count_nonzero(prior.cov) > len(prior.names):
-        raise SurveyError(f"{where}: a prior with correlations cannot be written to a project; give sigmas")
-    start = [vector.values[vector.names.index(name)] for name in prior.names]
-    if not np.array_equal(start, prior.mean):
-        raise SurveyError(
-            f"{where}: the prior's mean differs from the start value, which cannot be written to a project"
-        )
 
 
 def _target(target: Target, kind: TargetKind) -> list[Section]:
@@ -171,7 +167,7 @@ def _target(target: Target, kind: TargetKind) -> list[Section]:
 
 
 def _warp(warp: VectorParameter, where: str) -> dict[str, Any]:
-    _check_vector(warp, where)
+    check_vector(warp, where)
     if warp.names != WARP or warp.free not in ((), WARP) or (warp.prior and warp.prior.names != WARP):
         raise SurveyError(f"{where}: the two components are free, held or known together, else they cannot be written")
     numbers = {f"{name}_mm": float(from_si(value, "mm")) for name, value in zip(WARP, warp.values, strict=True)}
@@ -213,6 +209,8 @@ def _kind(target_id: str, kind: TargetKind) -> dict[str, Any]:
 
 def _point(point: PointParameter) -> dict[str, Any]:
     result: dict[str, Any] = {} if point.treatment == "free" else {"treatment": point.treatment}
+    if point.held:
+        result["held"] = point.held
     if point.value is not None:
         result["x_mm"] = from_si(point.value, "mm").tolist()
     if point.treatment == "prior" and point.prior_cov is not None:

@@ -1,7 +1,6 @@
 """Tables as TOML text, in the order given."""
 
 import json
-import math
 import re
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -35,9 +34,7 @@ def _value(value: Any) -> str:
     if isinstance(value, int):
         return str(value)
     if isinstance(value, float):
-        if math.isnan(value):
-            raise ValueError("nan in a project file")
-        return repr(value)
+        return repr(value)  # inf and nan are TOML, too
     if isinstance(value, Mapping):
         inner = ", ".join(f"{_key(key)} = {_value(item)}" for key, item in value.items())
         return f"{{ {inner} }}" if inner else "{}"

@@ -9,11 +9,13 @@ from adjust.model import FloatArray
 
 RAD_PER_DEG = math.pi / 180.0
 RAD_PER_ARCSEC = math.pi / 648000.0
-_UNITS = ("mm", "m", "deg", "arcsec", "px", "rad", "mm2")
+RAD_PER_GON = math.pi / 200.0
+_PER_UNIT = {"gon": RAD_PER_GON, "mgon": RAD_PER_GON / 1e3, "cc": RAD_PER_GON / 1e4}
+_UNITS = ("mm", "m", "deg", "arcsec", "gon", "mgon", "cc", "px", "rad", "mm2", "ppm", "mm_per_m", "1")
 
 
 def to_si(value: npt.ArrayLike, unit: str) -> FloatArray:
-    """Values in ``unit`` as metres, radians or pixels; the same shape."""
+    """Values in ``unit`` as metres, radians, pixels or plain numbers; the same shape."""
     x = np.asarray(value, dtype=float)
     match unit:
         case "mm":
@@ -24,7 +26,13 @@ def to_si(value: npt.ArrayLike, unit: str) -> FloatArray:
             return np.asarray(x * RAD_PER_DEG)
         case "arcsec":
             return np.asarray(x * RAD_PER_ARCSEC)
-        case "m" | "rad" | "px":
+        case "gon" | "mgon" | "cc":
+            return np.asarray(x * _PER_UNIT[unit])
+        case "ppm":
+            return np.asarray(x / 1e6)
+        case "mm_per_m":
+            return np.asarray(x / 1e3)
+        case "m" | "rad" | "px" | "1":
             return x
     raise ValueError(f"unknown unit {unit!r}; known: {_UNITS}")
 
@@ -32,7 +40,8 @@ def to_si(value: npt.ArrayLike, unit: str) -> FloatArray:
 def from_si(x: npt.ArrayLike, unit: str) -> FloatArray:
     """The inverse of ``to_si``, to the last bit where a double can do that; the same shape."""
     x = np.asarray(x, dtype=float)
-    factor = {"mm": 1000.0, "mm2": 1e6, "deg": 1 / RAD_PER_DEG, "arcsec": 1 / RAD_PER_ARCSEC}.get(unit, 1.0)
+    factors = {"mm": 1e3, "mm2": 1e6, "deg": 1 / RAD_PER_DEG, "arcsec": 1 / RAD_PER_ARCSEC, "ppm": 1e6, "mm_per_m": 1e3}
+    factor = ({name: 1 / rad for name, rad in _PER_UNIT.items()} | factors).get(unit, 1.0)
     first = np.asarray(x * factor)
     if factor == 1.0 or not first.size:
         return first

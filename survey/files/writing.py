@@ -28,6 +28,7 @@ from survey.files.project import (
 from survey.files.reading import LAYOUTS
 from survey.files.sections import head_section, option_sections, points_file, survey_sections
 from survey.files.table_writing import Columns, write_table
+from survey.files.terrestrial_columns import new_tables
 from survey.files.text import atomic_write
 from survey.files.toml_text import toml_text
 from survey.files.units import from_si
@@ -134,5 +135,6 @@ def _tables(survey: Survey, spots: Sequence[SpotBlock]) -> dict[str, Columns]:
         "distances": distance_columns(survey.distances),
         "coordinates": coordinates,
         "coordinates_covariance": between,
+        **new_tables(survey),
     }
     return {name: columns for name, columns in tables.items() if len(next(iter(columns.values())))}
