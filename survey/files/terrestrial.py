@@ -107,7 +107,7 @@ def _values(table: Table, kinds: Sequence[ReadingKind]) -> FloatArray:
         if wrong.any():
             row = first_row(wrong)
             found = "has a value of the wrong kind" if not np.isnan(bad[row]) else "has no value"
-            raise table.error(row, f"value: a {kinds[row]} {found}; give it {needs}")
+            raise table.error(row, f"value: the {kinds[row]} {found}; give it {needs}")
     values = np.where(angle, angles, length)
     for row, kind in enumerate(kinds):
         if kind == "zenith" and not 0.0 < values[row] < np.pi:
@@ -126,7 +126,7 @@ def _own_sigmas(table: Table, kinds: Sequence[ReadingKind]) -> FloatArray:
     if wrong.any():
         row = first_row(wrong)
         unit = "sigma_arcsec, sigma_cc or sigma_mgon" if angle[row] else "sigma_mm"
-        raise table.error(row, f"sigma: the sigma of a {kinds[row]} stands in {unit}; move it there")
+        raise table.error(row, f"sigma: that of a reading of kind {kinds[row]} stands in {unit}; move it there")
     return np.where(angle, angles, lengths)
 
 
@@ -182,7 +182,7 @@ def _positions(
 ) -> tuple[PositionRef, PositionRef, PositionRef | None]:
     columns = ("from_id", "to_id", "second_id")
     if (kind == "angle") != bool(texts[2]):
-        found = "an angle needs its right-hand target" if kind == "angle" else f"a {kind} has no second target"
+        found = "an angle needs its right-hand target" if kind == "angle" else f"readings of kind {kind} have no second target"
         raise table.error(row, f"second_id: {found}; {'fill it in' if kind == 'angle' else 'remove it'}")
     refs: list[PositionRef] = []
     for column, text in zip(columns, texts, strict=True):
@@ -194,7 +194,7 @@ def _positions(
         except NameProblemError as problem:
             raise table.error(row, f"{column}: {problem}") from problem
         if refs[-1] in refs[:-1]:
-            raise table.error(row, f"{column}: {text!r} stands in this row twice; a {kind} joins different positions")
+            raise table.error(row, f"{column}: {text!r} stands in this row twice; its positions must differ")
     return refs[0], refs[1], refs[2] if len(refs) > 2 else None
 
 
