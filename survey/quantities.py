@@ -44,18 +44,25 @@ def scale_of(adjustment: Adjustment, sigmas: SigmaKind) -> Scale:
     return Scale("a_posteriori", float(adjustment.sigma0), ellipsoid)
 
 
+SMALL_ANGLES = {
+    "non_orthogonality", "tilt_1", "tilt_2", "vertical_index", "inclination", "across_1", "across_2",
+}  # fmt: skip
+
+
 def unit_for_people(component: str, unit: str) -> tuple[str, float]:
-    """Unit and factor in which a person reads a value: mm, deg (arcsec for small angles of a table), px."""
+    """Unit and factor in which a person reads a value: mm, deg (arcsec for what is always small), ppm, px."""
     if unit == "m":
         return "mm", 1e3
     if unit == "rad":
-        return ("arcsec", ARCSEC_PER_RAD) if component == "non_orthogonality" else ("deg", 180.0 / np.pi)
+        return ("arcsec", ARCSEC_PER_RAD) if component in SMALL_ANGLES else ("deg", 180.0 / np.pi)
+    if component == "distance_scale":
+        return "ppm", 1e6
     return ("" if unit in ("1", "") else unit), 1.0
 
 
-def sigma_unit_for_people(unit: str) -> tuple[str, float]:
-    """Unit and factor in which a person reads a residual or a sigma: mm, arcsec, px."""
-    return ("arcsec", ARCSEC_PER_RAD) if unit == "rad" else unit_for_people("", unit)
+def sigma_unit_for_people(unit: str, component: str = "") -> tuple[str, float]:
+    """Unit and factor in which a person reads a residual or a sigma: mm, arcsec, ppm, px."""
+    return ("arcsec", ARCSEC_PER_RAD) if unit == "rad" else unit_for_people(component, unit)
 
 
 def key_of(component: str, unit: str) -> str:
@@ -87,7 +94,7 @@ def vector_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
         estimate.components, estimate.units, values, sigmas_of(estimate, scale), strict=True
     ):
         value_unit, value_factor = unit_for_people(name, unit)
-        sigma_unit, sigma_factor = sigma_unit_for_people(unit)
+        sigma_unit, sigma_factor = sigma_unit_for_people(unit, name)
         entry[key_of(name, value_unit)] = float(value * value_factor)
         entry[key_of(f"sigma_{name}", sigma_unit)] = float(sigma * sigma_factor)
     return entry | {"status": dict(zip(estimate.components, estimate.status, strict=True))}
