@@ -21,6 +21,7 @@ from survey.commands.examples import declare_example
 from survey.commands.navigating import declare_navigate
 from survey.commands.networks import declare_add, declare_remove, declare_trackers
 from survey.commands.planning import declare_plan
+from survey.commands.reporting import declare_report
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "TEST_FAILED", "USAGE", "build_parser", "main"]
 
@@ -39,6 +40,7 @@ Exit codes: 0 done, 1 error in the project, 2 wrong usage, 3 solved but residual
 _COMMANDS = (
     declare_adjust,
     declare_detect,
+    declare_report,
     declare_plan,
     declare_add,
     declare_remove,

@@ -3,13 +3,14 @@
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,9 @@ from survey.checked import checked
 from survey.detection import DetectionTask, ImageReport, SpotOptions, detect_images
 from survey.files import Definition, Project, SpotBlock, read, read_definition, write_image_points, write_spots
 from survey.identify import Identification, identify_spots, without_points
-from survey.results import RunInfo, solution_dict, summary_text, write_results
+from survey.quantities import scale_of
+from survey.results import ENGLISH_PAGE, ReportOptions, RunInfo, solution_dict, summary_text, write_results
+from survey.statistics import Statistics, statistics_of
 from survey.targets import DetectableTarget, PointList
 
 PICTURES = "detected"
@@ -79,6 +82,7 @@ class AdjustOutcome:
     adjustment: Adjustment
     run: RunInfo
     paths: dict[str, Path] = field(default_factory=dict)
+    statistics: Statistics | None = None
 
     def summary(self) -> dict[str, Any]:
         """``summary`` and ``warnings`` of the solution, with the paths written."""
@@ -97,7 +101,7 @@ class AdjustOutcome:
     @cached_property
     def solution(self) -> dict[str, Any]:
         """All that ``solution.json`` holds."""
-        return solution_dict(self.adjustment, self.run)
+        return solution_dict(self.adjustment, self.run, self.statistics)
 
 
 def detect_job(
@@ -168,22 +172,30 @@ def _blocks(definition: Definition, reports: Sequence[ImageReport]) -> tuple[lis
     return blocks, spots
 
 
-class _Clock:
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
+class Clock:
+    """How long each step took."""
+
+    def __init__(self, seconds: Mapping[str, float] = MappingProxyType({})) -> None:
+        self.seconds: dict[str, float] = dict(seconds)
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
+        """Time what is done inside."""
         begin = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
 
 def adjust_job(
-    folder: Path, *, out: Path | None = None, progress: bool = True, redetect: bool = False
+    folder: Path,
+    *,
+    out: Path | None = None,
+    progress: bool = True,
+    redetect: bool = False,
+    report: ReportOptions = ENGLISH_PAGE,
 ) -> AdjustOutcome:
     """The main job: detect where that has not been done, adjust everything, write the results. Raises SurveyError."""
-    clock, folder = _Clock(), Path(folder)
+    clock, folder = Clock(), Path(folder)
     messages: tuple[str, ...] = ()
     if redetect:
         with clock.step("detect"):
@@ -199,16 +211,29 @@ def adjust_job(
         adjustment = adjust_project(project, progress)
     notes = tuple(f"detection: {m}" for m in messages)
     adjustment = replace(adjustment, warnings=adjustment.warnings + notes)
+    return written(project, adjustment, out if out is not None else folder, clock, report)
+
+
+def written(
+    project: Project, adjustment: Adjustment, place: Path, clock: Clock, report: ReportOptions = ENGLISH_PAGE
+) -> AdjustOutcome:
+    """The statistics of an adjusted project, and everything written to ``place``."""
     run = run_info(project, clock.seconds)
+    with clock.step("statistics"):
+        found = statistics_of(adjustment, project.options.tolerances, scale_of(adjustment, run.sigmas))
     with clock.step("report"):
-        paths = write_results(out if out is not None else folder, adjustment, run)
-    return AdjustOutcome(adjustment, run, paths)
+        paths = write_results(place, adjustment, run, found, report)
+    return AdjustOutcome(adjustment, run, paths, found)
 
 
 def adjust_project(project: Project, progress: bool) -> Adjustment:
     """Adjust what was read. Raises SurveyError."""
     survey = project.survey
-    if not (survey.image_blocks or project.spots or survey.pairs or survey.distances or survey.coordinates):
+    observed = (
+        survey.image_blocks, project.spots, survey.pairs, survey.distances, survey.coordinates, survey.readings,
+        survey.coordinate_differences, survey.levels, survey.alignments, survey.laser_spots, survey.on_surfaces,
+    )  # fmt: skip
+    if not any(observed):
         raise SurveyError(
             f"{project.folder}: there is nothing to adjust; put images at images/<camera_id>/<epoch_id>.png or tables "
             "into observations/"
@@ -251,6 +276,10 @@ def _seen_points(survey: Survey) -> Survey:
     """Leave out the beacons that nothing observes any more: a beacon may be hidden in all images."""
     observed = {survey.points[int(i)].point_id for b in survey.image_blocks if b.target_id is None for i in b.point_idx}
     observed |= {r.point_id for c in survey.coordinates for r in c.positions if r.frame is None}
+    refs = [r for d in survey.coordinate_differences for r in (*d.at, *d.to)]
+    refs += [o.position for o in survey.on_surfaces]
+    refs += [r for x in survey.readings for r in (x.at, x.to, x.second) if r is not None]
+    observed |= {r.point_id for r in refs if r.frame is None}
     kept = tuple(p for p in survey.points if p.point_id in observed or p.x_in_world.treatment != "free")
     if len(kept) == len(survey.points):
         return survey
@@ -278,7 +307,9 @@ def run_info(project: Project, seconds: dict[str, float]) -> RunInfo:
             versions[package] = version(package)
         except PackageNotFoundError:
             continue
-    options = {**asdict(project.options), "datum": project.survey.datum.kind}
+    chosen = replace(project.options, tolerances=(), identification=())
+    options = {k: v for k, v in asdict(chosen).items() if v != ()} | {"datum": project.survey.datum.kind}
     date = datetime.now(UTC).isoformat(timespec="seconds")
     name = project.folder.resolve().name  # the name alone: results of a copied folder stay the same
-    return RunInfo(name, project.title, project.inputs, options, versions, date, seconds)
+    said = project.options.identification
+    return RunInfo(name, project.title, project.inputs, options, versions, date, seconds, identification=said)

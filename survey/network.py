@@ -17,12 +17,12 @@ from survey.files.pairs import COVARIANCE_COLUMNS, EULER, PAIRS, QUATERNION, SIG
 from survey.files.project import OBSERVATIONS_FOLDER
 from survey.files.references import NameProblemError, Names, check_epochs, read_frame
 from survey.files.tables import Table, read_table
-from survey.jobs import AdjustOutcome, adjust_project, run_info
+from survey.jobs import AdjustOutcome, Clock, adjust_project, written
 from survey.merging import Merged, merge
 from survey.network_summary import network_dict, pair_network
 from survey.previous import Move, Previous, moves, read_previous
 from survey.replacing import complete, place_for, recover, replace_parts
-from survey.results import RESULTS, write_results
+from survey.results import RESULTS
 from survey.warm_start import warm_adjustment
 
 _MOST_MOVES = 200
@@ -202,8 +202,7 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
         adjustment, start = warm_adjustment(grown, before, lambda p: adjust_project(p, progress), progress)
         if (folder / RESULTS).is_dir():  # what others put there stays
             shutil.copytree(folder / RESULTS, place / RESULTS)
-        run = run_info(grown, {"adjust": time.perf_counter() - begin})
-        outcome = AdjustOutcome(adjustment, run, write_results(place, adjustment, run))
+        outcome = written(grown, adjustment, place, Clock({"adjust": time.perf_counter() - begin}))
         if out is None:
             replace_parts(folder, [*merged.entries, RESULTS])
         else:

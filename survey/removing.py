@@ -21,11 +21,11 @@ from survey.files.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.files.reading import LAYOUTS
 from survey.files.tables import read_table
 from survey.files.text import atomic_write, suggestion
-from survey.jobs import AdjustOutcome, adjust_project, run_info
+from survey.jobs import AdjustOutcome, Clock, adjust_project, written
 from survey.merging import point_files, table_rows
 from survey.previous import Move, Previous, moves, read_previous
 from survey.replacing import complete, place_for, recover, replace_parts
-from survey.results import RESULTS, write_results
+from survey.results import RESULTS
 
 _ID_COLUMNS = {"pairs": "pair_id", "distances": "distance_id", "coordinates": "point_id"}
 _MOST_MOVES, _MOST_SHOWN = 200, 8
@@ -121,8 +121,7 @@ def remove_job(
             raise type(error)(said) from error
         if (folder / RESULTS).is_dir():  # what others put there stays
             shutil.copytree(folder / RESULTS, place / RESULTS)
-        run = run_info(reduced, {"adjust": time.perf_counter() - begin})
-        outcome = AdjustOutcome(adjustment, run, write_results(place, adjustment, run))
+        outcome = written(reduced, adjustment, place, Clock({"adjust": time.perf_counter() - begin}))
         if out is None:
             replace_parts(folder, [*(f"{OBSERVATIONS_FOLDER}/{name}.csv" for name in chosen), RESULTS])
         else:

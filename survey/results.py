@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,14 @@ from adjust.result import Adjustment
 from survey.files import atomic_write
 from survey.quantities import SigmaKind, scale_of
 from survey.report import report_html, summary_text
+from survey.report.pdf import report_pdf
 from survey.residual_tables import image_residuals_csv, other_residuals_csv
 from survey.solution import RunInfo, solution_dict, solution_json
+from survey.statistics import Statistics
 
 __all__ = [
     "RESULTS",
+    "ReportOptions",
     "RunInfo",
     "covariance_npz",
     "read_covariances",
@@ -67,16 +71,39 @@ def read_covariances(path: Path) -> dict[str, Any]:
         }
 
 
-def write_results(folder: Path, adjustment: Adjustment, run: RunInfo) -> dict[str, Path]:
-    """Write everything into ``folder/results``, each file whole or not at all; the paths by file name."""
+@dataclass(frozen=True)
+class ReportOptions:
+    """language: of report.html, "en" or "de". pdf: write report.pdf too."""
+
+    language: str = "en"
+    pdf: bool = False
+
+
+ENGLISH_PAGE = ReportOptions()
+
+
+def write_results(
+    folder: Path,
+    adjustment: Adjustment,
+    run: RunInfo,
+    statistics: Statistics | None = None,
+    options: ReportOptions = ENGLISH_PAGE,
+) -> dict[str, Path]:
+    """Write everything into ``folder/results``, each file whole or not at all; the paths by file name.
+
+    Raises SurveyError for a language that there is not, or where no PDF can be made; nothing has been written then.
+    """
     results = folder / RESULTS
+    solution = solution_dict(adjustment, run, statistics)
+    page = report_html(adjustment, run, solution, statistics, options.language)
+    pdf = report_pdf(page) if options.pdf else b""
     results.mkdir(parents=True, exist_ok=True)
-    solution = solution_dict(adjustment, run)
     makers: Mapping[str, Callable[[], bytes]] = {
         "covariance.npz": lambda: covariance_npz(adjustment, run.sigmas),
         "residuals.csv": lambda: image_residuals_csv(adjustment),
         "residuals_other.csv": lambda: other_residuals_csv(adjustment),
-        "report.html": lambda: report_html(adjustment, run, solution).encode(),
+        "report.html": page.encode,
+        **({"report.pdf": lambda: pdf} if options.pdf else {}),
         # last: whoever waits for the solution finds the rest beside it
         "solution.json": lambda: solution_json(solution).encode(),
     }

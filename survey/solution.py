@@ -13,6 +13,9 @@ from adjust.result import Adjustment, Estimate, GroupSummary
 from survey.adjusted_pairs import pairs_dict
 from survey.network_summary import loops_dict, network_dict, pair_loops, pair_network
 from survey.quantities import Scale, SigmaKind, point_entry, pose_entry, scale_of, vector_entry
+from survey.solution_instruments import instrument_entries
+from survey.statistics import Statistics
+from survey.statistics_dict import statistics_dict
 from survey.verdict import suspects, verdict
 
 CORRELATION_LIMIT = 0.95
@@ -32,7 +35,8 @@ class RunInfo:
     """What was run: everything in a result file that the adjustment itself does not know.
 
     date: time stamp, ISO 8601. seconds: duration per step; printed, but in no file, so that equal input gives equal
-    files. sigmas: how sigmas of unknowns are given.
+    files. sigmas: how sigmas of unknowns are given. identification: what the project says of itself (who, where, with
+    what), in its order.
     """
 
     folder: str
@@ -43,10 +47,11 @@ class RunInfo:
     date: str = ""
     seconds: Mapping[str, float] = field(default_factory=dict)
     sigmas: SigmaKind = "a_posteriori"
+    identification: tuple[tuple[str, str], ...] = ()
 
 
-def solution_dict(adjustment: Adjustment, run: RunInfo) -> dict[str, Any]:
-    """The whole solution as plain values, floats in full, None where there is no number."""
+def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None = None) -> dict[str, Any]:
+    """The whole solution as plain values, floats in full, None where there is no number; ``found``: its statistics."""
     scale = scale_of(adjustment, run.sigmas)
     solution: dict[str, Any] = _plain(
         {
@@ -59,11 +64,14 @@ def solution_dict(adjustment: Adjustment, run: RunInfo) -> dict[str, Any]:
             "tables": _tables(adjustment, scale),
             "targets": _targets(adjustment, scale),
             "pairs": pairs_dict(adjustment, scale),
+            **instrument_entries(adjustment, scale),
             **_network(adjustment.survey),
             "groups": {g.group: _group(g) for g in adjustment.groups},
             "warnings": list(adjustment.warnings),
+            **(statistics_dict(adjustment, found, scale) if found is not None else {}),
             "inputs": {
                 "folder": run.folder,
+                "identification": dict(run.identification),
                 "hashes": dict(run.input_hashes),
                 "options": dict(run.options),
                 "versions": dict(run.versions),

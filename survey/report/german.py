@@ -279,6 +279,28 @@ GERMAN = {
         "Ziehen dreht, das Rad vergrößert, auch Pfeiltasten drehen. Ellipsoide vergrößert"
     ),
     "times": "mal",
+    # what is demanded
+    "Identification": "Angaben zur Messung",
+    "Tolerances": "Toleranzen",
+    '<a href="#tolerances">{n} of {most} demands</a> on the results are not met.': (
+        '<a href="#tolerances">{n} von {most} Forderungen</a> an die Ergebnisse sind nicht erfüllt.'
+    ),
+    "U: expanded uncertainty at 95 % (k = {k}), in the worst direction. |Δ| + U: deviation from nominal with its "
+    "uncertainty; what is not proven is not met (ISO 14253-1).": (
+        "U: erweiterte Unsicherheit bei 95 % (k = {k}) in der ungünstigsten Richtung. |Δ| + U: Abweichung vom Nennwert "
+        "mit ihrer Unsicherheit; was nicht nachgewiesen ist, ist nicht erfüllt (ISO 14253-1)."
+    ),
+    "Demand": "Forderung",
+    "Quantity": "Größe",
+    "Found": "Gefunden",
+    "Allowed": "Erlaubt",
+    "Used [%]": "Ausgenutzt [%]",
+    "met": "erfüllt",
+    "not met": "nicht erfüllt",
+    "position": "Position",
+    "rotation": "Drehung",
+    "File": "Datei",
+    "Hash": "Prüfsumme",
     # statistics
     "Variance components": "Varianzkomponenten",
     "Factor of variance": "Varianzfaktor",

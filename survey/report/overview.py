@@ -2,16 +2,19 @@
 
 from typing import Any
 
+from survey.quantities import sigma_unit_for_people
 from survey.report import drawing as d
 from survey.report.context import Context
-from survey.report.language import message, t
+from survey.report.language import known, message, t
 from survey.report.markup import count, definition, esc, fixed, general, pill, section, table
 from survey.report.picture import pictures
 from survey.report.scene import scene_of
 from survey.report.space import space
+from survey.tolerances import Verdict, coverage
 
 _WORDS = {"passed": "Passed", "check": "Needs a look", "failed": "Failed"}
 _MOST_WARNINGS = 25
+_MOST_VERDICTS = 200
 _CLEAR = 3.0  # deviations of a group beyond this many sigmas are marked
 
 
@@ -33,6 +36,12 @@ def header(c: Context) -> str:
         problems.append(t('<a href="#observations">{n} other observations</a> are suspect.', n=n))
     if found["n_not_used"]:
         problems.append(t("{n} observations were not used.", n=count(found["n_not_used"])))
+    unmet = [v for v in c.statistics.verdicts if not v.met] if c.statistics is not None else []
+    if unmet:
+        most = count(len(c.statistics.verdicts) if c.statistics is not None else 0)
+        n = count(len(unmet))
+        said = t('<a href="#tolerances">{n} of {most} demands</a> on the results are not met.', n=n, most=most)
+        problems.insert(0, said)
     items = "".join(f"<li>{p}</li>" for p in problems)
     listed = (
         f'<ul class="problems">{items}</ul>'
@@ -126,6 +135,38 @@ def groups(c: Context) -> str:
     )
     columns = ("<Group", "Observations", "Redundancy", "Omega", "Variance factor", "Scale of sigmas", "Deviation [σ]")
     return section("groups", "Groups of observations", table(columns, rows) if rows else "", note)
+
+
+def identification(c: Context) -> str:
+    """Who measured what, as the project says it."""
+    rows = [(name, esc(value)) for name, value in c.run.identification]
+    return section("identification", "Identification", definition(rows) if rows else "")
+
+
+def tolerances(c: Context) -> str:
+    """What the project demands of its results, the hardest to meet first."""
+    if c.statistics is None or not c.statistics.verdicts:
+        return ""
+    found = sorted(c.statistics.verdicts, key=lambda v: -v.found / v.allowed)
+    rows = [_verdict_row(v) for v in found[:_MOST_VERDICTS]]
+    columns = ("<Demand", "<Result", "<Quantity", "<", "Found", "Allowed", "<Unit", "Used [%]", "<")
+    classes = ["" if v.met else "suspect" for v in found[:_MOST_VERDICTS]]
+    note = t(
+        "U: expanded uncertainty at 95 % (k = {k}), in the worst direction. |Δ| + U: deviation from nominal with its "
+        "uncertainty; what is not proven is not met (ISO 14253-1).",
+        k=fixed(coverage(c.adjustment, c.scale), 2),
+    )
+    return section("tolerances", "Tolerances", table(columns, rows, "", classes), note)
+
+
+def _verdict_row(v: Verdict) -> tuple[str, ...]:
+    unit, factor = sigma_unit_for_people(v.unit)
+    said = pill("good", t("met")) if v.met else pill("bad", t("not met"))
+    return (
+        esc(v.tolerance), esc(" ".join(v.result[1:])), esc(known(v.quantity)), "|Δ| + U" if v.of_value else "U",
+        general(v.found * factor, 3), general(v.allowed * factor, 3), esc(unit), fixed(100 * v.found / v.allowed, 0),
+        said,
+    )  # fmt: skip
 
 
 def picture(c: Context) -> str:

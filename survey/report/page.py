@@ -15,7 +15,9 @@ from survey.solution import RunInfo, solution_dict
 from survey.statistics import Statistics
 
 _SECTIONS = (
+    ("Identification", "identification", overview.identification),
     ("Summary", "summary", overview.summary),
+    ("Tolerances", "tolerances", overview.tolerances),
     ("Variance components", "components", statistics.components),
     ("Groups", "groups", overview.groups),
     ("Picture", "picture", overview.picture),

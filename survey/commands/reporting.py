@@ -1,0 +1,48 @@
+"""The command ``report``: the precision report of a project, in a language, as a page and on paper, with a check."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from survey.commands.common import DONE, TEST_FAILED, is_set, print_json, require_project, say, tested
+
+
+def declare_report(commands: Any, shaped: dict[str, Any]) -> None:
+    """Add ``report`` to the commands."""
+    parser = commands.add_parser(
+        "report",
+        help="write the precision report of a project, also in German, as PDF, or as a check",
+        usage="labsurvey report lab --pdf   (labsurvey report FOLDER [--language en|de] [--pdf] [--check] [--out DIR])",
+        description="Adjusts the observations of FOLDER and writes FOLDER/results, report.html in the language asked "
+        "for.\nWith --check the exit code is 3 when the global test or a tolerance of survey.toml is not met.",
+        epilog="Next: open FOLDER/results/report.html",
+        **shaped,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder with a survey.toml")
+    parser.add_argument("--language", choices=("en", "de"), default="en", help="of the report; default: en")
+    parser.add_argument("--pdf", action="store_true", help="write report.pdf too; needs Chromium, Chrome or WeasyPrint")
+    parser.add_argument("--check", action="store_true", help="exit code 3 also where a tolerance is not met")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
+    parser.set_defaults(run=_report)
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    require_project(arguments.folder)
+    from survey.jobs import adjust_job
+    from survey.results import ReportOptions
+
+    outcome = adjust_job(
+        arguments.folder, out=arguments.out, progress=not is_set(arguments, "quiet"),
+        report=ReportOptions(arguments.language, arguments.pdf),
+    )  # fmt: skip
+    unmet = [v for v in outcome.statistics.verdicts if not v.met] if outcome.statistics is not None else []
+    if is_set(arguments, "json"):
+        print_json(outcome.summary())
+    else:
+        print(outcome.text())
+        for v in unmet:
+            times = f"{v.found / v.allowed:.2f} times what is allowed"
+            print(f"  tolerance {v.tolerance} not met: {' '.join(v.result)} {v.quantity}, {times}")
+        say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+    code = tested(outcome.adjustment.global_test)
+    return TEST_FAILED if code == DONE and arguments.check and unmet else code
