@@ -4,26 +4,83 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from survey.commands.common import DONE, is_set, print_json, require_project
+from adjust.errors import SurveyError
+from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say
+
+_DESCRIPTION = """\
+With FOLDER/plan.toml: predicts what will be seen and says what sigmas everything will have, which directions are weak,
+what to measure next, how exact the parts must be; writes FOLDER/results/plan.html and plan.json. What is observed
+already is counted in. Without: counts conditions and redundancy of observations/pairs.csv, which needs no values yet.
+"""
 
 
 def declare_plan(commands: Any, shaped: dict[str, Any]) -> None:
     """Add ``plan`` to the commands."""
     parser = commands.add_parser(
         "plan",
-        help="say what a network of pairs will tell, before it is measured",
-        usage="labsurvey plan lab   (labsurvey plan FOLDER)",
-        description="Counts conditions and redundancy from survey.toml and observations/pairs.csv, which needs no "
-        "values yet, only pair_id,a_id,b_id; names the pairs that close no loop.",
+        help="precision before measuring, what to measure next, tolerances, places for beacons",
+        usage="labsurvey plan lab   (labsurvey plan FOLDER [--for NAME ...] [--add N] [--trials N] [--navigation]\n"
+        "                              [--place N] | labsurvey plan --error-analysis [--out DIR])",
+        description=_DESCRIPTION,
         epilog="Next: labsurvey adjust FOLDER",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder with a survey.toml")
+    parser.add_argument("folder", type=Path, nargs="?", metavar="FOLDER", help="folder with survey.toml and plan.toml")
+    parser.add_argument("--for", nargs="+", dest="wanted", metavar="NAME", default=[],
+                        help="what is to become precise: lens.X, head.camera_X, point.B*, everything")  # fmt: skip
+    parser.add_argument("--add", type=not_negative, default=5, metavar="N", help="candidates to choose (5)")
+    parser.add_argument("--criterion", choices=("D", "A"), default="D", help="determinant or mean variance (D)")
+    parser.add_argument("--trials", type=positive, metavar="N", help="simulate and adjust the plan N times")
+    parser.add_argument("--seed", type=not_negative, default=0, metavar="N", help="of everything random (0)")
+    parser.add_argument("--jobs", type=positive, metavar="N", help="processes for trials; default: one per processor")
+    parser.add_argument("--navigation", action="store_true", help="precision of the poses of [navigation]")
+    parser.add_argument("--place", type=positive, default=0, metavar="N", help="choose places of N beacons for them")
+    parser.add_argument("--error-analysis", action="store_true",
+                        help="pixel error by beacon and camera errors, 10000 trials a point")  # fmt: skip
+    parser.add_argument("--pixels", type=float, default=5.0, metavar="PX", help="pixel error allowed in it (5)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
     parser.set_defaults(run=_plan, parser=parser)
 
 
 def _plan(arguments: argparse.Namespace) -> int:
+    if arguments.error_analysis:
+        return _error_analysis(arguments)
+    if arguments.folder is None:
+        raise SurveyError("name the project folder: labsurvey plan FOLDER; or labsurvey plan --error-analysis")
     require_project(arguments.folder)
+    if not (arguments.folder / "plan.toml").is_file():
+        return _network(arguments)
+    from survey.planning.job import PlanRequest, planning_job
+
+    request = PlanRequest(
+        tuple(arguments.wanted), arguments.add, arguments.criterion, arguments.trials or 0, arguments.seed,
+        arguments.jobs, arguments.navigation, arguments.place,
+    )  # fmt: skip
+    outcome = planning_job(arguments.folder, request, out=arguments.out, progress=not is_set(arguments, "quiet"))
+    if is_set(arguments, "json"):
+        print_json(outcome.summary())
+        return DONE
+    print(outcome.text())
+    say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+    return DONE
+
+
+def _error_analysis(arguments: argparse.Namespace) -> int:
+    from survey.planning.errors import error_analysis_job
+
+    result = error_analysis_job(
+        arguments.out, n_trials=arguments.trials or 10_000, seed=arguments.seed, rms_px=arguments.pixels
+    )
+    if is_set(arguments, "json"):
+        print_json(result.summary())
+        return DONE
+    print(result.text())
+    say(arguments, *(f"written: {path}" for path in result.paths.values()))
+    return DONE
+
+
+def _network(arguments: argparse.Namespace) -> int:
+    """Without a plan.toml: the counts of a network of pairs."""
     from survey.network import plan_job
 
     outcome = plan_job(arguments.folder)

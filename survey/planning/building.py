@@ -1,0 +1,358 @@
+"""From a project and its plan to a survey with predicted observations, its values, and candidates."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.design import Candidate, predict, with_candidates
+from adjust.errors import SurveyError
+from adjust.graph import StartValues
+from adjust.lens import MODELS, camera_constants, unit_rays
+from adjust.model import Camera, FloatArray, IntArray, Point, PointParameter, PoseParameter, Station, Survey
+from adjust.observations import Coordinates, Distance, ImageBlock, Pair, PositionRef, TableReading
+from adjust.result import Adjustment, ParameterName
+from survey.files import Project
+from survey.planning.plan_file import ByHand, Measurements, Moment, Moments, Plan
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """A survey of existing and planned observations, the values of everything, and what could be added.
+
+    survey: without candidates. start: also has the values of what candidates bring. ideal image points are in
+    ``survey.image_blocks``. notes: for people.
+    """
+
+    survey: Survey
+    start: StartValues
+    candidates: tuple[Candidate, ...]
+    n_existing_blocks: int
+    n_planned_epochs: int
+    notes: tuple[str, ...]
+
+
+@dataclass(eq=False)
+class _Values:
+    """Values as they are gathered."""
+
+    lenses: dict[str, FloatArray] = field(default_factory=dict)
+    poses: dict[ParameterName, Pose3] = field(default_factory=dict)
+    points: dict[str, FloatArray] = field(default_factory=dict)
+    vectors: dict[ParameterName, FloatArray] = field(default_factory=dict)
+
+    def start(self) -> StartValues:
+        return StartValues(self.lenses, self.poses, self.points, self.vectors)
+
+
+def build_plan(project: Project, plan: Plan, existing: Adjustment | None, notes: Sequence[str] = ()) -> Planned:
+    """Predict everything planned. existing: adjustment of what is observed already, whose values then count.
+
+    Raises SurveyError where a value or a sigma is missing.
+    """
+    base = existing.survey if existing is not None else project.survey
+    values = _gather(base, existing)
+    taken = {b.epoch_id for b in base.image_blocks} | {r.epoch_id for r in base.table_readings}
+    taken |= {epoch for _, epoch in project.images}
+    said = list(notes)
+    planned = _moments(plan.planned.epochs, base, values)
+    possible = _moments(plan.candidates.epochs, base, values)
+    _check_new(plan, taken, planned + possible)
+    survey = _with_poses(base, planned + possible)
+    everything = _with_readings(survey, [r for m in planned + possible for r in _readings(m, project)])
+    start = _with_moving(values, planned + possible).start()
+    seen = _seen(everything, start, planned, plan, project)
+    dark = [m.epoch_id for m in planned if not any(b.epoch_id == m.epoch_id for b in seen)]
+    if dark:
+        said.append(f"planned epochs that show nothing, left out: {_listed(dark)}")
+    lit = [m for m in planned if m.epoch_id not in dark]
+    whole = replace(
+        survey,
+        image_blocks=base.image_blocks + seen,
+        table_readings=base.table_readings + tuple(r for m in lit for r in _readings(m, project)),
+        distances=base.distances + tuple(Distance(d.name, d.a, d.b, 1.0, d.sigma) for d in plan.planned.distances),
+        coordinates=base.coordinates + tuple(_coordinates(c.position, c.sigma) for c in plan.planned.coordinates),
+        pairs=base.pairs + tuple(Pair(p.name, p.a, p.b, Pose3(), p.cov) for p in plan.planned.pairs),
+    )
+    extra = {p.name: p.x_in_world for p in plan.candidates.points}
+    start = replace(start, points={**start.points, **extra})
+    candidates, blind = _candidates(whole, everything, start, possible, plan, project, lit)
+    if blind:
+        said.append(f"candidates that show nothing, left out: {_listed(blind)}")
+    return Planned(whole, start, candidates, len(base.image_blocks), len(lit), tuple(said))
+
+
+def _listed(names: Sequence[str], most: int = 8) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _gather(survey: Survey, existing: Adjustment | None) -> _Values:
+    """Values of survey.toml, those of an adjustment before them."""
+    v = _Values()
+    estimates = {} if existing is None else existing.estimates
+    for c in survey.cameras:
+        value = c.lens.values
+        if (found := estimates.get(("lens", c.camera_id))) is not None:
+            value = np.asarray(found.value)
+        if value is None:
+            raise SurveyError(
+                f"camera {c.camera_id}: its lens has no values to plan with; give them under "
+                f"[cameras.{c.camera_id}.lens] values, from a data sheet or an earlier calibration"
+            )
+        v.lenses[c.camera_id] = np.asarray(value, dtype=float)
+    for name, parameter in _poses(survey):
+        if parameter.value is not None:
+            v.poses[name] = parameter.value
+    for p in survey.points:
+        if p.x_in_world.value is not None:
+            v.points[p.point_id] = np.asarray(p.x_in_world.value, dtype=float)
+    for co in survey.coordinates:
+        for ref, x in zip(co.positions, co.values, strict=True):
+            if ref.frame is None and ref.point_id is not None:
+                v.points.setdefault(ref.point_id, np.asarray(x))
+    for name, e in estimates.items():
+        if isinstance(e.value, Pose3):
+            v.poses[name] = e.value
+        elif name[0] == "point":
+            v.points[name[1]] = np.asarray(e.value)
+        elif name[0] != "lens":
+            v.vectors[name] = np.asarray(e.value)
+    return v
+
+
+def _poses(survey: Survey) -> Iterable[tuple[ParameterName, PoseParameter]]:
+    for c in survey.cameras:
+        yield ("station_from_camera", c.camera_id), c.station_from_camera
+    for s in survey.stations:
+        yield ("world_from_station", s.station_id), s.world_from_station
+        yield ("mount_from_station", s.station_id), s.mount_from_station
+        for e, p in s.epochs.items():
+            yield ("world_from_station", s.station_id, e), p
+    for t in survey.tables:
+        yield ("world_from_table", t.table_id), t.world_from_table
+    for x in survey.targets:
+        yield ("carrier_from_target", x.target_id), x.carrier_from_target
+        for e, p in x.epochs.items():
+            yield ("carrier_from_target", x.target_id, e), p
+
+
+def _check_new(plan: Plan, taken: set[str], moments: Sequence[Moment]) -> None:
+    seen: set[str] = set()
+    for m in moments:
+        if m.epoch_id in taken or m.epoch_id in seen:
+            raise SurveyError(f"{plan.path}: epoch {m.epoch_id!r} is there already; give the series another name")
+        seen.add(m.epoch_id)
+
+
+def _moments(series: Sequence[Moments], survey: Survey, values: _Values) -> list[Moment]:
+    out: list[Moment] = []
+    for s in series:
+        if s.by_hand is None:
+            out += s.moments
+            continue
+        poses = _hand_poses(s.by_hand, survey, values)
+        per = len(s.moments) // s.by_hand.count
+        out += [_held_by_hand(m, s.by_hand, survey, values, poses[i // per]) for i, m in enumerate(s.moments)]
+    return out
+
+
+def _hand_poses(hand: ByHand, survey: Survey, values: _Values) -> list[Pose3]:
+    """camera_from_target: the middle of the target in nine cells of the image in turn, tilted, at any distance."""
+    rng = np.random.default_rng(hand.seed)
+    camera = next(c for c in survey.cameras if c.camera_id == hand.camera_id)
+    target = next(t for t in survey.targets if t.target_id == hand.target_id)
+    middle = 0.5 * (target.x_in_target.min(axis=0) + target.x_in_target.max(axis=0))
+    out = []
+    for i in range(hand.count):
+        cell = (4, 0, 8, 2, 6, 1, 7, 3, 5)[i % 9]
+        share = (np.array([cell % 3, cell // 3]) + rng.uniform(0.2, 0.8, 2)) / 3.0
+        ray = _ray(camera, values.lenses[camera.camera_id], share * np.array(camera.image_size))
+        axis, tilt = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.25, 1.0) * hand.tilt
+        turn = Pose3.Expmap(np.array([tilt * np.cos(axis), tilt * np.sin(axis), 0, 0, 0, 0])).rotation()
+        roll = Pose3.Expmap(np.array([0, 0, rng.choice([0.0, 0.0, 0.5, 1.0]) * np.pi, 0, 0, 0])).rotation()
+        R = turn.compose(roll)
+        out.append(Pose3(R, ray * rng.uniform(*hand.distance) - R.matrix() @ middle))
+    return out
+
+
+def _ray(camera: Camera, lens: FloatArray, pixel: FloatArray) -> FloatArray:
+    ray = unit_rays(MODELS[camera.lens.model], lens, camera_constants(camera), pixel[None])[0]
+    return np.asarray(ray / ray[2])
+
+
+def _held_by_hand(m: Moment, hand: ByHand, survey: Survey, values: _Values, camera_from_target: Pose3) -> Moment:
+    """Who moves: the target where it moves between epochs, else the station with its camera."""
+    camera = next(c for c in survey.cameras if c.camera_id == hand.camera_id)
+    target = next(t for t in survey.targets if t.target_id == hand.target_id)
+    station = next(s for s in survey.stations if s.station_id == camera.station_id)
+    mount = _value(values, ("station_from_camera", camera.camera_id), camera.station_from_camera)
+    if target.motion == "epoch":
+        if station.motion != "fixed":
+            raise SurveyError(
+                f"target {target.target_id} and station {station.station_id} both move between epochs: give poses for "
+                "one of them in plan.toml, by_hand is for one thing that moves"
+            )
+        world = _value(values, ("world_from_station", station.station_id), station.world_from_station)
+        return replace(m, target_id=target.target_id, pose=world * mount * camera_from_target)
+    if station.motion == "fixed":
+        raise SurveyError(f"neither {target.target_id} nor station {station.station_id} moves; by_hand needs one")
+    world = _value(values, ("carrier_from_target", target.target_id), target.carrier_from_target)
+    return replace(m, station_id=station.station_id, pose=world * camera_from_target.inverse() * mount.inverse())
+
+
+def _value(values: _Values, name: ParameterName, parameter: PoseParameter) -> Pose3:
+    if name in values.poses:
+        return values.poses[name]
+    if parameter.treatment == "held":
+        return parameter.value or Pose3()
+    raise SurveyError(f"{' '.join(name)} has no value to plan with; give translation_mm and a rotation in survey.toml")
+
+
+def _with_poses(survey: Survey, moments: Sequence[Moment]) -> Survey:
+    """The survey; that a fixed station or target is given poses is an error."""
+    stations, targets = {s.station_id: s for s in survey.stations}, {t.target_id: t for t in survey.targets}
+    for m in moments:
+        if m.station_id is not None and stations[m.station_id].motion == "fixed":
+            raise SurveyError(f'station {m.station_id} is given poses but is fixed; write motion = "epoch" or "table"')
+        if m.target_id is not None and targets[m.target_id].motion == "fixed":
+            raise SurveyError(f'target {m.target_id} is given poses but is fixed; write motion = "epoch"')
+    return survey
+
+
+def _with_moving(values: _Values, moments: Sequence[Moment]) -> _Values:
+    for m in moments:
+        if m.pose is not None:
+            name = ("world_from_station", m.station_id) if m.station_id else ("carrier_from_target", str(m.target_id))
+            values.poses[(*name, m.epoch_id)] = m.pose
+        if m.angles is not None:
+            values.vectors["table_angles", str(m.table_id), m.epoch_id] = m.angles
+    return values
+
+
+def _readings(m: Moment, project: Project) -> list[TableReading]:
+    if m.table_id is None or m.angles is None:
+        return []
+    sigma = project.sigmas.tables.get(m.table_id)
+    if sigma is None:
+        raise SurveyError(f"{project.folder}/survey.toml: table {m.table_id} has no sigma_arcsec; planning needs it")
+    scale = project.sigmas.scale.get("table", 1.0)
+    return [TableReading(m.table_id, m.epoch_id, m.angles, np.diag((scale * sigma) ** 2))]
+
+
+def _with_readings(survey: Survey, readings: Sequence[TableReading]) -> Survey:
+    return replace(survey, table_readings=survey.table_readings + tuple(readings))
+
+
+def _sigma_px(plan: Plan, project: Project) -> float:
+    sigma = plan.image_sigma_px if plan.image_sigma_px is not None else project.sigmas.image_px
+    if sigma is None:
+        raise SurveyError(f"{plan.path}: no sigma of image points; give image_sigma_px here or [sigmas] image_px")
+    return sigma * project.sigmas.scale.get("image", 1.0)
+
+
+def _wanted(survey: Survey, m: Moment, sigma: float, points: Sequence[int]) -> list[ImageBlock]:
+    """Every block that the images of an epoch may show: all points, seen or not."""
+    out = []
+    sizes = {t.target_id: len(t.point_ids) for t in survey.targets}
+    posed = {s.station_id for s in survey.stations if _is_posed(s, m)}
+    on = {c.camera_id: c.station_id for c in survey.cameras}
+    hung = {
+        t.target_id
+        for t in survey.targets
+        if (t.motion == "fixed" or m.target_id == t.target_id) and (t.station_id is None or t.station_id in posed)
+    }
+    for camera in (c for c in m.cameras if on[c] in posed):
+        for target in (t for t in m.targets if t in hung):
+            idx = np.arange(sizes[target], dtype=np.int64)
+            out.append(_block(camera, m.epoch_id, target, idx, sigma))
+        if m.points and len(points):
+            out.append(_block(camera, m.epoch_id, None, np.array(points, dtype=np.int64), sigma))
+    return out
+
+
+def _is_posed(station: Station, m: Moment) -> bool:
+    """Whether it is known where a station is at an epoch; what nobody placed then takes no image."""
+    if station.motion == "fixed" or m.station_id == station.station_id:
+        return True
+    return station.motion == "table" and m.table_id is not None and m.table_id == station.table_id
+
+
+def _block(camera: str, epoch: str, target: str | None, idx: IntArray, sigma: float) -> ImageBlock:
+    cov = np.tile(sigma**2 * np.eye(2), (len(idx), 1, 1))
+    return ImageBlock(camera, epoch, target, idx, np.zeros((len(idx), 2)), cov)
+
+
+def _seen(
+    survey: Survey, start: StartValues, moments: Sequence[Moment], plan: Plan, project: Project
+) -> tuple[ImageBlock, ...]:
+    sigma = _sigma_px(plan, project) if moments else 1.0
+    located = [i for i, p in enumerate(survey.points)
+               if p.point_id in start.points or p.x_in_world.treatment == "held"]  # fmt: skip
+    wanted = [b for m in moments for b in _wanted(survey, m, sigma, located)]
+    try:
+        return predict(_reachable(survey, start), start, wanted, plan.seeing)
+    except SurveyError as error:
+        raise SurveyError(f"{plan.path}: {error}; planning needs a value in survey.toml for everything") from error
+
+
+def _reachable(survey: Survey, start: StartValues) -> Survey:
+    """Without what has no place yet and therefore cannot be predicted."""
+    lost = [p.point_id for p in survey.points if p.point_id not in start.points and p.x_in_world.treatment != "held"]
+    if not lost:
+        return survey
+    raise SurveyError(f"points without coordinates: {_listed(lost)}; give x_mm, roughly will do")
+
+
+def _coordinates(ref: PositionRef, sigma: float) -> Coordinates:
+    return Coordinates((ref,), np.zeros((1, 3)), sigma**2 * np.eye(3))
+
+
+def _candidates(
+    whole: Survey, everything: Survey, start: StartValues, possible: Sequence[Moment], plan: Plan, project: Project,
+    planned: Sequence[Moment],
+) -> tuple[tuple[Candidate, ...], list[str]]:  # fmt: skip
+    out, blind = [], []
+    blocks = _seen(everything, start, possible, plan, project)
+    for m in possible:
+        own = tuple(b for b in blocks if b.epoch_id == m.epoch_id)
+        if not own:
+            blind.append(m.epoch_id)
+            continue
+        out.append(Candidate(_epoch_text(m), "epoch", own, tuple(_readings(m, project))))
+    for new in plan.candidates.points:
+        found = _new_beacon(whole, start, new.name, new.x_in_world, new.sigma, plan, project, planned)
+        out += [found] if found is not None else []
+        blind += [new.name] if found is None else []
+    c: Measurements = plan.candidates
+    out += [
+        Candidate(d.name, "distance", distances=(Distance(d.name, d.a, d.b, 1.0, d.sigma),)) for d in c.distances
+    ]
+    out += [Candidate(p.name, "coordinates", coordinates=(_coordinates(p.position, p.sigma),)) for p in c.coordinates]
+    out += [Candidate(p.name, "pair", pairs=(Pair(p.name, p.a, p.b, Pose3(), p.cov),)) for p in c.pairs]
+    return tuple(out), blind
+
+
+def _epoch_text(m: Moment) -> str:
+    if m.angles is None:
+        return m.epoch_id
+    return f"{m.epoch_id} ({', '.join(f'{a:g}' for a in np.round(np.degrees(m.angles), 6))} deg)"
+
+
+def _new_beacon(
+    whole: Survey, start: StartValues, name: str, x: FloatArray, sigma: float, plan: Plan, project: Project,
+    planned: Sequence[Moment],
+) -> Candidate | None:  # fmt: skip
+    """A beacon seen in the planned images that show world points, or surveyed."""
+    point, n = Point(name, PointParameter(x)), len(whole.points)
+    sigma_px = _sigma_px(plan, project)
+    blocks = tuple(
+        _block(c, m.epoch_id, None, np.array([n]), sigma_px) for m in planned if m.points for c in m.cameras
+    )
+    one = Candidate(name, "beacon", blocks, points=(point,))
+    seen = predict(with_candidates(whole, [one]), start, blocks, plan.seeing)
+    surveyed = (_coordinates(PositionRef(name), sigma),) if np.isfinite(sigma) else ()
+    if not seen:
+        return None
+    return replace(one, image_blocks=seen, coordinates=surveyed)
+

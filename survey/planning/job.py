@@ -1,0 +1,164 @@
+"""The job behind ``labsurvey plan``: predict, choose, budget, simulate, place beacons, and write the page."""
+
+import json
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from adjust.design import (
+    Budget,
+    Selection,
+    Tolerance,
+    Trials,
+    WeakDirection,
+    budget,
+    exact,
+    expect,
+    run_trials,
+    select,
+    tolerances,
+    weak_directions,
+)
+from adjust.design.selection import Component, Criterion
+from adjust.errors import SurveyError
+from adjust.result import Adjustment
+from survey.files import Project, atomic_write, read
+from survey.jobs import adjust_project
+from survey.network_summary import network_dict, pair_network
+from survey.planning.building import Planned, build_plan
+from survey.planning.navigation import NavigationOutcome, plan_navigation
+from survey.planning.plan_file import Plan, read_plan
+from survey.planning.summary import plan_summary, plan_text
+from survey.planning.wanted import required_sigmas, wanted_components
+
+RESULTS = "results"
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """What is asked of a plan.
+
+    wanted: patterns of components (none: those of plan.toml, else everything). add: how many candidates to choose.
+    trials: of the Monte Carlo; workers: processes for them, None for one per core. navigation: precision of the
+    navigated poses; place: how many beacons to place for them.
+    """
+
+    wanted: tuple[str, ...] = ()
+    add: int = 5
+    criterion: Criterion = "D"
+    trials: int = 0
+    seed: int = 0
+    workers: int | None = None
+    navigation: bool = False
+    place: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningOutcome:
+    """All that is known of a plan."""
+
+    folder: Path
+    title: str
+    plan: Plan
+    planned: Planned
+    expected: Adjustment
+    weak: tuple[WeakDirection, ...]
+    wanted: tuple[Component, ...]
+    selection: Selection | None
+    required: dict[Component, float]
+    budget: Budget | None
+    tolerances: tuple[Tolerance, ...]
+    trials: Trials | None
+    network: dict[str, Any] | None
+    navigation: NavigationOutcome | None
+    seconds: dict[str, float] = field(default_factory=dict)
+    paths: dict[str, Path] = field(default_factory=dict)
+
+    def summary(self) -> dict[str, Any]:
+        """As plain values."""
+        return plan_summary(self)
+
+    def text(self) -> str:
+        """For people."""
+        return plan_text(self)
+
+
+def planning_job(
+    folder: Path, request: PlanRequest = PlanRequest(), *, out: Path | None = None, progress: bool = True
+) -> PlanningOutcome:
+    """Plan what plan.toml lists beside what is measured already; writes ``results/plan.html`` and ``plan.json``.
+
+    Raises SurveyError, and IndeterminateError naming what the plan leaves open.
+    """
+    begin, folder = time.perf_counter(), Path(folder)
+    project = read(folder)
+    plan = read_plan(folder, project.survey)
+    existing, notes = _existing(project, progress)
+    planned = build_plan(project, plan, existing, notes)
+    built = time.perf_counter()
+    expected = expect(planned.survey, planned.start)
+    wanted = wanted_components(expected, request.wanted or plan.wanted)
+    solved = time.perf_counter()
+    selection = None
+    if planned.candidates and request.add:
+        selection = select(
+            planned.survey, planned.start, planned.candidates, wanted, request.add, request.criterion, expected
+        )
+    required = required_sigmas(expected, plan.required)
+    shares: Budget | None = None
+    allowed: tuple[Tolerance, ...] = ()
+    if required and not expected.datum_defect:
+        shares = budget(planned.survey, planned.start, expected, tuple(required))
+        allowed = tolerances(shares, dict(enumerate(required.values())))
+    chosen = time.perf_counter()
+    trials = _trials(planned, expected, request, progress) if request.trials else None
+    network = network_dict(pair_network(planned.survey)) if planned.survey.pairs else None
+    navigation = None
+    if request.navigation or request.place:
+        navigation = plan_navigation(plan, expected, request.place)
+    seconds = {"predict": built - begin, "expect": solved - built, "choose": chosen - solved,
+               "simulate and navigate": time.perf_counter() - chosen}  # fmt: skip
+    outcome = PlanningOutcome(
+        folder, project.title, plan, planned, expected, weak_directions(expected), wanted, selection, required, shares,
+        allowed, trials, network, navigation, seconds,
+    )  # fmt: skip
+    outcome.paths.update(_write(outcome, (out or folder) / RESULTS))
+    return outcome
+
+
+def _existing(project: Project, progress: bool) -> tuple[Adjustment | None, list[str]]:
+    """What is observed already, adjusted for its values; without, where it does not suffice for that."""
+    survey = project.survey
+    if not (survey.image_blocks or project.spots or survey.pairs):
+        lying = len(project.images)
+        return None, [f"{lying} images without detections are not counted; detect them first"] if lying else []
+    try:
+        return adjust_project(project, progress), []
+    except SurveyError as error:
+        first = str(error).splitlines()[0]
+        return None, [f"what is measured so far cannot be adjusted alone ({first}); values are those of survey.toml"]
+
+
+def _trials(planned: Planned, expected: Adjustment, request: PlanRequest, progress: bool) -> Trials:
+    ideal = exact(planned.survey, planned.start)
+    with tqdm(total=request.trials, desc="simulating", unit="survey", disable=not progress, file=sys.stderr) as bar:
+
+        def step(done: int) -> None:
+            bar.update(done - bar.n)
+
+        return run_trials(ideal, planned.start, expected, request.trials, request.seed, request.workers, step)
+
+
+def _write(outcome: PlanningOutcome, folder: Path) -> dict[str, Path]:
+    from survey.planning.page import plan_page
+
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {name: folder / name for name in ("plan.html", "plan.json")}
+    atomic_write(paths["plan.html"], plan_page(outcome))
+    content = {k: v for k, v in outcome.summary().items() if k not in ("folder", "written", "seconds")}
+    atomic_write(paths["plan.json"], json.dumps(content, indent=1, allow_nan=False) + "\n")
+    return paths

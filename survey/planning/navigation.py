@@ -1,0 +1,101 @@
+"""Precision of navigated poses before anything is measured, what each part may contribute, and where beacons go."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.design.placement import Placement, PlacementOptions, place_beacons
+from adjust.design.pose_budget import PoseBudget, PoseTolerance, pose_budget, pose_tolerances, simulate_poses
+from adjust.errors import SurveyError
+from adjust.model import FloatArray
+from adjust.navigation import Beacons, Expected, Head, expected_precision, head_and_beacons
+from adjust.result import Adjustment
+from survey.planning.plan_file import NavigationPlan, Plan
+
+_TRIALS = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class NavigationOutcome:
+    """Navigation from the planned beacons, and from beacons placed for it.
+
+    precision: per pose. beacons: those it was made with. placement: None where none were asked for; places (k, 3) m
+    of the chosen ones. budget, tolerances: of the poses that are determined; simulated: (6,) largest over the poses of
+    RMS error over its prediction with the shared tolerances, simulated anew.
+    """
+
+    station_id: str
+    plan: NavigationPlan
+    head: Head
+    beacons: Beacons
+    precision: tuple[Expected, ...]
+    placement: Placement | None
+    places: FloatArray
+    budget: PoseBudget | None
+    tolerances: tuple[PoseTolerance, ...]
+    simulated: FloatArray
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(q, 6) rad and m, in the head; infinite where a pose is open."""
+        return np.asarray(np.sqrt([np.diag(e.cov) for e in self.precision]))
+
+
+def plan_navigation(plan: Plan, expected: Adjustment, n_place: int) -> NavigationOutcome:
+    """Predict the poses of [navigation] with the calibration as planned. Raises SurveyError."""
+    nav = plan.navigation
+    if nav is None:
+        raise SurveyError(f"{plan.path}: there is no table [navigation]; say in it where the head will be")
+    station = nav.station_id or _station(plan, expected)
+    head, there = _head(expected, station)
+    placement, places = None, np.zeros((0, 3))
+    beacons = there
+    if n_place:
+        if not len(nav.places):
+            raise SurveyError(f"{plan.path}: [navigation] has no places for beacons; give room_mm and places")
+        options = PlacementOptions(
+            nav.criterion, nav.required_rotation, nav.required_translation, nav.at_least, sigma_px=nav.sigma_px,
+            spacing=nav.spacing,
+        )  # fmt: skip
+        placement = place_beacons(head, nav.poses, nav.places, nav.beacon_sigma, n_place, options)
+        places = nav.places[list(placement.chosen)]
+        ids = tuple(f"N{i + 1}" for i in range(len(places)))
+        beacons = Beacons(ids, places, nav.beacon_sigma**2 * np.eye(3 * len(places)))
+    if beacons is None:
+        raise SurveyError(f"{plan.path}: there are no beacons to navigate from; list [points], or --place some")
+    precision = expected_precision(head, beacons, nav.poses, nav.sigma_px)
+    found, allowed, ratio = _tolerances(nav, head, beacons, precision)
+    return NavigationOutcome(station, nav, head, beacons, precision, placement, places, found, allowed, ratio)
+
+
+def _station(plan: Plan, expected: Adjustment) -> str:
+    carrying = list(dict.fromkeys(c.station_id for c in expected.survey.cameras))
+    turned = [s.station_id for s in expected.survey.stations if s.station_id in carrying and s.motion == "table"]
+    for choice in (turned, carrying):
+        if len(choice) == 1:
+            return choice[0]
+    raise SurveyError(f"{plan.path}: several stations carry cameras; name one as station under [navigation]")
+
+
+def _head(expected: Adjustment, station: str) -> tuple[Head, Beacons | None]:
+    if expected.survey.points:
+        return head_and_beacons(expected, station)
+    none = Beacons(("-",), np.zeros((1, 3)), np.zeros((3, 3)))
+    return head_and_beacons(expected, station, known=none)[0], None
+
+
+def _tolerances(
+    nav: NavigationPlan, head: Head, beacons: Beacons, precision: tuple[Expected, ...]
+) -> tuple[PoseBudget | None, tuple[PoseTolerance, ...], FloatArray]:
+    good: list[Pose3] = [e.world_from_station for e in precision if not e.undetermined]
+    if not good:
+        return None, (), np.full(6, np.nan)
+    found = pose_budget(head, beacons, good)
+    required = np.array([nav.required_rotation] * 3 + [nav.required_translation] * 3)
+    planned = np.array([nav.sigma_px, nav.beacon_sigma, *nav.camera_sigma])
+    allowed = pose_tolerances(found, required, planned)
+    shared = np.array([t.shared for t in allowed])
+    errors = simulate_poses(found, shared, _TRIALS)
+    ratio = np.sqrt(np.mean(errors**2, axis=1) / found.variances(shared))
+    return found, allowed, np.asarray(ratio[np.argmax(np.abs(ratio - 1.0), axis=0), np.arange(6)])

@@ -1,0 +1,279 @@
+"""A plan as one HTML page that needs nothing but itself."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from gtsam import Pose3
+
+import survey.report
+from adjust.design import group_redundancy
+from survey.planning.plots import Series, bars, chart, seen_map
+from survey.planning.summary import meets, people, pose_sigmas, tolerance_values
+from survey.quantities import scale_of
+from survey.report import drawing as d
+from survey.report.markup import count, definition, esc, fixed, general, pill, section, sigma_text, table
+from survey.report.picture import pictures
+from survey.report.scene import Scene, Spot, scene_of
+
+if TYPE_CHECKING:
+    from survey.planning.job import PlanningOutcome
+    from survey.planning.navigation import NavigationOutcome
+
+_MOST_CANDIDATES = 30
+_COLOURS = {"epoch": d.BLUE, "beacon": d.RED, "distance": d.GREEN, "pair": d.ORANGE, "coordinates": "#7a3e9d"}
+
+
+def html_page(title: str, heading: str, sections: list[str]) -> str:
+    """A page in the style of the reports."""
+    style = Path(survey.report.__file__).with_name("style.css").read_text(encoding="utf-8")
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{esc(title)}</title><style>{style}</style></head>\n<body><main>"
+        f'<p class="meta">{esc(heading)}</p><h1>{esc(title)}</h1>' + "\n".join(sections) + "</main></body></html>\n"
+    )
+
+
+def plan_page(o: "PlanningOutcome") -> str:
+    """The page of a plan."""
+    title = o.title or o.folder.resolve().name
+    parts = [
+        _summary(o), _picture(o), _seen(o), _sigmas(o), _weak(o), _selection(o), _tolerances(o), _trials(o),
+        _navigation(o.navigation) if o.navigation is not None else "",
+    ]  # fmt: skip
+    return html_page(f"{title} – plan", "Plan: expected precision before measuring", [p for p in parts if p])
+
+
+def _summary(o: "PlanningOutcome") -> str:
+    e = o.expected
+    cards = [("observations", count(e.n_observations)), ("unknowns", count(e.n_unknowns)),
+             ("redundancy", count(e.redundancy)), ("planned epochs", count(o.planned.n_planned_epochs)),
+             ("images measured already", count(o.planned.n_existing_blocks))]  # fmt: skip
+    body = '<div class="cards">' + "".join(f"<div><b>{v}</b><span>{k}</span></div>" for k, v in cards) + "</div>"
+    notes = [*o.planned.notes, *e.warnings]
+    if notes:
+        body = '<ul class="problems">' + "".join(f"<li>{esc(n)}</li>" for n in notes) + "</ul>" + body
+    rows = [
+        (esc(g), count(n), fixed(r, 1), fixed(q[0], 3), fixed(q[1], 3), fixed(q[2], 3))
+        for g, (n, r, q) in group_redundancy(e).items()
+    ]
+    columns = ("<Group", "Observations", "Redundancy", "Smallest", "Median", "Largest number")
+    note = (
+        "No observation has a value yet: all sigmas on this page are <b>a priori</b>, from the planned sigmas of the "
+        "observations and the geometry alone. A redundancy number tells how well an observation is checked by the "
+        "others: an error in one near 0 would not be noticed."
+    )
+    return section("summary", "Summary", body + table(columns, rows), note)
+
+
+def _picture(o: "PlanningOutcome") -> str:
+    scale = scale_of(o.expected, "a_priori")
+    drawn, enlarged = pictures(scene_of(o.expected, scale), scale.ellipsoid)
+    note = (
+        f"95 % confidence ellipsoids of points (red) and stations (green), enlarged {general(enlarged, 3)} times. "
+        "Cameras are drawn at the first epoch; thin lines are their axes at others."
+    )
+    return section("picture", "The survey", f'<div class="figures">{drawn}</div>' if drawn else "", note)
+
+
+def _seen(o: "PlanningOutcome") -> str:
+    blocks = o.planned.survey.image_blocks
+    if not blocks:
+        return ""
+    epochs = list(dict.fromkeys(b.epoch_id for b in blocks))
+    rows = list(dict.fromkeys((b.camera_id, b.target_id or "points") for b in blocks))
+    rows.sort()
+    counts = np.zeros((len(rows), len(epochs)))
+    for b in blocks:
+        counts[rows.index((b.camera_id, b.target_id or "points")), epochs.index(b.epoch_id)] += len(b.point_idx)
+    title = "Points seen, by camera and target over epochs (darker: more)"
+    drawn = seen_map([f"{c}: {t}" for c, t in rows], epochs, counts, title)
+    return section("seen", "What will be seen", f"<figure>{drawn}</figure>")
+
+
+def _sigmas(o: "PlanningOutcome") -> str:
+    by_name = o.expected.precision.graph.unknowns.by_name
+    rows = []
+    for name in (n for n in by_name if len(n) < 3):
+        estimate, unknown = o.expected.estimates[name], by_name[name]
+        s = np.sqrt(np.maximum(np.diag(estimate.cov), 0.0))
+        cells = []
+        for c, unit in zip(unknown.components, unknown.units, strict=True):
+            label, factor = people(unit)
+            cells.append(f"{esc(c)} {sigma_text(factor * float(s[estimate.components.index(c)]))} {esc(label)}".strip())
+        rows.append((esc(".".join(name)), " &nbsp; ".join(cells)))
+    note = "One standard deviation, all others unknown too; poses in the tangent, in the frame on the right."
+    return section("sigmas", "Expected sigmas", table(("<Unknown", "<Sigmas"), rows), note)
+
+
+def _weak(o: "PlanningOutcome") -> str:
+    rows = [
+        (fixed(w.factor, 0), esc(", ".join(f"{a} {c} {s:+.2f}" for a, c, s in w.parts))) for w in o.weak
+    ]  # fmt: skip
+    note = (
+        "Combinations of unknowns that the observations hardly tell apart. Factor: how many times less precise the "
+        "combination is than its parts would be if the rest were known; shares in sigmas of each."
+    )
+    return section("weak", "Weak directions", table(("Factor", "<What moves together"), rows) if rows else "", note)
+
+
+def _selection(o: "PlanningOutcome") -> str:
+    s = o.selection
+    if s is None:
+        return ""
+    shown = s.first[:_MOST_CANDIDATES]
+    names = [f"{g.kind} {g.name}" for g in shown]
+    label = "gain in ln det" if s.criterion == "D" else "decrease of the mean variance"
+    drawn = bars(names, np.array([g.value(s.criterion) for g in shown]), f"Every candidate alone: {label}",
+                 [_COLOURS.get(g.kind, d.GREY) for g in shown])  # fmt: skip
+    steps = [
+        (str(i + 1), esc(g.kind), esc(g.name), fixed(g.ln_det, 3), fixed(g.ln_det_all, 3),
+         fixed(100 * g.mean_variance, 2) + " %")
+        for i, g in enumerate(s.steps)
+    ]  # fmt: skip
+    columns = ("", "<Kind", "<Measure next", "Gain ln det", "Of all unknowns", "Mean variance falls by")
+    body = f'<div class="figures"><figure>{drawn}</figure></div>' + table(columns, steps)
+    rows = []
+    for c, a, b in zip(s.wanted, s.sigmas.tolist(), s.after.tolist(), strict=True):
+        unit, factor = people(c.unit)
+        drop = fixed(100 * (1 - b / a), 1) + " %" if a > 0 else ""
+        rows.append((esc(c.text), sigma_text(factor * a), sigma_text(factor * b), esc(unit), drop))
+    body += "<details><summary>Sigmas of everything wanted, before and after</summary>"
+    body += table(("<Component", "Before", "After all", "<Unit", "Smaller by"), rows) + "</details>"
+    note = (
+        f"{len(s.first)} candidates; {s.criterion}-optimal choice of {len(s.steps)}, one after the other, each beside "
+        "those taken. ln det: of the covariance of what is wanted; the mean variance counts every component in units "
+        "of its variance now."
+    )
+    return section("next", "What to add next", body, note)
+
+
+def _tolerances(o: "PlanningOutcome") -> str:
+    if o.budget is None:
+        return ""
+    rows, share = [], o.budget.variances / o.budget.variances.sum(axis=0)
+    for k, (c, r) in enumerate(o.required.items()):
+        unit, factor = people(c.unit)
+        s = float(o.budget.sigmas[k])
+        word = pill("good", "met") if s <= r * (1 + 1e-9) else pill("bad", "not met")
+        parts = [fixed(100 * v, 0) + " %" for v in share[:, k]]
+        rows.append((esc(c.text), sigma_text(factor * r), sigma_text(factor * s), esc(unit), word, *parts))
+    body = table(("<Component", "Required", "Planned", "<Unit", "<", *map(esc, o.budget.groups)), rows)
+    lines = [(esc(t.group), _factor(t.alone), _factor(t.together), esc(t.limiting)) for t in o.tolerances]
+    body += table(("<Group", "Alone", "Together", "<Limited by"), lines, "Sigmas may be so many times the planned ones")
+    note = (
+        "The variance of each component by group of observations, weights as planned. Alone: this group is changed, "
+        "the others stay; together: every group takes an equal share of what is allowed."
+    )
+    return section("tolerances", "Required precision and tolerances", body, note)
+
+
+def _factor(value: float) -> str:
+    if np.isnan(value):
+        return "never"
+    return "any" if value > 1e6 else general(value, 3)
+
+
+def _trials(o: "PlanningOutcome") -> str:
+    t = o.trials
+    if t is None:
+        return ""
+    word = pill("good", "agrees") if t.passed else pill("bad", "does not agree")
+    facts = definition([
+        ("Surveys simulated and adjusted", f"{count(len(t.errors))}, {len(t.failed)} failed"),
+        ("Scatter and predicted covariance", word),
+        ("Mean of d' inv(C) d", f"{fixed(t.mean_square, 2)}, expected {t.dof} "
+                                f"({fixed(t.band[0], 2)} to {fixed(t.band[1], 2)} at 99 %)"),
+    ])  # fmt: skip
+    k = len(t.ratios)
+    x = np.arange(1.0, k + 1)
+    se = 1.0 / np.sqrt(2.0 * len(t.errors))
+    lines = [Series("expected", np.array([0.0, k]), np.ones(2), d.GREY, line=True),
+             Series("RMS error / predicted sigma", x, t.ratios, d.BLUE),
+             Series("± 2 standard errors", np.array([0.0, k]), np.ones(2) + 2 * se, d.GREY, line=True, dashed=True),
+             Series("", np.array([0.0, k]), np.ones(2) - 2 * se, d.GREY, line=True, dashed=True)]  # fmt: skip
+    drawn = chart(lines, "Scatter over prediction", "component", "ratio", 620, 260, None)
+    return section("trials", "Monte Carlo", facts + f"<figure>{drawn}</figure>")
+
+
+def _navigation(n: "NavigationOutcome") -> str:
+    turn, shift = pose_sigmas(n)
+    x = np.arange(1.0, len(turn) + 1)
+    limits = np.degrees(n.plan.required_rotation), 1e3 * n.plan.required_translation
+    figures = []
+    for what, values, limit, unit in (("rotation", turn, limits[0], "deg"), ("translation", shift, limits[1], "mm")):
+        good = np.isfinite(values)
+        if not good.any():
+            continue
+        lines = [Series("required", np.array([0.0, len(x)]), np.full(2, limit), d.RED, line=True, dashed=True),
+                 Series(f"largest sigma of {what}", x[good], values[good], d.BLUE)]  # fmt: skip
+        figures.append(f"<figure>{chart(lines, f'Expected {what} of every pose', 'pose', unit)}</figure>")
+    figures.append(f"<figure>{_room(n)}</figure>" if n.placement is None else "")
+    body = f'<div class="figures">{"".join(figures)}</div>'
+    good = meets(n)
+    open_poses = [i + 1 for i, e in enumerate(n.precision) if e.undetermined]
+    facts = [("Poses as precise as required", f"{int(good.sum())} of {len(good)}")]
+    if open_poses:
+        facts.append(("Not determined", ", ".join(map(str, open_poses[:20]))))
+    body = definition(facts) + body
+    if n.placement is not None:
+        body += _placement(n)
+    if n.tolerances:
+        rows = []
+        for t in n.tolerances:
+            unit, *sigmas = tolerance_values(t)
+            rows.append((esc(t.source), *("never" if np.isnan(v) else general(v, 3) for v in sigmas), unit))
+        caption = "Sigma per component that each source may have for every determined pose to be as required"
+        body += table(("<Source", "Alone", "Beside the planned", "Equal shares", "<Unit"), rows, caption)
+        body += (
+            f'<p class="note">With equal shares simulated and solved anew: RMS errors are {n.simulated.min():.3f} to '
+            f"{n.simulated.max():.3f} of their predictions.</p>"
+        )
+    note = (
+        f"Head {esc(n.station_id)} with its calibration as planned, {len(n.beacons.beacon_ids)} beacons; required: "
+        f"{limits[0]:.3g} deg and {limits[1]:.3g} mm per component."
+    )
+    return section("navigation", "Navigation", body, note)
+
+
+def _room(n: "NavigationOutcome") -> str:
+    from survey.report.picture import draw, perspective
+
+    scene = Scene()
+    beacons = np.asarray(n.beacons.x_in_world)
+    for name, x in zip(n.beacons.beacon_ids, beacons, strict=True):
+        scene.spots.append(Spot(name, "point", x, np.zeros((3, 3))))
+    for pose in n.plan.poses:
+        scene.moves.append(np.asarray(Pose3(pose).translation()))
+    if len(n.plan.places):
+        scene.clouds.append(("", n.plan.places))
+    everything = scene.positions()
+    return draw(scene, perspective(everything), everything, 1.0, 1.0)
+
+
+def _placement(n: "NavigationOutcome") -> str:
+    p = n.placement
+    if p is None:
+        return ""
+    measure = p.measure
+    x = np.arange(1.0, len(measure) + 1)
+    good = measure < 1e4
+    lines = []
+    if good.any():
+        lines.append(Series("greedy", x[good], np.sqrt(measure[good]), d.BLUE, line=True))
+        lines.append(Series("after exchanges", x[-1:], np.sqrt([p.final]), d.RED))
+    what = "worst pose" if n.plan.criterion == "worst" else "mean pose"
+    drawn = chart(lines, f"{what.capitalize()} over beacons placed", "beacons", "sigma / required") if lines else ""
+    rows = [
+        (f"N{i + 1}", *(fixed(1e3 * v, 0) for v in place), str(sum(f"N{i + 1}" in e.beacon_ids for e in n.precision)))
+        for i, place in enumerate(n.places)
+    ]
+    body = "<h3>Where to put beacons</h3>"
+    body += f'<div class="figures"><figure>{_room(n)}</figure><figure>{drawn}</figure></div>'
+    note = (
+        f'<p class="note">{len(n.places)} of {len(n.plan.places)} places on the walls (small dots), chosen one by one '
+        f"for the {what}, {p.exchanged} then exchanged; red: beacons, green: where the head will be. Every pose sees at "
+        f"least {min(p.seen)} beacons.</p>"
+    )
+    return body + note + table(("<Beacon", "x mm", "y mm", "z mm", "Poses that see it"), rows)

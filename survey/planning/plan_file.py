@@ -1,0 +1,442 @@
+"""``plan.toml``: what is to be measured, what could be measured in addition, and the precision that is wanted."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.design import Seeing
+from adjust.model import FloatArray, Survey
+from adjust.observations import FrameRef, PositionRef
+from survey.files.node import Node, read_toml
+from survey.files.poses import POSE_KEYS, read_pose, rotation_from_euler
+from survey.files.references import NameProblemError, Names, read_frame, read_position
+from survey.files.text import id_problem
+from survey.files.units import to_si
+
+PLAN_FILE = "plan.toml"
+_EPOCH_KEYS = (
+    *("name", "cameras", "targets", "points", "table", "angles_deg", "grid_deg", "station", "target", "poses"),
+    *("count", "by_hand", "each_camera"),
+)
+_HAND_KEYS = ("camera", "target", "count", "distance_mm", "tilt_deg", "seed")
+_SEEN_KEYS = ("margin_px", "nearest_mm", "farthest_mm", "widest_incidence_deg", "fewest_points", "two_sided")
+_NAVIGATION_KEYS = (
+    *("station", "sigma_px", "volume_mm", "steps", "attitudes_euler_xyz_deg", "turn_about", "turn_steps", "poses"),
+    *("required_rotation_deg", "required_translation_mm", "beacon_sigma_mm", "room_mm", "spacing_mm", "criterion"),
+    *("at_least", "camera_sigma_mm", "camera_sigma_deg", "places"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One planned epoch: what moves and where to, and which images are taken.
+
+    angles: (k,) rad of ``table_id``. pose: of ``station_id`` (world_from_station) or ``target_id``
+    (carrier_from_target).
+    """
+
+    epoch_id: str
+    cameras: tuple[str, ...]
+    targets: tuple[str, ...]
+    points: bool
+    table_id: str | None = None
+    angles: FloatArray | None = None
+    station_id: str | None = None
+    target_id: str | None = None
+    pose: Pose3 | None = None
+
+
+@dataclass(frozen=True)
+class ByHand:
+    """Poses as a person would give them: a target anywhere in the frame of a camera, tilted, at some distance (m)."""
+
+    camera_id: str
+    target_id: str
+    count: int
+    distance: tuple[float, float]
+    tilt: float
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """A series of epochs under one name; ``by_hand`` where their poses are still to be drawn."""
+
+    prefix: str
+    moments: tuple[Moment, ...]
+    by_hand: ByHand | None = None
+
+
+@dataclass(frozen=True)
+class PlannedDistance:
+    """A distance to be measured; sigma in m."""
+
+    name: str
+    a: PositionRef
+    b: PositionRef
+    sigma: float
+
+
+@dataclass(frozen=True)
+class PlannedPoint:
+    """Coordinates to be measured; sigma in m."""
+
+    name: str
+    position: PositionRef
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedPair:
+    """A pair to be measured: a pose with cov (6, 6), or a rotation with (3, 3)."""
+
+    name: str
+    a: FrameRef
+    b: FrameRef
+    cov: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class NewPoint:
+    """A beacon that could be added, with surveyed coordinates (sigma m) or without (nan)."""
+
+    name: str
+    x_in_world: FloatArray
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Epochs and single observations, planned or possible."""
+
+    epochs: tuple[Moments, ...] = ()
+    distances: tuple[PlannedDistance, ...] = ()
+    coordinates: tuple[PlannedPoint, ...] = ()
+    pairs: tuple[PlannedPair, ...] = ()
+    points: tuple[NewPoint, ...] = ()
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """Sigmas (SI) that the components matching ``pattern`` must have, by unit: rad, m, px."""
+
+    pattern: str
+    sigma: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class NavigationPlan:
+    """Where the head will be, how well its pose must be known (rad, m per component), and where beacons could be.
+
+    poses: world_from_station. places: (m, 3) m candidate places of beacons. sigmas of a spot (px), of a beacon, of the
+    cameras' places (m) and attitudes (rad) on the head.
+    """
+
+    station_id: str | None
+    poses: tuple[Pose3, ...]
+    required_rotation: float
+    required_translation: float
+    places: FloatArray
+    sigma_px: float
+    beacon_sigma: float
+    camera_sigma: tuple[float, float]
+    criterion: Literal["worst", "mean"]
+    at_least: int
+    spacing: float
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The whole file."""
+
+    path: Path
+    image_sigma_px: float | None
+    seeing: Seeing
+    planned: Measurements
+    candidates: Measurements
+    required: tuple[Requirement, ...] = ()
+    wanted: tuple[str, ...] = ()
+    navigation: NavigationPlan | None = None
+    inputs: dict[str, str] = field(default_factory=dict)
+
+
+def read_plan(folder: Path, survey: Survey) -> Plan:
+    """Read ``plan.toml`` of a project folder. Raises SurveyError with file and line."""
+    root, digest = read_toml(Path(folder) / PLAN_FILE)
+    root.allow("image_sigma_px", "seen", "epochs", "distances", "coordinates", "pairs", "candidates", "required",
+               "wanted", "navigation")  # fmt: skip
+    names = Names.of(survey)
+    candidates = root.table("candidates")
+    candidates.allow("epochs", "distances", "coordinates", "pairs", "points")
+    return Plan(
+        path=Path(folder) / PLAN_FILE,
+        image_sigma_px=root.number("image_sigma_px", positive=True) if root.has("image_sigma_px") else None,
+        seeing=_seeing(root.table("seen"), survey),
+        planned=_measurements(root, survey, names),
+        candidates=_measurements(candidates, survey, names),
+        required=tuple(_requirement(node) for node in _tables(root, "required")),
+        wanted=root.names("wanted", ()),
+        navigation=_navigation(root.table("navigation"), survey) if root.has("navigation") else None,
+        inputs={PLAN_FILE: digest},
+    )
+
+
+def _tables(node: Node, key: str) -> list[Node]:
+    """The tables of a list ``[[key]]``."""
+    values = node.values.get(key, [])
+    if not isinstance(values, list) or not all(isinstance(v, dict) for v in values):
+        raise node.error(f"expected a list of tables; write [[{'.'.join(map(str, (*node.path, key)))}]]", key)
+    return [Node(node.file, node.lines, (*node.path, key, i), v) for i, v in enumerate(values)]
+
+
+def _seeing(node: Node, survey: Survey) -> Seeing:
+    node.allow(*_SEEN_KEYS)
+    d = Seeing()
+    targets = tuple(t.target_id for t in survey.targets)
+    return Seeing(
+        margin_px=node.number("margin_px", d.margin_px),
+        nearest_m=float(to_si(node.number("nearest_mm", 1e3 * d.nearest_m, positive=True), "mm")),
+        farthest_m=float(to_si(node.number("farthest_mm", positive=True), "mm")) if node.has("farthest_mm") else np.inf,
+        widest_incidence=float(to_si(node.number("widest_incidence_deg", 70.0, positive=True), "deg")),
+        fewest_points=node.integer("fewest_points", 1, d.fewest_points),
+        two_sided=node.references("two_sided", targets, "target", ()),
+    )
+
+
+def _measurements(node: Node, survey: Survey, names: Names) -> Measurements:
+    return Measurements(
+        tuple(_moments(n, survey, i) for i, n in enumerate(_tables(node, "epochs"))),
+        tuple(_distance(n, names) for n in _tables(node, "distances")),
+        tuple(p for n in _tables(node, "coordinates") for p in _coordinates(n, names)),
+        tuple(_pair(n, names) for n in _tables(node, "pairs")),
+        tuple(_new_point(n, survey) for n in _tables(node, "points")),
+    )
+
+
+def _moments(node: Node, survey: Survey, number: int) -> Moments:
+    node.allow(*_EPOCH_KEYS)
+    prefix = node.text("name", f"p{number + 1}_")
+    if problem := id_problem(prefix):
+        raise node.error(problem, "name")
+    cameras = node.references("cameras", (c.camera_id for c in survey.cameras), "camera",
+                              tuple(c.camera_id for c in survey.cameras))  # fmt: skip
+    targets = node.references("targets", (t.target_id for t in survey.targets), "target",
+                              tuple(t.target_id for t in survey.targets))  # fmt: skip
+    points = node.flag("points", bool(survey.points))
+    kinds = [k for k in ("table", "poses", "count", "by_hand") if node.has(k)]
+    if len(kinds) != 1:
+        raise node.error("say what moves: one of table (with angles_deg or grid_deg), poses, by_hand, count")
+    places, hand = _places(node, survey, kinds[0])
+    each = [(c,) for c in cameras] if node.flag("each_camera", False) else [cameras]
+    width = max(2, len(str(len(places))))
+    moments = []
+    for i, place in enumerate(places):
+        for group in each:
+            own = f"{prefix}{i + 1:0{width}d}" + (f"-{group[0]}" if len(each) > 1 else "")
+            moments.append(Moment(own, group, targets, points, **place))
+    return Moments(prefix, tuple(moments), hand)
+
+
+def _places(node: Node, survey: Survey, kind: str) -> tuple[list[dict[str, Any]], ByHand | None]:
+    """What moves where, one entry per epoch."""
+    if kind == "count":
+        return [{}] * node.integer("count", 1), None
+    if kind == "by_hand":
+        hand = _by_hand(node.table("by_hand"), survey)
+        return [{}] * hand.count, hand
+    if kind == "table":
+        table = node.reference("table", (t.table_id for t in survey.tables), "table")
+        axes = next(len(t.axes) for t in survey.tables if t.table_id == table)
+        return [{"table_id": table, "angles": a} for a in _angles(node, axes)], None
+    if node.has("station") == node.has("target"):
+        raise node.error("poses are of one thing; name a station or a target", "poses")
+    key = "station" if node.has("station") else "target"
+    known = [s.station_id for s in survey.stations] if key == "station" else [t.target_id for t in survey.targets]
+    owner = node.reference(key, known, key)
+    out = []
+    for pose_node in _tables(node, "poses"):
+        pose_node.allow(*POSE_KEYS)
+        pose = read_pose(pose_node).value
+        if pose is None:
+            raise pose_node.error("a planned pose needs its place and rotation; add them")
+        out.append({f"{key}_id": owner, "pose": pose})
+    return out, None
+
+
+def _angles(node: Node, axes: int) -> list[FloatArray]:
+    if node.has("angles_deg") == node.has("grid_deg"):
+        raise node.error("give the table's angles once, as angles_deg or as grid_deg", "table")
+    if node.has("angles_deg"):
+        rows = node.value("angles_deg")
+        n = len(rows) if isinstance(rows, list) else 0
+        return list(to_si(node.numbers("angles_deg", (max(n, 1), axes)), "deg"))
+    ranges = node.numbers("grid_deg", (axes, 3))
+    for i, (low, high, step) in enumerate(ranges.tolist()):
+        if step <= 0 or high < low:
+            raise node.error(f"found [{low:g}, {high:g}, {step:g}]; expected [from, to, step] upwards", "grid_deg", i)
+    lines = [np.arange(low, high + 1e-9, step) for low, high, step in ranges]
+    grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, axes)
+    return list(to_si(grid, "deg"))
+
+
+def _by_hand(node: Node, survey: Survey) -> ByHand:
+    node.allow(*_HAND_KEYS)
+    near, far = to_si(node.numbers("distance_mm", (2,)), "mm").tolist()
+    if not 0 < near <= far:
+        raise node.error("expected [nearest, farthest]", "distance_mm")
+    return ByHand(
+        node.reference("camera", (c.camera_id for c in survey.cameras), "camera"),
+        node.reference("target", (t.target_id for t in survey.targets), "target"),
+        node.integer("count", 1), (near, far), float(to_si(node.number("tilt_deg", 40.0), "deg")),
+        node.integer("seed", 0, 1),
+    )  # fmt: skip
+
+
+def _distance(node: Node, names: Names) -> PlannedDistance:
+    node.allow("name", "from", "to", "sigma_mm")
+    a, b = (_position(node, key, names) for key in ("from", "to"))
+    name = node.text("name", f"{node.text('from')}-{node.text('to')}")
+    return PlannedDistance(name, a, b, float(to_si(node.number("sigma_mm", positive=True), "mm")))
+
+
+def _position(node: Node, key: str, names: Names) -> PositionRef:
+    try:
+        return read_position(node.text(key), names)
+    except NameProblemError as problem:
+        raise node.error(str(problem), key) from problem
+
+
+def _coordinates(node: Node, names: Names) -> list[PlannedPoint]:
+    node.allow("of", "sigma_mm")
+    sigma = float(to_si(node.number("sigma_mm", positive=True), "mm"))
+    out = []
+    for i, text in enumerate(node.names("of")):
+        try:
+            out.append(PlannedPoint(f"coordinates of {text}", read_position(text, names), sigma))
+        except NameProblemError as problem:
+            raise node.error(str(problem), "of", i) from problem
+    return out
+
+
+def _pair(node: Node, names: Names) -> PlannedPair:
+    node.allow("name", "a", "b", "sigma_rotation_arcsec", "sigma_translation_mm")
+    ends = []
+    for key in ("a", "b"):
+        try:
+            ends.append(read_frame(node.text(key), names))
+        except NameProblemError as problem:
+            raise node.error(str(problem), key) from problem
+    turn = float(to_si(node.number("sigma_rotation_arcsec", positive=True), "arcsec"))
+    sigmas = [turn] * 3
+    if node.has("sigma_translation_mm"):
+        sigmas += [float(to_si(node.number("sigma_translation_mm", positive=True), "mm"))] * 3
+    name = node.text("name", f"{node.text('a')}-{node.text('b')}")
+    return PlannedPair(name, ends[0], ends[1], np.diag(np.square(sigmas)))
+
+
+def _new_point(node: Node, survey: Survey) -> NewPoint:
+    node.allow("id", "x_mm", "sigma_mm")
+    name = node.text("id")
+    if problem := id_problem(name):
+        raise node.error(problem, "id")
+    if name in {p.point_id for p in survey.points}:
+        raise node.error(f"{name!r} is a point of the survey already; give the new one another id", "id")
+    sigma = float(to_si(node.number("sigma_mm", positive=True), "mm")) if node.has("sigma_mm") else float("nan")
+    return NewPoint(name, to_si(node.numbers("x_mm", (3,)), "mm"), sigma)
+
+
+def _requirement(node: Node) -> Requirement:
+    node.allow("of", "sigma_rotation_deg", "sigma_rotation_arcsec", "sigma_translation_mm", "sigma_mm", "sigma_px")
+    sigma: dict[str, float] = {}
+    for key, unit, si in (("sigma_rotation_deg", "deg", "rad"), ("sigma_rotation_arcsec", "arcsec", "rad"),
+                          ("sigma_translation_mm", "mm", "m"), ("sigma_mm", "mm", "m"),
+                          ("sigma_px", "px", "px")):  # fmt: skip
+        if node.has(key):
+            if si in sigma:
+                raise node.error("this sigma is given twice; keep one of the two", key)
+            sigma[si] = float(to_si(node.number(key, positive=True), unit))
+    if not sigma:
+        raise node.error("a requirement needs a sigma; add sigma_translation_mm, sigma_rotation_deg or sigma_px")
+    return Requirement(node.text("of"), sigma)
+
+
+def _navigation(node: Node, survey: Survey) -> NavigationPlan:
+    node.allow(*_NAVIGATION_KEYS)
+    stations = tuple(dict.fromkeys(c.station_id for c in survey.cameras))
+    criterion = node.choice("criterion", ("worst", "mean"), "worst")
+    poses = _navigation_poses(node)
+    if not poses:
+        raise node.error("say where the head will be: poses, or volume_mm with attitudes")
+    return NavigationPlan(
+        node.reference("station", stations, "station") if node.has("station") else None,
+        poses,
+        float(to_si(node.number("required_rotation_deg", 0.17, positive=True), "deg")),
+        float(to_si(node.number("required_translation_mm", 1.0, positive=True), "mm")),
+        _beacon_places(node),
+        node.number("sigma_px", 0.2, positive=True),
+        float(to_si(node.number("beacon_sigma_mm", 0.4, positive=True), "mm")),
+        (
+            float(to_si(node.number("camera_sigma_mm", 0.1, positive=True), "mm")),
+            float(to_si(node.number("camera_sigma_deg", 0.01, positive=True), "deg")),
+        ),
+        "worst" if criterion == "worst" else "mean",
+        node.integer("at_least", 1, 3),
+        float(to_si(node.number("spacing_mm", 0.0), "mm")),
+    )
+
+
+def _navigation_poses(node: Node) -> tuple[Pose3, ...]:
+    out = []
+    for pose_node in _tables(node, "poses"):
+        pose = read_pose(pose_node).value
+        if pose is None:
+            raise pose_node.error("a pose needs its place and rotation; add them")
+        out.append(pose)
+    if not node.has("volume_mm"):
+        return tuple(out)
+    box = to_si(node.numbers("volume_mm", (3, 2)), "mm")
+    steps = [int(v) for v in node.numbers("steps", (3,), [2, 2, 2])]
+    lines = [_line(low, high, n) for (low, high), n in zip(box.tolist(), steps, strict=True)]
+    places = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
+    return (*out, *(Pose3(R, x) for x in places.reshape(-1, 3) for R in _attitudes(node)))
+
+
+def _line(low: float, high: float, n: int) -> FloatArray:
+    return np.linspace(low, high, n) if n > 1 else np.array([0.5 * (low + high)])
+
+
+def _attitudes(node: Node) -> list[Rot3]:
+    rows = node.value("attitudes_euler_xyz_deg", [[0.0, 0.0, 0.0]])
+    n = len(rows) if isinstance(rows, list) else 1
+    first = [rotation_from_euler(a) for a in to_si(node.numbers("attitudes_euler_xyz_deg", (n, 3), rows), "deg")]
+    if not node.has("turn_about"):
+        return first
+    axis = "xyz".index(node.choice("turn_about", ("x", "y", "z")))
+    count = node.integer("turn_steps", 1, 8)
+    turns = [rotation_from_euler(np.eye(3)[axis] * 2 * np.pi * k / count) for k in range(count)]
+    return [turn * start for start in first for turn in turns]
+
+
+def _beacon_places(node: Node) -> FloatArray:
+    """Candidate places: a grid over the six walls of ``room_mm``, its step ``places`` per wall and edge."""
+    if not node.has("room_mm"):
+        return np.zeros((0, 3))
+    box = to_si(node.numbers("room_mm", (3, 2)), "mm")
+    n = node.integer("places", 2, 6)
+    out = []
+    for axis in range(3):
+        u, v = (i for i in range(3) if i != axis)
+        grid = np.stack(np.meshgrid(*(_inner(box[i], n) for i in (u, v)), indexing="ij"), axis=-1).reshape(-1, 2)
+        for wall in box[axis]:
+            x = np.empty((len(grid), 3))
+            x[:, axis], x[:, u], x[:, v] = wall, grid[:, 0], grid[:, 1]
+            out.append(x)
+    return np.concatenate(out)
+
+
+def _inner(edge: FloatArray, n: int) -> FloatArray:
+    """N places along an edge, none of them in a corner."""
+    return np.asarray(edge[0] + (np.arange(n) + 0.5) / n * (edge[1] - edge[0]))

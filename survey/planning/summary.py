@@ -1,0 +1,287 @@
+"""A plan as plain values and as text for the terminal."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from adjust.design import Component, group_redundancy
+from adjust.design.pose_budget import PoseTolerance
+from adjust.model import FloatArray
+from survey.quantities import ARCSEC_PER_RAD, key_of, sigma_unit_for_people
+
+if TYPE_CHECKING:
+    from survey.planning.job import PlanningOutcome
+    from survey.planning.navigation import NavigationOutcome
+
+_MOST = 8
+_PEOPLE = {"rad": ("arcsec", ARCSEC_PER_RAD), "m": ("mm", 1e3), "px": ("px", 1.0)}
+
+
+def people(unit: str) -> tuple[str, float]:
+    """Unit and factor in which a sigma is read."""
+    return sigma_unit_for_people(unit)
+
+
+def number(value: float) -> float | None:
+    """A finite number, or None for JSON."""
+    return float(value) if np.isfinite(value) else None
+
+
+def sigma_of(component: Component, sigma: float) -> str:
+    """``0.12 mm``."""
+    unit, factor = people(component.unit)
+    return f"{factor * sigma:.3g} {unit}".strip()
+
+
+def plan_summary(o: "PlanningOutcome") -> dict[str, Any]:
+    """All figures by name, units in the keys."""
+    out: dict[str, Any] = {
+        "folder": str(o.folder),
+        "title": o.title,
+        "observations": o.expected.n_observations,
+        "unknowns": o.expected.n_unknowns,
+        "redundancy": o.expected.redundancy,
+        "datum_defect": o.expected.datum_defect,
+        "existing_images": o.planned.n_existing_blocks,
+        "planned_epochs": o.planned.n_planned_epochs,
+        "planned_blocks": len(o.planned.survey.image_blocks) - o.planned.n_existing_blocks,
+        "groups": {
+            g: {"observations": n, "redundancy": r, "smallest": float(q[0]), "median": float(q[1])}
+            for g, (n, r, q) in group_redundancy(o.expected).items()
+        },
+        "sigmas": _sigmas(o),
+        "weak_directions": [
+            {"factor": w.factor, "parts": [{"unknown": a, "component": c, "share": s} for a, c, s in w.parts]}
+            for w in o.weak
+        ],
+        "notes": [*o.planned.notes, *o.expected.warnings],
+        "seconds": o.seconds,
+        "written": {name: str(path) for name, path in o.paths.items()},
+    }
+    if o.selection is not None:
+        out["selection"] = _selection(o)
+    if o.budget is not None:
+        out["tolerances"] = _tolerances(o)
+    if o.trials is not None:
+        t = o.trials
+        out["monte_carlo"] = {
+            "trials": len(t.errors), "failed": len(t.failed), "mean_square": t.mean_square, "dof": t.dof,
+            "band_99": list(t.band), "passed": t.passed, "mean_omega": float(t.omega.mean()),
+            "rms_over_sigma": [float(t.ratios.min()), float(np.median(t.ratios)), float(t.ratios.max())],
+        }  # fmt: skip
+    if o.network is not None:
+        out["network"] = o.network
+    if o.navigation is not None:
+        out["navigation"] = _navigation(o.navigation)
+    return out
+
+
+def _sigmas(o: "PlanningOutcome") -> dict[str, dict[str, float]]:
+    by_name = o.expected.precision.graph.unknowns.by_name
+    out = {}
+    for name, unknown in by_name.items():
+        estimate = o.expected.estimates[name]
+        s = np.sqrt(np.maximum(np.diag(estimate.cov), 0.0))
+        entry = {}
+        for component, unit in zip(unknown.components, unknown.units, strict=True):
+            shown, factor = people(unit)
+            at = estimate.components.index(component)
+            entry[f"sigma_{key_of(component, shown)}"] = float(factor * s[at])
+        out[".".join(name)] = entry
+    return out
+
+
+def _selection(o: "PlanningOutcome") -> dict[str, Any]:
+    s = o.selection
+    if s is None:
+        return {}
+
+    def gain(g: Any) -> dict[str, Any]:
+        return {"name": g.name, "kind": g.kind, "ln_det": g.ln_det, "ln_det_all": g.ln_det_all,
+                "mean_variance": g.mean_variance}  # fmt: skip
+
+    return {
+        "criterion": s.criterion,
+        "chosen": [gain(g) for g in s.steps],
+        "candidates": [gain(g) for g in s.first],
+        "wanted": {
+            c.text: {f"sigma_before_{people(c.unit)[0]}".rstrip("_"): people(c.unit)[1] * float(a),
+                     f"sigma_after_{people(c.unit)[0]}".rstrip("_"): people(c.unit)[1] * float(b)}
+            for c, a, b in zip(s.wanted, s.sigmas, s.after, strict=True)
+        },
+    }  # fmt: skip
+
+
+def _tolerances(o: "PlanningOutcome") -> dict[str, Any]:
+    if o.budget is None:
+        return {}
+    met = o.budget.sigmas <= np.array(list(o.required.values())) * (1 + 1e-9)
+    return {
+        "met": bool(met.all()),
+        "groups": {t.group: {"factor_alone": number(t.alone), "factor_together": number(t.together),
+                             "limited_by": t.limiting} for t in o.tolerances},
+        "components": {
+            c.text: {"required": people(c.unit)[1] * r, "planned": people(c.unit)[1] * float(s),
+                     "unit": people(c.unit)[0]}
+            for (c, r), s in zip(o.required.items(), o.budget.sigmas, strict=True)
+        },
+    }  # fmt: skip
+
+
+def tolerance_values(t: PoseTolerance) -> tuple[str, float, float, float]:
+    """Unit for people, then alone, beside, shared in it."""
+    unit, factor = ("deg", 180.0 / np.pi) if t.unit == "rad" else _PEOPLE[t.unit]
+    return unit, factor * t.alone, factor * t.beside, factor * t.shared
+
+
+def pose_sigmas(n: "NavigationOutcome") -> tuple[FloatArray, FloatArray]:
+    """Largest sigma of rotation (deg) and of translation (mm) of every pose."""
+    return np.degrees(n.sigmas[:, :3].max(axis=1)), 1e3 * n.sigmas[:, 3:].max(axis=1)
+
+
+def _navigation(n: "NavigationOutcome") -> dict[str, Any]:
+    turn, shift = pose_sigmas(n)
+    out: dict[str, Any] = {
+        "station": n.station_id,
+        "poses": len(n.precision),
+        "undetermined": sum(bool(e.undetermined) for e in n.precision),
+        "meet_requirement": int(np.sum(meets(n))),
+        "beacons": len(n.beacons.beacon_ids),
+        "sigma_rotation_deg": [number(v) for v in turn],
+        "sigma_translation_mm": [number(v) for v in shift],
+        "beacons_seen": [len(e.beacon_ids) for e in n.precision],
+        "tolerances": {},
+    }
+    for t in n.tolerances:
+        unit, alone, beside, shared = tolerance_values(t)
+        key = t.source.replace(" ", "_")
+        out["tolerances"][key] = {f"alone_{unit}": number(alone), f"beside_{unit}": number(beside),
+                                  f"shared_{unit}": number(shared)}  # fmt: skip
+    if n.tolerances:
+        out["simulated_over_predicted"] = [number(v) for v in n.simulated]
+    if n.placement is not None:
+        p = n.placement
+        out["placement"] = {
+            "x_mm": (1e3 * n.places).tolist(), "measure": [number(v) for v in p.measure], "exchanged": p.exchanged,
+            "final": p.final, "criterion": n.plan.criterion,
+        }  # fmt: skip
+    return out
+
+
+def meets(n: "NavigationOutcome") -> FloatArray:
+    """(q,) whether every component of a pose is as precise as required."""
+    limit = np.array([n.plan.required_rotation] * 3 + [n.plan.required_translation] * 3)
+    return np.asarray((n.sigmas <= limit).all(axis=1))
+
+
+def plan_text(o: "PlanningOutcome") -> str:
+    """For the terminal, problems first."""
+    e = o.expected
+    name = o.title or str(o.folder)
+    lines = [f"{name}: {e.n_observations} observations, {e.n_unknowns} unknowns, redundancy {e.redundancy}"]
+    lines += [f"  ! {note}" for note in (*o.planned.notes, *e.warnings)]
+    lines += ["", f"  {'group':<18}{'observations':>13}{'redundancy':>12}{'smallest':>10}{'median':>8}"]
+    for group, (n, r, q) in group_redundancy(e).items():
+        lines.append(f"  {group:<18}{n:>13}{r:>12.1f}{q[0]:>10.3f}{q[1]:>8.3f}")
+    lines += ["", *_sigma_lines(o)]
+    if o.weak:
+        lines += ["", "  weak directions", *(f"    {w.text()}" for w in o.weak[:3])]
+    lines += _selection_lines(o) + _tolerance_lines(o) + _trial_lines(o) + _navigation_lines(o)
+    return "\n".join(lines)
+
+
+def _sigma_lines(o: "PlanningOutcome") -> list[str]:
+    by_name = o.expected.precision.graph.unknowns.by_name
+    out = ["  expected sigmas (a priori)"]
+    names = [n for n in by_name if len(n) < 3]
+    for name in names[: 4 * _MOST]:
+        estimate, unknown = o.expected.estimates[name], by_name[name]
+        s = np.sqrt(np.maximum(np.diag(estimate.cov), 0.0))
+        shown = []
+        for c, unit in zip(unknown.components, unknown.units, strict=True):
+            label, factor = people(unit)
+            shown.append((c, f"{factor * s[estimate.components.index(c)]:.3g}", label))
+        groups: dict[str, list[str]] = {}
+        for c, value, label in shown:
+            groups.setdefault(label, []).append(f"{c} {value}")
+        words = "   ".join(" ".join(v) + f" {label}".rstrip() for label, v in groups.items())
+        out.append(f"    {'.'.join(name):<28}{words}")
+    if len(names) > 4 * _MOST:
+        out.append(f"    and {len(names) - 4 * _MOST} more, see plan.html")
+    return out
+
+
+def _selection_lines(o: "PlanningOutcome") -> list[str]:
+    s = o.selection
+    if s is None:
+        return []
+    out = ["", f"  what to add next ({s.criterion}-optimal), each beside those above it"]
+    out += [f"    {'gain in':<34}{'ln det':>9}{'of all':>9}{'variance':>10}"]
+    for g in s.steps:
+        less = f"-{100 * g.mean_variance:.1f} %"
+        out.append(f"    {g.kind + ' ' + g.name:<34}{g.ln_det:>9.3f}{g.ln_det_all:>9.3f}{less:>10}")
+    gained = sorted(zip(s.wanted, s.sigmas, s.after, strict=True), key=lambda x: x[2] / x[1] if x[1] > 0 else 1.0)
+    out += [f"    {c.text:<34}{sigma_of(c, a)} -> {sigma_of(c, b)}" for c, a, b in gained[:_MOST]]
+    return out
+
+
+def _tolerance_lines(o: "PlanningOutcome") -> list[str]:
+    if o.budget is None:
+        return []
+    out = ["", "  required precision"]
+    for (c, r), s in zip(o.required.items(), o.budget.sigmas, strict=True):
+        word = "met" if s <= r * (1 + 1e-9) else "NOT MET"
+        out.append(f"    {c.text:<34}{sigma_of(c, r):>14} required{sigma_of(c, float(s)):>14} planned   {word}")
+    out.append(f"    {'sigmas may be, times the planned':<34}{'alone':>9}{'together':>10}   limited by")
+    for t in o.tolerances:
+        out.append(f"    {t.group:<34}{_factor(t.alone):>9}{_factor(t.together):>10}   {t.limiting}")
+    return out
+
+
+def _factor(value: float) -> str:
+    if np.isnan(value):
+        return "never"
+    return "any" if value > 1e6 else f"{value:.3g}"
+
+
+def _trial_lines(o: "PlanningOutcome") -> list[str]:
+    t = o.trials
+    if t is None:
+        return []
+    word = "agrees" if t.passed else "DOES NOT AGREE"
+    return [
+        "",
+        f"  Monte Carlo: {len(t.errors)} simulated surveys adjusted, {len(t.failed)} failed; scatter {word} with the "
+        "predicted covariance",
+        f"    mean of d' inv(C) d {t.mean_square:.2f}, expected {t.dof} ({t.band[0]:.2f} to {t.band[1]:.2f} at 99 %)",
+        f"    RMS error over sigma: {t.ratios.min():.3f} to {t.ratios.max():.3f}, median {np.median(t.ratios):.3f}",
+    ]
+
+
+def _navigation_lines(o: "PlanningOutcome") -> list[str]:
+    n = o.navigation
+    if n is None:
+        return []
+    turn, shift = pose_sigmas(n)
+    good = np.isfinite(turn) & np.isfinite(shift)
+    head = f"  navigation of {n.station_id} from {len(n.beacons.beacon_ids)} beacons: {int(good.sum())} of {len(turn)}"
+    out = ["", f"{head} poses determined, {int(meets(n).sum())} as precise as required"]
+    if good.any():
+        out.append(
+            f"    largest sigma of a pose: median {np.median(turn[good]):.3f} deg {np.median(shift[good]):.2f} mm, "
+            f"worst {turn[good].max():.3f} deg {shift[good].max():.2f} mm"
+        )
+    if n.placement is not None:
+        out.append(f"    placed ({n.plan.criterion} pose, in required variances; {n.placement.exchanged} exchanged)")
+        for i, x in enumerate(1e3 * n.places):
+            out.append(f"      N{i + 1:<4}{x[0]:>9.1f}{x[1]:>9.1f}{x[2]:>9.1f} mm")
+        out.append(f"      measure at the end {n.placement.final:.3g}")
+    if n.tolerances:
+        out.append(f"    {'tolerances':<22}{'alone':>10}{'beside':>10}{'shared':>10}")
+        for t in n.tolerances:
+            unit, *values = tolerance_values(t)
+            cells = "".join(f"{'never' if np.isnan(v) else f'{v:.3g}':>10}" for v in values)
+            out.append(f"    {t.source:<22}{cells} {unit}")
+        low, high = n.simulated.min(), n.simulated.max()
+        out.append(f"    simulated with the shared tolerances: RMS error {low:.3f} to {high:.3f} of its prediction")
+    return out
