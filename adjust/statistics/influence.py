@@ -17,7 +17,7 @@ def shifts(system: LinearSystem, rows: Sequence[int], bias: Mapping[int, FloatAr
     """How all unknowns (n, k) move with a bias of each of k observations; biases (c,) in sigmas, observed too large."""
     right = np.zeros((len(system.columns), len(rows)))
     for i, row in enumerate(rows):
-        right[:, i] = system.A[system.ptr[row] : system.ptr[row + 1]].T @ bias[row]
+        right[:, i] = system.bias_column(row, bias[row])
     return system.normal.solve(right)
 
 

@@ -28,7 +28,8 @@ from adjust.statistics.single_tests import (
     p_tau,
     whitened,
 )
-from adjust.statistics.system import LinearSystem, linear_system, precision_of
+from adjust.statistics.system import LinearSystem, linear_system, observation_groups, precision_of
+from adjust.terrestrial.statistics import influences as influences_of_readings
 
 DEFAULT_LEVELS = LevelOptions()
 _OF_ROWS = ("redundancy", "least", "statistic", "p", "p_posterior", "detectable", "external")
@@ -54,10 +55,9 @@ def reliability(
     system: of this adjustment, where it is known already.
     """
     precision = system.precision if system is not None else precision_of(adjustment)
-    batches = [_images(precision), *_others(precision)]
-    n_image = len(batches[0].rows)
-    sizes = np.full(n_image + len(precision.graph.others), 2, dtype=np.int64)
-    for batch in batches[1:]:
+    batches = [_images(precision), *_others(precision), *_readings(precision)]
+    sizes = np.zeros(sum(len(b.rows) for b in batches), dtype=np.int64)
+    for batch in batches:
         sizes[batch.rows] = batch.x.g.shape[1]
     ptr = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     n_tests = int(sum(np.count_nonzero(b.x.freedom) for b in batches))
@@ -146,6 +146,29 @@ def _others(precision: Precision) -> list[_Batch]:
     return out
 
 
+def _readings(precision: Precision) -> list[_Batch]:
+    """All readings, one component each; those with a joint covariance by a bias of each alone (Baarda 1968)."""
+    batch = precision.graph.terrestrial
+    if batch is None:
+        return []
+    e = batch.unweighted(precision.solved.values).copy()
+    M, W = influences_of_readings(batch, precision.tree), 1.0 / batch.sigma
+    K, g = np.where(batch.used, 1.0 - M, 1.0 / (1.0 + M)), np.where(batch.used, e, e / (1.0 + M))
+    for c in batch.correlated:
+        chunk = batch.layout.chunks[c]
+        rows, whitener = chunk.rows, np.asarray(chunk.whitener)
+        A, eye = batch.jacobian(c), np.eye(len(chunk.rows))
+        influence = A @ precision.tree.joint(chunk.keys) @ A.T
+        used = bool(batch.used[rows].all())
+        Q = eye - influence if used else np.linalg.inv(eye + influence)
+        W[rows] = np.linalg.norm(whitener, axis=0)
+        K[rows] = np.einsum("ji,jk,ki->i", whitener, Q, whitener) / W[rows] ** 2
+        g[rows] = whitener.T @ (e[rows] if used else Q @ e[rows]) / W[rows]
+    n, first = len(e), sum(len(b.uv) for b in precision.graph.survey.image_blocks) + len(precision.graph.others)
+    x = Whitened(g[:, None], K[:, None, None], K[:, None], np.ones((n, 1, 1)), batch.used)
+    return [_Batch(first + np.arange(n), x, W[:, None, None], 1.0 / W[:, None, None])]
+
+
 def _table(
     adjustment: Adjustment, precision: Precision, batches: Sequence[_Batch], ptr: IntArray, found: Criteria
 ) -> ObservationTests:
@@ -164,8 +187,11 @@ def _table(
         )
         for name, values in _of_components(batch, adjustment, found).items():
             of_part[name][parts] = values.ravel()
+    readings = adjustment.reading_residuals
+    if readings is not None:  # of joint readings: the shares of the degrees of freedom, not of a bias that shows
+        of_row["redundancy"][M - len(readings.used) :] = readings.redundancy
     level = found.alpha[np.maximum(freedom, 1) - 1]
-    groups = _groups(adjustment, precision)
+    groups = observation_groups(precision.graph)
     names = tuple(dict.fromkeys(groups))
     number = {g: i for i, g in enumerate(names)}
     with np.errstate(invalid="ignore"):
@@ -176,12 +202,6 @@ def _table(
         group_names=names, used=used, n_components=np.diff(ptr), freedom=freedom, fails=fails,
         fails_posterior=fails_posterior, tau=of_part["w"] / sigma0, **of_row, **of_part,
     )  # fmt: skip
-
-
-def _groups(adjustment: Adjustment, precision: Precision) -> list[str]:
-    return [b.group for b in adjustment.survey.image_blocks for _ in range(len(b.uv))] + [
-        o.group for o in precision.graph.others
-    ]
 
 
 def _of_rows(x: Whitened, found: Criteria) -> dict[str, FloatArray]:

@@ -51,12 +51,20 @@ class Columns:
 
 
 @dataclass(frozen=True, eq=False)
+class JointReadings:
+    """Readings with a joint covariance. rows: (k,) of the system. W: (k, k), inv(cov) = W'W, that whitens them."""
+
+    rows: IntArray
+    W: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class LinearSystem:
     """All observations at the solution, image points first, then ``Adjustment.other_residuals``; M in all.
 
     A: (m, n) whitened. e: (m,) whitened predicted minus observed. ptr: (M + 1,) rows of an observation. used: (M,).
     group: (M,) into group_names. datum: (d, n) rows that decide on what the observations leave open; motions: (n, d')
-    that these are. n_image: image points.
+    that these are. n_image: image points. joint: readings that are whitened together.
     """
 
     precision: Precision
@@ -70,6 +78,24 @@ class LinearSystem:
     datum: sparse.csr_matrix
     motions: FloatArray
     n_image: int
+    joint: tuple[JointReadings, ...] = ()
+
+    @cached_property
+    def joint_of(self) -> dict[int, tuple[JointReadings, int]]:
+        """By observation: the readings it is whitened with, and its place among them."""
+        return {int(self.row_of[r]): (j, i) for j in self.joint for i, r in enumerate(j.rows)}
+
+    def bias_column(self, observation: int, bias: FloatArray) -> FloatArray:
+        """Right-hand side (n,) of the normal equations for a bias of one observation.
+
+        bias: (k,) whitened, or (1,) over the conditional sigma of a reading with a joint covariance.
+        """
+        if observation in self.joint_of:
+            joint, i = self.joint_of[observation]
+            column = joint.W[:, i]
+            return np.asarray(self.A[joint.rows].T @ (column * (bias[0] / np.linalg.norm(column))))
+        rows = slice(int(self.ptr[observation]), int(self.ptr[observation + 1]))
+        return np.asarray(self.A[rows].T @ bias)
 
     @cached_property
     def row_of(self) -> IntArray:
@@ -142,17 +168,48 @@ def linear_system(adjustment: Adjustment) -> LinearSystem:
     n = len(columns)
     images = _image_rows(graph, n, key_columns, values)
     others = _other_rows(precision, n, key_columns)
-    n_image = images[0].shape[0] // 2
-    A = sparse.vstack([images[0], others[0]]).tocsr()
-    ptr = np.concatenate([2 * np.arange(n_image + 1), 2 * n_image + np.cumsum(others[2])]).astype(np.int64)
-    used = np.concatenate([graph.used(), np.array([o.used for o in graph.others], dtype=np.bool_)])
-    groups = [b.group for b in graph.survey.image_blocks for _ in range(len(b.uv))] + [o.group for o in graph.others]
+    readings = _reading_rows(precision, n, key_columns)
+    n_image, n_before = images[0].shape[0] // 2, images[0].shape[0] + others[0].shape[0]
+    A = sparse.vstack([images[0], others[0], readings[0]]).tocsr()
+    lengths = np.concatenate([np.full(n_image, 2), others[2], np.ones(len(readings[1]))])
+    ptr = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+    used = used_observations(graph)
+    groups = observation_groups(graph)
     names = tuple(dict.fromkeys(groups))
     number = {g: i for i, g in enumerate(names)}
     group = np.array([number[g] for g in groups], dtype=np.int64)
     datum, motions = _datum(precision, n, key_columns)
-    e = np.concatenate([images[1], others[1]])
-    return LinearSystem(precision, columns, A, e, ptr, used, group, names, datum, motions, n_image)
+    e = np.concatenate([images[1], others[1], readings[1]])
+    joint = tuple(JointReadings(n_before + rows, W) for rows, W in joint_readings(graph))
+    return LinearSystem(precision, columns, A, e, ptr, used, group, names, datum, motions, n_image, joint)
+
+
+def observation_groups(graph: AdjustmentGraph) -> list[str]:
+    """Group of every observation, in the order of a :class:`LinearSystem`."""
+    out = [b.group for b in graph.survey.image_blocks for _ in range(len(b.uv))] + [o.group for o in graph.others]
+    return out + [r.group for r in graph.survey.readings]
+
+
+def used_observations(graph: AdjustmentGraph) -> BoolArray:
+    """Which observations take part, in the order of a :class:`LinearSystem`."""
+    readings = graph.terrestrial.used if graph.terrestrial is not None else np.zeros(0, dtype=np.bool_)
+    return np.concatenate([graph.used(), np.array([o.used for o in graph.others], dtype=np.bool_), readings])
+
+
+def joint_readings(graph: AdjustmentGraph) -> list[tuple[IntArray, FloatArray]]:
+    """Readings that share a covariance, by their place in ``Survey.readings``, and what whitens them."""
+    chunks = graph.terrestrial.layout.chunks if graph.terrestrial is not None else ()
+    return [(c.rows, c.whitener) for c in chunks if c.whitener is not None]
+
+
+def mixed_blocks(system: LinearSystem) -> list[tuple[IntArray, tuple[str, ...], FloatArray]]:
+    """Joint readings of several groups: rows (k,) of the system, groups (k,), inverse of what whitens them (k, k)."""
+    out = []
+    for joint in system.joint:
+        groups = tuple(system.group_names[g] for g in system.group[system.row_of[joint.rows]])
+        if len(set(groups)) > 1:
+            out.append((joint.rows, groups, np.asarray(np.linalg.inv(joint.W))))
+    return out
 
 
 def precision_of(adjustment: Adjustment) -> Precision:
@@ -162,7 +219,7 @@ def precision_of(adjustment: Adjustment) -> Precision:
         return found
     start = values_of(adjustment)
     graph = GraphBuilder(adjustment.survey, start.lenses).build(start)
-    if [o.ids for o in graph.others] != [o.ids for o in adjustment.other_residuals]:
+    if [o.ids for o in graph.others] != [o.ids for o in adjustment.other_residuals[: len(graph.others)]]:
         raise SurveyError("the adjustment does not fit its survey; adjust the survey again")
     return Precision(graph, solve(graph))
 
@@ -290,6 +347,16 @@ def _other_rows(
         lengths.append(len(b))
         at += len(b)
     return entries.matrix((at, n)), np.concatenate(residuals), np.array(lengths, dtype=np.int64)
+
+
+def _reading_rows(precision: Precision, n: int, key_columns: dict[int, IntArray]) -> Rows:
+    batch = precision.graph.terrestrial
+    if batch is None:
+        return sparse.csr_matrix((0, n)), np.zeros(0)
+    e, entries = batch.unweighted(precision.solved.values).copy(), _Entries()
+    for c, chunk in enumerate(batch.layout.chunks):
+        entries.add(chunk.rows, np.concatenate([key_columns[k] for k in chunk.keys]), batch.jacobian(c))
+    return entries.matrix((len(e), n)), e
 
 
 def _datum(precision: Precision, n: int, key_columns: dict[int, IntArray]) -> tuple[sparse.csr_matrix, FloatArray]:

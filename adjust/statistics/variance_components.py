@@ -1,0 +1,266 @@
+"""Variance components of the groups of a survey, iterated until the residuals of each are as large as they say.
+
+Helmert's equations are solved in every step, which is Fisher's scoring of the restricted likelihood (REML); where that
+would leave the positive factors or go far, the scoring of their logarithms. In very large surveys it is Foerstner's
+(1979) step ``factor * q / r``: the same fixed point without traces, but only for groups that share no correlated block.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import chi2
+
+from adjust.adjustment import AdjustOptions, adjust
+from adjust.errors import SurveyError
+from adjust.graph import StartValues
+from adjust.model import BoolArray, FloatArray, IntArray, Survey
+from adjust.pair_screen import values_of
+from adjust.result import Adjustment
+from adjust.statistics.group_sums import GroupSums, Moments, group_sums, moments
+from adjust.statistics.result import Component, VarianceComponents
+from adjust.statistics.scaling import scaled_survey
+from adjust.statistics.system import DENSE, LinearSystem, linear_system, mixed_blocks, precision_of
+
+_VANISHED = 1e-6
+_SINGULAR = 1e-6
+_LONGEST = 1.5
+_MANY_POINTS = 300_000
+_LINEAR_STEPS = 100
+
+
+@dataclass(frozen=True)
+class ComponentOptions:
+    """groups: of which the components are estimated (all but ``fixed``, where None).
+
+    least_redundancy: a group with less is not estimated. convergence: relative change of all factors by one more
+    solution of the survey. level: of the confidence limits. method: "reml" or "foerstner" (see above).
+    """
+
+    groups: tuple[str, ...] | None = None
+    fixed: tuple[str, ...] = ("prior",)
+    least_redundancy: float = 1.0
+    convergence: float = 1e-4
+    max_iterations: int = 20
+    level: float = 0.95
+    method: str = "reml"
+    adjust: AdjustOptions = field(default_factory=AdjustOptions)
+
+
+DEFAULT_COMPONENTS = ComponentOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """The survey with its estimated variances, adjusted, and the components that were found."""
+
+    survey: Survey
+    adjustment: Adjustment
+    components: VarianceComponents
+
+
+@dataclass(frozen=True, eq=False)
+class LinearComponents:
+    """Factors of a linear system. theta: (G,) of all groups; estimated: (G,) which were; S: (k, k) of the sets.
+
+    merged: (G,) number of the set that a group was estimated with, -1 for those that were not. vanished: (G,).
+    """
+
+    theta: FloatArray
+    estimated: BoolArray
+    merged: IntArray
+    vanished: BoolArray
+    S: FloatArray
+    moments: Moments
+    steps: int
+    converged: bool
+
+
+def estimate_variance_components(
+    survey: Survey, start: StartValues | None = None, options: ComponentOptions = DEFAULT_COMPONENTS,
+    progress: Callable[[int, float], None] | None = None, first: Adjustment | None = None,
+) -> Scaled:  # fmt: skip
+    """Estimate the variance components of a survey's groups, and adjust it with them.
+
+    first: an adjustment of this survey, where there is one. Raises SurveyError where a group is not in the survey or
+    has no observation in use, and as :func:`adjust.adjustment.adjust`.
+    """
+    now = first or adjust(survey, start, options.adjust, progress)
+    survey = now.survey
+    total: dict[str, float] = {}
+    for iteration in range(1, options.max_iterations + 1):
+        found = _of_adjustment(now, options)
+        change = max((abs(np.log(c.factor)) for c in found.components if c.status in _CHANGED), default=0.0)
+        if change < options.convergence:
+            total = {c.group: total.get(c.group, 1.0) for c in found.components}
+            return Scaled(now.survey, now, _totals(found, total, iteration, True, options))
+        total = {c.group: total.get(c.group, 1.0) * c.factor for c in found.components}
+        now = adjust(scaled_survey(survey, total), values_of(now), options.adjust, progress)
+    found = _of_adjustment(now, options)
+    total = {c.group: total.get(c.group, 1.0) for c in found.components}
+    return Scaled(now.survey, now, _totals(found, total, options.max_iterations, False, options))
+
+
+_CHANGED = ("estimated", "unseparable", "vanished")
+
+
+def _totals(
+    found: VarianceComponents, total: dict[str, float], iterations: int, converged: bool, options: ComponentOptions
+) -> VarianceComponents:
+    """The last step's components with factors over the a priori variances."""
+    components = tuple(
+        _component(c.group, total[c.group], c.sigma / c.factor * total[c.group], c.n, c.redundancy, c.omega,
+                   "vanished" if c.status == "estimated" and total[c.group] < 10.0 * _VANISHED else c.status, options)
+        for c in found.components
+    )  # fmt: skip
+    return VarianceComponents(components, found.estimated, found.correlation, found.unseparable, iterations, converged,
+                              found.method)  # fmt: skip
+
+
+def _of_adjustment(adjustment: Adjustment, options: ComponentOptions) -> VarianceComponents:
+    groups = {g.group: g for g in adjustment.groups}
+    wanted = options.groups if options.groups is not None else tuple(g for g in groups if g not in options.fixed)
+    unknown = [g for g in wanted if g not in groups]
+    if unknown:
+        raise SurveyError(
+            f"no observation in use belongs to group {unknown[0]!r}; groups with observations: {', '.join(groups)}"
+        )
+    large = precision_of(adjustment).graph.unknowns.n_unknowns > DENSE
+    if large or len(adjustment.image_residuals.test) > _MANY_POINTS:
+        return _simplified(adjustment, wanted, options)
+    return components_of(linear_system(adjustment), wanted, options)
+
+
+def _simplified(adjustment: Adjustment, wanted: Sequence[str], options: ComponentOptions) -> VarianceComponents:
+    """Foerstner's step from the sums of the adjustment; sigmas without the coupling of the groups."""
+    out = []
+    for g in adjustment.groups:
+        enough = g.group in wanted and g.redundancy >= options.least_redundancy
+        status = "estimated" if enough else "no redundancy" if g.group in wanted else "fixed"
+        factor = max(g.factor, _VANISHED) if enough else 1.0
+        sigma = factor * np.sqrt(2.0 / g.redundancy) if enough else np.nan
+        out.append(_component(g.group, factor, float(sigma), g.n_observations, g.redundancy, g.omega, status, options))
+    names = tuple(c.group for c in out if c.status == "estimated")
+    return VarianceComponents(tuple(out), names, np.eye(len(names)), (), 1, True, "foerstner")
+
+
+def components_of(
+    system: LinearSystem, wanted: Sequence[str], options: ComponentOptions = DEFAULT_COMPONENTS
+) -> VarianceComponents:
+    """Variance components of a linear system: no new linearisation."""
+    names = system.group_names
+    number = {g: i for i, g in enumerate(names)}
+    mixed = [(rows, np.array([number[g] for g in of], dtype=np.int64), back) for rows, of, back in mixed_blocks(system)]
+    sums = group_sums(system, mixed)
+    chosen = np.array([g in wanted for g in names], dtype=np.bool_)
+    found = linear_components(sums, chosen, options)
+    return _named(names, sums, chosen, found, options)
+
+
+def linear_components(sums: GroupSums, chosen: BoolArray, options: ComponentOptions) -> LinearComponents:
+    """Factors of the ``chosen`` groups (G,); the others keep 1. Groups that cannot be told apart share one factor."""
+    G = len(chosen)
+    first = moments(sums, np.ones(G))
+    chosen = chosen & (first.r >= options.least_redundancy)
+    sets = _sets(first.S, chosen)
+    to = np.where(sets >= 0, sets, 0)
+    k = int(sets.max(initial=-1)) + 1
+    fixed = sets < 0
+    to[fixed] = k  # all fixed ones together, last
+    small = sums.merged(to) if G else sums
+    n_sets = int(to.max(initial=-1)) + 1
+    theta, converged, steps = np.ones(n_sets), k == 0, 0
+    now = moments(small, theta)
+    held = np.zeros(k, dtype=np.bool_)
+    while not converged and steps < _LINEAR_STEPS:
+        steps += 1
+        step = _step(now, k, held, options.method)
+        theta[:k] = np.maximum(theta[:k] * step, _VANISHED)
+        held |= theta[:k] <= _VANISHED
+        now = moments(small, theta)
+        converged = bool(np.all(np.abs(np.log(step))[~held] < 1e-2 * options.convergence))
+    factors = np.where(fixed, 1.0, theta[to])
+    merged = np.where(fixed, -1, to)
+    vanished = ~fixed & (factors <= _VANISHED)
+    final = now if n_sets == G and k == G else moments(sums, factors)
+    return LinearComponents(factors, ~fixed, merged, vanished, now.S[:k, :k], final, steps, converged)
+
+
+def _step(now: Moments, k: int, held: BoolArray, method: str) -> FloatArray:
+    """Relative change (k,) of the factors: Helmert's where it is positive and not far, else of their logarithms."""
+    if method == "foerstner":
+        simple = np.maximum(now.q[:k] / np.maximum(now.r[:k], 1e-9), 1e-3)
+        return np.where(held, 1.0, simple)
+    free = np.flatnonzero(~held)
+    rest = np.setdiff1d(np.arange(len(now.q)), free)
+    right = now.q[free] - now.S[np.ix_(free, rest)].sum(axis=1)
+    out = np.ones(k)
+    out[free] = np.linalg.lstsq(now.S[np.ix_(free, free)], right, rcond=1e-10)[0]
+    if not (np.all(out[free] > 0.2) and np.all(out[free] < 5.0)):
+        score = now.q[free] - now.r[free]
+        logs = np.linalg.lstsq(now.S[np.ix_(free, free)], score, rcond=1e-10)[0]
+        out[free] = np.exp(np.clip(logs, -_LONGEST, _LONGEST))
+    return out
+
+
+def _sets(S: FloatArray, chosen: BoolArray) -> IntArray:
+    """Number (G,) of the set of groups that are estimated together, -1 for what is not estimated.
+
+    Where a combination of factors leaves all expectations as they are, its groups cannot be told apart.
+    """
+    index = np.flatnonzero(chosen)
+    sets = np.full(len(chosen), -1, dtype=np.int64)
+    sets[index] = np.arange(len(index))
+    if not len(index):
+        return sets
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(S)[index], 1e-300))
+    values, vectors = np.linalg.eigh(S[np.ix_(index, index)] * np.outer(scale, scale))
+    for vector in vectors[:, values < _SINGULAR].T:
+        together = index[np.abs(vector) > 0.05]
+        sets[np.isin(sets, sets[together])] = sets[together].min()
+    for new, old in enumerate(np.unique(sets[sets >= 0])):
+        sets[sets == old] = new
+    return sets
+
+
+def _named(
+    names: Sequence[str], sums: GroupSums, chosen: BoolArray, found: LinearComponents, options: ComponentOptions
+) -> VarianceComponents:
+    k = len(found.S)
+    cov = 2.0 * np.linalg.pinv(found.S, hermitian=True) if k else np.zeros((0, 0))
+    counts = sums.n.copy()
+    for m in sums.mixed:
+        np.add.at(counts, m.group, 1.0)
+    out = []
+    shared = [tuple(np.array(names)[found.merged == i].tolist()) for i in range(k)]
+    for g, name in enumerate(names):
+        if counts[g] == 0:
+            continue
+        at = int(found.merged[g])
+        sigma = found.theta[g] * np.sqrt(cov[at, at]) if at >= 0 else np.nan
+        status = "fixed" if not chosen[g] else "no redundancy"
+        if at >= 0:
+            status = "unseparable" if len(shared[at]) > 1 else "vanished" if found.vanished[g] else "estimated"
+        out.append(_component(name, float(found.theta[g]), float(sigma), int(counts[g]), float(found.moments.r[g]),
+                              float(found.moments.q[g]), status, options))  # fmt: skip
+    d = np.sqrt(np.diag(cov))
+    correlation: FloatArray = np.asarray(cov / np.outer(d, d), dtype=float)
+    return VarianceComponents(
+        tuple(out), tuple(" + ".join(s) for s in shared), correlation, tuple(s for s in shared if len(s) > 1),
+        found.steps, found.converged, options.method,
+    )  # fmt: skip
+
+
+def _component(
+    group: str, factor: float, sigma: float, n: int, redundancy: float, omega: float, status: str,
+    options: ComponentOptions,
+) -> Component:  # fmt: skip
+    """Limits and test from chi-square with the equivalent degrees of freedom (Satterthwaite 1946)."""
+    if status == "vanished" or not (np.isfinite(sigma) and sigma > 0.0 and factor > 0.0):
+        nan = float("nan")
+        return Component(group, factor, sigma, n, redundancy, omega, nan, nan, nan, nan, status)
+    freedom = 2.0 * factor**2 / sigma**2
+    low, high = chi2.ppf([0.5 - 0.5 * options.level, 0.5 + 0.5 * options.level], freedom)
+    p = 2.0 * min(float(chi2.cdf(factor * freedom, freedom)), float(chi2.sf(factor * freedom, freedom)))
+    return Component(group, factor, sigma, n, redundancy, omega, freedom, min(1.0, p), float(factor * freedom / high),
+                     float(factor * freedom / low), status)  # fmt: skip
