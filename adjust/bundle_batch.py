@@ -5,7 +5,7 @@ Values, and :meth:`BundleBatch.complete` puts their steps into GTSAM's delta. Th
 remains on the interface: the reduced camera system, condensed once more.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import gtsam
@@ -391,6 +391,60 @@ class BundleBatch:
             self.pose_at, self.point_at, Q_local, influence,
         )  # fmt: skip
         return Q, C, influence
+
+    def hidden_transposed(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
+        """Rows on hidden unknowns, transposed (dim, k) per key, as rows on the interface (n_interface, k)."""
+        nh, u = self.n_hidden, self._by_keys(rows, k)
+        out = u[nh:]
+        return out + self._hidden_poses_given_interface()[0].T @ u[:nh] if nh else out
+
+    def hidden_products(self, interface: FloatArray, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
+        """Covariance times rows of every hidden unknown (dim, k), from that of the interface (n_interface, k).
+
+        rows: what the rows are on hidden unknowns, transposed (dim, k) per key. The batch must be prepared.
+        """
+        nh, k = self.n_hidden, interface.shape[1]
+        d = np.zeros((self.n_keys, k))
+        d[nh:] = interface
+        if nh:
+            T, P = self._hidden_poses_given_interface()
+            d[:nh] = T @ interface + P @ self._by_keys(rows, k)[:nh]
+        dX, local = np.zeros((len(self.reduced), 3, k)), self.G @ d
+        for i in range(k):
+            one = np.zeros((len(self.reduced), 3))
+            back_substitute(
+                self.ptr, self.pc_ptr, self.pc_camera, self.camera_of, self.state.lenses.n_free, self.lens_at,
+                self.pose_at, self.Vi, self.W3, self.WL, np.zeros_like(self.h), np.ascontiguousarray(local[:, i]), one,
+            )  # fmt: skip
+            dX[:, :, i] = one
+        dX += self.Vi @ self._of_points(rows, k)
+        out = {key: d[self.key_at[key] : self.key_at[key] + 6] for key in self.hidden_poses}
+        return out | {self.point_key[i]: dX[j] for j, i in enumerate(self.reduced)}
+
+    def _of_points(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
+        out = np.zeros((len(self.reduced), 3, k))
+        for j, i in enumerate(self.reduced):
+            if self.point_key[i] in rows:
+                out[j] = rows[self.point_key[i]]
+        return out
+
+    def _by_keys(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
+        """Rows on hidden unknowns, transposed, as rows (n_keys, k) on the poses and the interface, points reduced."""
+        g = self.Vi @ self._of_points(rows, k)
+        local = np.zeros((self.n_local, k))
+        point = np.repeat(np.arange(len(self.reduced)), np.diff(self.ptr))
+        n = self.n_reduced
+        by_pose = -np.einsum("kaq,kam->kqm", self.W3[:n], g[point])
+        np.add.at(local, (self.pose_at[:n, None] + np.arange(6)), by_pose)
+        owner = np.repeat(np.arange(len(self.reduced)), np.diff(self.pc_ptr))
+        for i, camera in enumerate(self.pc_camera):
+            at, free = self.lens_at[camera], self.state.lenses.n_free[camera]
+            local[at : at + free] -= self.WL[i, :, :free].T @ g[owner[i]]
+        out = np.asarray(self.G.T @ local)
+        for key in self.hidden_poses:
+            if key in rows:
+                out[self.key_at[key] : self.key_at[key] + 6] += rows[key]
+        return out
 
     def hidden_from_interface(self, keys: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         """How hidden poses and points follow from the interface, stacked: M (n, n_interface), and their own scatter.

@@ -1,24 +1,27 @@
-"""The seven motions that images and pairs cannot see, and inner constraints against them.
+"""The seven motions that images, pairs and readings cannot see, and inner constraints against them.
 
-Inner constraints are rows ``G' dx = 0`` over the datum's unknowns, as many as the survey has defects. They alone decide
-on the defects, so the adjusted shape does not depend on their weight; what their variance adds to the covariances is
-known exactly and taken off again (S-transformation; Baarda 1973, Koch 1999 section 3.3.6).
+The normal equations are solved with a minimal datum: as many single components as there are defects, held at no cost
+to the sparsity. Steps and covariances are then brought into the survey's datum, inner constraints ``R dx = 0`` over any
+number of unknowns, by an S-transformation (Baarda 1973; Koch 1999 section 3.3.6): ``S = I - G (R G)^-1 R`` with the
+motions G. The adjusted shape does not depend on either datum.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from gtsam import Pose3
+from scipy.linalg import qr
 
 from adjust.errors import SurveyError
-from adjust.factors import Jacobians, custom
 from adjust.geometry.motions import MOVED, vector_motions
 from adjust.graph import AdjustmentGraph, inner_datum_keys
 from adjust.model import FloatArray, IntArray
 from adjust.motions import motions_of
 from adjust.result import ParameterName
+from adjust.terrestrial.motions import MOVED as READINGS_MOVED
+from adjust.terrestrial.motions import reading_motions
 from adjust.unknowns import Unknown
 
 BLIND = 1e-8
@@ -29,6 +32,8 @@ def gauge(graph: AdjustmentGraph, unknown: Unknown, values: gtsam.Values) -> Flo
     """How an unknown moves (dim, 7) with the whole survey: translations, rotations (about the world origin), scale."""
     if unknown.name[0] in MOVED:
         return vector_motions(graph.survey, graph.unknowns, unknown, values)
+    if unknown.name[0] in READINGS_MOVED:
+        return reading_motions(graph.survey, graph.unknowns, graph.terrestrial, unknown, values)
     return motions_of(unknown, values, in_world(graph, unknown.name))
 
 
@@ -86,7 +91,10 @@ def normal_diagonal(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> Float
 
 @dataclass(frozen=True, eq=False)
 class InnerDatum:
-    """Inner constraints: rows (k, dim) per key, relative to ``base``; ``directions`` (7, k) are the defects there."""
+    """Inner constraints: rows (k, dim) per key, relative to ``base``; ``directions`` (7, k) are the defects there.
+
+    minimal: per key the components that the normal equations hold, and their weights. sigma: of a datum component.
+    """
 
     keys: list[int]
     rows: dict[int, FloatArray]
@@ -94,35 +102,57 @@ class InnerDatum:
     kinds: dict[int, str]
     directions: FloatArray
     sigma: float
-    addition: FloatArray  # (k, k): what the rows' own variance adds, in terms of the defect motions
+    minimal: Mapping[int, tuple[IntArray, FloatArray]]
 
     @property
     def defect(self) -> int:
         """Number of undetermined motions."""
         return int(self.directions.shape[1])
 
-    def factor(self) -> gtsam.NonlinearFactor:
-        """The constraint rows as a factor."""
-        base, kinds, rows = self.base, self.kinds, self.rows
+    def add_to(self, linear: gtsam.GaussianFactorGraph) -> None:
+        """Hold the minimal datum's components at their values."""
+        for key, (components, weights) in self.minimal.items():
+            dim = self.rows[key].shape[1] if key in self.rows else 3 if self.kinds[key] == "point" else 6
+            A = np.zeros((len(components), dim))
+            A[np.arange(len(components)), components] = weights
+            linear.add(key, A, np.zeros(len(components)), gtsam.noiseModel.Unit.Create(len(components)))
 
-        def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
-            r, blocks = np.zeros(self.defect), []
-            for key, row in rows.items():
-                if kinds[key] == "point":
-                    r += row @ (np.asarray(values.atPoint3(key)) - np.asarray(base.atPoint3(key)))
-                    blocks.append((key, row))
-                else:
-                    D = np.zeros((6, 6), order="F")
-                    r += row @ Pose3.Logmap(base.atPose3(key).between(values.atPose3(key)), D)
-                    blocks.append((key, row @ D))
-            return r, blocks
+    def completed(self, graph: AdjustmentGraph, values: gtsam.Values, delta: gtsam.VectorValues) -> gtsam.VectorValues:
+        """The step ``delta`` of all unknowns from ``values``, moved into this datum."""
+        motions = survey_motions(graph, values, self.directions)
+        offset, seen = np.zeros(self.defect), np.zeros((self.defect, self.defect))
+        for key, row in self.rows.items():
+            if self.kinds[key] == "point":
+                offset += row @ (np.asarray(values.atPoint3(key)) - np.asarray(self.base.atPoint3(key)) + delta.at(key))
+                seen += row @ motions[key]
+            else:
+                D = np.zeros((6, 6), order="F")
+                local = Pose3.Logmap(self.base.atPose3(key).between(values.atPose3(key)), D)
+                offset += row @ (local + D @ delta.at(key))
+                seen += row @ D @ motions[key]
+        shift = np.linalg.solve(seen, offset)
+        out = gtsam.VectorValues()
+        for key, moved in motions.items():
+            out.insert(key, delta.at(key) - moved @ shift)
+        return out
 
-        return custom(self.keys, np.eye(self.defect) * self.sigma**2, residual)
 
-    def excess(self, gauge_rows: FloatArray) -> FloatArray:
-        """What to take off the covariance of an unknown whose motions are ``gauge_rows`` (dim, 7)."""
-        B = gauge_rows @ self.directions
-        return np.asarray(B @ self.addition @ B.T)
+def survey_motions(graph: AdjustmentGraph, values: gtsam.Values, directions: FloatArray) -> dict[int, FloatArray]:
+    """How every unknown moves (dim, k) with the motions ``directions`` (7, k) of the whole survey."""
+    unknowns = graph.unknowns.by_name.values()
+    points = [u.key for u in unknowns if u.kind == "point"]
+    x = np.array([values.atPoint3(key) for key in points]).reshape(-1, 3)
+    B = np.zeros((len(points), 3, 7))
+    B[:, :, :3], B[:, :, 6] = np.eye(3), x
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # w x x, by w
+        B[:, i, 3 + j], B[:, j, 3 + i] = x[:, k], -x[:, k]
+    out = dict(zip(points, B @ directions, strict=True))
+    for u in unknowns:
+        if u.kind != "point":
+            out[u.key] = gauge(graph, u, values) @ directions
+        for i in graph.unknowns.held.get(u.key, ()):
+            out[u.key][i] = 0.0
+    return out
 
 
 def defects(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> FloatArray:
@@ -153,23 +183,46 @@ def inner_datum(graph: AdjustmentGraph, base: gtsam.Values) -> InnerDatum | None
         raise SurveyError("datum kind 'inner' needs free points or free fixed stations; name some, or hold something")
     graph.prepare(base, jacobians=True)
     linear = graph.graph.linearize(base)
+    stack = stacking(graph, visible_keys(graph))
+    weights = normal_diagonal(linear, stack)
     directions = defects(graph, linear, base)
     if directions.shape[1] == 0:
         return None
     by_key = graph.unknowns.by_key
-    stacked = np.concatenate([gauge(graph, by_key[k], base) @ directions for k in keys])
-    Q, triangular = np.linalg.qr(stacked)
+    motions = survey_motions(graph, base, directions)
+    Q, triangular = np.linalg.qr(np.concatenate([motions[k] for k in keys]))
     if np.abs(np.diag(triangular)).min() < 1e-9 * np.abs(triangular).max():
         raise SurveyError("the points and stations named for the inner datum cannot carry it; name three points")
-    stack = stacking(graph, visible_keys(graph))
-    held = {stack.at[k].start + i for k in keys for i in graph.unknowns.held.get(k, ())}
-    mine = normal_diagonal(linear, stack)[[int(i) for i in stack.index(keys) if int(i) not in held]]
-    sigma = float(1.0 / np.sqrt(np.median(mine)))
     rows, o = {}, 0
     for key in keys:
         rows[key] = Q[o : o + by_key[key].dim].T.copy()
         o += by_key[key].dim
-    inverse = np.linalg.inv(triangular)
-    kinds = {k: by_key[k].kind for k in keys}
-    addition = sigma**2 * inverse @ inverse.T
-    return InnerDatum(keys, rows, base, kinds, directions, sigma, addition)
+    minimal = minimal_datum(graph, stack, weights, motions)
+    kinds = {k: by_key[k].kind for k in [*keys, *minimal]}
+    sigma = float(1.0 / np.median(np.concatenate([w for _, w in minimal.values()])))
+    return InnerDatum(keys, rows, base, kinds, directions, sigma, minimal)
+
+
+def minimal_datum(
+    graph: AdjustmentGraph, stack: Stacking, diagonal: FloatArray, motions: Mapping[int, FloatArray]
+) -> dict[int, tuple[IntArray, FloatArray]]:
+    """As many components of points and poses as there are defects, those that tell the motions apart best.
+
+    diagonal: of the normal matrix, stacked. The components come from a pivoted QR factorisation of the motions in units
+    of the components' own sigmas.
+    """
+    root = np.sqrt(diagonal)
+    by_key = graph.unknowns.by_key
+    keys = [k for k in stack.at if by_key[k].kind in ("point", "pose") and np.abs(motions[k]).max() > 0.0]
+    if not keys:
+        raise SurveyError("an inner datum needs free points or poses of the world; free some, or set no inner datum")
+    index = stack.index(keys)
+    B = np.concatenate([motions[k] for k in keys]) * root[index][:, None]
+    orthonormal = np.linalg.qr(B)[0]
+    chosen = qr(orthonormal.T, pivoting=True, mode="r")[1][: B.shape[1]]
+    out: dict[int, tuple[IntArray, FloatArray]] = {}
+    owner = np.repeat(np.arange(len(keys)), [by_key[k].dim for k in keys])
+    for number in dict.fromkeys(owner[chosen].tolist()):
+        mine = np.sort(index[chosen][owner[chosen] == number])
+        out[keys[number]] = (mine - stack.at[keys[number]].start, root[mine])
+    return out

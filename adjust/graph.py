@@ -177,7 +177,7 @@ class GraphBuilder:
         # unused observations too: they are predicted with the joint covariance of their unknowns
         outside = {k for item in self.others for k in list(item.factor.keys())}
         outside |= {k for keys in images.keys for k in keys} | (readings.keys if readings is not None else set())
-        outside |= self._datum_keys() | set(self.unknowns.held)
+        outside |= set(self.unknowns.held)
         unknown = [(i, b) for i, free, b in split if free]
         bundle = None
         if unknown:
@@ -353,12 +353,6 @@ class GraphBuilder:
         self.others.append(
             ObservationFactor(factor, kind, group, ids, components, units, np.asarray(observed, dtype=float), used)
         )
-
-    def _datum_keys(self) -> set[int]:
-        """Unknowns that carry inner constraints: they have to stay visible to GTSAM."""
-        if self.survey.datum.kind != "inner":
-            return set()
-        return set(inner_datum_keys(self.survey, self.unknowns))
 
     def _values(self, start: StartValues) -> gtsam.Values:
         values = gtsam.Values()

@@ -4,7 +4,7 @@ Redundancy numbers and residual covariances follow Baarda (1968) and Foerstner (
 Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, chi-square with two degrees of freedom.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gtsam
@@ -12,7 +12,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
-from adjust.datum import gauge, stacking
+from adjust.datum import stacking, survey_motions
 from adjust.graph import AdjustmentGraph
 from adjust.model import BoolArray, FloatArray
 from adjust.observation_factor import ObservationFactor
@@ -24,6 +24,7 @@ from adjust.result import (
     ParameterName,
     ReadingResiduals,
 )
+from adjust.s_transformation import STransformation, s_transformation
 from adjust.solve import Solved
 from adjust.tree_covariance import TreeCovariance
 
@@ -43,6 +44,30 @@ class Precision:
         self.bundle_influence = np.zeros((0, 3))
         if graph.bundle is not None:
             self._bundle()
+        self.transformation: STransformation | None = None
+        if solved.datum is not None:
+            motions = survey_motions(graph, solved.values, solved.datum.directions)
+            self.transformation = s_transformation(solved.datum.rows, motions, self.products)
+
+    def products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
+        """Covariance, as solved, times the transpose of ``rows`` (k, dim per key): (dim, k) for every unknown."""
+        tree, bundle = self.tree, self.graph.bundle
+        k = next(iter(rows.values())).shape[0]
+        right = np.zeros((tree.n, k))
+        hidden = {}
+        for key, row in rows.items():
+            if key in self.hidden:
+                hidden[key] = row.T
+            else:
+                right[tree.rows([key])] += row.T
+        if bundle is not None and self.hidden:
+            right[tree.rows(bundle.interface)] += bundle.hidden_transposed(hidden, k)
+        product = tree.times(right)
+        at = tree.places()
+        out = {key: product[place] for key, place in at.items()}
+        if bundle is not None and self.hidden:
+            out |= bundle.hidden_products(product[tree.rows(bundle.interface)], hidden)
+        return out
 
     def _bundle(self) -> None:
         bundle = self.graph.bundle
@@ -56,17 +81,13 @@ class Precision:
         for j, i in enumerate(bundle.reduced):
             self.hidden[bundle.point_key[i]] = points[j]
 
-    def _excess(self, keys: Sequence[int]) -> FloatArray | float:
-        datum = self.solved.datum
-        if datum is None:
-            return 0.0
-        by_key = self.graph.unknowns.by_key
-        return datum.excess(np.concatenate([gauge(self.graph, by_key[k], self.solved.values) for k in keys]))
+    def _in_datum(self, keys: Sequence[int], Q: FloatArray) -> FloatArray:
+        return Q if self.transformation is None else self.transformation.apply(keys, Q)
 
     def cov(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
         Q = self.hidden[key] if key in self.hidden else self.tree.marginal(key)
-        Q = np.array(Q - self._excess([key]))
+        Q = np.array(self._in_datum([key], Q))
         held = list(self.graph.unknowns.held.get(key, ()))
         Q[held], Q[:, held] = 0.0, 0.0
         return Q
@@ -80,7 +101,7 @@ class Precision:
         hidden = [k for k in keys if k in self.hidden]
         bundle = self.graph.bundle
         if not hidden or bundle is None:
-            return np.asarray(self.tree.joint(keys) - self._excess(keys))
+            return self._in_datum(keys, self.tree.joint(keys))
         seen = [k for k in keys if k not in self.hidden]
         outer = list(dict.fromkeys(bundle.interface + seen))
         Q, at = self.tree.joint(outer), stacking(self.graph, outer)
@@ -92,13 +113,13 @@ class Precision:
         scatter[np.ix_(place.index(hidden), place.index(hidden))] = own
         if seen:
             L[place.index(seen), at.index(seen)] = 1.0
-        return np.asarray(L @ Q @ L.T + scatter - self._excess(keys))
+        return self._in_datum(keys, L @ Q @ L.T + scatter)
 
     def influence(self, item: ObservationFactor) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Whitened residual (k,), whitened A Q A' (k, k), and the square root information's inverse (k, k)."""
         linear = item.factor.linearize(self.solved.values)
         A, b = linear.jacobian()
-        Q = self.tree.joint(list(linear.keys()))
+        Q = self._in_datum(list(linear.keys()), self.tree.joint(list(linear.keys())))
         return -b, A @ Q @ A.T, np.asarray(np.linalg.inv(noise_of(item).R()))
 
 

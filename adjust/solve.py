@@ -18,6 +18,12 @@ from adjust.rank import describe_null_space, unobserved_unknowns
 _SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
 """Sigmas that depend on distances (target centring) follow the solution until they change by no more than this."""
 
+_LATE = frozenset((
+    "lens", "station_from_camera", "mount_from_station", "world_from_table", "table_geometry", "warp", "instrument",
+    "vertical", "beam", "surface",
+))  # fmt: skip
+"""What many observations share is eliminated last."""
+
 Progress = Callable[[int, float], None]
 
 
@@ -55,10 +61,19 @@ class _Loop:
 
     def _set_datum(self) -> None:
         self.datum = inner_datum(self.graph, self.values)
-        self.full, self.datum_graph = gtsam.NonlinearFactorGraph(self.graph.graph), gtsam.NonlinearFactorGraph()
+
+    def linearize(self) -> gtsam.GaussianFactorGraph:
+        """The linearised graph at the present values, with the minimal datum where the survey has an inner one."""
+        linear = self.graph.graph.linearize(self.values)
         if self.datum is not None:
-            self.datum_graph.add(self.datum.factor())
-            self.full.push_back(self.datum_graph)
+            self.datum.add_to(linear)
+        return linear
+
+    def completed(self, delta: gtsam.VectorValues) -> gtsam.VectorValues:
+        """The step of all unknowns in the survey's datum, from that of the visible ones in the minimal datum."""
+        if self.graph.bundle is not None:
+            self.graph.bundle.complete(delta)
+        return delta if self.datum is None else self.datum.completed(self.graph, self.values, delta)
 
     def evaluate(self, values: gtsam.Values) -> float:
         """Weighted square sum at ``values``; everything is ready to be linearised there, since most steps are good."""
@@ -68,14 +83,13 @@ class _Loop:
             if values is self.values:
                 raise
             return np.inf  # a step that made a point undetermined is no step
-        omega = self.graph.objective(values)
-        return omega + (2.0 * float(self.datum_graph.error(values)) if self.datum is not None else 0.0)
+        return self.graph.objective(values)
 
     def step(self, linear: gtsam.GaussianFactorGraph) -> gtsam.VectorValues:
         """The (damped) step; raises IndeterminateError by name where there is none."""
         if self.ordering is None:
             last = self._last_keys()
-            self.ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(self.full, last)
+            self.ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(self.graph.graph, last)
         system = linear if self.damping == 0.0 else damped(self.graph, linear, self.damping)
         try:
             how = (self.ordering, gtsam.EliminateQR) if self.use_qr else (self.ordering,)
@@ -93,14 +107,14 @@ class _Loop:
         return delta
 
     def _last_keys(self) -> list[int]:
-        late = {"lens", "station_from_camera", "mount_from_station", "world_from_table", "table_geometry", "warp"}
-        by_key = self.graph.unknowns.by_key
-        keys = [k for k in self.full.keyVector() if k in by_key and by_key[k].name[0] in late]
-        return keys if len(keys) < len(list(self.full.keyVector())) else []
+        by_key, all_keys = self.graph.unknowns.by_key, list(self.graph.graph.keyVector())
+        keys = [k for k in all_keys if k in by_key and by_key[k].name[0] in _LATE]
+        keys += [k for k in (self.datum.minimal if self.datum is not None else ()) if k not in keys]
+        return keys if len(keys) < len(all_keys) else []
 
     def run(self) -> Solved:
         omega = self.evaluate(self.values)
-        linear = self.full.linearize(self.values)
+        linear = self.linearize()
         moved = before = np.inf
         for iteration in range(1, self.options.max_iterations + 1):
             delta = self.step(linear)
@@ -108,7 +122,7 @@ class _Loop:
             decrease = -float(delta.dot(gradient))
             if self.graph.bundle is not None:
                 decrease += self.graph.bundle.hidden_decrease
-                self.graph.bundle.complete(delta)
+            delta = self.completed(delta)
             before, moved = moved, np.sqrt(max(0.0, decrease))
             trial = self.values.retract(delta)
             used, new = self.damping, self.evaluate(trial)
@@ -128,7 +142,7 @@ class _Loop:
                     raise self._stuck(iteration, moved)
             if self.damping != used or self.values is not trial:
                 self.graph.prepare(self.values, True, self.damping)
-            linear = self.full.linearize(self.values)
+            linear = self.linearize()
         raise self._stuck(self.options.max_iterations, moved)
 
     @staticmethod
@@ -148,14 +162,11 @@ class _Loop:
         if self.datum is not None:
             self._set_datum()  # about the solution, where the covariances belong; the solution stays
             self.graph.prepare(self.values, True)
-        linear = self.full.linearize(self.values)
+        linear = self.linearize()
         if self.ordering is None:
             raise ValueError("no ordering before the first step")
         # the covariances need this linearisation anyway: its step costs one elimination and brings the last digits
-        delta = self.step(linear)
-        if self.graph.bundle is not None:
-            self.graph.bundle.complete(delta)
-        self.values = self.values.retract(delta)
+        self.values = self.values.retract(self.completed(self.step(linear)))
         return Solved(self.values, linear, self.ordering, self.use_qr, omega, iteration, moved, self.datum)
 
 

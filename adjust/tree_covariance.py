@@ -117,6 +117,11 @@ class TreeCovariance:
         """Rows of these keys in a stacked vector of all unknowns, as :meth:`times` takes it."""
         return np.concatenate([np.arange(self._first[k], self._first[k + 1]) for k in (self.number[q] for q in keys)])
 
+    def places(self) -> dict[int, slice]:
+        """Rows of every key in a stacked vector of all unknowns."""
+        first = self._first.tolist()
+        return {key: slice(first[i], first[i + 1]) for key, i in self.number.items()}
+
     @property
     def n(self) -> int:
         """Length of a stacked vector of all unknowns."""
