@@ -10,9 +10,12 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from adjust.errors import SurveyError
+
+if TYPE_CHECKING:
+    from capture.camera import CameraInfo
 
 DONE, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -45,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return FAILED
     except SurveyError as error:
         print(f"labcapture: error: {error}", file=sys.stderr)
-        return FAILED
+        return INTERRUPTED if getattr(error, "interrupted", False) else FAILED
     except OSError as error:
         if error.filename is None:
             raise  # not about a file of the user
@@ -187,10 +190,9 @@ def _run(arguments: argparse.Namespace) -> int:
         else:
             print(f"{plan_text(plan)}\nNext: labcapture run {arguments.plan}")
         return DONE
-    from capture.session_quality import make_judge
     from capture.session_run import run_plan
 
-    outcome = run_plan(plan, shown=not _is(arguments, "quiet"), judge=make_judge(plan))
+    outcome = run_plan(plan, shown=not _is(arguments, "quiet"))
     if _is(arguments, "json"):
         _print_json(outcome.summary())
         return DONE
@@ -208,7 +210,7 @@ def _cameras(arguments: argparse.Namespace) -> int:
 
     from capture.drivers.cameras import DRIVERS, describe_driver, discover
 
-    found = []
+    found: list[CameraInfo] = []
     for name in DRIVERS if arguments.driver == "all" else [describe_driver(arguments.driver).name]:
         try:
             found += discover(name)

@@ -99,12 +99,10 @@ def _values(node: Node, key: str) -> FloatArray:
 
 def _cover(node: Node, table: TablePlan, survey: Path | None) -> FloatArray:
     from capture.plan_cover import CoverRequest, cover_board
-    from survey.files import read_definition
-
     node.allow("kind", *_COVER)
     if survey is None:
         raise node.error('"cover" needs approximate lenses and poses; name a survey.toml with survey = "..."', "kind")
-    definition = read_definition(survey.parent) if survey.name == "survey.toml" else _definition_of(survey)
+    definition = definition_of(survey)
     cameras = {camera.camera_id: camera for camera in definition.survey.cameras}
     targets = {target.target_id: target for target in definition.survey.targets}
     default = CoverRequest()
@@ -123,7 +121,7 @@ def _cover(node: Node, table: TablePlan, survey: Path | None) -> FloatArray:
     return np.concatenate(found)
 
 
-def _definition_of(path: Path) -> "Definition":
+def definition_of(path: Path) -> "Definition":
     """A template of any name, read as the survey.toml of an empty folder."""
     import tempfile
 

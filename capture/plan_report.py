@@ -44,8 +44,8 @@ def plan_text(plan: CapturePlan) -> str:
         f"cameras   {', '.join(f'{name} at {address}' for name, address in summary['cameras'].items())}",
         f"images    {len(summary['poses'])} poses x {summary['repeats']} repeats x {len(plan.cameras)} cameras = "
         f"{summary['images']}",
-        f"time      about {_clock(seconds['total'])} (moving {seconds['moving']:g} s, settling {seconds['waiting']:g} s, "
-        f"images {seconds['imaging']:g} s)",
+        f"time      about {_clock(seconds['total'])} (moving {seconds['moving']:g} s, settling "
+        f"{seconds['waiting']:g} s, images {seconds['imaging']:g} s)",
     ]
     if plan.table is not None:
         lines.insert(-2, "limits    all poses are within them: " + _limits(plan))

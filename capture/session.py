@@ -60,6 +60,10 @@ class CameraSet(Protocol):
 class SessionStoppedError(SurveyError):
     """The session gave up, or was told to; table stopped, everything recorded so far is on disk."""
 
+    def __init__(self, message: str, interrupted: bool = False) -> None:
+        super().__init__(message)
+        self.interrupted = interrupted
+
 
 class DriftError(SurveyError):
     """The table moved while the images were taken."""
@@ -328,4 +332,4 @@ class Session:
         else:
             return error
         again = f"the same command goes on with the rest: labcapture run {self._plan.file}"
-        return SessionStoppedError(f"{reason}\n  {safe}all recorded images are on disk; {again}")
+        return SessionStoppedError(f"{reason}\n  {safe}all recorded images are on disk; {again}", self.control.stopping)

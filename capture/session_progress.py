@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from capture.session import Taken
 from capture.session_folder import CAPTURE_FOLDER
+from capture.session_quality import quality_text
 
 
 def status_path(folder: Path) -> Path:
@@ -33,7 +34,7 @@ class Progress:
         if self._first is None:
             self._first = taken.done - 1
         self._bar.n = taken.done
-        self._bar.set_postfix_str(quality_text(taken.record["epoch_id"], quality))
+        self._bar.set_postfix_str(quality_text(quality) or taken.record["epoch_id"])
         each = (time.monotonic() - self._begin) / (taken.done - self._first)
         self._last = {
             "done": taken.done,
@@ -46,6 +47,11 @@ class Progress:
         }
         self.state("running")
 
+    def quality(self, quality: Mapping[str, Mapping[str, Any]]) -> None:
+        """What was found out later."""
+        self._last |= {"quality": {name: dict(values) for name, values in quality.items()}}
+        self._bar.set_postfix_str(quality_text(quality))
+
     def note(self, line: str) -> None:
         """Something worth a line of its own."""
         if not self._bar.disable:
@@ -56,22 +62,14 @@ class Progress:
         path = status_path(self._folder)
         text = json.dumps({"state": state, "message": message, **self._last})
         temporary = path.with_name(f".{path.name}.tmp")
-        with suppress(OSError):
+        try:
             temporary.write_text(text, encoding="utf-8")
             temporary.replace(path)
+        except OSError:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
 
     def close(self) -> None:
         """End the line."""
         self._bar.close()
 
-
-def quality_text(epoch_id: str, quality: Mapping[str, Mapping[str, Any]]) -> str:
-    """``t07 X sharp 0.82 sat 0.1% board``."""
-    parts = [epoch_id]
-    for name, values in quality.items():
-        words = [name]
-        words += [f"{values['sharpness']:.2f}"] if values.get("sharpness") is not None else []
-        words += [f"sat {100 * values['saturated']:.1f}%"] if values.get("saturated") else []
-        words += ["target" if values["target_found"] else "NO TARGET"] if "target_found" in values else []
-        parts.append(" ".join(words))
-    return ", ".join(parts)

@@ -8,10 +8,9 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 from adjust.errors import SurveyError
 from capture.drivers.turntables.moving import MovingTable
@@ -22,17 +21,17 @@ from capture.session_cameras import PlannedCameras
 from capture.session_control import Control
 from capture.session_folder import FolderLock
 from capture.session_progress import Progress
+from capture.session_quality import QualityWatch
 from capture.session_resume import last_readback
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 _LOOK_S = 0.05
-Judge = Callable[[Taken], Mapping[str, Mapping[str, Any]]]
 
 
-def run_plan(plan: CapturePlan, *, shown: bool = True, judge: Judge | None = None) -> Outcome:
-    """Take all images of a plan that are not there yet. Raises SurveyError, KeyboardInterrupt after Ctrl-C.
+def run_plan(plan: CapturePlan, *, shown: bool = True) -> Outcome:
+    """Take all images of a plan that are not there yet; ``shown``: progress on stderr.
 
-    shown: progress on stderr. judge: the quality of the images of an epoch.
+    Raises SurveyError; SessionStoppedError after a fault that stayed, or a Ctrl-C.
     """
     check_plan_limits(plan)
     with ExitStack() as stack:
@@ -44,7 +43,8 @@ def run_plan(plan: CapturePlan, *, shown: bool = True, judge: Judge | None = Non
         control = stack.enter_context(_signals_blocked(Control()))
         table = _open_table(plan, stack)
         cameras = stack.enter_context(PlannedCameras(plan.cameras, plan.options.trigger))
-        return run_session(plan, table, cameras, control, progress, judge)
+        watch = stack.enter_context(QualityWatch(plan)) if plan.options.quality else None
+        return run_session(plan, table, cameras, control, progress, watch)
 
 
 def _open_table(plan: CapturePlan, stack: ExitStack) -> MovingTable | None:
@@ -62,13 +62,13 @@ def run_session(
     cameras: CameraSet,
     control: Control,
     progress: Progress,
-    judge: Judge | None,
+    watch: QualityWatch | None,
 ) -> Outcome:
     """The session in a thread, signals and keys here."""
     found: list[Outcome | BaseException] = []
 
     def listener(taken: Taken) -> None:
-        progress.taken(taken, judge(taken) if judge is not None else {})
+        progress.taken(taken, watch(taken.record["epoch_id"], taken.frames) if watch is not None else {})
 
     session = Session(plan, table, cameras, control, listener, progress.note)
 
@@ -89,6 +89,8 @@ def run_session(
     if isinstance(result, BaseException):
         progress.state("stopped", str(result))
         raise result
+    if watch is not None:
+        progress.quality(watch.finish())
     progress.state("finished")
     return result
 

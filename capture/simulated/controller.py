@@ -45,12 +45,12 @@ class SimulatedTable:
             self._log.write(f"{time.monotonic_ns()} {line}\n")
 
     def truth(self) -> dict[str, Any]:
-        """True angles now."""
+        """True angles now, by the names that ``capture.simulated.angles`` reads."""
         with self.lock:
             now = time.monotonic()
-            angles = [math.degrees(axis.advance(now)) for axis in self.axes]
+            angles = {f"axis{i + 1}_rad": axis.advance(now) for i, axis in enumerate(self.axes)}
             moving = any(axis.moving(now) for axis in self.axes)
-        return {"angles_deg": angles, "moving": moving, "monotonic_ns": round(now * 1e9), "pid": os.getpid()}
+        return {**angles, "moving": moving, "monotonic_ns": round(now * 1e9), "pid": os.getpid()}
 
     def inject(self, words: Sequence[str]) -> str:
         """A fault, by a line that begins with SIM."""

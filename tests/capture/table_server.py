@@ -1,6 +1,7 @@
 """The simulated controller as a process of its own, for tests: where it is, what it received, what is true."""
 
 import json
+import math
 import os
 import socket
 import subprocess
@@ -34,8 +35,10 @@ class TableServer:
         """The lines that ask for motion or its end, in either language."""
         return [row for row in self.received() if row[1].startswith(("MA", "ST", "HM")) or row[1][1:3] in ("PA", "OR")]
 
-    def truth(self) -> dict[str, object]:
-        return dict(json.loads(self.truth_file.read_text()))
+    def truth_deg(self) -> list[float]:
+        """True angles of both axes."""
+        told = json.loads(self.truth_file.read_text())
+        return [math.degrees(told["axis1_rad"]), math.degrees(told["axis2_rad"])]
 
     def inject(self, words: str) -> int:
         """Send a SIM line on a connection of its own; the monotonic time (ns) just before."""

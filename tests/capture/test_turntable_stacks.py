@@ -40,7 +40,7 @@ def test_dialect_over_tcp(tmp_path, dialect):
         table.set(np.radians([12.5, -30.25])).wait(5.0)
         assert np.allclose(np.degrees(table.position), [12.5, -30.25], atol=2e-3)
         time.sleep(0.02)
-        assert np.allclose(server.truth()["angles_deg"], [12.5, -30.25], atol=1e-5)
+        assert np.allclose(server.truth_deg(), [12.5, -30.25], atol=1e-5)
         table.home().wait(5.0)
         assert np.allclose(np.degrees(table.position), [0, 0], atol=2e-3)
 

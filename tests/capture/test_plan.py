@@ -1,0 +1,128 @@
+"""Capture plans: poses, limits, time, mistakes; boards that cover images, projected by OpenCV."""
+
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from adjust.errors import SurveyError
+from capture.cli import main
+from capture.plan import check_plan_limits, estimate, read_plan
+from capture.turntable import LimitError
+from survey.examples import write_example
+from tests.capture.session_runs import write_plan
+
+
+def edited(tmp_path, *changes, **keywords):
+    plan = write_plan(tmp_path, **keywords)
+    text = plan.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    plan.write_text(text)
+    return plan
+
+
+def test_grid_turns_back_and_forth(tmp_path):
+    plan = read_plan(write_plan(tmp_path))
+    angles = np.degrees([pose.angles for pose in plan.poses])
+    assert np.allclose(angles, [(-12, -12), (-12, 0), (-12, 12), (12, 12), (12, 0), (12, -12)])
+    assert [pose.pose_id for pose in plan.poses] == ["t01", "t02", "t03", "t04", "t05", "t06"]
+
+
+def test_repeats_are_epochs_of_their_own(tmp_path):
+    plan = read_plan(write_plan(tmp_path, options="repeats = 2"))
+    assert [shot.epoch_id for shot in plan.shots][:3] == ["t01-1", "t01-2", "t02-1"]
+
+
+def test_list(tmp_path):
+    plan = edited(tmp_path, ("[poses.t]", '[poses.a]\nkind = "list"\nangles_deg = [[1, 2], [3, 4]]\n[poses.t]'))
+    poses = read_plan(plan).poses
+    assert [pose.pose_id for pose in poses[:3]] == ["a01", "a02", "t01"]
+    assert np.allclose(np.degrees(poses[1].angles), [3, 4])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[capture]", "[capture]\nrepeat = 2", r"capture\.repeat: unknown key; did you mean 'repeats'"),
+        ("project =", "projekt =", r"did you mean 'project'"),
+        ("sigma_arcsec", "sigma_arcsecs", r"table\.sigma_arcsecs: unknown key; did you mean 'sigma_arcsec'"),
+        ("limits_deg", "limit_deg", r"table\.axes\.axis1\.limit_deg: unknown key; did you mean 'limits_deg'"),
+        ('driver = "simulated"', 'driver = "simulate"', r"did you mean 'simulated'"),
+        ('kind = "grid"', 'kind = "gird"', r"did you mean 'grid'"),
+        ("axis2_deg", "axis3_deg", r"axis3_deg: unknown key; did you mean 'axis1_deg'|axis2_deg"),
+        ("ExposureTime = 500.0", "ExposureTime = [1]", r"a feature is a number"),
+        ("limits_deg = [-60, 60]", "limits_deg = [60, -60]", r"the lower limit comes first"),
+        ("window_s = 0.01", "window_s = -1", r"must be positive"),
+        ("[capture]", '[capture]\ntrigger = "hard"', r"did you mean 'hardware'"),
+        ("[capture]", "[capture]\nwait_s = -1", r"cannot be negative"),
+        ("count = 2", "count = 0", r"at least 1"),
+        ("format = 1", "format = 2", r"reads format 1"),
+    ],
+)
+def test_mistakes_are_named_with_their_line(tmp_path, old, new, message):
+    plan = edited(tmp_path, (old, new))
+    with pytest.raises(SurveyError, match=message) as caught:
+        read_plan(plan)
+    assert str(caught.value).startswith(f"{plan}:")
+
+
+def test_two_poses_of_one_name(tmp_path):
+    plan = edited(tmp_path, ("[poses.t]", '[poses.T]\nkind = "list"\nangles_deg = [[1, 2]]\n[poses.t]'))
+    with pytest.raises(SurveyError, match="two sections give a pose"):
+        read_plan(plan)
+
+
+def test_limits_name_the_pose(tmp_path):
+    plan = read_plan(edited(tmp_path, ("from = -12, to = 12, count = 3", "from = -12, to = 72, count = 3")))
+    with pytest.raises(LimitError, match=r"pose 't03': axis 'axis2': 72\.0000 deg is outside its limits -60\.0000"):
+        check_plan_limits(plan)
+
+
+def test_time_has_its_closed_form(tmp_path):
+    """Five moves: 12 deg four times, 24 once, by the slower axis; 6 windows; 6 sets of the longer exposure."""
+    plan = read_plan(edited(tmp_path, ("[capture]", "[capture]\noverhead_s = 0.25\nwait_s = 0.5"), n=(2, 3)))
+    ramp = 200.0**2 / 4000.0  # deg, below which the top speed is not reached
+    twelve = 12 / 200 + 200 / 4000 if ramp < 12 else 2 * math.sqrt(12 / 4000)
+    twenty_four = 24 / 200 + 200 / 4000
+    found = estimate(plan)
+    assert found.moving_s == pytest.approx(4 * twelve + twenty_four)
+    assert found.waiting_s == pytest.approx(6 * (0.01 + 0.5))
+    assert found.imaging_s == pytest.approx(6 * (500e-6 + 0.25))
+
+
+def test_dry_run_prints_and_moves_nothing(tmp_path, capsys):
+    plan = write_plan(tmp_path)
+    assert main(["run", str(plan), "--dry-run"]) == 0
+    out = capsys.readouterr().out
+    assert "t06" in out and "6 poses x 1 repeats x 2 cameras = 12" in out and f"Next: labcapture run {plan}" in out
+    assert main(["run", str(plan), "--dry-run", "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["poses"]["t04"] == [12.0, 12.0]
+    assert summary["images"] == 12
+    assert not (tmp_path / "lab").exists()
+
+
+def test_dry_run_beyond_a_limit_fails(tmp_path, capsys):
+    plan = edited(tmp_path, ("from = -12, to = 12, count = 3", "from = -12, to = 72, count = 3"))
+    assert main(["run", str(plan), "--dry-run"]) == 1
+    assert "outside its limits" in capsys.readouterr().err
+
+
+def test_help_opens_with_a_real_command(capsys):
+    for command in ([], ["run"], ["cameras"], ["table"], ["view"], ["export"]):
+        with pytest.raises(SystemExit) as caught:
+            main([*command, "--help"])
+        assert caught.value.code == 0
+        assert capsys.readouterr().out.startswith("usage: labcapture ")
+
+
+@pytest.fixture(scope="module")
+def known_lab(tmp_path_factory):
+    """A project of known truth whose survey.toml has the truth as approximate values, to whole degrees and cm."""
+    folder = tmp_path_factory.mktemp("cover") / "lab"
+    write_example("full-lab", folder, seed=1, jobs=2, progress=False)
+    return folder

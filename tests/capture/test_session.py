@@ -1,0 +1,359 @@
+"""The session: what it writes, what it survives, how it stops."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from adjust.errors import SurveyError
+from capture.journal import read_journal
+from capture.plan import read_plan
+from capture.session import SessionStoppedError
+from capture.session_folder import FolderLock, lock_holder
+from capture.session_run import run_plan
+from capture.turntable import LimitError
+from tests.capture.session_runs import processes, require_complete, run_to_end, write_plan
+from tests.capture.table_server import table_server
+
+FAST = ("--speed", "2000", "--acceleration", "100000")
+
+
+def run(plan):
+    return run_plan(read_plan(plan), shown=False)
+
+
+def events(plan, what):
+    records, _, _ = read_journal(plan.parent / "lab" / "capture" / "journal.jsonl")
+    return [r["message"] for r in records if r["kind"] == "event" and r["what"] == what]
+
+
+def test_a_run_writes_what_was_planned(tmp_path):
+    plan = write_plan(tmp_path, options="repeats = 2")
+    outcome = run(plan)
+    assert (outcome.planned, outcome.before, outcome.taken, dict(outcome.retries)) == (12, 0, 12, {})
+    require_complete(plan, 12)
+    rows = (tmp_path / "lab" / "observations" / "table_angles.csv").read_text().splitlines()
+    assert rows[0] == "epoch_id,table_id,axis1_deg,axis2_deg,sigma_axis1_arcsec,sigma_axis2_arcsec"
+    assert rows[1].startswith("t01-1,turntable,-12")
+    assert rows[2].startswith("t01-2,turntable,-12")
+    assert json.loads((tmp_path / "lab" / "capture" / "status.json").read_text())["state"] == "finished"
+
+
+def test_a_second_run_takes_nothing(tmp_path):
+    plan = write_plan(tmp_path)
+    run(plan)
+    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "lab" / "images").rglob("*.png")}
+    outcome = run(plan)
+    assert (outcome.before, outcome.taken) == (6, 0)
+    assert before == {p: p.stat().st_mtime_ns for p in (tmp_path / "lab" / "images").rglob("*.png")}
+
+
+def test_cameras_without_a_table(tmp_path):
+    plan = write_plan(tmp_path, table=False)
+    assert run(plan).taken == 6
+    require_complete(plan, 6)
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind"),
+    [
+        ("timeout", "FetchTimeout"),
+        ("incomplete", "IncompleteFrame"),
+        ("disconnect", "Disconnected"),
+        ("wrong_id", "FrameOrder"),
+        ("duplicate", "FrameOrder"),
+        ("extra", "FrameOrder"),
+        ("lost", "FetchTimeout"),
+    ],
+)
+def test_fault_of_a_camera_is_retried(tmp_path, fault, kind):
+    """At the third image of one of two cameras: both images of that try are discarded, the epoch is taken once."""
+    plan = write_plan(tmp_path, faults={"Y": f"{fault}@3"})
+    outcome = run(plan)
+    assert outcome.taken == 6
+    assert kind in outcome.retries
+    require_complete(plan, 6)
+
+
+def test_images_in_the_wrong_order_never_meet_another_pose(tmp_path):
+    """The camera holds one image back: its number then says that it belongs to the trigger before."""
+    plan = write_plan(tmp_path, faults={"X": "swap@2", "Y": "swap@4"})
+    assert run(plan).taken == 6
+    require_complete(plan, 6)
+    records, _, _ = read_journal(tmp_path / "lab" / "capture" / "journal.jsonl")
+    for record in records:
+        if record["kind"] == "set":  # exposed after the table had settled there, and before it left
+            for image in record["images"].values():
+                assert record["before"]["monotonic_ns"] < image["host_monotonic_ns"] < record["after"]["monotonic_ns"]
+
+
+def test_lost_camera_stops_clearly_and_the_rest_follows(tmp_path):
+    plan = write_plan(tmp_path, faults={"Y": "timeout@3,timeout@4,timeout@5"})
+    with pytest.raises(SessionStoppedError) as caught:
+        run(plan)
+    message = str(caught.value)
+    assert "simulated:Y: no image within 0.1 s" in message
+    assert "the table is stopped" in message
+    assert f"labcapture run {plan}" in message
+    assert run(write_plan(tmp_path)).before == 2
+    require_complete(plan, 6)
+
+
+def test_connection_of_the_table_cut_at_work(tmp_path):
+    with table_server(tmp_path, *FAST) as server:
+        plan = write_plan(tmp_path, server.url, n=(3, 4), options="wait_s = 0.05")
+        context = processes()
+        process = context.Process(target=run_plan_quietly, args=(str(plan),))
+        process.start()
+        n = 0
+        while process.is_alive() and n < 3:
+            done = len(list((tmp_path / "lab" / "images").rglob("X/t*.png")))
+            if done > 2 * n:
+                server.inject("DROP")
+                n += 1
+            time.sleep(0.005)
+        process.join(30)
+        assert process.exitcode == 0
+        assert n == 3
+        require_complete(plan, 12)
+        assert any("connection lost" in line for line in events(plan, "retry"))
+
+
+def run_plan_quietly(plan):
+    from tests.capture.session_runs import run_quietly
+
+    run_quietly(plan)
+
+
+def test_stalled_table_stops_the_session(tmp_path):
+    with table_server(tmp_path, *FAST) as server:
+        server.inject("JAM 2")
+        plan = write_plan(tmp_path, server.url, settle="window_s = 0.01, stall_s = 0.1, poll_s = 0.003")
+        with pytest.raises(SessionStoppedError, match="'axis2' stands still while it should move"):
+            run(plan)
+        assert len(events(plan, "retry")) == 2
+        assert server.commands()[-1][1] == "ST"
+        server.inject("UNJAM 2")
+        assert run(plan).taken == 6
+        require_complete(plan, 6)
+
+
+def test_pose_outside_the_limits_never_reaches_the_controller(tmp_path):
+    with table_server(tmp_path) as server:
+        plan = write_plan(tmp_path, server.url)
+        plan.write_text(plan.read_text() + '[poses.u]\nkind = "list"\nangles_deg = [[0, 0], [0, 60.5]]\n')
+        with pytest.raises(LimitError, match=r"pose 'u02'.*'axis2': 60\.5000 deg is outside its limits"):
+            run(plan)
+        assert server.received() == []
+        assert not (tmp_path / "lab" / "images").exists()
+
+
+def test_interrupt_stops_the_table_within_50_ms(tmp_path):
+    """From the signal to the stop that the controller receives, while the table turns slowly; the median of three."""
+    delays = []
+    with table_server(tmp_path, "--speed", "2") as server:
+        plan = write_plan(tmp_path, server.url)
+        for _ in range(3):
+            process = processes().Process(target=run_plan_quietly, args=(str(plan),))
+            n = len(server.commands())
+            process.start()
+            while len(server.commands()) < n + 2:
+                time.sleep(0.005)
+            time.sleep(0.05)
+            begin = time.monotonic_ns()
+            os.kill(process.pid, signal.SIGINT)
+            process.join(20)
+            assert process.exitcode == 130
+            stops = [when for when, line in server.commands() if line == "ST" and when > begin]
+            delays.append((stops[0] - begin) / 1e6)
+    assert np.median(delays) < 50.0, delays
+
+
+def test_pause_and_go_on(tmp_path):
+    plan = write_plan(tmp_path, n=(3, 4), options="wait_s = 0.05")
+    process = processes().Process(target=run_plan_quietly, args=(str(plan),))
+    process.start()
+    images = tmp_path / "lab" / "images"
+    while len(list(images.rglob("Y/t*.png"))) < 2:
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGUSR1)
+    time.sleep(0.5)
+    n = len(list(images.rglob("Y/t*.png")))
+    time.sleep(0.3)
+    assert len(list(images.rglob("Y/t*.png"))) == n < 12
+    os.kill(process.pid, signal.SIGUSR1)
+    process.join(20)
+    assert process.exitcode == 0
+    require_complete(plan, 12)
+    assert len(events(plan, "paused")) == len(events(plan, "resumed")) == 1
+
+
+def test_two_sessions_on_one_folder_are_refused(tmp_path):
+    plan = write_plan(tmp_path)
+    holder = "import sys,time,pathlib; from capture.session_folder import FolderLock as L\n"
+    holder += f"lock = L(pathlib.Path({str(tmp_path / 'lab')!r})); lock.acquire()\n"
+    holder += "print('held', flush=True); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", holder], stdout=subprocess.PIPE, text=True) as other:
+        try:
+            assert other.stdout.readline() == "held\n"
+            with pytest.raises(SurveyError, match=f"another session works on this folder .process {other.pid} on"):
+                run(plan)
+            assert lock_holder(tmp_path / "lab").startswith(f"process {other.pid}")
+        finally:
+            other.kill()
+        other.wait()
+    # the lock file is still there and names a process that is dead: nobody holds it
+    assert str(other.pid) in (tmp_path / "lab" / "capture" / "lock").read_text()
+    assert lock_holder(tmp_path / "lab") is None
+    assert run(plan).taken == 6
+
+
+def test_lock_is_given_back(tmp_path):
+    first = FolderLock(tmp_path)
+    first.acquire()
+    with pytest.raises(SurveyError, match="another session"):
+        FolderLock(tmp_path).acquire()
+    first.release()
+    second = FolderLock(tmp_path)
+    second.acquire()
+    second.release()
+
+
+def test_disk_full(tmp_path):
+    """A file system with room for some images only: a clear stop, and with more room the rest."""
+    small = tmp_path / "small"
+    small.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", str(small)], capture_output=True, text=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip(f"no small file system can be mounted here: {mounted.stderr.strip()}")
+    try:
+        plan = write_plan(small, n=(3, 4), options="repeats = 2")
+        assert run_to_end(processes(), plan) == 1
+        text = (small / "lab" / "capture" / "journal.jsonl").read_bytes()
+        assert text.endswith(b"\n")
+        n = sum(b'"kind": "set"' in line for line in text.splitlines())
+        assert 0 < n < 24
+        assert not list(small.rglob("*.tmp"))
+        subprocess.run(["mount", "-o", "remount,size=4m", str(small)], check=True)
+        assert run_to_end(processes(), plan) == 0
+        require_complete(plan, 24)
+    finally:
+        subprocess.run(["umount", str(small)], check=True)
+
+
+@pytest.mark.parametrize("step", ["write", "fsync"])
+def test_disk_full_is_said(tmp_path, monkeypatch, step):
+    """The same by an error that is injected where an image, or a journal line, is written through."""
+    plan, real, n = write_plan(tmp_path), os.fsync, [0]
+
+    def full(handle):
+        n[0] += 1
+        if n[0] == (12 if step == "write" else 15):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(SessionStoppedError, match="the disk is full; make room\n  the table is stopped"):
+        run(plan)
+    monkeypatch.undo()
+    assert not list((tmp_path / "lab").rglob("*.png.tmp"))
+    run(plan)
+    require_complete(plan, 6)
+
+
+def test_clock_that_jumps_is_harmless(tmp_path, monkeypatch):
+    """UTC jumps by an hour at every look, back and forth; order and times of waiting do not care."""
+    real, n = time.time_ns, [0]
+
+    def jumping():
+        n[0] += 1
+        return real() + (-1) ** n[0] * 3600 * 10**9
+
+    monkeypatch.setattr(time, "time_ns", jumping)
+    monkeypatch.setattr(time, "time", lambda: jumping() / 1e9)
+    plan = write_plan(tmp_path)
+    assert run(plan).seconds < 10.0
+    require_complete(plan, 6)
+    records, _, _ = read_journal(tmp_path / "lab" / "capture" / "journal.jsonl")
+    times = [record["monotonic_ns"] for record in records]
+    assert times == sorted(times)
+    assert sorted(r["time_ns"] for r in records) != [r["time_ns"] for r in records]  # it did jump
+
+
+def test_damaged_image_is_taken_again(tmp_path):
+    plan = write_plan(tmp_path)
+    run(plan)
+    path = tmp_path / "lab" / "images" / "X" / "t03.png"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    (tmp_path / "lab" / "images" / "Y" / "t05.png").unlink()
+    outcome = run(plan)
+    assert (outcome.before, outcome.taken) == (4, 2)
+    require_complete(plan, 6)
+
+
+def test_torn_last_line_is_cut_and_what_it_said_is_done_again(tmp_path):
+    plan = write_plan(tmp_path)
+    run(plan)
+    journal = tmp_path / "lab" / "capture" / "journal.jsonl"
+    lines = journal.read_bytes().splitlines(keepends=True)
+    last = max(i for i, line in enumerate(lines) if b'"kind": "set"' in line)
+    journal.write_bytes(b"".join(lines[:last]) + lines[last][:-40])
+    assert run(plan).taken == 1
+    require_complete(plan, 6)
+
+
+def test_half_an_image_is_removed_and_foreign_ones_stay(tmp_path):
+    plan = write_plan(tmp_path)
+    images = tmp_path / "lab" / "images" / "X"
+    images.mkdir(parents=True)
+    (images / ".t01.png.tmp").write_bytes(b"half")
+    (images / "t02.png").write_bytes(b"an image that no journal knows")
+    (images / "byhand01.png").write_bytes(b"of the user")
+    run(plan)
+    assert (images / "byhand01.png").read_bytes() == b"of the user"
+    (images / "byhand01.png").unlink()
+    require_complete(plan, 6)
+
+
+def test_changed_plan_is_refused(tmp_path):
+    plan = write_plan(tmp_path)
+    run(plan)
+    plan.write_text(plan.read_text().replace("from = -12", "from = -11"))
+    with pytest.raises(SurveyError, match=r"t01 is at \[-11.*holds it at \[-12"):
+        run(plan)
+
+
+def test_table_that_drifts_is_not_trusted(tmp_path, monkeypatch):
+    from capture.session_cameras import PlannedCameras
+
+    plan = write_plan(tmp_path)
+    real, n = PlannedCameras.take, [0]
+
+    def take(self, timeout_s):
+        n[0] += 1
+        frames = real(self, timeout_s)
+        if n[0] == 2:
+            tables[0].simulated[0].angle += np.radians(0.1)
+            tables[0].simulated[0]._motor = None
+            tables[0].simulated[0].pieces = []
+        return frames
+
+    from capture.drivers.turntables.simulated import SimulatedController
+
+    tables = []
+    opened = SimulatedController.open
+    monkeypatch.setattr(SimulatedController, "open", lambda self: (tables.append(self), opened(self))[1])
+    monkeypatch.setattr(PlannedCameras, "take", take)
+    outcome = run(plan)
+    assert dict(outcome.retries) == {"Drift": 1}
+    require_complete(plan, 6)
