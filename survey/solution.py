@@ -56,7 +56,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
     solution: dict[str, Any] = _plain(
         {
             "format": 1,
-            "summary": _summary(adjustment, run, scale),
+            "summary": _summary(adjustment, run, scale, sum(not v.met for v in found.verdicts) if found else 0),
             "conventions": CONVENTIONS,
             "cameras": _cameras(adjustment, scale),
             "stations": _stations(adjustment, scale),
@@ -97,9 +97,9 @@ def _plain(value: Any) -> Any:
     return value if value is None else str(value)
 
 
-def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale) -> dict[str, Any]:
+def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, n_unmet: int) -> dict[str, Any]:
     found, test = suspects(adjustment), adjustment.global_test
-    level, reason = verdict(adjustment, found)
+    level, reason = verdict(adjustment, found, n_unmet)
     return {
         "title": run.title,
         "verdict": level,
@@ -110,6 +110,7 @@ def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale) -> dict[str, An
         "n_unknowns": adjustment.n_unknowns,
         "datum": adjustment.survey.datum.kind,
         "datum_defect": adjustment.datum_defect,
+        "n_tolerances_not_met": n_unmet,
         "converged": adjustment.converged,
         "iterations": adjustment.iterations,
         "last_step_sigmas": adjustment.max_step,

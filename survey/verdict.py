@@ -40,8 +40,8 @@ def suspects(adjustment: Adjustment) -> Suspects:
     return Suspects(alpha, image_limit, w_limit, n_image, n_other, n_not_used)
 
 
-def verdict(adjustment: Adjustment, found: Suspects) -> tuple[str, str]:
-    """``passed``, ``check`` or ``failed``, and the reason in words."""
+def verdict(adjustment: Adjustment, found: Suspects, n_unmet: int = 0) -> tuple[str, str]:
+    """``passed``, ``check`` or ``failed``, and the reason in words; ``n_unmet``: tolerances that are not met."""
     test = adjustment.global_test
     if not adjustment.converged:
         return "failed", "The adjustment did not converge: the numbers below are no solution."
@@ -57,6 +57,8 @@ def verdict(adjustment: Adjustment, found: Suspects) -> tuple[str, str]:
         )
     if test is None:
         return "check", "Nothing was tested: the survey has no redundant observations."
+    if n_unmet:
+        return "check", "Global test passed, but tolerances are not met; see the tolerances."
     if found.n_image + found.n_other:
         return "check", "Global test passed, but some observations disagree with the others; see the suspects."
     if adjustment.warnings:

@@ -417,6 +417,10 @@ GERMAN_MESSAGES = (
         r"Global test passed, but some observations disagree with the others; see the suspects\.",
         "Globaltest bestanden, aber einige Beobachtungen widersprechen den anderen; siehe die verdächtigen.",
     ),
+    (
+        r"Global test passed, but tolerances are not met; see the tolerances\.",
+        "Globaltest bestanden, aber Toleranzen sind nicht erfüllt; siehe die Toleranzen.",
+    ),
     (r"Global test passed; please read the warnings\.", "Globaltest bestanden; bitte die Warnungen lesen."),
     (r"Observations, sigmas and model agree\.", "Beobachtungen, Sigmas und Modell stimmen überein."),
 )
