@@ -5,6 +5,7 @@ TriggerSelector TriggerMode TriggerSource TriggerSoftware DeviceSerialNumber. Dr
 ``capture.drivers.cameras``, which also opens and discovers cameras by address.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self
@@ -16,6 +17,8 @@ from adjust.errors import SurveyError
 
 GrayImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 FeatureValue = bool | int | float | str
+ImageSource = Callable[[float, float], GrayImage]
+"""What a simulated camera looks at: of exposure time (us) and gain (dB), the image (h, w) that is seen now, 8 bit."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,18 +5,19 @@ The library comes with the wheel aravis-python; glib and libxml2 are the system'
 
 import ctypes
 import importlib.util
+import socket
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from adjust.errors import SurveyError
-from capture.drivers.cameras.simulated import ImageSource
-from survey.rendering import GrayImage
+from capture.camera import GrayImage, ImageSource
 
 _FILL = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
 )  # buffer, user data, exposure (us), gain, pixel format
+_PORT = 3956  # of GigE Vision's control channel
 _SYSTEM_PACKAGES = "libglib2.0-0 libxml2"
 
 
@@ -37,17 +38,21 @@ class AravisCamera:
     ) -> None:
         self._source, self._failed = source, failed
         self._library = _load()
+        _require_free(interface)
         self._callback = _FILL(self._fill)
         self._camera = self._library.arv_gv_fake_camera_new(interface.encode(), serial.encode())
         if not self._library.arv_gv_fake_camera_is_running(self._camera):
             raise SurveyError(
-                f"GigE Vision camera on {interface}: it cannot start; is port 3956 taken there, or is that no address"
-                " of this machine? End the other one, or use 127.0.0.1"
+                f"GigE Vision camera on {interface}: it cannot start; Aravis knows no such interface, use 127.0.0.1"
             )
         if lost_ratio:
-            self._library.g_object_set(self._camera, b"gvsp-lost-ratio", ctypes.c_double(lost_ratio), None)
+            self._lose(lost_ratio)
         inner = self._library.arv_gv_fake_camera_get_fake_camera(self._camera)
         self._library.arv_fake_camera_set_fill_pattern(inner, self._callback, None)
+
+    def _lose(self, ratio: float) -> None:
+        camera, end = ctypes.c_void_p(self._camera), ctypes.c_void_p()
+        self._library.g_object_set(camera, b"gvsp-lost-ratio", ctypes.c_double(ratio), end)
 
     def _fill(self, buffer: int, _: int, exposure_us: int, gain: int, pixel_format: int) -> None:
         """Called by the library for every image it is about to send."""
@@ -70,6 +75,18 @@ class AravisCamera:
         sent[:] = 0
         part = image[y : y + height, x : x + width]
         sent[: part.shape[0], : part.shape[1]] = part
+
+
+def _require_free(interface: str) -> None:
+    """The library would share the port with another camera, and each would get some of the commands."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((interface, _PORT))
+        except OSError as error:
+            raise SurveyError(
+                f"GigE Vision camera on {interface}: port {_PORT} is taken, or that is no address of this machine"
+                f" ({error}); end the other camera, or use 127.0.0.1"
+            ) from error
 
 
 def _load() -> ctypes.CDLL:

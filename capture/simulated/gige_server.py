@@ -9,7 +9,8 @@ import logging
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+import time
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -17,11 +18,9 @@ from typing import Self
 import numpy as np
 
 from adjust.errors import SurveyError
+from capture.camera import GrayImage, ImageSource
 from capture.simulated.angles import AnglesFile
 from capture.simulated.aravis import AravisCamera
-from capture.simulated.folder import ANGLES, read_lab
-from capture.simulated.laboratory import ROOM_EXPOSURE_US, SimulatedLab
-from survey.rendering import GrayImage
 
 _READY = "ready"
 _START_S = 60.0  # the renderer may have to be compiled
@@ -86,31 +85,36 @@ class GigeServer:
         self.process = None
 
 
-class _Follower:
-    """Renders ahead: as soon as the table stands still, the image without noise is made and kept."""
+def _lab_source(camera: Path, file: Path | None) -> ImageSource:
+    """What the camera sees now; as soon as the table stands still, the image without noise is made and kept."""
+    from capture.simulated.folder import ANGLES, read_lab  # the renderer takes its time to load
 
-    def __init__(self, lab: SimulatedLab, camera_id: str, angles: AnglesFile) -> None:
-        self._lab, self._camera_id, self._angles = lab, camera_id, angles
-        self._lock = threading.Lock()
+    lab, angles = read_lab(camera.parent), AnglesFile(file or camera.parent / ANGLES)
+    lock = threading.Lock()
 
-    def __call__(self, exposure_us: float, gain_db: float) -> GrayImage:
-        with self._lock:
-            return self._lab.image(self._camera_id, self._angles(), exposure_us, gain_db)
+    def image(exposure_us: float, gain_db: float) -> GrayImage:
+        with lock:
+            return lab.image(camera.name, angles(), exposure_us, gain_db)
 
-    def follow(self) -> None:
-        before = None
-        while True:
-            try:
-                now = self._angles()
-            except SurveyError:
-                now = None
-            if now is not None and now == before:
-                self(ROOM_EXPOSURE_US, 0.0)
-            before = now
-            threading.Event().wait(_LOOK_S)
+    image(1.0, 0.0)  # compiled before anyone waits for it
+    threading.Thread(target=_look_ahead, args=(angles, image), daemon=True).start()
+    return image
 
 
-def _gradient() -> Callable[[float, float], GrayImage]:
+def _look_ahead(angles: AnglesFile, image: ImageSource) -> None:
+    before = rendered = None
+    while True:
+        now = None
+        with suppress(SurveyError):
+            now = angles()
+        if now is not None and now == before != rendered:
+            image(1.0, 0.0)
+            rendered = now
+        before = now
+        time.sleep(_LOOK_S)
+
+
+def _gradient() -> ImageSource:
     numbers = iter(range(1, 2**32))
     rows, columns = np.arange(2048) // 8, np.arange(2048) // 8
     base = np.asarray((rows[:, None] + columns[None, :]) % 256, np.uint8)
@@ -141,14 +145,6 @@ def main() -> None:
     sys.stdout.flush()
     sys.stdin.read()
     del camera
-
-
-def _lab_source(camera: Path, angles: Path | None) -> _Follower:
-    lab = read_lab(camera.parent)
-    source = _Follower(lab, camera.name, AnglesFile(angles or camera.parent / ANGLES))
-    source(ROOM_EXPOSURE_US, 0.0)  # compiled before anyone waits for it
-    threading.Thread(target=source.follow, daemon=True).start()
-    return source
 
 
 def _complain(error: Exception) -> None:

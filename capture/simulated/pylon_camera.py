@@ -11,8 +11,8 @@ from pathlib import Path
 import cv2
 
 from adjust.errors import SurveyError
+from capture.camera import ImageSource
 from capture.drivers.cameras.pylon import PylonCamera
-from capture.drivers.cameras.simulated import ImageSource
 
 _FILES, _NEW = ("a.bmp", "b.bmp"), "new.bmp"
 

@@ -67,6 +67,8 @@ class GenicamClientCamera(DriverCamera):
             try:
                 self._write(found, value)
             except (vg.GenApiError, vg.ParseError) as error:
+                if not self._answers():
+                    raise self._gone() from error
                 state = self._state(found)
                 if "W" not in state.access:
                     raise self._locked(name) from error

@@ -56,11 +56,11 @@ class GigeCamera(GenicamClientCamera):
             device = next((d for d in devices if _look_at(d)[0] == place), None)
         if device is None:
             raise not_found(self.address, [d.ip for d in devices])
+        if _look_at(device)[1]:  # an attempt to connect would tell only after seconds
+            raise held_by_another(self.address)
         try:
             connected = vg.connect_gige(device)
         except vg.GenicamError as error:
-            if _look_at(device)[1]:
-                raise held_by_another(self.address) from error
             raise not_found(self.address, [d.ip for d in devices]) from error
         self._ns_per_tick = _ns_per_tick(connected)
         return connected

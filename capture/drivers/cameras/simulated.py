@@ -6,7 +6,7 @@ first of its process. Without ``source`` its images are a gradient with the numb
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, cast, get_args
 from urllib.parse import parse_qs
@@ -22,6 +22,7 @@ from capture.camera import (
     FetchTimeoutError,
     Frame,
     GrayImage,
+    ImageSource,
     IncompleteFrameError,
     InUseError,
     OutOfRangeError,
@@ -29,9 +30,6 @@ from capture.camera import (
 from capture.drivers.cameras.base import LOCKED_WHILE_ARMED, DriverCamera, bits_of
 
 FaultKind = Literal["timeout", "incomplete", "disconnect", "wrong_id", "duplicate", "swap", "extra", "lost"]
-ImageSource = Callable[[float, float], GrayImage]
-"""Of exposure time (us) and gain (dB): the image (h, w) that is seen now, 8 bit."""
-
 _RANGES = {"Width": (16, 8192), "Height": (16, 8192), "OffsetX": (0, 8191), "OffsetY": (0, 8191),
            "ExposureTime": (10.0, 1e7), "Gain": (0.0, 48.0)}  # fmt: skip
 _CHOICES = {

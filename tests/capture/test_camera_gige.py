@@ -1,0 +1,178 @@
+"""GigE Vision over loopback: Aravis' camera in another process, and the client's own fakes."""
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from viva_genicam.testing import FakeGigeCamera, FakeU3vCamera
+
+from adjust.errors import SurveyError
+from capture.camera import Camera, DisconnectedError, FetchTimeoutError, IncompleteFrameError, InUseError
+from capture.drivers.cameras import discover
+from capture.drivers.cameras.u3v import U3vCamera
+from capture.simulated.gige_server import GigeServer
+from capture.trigger_set import TriggerSet
+from tests.capture.camera_helpers import GIGE, gige_port, number_in, open_camera, set_up
+
+
+@pytest.fixture(scope="module")
+def port() -> Iterator[None]:
+    with gige_port():
+        yield
+
+
+@pytest.fixture
+def server(port: None) -> Iterator[GigeServer]:
+    with GigeServer("gradient", serial="S-4711") as running:
+        yield running
+
+
+def test_discovery_tells_serial_number_and_whether_it_is_held(server: GigeServer) -> None:
+    (info,) = discover("gige")
+    assert (info.address, info.vendor, info.serial, info.in_use) == (GIGE, "Aravis", "S-4711", False)
+    with open_camera("gige:S-4711") as camera:
+        assert camera.serial == "S-4711"
+        assert discover("gige")[0].in_use
+
+
+def test_pixels_are_those_that_were_sent_of_the_region_that_was_set(server: GigeServer) -> None:
+    with open_camera(GIGE) as camera:
+        set_up(camera, 96, 40)
+        camera.set("OffsetX", 16)
+        camera.set("OffsetY", 8)
+        camera.arm()
+        camera.trigger()
+        rows, columns = np.arange(8, 48) // 8, np.arange(16, 112) // 8
+        np.testing.assert_array_equal(camera.fetch(2.0).image, rows[:, None] + columns[None, :])
+        camera.disarm()
+        camera.set("PixelFormat", "Mono16")
+        camera.arm()
+        camera.trigger()
+        frame = camera.fetch(2.0)
+        assert frame.bits == 16
+        np.testing.assert_array_equal(frame.image, rows[:, None] + columns[None, :])
+
+
+def test_its_clock_is_told_in_nanoseconds(server: GigeServer) -> None:
+    with open_camera(GIGE) as camera:
+        set_up(camera)
+        camera.arm()
+        stamps = []
+        for pause in (0.0, 0.2):
+            time.sleep(pause)
+            camera.trigger()
+            frame = camera.fetch(2.0)
+            stamps.append((frame.device_time_ns, frame.host_monotonic_ns))
+    (device0, host0), (device1, host1) = stamps
+    assert device0 is not None
+    assert device1 is not None
+    assert (device1 - device0) * 1e-9 == pytest.approx((host1 - host0) * 1e-9, abs=0.05)
+
+
+def test_block_ids_of_16_bit_begin_anew_at_1(port: None) -> None:
+    """Aravis starts at 65400, for this very test."""
+    with GigeServer("gradient"), open_camera(GIGE) as camera:
+        set_up(camera)
+        camera.set("TriggerMode", "Off")
+        camera.set("AcquisitionFrameRate", 300.0)
+        camera.arm()
+        frames = [camera.fetch(2.0) for _ in range(128)]  # up to 65528
+        camera.disarm()
+        camera.set("TriggerMode", "On")
+        cameras = TriggerSet({"X": camera})
+        cameras.arm()
+        frames += [cameras.take(2.0).frames["X"] for _ in range(16)]
+        assert camera.last_block_id == 65535
+    ids = [f.block_id for f in frames]
+    assert 1 in ids
+    assert 65535 in ids
+    assert 0 not in ids
+    numbers = [number_in(f.image) for f in frames[128:]]
+    assert numbers == list(range(numbers[0], numbers[0] + 16))
+
+
+def test_lost_packets_make_incomplete_images(port: None) -> None:
+    lost, good = 0, 0
+    with GigeServer("gradient", lost_ratio=0.05), open_camera(GIGE) as camera:
+        set_up(camera, 256, 128)  # some 25 packets
+        camera.arm()
+        for _ in range(20):
+            camera.trigger()
+            try:
+                image = camera.fetch(1.0).image
+            except (IncompleteFrameError, FetchTimeoutError):  # the latter where nothing of it came
+                lost += 1
+            else:
+                np.testing.assert_array_equal(image[1], np.arange(256) // 8)
+                good += 1
+    assert lost >= 3  # of 20 images at 72 % each; 3 or fewer by chance: 1e-7
+    assert lost + good == 20
+
+
+def test_a_camera_whose_plug_is_pulled(port: None) -> None:
+    with GigeServer("gradient") as server, open_camera(GIGE) as camera:
+        set_up(camera)
+        camera.arm()
+        camera.trigger()
+        camera.fetch(2.0)
+        server.kill()
+        with pytest.raises(DisconnectedError, match=r"does not answer any more; .*open it anew"):
+            camera.trigger()
+        begin = time.monotonic()
+        with pytest.raises(DisconnectedError):
+            camera.fetch(0.1)
+        assert time.monotonic() - begin < 5.0
+
+
+def test_two_servers_on_one_address(server: GigeServer) -> None:
+    with pytest.raises(SurveyError, match="did not start"), GigeServer("gradient"):
+        pass
+
+
+def use_for(seconds: float, camera: Camera) -> None:
+    """The loss is noticed with the next heartbeat."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        camera.set("ExposureTime", 1000.0)
+        time.sleep(0.05)
+
+
+def test_control_taken_by_another(port: None) -> None:
+    with FakeGigeCamera(width=64, height=48) as fake, open_camera(GIGE) as camera:
+        assert camera.serial == "VIVA-FAKE-001"
+        with pytest.raises(InUseError):
+            open_camera(GIGE)
+        fake._native.revoke_control()
+        with pytest.raises(DisconnectedError, match="open it anew"):
+            use_for(5.0, camera)
+
+
+def test_resent_packets_complete_an_image(port: None) -> None:
+    for resend, expected in ((True, [1, 2, 3]), (False, [1, "lost", 3])):
+        fake = FakeGigeCamera(width=64, height=48, fps=50, drop_packets=[(2, 1)], packet_resend=resend)
+        with fake, open_camera(GIGE) as camera:
+            camera.arm()
+            seen: list[int | str] = []
+            for _ in range(3):
+                try:
+                    seen.append(camera.fetch(2.0).block_id)
+                except IncompleteFrameError:
+                    seen.append("lost")
+        assert seen == expected
+
+
+def test_usb3_vision() -> None:
+    fake = FakeU3vCamera(width=64, height=48)
+    with U3vCamera("FAKE", fake.connect) as camera:
+        camera.open()
+        assert camera.last_block_id is None
+        camera.arm()
+        assert fake.acquiring()
+        frames = [camera.fetch(2.0) for _ in range(3)]
+        camera.disarm()
+        assert not fake.acquiring()
+    assert [f.block_id for f in frames] == [0, 1, 2]
+    assert frames[0].image.shape == (48, 64)
+    stamps = [f.device_time_ns or 0 for f in frames]
+    assert 0 < stamps[0] < stamps[1] < stamps[2]
