@@ -210,7 +210,8 @@ class TerrestrialBatch:
         noise: dict[int, gtsam.noiseModel.Base] = {}
         for c, chunk in enumerate(self.layout.chunks):
             m = len(chunk.rows)
-            if used[chunk.rows].any():
+            # readings between held positions adjust nothing, but count in the square sum and the redundancy
+            if used[chunk.rows].any() and chunk.keys:
                 noise.setdefault(m, gtsam.noiseModel.Unit.Create(m))
                 graph.add(gtsam.CustomFactor(noise[m], list(chunk.keys), _callback(self, c)))
 

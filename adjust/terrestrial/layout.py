@@ -210,9 +210,9 @@ class LayoutBuilder:
         for r in rows:
             for key in self._keys(r):
                 keys.setdefault(key, self.dims[key])
-        if not keys:
+        if not keys and whitener is not None:
             names = ", ".join(repr(self.survey.readings[r].reading_id) for r in rows[:3])
-            raise SurveyError(f"reading {names} joins held positions only; it can adjust nothing: leave it out")
+            raise SurveyError(f"correlated readings {names} join held positions only; give them sigmas of their own")
         start, at = self.size, {}
         for key, dim in keys.items():
             at[key] = self.size
