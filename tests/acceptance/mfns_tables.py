@@ -201,7 +201,8 @@ published.""",
   turns about axes; the column here is of turns.
 - `C_x^b`, `C_y^b`: the steps take `C_t^w` as free of error; the sigmas they claim leave out what came before
   (compare *claimed* with *rms*).
-- Printed sigmas of the transverse angles are 3 to 10 times the bound: mostly what the steps lose (*steps / bound*). What
+- Printed sigmas of the transverse angles are 3 to 10 times the bound: mostly what the steps lose (*steps / bound*).
+  What
   remains must come from what the replica does not have; the paper does not say enough to tell a board that is not flat
   from a lens that two radial terms do not describe.
 - *Mean* is the bias of the small-angle steps at the published alignment (up to 0.13°): it stays below its scatter.
