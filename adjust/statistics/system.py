@@ -355,7 +355,8 @@ def _reading_rows(precision: Precision, n: int, key_columns: dict[int, IntArray]
         return sparse.csr_matrix((0, n)), np.zeros(0)
     e, entries = batch.unweighted(precision.solved.values).copy(), _Entries()
     for c, chunk in enumerate(batch.layout.chunks):
-        entries.add(chunk.rows, np.concatenate([key_columns[k] for k in chunk.keys]), batch.jacobian(c))
+        if chunk.keys:  # those between held positions have none
+            entries.add(chunk.rows, np.concatenate([key_columns[k] for k in chunk.keys]), batch.jacobian(c))
     return entries.matrix((len(e), n)), e
 
 

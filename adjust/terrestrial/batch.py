@@ -189,7 +189,8 @@ class TerrestrialBatch:
 
     def jacobian(self, c: int) -> FloatArray:
         """Whitened Jacobian (m, n) of chunk ``c`` as last served, keys in the chunk's order."""
-        return np.hstack(self._views[c])
+        views = self._views[c]
+        return np.hstack(views) if views else np.zeros((len(self.layout.chunks[c].rows), 0))
 
     def update_sigmas(self, values: gtsam.Values) -> float:
         """Sigmas with the target's centring at these distances; returns the largest relative change."""
