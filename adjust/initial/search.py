@@ -9,7 +9,7 @@ from adjust.geometry.building import frame_refs, position_refs
 from adjust.initial.gauge import fix_one_gauge, frames_of, world_is_free
 from adjust.initial.lenses import Sighting, start_lens
 from adjust.initial.motion import solve_motion
-from adjust.initial.network import ChainObservation, PoseNetwork, as_pose3
+from adjust.initial.network import ChainObservation, PoseNetwork, as_pose3, partial_pose
 from adjust.initial.pairs import network_start
 from adjust.initial.points import PARALLAX, PointField, improve, intersect_points, point_field, resect
 from adjust.initial.polish import polish
@@ -158,9 +158,23 @@ class _Search:
         while self._advance():
             pass
         self.network.observations = [o for o in self.network.observations if o not in self.doubtful]
+        while self._use_open_prior():
+            while self._advance():
+                pass
         missing = undetermined(self.survey, self.network, self.points)
         if missing:
             raise SurveyError(missing)
+
+    def _use_open_prior(self) -> bool:
+        """Start a pose that no image or pair reaches at the mean of its prior, though that leaves components open."""
+        network = self.network
+        for slot, name in sorted(network.names.items()):
+            value = None if slot in network.known else partial_pose(network.unknowns.parameters.get(name))
+            if value is not None:
+                network.known[slot] = value
+                self.notes.append(f"{' '.join(name)}: starts at the mean of its prior, no image or pair reaches it")
+                return True
+        return False
 
     def _advance(self) -> bool:
         """One step, the first of the list that is possible; whether there was one."""
