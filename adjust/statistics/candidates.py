@@ -1,0 +1,98 @@
+"""Which part of a survey an observation of a linear system is, and the survey without some of them."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from adjust.graph import AdjustmentGraph
+from adjust.model import BoolArray, Survey
+from adjust.observations import ReadingCovariance
+
+_FIELD = {
+    "pair": "pairs", "distance": "distances", "coordinates": "coordinates", "level": "levels",
+    "alignment": "alignments", "laser": "laser_spots", "surface": "on_surfaces",
+    "coordinate_difference": "coordinate_differences",
+}  # fmt: skip
+_READINGS = "readings"
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Observations that can be left out. place: by observation (field of the survey, index); images by their row.
+
+    n_image, n: observations in all. image_ptr: (B + 1,) rows of the image blocks.
+    """
+
+    place: Mapping[int, tuple[str, int]]
+    n_image: int
+    n: int
+    image_ptr: tuple[int, ...]
+
+    def mask(self, with_images: bool = True) -> BoolArray:
+        """Which observations (n,) can be left out at all."""
+        out = np.zeros(self.n, dtype=np.bool_)
+        out[list(self.place)] = True
+        out[: self.n_image] = with_images
+        return out
+
+
+def candidates(graph: AdjustmentGraph) -> Candidates:
+    """Of a graph; priors and readings of a table define what they belong to, and stay."""
+    survey = graph.survey
+    ptr = np.cumsum([0] + [len(b.uv) for b in survey.image_blocks])
+    n_image, count, place = int(ptr[-1]), dict.fromkeys(_FIELD, 0), {}
+    for i, item in enumerate(graph.others):
+        if item.kind in _FIELD:
+            place[n_image + i] = (_FIELD[item.kind], count[item.kind])
+            count[item.kind] += 1
+    for kind, n in count.items():
+        if n not in (0, len(getattr(survey, _FIELD[kind]))):
+            raise ValueError(f"{n} factors of kind {kind} for {len(getattr(survey, _FIELD[kind]))} observations")
+    first = n_image + len(graph.others)
+    place |= {first + i: (_READINGS, i) for i in range(len(survey.readings))}
+    return Candidates(place, n_image, first + len(survey.readings), tuple(ptr.tolist()))
+
+
+def without(survey: Survey, found: Candidates, rejected: Iterable[int]) -> Survey:
+    """The survey with these observations out of use: predicted and tested, and as given for everything else."""
+    out = np.zeros(found.n, dtype=np.bool_)
+    out[list(rejected)] = True
+    changed: dict[str, Any] = {"image_blocks": _blocks(survey, found, out)}
+    by_field: dict[str, set[int]] = {}
+    for row in np.flatnonzero(out[found.n_image :]).tolist():
+        field, i = found.place[row + found.n_image]
+        by_field.setdefault(field, set()).add(i)
+    for field, numbers in by_field.items():
+        changed[field] = tuple(
+            replace(x, used=False) if i in numbers else x for i, x in enumerate(getattr(survey, field))
+        )
+    if _READINGS in by_field:
+        lost = {survey.readings[i].reading_id for i in by_field[_READINGS]}
+        changed["reading_covariances"] = tuple(
+            part for c in survey.reading_covariances for part in _parts(c, lost)
+        )
+    return replace(survey, **changed)
+
+
+def _blocks(survey: Survey, found: Candidates, out: BoolArray) -> tuple[Any, ...]:
+    blocks = []
+    for b, block in enumerate(survey.image_blocks):
+        mine = out[found.image_ptr[b] : found.image_ptr[b + 1]]
+        if not mine.any():
+            blocks.append(block)
+            continue
+        used = np.ones(len(mine), dtype=np.bool_) if block.used is None else block.used
+        blocks.append(replace(block, used=used & ~mine))
+    return tuple(blocks)
+
+
+def _parts(c: ReadingCovariance, lost: set[str]) -> list[ReadingCovariance]:
+    """The covariance of what is left, and that of what is out: all readings of one covariance are used, or none."""
+    ids = np.array(c.reading_ids)
+    gone = np.array([i in lost for i in c.reading_ids], dtype=np.bool_)
+    if not gone.any():
+        return [c]
+    parts = [np.flatnonzero(~gone), np.flatnonzero(gone)]
+    return [ReadingCovariance(tuple(ids[p].tolist()), c.cov[np.ix_(p, p)]) for p in parts if len(p)]
