@@ -137,7 +137,8 @@ def test_agreement_with_the_published_lenses_and_centres(self_calibrated, with_p
     focal = focal_lengths(self_calibrated) / np.array([0.5 * (v[0] + v[1]) for v in spots[3]])
     with capsys.disabled():
         print(f"\nspots: {ours:.3f} px (published lenses held: {theirs:.3f} px); centres {apart:.1f} mm from those "
-              f"with the published lenses; published centres off by {misfits[0]:.1f} and {misfits[1]:.1f} mm; focal lengths "
+              f"with the published lenses; published centres off by "
+              f"{misfits[0]:.1f} and {misfits[1]:.1f} mm; focal lengths "
               + " ".join(f"{100 * (f - 1):+.1f} %" for f in focal))  # fmt: skip
     # the published lenses fit these spots clearly worse, although they lose more of them as gross errors
     assert ours < 0.22
