@@ -1,6 +1,7 @@
 """Precision of navigated poses before anything is measured, what each part may contribute, and where beacons go."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 
 import numpy as np
 from gtsam import Pose3
@@ -10,7 +11,9 @@ from adjust.design.pose_budget import PoseBudget, PoseTolerance, pose_budget, po
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from adjust.navigation import Beacons, Expected, Head, expected_precision, head_and_beacons
+from adjust.observations import FrameRef
 from adjust.result import Adjustment
+from survey.adjusted_frames import AdjustedFrames
 from survey.planning.plan_file import NavigationPlan, Plan
 
 _TRIALS = 1000
@@ -48,6 +51,7 @@ def plan_navigation(plan: Plan, expected: Adjustment, n_place: int) -> Navigatio
     if nav is None:
         raise SurveyError(f"{plan.path}: there is no table [navigation]; say in it where the head will be")
     station = nav.station_id or _station(plan, expected)
+    nav = replace(nav, poses=nav.poses + _at_epochs(plan, nav, expected, station))
     head, there = _head(expected, station)
     placement, places = None, np.zeros((0, 3))
     beacons = there
@@ -76,6 +80,19 @@ def _station(plan: Plan, expected: Adjustment) -> str:
         if len(choice) == 1:
             return choice[0]
     raise SurveyError(f"{plan.path}: several stations carry cameras; name one as station under [navigation]")
+
+
+def _at_epochs(plan: Plan, nav: NavigationPlan, expected: Adjustment, station: str) -> tuple[Pose3, ...]:
+    """Poses of the station at the epochs that [navigation] names by pattern."""
+    survey, frames, out = expected.survey, AdjustedFrames(expected), []
+    epochs = [r.epoch_id for r in survey.table_readings] + [b.epoch_id for b in survey.image_blocks]
+    for pattern in nav.epochs:
+        found = [e for e in dict.fromkeys(epochs) if fnmatchcase(e, pattern)]
+        poses = [frames.world_from(FrameRef("station", station, e)) for e in found]
+        if not any(p is not None for p in poses):
+            raise SurveyError(f"{plan.path}: [navigation] epochs: {pattern!r} is no epoch at which {station} is placed")
+        out += [p for p in poses if p is not None]
+    return tuple(out)
 
 
 def _head(expected: Adjustment, station: str) -> tuple[Head, Beacons | None]:

@@ -109,7 +109,7 @@ def _sigmas(o: "PlanningOutcome") -> str:
 
 def _weak(o: "PlanningOutcome") -> str:
     rows = [
-        (fixed(w.factor, 0), esc(", ".join(f"{a} {c} {s:+.2f}" for a, c, s in w.parts))) for w in o.weak
+        (fixed(w.factor, 0), "<br>".join(esc(f"{s:+.2f}  {a}: {c}") for a, c, s in w.parts)) for w in o.weak
     ]  # fmt: skip
     note = (
         "Combinations of unknowns that the observations hardly tell apart. Factor: how many times less precise the "
@@ -231,7 +231,7 @@ def _navigation(n: "NavigationOutcome") -> str:
             f"{n.simulated.max():.3f} of their predictions.</p>"
         )
     note = (
-        f"Head {esc(n.station_id)} with its calibration as planned, {len(n.beacons.beacon_ids)} beacons; required: "
+        f"Station {esc(n.station_id)} with its calibration as planned, {len(n.beacons.beacon_ids)} beacons; required: "
         f"{limits[0]:.3g} deg and {limits[1]:.3g} mm per component."
     )
     return section("navigation", "Navigation", body, note)
@@ -273,7 +273,7 @@ def _placement(n: "NavigationOutcome") -> str:
     body += f'<div class="figures"><figure>{_room(n)}</figure><figure>{drawn}</figure></div>'
     note = (
         f'<p class="note">{len(n.places)} of {len(n.plan.places)} places on the walls (small dots), chosen one by one '
-        f"for the {what}, {p.exchanged} then exchanged; red: beacons, green: where the head will be. Every pose sees at "
-        f"least {min(p.seen)} beacons.</p>"
+        f"for the {what}, {p.exchanged} then exchanged; red: beacons, green: where the head will be. Every pose sees "
+        f"at least {min(p.seen)} beacons.</p>"
     )
     return body + note + table(("<Beacon", "x mm", "y mm", "z mm", "Poses that see it"), rows)

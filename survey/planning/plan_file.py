@@ -26,7 +26,7 @@ _SEEN_KEYS = ("margin_px", "nearest_mm", "farthest_mm", "widest_incidence_deg", 
 _NAVIGATION_KEYS = (
     *("station", "sigma_px", "volume_mm", "steps", "attitudes_euler_xyz_deg", "turn_about", "turn_steps", "poses"),
     *("required_rotation_deg", "required_translation_mm", "beacon_sigma_mm", "room_mm", "spacing_mm", "criterion"),
-    *("at_least", "camera_sigma_mm", "camera_sigma_deg", "places"),
+    *("at_least", "camera_sigma_mm", "camera_sigma_deg", "places", "epochs"),
 )
 
 
@@ -131,7 +131,7 @@ class Requirement:
 class NavigationPlan:
     """Where the head will be, how well its pose must be known (rad, m per component), and where beacons could be.
 
-    poses: world_from_station. places: (m, 3) m candidate places of beacons. sigmas of a spot (px), of a beacon, of the
+    poses: world_from_station. epochs: patterns of planned epochs, whose poses come after these. places: (m, 3) m candidate places of beacons. sigmas of a spot (px), of a beacon, of the
     cameras' places (m) and attitudes (rad) on the head.
     """
 
@@ -146,6 +146,7 @@ class NavigationPlan:
     criterion: Literal["worst", "mean"]
     at_least: int
     spacing: float
+    epochs: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,8 +369,8 @@ def _navigation(node: Node, survey: Survey) -> NavigationPlan:
     stations = tuple(dict.fromkeys(c.station_id for c in survey.cameras))
     criterion = node.choice("criterion", ("worst", "mean"), "worst")
     poses = _navigation_poses(node)
-    if not poses:
-        raise node.error("say where the head will be: poses, or volume_mm with attitudes")
+    if not poses and not node.has("epochs"):
+        raise node.error("say where the head will be: poses, volume_mm with attitudes, or planned epochs")
     return NavigationPlan(
         node.reference("station", stations, "station") if node.has("station") else None,
         poses,
@@ -385,6 +386,7 @@ def _navigation(node: Node, survey: Survey) -> NavigationPlan:
         "worst" if criterion == "worst" else "mean",
         node.integer("at_least", 1, 3),
         float(to_si(node.number("spacing_mm", 0.0), "mm")),
+        node.names("epochs", ()),
     )
 
 

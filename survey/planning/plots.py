@@ -30,7 +30,8 @@ def ticks(low: float, high: float, most: int = 5) -> FloatArray:
     step = d.round_below((high - low) / max(most - 1, 1))
     while (high - low) / step > most:
         step = d.round_below(step * 2.6)
-    return np.asarray(np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step)
+    marks = np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step
+    return np.asarray(marks + 0.0)  # adding zero takes the sign off a negative one
 
 
 def chart(
@@ -43,7 +44,7 @@ def chart(
     lows = np.concatenate([s.y - (0 if s.error is None else s.error) for s in series])
     x0, x1 = (0.0 if least == 0.0 else float(xs.min())), float(xs.max())
     y0, y1 = (float(np.nanmin(lows)) if least is None else least), float(np.nanmax(tops))
-    y1 += 0.06 * (y1 - y0) or 1.0
+    y1 += (16.0 + 14.0 * len(series)) / (height - _TOP - _BOTTOM) * (y1 - y0) or 1.0  # room for the labels
     x1 = x1 if x1 > x0 else x0 + 1.0
 
     def place(x: FloatArray, y: FloatArray) -> FloatArray:
