@@ -272,7 +272,7 @@ class GraphBuilder:
             if unknown is not None:
                 factor = gtsam.PriorFactorVector(unknown.key, reading.angles, gaussian(reading.cov))
                 self._other(factor, "table", reading.group, (reading.table_id, reading.epoch_id), unknown.components,
-                            unknown.units, reading.angles)  # fmt: skip
+                            unknown.units, reading.angles, reading.used)  # fmt: skip
         for pair, chain in zip(self.survey.pairs, pair_chains, strict=True):
             self._pair(state, pair, chain)
         for d in self.survey.distances:

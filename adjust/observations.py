@@ -50,13 +50,14 @@ class ImageBlock:
 
 @dataclass(frozen=True, eq=False)
 class TableReading:
-    """Angles (k,) rad read off a table's axes at an epoch, with covariance (k, k)."""
+    """Angles (k,) rad read off a table's axes at an epoch, with covariance (k, k); they are a start even if not used."""
 
     table_id: str
     epoch_id: str
     angles: FloatArray
     cov: FloatArray
     group: str = "table"
+    used: bool = True
 
 
 @dataclass(frozen=True, eq=False)

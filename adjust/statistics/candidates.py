@@ -39,12 +39,16 @@ class Candidates:
 
 
 def candidates(graph: AdjustmentGraph) -> Candidates:
-    """Of a graph; priors and readings of a table define what they belong to, and stay."""
+    """Of a graph; priors stay, for they are part of what is asked for."""
     survey = graph.survey
     ptr = np.cumsum([0] + [len(b.uv) for b in survey.image_blocks])
-    n_image, count, place = int(ptr[-1]), dict.fromkeys(_FIELD, 0), {}
+    tables: dict[tuple[str, ...], int] = {(r.table_id, r.epoch_id): i for i, r in enumerate(survey.table_readings)}
+    n_image, count = int(ptr[-1]), dict.fromkeys(_FIELD, 0)
+    place: dict[int, tuple[str, int]] = {}
     for i, item in enumerate(graph.others):
-        if item.kind in _FIELD:
+        if item.kind == "table":
+            place[n_image + i] = ("table_readings", tables[item.ids])
+        elif item.kind in _FIELD:
             place[n_image + i] = (_FIELD[item.kind], count[item.kind])
             count[item.kind] += 1
     for kind, n in count.items():

@@ -30,7 +30,7 @@ class SearchOptions:
     """levels: of the tests; with method "sidak" the family is all tested observations.
 
     kinds: which may be left out (kinds as in ``ObservationResidual``, "image" for image points); None for all but
-    priors and table readings. robust: begin with a robust solution. posterior: test with sigma0 of the other
+    priors. robust: begin with a robust solution. posterior: test with sigma0 of the other
     observations. typical: where the sigmas of a whole group are plainly too small, widen its limits.
     """
 
@@ -53,7 +53,7 @@ class OutlierSearch:
 
     rejected: what is out in the end, worst first. log: every decision in order, also those taken back. suspects: what
     fails its test but cannot be left out, because something would be undetermined without it, or because it is a prior
-    or a table reading. converged: whether the last round changed nothing.
+    or of a kind that is kept. converged: whether the last round changed nothing.
     """
 
     adjustment: Adjustment

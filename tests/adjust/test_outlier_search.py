@@ -1,0 +1,221 @@
+"""The search for gross errors: every step against a dense refit, planted errors, false alarms, what comes back."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gtsam import Pose3
+from scipy.stats import binom
+
+from adjust.adjustment import adjust
+from adjust.model import FloatArray, PointParameter, Survey
+from adjust.observations import Distance, FrameRef, Pair, PositionRef, ReadingCovariance
+from adjust.statistics.candidates import candidates, without
+from adjust.statistics.outlier_search import SearchOptions, search_outliers
+from adjust.statistics.reliability import reliability
+from adjust.statistics.result import LevelOptions
+from adjust.statistics.snooping import Snooping
+from adjust.statistics.system import LinearSystem, linear_system
+from survey.simulate import head_on_table, resample
+from tests.adjust import helpers as h
+from tests.adjust import statistics_networks as net
+
+
+def refit(system: LinearSystem, out: list[int]) -> tuple[FloatArray, FloatArray]:
+    """Residuals (m,) and their cofactors I - A Q A' (m, m) by dense algebra, without the observations ``out``."""
+    A, rows = system.A.toarray(), ~np.isin(system.row_of, out)
+    for joint in system.joint:  # a bias for what is out of a joint block, which is the same as leaving it out
+        for place, row in enumerate(joint.rows):
+            if system.row_of[row] in out:
+                rows[row] = True
+                column = np.zeros((len(A), 1))
+                column[joint.rows, 0] = joint.W[:, place]
+                A = np.hstack([A, column])
+    used = A[rows]
+    D = np.hstack([system.datum.toarray(), np.zeros((system.datum.shape[0], A.shape[1] - system.datum.shape[1]))])
+    Q = np.linalg.inv(used.T @ used + D.T @ D)
+    e = system.e - A @ Q @ used.T @ system.e[rows]
+    return e, np.eye(len(A)) - A @ Q @ A.T
+
+
+def mixed_survey() -> LinearSystem:
+    """Images of unknown points, coordinates, distances, and readings with a joint covariance."""
+    survey, truth = h.network(7, n_epochs=3, n_points=9, coordinates=2)
+    system = linear_system(adjust(survey, h.start_at(truth)))
+    return system
+
+
+def joint_hall() -> LinearSystem:
+    survey, start = net.hall(3)
+    ids = tuple(r.reading_id for r in survey.readings[:6])
+    s = np.array([r.sigma for r in survey.readings[:6]])
+    C = 0.4 * np.ones((6, 6)) + 0.6 * np.eye(6)
+    survey = replace(survey, reading_covariances=(ReadingCovariance(ids, C * np.outer(s, s)),))
+    return linear_system(adjust(survey, start))
+
+
+@pytest.mark.parametrize(("make", "out"), [(mixed_survey, [3, 20, 45]), (joint_hall, [2, 14, 40, 17])])
+def test_elimination_against_a_dense_refit(make, out: list[int]) -> None:  # type: ignore[no-untyped-def]
+    system = make()
+    snooping = Snooping(system, np.ones(len(system.used), dtype=np.bool_), 0.001, np.ones(len(system.group_names)))
+    for o in out:
+        snooping.leave_out(o)
+    e, R = refit(system, out)
+    T, freedom, _ = snooping.statistics()
+    joint = set(system.joint_of)
+    for o in range(len(system.used)):
+        rows = np.arange(system.ptr[o], system.ptr[o + 1])
+        if o in out or freedom[o] < len(rows):
+            continue
+        if o in joint:
+            block, place = system.joint_of[o]
+            c = block.W[:, place]
+            expected = (c @ e[block.rows]) ** 2 / (c @ R[np.ix_(block.rows, block.rows)] @ c)
+        else:
+            expected = e[rows] @ np.linalg.solve(R[np.ix_(rows, rows)], e[rows])
+        np.testing.assert_allclose(T[o], expected, rtol=1e-5, atol=1e-7)
+    for o in out:  # what is out: prediction against observation, with the others out
+        if o in joint:
+            continue
+        rows = np.arange(system.ptr[o], system.ptr[o + 1])
+        cov = 2.0 * np.eye(len(rows)) - R[np.ix_(rows, rows)]  # I + A Q A'
+        expected = e[rows] @ np.linalg.solve(cov, e[rows])
+        assert snooping.verdict(o).statistic == pytest.approx(expected, rel=1e-6)
+        assert snooping.verdict(o).error == pytest.approx(np.linalg.norm(e[rows]), rel=1e-6)
+    used = ~np.isin(system.row_of, out)
+    if not joint:
+        assert snooping.omega == pytest.approx(e[used] @ e[used], rel=1e-9)
+        assert snooping.left == int(used.sum()) - len(system.columns)
+    before = Snooping(system, snooping.candidates, 0.001, snooping.factors).statistics()[0]
+    snooping.take_back(out)
+    np.testing.assert_allclose(snooping.statistics()[0], before, rtol=1e-7, atol=1e-9)
+
+
+def planted(seed: int) -> tuple[Survey, Survey, dict[str, float]]:
+    """A hall clean and with errors of 6 to 50 sigmas in 5 % of its readings, and these over the detectable bias."""
+    survey, start = net.hall(seed, n_points=20, n_stations=4, n_tapes=20)
+    tests = reliability(adjust(survey, start), most_influences=0).tests
+    rng = np.random.default_rng(seed)
+    readings, sizes = list(survey.readings), {}
+    first = len(tests.used) - len(readings)
+    for i in rng.choice(len(readings), len(readings) // 20, replace=False):
+        r, error = readings[i], float(rng.uniform(6.0, 50.0) * rng.choice([-1, 1]) * readings[i].sigma)
+        readings[i] = replace(r, value=r.value + error)
+        sizes[r.reading_id] = abs(error) / tests.detectable_component[tests.ptr[first + i]]
+    return survey, replace(survey, readings=tuple(readings)), sizes
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_planted_errors_are_found_and_named(seed: int) -> None:
+    _, wrong, sizes = planted(seed)
+    _, start = net.hall(seed, n_points=20, n_stations=4, n_tapes=20)
+    found = search_outliers(wrong, start, SearchOptions(LevelOptions(family_alpha=0.05)))
+    named = {d.ids[0] for d in found.rejected}
+    assert found.converged
+    assert named >= {i for i, size in sizes.items() if size > 1.5}
+    assert len(named - set(sizes)) <= 1
+    assert abs(found.adjustment.sigma0 - 1.0) < 0.2
+    # reversible: what was given is as it was but for the flags
+    assert [replace(r, used=True) for r in found.survey.readings] == list(wrong.readings)
+    kept = {r.reading_id for r in found.survey.readings if not r.used}
+    assert kept == named
+    worst = found.rejected[0]
+    assert worst.kind in worst.text()
+    assert worst.statistic > worst.limit
+    assert worst.p < 1e-6
+
+
+def test_false_alarms_at_the_nominal_rate() -> None:
+    """400 clean samples of one network: at least one false alarm in 5 % of them; 0.1 % of all tests by method b."""
+    survey, start = net.hall(5)
+    system = linear_system(adjust(survey, start))
+    rng = np.random.default_rng(5)
+    M, ones = len(system.used), np.ones(len(system.group_names))
+    first = Snooping(system, np.ones(M, dtype=np.bool_), 1.0 - 0.95 ** (1.0 / M), ones)
+    alarms, single = 0, 0
+    A, N = system.A, system.normal
+    for _ in range(400):
+        e = rng.normal(size=len(system.e))
+        first.g = e - A @ N.solve(A.T @ e)
+        excess, _ = first.failing()
+        alarms += bool(excess.max() > 1.0)
+        T, freedom, _ = first.statistics()
+        single += int(np.sum(T[freedom > 0] > 10.828))  # chi-square, 0.1 %
+    # tests of one network are correlated: the rate of the family stays a little below its bound
+    low, high = binom.ppf([0.001, 0.999], 400, 0.05)
+    assert low - 8 <= alarms <= high
+    low, high = binom.ppf([0.001, 0.999], 400 * M, 0.001)
+    assert low <= single <= high
+
+
+def test_a_robust_suspect_that_fits_comes_back() -> None:
+    """Two large errors in one point's few sights pull the rest of them along; in the end only the two are out."""
+    survey, start = net.hall(8)
+    mine = [i for i, r in enumerate(survey.readings) if r.to.point_id == "P3" and r.kind == "slope_distance"]
+    wrong = net.with_reading(survey, mine[0], value=survey.readings[mine[0]].value + 0.02)
+    found = search_outliers(wrong, start)
+    assert [d.ids[0] for d in found.rejected] == [survey.readings[mine[0]].reading_id]
+    out = {d.ids for d in found.log if d.action == "rejected"} - {d.ids for d in found.log if d.action == "readmitted"}
+    assert out == {d.ids for d in found.rejected}
+
+
+def test_errors_of_other_kinds() -> None:
+    """A pair, a distance and an image point off in one survey of a head on a table."""
+    survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=4, n_free_epochs=2)
+    blocks = tuple(replace(b, point_idx=b.point_idx[::3], uv=b.uv[::3], cov=b.cov[::3]) for b in survey.image_blocks)
+    a, b = (FrameRef("camera", c.camera_id, survey.image_blocks[0].epoch_id) for c in survey.cameras[:2])
+    board = survey.targets[0]
+    far = PositionRef(board.point_ids[-1], FrameRef("target", board.target_id))
+    near = PositionRef(frame=FrameRef("camera", survey.cameras[0].camera_id, survey.image_blocks[0].epoch_id))
+    pairs, tapes = (Pair("pair", a, b, Pose3(), 1e-8 * np.eye(6)),), (Distance("tape", near, far, 1.0, 3e-4),)
+    survey = replace(survey, image_blocks=blocks, pairs=pairs, distances=tapes)
+    survey = resample(survey, truth, 4)
+    uv = survey.image_blocks[3].uv.copy()
+    uv[2] += (4.0, -3.0)
+    pair = replace(survey.pairs[0], b_from_a=survey.pairs[0].b_from_a * Pose3.Expmap(np.array([0.05, 0, 0, 0, 0, 0])))
+    blocks = (*survey.image_blocks[:3], replace(survey.image_blocks[3], uv=uv), *survey.image_blocks[4:])
+    wrong = replace(survey, image_blocks=blocks, pairs=(pair,),
+                    distances=(replace(survey.distances[0], value=survey.distances[0].value + 0.01),))  # fmt: skip
+    found = search_outliers(wrong, h.start_at(truth))
+    assert sorted(d.kind for d in found.rejected) == ["distance", "image", "pair"]
+    image = next(d for d in found.rejected if d.kind == "image")
+    block = wrong.image_blocks[3]
+    assert image.ids == (block.camera_id, block.epoch_id, block.target_id, board.point_ids[int(block.point_idx[2])])
+    only = search_outliers(wrong, h.start_at(truth), SearchOptions(kinds=("pair", "distance")))
+    assert sorted(d.kind for d in only.rejected) == ["distance", "pair"]
+    assert only.suspects[0].ids == image.ids
+
+
+def test_a_wrong_table_reading_and_a_wrong_prior() -> None:
+    """The reading is left out and predicted; the prior, part of what is asked for, is only named."""
+    survey, truth = head_on_table(2, n_cameras=1, n_table_epochs=5, n_free_epochs=0)
+    survey = resample(survey, truth, 4)
+    readings = list(survey.table_readings)
+    readings[2] = replace(readings[2], angles=readings[2].angles + 60.0 * np.sqrt(np.diag(readings[2].cov)))
+    found = search_outliers(replace(survey, table_readings=tuple(readings)), h.start_at(truth))
+    assert [(d.kind, d.ids[1]) for d in found.rejected] == [("table", readings[2].epoch_id)]
+    assert not found.suspects
+    assert [o.used for o in found.adjustment.other_residuals if o.kind == "table"] == [True, True, False, True, True]
+    hall, start = net.hall(3)
+    points = list(hall.points)
+    x = np.asarray(points[5].x_in_world.value)
+    points[5] = replace(points[5], x_in_world=PointParameter(x + 0.04, "prior", 1e-6 * np.eye(3)))
+    found = search_outliers(replace(hall, points=tuple(points)), start)
+    assert [(d.kind, d.ids[1]) for d in found.suspects] == [("prior", points[5].point_id)]
+    assert any("cannot be left out: prior" in n for n in found.notes)
+
+
+def test_joint_covariances_are_split() -> None:
+    survey, start = net.hall(3)
+    ids = tuple(r.reading_id for r in survey.readings[:4])
+    cov = np.diag([r.sigma**2 for r in survey.readings[:4]])
+    cov[0, 1] = cov[1, 0] = 0.3 * np.sqrt(cov[0, 0] * cov[1, 1])
+    survey = replace(survey, reading_covariances=(ReadingCovariance(ids, cov),))
+    adjustment = adjust(survey, start)
+    place = candidates(adjustment.precision.graph)
+    row = place.n - len(survey.readings) + 1
+    less = without(survey, place, [row])
+    assert [c.reading_ids for c in less.reading_covariances] == [(ids[0], ids[2], ids[3]), (ids[1],)]
+    assert not less.readings[1].used
+    np.testing.assert_array_equal(less.reading_covariances[0].cov, cov[np.ix_([0, 2, 3], [0, 2, 3])])
+    assert adjust(less, start).redundancy == adjustment.redundancy - 1
