@@ -13,6 +13,7 @@ from typing import Any
 
 from adjust.errors import SurveyError
 from survey.commands.adjusting import declare_adjust
+from survey.commands.aligning import declare_align
 from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, message
 from survey.commands.comparing import declare_compare
 from survey.commands.converting import declare_convert
@@ -47,6 +48,7 @@ _COMMANDS = (
     declare_convert,
     declare_trackers,
     declare_navigate,
+    declare_align,
     declare_compare,
     declare_example,
 )

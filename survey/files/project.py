@@ -4,7 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gtsam import Rot3
+
 from adjust.model import FloatArray, IntArray, Survey
+from adjust.observations import FrameRef
 from survey.targets import TargetKind
 from survey.tolerances import Tolerance
 
@@ -55,6 +58,31 @@ class AdjustmentOptions:
     reject_pairs: bool = True
     tolerances: tuple[Tolerance, ...] = ()
     identification: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Foot:
+    """A screw or edge that carries a body, at (x, y) m in the body's plane."""
+
+    name: str
+    x: float
+    y: float
+
+
+@dataclass(frozen=True, eq=False)
+class AlignmentTask:
+    """A body that is to be turned until its axes are those of ``onto`` (the table [align.ID]).
+
+    onto_from_body: the rotation wanted. pitch: m per turn of the feet's screws. tolerance: rad, about each axis.
+    """
+
+    task_id: str
+    body: FrameRef
+    onto: FrameRef
+    onto_from_body: Rot3 = field(default_factory=Rot3)
+    feet: tuple[Foot, ...] = ()
+    pitch: float | None = None
+    tolerance: float | None = None
 
 
 @dataclass(frozen=True)
@@ -124,6 +152,7 @@ class Definition:
     sigmas: Sigmas
     inputs: Mapping[str, str]
     target_cameras: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    alignment_tasks: tuple[AlignmentTask, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from typing import Any
 
 from adjust.errors import SurveyError
 from adjust.model import Datum, FloatArray, Point, PointParameter, Survey
+from survey.files.alignment_tasks import read_alignment_tasks
 from survey.files.bodies import read_beams, read_surfaces
 from survey.files.differences import DIFFERENCES, DIFFERENCES_COVARIANCE, read_differences
 from survey.files.geometric import (
@@ -78,6 +79,7 @@ _TOP_LEVEL = (
     "tables",
     "targets",
     "points",
+    "align",
     "dimensions",
     "vertical",
     "bearings",
@@ -191,6 +193,7 @@ def _read_definition(folder: Path) -> tuple[Definition, Node]:
         sigmas=dataclasses.replace(_read_sigmas(root.table("sigmas"), table_sigmas), instruments=accuracies),
         inputs=inputs,
         target_cameras=seen_by,
+        alignment_tasks=read_alignment_tasks(root, survey),
     )
     return definition, root
 

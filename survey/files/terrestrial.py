@@ -182,8 +182,9 @@ def _positions(
 ) -> tuple[PositionRef, PositionRef, PositionRef | None]:
     columns = ("from_id", "to_id", "second_id")
     if (kind == "angle") != bool(texts[2]):
-        found = "an angle needs its right-hand target" if kind == "angle" else f"readings of kind {kind} have no second target"
-        raise table.error(row, f"second_id: {found}; {'fill it in' if kind == 'angle' else 'remove it'}")
+        if kind == "angle":
+            raise table.error(row, "second_id: an angle needs its right-hand target; fill it in")
+        raise table.error(row, f"second_id: readings of kind {kind} have no second target; remove it")
     refs: list[PositionRef] = []
     for column, text in zip(columns, texts, strict=True):
         if not text:

@@ -9,6 +9,7 @@ import numpy as np
 from adjust.errors import SurveyError
 from adjust.model import Survey
 from adjust.observations import ImageBlock
+from survey.files.alignment_tasks import task_sections
 from survey.files.observation_columns import (
     angle_columns,
     coordinate_columns,
@@ -21,6 +22,7 @@ from survey.files.project import (
     DEFINITION_FILE,
     OBSERVATIONS_FOLDER,
     AdjustmentOptions,
+    AlignmentTask,
     Sigmas,
     SpotBlock,
     SpotsRequest,
@@ -58,6 +60,7 @@ def write_project(
     sigmas: Sigmas | None = None,
     spots_request: SpotsRequest | None = None,
     spots: Sequence[SpotBlock] = (),
+    alignment_tasks: Sequence[AlignmentTask] = (),
     parquet: bool = False,
     overwrite: bool = False,
 ) -> None:
@@ -82,6 +85,7 @@ def write_project(
         [
             head_section(title, tie_points),
             *sections,
+            *task_sections(alignment_tasks),
             *option_sections(options or AdjustmentOptions(), spots_request, sigmas),
         ]
     )

@@ -87,7 +87,7 @@ def test_levels_and_laser_alone_give_the_alignment_without_images() -> None:
 
 def test_alignment_scatters_as_its_covariance_says() -> None:
     """d' inv(C) d of the rotation over fresh noise, chi-square with three degrees of freedom each."""
-    runs, total = 120, 0.0
+    runs, total = 50, 0.0
     for seed in range(runs):
         estimate = adjust(aligned(seed)).estimates[TABLE]
         d = turn_error(estimate.value)

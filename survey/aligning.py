@@ -1,0 +1,97 @@
+"""The job of the command ``align``: adjust the readings, write the working sheet, keep the rounds."""
+
+import csv
+import io
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from adjust.errors import SurveyError
+from adjust.result import Adjustment
+from survey.files import atomic_write, read
+from survey.jobs import adjust_project
+from survey.report.working_sheet import ROUND_COLUMNS, sheet_html, sheet_text, steps
+from survey.working_sheet import ARCSEC, Sheet, working_sheets
+
+PAGE, ROUNDS = "alignment.html", "alignment_rounds.csv"
+
+
+@dataclass(frozen=True, eq=False)
+class AlignOutcome:
+    """The sheets, and where they were written."""
+
+    adjustment: Adjustment
+    sheets: tuple[Sheet, ...]
+    page: Path
+
+    @property
+    def aligned(self) -> bool:
+        """Whether nothing is left to do."""
+        return all(sheet.state == "aligned" for sheet in self.sheets)
+
+    def text(self) -> str:
+        """For the terminal."""
+        return f"{sheet_text(self.sheets)}\nWorking sheet: {self.page}"
+
+    def summary(self) -> dict[str, Any]:
+        """For ``--json``."""
+        tasks = {
+            sheet.task.task_id: {
+                "state": sheet.state,
+                "axes": {
+                    a.axis: {"off_arcsec": a.angle / ARCSEC, "sigma_arcsec": a.sigma / ARCSEC, "state": a.state}
+                    for a in sheet.axes
+                },
+                "feet": {
+                    f.name: {"move_mm": 1e3 * f.move, "sigma_mm": 1e3 * f.sigma, "turns": f.turns, "stays": f.stays}
+                    for f in sheet.feet
+                },
+                "steps": steps(sheet),
+            }
+            for sheet in self.sheets
+        }
+        return {"aligned": self.aligned, "tasks": tasks, "page": str(self.page)}
+
+
+def align_job(folder: Path, *, out: Path | None = None, progress: bool = True) -> AlignOutcome:
+    """Adjust a project and say how its bodies are to be turned; a new round where its inputs have changed."""
+    project = read(Path(folder))
+    if not project.alignment_tasks:
+        raise SurveyError(
+            f"{folder}/survey.toml: it does not say what is to be aligned; add for instance\n"
+            '[align.board]\nbody = "target:board"\nonto = "table:turntable"\ntolerance_arcsec = 60'
+        )
+    adjustment = adjust_project(project, progress)
+    sheets = working_sheets(adjustment, project.alignment_tasks, project.options.alpha)
+    place = (Path(out) if out is not None else Path(folder)) / "results"
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    rounds = _with_round(_rounds(place / ROUNDS), sheets, date)
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerows([ROUND_COLUMNS, *rounds])
+    atomic_write(place / ROUNDS, stream.getvalue())
+    atomic_write(place / PAGE, sheet_html(sheets, project.title or Path(folder).resolve().name, date, rounds))
+    return AlignOutcome(adjustment, sheets, place / PAGE)
+
+
+def _rounds(path: Path) -> list[list[str]]:
+    if not path.is_file():
+        return []
+    with path.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.reader(stream))
+    if not rows or tuple(rows[0]) != ROUND_COLUMNS:
+        raise SurveyError(f"{path}:1: this is no list of rounds; remove the file")
+    return rows[1:]
+
+
+def _with_round(rounds: list[list[str]], sheets: tuple[Sheet, ...], date: str) -> list[list[str]]:
+    """A row per sheet, unless its last round found the same."""
+    out = list(rounds)
+    for sheet in sheets:
+        numbers = [f"{x / ARCSEC:.2f}" for x in (*sheet.off, *(axis.sigma for axis in sheet.axes))]
+        row = [date, sheet.task.task_id, sheet.state, *numbers]
+        before = [r for r in rounds if r[1] == sheet.task.task_id]
+        if not before or before[-1][2:] != row[2:]:
+            out.append(row)
+    return out
