@@ -63,6 +63,7 @@ class BundleBatch:
         self._sort_observations()
         self._place_local_unknowns()
         self._prepared: gtsam.Values | None = None
+        self._damping = 0.0
         self._with_jacobians = False
         self.chi_square = 0.0
         self.hidden_decrease = 0.0  # of chi-square, by the step of what is hidden
@@ -184,12 +185,15 @@ class BundleBatch:
 
     def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
         """Evaluate at ``values`` (already loaded into the state). Raises IndeterminateError for undetermined points."""
+        if values is self._prepared and damping == self._damping and self._with_jacobians >= jacobians:
+            return
+        self._prepared = None
         self.chains.evaluate(self.state)
         self._rows(values, self.W)
         self.chi_square = float(self.chi.sum())
         if jacobians:
             self._condense(values, damping)
-        self._prepared, self._with_jacobians = values, jacobians
+        self._prepared, self._with_jacobians, self._damping = values, jacobians, damping
 
     def _condense(self, values: gtsam.Values, damping: float) -> None:
         s = self.state

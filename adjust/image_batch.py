@@ -198,6 +198,8 @@ class ImageBatch:
 
     def prepare(self, values: gtsam.Values, jacobians: bool) -> None:
         """Evaluate all blocks at ``values``; ``state`` must have been loaded from the same values."""
+        if values is self._prepared and self._with_jacobians >= jacobians:
+            return
         self.chains.evaluate(self.state)
         self._evaluate(self._all, jacobians)
         self._prepared, self._with_jacobians = values, jacobians
