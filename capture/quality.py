@@ -12,7 +12,7 @@ from survey.detection.detect import detect_image
 from survey.detection.gray import Gray32
 from survey.targets import DetectableTarget
 
-_LOOK_PX = 640  # longer side of the image in which targets are looked for
+_LOOK_PX = 400  # longer side of the image in which targets are looked for
 _SMOOTHING_PX = 1.0
 _EDGE_SHARE = 0.25  # of the strongest gradient: what counts as an edge
 _FEWEST_EDGE_PX = 50
@@ -44,12 +44,17 @@ def image_quality(frame: Frame, targets: Mapping[str, DetectableTarget] | None =
     """Quality of a frame, and the targets in it; without ``targets`` none is looked for."""
     full = float(2**frame.bits - 1)
     gray = frame.image.astype(np.float32)
-    points = {target_id: _found(frame.image, target) for target_id, target in (targets or {}).items()}
+    blur_px = edge_blur_px(gray)
+    # where nothing has an edge the finders would try long and in vain
+    points = {
+        target_id: np.zeros((0, 2)) if np.isnan(blur_px) else _found(frame.image, target)
+        for target_id, target in (targets or {}).items()
+    }
     return ImageQuality(
         float(gray.mean()) / full,
         float(np.quantile(gray[::3, ::3], 0.999)) / full,
         float(np.mean(frame.image >= full)),
-        edge_blur_px(gray),
+        blur_px,
         points,
     )
 

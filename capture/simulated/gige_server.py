@@ -96,7 +96,8 @@ def _lab_source(camera: Path, file: Path | None) -> ImageSource:
         with lock:
             return lab.image(camera.name, angles(), exposure_us, gain_db)
 
-    image(1.0, 0.0)  # compiled before anyone waits for it
+    lab.warm_up()  # a camera that does not answer for 3 s has lost its client
+    image(1.0, 0.0)
     threading.Thread(target=_look_ahead, args=(angles, image), daemon=True).start()
     return image
 

@@ -87,6 +87,11 @@ class SimulatedLab:
         image += np.float32(_NOISE_GRAY) * rng.standard_normal(image.shape, dtype=np.float32)
         return np.asarray(np.clip(np.rint(image), 0.0, 255.0), np.uint8)
 
+    def warm_up(self) -> None:
+        """Render a board and beacons once: the first time the renderer is compiled, which may take many seconds."""
+        for pose in self.poses[:1]:
+            self._light_at(pose.camera_ids[0], (pose.axis1_rad, pose.axis2_rad))
+
     def _light_at(self, camera_id: str, angles_rad: tuple[float, float]) -> _Light:
         key = (camera_id, round(angles_rad[0], 9), round(angles_rad[1], 9))
         if key in self._light:

@@ -94,10 +94,10 @@ class ImageFiles(DriverCamera):
     def fetch(self, timeout_s: float) -> Frame:
         """See ``Camera``."""
         self._require_armed("fetch")
-        if self._next >= len(self._files):
-            raise DisconnectedError(self.address, f"all {len(self._files)} images have been played", "arm it again")
         if self.triggered and self._asked <= self._next:
             raise FetchTimeoutError(self.address, f"no image within {timeout_s:g} s", "trigger it")
+        if self._next >= len(self._files):
+            raise DisconnectedError(self.address, f"all {len(self._files)} images have been played", "arm it again")
         self._next += 1
         return self._frame(self._image(self._next - 1), self._next, None)
 
