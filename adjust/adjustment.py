@@ -14,6 +14,7 @@ from adjust.precision import Precision, global_test, group_summaries, image_resi
 from adjust.result import Adjustment, Estimate, ParameterName
 from adjust.robust import limit, screen
 from adjust.solve import Solved, SolveOptions, solve
+from adjust.terrestrial.joint_start import find_all, needs_points
 from adjust.terrestrial.statistics import JoinedResiduals, reading_residuals
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
 
@@ -81,7 +82,7 @@ def rejections(survey: Survey) -> tuple[str, ...]:
 
 def _trusted(survey: Survey, options: AdjustOptions) -> tuple[Survey, StartValues, tuple[str, ...]]:
     """Start values; what the search refused gets a second chance with the lenses that the rest determines."""
-    found = find_start(survey)
+    found = find_all(survey) if needs_points(survey) else find_start(survey)
     if not found.excluded_blocks or not options.reject_blocks:
         return survey, start_values(found), ()
     kept = _without(survey, found.excluded_blocks)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from gtsam import Pose3
+from scipy import sparse
 from scipy.linalg import qr
 
 from adjust.errors import SurveyError
@@ -59,7 +60,11 @@ class Stacking:
 
     def index(self, keys: Iterable[int]) -> IntArray:
         """Positions of the components of ``keys``, one key after the other."""
-        return np.concatenate([np.arange(self.at[k].start, self.at[k].stop) for k in keys])
+        places = [self.at[k] for k in keys]
+        start = np.array([p.start for p in places], dtype=np.int64)
+        dims = np.array([p.stop for p in places], dtype=np.int64) - start
+        first = np.cumsum(dims) - dims
+        return np.asarray(np.repeat(start - first, dims) + np.arange(int(dims.sum())))
 
 
 def stacking(graph: AdjustmentGraph, keys: Sequence[int]) -> Stacking:
@@ -71,22 +76,24 @@ def stacking(graph: AdjustmentGraph, keys: Sequence[int]) -> Stacking:
     return Stacking(at, n)
 
 
+def whitened_rows(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> sparse.csr_matrix:
+    """The whitened Jacobian (m, n), columns as stacked; ``stack`` has all keys of ``linear``."""
+    i, j, value = np.asarray(linear.sparseJacobian_())  # counted from 1; keys in ascending order, then the right side
+    place = np.append(stack.index(sorted(stack.at)), stack.n)
+    rows = int(i.max()) if len(i) else 0
+    full = sparse.csr_matrix((value, (i.astype(np.int64) - 1, place[j.astype(np.int64) - 1])), (rows, stack.n + 1))
+    return full[:, : stack.n]
+
+
 def times(linear: gtsam.GaussianFactorGraph, stack: Stacking, V: FloatArray) -> FloatArray:
     """The whitened Jacobian times V (n, k), row after row."""
-    out = []
-    for i in range(linear.size()):
-        factor = linear.at(i)
-        out.append(factor.jacobian()[0] @ V[stack.index(factor.keys())])
-    return np.concatenate(out)
+    return np.asarray(whitened_rows(linear, stack) @ V)
 
 
 def normal_diagonal(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> FloatArray:
     """Diagonal (n,) of the normal matrix."""
-    out = np.zeros(stack.n)
-    for i in range(linear.size()):
-        factor = linear.at(i)
-        np.add.at(out, stack.index(factor.keys()), (factor.jacobian()[0] ** 2).sum(axis=0))
-    return out
+    A = whitened_rows(linear, stack)
+    return np.asarray(A.multiply(A).sum(axis=0)).ravel()
 
 
 @dataclass(frozen=True, eq=False)

@@ -133,6 +133,33 @@ class TreeCovariance:
         self._solve(np.arange(len(self._front), dtype=np.int64), x)
         return x
 
+    def full(self) -> FloatArray:
+        """The whole covariance matrix (n, n) of all unknowns, rows as :meth:`places` says, parents before children.
+
+        From the roots down: with Q of all that comes before, Q_f, = T Q_s, and Q_ff = R^-1 R^-T + T Q_sf. Costs the size
+        of the factor times n, by matrix products.
+        """
+        Q = np.zeros((self.n, self.n))
+        keys, ptr, first, dims = self._keys, self._key_ptr, self._first, self._dims
+        for c in range(len(self._front)):
+            nf, n = int(self._front[c]), int(self._width[c])
+            mine = keys[ptr[c] : ptr[c + 1]]
+            start = np.repeat(first[mine], dims[mine])
+            step = np.arange(n) - np.repeat(np.cumsum(dims[mine]) - dims[mine], dims[mine])
+            rows = start + step
+            done = int(rows[0])  # frontal keys are numbered where they first appear, cliques in their order
+            A = self._data[self._at[c] : self._at[c] + nf * n].reshape(nf, n)
+            own = slice(done, done + nf)
+            inverse = np.triu(A[:, :nf])
+            Q[own, own] = inverse @ inverse.T
+            if n > nf:
+                T = A[:, nf:]
+                across = T @ Q[rows[nf:], :done]
+                Q[own, :done] = across
+                Q[:done, own] = across.T
+                Q[own, own] += across[:, rows[nf:]] @ T.T
+        return Q
+
     def pairs(self, first: IntArray, second: IntArray, dim: int) -> FloatArray:
         """Joint covariances (p, 2 dim, 2 dim) of pairs of keys that share a factor; -1 stands for a constant.
 

@@ -31,6 +31,7 @@ from adjust.initial.views import (
 from adjust.model import FloatArray, Survey
 from adjust.observations import FrameRef, PositionRef
 from adjust.result import ParameterName
+from adjust.terrestrial.building import reading_refs
 from adjust.unknowns import Chain, FrameTree, Unknowns
 
 _ROUNDS = 3
@@ -94,7 +95,7 @@ class _Search:
             (self.network.observations if pair.used else self.doubtful).append(observation)
         refs = [ref for d in self.survey.distances for ref in (d.a, d.b)]
         refs += [ref for c in self.survey.coordinates for ref in c.positions]
-        refs += position_refs(self.survey)
+        refs += position_refs(self.survey) + reading_refs(self.survey)
         for frame in [*frame_refs(self.survey), *(ref.frame for ref in refs if ref.frame is not None)]:
             self.network.frames.world_from(frame)
 
