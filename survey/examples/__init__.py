@@ -12,6 +12,7 @@ EXAMPLES = {
     "full-lab": "three-camera head on a two-axis table, board, wall plates, beacons, relay station of four cameras",
     "stereo": "two cameras and a checkerboard held by hand",
     "one-camera": "one camera and a checkerboard held by hand",
+    "alignment": "board to be made parallel to a turntable by levels and a laser's trace; no images",
     "relay": "thirty stations through four rooms and a corridor, joined by measured pairs; no images",
 }
 
@@ -27,9 +28,9 @@ def write_example(name: str, folder: Path, *, seed: int = 1, jobs: int | None = 
         raise SurveyError(f"example {name!r}: unknown; choose one of {', '.join(EXAMPLES)}")
     from survey.examples.folders import MAKERS
     from survey.examples.pictures import write_images
-    from survey.examples.relay import relay_files
+    from survey.examples.plain import WITHOUT_IMAGES
 
-    draft, files = MAKERS[name](seed) if name in MAKERS else (None, relay_files(seed))
+    draft, files = MAKERS[name](seed) if name in MAKERS else (None, WITHOUT_IMAGES[name](seed))
     with whole_folder(Path(folder)) as place:
         for path, text in files.items():
             (place / path).parent.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,11 @@
+"""The examples without images, by name."""
+
+from collections.abc import Callable
+
+from survey.examples.alignment import alignment_files
+from survey.examples.relay import relay_files
+
+WITHOUT_IMAGES: dict[str, Callable[[int], dict[str, str]]] = {
+    "alignment": alignment_files,
+    "relay": relay_files,
+}
