@@ -19,7 +19,8 @@ NULL_EIGENVALUE = 1e-11
 class DenseResult:
     """points (n, 3) and sigmas (n, 3) by point; rows in the order readings, baselines (dx dy dz), coordinates.
 
-    adjusted: observed + linear residual. adjusted_sigmas, cofactors of residuals (variances), standardized: (m,).
+    residual_cov (m,): variances of the residuals. decorrelated (m,): the same numbers as GNU Gama forms them, from the
+    rows that the Cholesky factor of a correlated cluster has decorrelated; equal where nothing is correlated.
     last_step: m.
     """
 
@@ -32,6 +33,7 @@ class DenseResult:
     sigma: FloatArray
     residuals: FloatArray
     residual_cov: FloatArray
+    decorrelated: FloatArray
     adjusted_sigmas: FloatArray
     omega: float
     redundancy: int
@@ -123,7 +125,7 @@ class _Model:
             extra = (self.setup_column[r.setup_id], by_setup) if by_setup else None
             add(r.value, predicted, parts, r.kind in ("direction", "azimuth", "angle"), extra)
         place = {r.reading_id: k for k, r in enumerate(self.survey.readings)}
-        cov = sparse.lil_array(np.diag([r.sigma**2 for r in self.survey.readings]) if place else np.zeros((0, 0)))
+        cov = sparse.lil_array(sparse.diags_array(np.array([r.sigma**2 for r in self.survey.readings])))
         for joint in self.survey.reading_covariances:
             idx = [place[i] for i in joint.reading_ids]
             cov[np.ix_(idx, idx)] = joint.cov
@@ -178,6 +180,14 @@ def _cofactors(model: _Model, N: FloatArray) -> tuple[FloatArray, int]:
     return S @ Q @ S.T, int(null.sum())
 
 
+def _decorrelated(A: sparse.csr_array, Q: FloatArray, cov: sparse.csr_array) -> FloatArray:
+    """sigma^2 (1 - q) with q the diagonal of L^-1 A Q A' L^-T, cov = L L'."""
+    if cov.nnz == cov.shape[0]:
+        return cov.diagonal() - np.einsum("ij,ij->i", A @ Q, A.toarray())
+    B = np.linalg.solve(np.linalg.cholesky(cov.toarray()), A.toarray())
+    return cov.diagonal() * (1.0 - np.einsum("ij,ij->i", B @ Q, B))
+
+
 def dense_adjust(survey: Survey, start: dict[str, FloatArray], steps: int = 30, tolerance: float = 1e-9) -> DenseResult:
     """Gauss-Newton from ``start``; with ``steps=1`` one linearisation, as GNU Gama does it."""
     model = _Model(survey, start)
@@ -200,8 +210,43 @@ def dense_adjust(survey: Survey, start: dict[str, FloatArray], steps: int = 30, 
         p: np.array([sigma[model.columns[p, i]] if (p, i) in model.columns else 0.0 for i in range(3)])
         for p in model.x
     }
+    adjusted_sigmas = np.sqrt(np.clip(adjusted_cov, 0.0, None))
     return DenseResult(
         model.x, sigmas, Q, model.columns, dict(model.orientations), observed, np.sqrt(variances), v,
-        variances - adjusted_cov, np.sqrt(np.clip(adjusted_cov, 0.0, None)), float(v @ (P @ v)),
+        variances - adjusted_cov, _decorrelated(A, Q, cov), adjusted_sigmas, float(v @ (P @ v)),
         len(observed) - model.n + defect, defect, step,
     )  # fmt: skip
+
+
+def sparse_sigmas(survey: Survey, points: dict[str, FloatArray], chosen: list[tuple[str, int]]) -> FloatArray:
+    """A priori sigmas of some coordinates of a large spatial network, linearised at ``points``.
+
+    The datum is given, or inner over all points: then N is bordered by the motions that the readings do not see, three
+    translations and the rotation about z.
+    """
+    model = _Model(survey, points)
+    model.orient()
+    A, _, _, cov = model.system()
+    N = sparse.csc_array(A.T @ _inverse(cov) @ A)
+    scale = 1.0 / np.sqrt(N.diagonal())
+    D = sparse.diags_array(scale)
+    K = D @ N @ D
+    if survey.datum.kind == "inner":
+        motions = np.zeros((model.n, 4))
+        for (point, i), column in model.columns.items():
+            motions[column, i] = 1.0
+            motions[column, 3] = (-model.x[point][1], model.x[point][0], 0.0)[i]
+        sign = -1.0 if survey.bearings.clockwise else 1.0
+        border = np.linalg.qr(motions)[0]  # over the points alone: what the datum sums up
+        motions[list(model.setup_column.values()), 3] = sign
+        assert np.abs(A @ motions).max() < 1e-9 * np.abs(motions).max(), "no motion that the readings do not see"
+        B = sparse.csc_array(border * scale[:, None])
+        K = sparse.block_array([[K, B], [B.T, None]])
+    factors = sparse.linalg.splu(sparse.csc_array(K))
+    out = []
+    for name in chosen:
+        column = model.columns[name]
+        unit = np.zeros(K.shape[0])
+        unit[column] = 1.0
+        out.append(scale[column] * np.sqrt(factors.solve(unit)[column]))
+    return np.array(out)
