@@ -1,0 +1,73 @@
+"""Uncertainty budgets: which source of information makes how much of the uncertainty of a result (GUM, JCGM 100:2008).
+
+With Q the covariance of the unknowns and N_g the normal matrix of a source, Q = sum of Q N_g Q: what the errors of
+source g put into the result.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import norm
+from scipy.stats import t as student
+
+from adjust.errors import SurveyError
+from adjust.model import FloatArray, IntArray
+from adjust.result import Adjustment, ParameterName
+from adjust.statistics.result import BudgetEntry, BudgetLine, VarianceComponents
+from adjust.statistics.system import LinearSystem, linear_system
+from adjust.statistics.weakness import covariance_columns
+
+
+def uncertainty_budget(
+    adjustment: Adjustment, names: Sequence[ParameterName], level: float = 0.95,
+    components: VarianceComponents | None = None, system: LinearSystem | None = None,
+) -> tuple[BudgetEntry, ...]:  # fmt: skip
+    """Budget of every free component of these unknowns. Priors count one by one, observations by group.
+
+    components: of the variances that the adjustment was made with; sources among them that were estimated are type A
+    with their degrees of freedom, all others type B. level: of the expanded uncertainty; the coverage factor is
+    Student's with the effective degrees of freedom (GUM, G.4). Raises SurveyError for what is no unknown.
+    """
+    system = system or linear_system(adjustment)
+    lost = [n for n in names if n not in system.columns.at]
+    if lost:
+        raise SurveyError(f"{' '.join(lost[0])} is no unknown of this adjustment; a budget needs one")
+    index = system.columns.of(names)
+    sources, of_row = _sources(system)
+    estimated = components.components if components is not None else ()
+    kinds = {c.group: c.freedom for c in estimated if c.status in ("estimated", "unseparable")}
+    used = system.used[system.row_of]
+    effects = np.asarray(system.A[used] @ covariance_columns(system, index)) ** 2
+    squares = np.zeros((len(sources), len(index)))
+    np.add.at(squares, of_row[used], effects)
+    return tuple(_entry(system, int(column), squares[:, i], sources, kinds, level) for i, column in enumerate(index))
+
+
+def _sources(system: LinearSystem) -> tuple[list[str], IntArray]:
+    """Names of all sources, and that of every row (m,): a group, or a single prior."""
+    names = list(system.group_names)
+    of_observation = system.group.copy()
+    for i, item in enumerate(system.precision.graph.others):
+        if item.kind == "prior":
+            of_observation[system.n_image + i] = len(names)
+            names.append(f"prior {' '.join(item.ids)}")
+    return names, of_observation[system.row_of]
+
+
+def _entry(
+    system: LinearSystem, column: int, squares: FloatArray,
+    sources: Sequence[str], freedoms: dict[str, float], level: float,
+) -> BudgetEntry:  # fmt: skip
+    total = float(squares.sum())
+    lines = tuple(
+        BudgetLine(sources[g], "A" if sources[g] in freedoms else "B", float(np.sqrt(squares[g])),
+                   float(squares[g] / total), freedoms.get(sources[g], float("inf")))
+        for g in np.argsort(-squares, kind="stable") if squares[g] > 0.0
+    )  # fmt: skip
+    loss = sum(line.u**4 / line.freedom for line in lines)
+    freedom = total**2 / loss if loss > 0.0 else float("inf")
+    coverage = float(student.ppf(0.5 + 0.5 * level, freedom) if np.isfinite(freedom) else norm.ppf(0.5 + 0.5 * level))
+    u = float(np.sqrt(total))
+    c = system.columns
+    what = c.names[column], c.components[column], c.units[column]
+    return BudgetEntry(*what, u, freedom, level, coverage, coverage * u, lines)

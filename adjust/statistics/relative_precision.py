@@ -1,0 +1,179 @@
+"""Confidence ellipsoids, and the precision of one point, station or camera relative to another."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from gtsam import Pose3
+from scipy.stats import chi2
+from scipy.stats import f as fisher
+
+from adjust.errors import SurveyError
+from adjust.factors import ChainPose
+from adjust.graph import GraphBuilder
+from adjust.model import FloatArray
+from adjust.observations import FrameRef
+from adjust.pair_screen import values_of
+from adjust.result import Adjustment, ParameterName
+from adjust.statistics.result import Ellipsoid, RelativePrecision
+
+_HELD = 1e-16
+"""Variance (m^2) of what is held, (10 nm)^2."""
+Place = ParameterName | FrameRef
+
+
+def ellipsoid(
+    cov: FloatArray, level: float = 0.95, sigma0: float | None = None, redundancy: int = 0
+) -> Ellipsoid:
+    """Confidence region of a position with covariance (3, 3) or, of x and y alone, (2, 2); m^2.
+
+    With sigma0 (and its redundancy) the covariance is scaled by it and Fisher's F stands for chi-square.
+    """
+    values, vectors = np.linalg.eigh(0.5 * (cov + cov.T))
+    kept = values > _HELD
+    values, vectors = values[kept][::-1], vectors[:, kept][:, ::-1]
+    axes = np.zeros((3, len(values)))
+    axes[: len(cov)] = vectors
+    k = max(1, len(values))
+    if sigma0 is not None and redundancy > 0:
+        quantile = k * float(fisher.ppf(level, k, redundancy)) * sigma0**2
+    else:
+        quantile = float(chi2.ppf(level, k))
+    return Ellipsoid(np.sqrt(quantile * values), axes, level, sigma0 is not None and redundancy > 0)
+
+
+def point_ellipsoid(
+    adjustment: Adjustment, name: Place, level: float = 0.95, scaled: bool = False
+) -> Ellipsoid:
+    """Of a point's coordinates or a pose's origin, in world axes."""
+    place = _Places(adjustment).place(name)
+    return ellipsoid(place.cov(adjustment), level, *_scale(adjustment, scaled))
+
+
+def relative_precision(
+    adjustment: Adjustment, pairs: Sequence[tuple[Place, Place]], level: float = 0.95, scaled: bool = False
+) -> tuple[RelativePrecision, ...]:
+    """Of b relative to a, for every pair (a, b).
+
+    Places are names of unknowns that are points or poses in the world, or frames (cameras, stations on a table ...).
+    Raises SurveyError for a name that is no position.
+    """
+    places = _Places(adjustment)
+    return tuple(_relative(adjustment, places.place(a), places.place(b), level, scaled) for a, b in pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A position x (3,), its axes R (3, 3), and derivatives (6, dim) by unknowns: turn (own axes), x (world)."""
+
+    name: ParameterName
+    x: FloatArray
+    R: FloatArray | None
+    by: dict[ParameterName, FloatArray]
+
+    def cov(self, adjustment: Adjustment) -> FloatArray:
+        """Of x (3, 3)."""
+        names = list(self.by)
+        if not names:
+            return np.zeros((3, 3))
+        J = np.hstack([self.by[n][3:] for n in names])
+        return np.asarray(J @ adjustment.precision.joint(names) @ J.T)
+
+
+class _Places:
+    """Positions by name or frame; the frames of a survey are built when one is asked for."""
+
+    def __init__(self, adjustment: Adjustment) -> None:
+        self.adjustment = adjustment
+        self.builder: GraphBuilder | None = None
+
+    def place(self, what: Place) -> _Place:
+        if isinstance(what, FrameRef):
+            return self._frame(what)
+        estimate = self.adjustment.estimates.get(what)
+        if estimate is None or what[0] not in ("point", "world_from_station", "world_from_table"):
+            raise SurveyError(f"{' '.join(what)}: no such position was adjusted; name a point, a station or a frame")
+        if isinstance(estimate.value, Pose3) and not np.isfinite(estimate.value.translation()).all():
+            raise SurveyError(f"{' '.join(what)}: only its rotation was measured; there is no position to compare")
+        held = np.array([s == "held" for s in estimate.status], dtype=np.bool_)
+        if isinstance(estimate.value, Pose3):
+            R, x = estimate.value.rotation().matrix(), np.asarray(estimate.value.translation())
+            J = np.zeros((6, 6))
+            J[:3, :3], J[3:, 3:] = np.eye(3), R
+            return _Place(what, x, R, {} if held.all() else {what: J * ~held})
+        J = np.zeros((6, 3))
+        J[3:] = np.eye(3)
+        return _Place(what, np.asarray(estimate.value), None, {} if held.all() else {what: J * ~held})
+
+    def _frame(self, ref: FrameRef) -> _Place:
+        if self.builder is None:
+            start = values_of(self.adjustment)
+            self.builder = GraphBuilder(self.adjustment.survey, start.lenses)
+            self.graph = self.builder.build(start)
+        unknowns = self.graph.unknowns
+        chain = self.builder.frames.relative(ref, FrameRef("world"))
+        pose, jacobians = ChainPose(unknowns, self.graph.state, chain)(self.graph.start)
+        R, by = pose.rotation().matrix(), dict[ParameterName, FloatArray]()
+        for key, D in jacobians:
+            J = np.vstack([D[:3], R @ D[3:]])
+            J[:, list(unknowns.held.get(key, ()))] = 0.0
+            name = unknowns.by_key[key].name
+            by[name] = by[name] + J if name in by else J
+        called: ParameterName = (ref.kind, ref.frame_id) + ((ref.epoch_id,) if ref.epoch_id else ())
+        return _Place(called, np.asarray(pose.translation()), R, by)
+
+
+def _scale(adjustment: Adjustment, scaled: bool) -> tuple[float | None, int]:
+    known = scaled and adjustment.redundancy > 0
+    return (adjustment.sigma0 if known else None), adjustment.redundancy
+
+
+def _relative(adjustment: Adjustment, a: _Place, b: _Place, level: float, scaled: bool) -> RelativePrecision:
+    names = list(dict.fromkeys([*a.by, *b.by]))
+    dims = {n: J.shape[1] for p in (a, b) for n, J in p.by.items()}
+    turned = a.R is not None and b.R is not None
+    back = b.R.T @ a.R if a.R is not None and b.R is not None else np.eye(3)
+    columns = []
+    for n in names:
+        of_a, of_b = (p.by.get(n, np.zeros((6, dims[n]))) for p in (a, b))
+        columns.append(np.vstack([of_b[:3] - back @ of_a[:3], of_b[3:] - of_a[3:]]))
+    cov = np.zeros((6, 6))
+    if names:
+        J = np.hstack(columns)
+        cov = J @ np.asarray(adjustment.precision.joint(names)) @ J.T
+    d, own = b.x - a.x, cov[3:, 3:]
+    length = float(np.linalg.norm(d))
+    u = d / length if length > 0.0 else np.zeros(3)
+    scale = _scale(adjustment, scaled)
+    flat = ellipsoid(own[:2, :2], level, *scale)
+    return RelativePrecision(
+        a.name, b.name, d, own, length, float(np.sqrt(max(0.0, float(u @ own @ u)))), ellipsoid(own, level, *scale),
+        flat if flat.dimension == 2 else None, cov[:3, :3] if turned else None,
+    )  # fmt: skip
+
+
+def relative_sigmas(adjustment: Adjustment, names: Sequence[ParameterName]) -> tuple[FloatArray, FloatArray]:
+    """Of all pairs of points (n, n): sigma of their distance, and the largest sigma of their relative position; m."""
+    places = _Places(adjustment)
+    found = [places.place(n) for n in names]
+    n = len(found)
+    x = np.array([p.x for p in found])
+    free = list(dict.fromkeys(k for p in found for k in p.by))
+    Q = np.zeros((3 * n, 3 * n))
+    if free:
+        joint = np.asarray(adjustment.precision.joint(free))
+        dims = {k: p.by[k].shape[1] for p in found for k in p.by}
+        at = dict(zip(free, np.cumsum([0] + [dims[k] for k in free])[:-1].tolist(), strict=True))
+        J = np.zeros((3 * n, len(joint)))
+        for i, p in enumerate(found):
+            for k, D in p.by.items():
+                J[3 * i : 3 * i + 3, at[k] : at[k] + dims[k]] = D[3:]
+        Q = J @ joint @ J.T
+    blocks = Q.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
+    own = blocks[np.arange(n), np.arange(n)]
+    cov = own[:, None] + own[None, :] - blocks - blocks.transpose(0, 1, 3, 2)
+    d = x[None, :] - x[:, None]
+    length = np.linalg.norm(d, axis=2)
+    u = np.divide(d, length[..., None], out=np.zeros_like(d), where=length[..., None] > 0.0)
+    along = np.sqrt(np.maximum(0.0, np.einsum("abi,abij,abj->ab", u, cov, u)))
+    return along, np.sqrt(np.maximum(0.0, np.linalg.eigvalsh(cov)[..., -1]))
