@@ -5,6 +5,7 @@
 """
 
 import json
+import secrets
 from dataclasses import asdict
 from pathlib import Path
 
@@ -49,13 +50,17 @@ def write_lab(folder: Path, seed: int, size: LabSize = _DEFAULT) -> SimulatedLab
     return lab
 
 
-def read_lab(folder: Path) -> SimulatedLab:
-    """The laboratory of a folder. Raises SurveyError where the folder holds none."""
+def read_lab(folder: Path, noise_seed: int | None = None) -> SimulatedLab:
+    """The laboratory of a folder, with noise of its own unless ``noise_seed`` says which.
+
+    Raises SurveyError where the folder holds none.
+    """
     file = Path(folder) / LAB
     try:
         told = json.loads(file.read_text(encoding="utf-8"))
         poses = (LabPose(**{**pose, "camera_ids": tuple(pose["camera_ids"])}) for pose in told["poses"])
-        return furnished_lab(int(told["seed"]), tuple(poses))
+        noise_seed = secrets.randbits(32) if noise_seed is None else noise_seed
+        return furnished_lab(int(told["seed"]), tuple(poses), noise_seed)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SurveyError(f"{file}: no simulated laboratory ({error}); write one first") from error
 

@@ -57,11 +57,12 @@ class LabSize:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedLab:
-    """See the module. ``truth`` has the name and the value of everything, as in ``survey.simulate``."""
+    """See the module. ``noise_seed``: of the noise of the images, one for each process that plays a camera."""
 
     draft: Draft
     seed: int
     poses: tuple[LabPose, ...]
+    noise_seed: int = 0
     _light: OrderedDict[tuple[str, float, float], _Light] = field(default_factory=OrderedDict, repr=False)
     _numbers: dict[str, "count[int]"] = field(default_factory=dict, repr=False)
 
@@ -83,7 +84,7 @@ class SimulatedLab:
         image = room * np.float32(gain * exposure_us / ROOM_EXPOSURE_US)
         image += beacons * np.float32(gain * exposure_us / BEACON_EXPOSURE_US)
         number = next(self._numbers.setdefault(camera_id, count()))
-        rng = np.random.default_rng((self.seed, CAMERA_IDS.index(camera_id), number))
+        rng = np.random.default_rng((self.noise_seed, CAMERA_IDS.index(camera_id), number))
         image += np.float32(_NOISE_GRAY) * rng.standard_normal(image.shape, dtype=np.float32)
         return np.asarray(np.clip(np.rint(image), 0.0, 255.0), np.uint8)
 
@@ -161,11 +162,11 @@ def make_lab(seed: int, size: LabSize = _DEFAULT) -> SimulatedLab:
     return furnished_lab(seed, tuple(poses))
 
 
-def furnished_lab(seed: int, poses: tuple[LabPose, ...]) -> SimulatedLab:
+def furnished_lab(seed: int, poses: tuple[LabPose, ...], noise_seed: int = 0) -> SimulatedLab:
     """The laboratory of that seed, its positions known already (looking for them takes seconds)."""
     draft = _room(seed, beacons=any(p.exposure_us == BEACON_EXPOSURE_US for p in poses))
     _halve_images(draft)
-    return SimulatedLab(draft, seed, poses)
+    return SimulatedLab(draft, seed, poses, noise_seed)
 
 
 def _room(seed: int, beacons: bool) -> Draft:

@@ -16,7 +16,7 @@ from capture.trigger_set import TriggerSet
 from tests.capture.camera_helpers import GIGE, gige_port, number_in, open_camera, set_up
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def port() -> Iterator[None]:
     with gige_port():
         yield
