@@ -1,7 +1,7 @@
 """The quality of the images just taken, looked at in a thread of its own so that the table need not wait for it.
 
-Every image gives a line of ``capture/quality.jsonl``: for the web page, and for the coverage after a restart. The file is
-no record: what a crash takes of it is only not shown.
+Every image gives a line of ``capture/quality.jsonl``: for the web page, and for the coverage after a restart. The file
+is no record: what a crash takes of it is only not shown.
 """
 
 import json

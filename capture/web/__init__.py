@@ -1,0 +1,1 @@
+"""A local web page that shows a session, or what the cameras see now."""

@@ -1,0 +1,185 @@
+"""The web server of ``labcapture view``: loopback only, read-only unless moving was allowed at the start.
+
+A page of another site that the same browser shows must not reach it: the Host header has to name this machine (else DNS
+rebinding would do), commands need a token that only the printed address holds, and no other origin is accepted.
+"""
+
+import ipaddress
+import json
+import secrets
+import signal
+import socket
+import threading
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from adjust.errors import SurveyError
+from capture.plan import read_plan
+from capture.web.state import FolderView, LiveView, View, png_with_overlay
+
+_FILES = {
+    "/": ("page.html", "text/html"),
+    "/style.css": ("style.css", "text/css"),
+    "/app.js": ("app.js", "text/javascript"),
+}
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+_LONGEST_BODY = 4096
+_ENDINGS = {signal.SIGINT, signal.SIGTERM}
+
+
+def loopback_address(host: str) -> str:
+    """The address to listen on; raises SurveyError for anything that others could reach."""
+    text = "127.0.0.1" if host == "localhost" else host
+    try:
+        address = ipaddress.ip_address(text)
+    except ValueError as error:
+        raise SurveyError(f"--host {host!r}: not an address; the page is served on 127.0.0.1 or ::1") from error
+    if not address.is_loopback:
+        raise SurveyError(
+            f"--host {host}: others could reach the laboratory there; the page is served on loopback only, so from "
+            "another machine go through: ssh -L 8780:127.0.0.1:8780 THIS_MACHINE"
+        )
+    return text
+
+
+class PageServer(ThreadingHTTPServer):
+    """Serves one view. token: what commands must bring; None where nothing may be commanded."""
+
+    daemon_threads = True
+
+    def __init__(self, view: View, host: str = "127.0.0.1", port: int = 0, token: str | None = None) -> None:
+        self.view, self.token = view, token
+        address = loopback_address(host)
+        if ":" in address:
+            self.address_family = socket.AF_INET6
+        try:
+            super().__init__((address, port), _Handler)
+        except OSError as error:
+            raise SurveyError(f"port {port} cannot be used ({error.strerror}); name another with --port") from error
+
+    @property
+    def url(self) -> str:
+        """Where the page is, without the token."""
+        host, port = self.server_address[:2]
+        text = host.decode() if isinstance(host, bytes | bytearray) else str(host)
+        return f"http://[{text}]:{port}/" if ":" in text else f"http://{text}:{port}/"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: PageServer
+    timeout = 30
+
+    def do_GET(self) -> None:
+        """Page, status, images."""
+        path = urlsplit(self.path).path
+        if not self._is_from_here():
+            return
+        if path in _FILES:
+            name, kind = _FILES[path]
+            self._answer((Path(__file__).parent / name).read_bytes(), f"{kind}; charset=utf-8")
+        elif path == "/status.json":
+            status = {**self.server.view.status(), "may_move": self.server.token is not None}
+            self._answer(json.dumps(status).encode(), "application/json")
+        elif path.startswith("/image/") and path.endswith(".png"):
+            shown = self.server.view.shown(unquote(path.removeprefix("/image/").removesuffix(".png")))
+            if shown is None:
+                self._refuse(HTTPStatus.NOT_FOUND, "no image yet")
+            else:
+                self._answer(png_with_overlay(shown), "image/png")
+        else:
+            self._refuse(HTTPStatus.NOT_FOUND, "no such page")
+
+    def do_POST(self) -> None:
+        """Commands to the table."""
+        if not self._is_from_here() or not self._may_move():
+            return
+        try:
+            length = int(self.headers.get("Content-Length", "0"))
+            if not 0 <= length <= _LONGEST_BODY:
+                raise ValueError(f"{length} bytes")
+            body = json.loads(self.rfile.read(length) or b"{}")
+            words = [str(word) for word in body.get("jog", [])]
+        except (ValueError, AttributeError, TypeError) as error:
+            return self._refuse(HTTPStatus.BAD_REQUEST, f"not understood: {error}")
+        path = urlsplit(self.path).path
+        try:
+            if path == "/stop":
+                self.server.view.stop()
+            elif path == "/jog":
+                self.server.view.jog(words)
+            else:
+                return self._refuse(HTTPStatus.NOT_FOUND, "no such command")
+        except SurveyError as error:
+            return self._refuse(HTTPStatus.CONFLICT, str(error))
+        return self._answer(b"{}", "application/json")
+
+    def _is_from_here(self) -> bool:
+        """Whether the browser believes to talk to this machine, and no page of another site talks through it."""
+        allowed = {f"{name}:{self.server.server_address[1]}" for name in ("127.0.0.1", "localhost", "[::1]")}
+        host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
+        if host in allowed and (origin is None or origin.removeprefix("http://") in allowed):
+            return True
+        self._refuse(HTTPStatus.FORBIDDEN, "this page is for this machine only")
+        return False
+
+    def _may_move(self) -> bool:
+        token = self.server.token
+        if token is None:
+            self._refuse(HTTPStatus.FORBIDDEN, "read-only; start it with --live --allow-move to turn the table")
+            return False
+        if not secrets.compare_digest(self.headers.get("X-Token", "").encode(), token.encode()):
+            self._refuse(HTTPStatus.FORBIDDEN, "the token is missing or wrong; use the address that was printed")
+            return False
+        return True
+
+    def _refuse(self, status: HTTPStatus, reason: str) -> None:
+        self._answer(json.dumps({"error": reason}).encode(), "application/json", status)
+
+    def _answer(self, data: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
+        self.send_response(status)
+        for name, value in {"Content-Type": kind, "Content-Length": str(len(data)), **_HEADERS}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Requests are not worth a line each."""
+
+
+def serve(
+    path: Path, *, host: str, port: int, live: bool, allow_move: bool, say: Callable[[str], None]
+) -> int:
+    """Serve until Ctrl-C; the exit code. Raises SurveyError."""
+    plan = read_plan(path)
+    loopback_address(host)
+    if allow_move and not live:
+        raise SurveyError("--allow-move needs --live: while a session runs, the session alone moves the table")
+    token = secrets.token_urlsafe(16) if allow_move else None
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDINGS)  # in all threads from here on: this one waits for them
+    try:
+        view: View = LiveView(plan, allow_move) if live else FolderView(plan)
+    except BaseException:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        raise
+    try:
+        with PageServer(view, host, port, token) as server:
+            print(server.url + (f"#{token}" if token else ""), flush=True)
+            say("Ctrl-C ends it")
+            threading.Thread(target=server.serve_forever, daemon=True).start()
+            signal.sigwait(_ENDINGS)
+            if token is not None:
+                view.stop()
+            server.shutdown()
+    finally:
+        view.close()
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return 0

@@ -1,0 +1,228 @@
+"""What the page shows: from the files of a project while a session works on it, or live from cameras and table."""
+
+import json
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from adjust.errors import SurveyError
+from adjust.model import FloatArray
+from capture.camera import GrayImage
+from capture.drivers.turntables.moving import MovingTable
+from capture.plan import CapturePlan
+from capture.plan_table import make_table
+from capture.quality import Coverage, image_quality
+from capture.session_cameras import PlannedCameras
+from capture.session_folder import FolderLock, lock_holder
+from capture.session_progress import status_path
+from capture.session_quality import coverages, read_qualities, targets_by_camera
+from capture.session_resume import last_readback
+from capture.table_jobs import jog_target, table_status
+
+_LIVE_S = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """An image and the target points (n, 2) px in it."""
+
+    image: GrayImage
+    points: FloatArray
+
+
+class View(Protocol):
+    """What the server asks for."""
+
+    def status(self) -> dict[str, Any]:
+        """Progress, quality and coverage as plain values."""
+        ...
+
+    def shown(self, camera_id: str) -> Shown | None:
+        """The last image of a camera; None where there is none yet."""
+        ...
+
+    def jog(self, words: list[str]) -> None:
+        """Turn the table, as ``labcapture table --jog``."""
+        ...
+
+    def stop(self) -> None:
+        """Stop the table."""
+        ...
+
+    def close(self) -> None:
+        """Let go of everything."""
+        ...
+
+
+def _coverage_dict(found: Mapping[str, Coverage]) -> dict[str, Any]:
+    return {
+        name: {"cells": list(c.cells), "hit": sorted(map(list, c.hit)), "share": round(c.share, 4)}
+        for name, c in found.items()
+    }
+
+
+class FolderView:
+    """Read-only: all from the files that a session writes."""
+
+    def __init__(self, plan: CapturePlan) -> None:
+        self._plan = plan
+
+    def status(self) -> dict[str, Any]:
+        """See ``View``."""
+        told: dict[str, Any] = {}
+        with suppress(OSError, ValueError):
+            told = json.loads(status_path(self._plan.project).read_text(encoding="utf-8"))
+        running = lock_holder(self._plan.project)
+        if running is None and told.get("state") in ("running", "paused"):
+            told |= {"state": "broken off", "message": "the session's process has ended; start it again to go on"}
+        rows = read_qualities(self._plan.project)
+        return {
+            "state": "not started",
+            "total": len(self._plan.shots),
+            "done": 0,
+            **told,
+            "live": False,
+            "cameras": [camera.camera_id for camera in self._plan.cameras],
+            "coverage": _coverage_dict(coverages(rows)),
+        }
+
+    def shown(self, camera_id: str) -> Shown | None:
+        """See ``View``."""
+        status = self.status()
+        path = status.get("images", {}).get(camera_id)
+        read = None if path is None else cv2.imread(str(self._plan.project / path), cv2.IMREAD_UNCHANGED)
+        if read is None:
+            return None
+        image: GrayImage = np.asarray(read, np.uint16) if read.dtype == np.uint16 else np.asarray(read, np.uint8)
+        epoch_id = status["epoch_id"]
+        for row in reversed(read_qualities(self._plan.project)):
+            if (row["camera_id"], row["epoch_id"]) == (camera_id, epoch_id):
+                points = [np.array(uv, float).reshape(-1, 2) for uv in row["points"].values()]
+                return Shown(image, np.concatenate([np.zeros((0, 2)), *points]))
+        return Shown(image, np.zeros((0, 2)))
+
+    def jog(self, words: list[str]) -> None:
+        """See ``View``."""
+        raise SurveyError("the page shows a project only; start it with --live --allow-move to turn the table")
+
+    def stop(self) -> None:
+        """See ``View``."""
+        raise SurveyError("the page only shows a project; stop its session with Ctrl-C or labcapture table PLAN --stop")
+
+    def close(self) -> None:
+        """See ``View``."""
+
+
+class LiveView:
+    """Cameras, and the table where moving is allowed, held by this process; the project's lock keeps sessions away."""
+
+    def __init__(self, plan: CapturePlan, with_table: bool) -> None:
+        self._plan, self._targets = plan, targets_by_camera(plan)
+        self._shown: dict[str, Shown] = {}
+        self._quality: dict[str, Any] = {}
+        self._coverage: dict[str, Coverage] = {}
+        self._message, self._ending = "", threading.Event()
+        self._lock = FolderLock(plan.project)
+        self._lock.acquire()
+        self._table: MovingTable | None = None
+        trigger = "free" if plan.options.trigger == "hardware" else plan.options.trigger
+        self._cameras = PlannedCameras(plan.cameras, trigger)
+        try:
+            if with_table and plan.table is not None:
+                self._table = make_table(plan.table, last_readback(plan.project))
+                self._table.open()
+            self._cameras.open()
+        except BaseException:
+            self.close()
+            raise
+        self._worker = threading.Thread(target=self._look, name="live images", daemon=True)
+        self._worker.start()
+
+    def _look(self) -> None:
+        while not self._ending.wait(_LIVE_S):
+            try:
+                for camera_id, frame in self._cameras.take(self._plan.options.fetch_timeout_s).items():
+                    found = image_quality(frame, self._targets(camera_id))
+                    uv = np.concatenate([np.zeros((0, 2)), *found.points.values()])
+                    height, width = frame.image.shape
+                    covered = self._coverage.get(camera_id, Coverage((width, height)))
+                    self._coverage[camera_id] = covered.with_points(uv)
+                    self._shown[camera_id] = Shown(frame.image, uv)
+                    self._quality[camera_id] = {
+                        "blur_px": round(found.blur_px, 3) if found.blur_px == found.blur_px else None,
+                        "brightness": round(found.brightness, 4),
+                        "saturated": round(found.saturated, 6),
+                        "targets": {name: len(points) for name, points in found.points.items()},
+                    }
+                self._message = ""
+            except SurveyError as error:
+                self._message = str(error)
+                with suppress(SurveyError):
+                    self._cameras.recover(reopen=True)
+                self._ending.wait(1.0)
+
+    def status(self) -> dict[str, Any]:
+        """See ``View``."""
+        table: dict[str, Any] | None = None
+        if self._table is not None:
+            try:
+                table = table_status(self._table, self._plan)
+            except SurveyError as error:
+                self._message = str(error)
+        return {
+            "state": "live",
+            "message": self._message,
+            "live": True,
+            "cameras": [camera.camera_id for camera in self._plan.cameras],
+            "quality": dict(self._quality),
+            "coverage": _coverage_dict(dict(self._coverage)),
+            "table": table,
+            "time": time.monotonic(),
+        }
+
+    def shown(self, camera_id: str) -> Shown | None:
+        """See ``View``."""
+        return self._shown.get(camera_id)
+
+    def jog(self, words: list[str]) -> None:
+        """See ``View``; returns when the move has begun."""
+        if self._table is None:
+            raise SurveyError("no table is held; start the page with --live --allow-move and a plan that has one")
+        self._table.set(jog_target(self._table, words))
+
+    def stop(self) -> None:
+        """See ``View``."""
+        if self._table is not None:
+            self._table.stop()
+
+    def close(self) -> None:
+        """See ``View``."""
+        self._ending.set()
+        if hasattr(self, "_worker"):
+            self._worker.join(10.0)
+        self._cameras.close()
+        if self._table is not None:
+            self._table.close()
+        self._lock.release()
+
+
+def png_with_overlay(shown: Shown, longest_px: int = 900) -> bytes:
+    """The image in 8 bit, made smaller, with its target points ringed."""
+    image = shown.image
+    gray = image if image.dtype == np.uint8 else np.clip(image / max(float(image.max()), 1.0) * 255.0, 0, 255)
+    factor = min(1.0, longest_px / max(image.shape))
+    size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
+    small = cv2.resize(gray.astype(np.uint8), size, interpolation=cv2.INTER_AREA)
+    picture = np.asarray(cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), np.uint8)
+    for u, v in (shown.points + 0.5) * factor - 0.5:
+        cv2.circle(picture, (round(u * 16), round(v * 16)), 4 * 16, (60, 200, 60), 1, cv2.LINE_AA, 4)
+    done, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not done:
+        raise ValueError("no PNG")
+    return data.tobytes()
