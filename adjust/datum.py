@@ -197,17 +197,24 @@ def inner_datum(graph: AdjustmentGraph, base: gtsam.Values) -> InnerDatum | None
         return None
     by_key = graph.unknowns.by_key
     motions = survey_motions(graph, base, directions)
+    rows = datum_rows(keys, motions)
+    minimal = minimal_datum(graph, stack, weights, motions)
+    kinds = {k: by_key[k].kind for k in [*keys, *minimal]}
+    sigma = float(1.0 / np.median(np.concatenate([w for _, w in minimal.values()])))
+    return InnerDatum(keys, rows, base, kinds, directions, sigma, minimal)
+
+
+def datum_rows(keys: Sequence[int], motions: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
+    """Orthonormal rows (k, dim per key) that forbid the motions (dim, k) of ``keys``; raises SurveyError."""
     Q, triangular = np.linalg.qr(np.concatenate([motions[k] for k in keys]))
     if np.abs(np.diag(triangular)).min() < 1e-9 * np.abs(triangular).max():
         raise SurveyError("the points and stations named for the inner datum cannot carry it; name three points")
     rows, o = {}, 0
     for key in keys:
-        rows[key] = Q[o : o + by_key[key].dim].T.copy()
-        o += by_key[key].dim
-    minimal = minimal_datum(graph, stack, weights, motions)
-    kinds = {k: by_key[k].kind for k in [*keys, *minimal]}
-    sigma = float(1.0 / np.median(np.concatenate([w for _, w in minimal.values()])))
-    return InnerDatum(keys, rows, base, kinds, directions, sigma, minimal)
+        dim = len(motions[key])
+        rows[key] = Q[o : o + dim].T.copy()
+        o += dim
+    return rows
 
 
 def minimal_datum(

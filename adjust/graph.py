@@ -136,6 +136,7 @@ class GraphBuilder:
         self.terrestrial = collect_terrestrial(survey, self.unknowns)
         self.frames = FrameTree(survey, self.unknowns)
         self.point_ids = [p.point_id for p in survey.points]
+        self.known_ids = set(self.point_ids)
         self.targets = {t.target_id: t for t in survey.targets}
         self.others: list[ObservationFactor] = []
         self.vector_starts: dict[ParameterName, FloatArray] = {}
@@ -236,7 +237,7 @@ class GraphBuilder:
 
     def _position_chain(self, ref: PositionRef) -> Chain | None:
         if ref.frame is None:
-            if ref.point_id not in set(self.point_ids):
+            if ref.point_id not in self.known_ids:
                 raise SurveyError(f"point {ref.point_id!r} is observed but not part of the survey; add it under points")
             return None
         return self.frames.relative(ref.frame, FrameRef("world"))

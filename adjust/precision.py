@@ -69,6 +69,16 @@ class Precision:
             out |= bundle.hidden_products(product[tree.rows(bundle.interface)], hidden)
         return out
 
+    def datum_products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
+        """The same as :meth:`products`, of the covariance in the survey's datum: S Q S' times rows."""
+        found, t = self.products(rows), self.transformation
+        if t is None:
+            return found
+        moved = np.sum([row @ t.motions[key] for key, row in rows.items()], axis=0)
+        spread = np.sum([row @ t.spread[key] for key, row in rows.items()], axis=0)
+        return {key: H - t.motions[key] @ spread.T - t.spread[key] @ moved.T + t.motions[key] @ t.core @ moved.T
+                for key, H in found.items()}  # fmt: skip
+
     def _bundle(self) -> None:
         bundle = self.graph.bundle
         if bundle is None:
