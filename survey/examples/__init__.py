@@ -12,6 +12,7 @@ EXAMPLES = {
     "full-lab": "three-camera head on a two-axis table, board, wall plates, beacons, relay station of four cameras",
     "stereo": "two cameras and a checkerboard held by hand",
     "one-camera": "one camera and a checkerboard held by hand",
+    "total-station": "beacons of a laboratory by total station, caliper and levelling; no images",
     "alignment": "board to be made parallel to a turntable by levels and a laser's trace; no images",
     "relay": "thirty stations through four rooms and a corridor, joined by measured pairs; no images",
 }

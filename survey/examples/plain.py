@@ -3,9 +3,11 @@
 from collections.abc import Callable
 
 from survey.examples.alignment import alignment_files
+from survey.examples.beacons import beacon_files
 from survey.examples.relay import relay_files
 
 WITHOUT_IMAGES: dict[str, Callable[[int], dict[str, str]]] = {
+    "total-station": beacon_files,
     "alignment": alignment_files,
     "relay": relay_files,
 }

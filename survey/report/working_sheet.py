@@ -140,7 +140,7 @@ def drawing(sheet: Sheet) -> str:
     at = {foot.name: (foot.x, foot.y) for foot in sheet.task.feet}
     xs, ys = [x for x, _ in at.values()], [y for _, y in at.values()]
     size = max(max(xs) - min(xs), max(ys) - min(ys))
-    scale, margin = 300.0 / size, 110.0
+    scale, margin = 300.0 / size, 70.0
 
     def place(x: float, y: float) -> tuple[float, float]:
         return margin + (x - min(xs)) * scale, margin + (max(ys) - y) * scale
@@ -155,10 +155,11 @@ def drawing(sheet: Sheet) -> str:
     ]
     for foot in sheet.feet:
         u, v = place(*at[foot.name])
+        text_v = v + 26 if v > height / 2 else v - 16  # beside the body, not on it
         label = "stays" if foot.stays else f"{1e3 * foot.move:+.2f} mm"
         colour = "#5b6672" if foot.stays else "#b3261e"
         parts.append(
-            f'<circle cx="{u:.1f}" cy="{v:.1f}" r="9" fill="{colour}"/><text x="{u:.1f}" y="{v - 16:.1f}" '
+            f'<circle cx="{u:.1f}" cy="{v:.1f}" r="9" fill="{colour}"/><text x="{u:.1f}" y="{text_v:.1f}" '
             f'text-anchor="middle" font-size="15">{esc(foot.name)}: {label}</text>'
         )
     z = next(axis for axis in sheet.axes if axis.axis == "z")

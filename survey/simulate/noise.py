@@ -19,6 +19,7 @@ from adjust.model import (
     VectorPrior,
 )
 from adjust.observations import Pair
+from survey.simulate.readings import fresh_readings
 from survey.simulate.scene import BROWN, Scene, Truth
 
 
@@ -52,7 +53,7 @@ def resample(survey: Survey, truth: Truth, seed: int) -> Survey:
     rng = np.random.default_rng(seed)
     noise = np.einsum("nij,nj->ni", ideal.uv_factor, rng.standard_normal(ideal.uv.shape))
     parts = np.split(ideal.uv + noise, ideal.block_ends[:-1]) if ideal.block_ends else []
-    return replace(
+    again = replace(
         survey,
         image_blocks=tuple(replace(b, uv=uv) for b, uv in zip(survey.image_blocks, parts, strict=True)),
         table_readings=tuple(
@@ -77,6 +78,7 @@ def resample(survey: Survey, truth: Truth, seed: int) -> Survey:
         targets=tuple(_target(t, truth, rng) for t in survey.targets),
         points=tuple(_point(p, truth, rng) for p in survey.points),
     )
+    return replace(again, **fresh_readings(ideal.scene, rng))
 
 
 def _ideal(scene: Scene) -> _Ideal:

@@ -174,6 +174,9 @@ class Scene:
             return self.world_from_camera(frame.frame_id, frame.epoch_id)
         if frame.kind == "target":
             return self.world_from_target(frame.frame_id, frame.epoch_id)
+        if frame.kind == "mount":
+            angles = self.vector("table_angles", frame.frame_id, str(frame.epoch_id))
+            return self._pose("world_from_table", frame.frame_id) @ self.table_from_mount(frame.frame_id, angles)
         return self._pose("world_from_table", frame.frame_id)
 
     def position(self, ref: PositionRef) -> FloatArray:
