@@ -75,6 +75,8 @@ def test_a_feature_that_it_does_not_have(camera: Camera) -> None:
 def test_the_region_is_locked_while_it_is_armed(camera: Camera) -> None:
     width = camera.get("Width")
     camera.arm()
+    with pytest.raises((InUseError, UnknownFeatureError), match="TriggerMode"):
+        camera.set("TriggerMode", "Off")
     with pytest.raises(InUseError, match=r"Width .* disarm"):
         camera.set("Width", 100)
     assert camera.get("Width") == width

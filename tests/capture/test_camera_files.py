@@ -48,10 +48,14 @@ def test_files_wait_for_their_trigger(tmp_path: Path) -> None:
         camera.arm()
         with pytest.raises(FetchTimeoutError):
             camera.fetch(0.0)
+        with pytest.raises(InUseError):
+            camera.set("TriggerMode", "Off")
+        camera.disarm()
         camera.set("TriggerMode", "Off")
-        assert camera.fetch(0.0).image.max() == 1
         with pytest.raises(OutOfRangeError, match=r"TriggerSource .*Software"):
             camera.set("TriggerSource", "Line1")
+        camera.arm()
+        assert camera.fetch(0.0).image.max() == 1
         with pytest.raises(InUseError):
             camera.set("Width", 4)
         with pytest.raises(UnknownFeatureError):

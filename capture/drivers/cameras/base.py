@@ -27,8 +27,12 @@ OLDER_NAMES = {
     "DeviceSerialNumber": "DeviceID",
     "AcquisitionFrameRate": "AcquisitionFrameRateAbs",
 }
-# SFNC locks them while images are sent; not every camera does
-LOCKED_WHILE_ARMED = ("Width", "Height", "OffsetX", "OffsetY", "PixelFormat")
+# SFNC locks the region while images are sent; not every camera does. What starts an image is asked for once, when the
+# camera is armed
+LOCKED_WHILE_ARMED = (
+    *("Width", "Height", "OffsetX", "OffsetY", "PixelFormat"),
+    *("TriggerSelector", "TriggerMode", "TriggerSource"),
+)
 _LATE_S = 0.3  # how long after its exposure an image may still arrive
 
 
@@ -40,6 +44,8 @@ class DriverCamera(ABC):
         self._serial = place
         self._armed = False
         self._unanswered = False
+        self._triggered_armed = False
+        self._source_armed = ""
 
     @property
     def address(self) -> str:
@@ -59,10 +65,17 @@ class DriverCamera(ABC):
     @property
     def triggered(self) -> bool:
         """TriggerMode is On; False where the camera has none."""
+        if self._armed:
+            return self._triggered_armed
         try:
             return self.get("TriggerMode") == "On"
         except UnknownFeatureError:
             return False
+
+    def _note_trigger(self) -> None:
+        """To be called when the camera is about to be armed: what starts an image."""
+        self._triggered_armed = self.triggered
+        self._source_armed = str(self.get("TriggerSource")) if self._triggered_armed else ""
 
     def __enter__(self) -> Self:
         return self
@@ -114,11 +127,10 @@ class DriverCamera(ABC):
         if not self.triggered:
             self._skip_pending()
             return
-        source = self.get("TriggerSource")
-        if source != "Software":
+        if self._source_armed != "Software":
             raise CameraError(
                 self.address,
-                f"its trigger comes from {source}, not from software",
+                f"its trigger comes from {self._source_armed}, not from software",
                 "fire that line, or set TriggerSource to Software",
             )
         self._unanswered = True

@@ -96,6 +96,7 @@ class GenicamClientCamera(DriverCamera):
     def arm(self) -> None:
         """See ``Camera``."""
         self.disarm()
+        self._note_trigger()
         pixel_format = str(self.get("PixelFormat"))
         if not is_mosaic_or_gray(pixel_format):
             raise CameraError(self.address, f"it sends colour ({pixel_format})", "set PixelFormat to Mono8 or Mono12")

@@ -159,6 +159,7 @@ class GentlCamera(DriverCamera):
     def arm(self) -> None:
         """See ``Camera``."""
         self.disarm()
+        self._note_trigger()
         pixel_format = str(self.get("PixelFormat"))
         if not is_mosaic_or_gray(pixel_format) or pixel_format.endswith(("p", "Packed")):
             advice = "set PixelFormat to Mono8, Mono10, Mono12 or Mono16, not packed"

@@ -14,7 +14,7 @@ from capture.camera import (
     GrayImage,
     OutOfRangeError,
 )
-from capture.drivers.cameras.base import DriverCamera, gray_copy
+from capture.drivers.cameras.base import LOCKED_WHILE_ARMED, DriverCamera, gray_copy
 from survey.detection.gray import read_image
 from survey.files.images import IMAGE_ENDINGS
 from survey.files.text import natural_key
@@ -69,6 +69,8 @@ class ImageFiles(DriverCamera):
     def set(self, name: str, value: FeatureValue) -> None:
         """See ``Camera``. Only triggers can be set."""
         allowed = {"TriggerMode": ("On", "Off"), "TriggerSource": ("Software",), "TriggerSelector": ("FrameStart",)}
+        if self._armed and name in LOCKED_WHILE_ARMED:
+            raise self._locked(name)
         if name not in allowed:
             if name in ("Width", "Height", "PixelFormat", "DeviceSerialNumber"):
                 raise self._locked(name)
@@ -79,6 +81,8 @@ class ImageFiles(DriverCamera):
 
     def arm(self) -> None:
         """See ``Camera``."""
+        self.disarm()
+        self._note_trigger()
         self._armed, self._next, self._asked = True, 0, 0
 
     def disarm(self) -> None:

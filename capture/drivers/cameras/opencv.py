@@ -114,6 +114,8 @@ class OpencvCamera(DriverCamera):
     def arm(self) -> None:
         """See ``Camera``."""
         self._opened()
+        self.disarm()
+        self._note_trigger()
         self._armed, self._block_id = True, 0
         self._skip_pending()
 

@@ -16,7 +16,7 @@ from capture.camera import (
     InUseError,
     OutOfRangeError,
 )
-from capture.drivers.cameras.base import OLDER_NAMES, DriverCamera, bits_of, gray_copy, is_mosaic_or_gray
+from capture.drivers.cameras.base import LOCKED_WHILE_ARMED, OLDER_NAMES, DriverCamera, bits_of, is_mosaic_or_gray
 
 with warnings.catch_warnings():
     # SWIG's types have no __module__; where warnings are errors, that one ends the interpreter
@@ -102,6 +102,8 @@ class PylonCamera(DriverCamera):
 
     def set(self, name: str, value: FeatureValue) -> None:
         """See ``Camera``."""
+        if self._armed and name in LOCKED_WHILE_ARMED:
+            raise self._locked(name)
         with self._translated(name):
             node = self._node(name)
             try:
@@ -124,12 +126,13 @@ class PylonCamera(DriverCamera):
     def arm(self) -> None:
         """See ``Camera``."""
         self.disarm()
+        self._note_trigger()
         pixel_format = str(self.get("PixelFormat"))
         self._bits, self._mono = bits_of(pixel_format), is_mosaic_or_gray(pixel_format)
         with self._translated("arm"):
             self._camera.StartGrabbing(pylon.GrabStrategy_OneByOne, pylon.GrabLoop_ProvidedByUser)
             self._armed = True
-            if self.triggered and self.get("TriggerSource") == "Software":
+            if self._source_armed == "Software":
                 self._wait_until_ready()
         self._drain()
 
@@ -179,13 +182,13 @@ class PylonCamera(DriverCamera):
         if complete and not self._mono:
             found = f"it sends colour ({self.get('PixelFormat')})"
             raise CameraError(self.address, found, "set PixelFormat to Mono8, Mono12 or Mono16")
-        if complete:
-            return self._frame(gray_copy(result.Array), int(result.BlockID), int(result.TimeStamp), self._bits)
+        if complete:  # Array is a copy already
+            return self._frame(result.Array, int(result.BlockID), int(result.TimeStamp), self._bits)
         found = f"image {int(result.BlockID)} arrived incomplete ({result.ErrorDescription or 'no reason given'})"
         raise IncompleteFrameError(self.address, found, "take it again; if it repeats, check cable and bandwidth")
 
     def _no_image(self, timeout_s: float) -> CameraError:
-        if self._camera.IsCameraDeviceRemoved():
+        if timeout_s > 0.0 and self._camera.IsCameraDeviceRemoved():  # the question takes 2 ms
             return self._gone()
         found = f"no image within {timeout_s:g} s"
         return FetchTimeoutError(self.address, found, "was it triggered? check trigger, exposure and cable")

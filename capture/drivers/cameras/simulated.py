@@ -138,6 +138,8 @@ class SimulatedCamera(DriverCamera):
     def arm(self) -> None:
         """See ``Camera``."""
         self._require_there()
+        self.disarm()
+        self._note_trigger()
         self._queue.clear()
         self._delayed = None
         self._armed, self._block_id = True, 0
