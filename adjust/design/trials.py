@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
 from adjust.design.expectation import shared_names
 from adjust.design.noise import disturbed
+from adjust.distributions import chi2
 from adjust.errors import SurveyError
 from adjust.graph import GraphBuilder, StartValues
 from adjust.model import FloatArray, Survey

@@ -131,7 +131,8 @@ class Requirement:
 class NavigationPlan:
     """Where the head will be, how well its pose must be known (rad, m per component), and where beacons could be.
 
-    poses: world_from_station. epochs: patterns of planned epochs, whose poses come after these. places: (m, 3) m candidate places of beacons. sigmas of a spot (px), of a beacon, of the
+    poses: world_from_station. epochs: patterns of planned epochs, whose poses come after these.
+    places: (m, 3) m candidate places of beacons. sigmas of a spot (px), of a beacon, of the
     cameras' places (m) and attitudes (rad) on the head.
     """
 

@@ -66,7 +66,7 @@ def chart(
                         f' transform="rotate(-90 13 {0.5 * (height + _TOP - _BOTTOM):.1f})"'))  # fmt: skip
     for s in series:
         parts += _drawn(s, place)
-    for i, s in enumerate(series):
+    for i, s in enumerate(s for s in series if s.label):
         y = _TOP + 9 + 14 * i
         mark = d.line(_LEFT + 8, y - 4, _LEFT + 24, y - 4, s.colour, 1.6, _dash(s)) if s.line else ""
         mark = mark or d.dot(_LEFT + 16, y - 4, 2.6, s.colour)

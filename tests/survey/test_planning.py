@@ -247,3 +247,29 @@ def test_charts():
     assert "a &lt; b" in drawn
     assert drawn.count("<polyline") == 1
     assert PLAN.count("[[epochs]]") == 5
+
+
+def test_a_chain_of_pairs_in_closed_form(tmp_path):
+    """Equal pairs one after the other: the rotation's variance grows by one pair each; a pair to the end joins in."""
+    lines = ["format = 1"]
+    for i in range(5):
+        held = 'treatment = "held", ' if i == 0 else ""
+        place = f"translation_mm = [{2000 * i}, {500 * (i % 2)}, 0], rotation_euler_xyz_deg = [0, 0, {10 * i}]"
+        lines += [f"[stations.S{i}]", 'motion = "fixed"', f"world_from_station = {{ {held}{place} }}"]
+    (tmp_path / "survey.toml").write_text("\n".join(lines))
+    sigmas = "sigma_rotation_arcsec = 20\nsigma_translation_mm = 0.5\n"
+    chain = [f'[[pairs]]\na = "S{i}"\nb = "S{i + 1}"\n{sigmas}' for i in range(4)]
+    more = [f'[[candidates.pairs]]\na = "S0"\nb = "S{j}"\n{sigmas}' for j in (2, 4)]
+    (tmp_path / "plan.toml").write_text("".join(chain + more))
+    found = planning_job(tmp_path, PlanRequest(wanted=("world_from_station.S4.r?",), add=1), progress=False)
+    for k in range(1, 5):
+        entry = found.summary()["sigmas"][f"world_from_station.S{k}"]
+        assert entry["sigma_rx_arcsec"] == pytest.approx(20.0 * np.sqrt(k), rel=1e-9)
+    best = found.selection.steps[0]
+    assert best.name == "S0-S4"
+    # rotations alone would give 1 / (1/4 + 1) of a pair's variance; the lever arms of the translations help a little
+    after = np.degrees(best.sigmas) * 3600
+    assert np.all(after < 20.0 * np.sqrt(0.8) + 1e-6)
+    assert np.all(after > 20.0 * np.sqrt(0.5))
+    assert found.summary()["network"]["measured_pairs"] == 4
+    assert "network: 5 stations, 4 of 10 pairs, 0 conditions" in found.text()
