@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from adjust.closed_forms.rigid import rigid, rotation_exp, rotation_to, skew
+from adjust.closed_forms.rigid import rigid, rotation_exp, rotation_to
+from adjust.closed_forms.view_kernels import errors_of_views, plane_poses, refine_views
 from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
 
 _PLANAR = 1e-4  # thickness against extent below which points count as a plane
-_WIDEST = np.cos(np.deg2rad(80.0))  # rays further off the mean direction are left to the refinement
+_WIDEST = float(np.cos(np.deg2rad(80.0)))  # rays further off the mean direction are left to the refinement
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,9 @@ def pose_solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
     """The unrefined poses (k, 4, 4) of :func:`absolute_pose`, in no order and not checked for what lies in front."""
     if len(x) < 3:
         raise SurveyError(f"a camera pose needs 3 known points, got {len(x)}: observe more of them")
+    both = np.empty((2, 4, 4))
+    if len(x) > 3 and plane_poses(_flat(x), _flat(rays), _PLANAR, _WIDEST, both) == 2:
+        return both
     mean = rays.mean(axis=0)
     front_from_camera = rotation_to(mean, np.array([0.0, 0.0, 1.0]))
     turned = rays @ front_from_camera.T
@@ -120,22 +124,18 @@ def tangent_axes(rays: FloatArray) -> FloatArray:
     return out
 
 
-def _gnomonic(x_in_camera: FloatArray, rays: FloatArray, across: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Offsets (n, 2) rad of points in the plane tangent at each ray, and the depths (n,) along the ray."""
-    depth = np.sum(x_in_camera * rays, axis=1)
-    safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
-    return (across @ x_in_camera[:, :, None])[..., 0] / safe[:, None], depth
-
-
 def view_errors(
     camera_from_target: FloatArray, x: FloatArray, rays: FloatArray, ptr: IntArray
 ) -> tuple[FloatArray, BoolArray]:
     """Per view the rms (B,) of its point offsets, rad, and whether (B,) all its points lie in front."""
-    view = np.repeat(np.arange(len(ptr) - 1), np.diff(ptr))
-    p = (camera_from_target[view, :3, :3] @ x[:, :, None])[..., 0] + camera_from_target[view, :3, 3]
-    r, depth = _gnomonic(p, rays, tangent_axes(rays))
-    mean = np.add.reduceat(np.sum(r**2, axis=1), ptr[:-1]) / np.diff(ptr)
-    return np.sqrt(mean), np.asarray(np.minimum.reduceat(depth, ptr[:-1]) > 0)
+    rms, in_front = np.empty(len(ptr) - 1), np.empty(len(ptr) - 1, dtype=np.bool_)
+    errors_of_views(_flat(camera_from_target), _flat(x), _flat(rays), np.asarray(ptr, dtype=np.int64), rms, in_front)
+    return rms, in_front
+
+
+def _flat(array: FloatArray) -> FloatArray:
+    """As the compiled code takes it."""
+    return np.ascontiguousarray(array, dtype=np.float64)
 
 
 def refine_poses(
@@ -151,46 +151,6 @@ def refine_poses(
     x, rays: (N, 3), view after view; ptr: (B + 1,) row ranges, none empty. With ``robust`` the points of a view carry
     Cauchy weights at three times its median offset. A view keeps its pose where a step does not lower its error.
     """
-    poses = camera_from_target.copy()
-    sizes = np.diff(ptr)
-    view = np.repeat(np.arange(len(sizes)), sizes)
-    across = tangent_axes(rays)
-    damping = np.full(len(sizes), 1e-6)
-    eye = np.eye(6)
-
-    def errors(p4: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        p = (p4[view, :3, :3] @ x[:, :, None])[..., 0] + p4[view, :3, 3]
-        r, depth = _gnomonic(p, rays, across)
-        r = np.where(depth[:, None] > 0, r, 1e3)  # behind the camera: never accepted
-        return p, r, depth, np.sum(r**2, axis=1)
-
-    p, r, depth, square = errors(poses)
-    for _ in range(iterations):
-        w = _cauchy(np.sqrt(square), ptr, view) if robust else np.ones(len(x))
-        by_point = (across - r[:, :, None] * rays[:, None, :]) / depth[:, None, None]
-        j = np.concatenate([-by_point @ skew(p), by_point], axis=2)
-        jw = j * w[:, None, None]
-        normal = np.add.reduceat(np.swapaxes(jw, 1, 2) @ j, ptr[:-1])
-        right = np.add.reduceat((np.swapaxes(jw, 1, 2) @ r[:, :, None])[..., 0], ptr[:-1])
-        diagonal = np.einsum("bii->bi", normal)
-        # the last term keeps a view of three points on a line from stopping all the others
-        system = normal + (damping[:, None] * diagonal + 1e-14 * np.max(diagonal, axis=1)[:, None])[:, :, None] * eye
-        step = -np.linalg.solve(system, right[..., None])[..., 0]
-        trial = rigid(rotation_exp(step[:, :3]), step[:, 3:]) @ poses
-        new = errors(trial)
-        cost_old, cost_new = (np.add.reduceat(w * s, ptr[:-1]) for s in (square, new[3]))
-        better = cost_new < cost_old
-        damping = np.where(better, damping * 0.1, damping * 30.0)
-        poses = np.where(better[:, None, None], trial, poses)
-        take = better[view]
-        p, r = np.where(take[:, None], new[0], p), np.where(take[:, None], new[1], r)
-        depth, square = np.where(take, new[2], depth), np.where(take, new[3], square)
-        if not np.any(better & (cost_old - cost_new > 1e-12 * cost_old)):
-            break
+    poses = np.array(camera_from_target, dtype=np.float64)
+    refine_views(poses, _flat(x), _flat(rays), np.asarray(ptr, dtype=np.int64), iterations, robust)
     return poses
-
-
-def _cauchy(size: FloatArray, ptr: IntArray, view: IntArray) -> FloatArray:
-    order = np.lexsort((size, view))
-    median = size[order][ptr[:-1] + np.diff(ptr) // 2]
-    return np.asarray(1.0 / (1.0 + (size / np.maximum(3.0 * median[view], 1e-12)) ** 2))

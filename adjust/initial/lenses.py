@@ -175,10 +175,9 @@ class _LensSearch:
     def _error_px(self, values: FloatArray, images: Sequence[Sighting]) -> float:
         """Median over the images of the best pose's error, relative to the extent of the points, in px."""
         focal, errors = focal_length_px(self.model, values, self.constants), []
-        for s in images:
+        for s, rays in zip(images, self._rays(values, images), strict=True):
             try:
-                rays = unit_rays(self.model, values, self.constants, s.uv)
-                errors.append(float(absolute_pose(s.x, rays, refinements=2).error[0]) * focal)
+                errors.append(np.inf if rays is None else focal * float(absolute_pose(s.x, rays, 2).error[0]))
             except SurveyError:
                 errors.append(np.inf)
         return float(np.median(errors))
@@ -210,14 +209,30 @@ class _LensSearch:
 
     def _poses(self, values: FloatArray, chosen: Sequence[Sighting]) -> tuple[list[Sighting], FloatArray]:
         images, poses = [], []
-        for s in chosen:
+        for s, rays in zip(chosen, self._rays(values, chosen), strict=True):
+            if rays is None:
+                continue
             try:
-                rays = unit_rays(self.model, values, self.constants, s.uv)
                 poses.append(absolute_pose(s.x, rays, refinements=3).camera_from_target[0])
                 images.append(s)
             except SurveyError:  # left to the screening of all blocks, which reports it
                 continue
         return images, np.array(poses).reshape(-1, 4, 4)
+
+    def _rays(self, values: FloatArray, images: Sequence[Sighting]) -> list[FloatArray | None]:
+        """Unit rays of every image, None for one with pixels that the lens cannot have imaged."""
+        try:
+            rays = unit_rays(self.model, values, self.constants, np.concatenate([s.uv for s in images]))
+            return list(np.split(rays, np.cumsum([len(s.uv) for s in images])[:-1]))
+        except SurveyError:  # some pixel of some image: find out which
+            pass
+        found: list[FloatArray | None] = []
+        for s in images:
+            try:
+                found.append(unit_rays(self.model, values, self.constants, s.uv))
+            except SurveyError:
+                found.append(None)
+        return found
 
     def _directions(self, level: str) -> FloatArray:
         """Columns (n, p) of the lens components that this level frees, with ties; fx, fy apart only with the centre."""

@@ -4,6 +4,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.closed_forms import align, rigid
+from adjust.closed_forms.view_kernels import median_offset
 from adjust.errors import SurveyError
 from adjust.geometry.building import frame_refs, position_refs
 from adjust.initial.gauge import fix_one_gauge, frames_of, world_is_free
@@ -22,7 +23,6 @@ from adjust.initial.views import (
     block_text,
     focal_px,
     make_view,
-    ray_errors,
     refine_views,
     target_points,
     untrustworthy,
@@ -307,10 +307,9 @@ class _Search:
                 x, rays, focal = self.points.x[sights[i].rows], sights[i].rays, sights[i].focal_px
             else:
                 continue
-            pose = self.network.product(chain)
-            offset = ray_errors(pose, x, rays) * focal
+            offset = median_offset(self.network.product(chain), np.ascontiguousarray(x), np.ascontiguousarray(rays))
             # the median of a circular normal's radius is 1.18 sigma, its rms 1.41 sigma
-            rms[i] = 1.2 * float(np.median(offset)) if len(offset) else np.nan
+            rms[i] = 1.2 * focal * offset if len(x) else np.nan
         return rms
 
     def result(self) -> Start:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -101,6 +102,7 @@ def make_view(block_idx: int, x: FloatArray, rays: FloatArray, focal: float) -> 
     return _ranked(View(block_idx, x, rays, focal, poses, error * focal), poses, error * focal, in_front)
 
 
+@lru_cache(maxsize=256)
 def _sample(n: int) -> IntArray:
     """Positions of at most ``_ENOUGH`` of n points, without the pattern of a grid, the same at every call."""
     return np.arange(n) if n <= _ENOUGH else np.sort(np.random.default_rng(n).permutation(n)[:_ENOUGH])
