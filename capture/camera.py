@@ -57,7 +57,7 @@ class Camera(Protocol):
 
     ``with open_camera(address) as camera`` closes it at the end. Between ``arm`` and ``disarm`` it takes images, one
     for each trigger where ``TriggerMode`` is On (by ``trigger`` where ``TriggerSource`` is Software), else one after
-    the other. Block ids start anew with ``arm``.
+    the other. Block ids may start anew with ``arm``.
     """
 
     @property

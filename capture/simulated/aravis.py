@@ -17,6 +17,7 @@ from capture.camera import GrayImage, ImageSource
 _FILL = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
 )  # buffer, user data, exposure (us), gain, pixel format
+_SIZE_REGISTERS = (0x100, 0x104)  # Width and Height, as the XML of the library's camera has them
 _PORT = 3956  # of GigE Vision's control channel
 _SYSTEM_PACKAGES = "libglib2.0-0 libxml2"
 
@@ -24,6 +25,7 @@ _SYSTEM_PACKAGES = "libglib2.0-0 libxml2"
 class AravisCamera:
     """A GigE Vision camera on one address of this machine, served by threads of the library while the object lives.
 
+    image_size: (width, height) px of the region that it sends until a client sets another; None: 512 x 512.
     lost_ratio: share of the packets of images that are never sent. failed: is given the error where ``source`` raises,
     since nothing may pass through the library.
     """
@@ -34,6 +36,7 @@ class AravisCamera:
         interface: str = "127.0.0.1",
         serial: str = "LAB-1",
         lost_ratio: float = 0.0,
+        image_size: tuple[int, int] | None = None,
         failed: Callable[[Exception], None] | None = None,
     ) -> None:
         self._source, self._failed = source, failed
@@ -48,6 +51,8 @@ class AravisCamera:
         if lost_ratio:
             self._lose(lost_ratio)
         inner = self._library.arv_gv_fake_camera_get_fake_camera(self._camera)
+        for register, value in zip(_SIZE_REGISTERS, image_size or (), strict=False):
+            self._library.arv_fake_camera_write_register(inner, register, value)
         self._library.arv_fake_camera_set_fill_pattern(inner, self._callback, None)
 
     def _lose(self, ratio: float) -> None:
@@ -115,6 +120,7 @@ def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
         "arv_gv_fake_camera_is_running": (ctypes.c_int, [pointer]),
         "arv_gv_fake_camera_get_fake_camera": (pointer, [pointer]),
         "arv_fake_camera_set_fill_pattern": (None, [pointer, _FILL, pointer]),
+        "arv_fake_camera_write_register": (ctypes.c_int, [pointer, ctypes.c_uint32, ctypes.c_uint32]),
         "arv_buffer_get_data": (pointer, [pointer, ctypes.POINTER(ctypes.c_size_t)]),
     }
     for name in ("x", "y", "width", "height"):

@@ -97,7 +97,6 @@ def _lab_source(camera: Path, file: Path | None) -> ImageSource:
             return lab.image(camera.name, angles(), exposure_us, gain_db)
 
     lab.warm_up()  # a camera that does not answer for 3 s has lost its client
-    image(1.0, 0.0)
     threading.Thread(target=_look_ahead, args=(angles, image), daemon=True).start()
     return image
 
@@ -139,7 +138,8 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     try:
         source = _gradient() if options.camera == GRADIENT else _lab_source(Path(options.camera), options.angles)
-        camera = AravisCamera(source, options.interface, options.serial, options.lost_ratio, _complain)
+        size = None if options.camera == GRADIENT else source(1.0, 0.0).shape[::-1]
+        camera = AravisCamera(source, options.interface, options.serial, options.lost_ratio, size, _complain)
     except SurveyError as error:
         sys.exit(str(error))
     sys.stdout.write(_READY + "\n")

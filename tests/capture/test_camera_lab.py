@@ -130,7 +130,8 @@ def served(folder: Path) -> Iterator[dict[str, Camera]]:
         addresses = {"X": GIGE, "Y": f"lab:{folder}/Y?via=pylon:0815-0001", "Z": f"lab:{folder}/Z"}
         cameras = {name: stack.enter_context(open_camera(address)) for name, address in addresses.items()}
         for camera in cameras.values():
-            for name, value in (("Width", 640), ("Height", 512), ("TriggerMode", "On"), ("TriggerSource", "Software")):
+            assert (camera.get("Width"), camera.get("Height")) == (640, 512)
+            for name, value in (("TriggerMode", "On"), ("TriggerSource", "Software")):
                 camera.set(name, value)
         yield cameras
 

@@ -57,8 +57,10 @@ def test_failed_buffers_are_incomplete_images(camera: PylonCamera) -> None:
     camera.set("ForceFailedBufferCount", 1)
     camera._node("ForceFailedBuffer").Execute()
     camera.trigger()
-    with pytest.raises(IncompleteFrameError, match=r"image 0 arrived incomplete .*take it again"):
+    with pytest.raises(IncompleteFrameError, match=r"image 0 arrived incomplete .*take it again") as caught:
         camera.fetch(2.0)
+    assert caught.value.frame is not None
+    assert not caught.value.frame.complete
     camera.trigger()
     assert camera.fetch(2.0).block_id == 1
 

@@ -152,21 +152,22 @@ class GenicamClientCamera(DriverCamera):
             raise self._gone()
         if not received.is_complete:
             raise self._incomplete(received)
-        return self._converted(received)
+        return self._converted(received, complete=True)
 
-    def _converted(self, received: Any) -> Frame:
+    def _converted(self, received: Any, complete: bool) -> Frame:
         image = cast(GrayImage, received.to_numpy())
         ticks = received.ts_dev
         device_time_ns = None if not ticks else round(ticks * self._ns_per_tick)
-        return self._frame(image, received.block_id, device_time_ns, bits_of(received.pixel_format))
+        return self._frame(image, received.block_id, device_time_ns, bits_of(received.pixel_format), complete)
 
     def _incomplete(self, received: Any) -> IncompleteFrameError:
         missing = received.missing_packets
         what = f"{missing} packets are missing" if missing else f"status {received.status.value}"
         found = f"image {received.block_id} arrived incomplete ({what})"
-        return IncompleteFrameError(
-            self.address, found, "take it again; if it repeats, check cable, packet size and bandwidth"
-        )
+        advice = "take it again; if it repeats, check cable, packet size and bandwidth"
+        error = IncompleteFrameError(self.address, found, advice)
+        error.frame = self._converted(received, complete=False)
+        return error
 
     def _no_image(self, timeout_s: float) -> CameraError:
         if timeout_s > 0.0 and not self._answers():

@@ -182,10 +182,14 @@ class PylonCamera(DriverCamera):
         if complete and not self._mono:
             found = f"it sends colour ({self.get('PixelFormat')})"
             raise CameraError(self.address, found, "set PixelFormat to Mono8, Mono12 or Mono16")
-        if complete:  # Array is a copy already
-            return self._frame(result.Array, int(result.BlockID), int(result.TimeStamp), self._bits)
-        found = f"image {int(result.BlockID)} arrived incomplete ({result.ErrorDescription or 'no reason given'})"
-        raise IncompleteFrameError(self.address, found, "take it again; if it repeats, check cable and bandwidth")
+        # Array is a copy already
+        frame = self._frame(result.Array, int(result.BlockID), int(result.TimeStamp), self._bits, complete)
+        if complete:
+            return frame
+        found = f"image {frame.block_id} arrived incomplete ({result.ErrorDescription or 'no reason given'})"
+        error = IncompleteFrameError(self.address, found, "take it again; if it repeats, check cable and bandwidth")
+        error.frame = frame
+        raise error
 
     def _no_image(self, timeout_s: float) -> CameraError:
         if timeout_s > 0.0 and self._camera.IsCameraDeviceRemoved():  # the question takes 2 ms
