@@ -7,9 +7,8 @@ source g put into the result.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import norm
-from scipy.stats import t as student
 
+from adjust.distributions import norm, student
 from adjust.errors import SurveyError
 from adjust.model import FloatArray, IntArray
 from adjust.result import Adjustment, ParameterName

@@ -4,11 +4,12 @@ A bias of non-centrality ``lambda0`` is found by a chi-square test of q componen
 Baarda's B-method asks the same lambda0 of all tests, so that a bias is found equally well whatever it is tested with.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2, ncx2
 
-from adjust.model import FloatArray
+from adjust.distributions import chi2, ncx2
 from adjust.statistics.result import Criteria, LevelOptions
 
 
@@ -17,6 +18,7 @@ def sidak(family_alpha: float, n_tests: int) -> float:
     return float(-np.expm1(np.log1p(-family_alpha) / max(1, n_tests)))
 
 
+@lru_cache(maxsize=1024)
 def noncentrality(alpha: float, power: float, q: int) -> float:
     """lambda0: chi-square (q, lambda0) exceeds the critical value of level ``alpha`` with probability ``power``."""
     critical = float(chi2.isf(alpha, q))
@@ -24,6 +26,12 @@ def noncentrality(alpha: float, power: float, q: int) -> float:
     while ncx2.sf(critical, q, high) < power:
         high *= 2.0
     return float(brentq(lambda x: float(ncx2.sf(critical, q, x)) - power, 1e-12, high, xtol=1e-12, rtol=1e-12))
+
+
+def _critical(lambda0: float, power: float, q: int) -> float:
+    """What chi-square (q, lambda0) exceeds with probability ``power``."""
+    high = lambda0 + q
+    return float(brentq(lambda x: float(ncx2.sf(x, q, lambda0)) - power, 0.0, high, xtol=1e-12, rtol=1e-12))
 
 
 def criteria(options: LevelOptions, n_tests: int, most_components: int = 6) -> Criteria:
@@ -34,5 +42,5 @@ def criteria(options: LevelOptions, n_tests: int, most_components: int = 6) -> C
         lambda0 = np.array([noncentrality(float(alpha[0]), options.power, int(q)) for q in freedom])
         return Criteria(options, n_tests, alpha, np.asarray(chi2.isf(alpha, freedom)), lambda0)
     one = noncentrality(options.alpha0, options.power, 1)
-    critical: FloatArray = np.asarray(ncx2.isf(options.power, freedom, one), dtype=float)
+    critical = np.array([_critical(one, options.power, int(q)) for q in freedom])
     return Criteria(options, n_tests, np.asarray(chi2.sf(critical, freedom)), critical, np.full(len(freedom), one))

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
 
 from adjust.adjustment import AdjustOptions, adjust
+from adjust.distributions import chi2
 from adjust.graph import StartValues
 from adjust.model import BoolArray, IntArray, Survey
 from adjust.pair_screen import values_of

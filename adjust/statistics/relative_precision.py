@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from gtsam import Pose3
-from scipy.stats import chi2
-from scipy.stats import f as fisher
 
+from adjust.distributions import chi2, fisher
 from adjust.errors import SurveyError
 from adjust.factors import ChainPose
 from adjust.graph import GraphBuilder

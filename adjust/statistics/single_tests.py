@@ -9,10 +9,8 @@ Teunissen 2006). All in sigmas of the observation; the other two functions turn 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2, norm
-from scipy.stats import f as fisher
-from scipy.stats import t as student
 
+from adjust.distributions import chi2, fisher, norm, student
 from adjust.model import BoolArray, FloatArray, IntArray
 
 CONTROLLED = 1e-6

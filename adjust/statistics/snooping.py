@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import sparse
-from scipy.stats import chi2
-from scipy.stats import f as fisher
 
+from adjust.distributions import chi2, fisher
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.statistics.single_tests import CONTROLLED, eigen2
 from adjust.statistics.system import LinearSystem
@@ -249,7 +248,7 @@ def typical_factors(snooping: Snooping, n_groups: int) -> FloatArray:
         n = int(mine.sum())
         if n < 20:
             continue
-        ratio = T[mine] / chi2.median(freedom[mine])
+        ratio = T[mine] / chi2.ppf(0.5, freedom[mine])
         if np.mean(ratio > 1.0) > 0.5 + 1.5 / np.sqrt(n):  # three sigmas of a fair coin
             out[g] = max(1.0, float(np.median(ratio)))
     return out

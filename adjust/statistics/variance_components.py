@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import chi2
 
 from adjust.adjustment import AdjustOptions, adjust
+from adjust.distributions import chi2
 from adjust.errors import SurveyError
 from adjust.graph import StartValues
 from adjust.model import BoolArray, FloatArray, IntArray, Survey

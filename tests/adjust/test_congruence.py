@@ -1,0 +1,159 @@
+"""Congruence of epochs: error rates and power by simulation, planted motions found, no dependence on any datum."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gtsam import Pose3
+from scipy.stats import binom
+
+from adjust.adjustment import adjust
+from adjust.congruence import CongruenceOptions, compare, congruence
+from adjust.epoch_states import EpochState, aligned, epoch_state, moved
+from adjust.errors import SurveyError
+from adjust.graph import StartValues
+from adjust.model import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
+from adjust.observations import FrameRef, Pair
+from tests.adjust import helpers as h
+from tests.adjust import statistics_networks as net
+
+
+def free_hall(seed: int, shift: dict[str, FloatArray] | None = None, noise: bool = True) -> tuple[Survey, StartValues]:
+    """A free network; ``shift`` (m) of points against the coordinates they were drawn with."""
+    x = net.coordinates(1, 12, 3)
+    moved_x = {n: v + (shift or {}).get(n, 0.0) for n, v in x.items()}
+    survey, start = net.hall(seed, n_tapes=0, noise=noise, places=moved_x)
+    points = tuple(replace(p, x_in_world=PointParameter()) for p in survey.points)
+    return replace(survey, points=points, datum=Datum("inner")), start
+
+
+def states() -> tuple[EpochState, tuple[str, ...]]:
+    state = epoch_state(adjust(*free_hall(1, noise=False)))
+    return state, tuple(n[1] for n in state.names)
+
+
+def drawn(state: EpochState, rng: np.random.Generator, factor: float = 1.0) -> EpochState:
+    """With noise of its own covariance (times factor)."""
+    values, vectors = np.linalg.eigh(state.cov)
+    d = vectors @ (np.sqrt(np.maximum(values, 0.0) * factor) * rng.normal(size=len(values)))
+    return replace(state, values=tuple(np.asarray(v) + x for v, x in zip(state.values, d.reshape(-1, 3), strict=True)))
+
+
+KNOWN = (1.0, float("inf"), float("nan"))
+
+
+def test_error_rate_of_the_global_test_and_of_the_single_ones() -> None:
+    state, _ = states()
+    rng = np.random.default_rng(1)
+    options = CongruenceOptions(scaled=False, search=False)
+    failed, single, n = 0, 0, 150
+    for _ in range(n):
+        a, b = drawn(state, rng), drawn(state, rng)
+        found = compare(state.names, a, b, state.directions, KNOWN, options)
+        assert found.before.freedom == 3 * len(state.names) - 4
+        failed += not found.before.passed
+        single += any(m.significant for m in found.motions)
+    low, high = binom.ppf([0.001, 0.999], n, 0.05)
+    assert low <= failed <= high
+    assert single <= high
+
+
+def test_power_of_the_smallest_motion() -> None:
+    """A point that moves by ``smallest`` in its worst direction is significant in 80 % of the samples."""
+    state, ids = states()
+    rng, i = np.random.default_rng(2), 5
+    stable = tuple(n for j, n in enumerate(state.names) if j != i)
+    options = CongruenceOptions(scaled=False, search=False, reference=stable)
+    one = compare(state.names, state, state, state.directions, KNOWN, options)
+    motion = next(m for m in one.motions if m.name == ("point", ids[i]))
+    step = motion.smallest * motion.ellipsoid.axes[:, 0]
+    seen = 0
+    for _ in range(150):
+        a, b = drawn(state, rng), drawn(state, rng)
+        values = list(b.values)
+        values[i] = values[i] + step
+        found = compare(state.names, a, replace(b, values=tuple(values)), state.directions, KNOWN, options)
+        seen += next(m for m in found.motions if m.name == motion.name).significant
+    low, high = binom.ppf([0.001, 0.999], 150, 0.8)
+    assert low <= seen <= high
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_planted_motions_are_found(scaled: bool) -> None:
+    shift = {"P3": np.array([0.004, 0.0, 0.0]), "P7": np.array([0.0, -0.003, 0.003])}
+    first, second = adjust(*free_hall(1)), adjust(*free_hall(2, shift))
+    found = congruence(first, second, CongruenceOptions(scaled=scaled))
+    assert not found.before.passed
+    assert found.after.passed
+    assert {n[1] for n in found.moved} == {"P3", "P7"}
+    assert {s.name[1] for s in found.steps} == {"P3", "P7"}
+    assert ("point", "P3") not in found.stable
+    assert found.datum == ("tx", "ty", "tz", "rz")
+    for m in found.motions:
+        if m.name[1] in shift:
+            d = m.displacement - shift[m.name[1]]
+            assert d @ np.linalg.solve(m.cov, d) < 16.0
+            assert np.linalg.norm(m.displacement) > m.ellipsoid.semi_axes[0]
+    quiet = congruence(first, adjust(*free_hall(3)), CongruenceOptions(scaled=scaled))
+    assert quiet.before.passed
+    assert not quiet.moved
+
+
+def test_the_datum_of_the_epochs_does_not_matter() -> None:
+    """The second epoch solved with other points in its datum, and then turned and shifted as a whole."""
+    shift = {"P3": np.array([0.004, 0.0, 0.0])}
+    first, (survey, start) = adjust(*free_hall(1)), free_hall(2, shift)
+    expected = congruence(first, adjust(survey, start))
+    other = replace(survey, datum=Datum("inner", points=("S1", "P2", "P9")))
+    found = congruence(first, adjust(other, start))
+    assert found.before.statistic == pytest.approx(expected.before.statistic, rel=1e-4)
+    before, after = epoch_state(first), epoch_state(adjust(survey, start))
+    away = moved(after, np.array([3.0, -2.0, 1.0, 0.0, 0.0, 0.7, 0.0]))
+    back = aligned(before, away, before.directions, range(len(before.names)))
+    again = compare(before.names, before, back, before.directions, (expected.sigma0, expected.redundancy, 0.5),
+                    CongruenceOptions())  # fmt: skip
+    assert again.before.statistic == pytest.approx(expected.before.statistic, rel=1e-6)
+    before_motion = {m.name: m.displacement for m in expected.motions}
+    for m in again.motions:
+        np.testing.assert_allclose(m.displacement, before_motion[m.name], atol=1e-7)
+
+
+def pair_network(seed: int, turned: float) -> tuple[Survey, StartValues]:
+    """Five stations, all relative poses between them; the third turns by ``turned`` (rad) about its y."""
+    rng = np.random.default_rng(4)
+    poses = [h.pose(rng, 1.0) for _ in range(5)]
+    poses[2] = poses[2] * Pose3.Expmap(np.array([0.0, turned, 0.0, 0.0, 0.0, 0.0]))
+    noise, cov = np.random.default_rng(seed), np.diag([2e-5] * 3 + [1e-4] * 3) ** 2
+    pairs = []
+    for i in range(5):
+        for j in range(i):
+            error = Pose3.Expmap(noise.multivariate_normal(np.zeros(6), cov))
+            pairs.append(Pair(f"{i}-{j}", FrameRef("station", f"R{i}"), FrameRef("station", f"R{j}"),
+                              poses[j].inverse() * poses[i] * error, cov))  # fmt: skip
+    stations = tuple(Station(f"R{i}", world_from_station=PoseParameter()) for i in range(5))
+    survey = Survey(stations=stations, pairs=tuple(pairs), datum=Datum("inner"))
+    return survey, StartValues({}, {("world_from_station", f"R{i}"): p for i, p in enumerate(poses)}, {})
+
+
+def test_a_station_that_turned() -> None:
+    first, second = adjust(*pair_network(1, 0.0)), adjust(*pair_network(2, 4e-4))
+    found = congruence(first, second)
+    assert found.moved == (("world_from_station", "R2"),)
+    motion = found.motions[0]
+    assert motion.rotation is not None
+    assert motion.rotation_cov is not None
+    assert motion.rotation_test is not None
+    assert not motion.rotation_test.passed
+    loose = 4.0 * np.sqrt(np.diag(motion.rotation_cov).max())
+    np.testing.assert_allclose(motion.rotation, [0.0, 4e-4, 0.0], atol=loose)
+    assert congruence(first, adjust(*pair_network(3, 0.0))).moved == ()
+
+
+def test_what_cannot_be_compared_is_said() -> None:
+    first = adjust(*free_hall(1))
+    survey, start = free_hall(2)
+    names = {p.point_id: f"Q{p.point_id}" for p in survey.points}
+    with pytest.raises(SurveyError, match="is not common"):
+        congruence(first, first, CongruenceOptions(reference=(("point", names["P1"]),)))
+    with pytest.raises(SurveyError, match="cannot carry the 4 motions"):
+        congruence(first, adjust(survey, start), CongruenceOptions(reference=(("point", "P1"),)))
