@@ -1,31 +1,32 @@
 """Surveys with total station readings, and the readings once more in a few plain lines of matrices."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.graph import StartValues
 from adjust.model import (
+    INSTRUMENT,
     Bearings,
     Datum,
     FloatArray,
     Instrument,
     Point,
     PointParameter,
-    PoseParameter,
     Setup,
-    Station,
     Survey,
     VectorParameter,
     Vertical,
     tilt_axes,
 )
-from adjust.observations import FrameRef, PositionRef, Reading, ReadingCovariance
+from adjust.observations import PositionRef, Reading
+from adjust.result import Adjustment
 
 ANGLES = ("direction", "angle", "azimuth")
-EARTH = 6.38e6
+Truth = Mapping[tuple[str, ...], Any]
 
 
 def plain_axes(survey: Survey, tilt: FloatArray, x: FloatArray) -> FloatArray:
@@ -44,7 +45,7 @@ def plain_axes(survey: Survey, tilt: FloatArray, x: FloatArray) -> FloatArray:
     return np.array([north, np.cross(north, up), up])
 
 
-def plain_reading(survey: Survey, r: Reading, truth: Mapping[tuple[str, ...], object], x: Mapping[PositionRef, FloatArray]) -> float:
+def plain_reading(survey: Survey, r: Reading, truth: Truth, x: Mapping[PositionRef, FloatArray]) -> float:
     """The error-free value of a reading, from the geometry alone."""
     tilt = np.asarray(truth.get(("vertical",), survey.vertical.tilt.values), dtype=float)
     setup = next((s for s in survey.setups if s.setup_id == r.setup_id), None)
@@ -56,8 +57,8 @@ def plain_reading(survey: Survey, r: Reading, truth: Mapping[tuple[str, ...], ob
     F = plain_axes(survey, tilt, x[r.at])
     if setup is not None and not setup.levelled:
         R = truth[("world_from_station", r.at.frame.frame_id)].rotation().matrix()
-        north, left, up = (R[:, 1], -R[:, 0], R[:, 2]) if survey.bearings.zero == "y" else (R[:, 0], R[:, 1], R[:, 2])
-        F = np.array([R[:, 0], -R[:, 1], R[:, 2]]) if survey.bearings.zero == "x" else np.array([R[:, 1], R[:, 0], R[:, 2]])
+        zero, right = (R[:, 0], -R[:, 1]) if survey.bearings.zero == "x" else (R[:, 1], R[:, 0])
+        F = np.array([zero, right, R[:, 2]])
     right = F[1]
     origin = x[r.at] + r.instrument_height * F[2] + c[0] * F[0] - c[1] * right + c[2] * F[2]
 
@@ -93,7 +94,7 @@ def plain_reading(survey: Survey, r: Reading, truth: Mapping[tuple[str, ...], ob
     return height(r.to) - height(r.at) + r.target_height - r.instrument_height - c[2]
 
 
-def positions_of(survey: Survey, truth: Mapping[tuple[str, ...], object]) -> dict[PositionRef, FloatArray]:
+def positions_of(survey: Survey, truth: Truth) -> dict[PositionRef, FloatArray]:
     out = {}
     for r in survey.readings:
         for ref in (r.at, r.to, r.second):
@@ -109,7 +110,7 @@ def positions_of(survey: Survey, truth: Mapping[tuple[str, ...], object]) -> dic
     return out
 
 
-def measured(survey: Survey, truth: Mapping[tuple[str, ...], object], seed: int | None) -> Survey:
+def measured(survey: Survey, truth: Truth, seed: int | None) -> Survey:
     """The survey with readings of the truth, with noise by their sigmas and covariances where a seed is given."""
     x = positions_of(survey, truth)
     rng = np.random.default_rng(seed)
@@ -117,7 +118,8 @@ def measured(survey: Survey, truth: Mapping[tuple[str, ...], object], seed: int 
     if seed is not None:
         errors = {r.reading_id: r.sigma * rng.standard_normal() for r in survey.readings}
         for block in survey.reading_covariances:
-            errors |= dict(zip(block.reading_ids, np.linalg.cholesky(block.cov) @ rng.standard_normal(len(block.cov)), strict=True))
+            joint = np.linalg.cholesky(block.cov) @ rng.standard_normal(len(block.cov))
+            errors |= dict(zip(block.reading_ids, joint, strict=True))
     readings = tuple(
         replace(r, value=plain_reading(survey, r, truth, x) + errors.get(r.reading_id, 0.0)) for r in survey.readings
     )
@@ -129,46 +131,53 @@ def P(name: str) -> PositionRef:
 
 
 def polar_network(
-    seed: int, *, n: int = 8, stations: int = 4, bearings: Bearings = Bearings(), vertical: Vertical = Vertical(),
-    instrument: VectorParameter | None = None, setup: Setup = Setup("", "T"), datum: Datum = Datum(), held: int = 2,
+    seed: int, *, n: int = 8, stations: int = 4, bearings: Bearings | None = None, vertical: Vertical | None = None,
+    instrument: VectorParameter | None = None, setup: Setup | None = None, datum: Datum | None = None, held: int = 2,
     extra: bool = True, plane: bool = False,
-) -> tuple[Survey, dict[tuple[str, ...], object]]:  # fmt: skip
+) -> tuple[Survey, dict[tuple[str, ...], Any]]:  # fmt: skip
     """Points in a hall of 60 m; ``stations`` of them set up, each seeing all others, with every kind of reading."""
     rng = np.random.default_rng(seed)
     x = rng.uniform((0, 0, 0), (60, 40, 12), (n, 3))
     if plane:
         x[:, 2] = 0.0
-    truth: dict[tuple[str, ...], object] = {("point", f"P{i}"): x[i] for i in range(n)}
+    truth: dict[tuple[str, ...], Any] = {("point", f"P{i}"): x[i] for i in range(n)}
     keep = ("z",) if plane else ()
-    points = tuple(Point(f"P{i}", PointParameter(x[i], "held") if i < held else PointParameter(x[i], held=keep)) for i in range(n))
-    parameter = instrument or VectorParameter(("distance_offset", "distance_scale", "refraction", "vertical_index"), np.zeros(4))
+    points = tuple(
+        Point(f"P{i}", PointParameter(q, "held") if i < held else PointParameter(q, held=keep)) for i, q in enumerate(x)
+    )
+    parameter = instrument or VectorParameter(INSTRUMENT, np.zeros(4))
+    kinds = [("direction", 1e-5), ("horizontal_distance", 2e-4)]
+    if not plane:
+        kinds = [("direction", 1e-5), ("zenith", 2e-5), ("slope_distance", 2e-4)]
     readings: list[Reading] = []
     setups = []
     for s in range(stations):
         name = f"S{s}"
-        setups.append(replace(setup, setup_id=name))
+        setups.append(replace(setup or Setup("", "T"), setup_id=name))
         truth["orientation", name] = np.array([rng.uniform(0, 6)])
         hi = 0.0 if plane else rng.uniform(1.4, 1.7)
         for t in range(n):
             if t == s:
                 continue
             ht = 0.0 if plane else rng.uniform(0.0, 0.3)
-            common = {"at": P(f"P{s}"), "to": P(f"P{t}"), "setup_id": name, "instrument_height": hi, "target_height": ht}
-            kinds = [("direction", 1e-5), ("horizontal_distance", 2e-4)] if plane else [("direction", 1e-5), ("zenith", 2e-5), ("slope_distance", 2e-4)]
             for kind, sigma in kinds:
-                readings.append(Reading(f"{kind}{s}-{t}", kind, value=0.0, sigma=sigma, **common))
+                readings.append(Reading(f"{kind}{s}-{t}", kind, P(f"P{s}"), P(f"P{t}"), 0.0, sigma, name,
+                                        instrument_height=hi, target_height=ht))  # fmt: skip
     if extra:
-        kinds = [("azimuth", 3e-5), ("horizontal_distance", 1e-4)] + ([] if plane else [("height_difference", 1e-4)])
-        for j, (kind, sigma) in enumerate(kinds):
+        more = [("azimuth", 3e-5), ("horizontal_distance", 1e-4)] + ([] if plane else [("height_difference", 1e-4)])
+        for j, (kind, sigma) in enumerate(more):
             a, b = f"P{n - 1 - j}", f"P{n - 3 - j}"
             readings.append(Reading(f"{kind}x", kind, P(a), P(b), 0.0, sigma, instrument_height=0.0 if plane else 1.5))
-        readings.append(Reading("anglex", "angle", P("P0"), P(f"P{n - 1}"), 0.0, 2e-5, second=P(f"P{n - 2}"), setup_id="S0",
-                                instrument_height=0.0 if plane else 1.5, second_height=0.0 if plane else 0.2))
-    return Survey(points=points, instruments=(Instrument("T", parameter),), setups=tuple(setups), readings=tuple(readings),
-                  bearings=bearings, vertical=vertical, datum=datum), truth  # fmt: skip
+        readings.append(Reading("anglex", "angle", P("P0"), P(f"P{n - 1}"), 0.0, 2e-5, "S0", P(f"P{n - 2}"),
+                                0.0 if plane else 1.5, 0.0, 0.0 if plane else 0.2))  # fmt: skip
+    survey = Survey(
+        points=points, instruments=(Instrument("T", parameter),), setups=tuple(setups), readings=tuple(readings),
+        bearings=bearings or Bearings(), vertical=vertical or Vertical(), datum=datum or Datum(),
+    )  # fmt: skip
+    return survey, truth
 
 
-def start_near(survey: Survey, truth: Mapping[tuple[str, ...], object], seed: int, points: float = 0.0) -> StartValues:
+def start_near(survey: Survey, truth: Truth, seed: int, points: float = 0.0) -> StartValues:
     """Start values at the truth, points off by ``points`` m; no orientations."""
     rng = np.random.default_rng(seed)
     return StartValues(
@@ -176,3 +185,54 @@ def start_near(survey: Survey, truth: Mapping[tuple[str, ...], object], seed: in
         {k[1]: np.asarray(v) + points * rng.standard_normal(3) for k, v in truth.items() if k[0] == "point"},
         {k: np.asarray(v) for k, v in truth.items() if k[0] in ("instrument", "vertical", "centring")},
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class DenseReadings:
+    """A (N, n) unwhitened, by differences of the plain readings; v (N,), C (N, N), used (N,), columns by unknown."""
+
+    A: FloatArray
+    v: FloatArray
+    C: FloatArray
+    used: np.ndarray
+    place: dict[tuple[str, ...], slice]
+
+
+def wrapped(v: FloatArray) -> FloatArray:
+    """Angles in [-pi, pi)."""
+    return np.asarray((v + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def dense(survey: Survey, result: Adjustment) -> DenseReadings:
+    """The linear system of all readings at the solution, from plain matrices and five-point differences."""
+    truth: dict[tuple[str, ...], Any] = {n: e.value for n, e in result.estimates.items()}
+    angle = np.array([r.kind in ANGLES for r in survey.readings])
+
+    def readings(values: Truth) -> FloatArray:
+        x = positions_of(survey, values)
+        return np.array([plain_reading(survey, r, values, x) for r in survey.readings])
+
+    def difference(a: FloatArray, b: FloatArray) -> FloatArray:
+        return np.where(angle, wrapped(a - b), a - b)
+
+    at, columns, place = readings(truth), [], {}
+    for name, estimate in result.estimates.items():
+        first = len(columns)
+        for i, status in enumerate(estimate.status):
+            if status == "held":
+                continue
+            total, step = np.zeros(len(at)), 1e-3
+            for k, weight in ((1, 8.0), (-1, -8.0), (2, -1.0), (-2, 1.0)):
+                value = np.array(estimate.value, dtype=float)
+                value[i] += k * step
+                total += weight * difference(readings({**truth, name: value}), at)
+            columns.append(total / (12.0 * step))
+        if len(columns) > first:
+            place[name] = slice(first, len(columns))
+    number = {r.reading_id: i for i, r in enumerate(survey.readings)}
+    C = np.diag([r.sigma**2 for r in survey.readings])
+    for block in survey.reading_covariances:
+        rows = [number[i] for i in block.reading_ids]
+        C[np.ix_(rows, rows)] = block.cov
+    v = difference(at, np.array([r.value for r in survey.readings]))
+    return DenseReadings(np.array(columns).T, v, C, np.array([r.used for r in survey.readings]), place)
