@@ -72,7 +72,10 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class CapturePlan:
-    """All that a session needs to know; ``shots`` in the order in which they are taken."""
+    """All that a session needs to know; ``shots`` in the order in which they are taken.
+
+    image_sizes: (width, height) px of cameras, as the survey says.
+    """
 
     file: Path
     digest: str
@@ -82,6 +85,7 @@ class CapturePlan:
     cameras: tuple[CameraPlan, ...]
     poses: tuple[Pose, ...]
     options: CaptureOptions
+    image_sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     @property
     def shots(self) -> tuple[Shot, ...]:
@@ -118,9 +122,18 @@ def read_plan(path: Path) -> CapturePlan:
         cameras=cameras,
         poses=poses,
         options=_options(root.table("capture")),
+        image_sizes=_image_sizes(survey),
     )
     _check_survey(root, plan)
     return plan
+
+
+def _image_sizes(survey: Path | None) -> Mapping[str, tuple[int, int]]:
+    if survey is None:
+        return {}
+    cameras = read_toml(survey)[0].tables("cameras")
+    sizes = {name: node.numbers("image_size_px", (2,)) for name, node in cameras if node.has("image_size_px")}
+    return {name: (int(size[0]), int(size[1])) for name, size in sizes.items()}
 
 
 def _cameras(root: Node) -> tuple[CameraPlan, ...]:

@@ -10,7 +10,7 @@ from gtsam import Pose3
 from adjust.initial.network import table_from_mount
 from adjust.lens import camera_constants, lens_model, monotone_radius_px, project
 from adjust.model import BoolArray, Camera, FloatArray, PoseParameter, Station, Survey, Target
-from capture.plan_table import TablePlan
+from capture.plan_table import AxisPlan, TablePlan
 
 _CELLS = (12, 10)
 _LEAST_GAIN = 0.5  # of a cell: what a pose must add before poses are taken for the sake of their angle
@@ -22,7 +22,7 @@ class CoverRequest:
 
     count: int = 12
     margin_px: float = 12.0
-    steps: int = 61
+    steps: int = 41
     steepest: float = math.radians(65.0)
 
 
@@ -35,22 +35,36 @@ def cover_board(
     that covers most of what is not covered yet, counting a second and third view of a cell for less, until there are
     enough. Raises ValueError where something is not known or the target is never seen whole.
     """
-    lattice = _lattice(table, request.steps)
-    views = [_view(survey, camera, target, row, request) for row in lattice]
-    seen = [i for i, uv in enumerate(views) if uv is not None]
-    if not seen:
+    coarse = _lattice(table, request.steps)
+    visible = [row for row in coarse if _view(survey, camera, target, row, request) is not None]
+    if not visible:
         raise ValueError(
             f"camera {camera.camera_id!r} never sees {target.target_id!r} whole within the table's limits; check the "
             "approximate poses in the survey, or widen the limits"
         )
-    masks = np.array([_cells(uv, camera) for i in seen if (uv := views[i]) is not None])
-    chosen = [seen[i] for i in _greedy(masks, lattice[seen], request.count)]
-    return _short_way(lattice[chosen])
+    fine = _refined(np.array(visible), table, request.steps)
+    views = [(row, _view(survey, camera, target, row, request)) for row in fine]
+    seen = [(row, _cells(uv, camera)) for row, uv in views if uv is not None]
+    angles = np.array([row for row, _ in seen])
+    return _short_way(angles[_greedy(np.array([mask for _, mask in seen]), angles, request.count)])
 
 
 def _lattice(table: TablePlan, steps: int) -> FloatArray:
-    values = [np.linspace(a.axis.lower, min(a.axis.upper, a.axis.lower + 2 * math.pi), steps) for a in table.axes]
+    values = [np.linspace(a.axis.lower, _end(a), steps) for a in table.axes]
     return np.stack([grid.ravel() for grid in np.meshgrid(*values, indexing="ij")], axis=1)
+
+
+def _end(axis: AxisPlan) -> float:
+    return min(axis.axis.upper, axis.axis.lower + 2 * math.pi)
+
+
+def _refined(angles: FloatArray, table: TablePlan, steps: int) -> FloatArray:
+    """Steps six times as fine around angles (m, n), out to their neighbours, within the limits."""
+    step = np.array([(_end(a) - a.axis.lower) / (steps - 1) for a in table.axes])
+    offsets = np.stack([g.ravel() for g in np.meshgrid(*[np.arange(-5, 6) / 6] * len(step), indexing="ij")], axis=1)
+    lower, upper = (np.array([getattr(a.axis, end) for a in table.axes]) for end in ("lower", "upper"))
+    rows = np.clip((angles[:, None] + offsets * step).reshape(-1, len(step)), lower, upper)
+    return np.asarray(np.unique(np.round(rows, 6), axis=0).clip(lower, upper))
 
 
 def _known(parameter: PoseParameter, name: str) -> FloatArray:

@@ -235,6 +235,7 @@ class Session:
         frames = self._cameras.take(plan.options.fetch_timeout_s)
         after = self._locate()
         self._require_rest(before, after)
+        self._require_sizes(frames)
         self.control.checkpoint()
         images = {camera_id: self._write(camera_id, shot, frame) for camera_id, frame in frames.items()}
         journal = self._require_journal()
@@ -274,6 +275,17 @@ class Session:
                 f"{degrees_text(self._table.axes, before.readback)} to "
                 f"{degrees_text(self._table.axes, after.readback)}; brake it, or give drift_deg a larger value"
             )
+
+    def _require_sizes(self, frames: Mapping[str, Frame]) -> None:
+        """An image that the survey cannot use is no image: better to hear of it at the first than after the last."""
+        for camera_id, frame in frames.items():
+            height, width = frame.image.shape
+            wanted = self._plan.image_sizes.get(camera_id, (width, height))
+            if (width, height) != wanted:
+                raise SurveyError(
+                    f"camera {camera_id!r} sends {width} x {height} px, but {self._plan.survey} says {wanted[0]} x "
+                    f"{wanted[1]}; set Width and Height (and OffsetX, OffsetY) in the plan, or correct image_size_px"
+                )
 
     def _write(self, camera_id: str, shot: Shot, frame: Frame) -> dict[str, Any]:
         values = self._cameras.values(camera_id, ("ExposureTime", "Gain", "PixelFormat"))

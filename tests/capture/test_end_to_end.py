@@ -31,7 +31,8 @@ def _plan(home, lab, url, angles_file):
     emulated = "lab:{home}/room/{name}?via=pylon:0815-000{i}&angles={angles_file}"
     places = {"X": GIGE}
     places |= {n: emulated.format(home=home, name=n, i=i, angles_file=angles_file) for i, n in enumerate("YZ")}
-    cameras = [f'[cameras.{n}]\naddress = "{p}"\nsettings = {{ ExposureTime = 10000.0 }}' for n, p in places.items()]
+    settings = "settings = { Width = 640, Height = 512, ExposureTime = 10000.0 }"
+    cameras = [f'[cameras.{n}]\naddress = "{p}"\n{settings}' for n, p in places.items()]
     text = f"""format = 1
 project = "lab"
 survey = "room/survey.toml"
@@ -57,7 +58,7 @@ angles_deg = {json.dumps(poses)}
 @pytest.fixture(scope="module")
 def adjusted(tmp_path_factory):
     home = tmp_path_factory.mktemp("laboratory")
-    lab = write_lab(home / "room", 1, LabSize(n_board=6))
+    lab = write_lab(home / "room", 1, LabSize(n_board=5))
     noise = ("--noise", "8", "--backlash", "20", "--speed", "100")
     with gige_port(), table_server(home, *noise) as server, GigeServer(home / "room" / "X", angles=server.truth_file):
         assert main(["run", str(_plan(home, lab, server.url, server.truth_file)), "--quiet"]) == 0

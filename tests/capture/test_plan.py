@@ -2,8 +2,8 @@
 
 import json
 import math
+from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -11,7 +11,10 @@ from adjust.errors import SurveyError
 from capture.cli import main
 from capture.plan import check_plan_limits, estimate, read_plan
 from capture.turntable import LimitError
-from survey.examples import write_example
+from survey.files import write_project
+from survey.simulate.labs import head_on_table
+from survey.simulate.scene import Scene
+from survey.targets import Checkerboard
 from tests.capture.session_runs import write_plan
 
 
@@ -98,7 +101,8 @@ def test_dry_run_prints_and_moves_nothing(tmp_path, capsys):
     plan = write_plan(tmp_path)
     assert main(["run", str(plan), "--dry-run"]) == 0
     out = capsys.readouterr().out
-    assert "t06" in out and "6 poses x 1 repeats x 2 cameras = 12" in out and f"Next: labcapture run {plan}" in out
+    for part in ("t06", "6 poses x 1 repeats x 2 cameras = 12", f"Next: labcapture run {plan}"):
+        assert part in out
     assert main(["run", str(plan), "--dry-run", "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["poses"]["t04"] == [12.0, 12.0]
@@ -121,8 +125,69 @@ def test_help_opens_with_a_real_command(capsys):
 
 
 @pytest.fixture(scope="module")
-def known_lab(tmp_path_factory):
-    """A project of known truth whose survey.toml has the truth as approximate values, to whole degrees and cm."""
-    folder = tmp_path_factory.mktemp("cover") / "lab"
-    write_example("full-lab", folder, seed=1, jobs=2, progress=False)
-    return folder
+def known_survey():
+    """A survey whose approximate values are the truth, and the scene that OpenCV projects."""
+    survey, truth = head_on_table(1)
+    cameras = tuple(
+        replace(
+            c,
+            lens=replace(c.lens, values=truth["lens", c.camera_id]),
+            station_from_camera=replace(c.station_from_camera, value=truth["station_from_camera", c.camera_id]),
+        )
+        for c in survey.cameras
+    )
+    (table,) = survey.tables
+    geometry = replace(table.geometry, values=truth["table_geometry", table.table_id])
+    world_from_table = replace(table.world_from_table, value=truth["world_from_table", table.table_id])
+    table = replace(table, geometry=geometry, world_from_table=world_from_table)
+    return replace(survey, cameras=cameras, tables=(table,)), truth
+
+
+def covering_plan(folder, survey, extra=""):
+    """A plan that covers camera Y's image with the board, on a template of that survey."""
+    kinds = {t.target_id: Checkerboard(*_board_size(t)) for t in survey.targets}
+    write_project(folder / "template", replace(survey, image_blocks=(), table_readings=()), target_kinds=kinds)
+    (folder / "plan.toml").write_text(
+        'format = 1\nproject = "lab"\nsurvey = "template/survey.toml"\n[table]\nid = "turntable"\n'
+        'driver = "simulated"\naxes.axis1 = { limits_deg = [-180, 180] }\naxes.axis2 = { limits_deg = [-180, 180] }\n'
+        '[cameras.Y]\naddress = "simulated:Y"\n'
+        f'[poses.c]\nkind = "cover"\ncameras = ["Y"]\ntarget = "board"\ncount = 12\n{extra}\n'
+    )
+    return folder / "plan.toml"
+
+
+def _board_size(target):
+    rows, columns = (max(int(p[1:].split("c")[k]) for p in target.point_ids) + 1 for k in (0, 1))
+    x = target.x_in_target
+    return columns, rows, float(np.linalg.norm(x[1] - x[0]))
+
+
+def test_board_covers_the_image(tmp_path, known_survey):
+    """Every pose shows the whole board, by OpenCV's projection; together they reach nearly every part of the image."""
+    survey, truth = known_survey
+    plan = read_plan(covering_plan(tmp_path, survey))
+    assert len(plan.poses) == 12
+    scene = Scene(survey, dict(truth) | {("table_angles", "turntable", p.pose_id): p.angles for p in plan.poses})
+    width, height = next(c.image_size for c in survey.cameras if c.camera_id == "Y")
+    seen = np.zeros((8, 10), bool)
+    for pose in plan.poses:
+        uv = scene.project("Y", pose.pose_id, scene.target_points("board"))
+        assert (uv > 11.9).all()
+        assert (uv < np.array([width, height]) - 12.9).all()
+        seen[(uv[:, 1] * 8 / height).astype(int), (uv[:, 0] * 10 / width).astype(int)] = True
+    assert seen.mean() > 0.9
+    check_plan_limits(plan)
+
+
+def test_cover_needs_approximate_values(tmp_path, known_survey):
+    survey, _ = known_survey
+    (table,) = survey.tables
+    unknown = replace(survey, tables=(replace(table, world_from_table=replace(table.world_from_table, value=None)),))
+    with pytest.raises(SurveyError, match=r"world_from_table of 'turntable' has no approximate value"):
+        read_plan(covering_plan(tmp_path, unknown))
+
+
+def test_cover_that_cannot_be(tmp_path, known_survey):
+    survey, _ = known_survey
+    with pytest.raises(SurveyError, match=r"camera 'Y' never sees 'board' whole"):
+        read_plan(covering_plan(tmp_path, survey, "margin_px = 500"))

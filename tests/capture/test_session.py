@@ -357,3 +357,16 @@ def test_table_that_drifts_is_not_trusted(tmp_path, monkeypatch):
     outcome = run(plan)
     assert dict(outcome.retries) == {"Drift": 1}
     require_complete(plan, 6)
+
+
+def test_images_of_another_size_than_the_survey_says(tmp_path):
+    """Said at the first image, and not tried again."""
+    (tmp_path / "survey.toml").write_text(
+        'format = 1\n[cameras.X]\nimage_size_px = [96, 64]\n[cameras.Y]\nimage_size_px = [640, 512]\n'
+        '[tables.turntable]\naxes = ["x", "z"]\n'
+    )
+    plan = write_plan(tmp_path)
+    plan.write_text(plan.read_text().replace("format = 1", 'format = 1\nsurvey = "survey.toml"'))
+    with pytest.raises(SessionStoppedError, match=r"camera 'Y' sends 96 x 64 px, but .*survey\.toml says 640 x 512"):
+        run(plan)
+    assert not list((tmp_path / "lab").rglob("*.png"))

@@ -69,7 +69,8 @@ def test_other_addresses_of_this_machine_do_not_answer(tmp_path):
     """127.0.0.2 is this machine too, but the socket is bound to 127.0.0.1 alone."""
     with served(FolderView(read_plan(write_plan(tmp_path)))) as server:
         assert server.socket.getsockname()[0] == "127.0.0.1"
-        with pytest.raises(ConnectionRefusedError), socket.create_connection(("127.0.0.2", server.server_address[1]), 1.0):
+        other = ("127.0.0.2", server.server_address[1])
+        with pytest.raises(ConnectionRefusedError), socket.create_connection(other, 1.0):
             pass
 
 
