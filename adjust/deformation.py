@@ -13,8 +13,8 @@ from itertools import pairwise
 
 import numpy as np
 from gtsam import Pose3, Rot3
-from scipy.stats import chi2
 
+from adjust.distributions import chi2
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from adjust.relay.motions import right_jacobian_inverse

@@ -44,6 +44,16 @@ class ncx2:  # noqa: N801  # the name that statisticians and SciPy use
         """Probability above x, to 1e-15: enough for the power of a test, not for far tails."""
         return 1.0 - special.chndtr(x, k, c)
 
+    @staticmethod
+    def ppf(p: Numbers, k: Numbers, c: Numbers) -> Numbers:
+        """Quantile of probability p below."""
+        return special.chndtrix(p, k, c)
+
+    @staticmethod
+    def isf(p: Numbers, k: Numbers, c: Numbers) -> Numbers:
+        """Quantile of probability p above."""
+        return special.chndtrix(np.subtract(1.0, p), k, c)
+
 
 class norm:  # noqa: N801  # the name that statisticians and SciPy use
     """The standard normal distribution."""
@@ -95,3 +105,12 @@ class fisher:  # noqa: N801  # as the others
     def sf(x: Numbers, m: Numbers, n: Numbers) -> Numbers:
         """Probability above x."""
         return special.fdtrc(m, n, x)
+
+
+class beta:  # noqa: N801  # as the others
+    """The beta distribution with shapes a and b: that of the order statistics of uniform numbers."""
+
+    @staticmethod
+    def ppf(p: Numbers, a: Numbers, b: Numbers) -> Numbers:
+        """Quantile of probability p below."""
+        return special.betaincinv(a, b, p)

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from gtsam import Pose3
-from scipy.stats import chi2
 
 from adjust.adjustment import AdjustOptions, adjust
+from adjust.distributions import chi2
 from adjust.errors import IndeterminateError
 from adjust.graph import StartValues
 from adjust.model import FloatArray, Survey
@@ -145,7 +145,7 @@ def _excess(result: Adjustment, candidates: set[str]) -> dict[str, float]:
     used = [o for o in tested if o.used]
     factor = 1.0
     if len(used) >= _MANY:
-        factor = max(1.0, float(np.median([o.test / chi2.median(len(o.components)) for o in used])))
+        factor = max(1.0, float(np.median([o.test / chi2.ppf(0.5, len(o.components)) for o in used])))
     return {o.ids[0]: float(o.test / (chi2.isf(single, len(o.components)) * factor)) for o in tested}
 
 

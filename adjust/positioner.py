@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from gtsam import Pose3, Rot3
-from scipy.stats import f as f_distribution
 
 from adjust.adjustment import adjust
 from adjust.closed_forms import nearest_rotation
+from adjust.distributions import fisher
 from adjust.errors import SurveyError
 from adjust.model import TABLE_GEOMETRY, FloatArray, Station, Survey, Table, VectorParameter
 from adjust.observations import FrameRef, Pair, TableReading
@@ -180,7 +180,7 @@ def axis_tests(
             C, g = blocks.cov[np.ix_(rows, rows)], blocks.n_blocks
             degrees, scale = (k, g - k), (g - k) / (g - 1)
         statistic = scale * float(x @ np.linalg.solve(C, x)) / k
-        p = float(f_distribution.sf(statistic, *degrees))
+        p = float(fisher.sf(statistic, *degrees))
         names = tuple(estimate.components[i] for i in idx)
         sigmas = tuple(float(s) for s in np.sqrt(np.diag(C)))
         tests.append(AxisTest(names, tuple(float(a) for a in x), sigmas, statistic, degrees, p, p < alpha))

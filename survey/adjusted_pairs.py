@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 from gtsam import Pose3
-from scipy.stats import chi2
 
+from adjust.distributions import chi2
 from adjust.model import FloatArray
 from adjust.observations import FrameRef
 from adjust.pose_network.from_survey import NamedPrecision

@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 from gtsam import Pose3
-from scipy.stats import chi2, f
 
+from adjust.distributions import chi2, fisher
 from adjust.model import FloatArray
 from adjust.result import Adjustment, Estimate
 
@@ -40,7 +40,7 @@ def scale_of(adjustment: Adjustment, sigmas: SigmaKind) -> Scale:
     known = sigmas == "a_priori" or adjustment.redundancy <= 0 or not np.isfinite(adjustment.sigma0)
     if known:
         return Scale("a_priori", 1.0, float(np.sqrt(chi2.ppf(PROBABILITY, 3))))
-    ellipsoid = float(np.sqrt(3.0 * f.ppf(PROBABILITY, 3, adjustment.redundancy)))
+    ellipsoid = float(np.sqrt(3.0 * fisher.ppf(PROBABILITY, 3, adjustment.redundancy)))
     return Scale("a_posteriori", float(adjustment.sigma0), ellipsoid)
 
 

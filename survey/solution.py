@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
 
+from adjust.distributions import norm
 from adjust.model import FloatArray, Survey
 from adjust.result import Adjustment, Estimate, GroupSummary
 from survey.adjusted_pairs import pairs_dict

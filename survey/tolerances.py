@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from gtsam import Pose3
-from scipy.stats import norm, t
 
+from adjust.distributions import norm, student
 from adjust.errors import SurveyError
 from adjust.result import Adjustment, Estimate
 from survey.quantities import PROBABILITY, Scale
@@ -72,7 +72,7 @@ def coverage(adjustment: Adjustment, scale: Scale) -> float:
     """Factor from a sigma to the expanded uncertainty at 95 %: normal, or Student's t where sigma0 was estimated."""
     if scale.sigmas == "a_priori":
         return float(norm.ppf(0.5 + PROBABILITY / 2))
-    return float(t.ppf(0.5 + PROBABILITY / 2, adjustment.redundancy))
+    return float(student.ppf(0.5 + PROBABILITY / 2, adjustment.redundancy))
 
 
 def verdicts(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], scale: Scale) -> tuple[Verdict, ...]:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2, norm
 
+from adjust.distributions import chi2, norm
 from adjust.result import Adjustment
 
 

@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 from gtsam import Rot3
-from scipy.stats import norm
 
+from adjust.distributions import norm
 from adjust.errors import SurveyError
 from adjust.factors import ChainPose
 from adjust.model import FloatArray

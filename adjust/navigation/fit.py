@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs
-from scipy.stats import chi2
 
 from adjust.closed_forms.rigid import rotation_exp
+from adjust.distributions import chi2
 from adjust.model import FloatArray, IntArray
 from adjust.navigation.pose_kernels import retracted, step_between
 from adjust.navigation.system import Sightings, System, evaluate

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import chi2
 
 from adjust.closed_forms.rigid import rigid
+from adjust.distributions import chi2
 from adjust.lens import MODELS, focal_length_px
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers, local, log_evidence

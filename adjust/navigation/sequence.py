@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from gtsam import Pose3
-from scipy.stats import chi2
 
+from adjust.distributions import chi2
 from adjust.model import FloatArray, IntArray
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, local
 from adjust.navigation.identification import Candidate, with_prior, without_prior

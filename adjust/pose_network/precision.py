@@ -11,8 +11,8 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
+from adjust.distributions import chi2
 from adjust.model import FloatArray, IntArray
 from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.solve import Minimum

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
+from adjust.distributions import chi2
 from adjust.errors import NotConvergedError
 from adjust.model import BoolArray, FloatArray
 from adjust.pose_network.network import PoseNetwork, loop_marks
@@ -73,7 +73,7 @@ def variance_factor(pairs: PairStatistics, used: BoolArray) -> float:
     rows = used & (pairs.freedom > 0)
     if int(rows.sum()) < 20:
         return 1.0
-    return max(1.0, float(np.median(pairs.test[rows] / chi2.median(pairs.freedom[rows]))))
+    return max(1.0, float(np.median(pairs.test[rows] / chi2.ppf(0.5, pairs.freedom[rows]))))
 
 
 def excess(pairs: PairStatistics, used: BoolArray, candidates: BoolArray, alpha: float) -> FloatArray:

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
 
+from adjust.distributions import norm
 from adjust.errors import NotConvergedError, SurveyError
 from adjust.model import FloatArray
 from adjust.relay.eye_solver import EyeProblem, EyeSolution, linearise

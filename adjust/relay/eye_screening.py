@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from adjust.distributions import chi2
 from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray
 from adjust.relay.eye_checks import OutlierEpoch

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
 
+from adjust.distributions import chi2
 from adjust.model import FloatArray, IntArray
 from adjust.relay.cycle_kernels import forest_loops, independent_of, meeting_stations, shortest_loops
 from adjust.relay.graph_kernels import adjacency, breadth_first

@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
+from adjust.distributions import chi2
 from adjust.model import FloatArray, IntArray
 from adjust.precision import global_test
 from adjust.relay.motions import Motions, right_jacobian_inverse

@@ -3,14 +3,14 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
 
 from adjust.closed_forms import inverse, rotation_exp, rotation_log, transform
+from adjust.distributions import chi2
 from adjust.model import FloatArray, IntArray, Target
 from adjust.table_checks.fit import TableFit, fit_table, residuals
 from adjust.table_checks.views import TableViews
 
-LIMIT = float(chi2_distribution.isf(1e-9, 6))
+LIMIT = float(chi2.isf(1e-9, 6))
 _MOST_SPLITS = 40
 _CAPPED = 100.0  # a view counts at most so many times the limit's share in comparing explanations
 _LEAST = 2  # views of a second place
@@ -153,7 +153,7 @@ def reread(views: TableViews, found: Places, epoch: int) -> Reread:
     r, info = misfit(angles)
     left = float(np.einsum("ni,nij,nj->", r, info, r)) / fit.scale
     sigmas = np.sqrt(np.diag(np.linalg.inv(N)) * fit.scale)
-    return Reread(angles, sigmas, left < float(chi2_distribution.isf(1e-9, 6 * len(rows) - len(angles))))
+    return Reread(angles, sigmas, left < float(chi2.isf(1e-9, 6 * len(rows) - len(angles))))
 
 
 def reading_scatter(views: TableViews, found: Places) -> FloatArray:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from adjust.distributions import beta, norm
 from adjust.model import FloatArray
 from adjust.result import ParameterName
 from adjust.statistics.result import BudgetEntry, Component, Influence, RelativePrecision
@@ -238,8 +239,6 @@ def normality(c: Context) -> str:
 
 def quantiles(name: str, w: FloatArray) -> str:
     """A Q-Q plot of sorted values; the band is that of order statistics (beta distribution)."""
-    from scipy.stats import beta, norm
-
     n, side, pad = len(w), 240.0, 26.0
     keep = np.unique(np.concatenate([np.arange(min(n, 40)), np.linspace(0, n - 1, 160).astype(int),
                                      np.arange(max(0, n - 40), n)]))  # fmt: skip
