@@ -86,7 +86,8 @@ class ConvertOutcome:
 
     def text(self) -> str:
         """For people."""
-        first, *rest = (f"{n} {what.replace('_', ' ')}" for what, n in self.counts.items())
+        named = [(n, what.replace("_", " ")) for what, n in self.counts.items()]
+        first, *rest = (f"{n} {what[:-1] if n == 1 else what}" for n, what in named)
         counts = f"{first} ({self.values})" + "".join(f" and {r}" if r == rest[-1] else f", {r}" for r in rest)
         return "\n".join([*(f"  ! {line}" for line in self.left_out), f"{self.target}: {counts} from {self.source}"])
 

@@ -95,7 +95,7 @@ class _Reader:
         scaled = parameters.get("sigma-act", "aposteriori") != "apriori"
         survey = self.draft.survey(self.bearings)
         sigma0 = self._sigma0()
-        return ForeignNetwork(survey, self.title, sigma0, scaled, 1.0 - level, notes=tuple(self.draft.notes))
+        return ForeignNetwork(survey, self.title, sigma0, scaled, round(1.0 - level, 12), notes=tuple(self.draft.notes))
 
     def _sigma0(self) -> float:
         return positive(self.parameters.get("sigma-apr", "10"), "sigma-apr", self.parameters.where)

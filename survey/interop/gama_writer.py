@@ -137,7 +137,8 @@ def _reading(reading: Reading) -> dict[str, Any]:
     angular = reading.kind in _ANGULAR
     value = reading.value % (2.0 * np.pi) if reading.kind in ("direction", "azimuth") else reading.value
     sigma = reading.sigma / (CC if angular else MM)
-    attributes: dict[str, Any] = {"from": reading.at.point_id}
+    # the point of a direction set stands with the set
+    attributes: dict[str, Any] = {} if reading.kind == "direction" else {"from": reading.at.point_id}
     if reading.second is not None:
         attributes |= {"bs": reading.to.point_id, "fs": reading.second.point_id}
     else:
