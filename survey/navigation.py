@@ -1,5 +1,6 @@
 """The job behind ``labsurvey navigate``: calibrate from everything else, then a pose for every navigation epoch."""
 
+import csv
 import json
 import sys
 import time
@@ -40,8 +41,9 @@ class NavigateRequest:
     """What is navigated.
 
     station: None for the only one with cameras, or the one a table carries. epochs: None for all in which its cameras
-    show beacons and no target. interval_s: time between epochs, None where motion is not to be used. unnamed: forget
-    the names that spots have.
+    show beacons and no target. interval_s: time between epochs. times: instead, a table with columns epoch_id and
+    time_s; epochs then come in the order of time. Without either motion is not used. unnamed: forget the names that
+    spots have.
     """
 
     station: str | None = None
@@ -49,6 +51,7 @@ class NavigateRequest:
     interval_s: float | None = None
     use_table: bool = True
     unnamed: bool = False
+    times: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,14 +127,18 @@ def navigate_job(
     project = read(Path(folder))
     station = request.station or _station(project)
     epochs = _epochs(project, station, request)
+    times = _times(epochs, request)
     calibration = _calibrate(project, station, epochs)
     calibrated = time.perf_counter()
     head, beacons = head_and_beacons(calibration, station)
     named = set(beacons.beacon_ids)
     missing = sorted({p.point_id for p in project.survey.points} - named, key=natural_key)
     notes = (f"beacons without coordinates, left out: {', '.join(missing)}",) if missing else ()
-    observed = [_observed(project, station, epoch_id, i, request, named) for i, epoch_id in enumerate(epochs)]
-    motion = Motion() if request.interval_s is not None else None
+    order = range(len(epochs)) if times is None else sorted(range(len(epochs)), key=times.__getitem__)
+    observed = [
+        _observed(project, station, epochs[i], None if times is None else times[i], request, named) for i in order
+    ]
+    motion = Motion() if times is not None else None
     options = NavigateOptions(motion=motion, use_table=request.use_table, alpha=min(project.options.alpha, 1e-3))
     with tqdm(total=len(epochs), desc="navigating", unit="epoch", disable=not progress, file=sys.stderr) as bar:
         trajectory = navigate(head, beacons, observed, options, lambda _done, _all: bar.update() and None)
@@ -173,6 +180,38 @@ def _epochs(project: Project, station: str, request: NavigateRequest) -> list[st
             "target; name epochs with --epochs, or detect spots first"
         )
     return found
+
+
+def _times(epochs: Sequence[str], request: NavigateRequest) -> list[float] | None:
+    """Time (s) of every epoch, None where nothing tells."""
+    if request.times is None:
+        step = request.interval_s
+        return None if step is None else [i * step for i in range(len(epochs))]
+    if request.interval_s is not None:
+        raise SurveyError("give either the interval between epochs or a table of their times, not both")
+    try:
+        rows = list(csv.DictReader(request.times.read_text().splitlines()))
+    except (OSError, UnicodeDecodeError) as error:
+        raise SurveyError(f"{request.times}: cannot be read as a table of epoch_id and time_s ({error})") from error
+    if not rows or not {"epoch_id", "time_s"} <= set(rows[0]):
+        raise SurveyError(f"{request.times}:1: the columns epoch_id and time_s are needed")
+    found: dict[str, float] = {}
+    for line, row in enumerate(rows, 2):
+        try:
+            value = float(row["time_s"])
+        except (TypeError, ValueError):
+            value = float("nan")
+        if not np.isfinite(value) or row["epoch_id"] in found:
+            problem = "is there twice" if row["epoch_id"] in found else f"has the time {row['time_s']!r}, give seconds"
+            raise SurveyError(f"{request.times}:{line}: epoch {row['epoch_id']!r} {problem}")
+        found[row["epoch_id"]] = value
+    missing = [e for e in epochs if e not in found]
+    if missing:
+        raise SurveyError(f"{request.times}: no time for epoch {', '.join(missing[:5])}; add it, or leave it out")
+    times = [found[e] for e in epochs]
+    if len(set(times)) < len(times):
+        raise SurveyError(f"{request.times}: two of the epochs to navigate have the same time; times must differ")
+    return times
 
 
 def _calibrate(project: Project, station: str, epochs: Sequence[str]) -> Adjustment:
@@ -229,7 +268,7 @@ def _with_known_points(survey: Survey) -> Survey:
 
 
 def _observed(
-    project: Project, station: str, epoch_id: str, number: int, request: NavigateRequest, named: set[str]
+    project: Project, station: str, epoch_id: str, time_s: float | None, request: NavigateRequest, named: set[str]
 ) -> NavigationEpoch:
     """One epoch's spots, named or not, and its table reading."""
     survey = project.survey
@@ -245,7 +284,6 @@ def _observed(
             spots.append(Spots(b.camera_id, b.uv[rows], b.cov[rows], tuple(ids[i] for i in rows)))
     carried = next(s for s in survey.stations if s.station_id == station).table_id
     reading = next((r for r in survey.table_readings if (r.table_id, r.epoch_id) == (carried, epoch_id)), None)
-    time_s = None if request.interval_s is None else number * request.interval_s
     if reading is None:
         return NavigationEpoch(epoch_id, tuple(spots), time_s)
     return NavigationEpoch(epoch_id, tuple(spots), time_s, reading.angles, reading.cov)

@@ -22,6 +22,7 @@ def declare_navigate(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument("--station", metavar="S", help="the head; default: the one that a table carries")
     parser.add_argument("--epochs", nargs="+", metavar="E", help="default: all that show beacons and no target")
     parser.add_argument("--interval", type=float, metavar="SECONDS", help="epochs follow each other: bridge by motion")
+    parser.add_argument("--times", type=Path, metavar="CSV", help="instead, a table of epoch_id and time_s")
     parser.add_argument("--no-table", action="store_true", help="make no use of the table's angles")
     parser.add_argument("--unnamed", action="store_true", help="forget the names that spots have")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
@@ -33,7 +34,9 @@ def _navigate(arguments: argparse.Namespace) -> int:
     from survey.navigation import NavigateRequest, navigate_job
 
     epochs = None if arguments.epochs is None else tuple(arguments.epochs)
-    request = NavigateRequest(arguments.station, epochs, arguments.interval, not arguments.no_table, arguments.unnamed)
+    request = NavigateRequest(
+        arguments.station, epochs, arguments.interval, not arguments.no_table, arguments.unnamed, arguments.times
+    )
     outcome = navigate_job(arguments.folder, request, out=arguments.out, progress=not is_set(arguments, "quiet"))
     if is_set(arguments, "verbose"):
         say(arguments, *(f"{step}: {seconds:.2f} s" for step, seconds in outcome.seconds.items()))

@@ -112,3 +112,33 @@ def test_quiet_says_nothing_and_text_counts(folder, capsys):
 def test_what_is_not_there_is_named(folder, request_, words):
     with pytest.raises(SurveyError, match=words):
         navigate_job(folder, request_, progress=False)
+
+
+def _table_of_times(folder, rows):
+    path = folder / "times.csv"
+    path.write_text("\n".join(["epoch_id,time_s", *(f"{e},{t}" for e, t in rows)]) + "\n")
+    return path
+
+
+def test_epochs_come_in_the_order_of_their_times(folder):
+    names = [f"n{i + 1:02d}" for i in range(8)]
+    order = [3, 0, 1, 2, 7, 6, 5, 4]
+    path = _table_of_times(folder, [(names[k], 0.5 * i + 0.1 * i * i) for i, k in enumerate(order)])
+    outcome = navigate_job(folder, NavigateRequest(times=path), progress=False)
+    assert [e.epoch_id for e in outcome.trajectory.epochs] == [names[k] for k in order]
+    assert {e.status for e in outcome.trajectory.epochs} <= {"fixed", "bridged"}
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([("n01", 0.0)], "no time for epoch n02, n03, n04, n05, n06"),
+        ([("n01", 0.0), ("n01", 1.0)], "times.csv:3: epoch 'n01' is there twice"),
+        ([("n01", "soon")], "times.csv:2: epoch 'n01' has the time 'soon', give seconds"),
+        ([(f"n{i + 1:02d}", 1.0) for i in range(8)], "have the same time"),
+        ([], "the columns epoch_id and time_s are needed"),
+    ],
+)
+def test_bad_times_are_named(folder, rows, words):
+    with pytest.raises(SurveyError, match=words):
+        navigate_job(folder, NavigateRequest(times=_table_of_times(folder, rows)), progress=False)
