@@ -187,9 +187,9 @@ def plan_text(o: "PlanningOutcome") -> str:
     if o.weak:
         lines += ["", "  weak directions", *(f"    {w.text()}" for w in o.weak[:3])]
     if o.network is not None:
-        n = o.network
-        lines += ["", f"  network: {n['n_stations']} stations, {n['measured_pairs']} of {n['measurable_pairs']} pairs, "
-                      f"{n['independent_conditions']} conditions, {n['conditions_per_pair']:.2f} per pair"]  # fmt: skip
+        w = o.network
+        lines += ["", f"  network: {w['n_stations']} stations, {w['measured_pairs']} of {w['measurable_pairs']} pairs, "
+                      f"{w['independent_conditions']} conditions, {w['conditions_per_pair']:.2f} per pair"]  # fmt: skip
     lines += _selection_lines(o) + _tolerance_lines(o) + _trial_lines(o) + _navigation_lines(o)
     return "\n".join(lines)
 

@@ -88,7 +88,8 @@ def test_json_and_files(lab, capsys):
     assert len(found["navigation"]["placement"]["x_mm"]) == 12
     measure = found["navigation"]["placement"]["measure"]
     assert found["navigation"]["placement"]["final"] <= measure[-1]
-    again = run(capsys, "plan", str(lab), "--place", "12", "--out", "again")
+    found = run(capsys, "plan", str(lab), "--add", "1", "--out", "there")
+    again = run(capsys, "plan", str(lab), "--add", "1", "--out", "again")
     first, second = ({k: v for k, v in x.items() if k not in ("seconds", "written")} for x in (found, again))
     assert first == second
 

@@ -56,9 +56,9 @@ def test_placement_is_measured_as_navigation_predicts_it(criterion):
     assert found.final <= found.measure[-1] * (1 + 1e-9)
     assert found.per_pose.max() == pytest.approx(found.final if criterion == "worst" else found.per_pose.max())
     rng = np.random.default_rng(3)
-    sets = [rng.choice(len(x), 24, replace=False) for _ in range(20)]  # random ones need far more to see enough
+    sets = [rng.choice(len(x), 24, replace=False) for _ in range(8)]  # random ones need far more to see enough
     others = [measured(head, at, x, some, options) for some in sets]
-    assert np.sum(np.isfinite(others)) > 5
+    assert np.sum(np.isfinite(others)) > 2
     assert found.final < np.median(others)
 
 
@@ -66,8 +66,8 @@ def test_placement_beside_exhaustive_search():
     head, at, x = wide_head(), poses(1), walls(40, seed=5)
     options = PlacementOptions()
     lit = expected_precision(head, Beacons(tuple(map(str, range(40))), x, np.zeros((120, 120))), at, 0.2)[0].beacon_ids
-    x = x[[int(i) for i in lit[:10]]]
-    assert len(x) == 10
+    x = x[[int(i) for i in lit[:8]]]
+    assert len(x) == 8
     found = place_beacons(head, at, x, SIGMA, 4, options)
     best = min(measured(head, at, x, some, options) for some in combinations(range(len(x)), 4))
     assert np.isfinite(best)
