@@ -36,6 +36,16 @@ TABLE_FAULTS = {"DROP": "connection cut", "JAM 1": "stall", "FAULT 1 hot": "faul
 CAMERA_FAULTS = ("timeout", "incomplete", "disconnect", "wrong_id", "duplicate", "swap", "extra", "lost")
 
 
+def is_complete(plan: Path, n_epochs: int) -> bool:
+    """Whether all is as it should be; what is not goes to stderr."""
+    try:
+        require_complete(plan, n_epochs)
+    except AssertionError as error:
+        print(f"{plan}: {error}", file=sys.stderr)
+        return False
+    return True
+
+
 def camera_faults(home: Path, kind: str, n_runs: int, rng: np.random.Generator) -> int:
     """Runs with one or two such faults at random images of random cameras; how many survived."""
     survived = 0
@@ -44,8 +54,7 @@ def camera_faults(home: Path, kind: str, n_runs: int, rng: np.random.Generator) 
         folder.mkdir()
         faults = {name: f"{kind}@{rng.integers(2, 6)}" for name in rng.choice(["X", "Y"], rng.integers(1, 3), False)}
         plan = write_plan(folder, faults=faults)
-        survived += run_to_end(processes(), plan) == 0
-        require_complete(plan, 6)
+        survived += run_to_end(processes(), plan) == 0 and is_complete(plan, 6)
     return survived
 
 
@@ -66,8 +75,7 @@ def at_work(home: Path, server: TableServer, fault: str, n_runs: int, rng: np.ra
         for line in ("UNJAM 1", "CLEAR", "SPEAK"):
             server.inject(line)
         process.join(60)
-        survived += run_to_end(processes(), plan) == 0
-        require_complete(plan, 12)
+        survived += run_to_end(processes(), plan) == 0 and is_complete(plan, 12)
     return survived
 
 
@@ -101,8 +109,7 @@ def full_disk(home: Path, kilobytes: int) -> bool | None:
         stopped = run_to_end(processes(), plan) == 1
         subprocess.run(["mount", "-o", "remount,size=4m", str(small)], check=True)
         done = run_to_end(processes(), plan) == 0
-        require_complete(plan, 24)
-        return stopped and done
+        return stopped and done and is_complete(plan, 24)
     finally:
         subprocess.run(["umount", str(small)], check=True)
 
@@ -131,6 +138,7 @@ def main() -> None:
     """All faults; rows go out as they are done."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--only", choices=("kills", "cameras", "table", "disk", "interrupt"), action="append")
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
@@ -139,23 +147,36 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         home = Path(name)
         (home / "server").mkdir()
+        wanted = given.only or ["kills", "cameras", "table", "disk", "interrupt"]
         with table_server(home / "server", *FAST) as server:
-            (home / "kills").mkdir()
-            counts = kill_runs(home / "kills", server.url, given.kills, given.seed)
-            print(f"{'SIGKILL at random instants':<44}{counts['kills']:>6}{counts['kills']:>10}", flush=True)
-            print(f"  {counts}")
-            n = fsync_points(home)
-            print(f"{'SIGKILL before every fsync of a run':<44}{n:>6}{n:>10}", flush=True)
-            for kind in CAMERA_FAULTS:
-                survived = camera_faults(home, kind, given.runs, rng)
-                print(f"{'camera: ' + kind:<44}{given.runs:>6}{survived:>10}", flush=True)
-            for fault, text in TABLE_FAULTS.items():
-                survived = at_work(home, server, fault, given.runs, rng)
-                print(f"{'table: ' + text:<44}{given.runs:>6}{survived:>10}", flush=True)
-        full = [full_disk(home, size) for size in (64, 80, 96, 128)]
-        print(f"{'disk full':<44}{sum(f is not None for f in full):>6}{sum(f is True for f in full):>10}", flush=True)
-        delays = interrupt_delays(home, given.runs)
-        print(f"Ctrl-C to the stop at the controller: median {np.median(delays):.1f} ms, largest {max(delays):.1f} ms")
+            if "kills" in wanted:
+                kills(home, server, given.kills, given.seed)
+            for kind in CAMERA_FAULTS if "cameras" in wanted else ():
+                row(f"camera: {kind}", given.runs, camera_faults(home, kind, given.runs, rng))
+            for fault, text in TABLE_FAULTS.items() if "table" in wanted else ():
+                row(f"table: {text}", given.runs, at_work(home, server, fault, given.runs, rng))
+        if "disk" in wanted:
+            full = [full_disk(home, size) for size in (64, 80, 96, 128)]
+            row("disk full", sum(f is not None for f in full), sum(f is True for f in full))
+        if "interrupt" in wanted:
+            delays = interrupt_delays(home, given.runs)
+            median, largest = np.median(delays), max(delays)
+            print(f"Ctrl-C to the stop at the controller: median {median:.1f} ms, largest {largest:.1f} ms")
+
+
+def kills(home: Path, server: TableServer, n: int, seed: int) -> None:
+    """Both rows of kills."""
+    (home / "kills").mkdir()
+    counts = kill_runs(home / "kills", server.url, n, seed)
+    row("SIGKILL at random instants", counts["kills"], counts["kills"])
+    print(f"  {counts}")
+    points = fsync_points(home)
+    row("SIGKILL before every fsync of a run", points, points)
+
+
+def row(fault: str, n_runs: int, survived: int) -> None:
+    """A line of the table."""
+    print(f"{fault:<44}{n_runs:>6}{survived:>10}", flush=True)
 
 
 if __name__ == "__main__":
