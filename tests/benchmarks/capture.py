@@ -9,7 +9,6 @@ take turns with those of the driver, so that a busy machine slows both.
 import argparse
 import gc
 import os
-import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +23,7 @@ from capture.drivers.cameras import open_camera
 from capture.drivers.cameras.simulated import SimulatedCamera
 from capture.simulated.gige_server import GigeServer
 from capture.trigger_set import TriggerSet
+from tests.capture.camera_helpers import gige_port
 
 WIDTH, HEIGHT = 640, 512
 BLOCK = 250  # images between two looks at the memory
@@ -53,27 +53,24 @@ def main() -> None:
             sys.stdout.flush()
 
 
-def row(name: str, take: Take, bare: Take | None, n_frames: int) -> str:
-    times: dict[str, list[float]] = {"driver": [], "bare": []}
-    cpu: dict[str, list[float]] = {"driver": [], "bare": []}
-    memory = []
-    run("driver", take, BLOCK, {"driver": []}, {"driver": []})
+def row(name: str, take: Take, bare: Take, n_frames: int) -> str:
+    n_blocks = n_frames // BLOCK
+    # what the measurement itself needs is there, and written to, before it begins
+    driver_times, bare_times = np.ones((n_blocks, BLOCK, 2)), np.ones((n_blocks, BLOCK // 5, 2))
+    memory = np.ones(n_blocks)
+    run(take, np.ones((BLOCK, 2)))
     before = counts()
-    begin, spent = time.perf_counter(), 0.0
-    for _ in range(n_frames // BLOCK):
-        run("driver", take, BLOCK, times, cpu)
-        if bare is not None:
-            pause = time.perf_counter()
-            run("bare", bare, BLOCK // 5, times, cpu)
-            spent += time.perf_counter() - pause
+    for k in range(n_blocks):
+        run(take, driver_times[k])
+        run(bare, bare_times[k])
         gc.collect()
-        memory.append(resident_bytes())
-    rate = n_frames / (time.perf_counter() - begin - spent)
-    settled = memory[len(memory) // 10 :]
+        memory[k] = resident_bytes()
+    settled = memory[n_blocks // 10 :]
     slope = np.polyfit(np.arange(len(settled)) * BLOCK, settled, 1)[0] if len(settled) > 1 else 0.0
-    median = statistics.median
-    driver_s, bare_s = median(times["driver"]), median(times["bare"]) if times["bare"] else float("nan")
-    cpu_s = median(cpu["driver"]) - (median(cpu["bare"]) if cpu["bare"] else float("nan"))
+    rate = 1.0 / driver_times[:, :, 0].mean()
+    driver_s, driver_cpu_s = np.median(driver_times, axis=(0, 1))
+    bare_s, bare_cpu_s = np.median(bare_times, axis=(0, 1))
+    cpu_s = driver_cpu_s - bare_cpu_s
     files, threads = (b - a for a, b in zip(before, counts(), strict=True))
     return (
         f"{name:<12}{rate:9.0f}{1e3 * driver_s:11.3f}{1e3 * bare_s:9.3f}{1e6 * (driver_s - bare_s):9.0f}"
@@ -81,12 +78,12 @@ def row(name: str, take: Take, bare: Take | None, n_frames: int) -> str:
     )
 
 
-def run(name: str, take: Take, n: int, times: dict[str, list[float]], cpu: dict[str, list[float]]) -> None:
-    for _ in range(n):
+def run(take: Take, times: np.ndarray) -> None:
+    """Fills times (n, 2) s: by the clock, and of this thread's processor."""
+    for row_of_times in times:
         begin, begin_cpu = time.perf_counter(), time.thread_time()
         take()
-        times[name].append(time.perf_counter() - begin)
-        cpu[name].append(time.thread_time() - begin_cpu)
+        row_of_times[:] = time.perf_counter() - begin, time.thread_time() - begin_cpu
 
 
 def counts() -> tuple[int, int]:
@@ -138,7 +135,7 @@ def pylon() -> Iterator[tuple[Take, Take]]:
 @contextmanager
 def gige() -> Iterator[tuple[Take, Take]]:
     """Free running, since Aravis' camera looks for triggers 25 times a second only; fetch alone."""
-    with GigeServer("gradient"), open_camera("gige:127.0.0.1") as camera:
+    with gige_port(), GigeServer("gradient"), open_camera("gige:127.0.0.1") as camera:
         prepared(camera, TriggerMode="Off", AcquisitionFrameRate=200.0)
         camera.arm()
         stream = camera._stream  # type: ignore[attr-defined]

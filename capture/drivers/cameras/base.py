@@ -2,6 +2,7 @@
 
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import suppress
 from types import TracebackType
 from typing import Self
@@ -10,6 +11,7 @@ import numpy as np
 
 from capture.camera import (
     CameraError,
+    DisconnectedError,
     FeatureValue,
     FetchTimeoutError,
     Frame,
@@ -33,6 +35,7 @@ LOCKED_WHILE_ARMED = (
     *("Width", "Height", "OffsetX", "OffsetY", "PixelFormat"),
     *("TriggerSelector", "TriggerMode", "TriggerSource"),
 )
+READY_S = 2.0  # from the start of acquisition, or from a trigger, until the next trigger is obeyed
 _LATE_S = 0.3  # how long after its exposure an image may still arrive
 
 
@@ -157,6 +160,30 @@ class DriverCamera(ABC):
     def _locked(self, name: str) -> InUseError:
         found = f"{name} cannot be written now"
         return InUseError(self.address, found, "disarm the camera first; if it is disarmed, the feature is read-only")
+
+    def _gone(self) -> DisconnectedError:
+        return DisconnectedError(self.address, "it does not answer any more", "check cable and power, open it anew")
+
+    def _late(self, timeout_s: float) -> FetchTimeoutError:
+        found = f"no image within {timeout_s:g} s"
+        return FetchTimeoutError(self.address, found, "was it triggered? check trigger, exposure, cable and firewall")
+
+    def _incomplete(self, what: str, why: str, frame: Frame | None = None) -> IncompleteFrameError:
+        advice = "take it again; if it repeats, check cable, packet size and bandwidth"
+        error = IncompleteFrameError(self.address, f"{what} arrived incomplete ({why})", advice)
+        error.frame, self._unanswered = frame, False
+        return error
+
+    def _wait_for(self, ready: Callable[[], object]) -> None:
+        """Until the camera waits for a trigger: one sent before is lost without a word."""
+        end = time.monotonic() + READY_S
+        while not ready():
+            if time.monotonic() > end:
+                raise FetchTimeoutError(
+                    self.address,
+                    f"it does not wait for a trigger within {READY_S:.0f} s",
+                    "check that TriggerSelector is FrameStart, and that the exposure is shorter than that",
+                )
 
     def _frame(
         self,

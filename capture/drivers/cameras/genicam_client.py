@@ -1,6 +1,5 @@
 """GigE Vision and USB3 Vision cameras without a maker's SDK, through viva-genicam."""
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, cast
@@ -18,9 +17,14 @@ from capture.camera import (
     InUseError,
     OutOfRangeError,
 )
-from capture.drivers.cameras.base import LOCKED_WHILE_ARMED, OLDER_NAMES, DriverCamera, bits_of, is_mosaic_or_gray
-
-_READY_S = 2.0
+from capture.drivers.cameras.base import (
+    LOCKED_WHILE_ARMED,
+    OLDER_NAMES,
+    READY_S,
+    DriverCamera,
+    bits_of,
+    is_mosaic_or_gray,
+)
 
 
 class GenicamClientCamera(DriverCamera):
@@ -110,15 +114,10 @@ class GenicamClientCamera(DriverCamera):
         self._drain()
 
     def _wait_until_ready(self) -> None:
-        """A trigger sent before the camera waits for it is lost; cameras that can tell are asked."""
-        if self._camera.node_info("AcquisitionStatus") is None:
-            return
-        self._camera.set_enum("AcquisitionStatusSelector", "FrameTriggerWait")
-        end = time.monotonic() + _READY_S
-        while not self._camera.get_bool("AcquisitionStatus"):
-            if time.monotonic() > end:
-                found = f"it does not wait for a trigger {_READY_S:.0f} s after it was armed"
-                raise FetchTimeoutError(self.address, found, "check that TriggerSelector is FrameStart")
+        """Cameras that can tell whether they wait for a trigger are asked."""
+        if self._camera.node_info("AcquisitionStatus") is not None:
+            self._camera.set_enum("AcquisitionStatusSelector", "FrameTriggerWait")
+            self._wait_for(lambda: self._camera.get_bool("AcquisitionStatus"))
 
     def disarm(self) -> None:
         """See ``Camera``."""
@@ -137,7 +136,7 @@ class GenicamClientCamera(DriverCamera):
         with suppress(FetchTimeoutError):
             while True:
                 self.fetch(0.0)
-        self.fetch(_READY_S)  # its exposure began before the call
+        self.fetch(READY_S)  # its exposure began before the call
 
     def fetch(self, timeout_s: float) -> Frame:
         """See ``Camera``."""
@@ -151,7 +150,7 @@ class GenicamClientCamera(DriverCamera):
         if received is None:
             raise self._gone()
         if not received.is_complete:
-            raise self._incomplete(received)
+            raise self._part(received)
         return self._converted(received, complete=True)
 
     def _converted(self, received: Any, complete: bool) -> Frame:
@@ -160,23 +159,17 @@ class GenicamClientCamera(DriverCamera):
         device_time_ns = None if not ticks else round(ticks * self._ns_per_tick)
         return self._frame(image, received.block_id, device_time_ns, bits_of(received.pixel_format), complete)
 
-    def _incomplete(self, received: Any) -> IncompleteFrameError:
-        missing = received.missing_packets
-        what = f"{missing} packets are missing" if missing else f"status {received.status.value}"
-        found = f"image {received.block_id} arrived incomplete ({what})"
-        advice = "take it again; if it repeats, check cable, packet size and bandwidth"
-        error = IncompleteFrameError(self.address, found, advice)
-        error.frame = self._converted(received, complete=False)
-        return error
+    def _part(self, received: Any) -> IncompleteFrameError:
+        missing, frame = received.missing_packets, None
+        with suppress(vg.GenicamError):  # where the end is missing it is no image
+            frame = self._converted(received, complete=False)
+        why = f"{missing} packets are missing" if missing else f"status {received.status.value}"
+        return self._incomplete(f"image {received.block_id}", why, frame)
 
     def _no_image(self, timeout_s: float) -> CameraError:
         if timeout_s > 0.0 and not self._answers():
             return self._gone()
-        found = f"no image within {timeout_s:g} s"
-        return FetchTimeoutError(self.address, found, "was it triggered? check trigger, exposure, cable and firewall")
-
-    def _gone(self) -> DisconnectedError:
-        return DisconnectedError(self.address, "it does not answer any more", "check cable and power, open it anew")
+        return self._late(timeout_s)
 
     @contextmanager
     def _translated(self, what: str) -> Iterator[None]:

@@ -5,7 +5,6 @@
 
 import atexit
 import os
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,20 +20,19 @@ from capture.camera import (
     FeatureValue,
     FetchTimeoutError,
     Frame,
-    IncompleteFrameError,
     InUseError,
     OutOfRangeError,
 )
 from capture.drivers.cameras.base import (
     LOCKED_WHILE_ARMED,
     OLDER_NAMES,
+    READY_S,
     DriverCamera,
     bits_of,
     gray_copy,
     is_mosaic_or_gray,
 )
 
-_READY_S = 2.0
 _BUFFERS = 8
 # a producer can be loaded once in a process, so its harvester stays until the end
 _HARVESTERS: dict[tuple[str, ...], Harvester] = {}
@@ -172,16 +170,11 @@ class GentlCamera(DriverCamera):
         self._drain()
 
     def _wait_until_ready(self) -> None:
-        """A trigger sent before the camera waits for it is lost; cameras that can tell are asked."""
+        """Cameras that can tell whether they wait for a trigger are asked."""
         nodes = self._acquirer.remote_device.node_map
-        if not nodes.has_node("AcquisitionStatus"):
-            return
-        nodes.AcquisitionStatusSelector.value = "FrameTriggerWait"
-        end = time.monotonic() + _READY_S
-        while not nodes.AcquisitionStatus.value:
-            if time.monotonic() > end:
-                found = f"it does not wait for a trigger {_READY_S:.0f} s after it was armed"
-                raise FetchTimeoutError(self.address, found, "check that TriggerSelector is FrameStart")
+        if nodes.has_node("AcquisitionStatus"):
+            nodes.AcquisitionStatusSelector.value = "FrameTriggerWait"
+            self._wait_for(lambda: nodes.AcquisitionStatus.value)
 
     def disarm(self) -> None:
         """See ``Camera``."""
@@ -199,7 +192,7 @@ class GentlCamera(DriverCamera):
         with suppress(FetchTimeoutError):
             while True:
                 self.fetch(1e-3)
-        self.fetch(_READY_S)  # its exposure began before the call
+        self.fetch(READY_S)  # its exposure began before the call
 
     def fetch(self, timeout_s: float) -> Frame:
         """See ``Camera``."""
@@ -209,7 +202,7 @@ class GentlCamera(DriverCamera):
             # harvesters takes 0 for "without end"; it gives None after the time and for a buffer with missing parts
             buffer = self._acquirer.try_fetch(timeout=max(timeout_s, 1e-3))
             if buffer is None:
-                raise self._no_image(timeout_s)
+                raise self._incomplete("an image", "its number is lost") if self._lost_parts else self._late(timeout_s)
             with buffer:
                 return self._frame_of(buffer)
 
@@ -217,13 +210,6 @@ class GentlCamera(DriverCamera):
         part = buffer.payload.components[0]
         image = gray_copy(part.data.reshape(part.height, part.width))
         return self._frame(image, int(buffer.frame_id), _time_stamp_ns(buffer), bits_of(part.data_format))
-
-    def _no_image(self, timeout_s: float) -> CameraError:
-        if self._lost_parts:
-            advice = "take it again; if it repeats, check cable and bandwidth"
-            return IncompleteFrameError(self.address, "an image arrived incomplete", advice)
-        found = f"no image within {timeout_s:g} s"
-        return FetchTimeoutError(self.address, found, "was it triggered? check trigger, exposure and cable")
 
     @contextmanager
     def _translated(self, what: str) -> Iterator[None]:
@@ -233,8 +219,7 @@ class GentlCamera(DriverCamera):
         except (gentl.ResourceInUseException, gentl.AccessDeniedException) as error:
             raise InUseError(self.address, "another program holds it", "close that program") from error
         except (gentl.IoException, gentl.InvalidHandleException, gentl.ClosedException) as error:
-            found = "it does not answer any more"
-            raise DisconnectedError(self.address, found, "check cable and power, open it anew") from error
+            raise self._gone() from error
         except (gentl.GenericException, genapi.GenericException) as error:
             message = str(error).split(" : ")[0].strip()
             raise CameraError(self.address, f"{what}: {message}", "see the camera's manual") from error

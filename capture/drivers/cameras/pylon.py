@@ -10,20 +10,23 @@ from capture.camera import (
     CameraInfo,
     DisconnectedError,
     FeatureValue,
-    FetchTimeoutError,
     Frame,
-    IncompleteFrameError,
     InUseError,
     OutOfRangeError,
 )
-from capture.drivers.cameras.base import LOCKED_WHILE_ARMED, OLDER_NAMES, DriverCamera, bits_of, is_mosaic_or_gray
+from capture.drivers.cameras.base import (
+    LOCKED_WHILE_ARMED,
+    OLDER_NAMES,
+    READY_S,
+    DriverCamera,
+    bits_of,
+    is_mosaic_or_gray,
+)
 
 with warnings.catch_warnings():
     # SWIG's types have no __module__; where warnings are errors, that one ends the interpreter
     warnings.filterwarnings("ignore", "builtin type .* has no __module__ attribute", DeprecationWarning)
     from pypylon import genicam, pylon
-
-_READY_S = 2.0  # from the start of acquisition, or from a trigger, until the next trigger is obeyed
 
 
 def discover() -> tuple[CameraInfo, ...]:
@@ -137,15 +140,9 @@ class PylonCamera(DriverCamera):
         self._drain()
 
     def _wait_until_ready(self) -> None:
-        """A trigger sent before the camera waits for it is lost without a word."""
-        if self._camera.CanWaitForFrameTriggerReady() and not self._camera.WaitForFrameTriggerReady(
-            int(1e3 * _READY_S), pylon.TimeoutHandling_Return
-        ):
-            raise FetchTimeoutError(
-                self.address,
-                f"it does not wait for a trigger, {_READY_S:.0f} s after the last",
-                "check that TriggerSelector is FrameStart, and that the exposure is not longer than that",
-            )
+        if self._camera.CanWaitForFrameTriggerReady():
+            wait_ms = int(1e3 * READY_S)
+            self._wait_for(lambda: self._camera.WaitForFrameTriggerReady(wait_ms, pylon.TimeoutHandling_Return))
 
     def disarm(self) -> None:
         """See ``Camera``."""
@@ -163,7 +160,7 @@ class PylonCamera(DriverCamera):
         with self._translated("trigger"):
             while (result := self._camera.RetrieveResult(0, pylon.TimeoutHandling_Return)).IsValid():
                 result.Release()
-            self.fetch(_READY_S)  # its exposure began before the call
+            self.fetch(READY_S)  # its exposure began before the call
 
     def fetch(self, timeout_s: float) -> Frame:
         """See ``Camera``."""
@@ -186,19 +183,12 @@ class PylonCamera(DriverCamera):
         frame = self._frame(result.Array, int(result.BlockID), int(result.TimeStamp), self._bits, complete)
         if complete:
             return frame
-        found = f"image {frame.block_id} arrived incomplete ({result.ErrorDescription or 'no reason given'})"
-        error = IncompleteFrameError(self.address, found, "take it again; if it repeats, check cable and bandwidth")
-        error.frame = frame
-        raise error
+        raise self._incomplete(f"image {frame.block_id}", result.ErrorDescription or "no reason given", frame)
 
     def _no_image(self, timeout_s: float) -> CameraError:
         if timeout_s > 0.0 and self._camera.IsCameraDeviceRemoved():  # the question takes 2 ms
             return self._gone()
-        found = f"no image within {timeout_s:g} s"
-        return FetchTimeoutError(self.address, found, "was it triggered? check trigger, exposure and cable")
-
-    def _gone(self) -> DisconnectedError:
-        return DisconnectedError(self.address, "it does not answer any more", "check cable and power, open it anew")
+        return self._late(timeout_s)
 
     @contextmanager
     def _translated(self, what: str) -> Iterator[None]:

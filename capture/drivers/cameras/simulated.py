@@ -17,13 +17,10 @@ from adjust.errors import SurveyError
 from capture.camera import (
     CameraError,
     CameraInfo,
-    DisconnectedError,
     FeatureValue,
-    FetchTimeoutError,
     Frame,
     GrayImage,
     ImageSource,
-    IncompleteFrameError,
     InUseError,
     OutOfRangeError,
 )
@@ -94,7 +91,7 @@ class SimulatedCamera(DriverCamera):
         }  # fmt: skip
         self._queue: deque[Frame] = deque()
         self._delayed: Frame | None = None
-        self._open = self._gone = False
+        self._open = self._vanished = False
         self._block_id = 0
         self.n_taken = 0
 
@@ -103,7 +100,7 @@ class SimulatedCamera(DriverCamera):
         if self.address in _HELD:
             raise InUseError(self.address, "it is open already", "close it there first")
         _HELD.add(self.address)
-        self._open, self._gone = True, False
+        self._open, self._vanished = True, False
 
     def close(self) -> None:
         """See ``Camera``."""
@@ -169,17 +166,15 @@ class SimulatedCamera(DriverCamera):
         if not self._queue:
             time.sleep(timeout_s)
             self._require_there()
-            raise FetchTimeoutError(self.address, f"no image within {timeout_s:g} s", "was it triggered?")
+            raise self._late(timeout_s)
         frame = self._queue.popleft()
         if frame.complete:
             return frame
-        error = IncompleteFrameError(self.address, f"image {frame.block_id} arrived incomplete", "take it again")
-        error.frame = frame
-        raise error
+        raise self._incomplete(f"image {frame.block_id}", "simulated", frame)
 
     def _require_there(self) -> None:
-        if self._gone:
-            raise DisconnectedError(self.address, "it does not answer any more", "open it anew")
+        if self._vanished:
+            raise self._gone()
         if not self._open:
             raise CameraError(self.address, "it is not open", "open it first")
 
@@ -187,7 +182,7 @@ class SimulatedCamera(DriverCamera):
         self.n_taken += 1
         kind = self._faults.get(self.n_taken)
         if kind == "disconnect":
-            self._gone = True
+            self._vanished = True
         if kind in ("timeout", "disconnect"):
             return
         self._block_id += 8 if kind == "wrong_id" else 1
