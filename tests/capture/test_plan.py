@@ -3,12 +3,14 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from adjust.errors import SurveyError
 from capture.cli import main
+from capture.drivers.turntables.dialect import read_dialect
 from capture.plan import check_plan_limits, estimate, read_plan
 from capture.turntable import LimitError
 from survey.files import write_project
@@ -191,3 +193,16 @@ def test_cover_that_cannot_be(tmp_path, known_survey):
     survey, _ = known_survey
     with pytest.raises(SurveyError, match=r"camera 'Y' never sees 'board' whole"):
         read_plan(covering_plan(tmp_path, survey, "margin_px = 500"))
+
+
+def test_plan_and_dialect_of_the_manual(tmp_path):
+    """What docs/capture.md shows can be used as it stands, but for the poses that need a survey."""
+    text = (Path(__file__).resolve().parents[2] / "docs" / "capture.md").read_text()
+    plan, dialect = (block.split("```")[0] for block in text.split("```toml\n")[1:])
+    plan = plan[: plan.index("[poses.c]")].replace("survey =", "# survey =")
+    (tmp_path / "plan.toml").write_text(plan)
+    found = read_plan(tmp_path / "plan.toml")
+    assert len(found.poses) == 17
+    check_plan_limits(found)
+    (tmp_path / "mine.toml").write_text(dialect)
+    assert read_dialect("mine.toml", tmp_path).texts == {"3": "beyond the controller's own limits"}
