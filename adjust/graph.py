@@ -25,7 +25,7 @@ from adjust.geometry.building import GeometryFactors, position_refs
 from adjust.image_batch import ImageBatch, warp_shape
 from adjust.model import BoolArray, FloatArray, Survey, VectorPrior
 from adjust.observation_factor import ObservationFactor, frame_text, position_text
-from adjust.observations import FrameRef, ImageBlock, Pair, PositionRef
+from adjust.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef
 from adjust.result import ParameterName
 from adjust.state import State, collect_vectors
 from adjust.terrestrial.batch import TerrestrialBatch
@@ -314,8 +314,11 @@ class GraphBuilder:
                 if p.value is None or p.prior_cov is None:
                     raise SurveyError(f"point {point.point_id!r} has a prior without coordinates or sigma; give both")
                 name = ("point", point.point_id)
-                factor = gtsam.PriorFactorPoint3(u.by_name[name].key, p.value, gaussian(p.prior_cov))
-                self._other(factor, "prior", "prior", name, ("x", "y", "z"), ("m",) * 3, p.value)
+                known = np.isfinite(np.diag(p.prior_cov))
+                mean = Coordinates((PositionRef(point.point_id),), np.asarray(p.value)[None], p.prior_cov)
+                factor = coordinates_factor(mean, [Position(None, np.zeros(3), u.by_name[name].key)])
+                self._other(factor, "prior", "prior", name, tuple(np.array(["x", "y", "z"])[known]),
+                            ("m",) * int(known.sum()), np.asarray(p.value)[known])  # fmt: skip
         owners: list[tuple[ParameterName, VectorPrior | None]]
         owners = [(("lens", c.camera_id), c.lens.prior) for c in self.survey.cameras]
         owners += [(("table_geometry", t.table_id), t.geometry.prior) for t in self.survey.tables]

@@ -359,6 +359,17 @@ def test_point_coordinates_scatter_as_their_covariance_says() -> None:
     assert abs(sum(chi) - 2520.0) < 3.3 * 71.0
 
 
+def test_point_prior_that_leaves_a_height_open() -> None:
+    """x and y from the prior, z from one distance straight down."""
+    prior = PointParameter(np.array([1.0, 2.0, 0.9]), "prior", np.diag([1e-6, 4e-6, np.inf]))
+    survey = Survey(points=(Point("P", prior), Point("F", PointParameter(np.array([1.0, 2.0, 0.0]), "held"))),
+                    distances=(Distance("d", PositionRef("F"), PositionRef("P"), 1.0, 1e-4),))  # fmt: skip
+    result = adjust(survey, StartValues({}, {}, {"P": np.array([1.0, 2.0, 0.9])}))
+    np.testing.assert_allclose(result.estimates["point", "P"].value, [1.0, 2.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(np.sqrt(np.diag(result.estimates["point", "P"].cov)), [1e-3, 2e-3, 1e-4], rtol=1e-9)
+    assert (result.n_observations, result.redundancy) == (3, 0)
+
+
 def levelled(value_1: float, value_2: float) -> Survey:
     station = Station("stage", world_from_station=PoseParameter(Pose3(), "free", held=("rz", "tx", "ty", "tz")))
     frame = FrameRef("station", "stage")
