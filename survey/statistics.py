@@ -1,12 +1,15 @@
 """What the statistics of an adjustment say, gathered for reports and result files."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from gtsam import Pose3
+from scipy.spatial import cKDTree
 
 from adjust.model import FloatArray
 from adjust.result import Adjustment, Estimate, ParameterName
+from adjust.statistics.budget import uncertainty_budget
+from adjust.statistics.relative_precision import relative_precision
 from adjust.statistics.reliability import reliability
 from adjust.statistics.result import (
     BudgetEntry,
@@ -17,7 +20,9 @@ from adjust.statistics.result import (
     VarianceComponents,
     WeakDirection,
 )
-from survey.quantities import Scale
+from adjust.statistics.system import linear_system
+from adjust.statistics.weakness import correlations, weak_directions
+from survey.quantities import PROBABILITY, Scale
 from survey.tolerances import Tolerance, Verdict, verdicts
 
 
@@ -53,13 +58,70 @@ class Statistics:
 
 MOST_CORRELATED = 110
 """Components that the picture of correlations shows: what there is once before what there is at every epoch."""
+MOST_BUDGETS = 60
+"""Parameters with a budget: cameras, tables and stations first, then points."""
+MOST_NEIGHBOURS = 150
+LARGE = 300_000
+"""Observed components above which correlations, weak directions and budgets are left out: they need minutes there."""
 
 
 def statistics_of(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], scale: Scale) -> Statistics:
     """All of them. Raises SurveyError for a tolerance that is about nothing."""
     judged = verdicts(adjustment, tolerances, scale)
-    found = reliability(adjustment)
-    return Statistics(found, None, (), (), (), (), correlation_matrix(adjustment), (), judged)
+    if adjustment.n_observations > LARGE:
+        found = reliability(adjustment)
+        return Statistics(found, adjustment.variance_components, (), (), neighbours(adjustment, scale), (),
+                          correlation_matrix(adjustment), adjustment.decisions, judged)  # fmt: skip
+    system = linear_system(adjustment)
+    components = adjustment.variance_components
+    names = _budgeted(adjustment)
+    budget = uncertainty_budget(adjustment, names, PROBABILITY, components, system) if names else ()
+    return Statistics(
+        reliability(adjustment, system=system), components, correlations(adjustment, system=system),
+        weak_directions(adjustment, system=system), neighbours(adjustment, scale),
+        tuple(_scaled_budget(x, scale.factor) for x in budget), correlation_matrix(adjustment), adjustment.decisions,
+        judged,
+    )  # fmt: skip
+
+
+def _budgeted(adjustment: Adjustment) -> tuple[ParameterName, ...]:
+    """What gets a budget: what there is once, points last."""
+    rank = {"lens": 0, "station_from_camera": 1, "mount_from_station": 2, "world_from_table": 3, "table_geometry": 4,
+            "world_from_station": 5, "point": 6}  # fmt: skip
+    names = [n for n, e in adjustment.estimates.items() if n[0] in rank and len(n) == 2 and _unknown_components(e)]
+    return tuple(sorted(names, key=lambda n: rank[n[0]])[:MOST_BUDGETS])
+
+
+def _scaled_budget(entry: BudgetEntry, factor: float) -> BudgetEntry:
+    lines = tuple(replace(line, u=factor * line.u) for line in entry.lines)
+    return replace(entry, u=factor * entry.u, expanded=factor * entry.expanded, lines=lines)
+
+
+def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision, ...]:
+    """Relative precision of every point and fixed station to its two nearest; sigmas scaled as the others are."""
+    names, places = [], []
+    for name, e in adjustment.estimates.items():
+        if len(name) == 2 and name[0] in ("point", "world_from_station"):
+            x = np.asarray(e.value.translation() if isinstance(e.value, Pose3) else e.value, dtype=float)
+            if np.isfinite(x).all():
+                names.append(name)
+                places.append(x)
+    if len(names) < 2:
+        return ()
+    _, near = cKDTree(np.array(places)).query(np.array(places), k=min(3, len(names)))
+    pairs = dict.fromkeys((min(i, int(k)), max(i, int(k))) for i, row in enumerate(near) for k in row if int(k) != i)
+    free = [(names[i], names[k]) for i, k in pairs if _is_free(adjustment, names[i]) or _is_free(adjustment, names[k])]
+    posterior = scale.sigmas == "a_posteriori"
+    f = scale.factor
+    return tuple(
+        replace(r, cov=f**2 * r.cov, sigma_distance=f * r.sigma_distance,
+                rotation_cov=None if r.rotation_cov is None else f**2 * r.rotation_cov)
+        for r in relative_precision(adjustment, free[:MOST_NEIGHBOURS], PROBABILITY, posterior)
+    )  # fmt: skip
+
+
+def _is_free(adjustment: Adjustment, name: ParameterName) -> bool:
+    return bool(_unknown_components(adjustment.estimates[name]))
 
 
 def correlation_matrix(adjustment: Adjustment) -> CorrelationMatrix | None:
