@@ -206,8 +206,9 @@ def inner_datum(graph: AdjustmentGraph, base: gtsam.Values) -> InnerDatum | None
 
 def datum_rows(keys: Sequence[int], motions: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
     """Orthonormal rows (k, dim per key) that forbid the motions (dim, k) of ``keys``; raises SurveyError."""
-    Q, triangular = np.linalg.qr(np.concatenate([motions[k] for k in keys]))
-    if np.abs(np.diag(triangular)).min() < 1e-9 * np.abs(triangular).max():
+    stacked = np.concatenate([motions[k] for k in keys])
+    Q, triangular = np.linalg.qr(stacked)
+    if len(stacked) < stacked.shape[1] or np.abs(np.diag(triangular)).min() < 1e-9 * np.abs(triangular).max():
         raise SurveyError("the points and stations named for the inner datum cannot carry it; name three points")
     rows, o = {}, 0
     for key in keys:

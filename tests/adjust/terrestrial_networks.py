@@ -1,6 +1,6 @@
 """Surveys with total station readings, and the readings once more in a few plain lines of matrices."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -203,21 +203,33 @@ def wrapped(v: FloatArray) -> FloatArray:
     return np.asarray((v + np.pi) % (2.0 * np.pi) - np.pi)
 
 
+def concerns(r: Reading, name: tuple[str, ...]) -> bool:
+    """Whether an unknown may change a reading."""
+    if name[0] == "point":
+        return any(ref is not None and ref.point_id == name[1] for ref in (r.at, r.to, r.second))
+    return r.setup_id == name[1] if name[0] in ("orientation", "centring") else True
+
+
 def dense(survey: Survey, result: Adjustment) -> DenseReadings:
     """The linear system of all readings at the solution, from plain matrices and five-point differences."""
     truth: dict[tuple[str, ...], Any] = {n: e.value for n, e in result.estimates.items()}
     angle = np.array([r.kind in ANGLES for r in survey.readings])
 
-    def readings(values: Truth) -> FloatArray:
+    def readings(values: Truth, rows: Sequence[int]) -> FloatArray:
         x = positions_of(survey, values)
-        return np.array([plain_reading(survey, r, values, x) for r in survey.readings])
+        out = np.zeros(len(survey.readings))
+        out[rows] = [plain_reading(survey, survey.readings[i], values, x) for i in rows]
+        return out
 
     def difference(a: FloatArray, b: FloatArray) -> FloatArray:
         return np.where(angle, wrapped(a - b), a - b)
 
-    at, columns, place = readings(truth), [], {}
+    at, columns, place = readings(truth, range(len(survey.readings))), [], {}
     for name, estimate in result.estimates.items():
         first = len(columns)
+        rows = [i for i, r in enumerate(survey.readings) if concerns(r, name)]
+        mine = np.zeros(len(at))
+        mine[rows] = at[rows]
         for i, status in enumerate(estimate.status):
             if status == "held":
                 continue
@@ -225,7 +237,7 @@ def dense(survey: Survey, result: Adjustment) -> DenseReadings:
             for k, weight in ((1, 8.0), (-1, -8.0), (2, -1.0), (-2, 1.0)):
                 value = np.array(estimate.value, dtype=float)
                 value[i] += k * step
-                total += weight * difference(readings({**truth, name: value}), at)
+                total += weight * difference(readings({**truth, name: value}, rows), mine)
             columns.append(total / (12.0 * step))
         if len(columns) > first:
             place[name] = slice(first, len(columns))
