@@ -134,6 +134,8 @@ class Adjustment:
     max_step: the last step in sigmas of the unknowns. warnings: for people, worst first.
     other_residuals: of all that are not image points, the readings last, also as arrays in ``reading_residuals``.
     precision: gives joint covariances, ``precision.joint([name, ...])``.
+    variance_components: ``adjust.statistics.result.VarianceComponents``, where they were estimated. decisions: the log
+    of the search for gross errors, ``adjust.statistics.result.Decision``.
     """
 
     survey: Survey
@@ -154,3 +156,5 @@ class Adjustment:
     warnings: tuple[str, ...]
     precision: Any = None
     reading_residuals: ReadingResiduals | None = None
+    variance_components: Any = None
+    decisions: tuple[Any, ...] = ()

@@ -21,9 +21,10 @@ from adjust.errors import IndeterminateError, SurveyError
 from adjust.lost_points import without_lost_points
 from adjust.model import IntArray, Survey
 from adjust.observations import ImageBlock
-from adjust.pair_screen import PairOptions, adjust_with_pairs
 from adjust.result import Adjustment
+from adjust.statistics.cleaned import adjust_cleaned
 from survey.checked import checked
+from survey.cleaning import clean_options
 from survey.detection import DetectionTask, ImageReport, SpotOptions, detect_images
 from survey.files import Definition, Project, SpotBlock, read, read_definition, write_image_points, write_spots
 from survey.identify import Identification, identify_spots, without_points
@@ -253,10 +254,8 @@ def adjust_project(project: Project, progress: bool) -> Adjustment:
                 notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
             survey = replace(survey, image_blocks=survey.image_blocks + found.blocks)
             survey = _seen_points(survey)
-        pairs = PairOptions(project.options.reject_pairs, options)
-        result = checked(
-            survey, lambda: without_lost_points(survey, lambda part: adjust_with_pairs(part, pairs, step))
-        )
+        how = clean_options(project.options)
+        result = checked(survey, lambda: without_lost_points(survey, lambda part: adjust_cleaned(part, how, step)))
     return replace(result, warnings=result.warnings + notes)
 
 

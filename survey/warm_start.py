@@ -17,9 +17,11 @@ from adjust.errors import NotConvergedError
 from adjust.graph import StartValues
 from adjust.initial import find_start
 from adjust.model import FloatArray, PointParameter, PoseParameter, Survey
-from adjust.pair_screen import PairOptions, adjust_with_pairs, adjusted_network, is_pure, network_solution
+from adjust.pair_screen import PairOptions, adjusted_network, is_pure, network_solution
 from adjust.pose_network.from_survey import network_from_survey
 from adjust.result import Adjustment, ParameterName
+from adjust.statistics.cleaned import adjust_cleaned
+from survey.cleaning import clean_options
 from survey.files import Project
 from survey.previous import Previous
 
@@ -47,7 +49,7 @@ def warm_adjustment(
                 return adjusted_network(survey, network_solution(survey, pairs, step, begin), pairs), WARM
         elif (start := survey_start(survey, previous)) is not None:
             try:
-                return adjust_with_pairs(survey, pairs, step, start), WARM
+                return adjust_cleaned(survey, clean_options(project.options), step, start), WARM
             except NotConvergedError:
                 pass  # what is new may contradict what was there; the search from the beginning looks for that
     return cold(project), COLD

@@ -47,8 +47,9 @@ class AdjustmentOptions:
     """How the project is adjusted and reported: the tables [adjustment], [tolerances.NAME] and [identification].
 
     alpha: error probability of the tests. reject_blocks: leave mis-detected images out of the start, then test them.
-    reject_points: leave gross errors among the image points out, and list them. reject_pairs: the same for whole
-    measured pairs. tolerances: what is demanded of the results. identification: who measured what, where and with
+    reject_points: leave gross errors among the image points out, and list them. reject_pairs: the same for measured
+    pairs and single observations of all other kinds. variance_components: estimate the variance of every group.
+    tolerances: what is demanded of the results. identification: who measured what, where and with
     what, printed in the report as it is.
     """
 
@@ -56,6 +57,7 @@ class AdjustmentOptions:
     reject_blocks: bool = True
     reject_points: bool = True
     reject_pairs: bool = True
+    variance_components: bool = False
     tolerances: tuple[Tolerance, ...] = ()
     identification: tuple[tuple[str, str], ...] = ()
 

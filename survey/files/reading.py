@@ -237,12 +237,13 @@ def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest
 def _read_options(root: Node) -> AdjustmentOptions:
     """The tables [adjustment], [tolerances] and [identification]."""
     node, said = root.table("adjustment"), root.table("identification")
-    node.allow("alpha", "reject_blocks", "reject_points", "reject_pairs")
+    node.allow("alpha", "reject_blocks", "reject_points", "reject_pairs", "variance_components")
     alpha = node.number("alpha", 0.05, positive=True)
     if alpha >= 1:
         raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
     flags = {name: node.flag(name, True) for name in ("reject_blocks", "reject_points", "reject_pairs")}
     identification = tuple((key, said.text(key)) for key in said.values)
+    flags["variance_components"] = node.flag("variance_components", False)
     return AdjustmentOptions(alpha, **flags, tolerances=read_tolerances(root), identification=identification)
 
 

@@ -71,6 +71,8 @@ def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, si
         sections.append((("sigmas",), {"image_px": sigmas.image_px}))
     flags = {"reject_blocks": options.reject_blocks, "reject_points": options.reject_points}
     flags["reject_pairs"] = options.reject_pairs
+    if options.variance_components:
+        flags["variance_components"] = True
     sections.append((("adjustment",), {"alpha": options.alpha, **flags}))
     if options.identification:
         sections.append((("identification",), dict(options.identification)))

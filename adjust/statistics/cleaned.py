@@ -1,0 +1,142 @@
+"""The whole adjustment of a survey: without its gross errors, and with estimated variances where that is asked for."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from adjust.adjustment import adjust
+from adjust.graph import StartValues
+from adjust.model import Survey
+from adjust.pair_screen import PairOptions, adjust_with_pairs, is_pure, values_of
+from adjust.result import Adjustment
+from adjust.statistics.criteria import sidak
+from adjust.statistics.outlier_search import OutlierSearch, SearchOptions, search_outliers
+from adjust.statistics.result import Component, VarianceComponents
+from adjust.statistics.scaling import scaled_survey
+from adjust.statistics.variance_components import ComponentOptions, Scaled, estimate_variance_components
+
+_LARGEST = 6000
+_PASSES = 3
+_OTHERS = (
+    "table", "pair", "distance", "coordinates", "coordinate_difference", "level", "alignment", "laser", "surface",
+    "direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance", "height_difference",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class CleanOptions:
+    """pairs: what holds for pairs, and the adjustment itself.
+
+    reject_others: observations of every kind but image points (these are screened by ``AdjustOptions``) are left out
+    where they contradict the rest. variance_components: the variances of all groups are estimated.
+    """
+
+    pairs: PairOptions = field(default_factory=PairOptions)
+    reject_others: bool = True
+    variance_components: bool = False
+
+
+def adjust_cleaned(
+    survey: Survey, options: CleanOptions, progress: Callable[[int, float], None] | None = None,
+    start: StartValues | None = None,
+) -> Adjustment:  # fmt: skip
+    """Adjust; what was left out and which variances were estimated is part of the result and its warnings.
+
+    Raises as :func:`adjust.adjustment.adjust`. Networks of nothing but pairs have a search of their own.
+    """
+    first = adjust_with_pairs(survey, options.pairs, progress, start)
+    if is_pure(survey):
+        return first
+    now, search, scaled, factors = first, None, None, dict[str, float]()
+    rejected: set[tuple[str, ...]] | None = None
+    for _ in range(_PASSES):
+        if factors:  # what was left out before is tried again with the variances of now
+            given = scaled_survey(first.survey, factors)
+            now = adjust(given, values_of(now), options.pairs.adjust, progress)
+        search = _searched(now, options, progress)
+        now = search.adjustment if search is not None else now
+        found = {(d.kind, *d.ids) for d in search.rejected} if search is not None else set[tuple[str, ...]]()
+        if not options.variance_components or found == rejected:
+            break
+        rejected = found
+        how = ComponentOptions(adjust=options.pairs.adjust)
+        scaled = estimate_variance_components(now.survey, options=how, progress=progress, first=now)
+        now = scaled.adjustment
+        factors = {c.group: factors.get(c.group, 1.0) * c.factor for c in scaled.components.components}
+    return _told(now, first, search, scaled, factors)
+
+
+def _searched(
+    now: Adjustment, options: CleanOptions, progress: Callable[[int, float], None] | None
+) -> OutlierSearch | None:
+    """The search for gross errors; None where nothing fails, or nothing can be searched."""
+    if not options.reject_others or now.n_unknowns > _LARGEST or not _fails(now):
+        return None
+    how = SearchOptions(kinds=_OTHERS, adjust=options.pairs.adjust)
+    return search_outliers(now.survey, options=how, progress=progress, first=now)
+
+
+def _fails(now: Adjustment) -> bool:
+    tests = [(o.test, len(o.components)) for o in now.other_residuals if o.used and float(o.redundancy.max()) > 1e-6]
+    n = len(tests) + int(now.image_residuals.used.sum())
+    level = sidak(SearchOptions().levels.family_alpha, n)
+    limits = {k: float(chi2.isf(level, k)) for k in {k for _, k in tests}}
+    return any(np.isfinite(t) and t > limits[k] for t, k in tests)
+
+
+def _told(
+    now: Adjustment, first: Adjustment, search: OutlierSearch | None, scaled: Scaled | None, factors: dict[str, float]
+) -> Adjustment:
+    """With its history, and the warnings of the first adjustment that are not about the solution itself."""
+    known = set(now.warnings)
+    about_first = ("left out", "camera", "pair")
+    kept = tuple(w for w in first.warnings if w not in known and w.startswith(about_first))
+    notes = search.notes if search is not None else ()
+    components = None
+    if scaled is not None:
+        components = replace(scaled.components, components=_total(scaled.components.components, factors))
+        notes += component_notes(components)
+    return replace(
+        now, warnings=now.warnings + notes + kept, variance_components=components,
+        decisions=search.log if search is not None else (),
+    )  # fmt: skip
+
+
+def _total(components: Sequence[Component], factors: dict[str, float]) -> tuple[Component, ...]:
+    """Over the a priori variances, of all passes."""
+    out = []
+    for c in components:
+        ratio = factors.get(c.group, c.factor) / c.factor
+        values = {name: getattr(c, name) * ratio for name in ("factor", "sigma", "lower", "upper")}
+        out.append(replace(c, **values))
+    return tuple(out)
+
+
+def component_notes(components: VarianceComponents) -> tuple[str, ...]:
+    """What the reader of variance components should know."""
+    out = []
+    for c in components.components:
+        if c.status == "vanished":
+            out.append(
+                f"variance component of group {c.group}: its residuals are smaller than any variance explains; check "
+                "whether its observations are independent of the others"
+            )
+        elif c.status == "no redundancy":
+            out.append(f"variance component of group {c.group}: too few checked observations; its sigmas are as given")
+        elif c.status == "estimated" and c.p < 0.01:
+            out.append(
+                f"variance component of group {c.group}: sigmas were {np.sqrt(c.factor):.2f} times those given "
+                f"(factor {c.factor:.3g} +- {c.sigma:.2g}, p {c.p:.2g})"
+            )
+    for groups in components.unseparable:
+        out.append(f"variance components of groups {', '.join(groups)}: only a mixture shows; they share one factor")
+    if not components.converged:
+        out.append("the variance components did not settle; look for gross errors or groups with too few observations")
+    return tuple(out)
+
+
+def rescaled(survey: Survey, components: VarianceComponents) -> Survey:
+    """A survey with the variances that another adjustment of the same instruments found."""
+    return scaled_survey(survey, {c.group: c.factor for c in components.components})
