@@ -1,6 +1,18 @@
 """The report in German: texts by their English form, and patterns of messages that the adjustment makes."""
 
 GERMAN = {
+    # instruments and surfaces
+    "Instruments and surfaces": "Instrumente und Flächen",
+    "Vertical": "Lotrichtung",
+    "upwards in the world": "aufwärts in der Welt",
+    "Instrument": "Instrument",
+    "Setup": "Aufstellung",
+    "Laser beam": "Laserstrahl",
+    "along": "entlang",
+    "direction": "Richtung",
+    "plane": "Ebene",
+    "line": "Gerade",
+    "sphere": "Kugel",
     # page and summary
     "Adjustment report": "Ausgleichungsbericht",
     "Summary": "Übersicht",

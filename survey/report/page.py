@@ -5,7 +5,7 @@ from typing import Any
 
 from adjust.result import Adjustment
 from survey.quantities import scale_of
-from survey.report import every, loops, observations, overview, statistics, unknowns
+from survey.report import every, instruments, loops, observations, overview, statistics, unknowns
 from survey.report.context import Context
 from survey.report.embedding import json_script
 from survey.report.language import language, localised, speaking, t
@@ -26,6 +26,7 @@ _SECTIONS = (
     ("Turntables", "tables", unknowns.tables),
     ("Targets", "targets", unknowns.targets),
     ("Points", "points", unknowns.points),
+    ("Instruments and surfaces", "instruments", instruments.instruments),
     ("Network", "network", loops.network),
     ("Loops", "loops", loops.loops),
     ("Pairs", "pairs", loops.pairs),

@@ -57,3 +57,18 @@ def test_commands(tmp_path, capsys):
         assert set(solution["setups"]) == {"S1a", "S2a", "S3a"}
         assert solution["instruments"]["total_station"]["sigma_distance_offset_mm"] < 0.3
         assert solution["vertical"]["up_in_world"] == [0.0, 0.0, 1.0]
+
+
+def test_report_shows_instruments_surfaces_and_beams_in_both_languages(tmp_path):
+    from survey.jobs import run_info
+    from survey.report import report_html
+
+    assert main(["example", "alignment", str(tmp_path / "a"), "--quiet"]) == 0
+    project = read(tmp_path / "a")
+    result = adjust_project(project, progress=False)
+    run = run_info(project, {})
+    english, german = (report_html(result, run, in_language=name) for name in ("en", "de"))
+    assert "Laser beam laser (mount turntable, along z)" in english
+    assert "Laserstrahl laser" in german
+    assert "<code>tilt_1</code>" in english
+    assert "upwards in the world: (" in english
