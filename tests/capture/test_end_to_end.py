@@ -58,7 +58,7 @@ angles_deg = {json.dumps(poses)}
 @pytest.fixture(scope="module")
 def adjusted(tmp_path_factory):
     home = tmp_path_factory.mktemp("laboratory")
-    lab = write_lab(home / "room", 1, LabSize(n_board=5))
+    lab = write_lab(home / "room", 1, LabSize(n_board=4))
     noise = ("--noise", "8", "--backlash", "20", "--speed", "100")
     with gige_port(), table_server(home, *noise) as server, GigeServer(home / "room" / "X", angles=server.truth_file):
         assert main(["run", str(_plan(home, lab, server.url, server.truth_file)), "--quiet"]) == 0

@@ -129,7 +129,7 @@ def test_help_opens_with_a_real_command(capsys):
 @pytest.fixture(scope="module")
 def known_survey():
     """A survey whose approximate values are the truth, and the scene that OpenCV projects."""
-    survey, truth = head_on_table(1)
+    survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=1, n_free_epochs=1)
     cameras = tuple(
         replace(
             c,
