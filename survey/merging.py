@@ -19,7 +19,7 @@ from survey.files.text import atomic_write, decode, read_bytes, suggestion
 from survey.files.toml_lines import KeyPath, key_lines
 from survey.files.toml_text import toml_text
 
-_KINDS = ("cameras", "stations", "tables", "targets", "points")
+_KINDS = ("cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces")
 Origin = tuple[Path, int]
 
 
