@@ -1,5 +1,7 @@
 """GigE Vision over loopback: Aravis' camera in another process, and the client's own fakes."""
 
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 
@@ -123,6 +125,27 @@ def test_a_camera_whose_plug_is_pulled(port: None) -> None:
         with pytest.raises(DisconnectedError):
             camera.fetch(0.1)
         assert time.monotonic() - begin < 5.0
+
+
+HOLDER = """
+import sys
+from capture.drivers.cameras import open_camera
+camera = open_camera("gige:127.0.0.1")
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_after_a_crash_the_camera_opens_again(server: GigeServer) -> None:
+    """The camera holds to the dead program for 3 s; a session that resumes at once need not know."""
+    with subprocess.Popen([sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline().strip() == b"held"
+        holder.kill()
+        holder.wait()
+        assert discover("gige")[0].in_use
+        with open_camera(GIGE) as camera:
+            camera.set("Width", 64)
 
 
 def test_two_servers_on_one_address(server: GigeServer) -> None:

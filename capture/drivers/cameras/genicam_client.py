@@ -190,7 +190,7 @@ def not_found(address: str, seen: list[str]) -> DisconnectedError:
 
 def held_by_another(address: str) -> InUseError:
     """Another program controls the camera."""
-    return InUseError(address, "another program controls it", "close that program, or wait until its lease runs out")
+    return InUseError(address, "another program controls it", "close that program")
 
 
 def _range(state: Any) -> str:

@@ -1,5 +1,6 @@
 """GigE Vision cameras without a maker's SDK: ``gige:IP`` or ``gige:SERIAL``."""
 
+import time
 from contextlib import suppress
 from typing import Any
 
@@ -10,6 +11,8 @@ from capture.drivers.cameras.base import OLDER_NAMES
 from capture.drivers.cameras.genicam_client import GenicamClientCamera, held_by_another, not_found
 
 _DISCOVERY_MS = 300
+# a camera lets go of a program that has died when it has heard nothing for 3 s, not even a question
+_LEASE_S = 4.0
 # registers of the GigE Vision bootstrap block, the same in every camera
 _CONTROL_PRIVILEGE, _TICK_FREQUENCY = 0x0A00, 0x093C
 
@@ -56,8 +59,10 @@ class GigeCamera(GenicamClientCamera):
             device = next((d for d in devices if _look_at(d)[0] == place), None)
         if device is None:
             raise not_found(self.address, [d.ip for d in devices])
-        if _look_at(device)[1]:  # an attempt to connect would tell only after seconds
-            raise held_by_another(self.address)
+        if _look_at(device)[1]:
+            time.sleep(_LEASE_S)
+            if _look_at(device)[1]:
+                raise held_by_another(self.address)
         try:
             connected = vg.connect_gige(device)
         except vg.GenicamError as error:
