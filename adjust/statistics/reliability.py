@@ -6,10 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.model import FloatArray, IntArray
+from adjust.pose_network.from_survey import NamedPrecision
 from adjust.precision import Precision, noise_of
 from adjust.result import Adjustment
 from adjust.statistics.criteria import criteria
 from adjust.statistics.influence import influences
+from adjust.statistics.pose_networks import network_whitening
 from adjust.statistics.result import (
     Criteria,
     ImageEllipses,
@@ -28,10 +30,11 @@ from adjust.statistics.single_tests import (
     p_tau,
     whitened,
 )
-from adjust.statistics.system import LinearSystem, linear_system, observation_groups, precision_of
+from adjust.statistics.system import LinearSystem, linear_system, precision_of
 from adjust.terrestrial.statistics import influences as influences_of_readings
 
 DEFAULT_LEVELS = LevelOptions()
+_LARGEST_NETWORK = 3000
 _OF_ROWS = ("redundancy", "least", "statistic", "p", "p_posterior", "detectable", "external")
 _OF_COMPONENTS = ("w", "p_w", "p_tau", "error", "detectable_component", "bias")
 
@@ -54,20 +57,34 @@ def reliability(
 
     system: of this adjustment, where it is known already.
     """
-    precision = system.precision if system is not None else precision_of(adjustment)
-    batches = [_images(precision), *_others(precision), *_readings(precision)]
+    batches = _batches(adjustment, system)
     sizes = np.zeros(sum(len(b.rows) for b in batches), dtype=np.int64)
     for batch in batches:
         sizes[batch.rows] = batch.x.g.shape[1]
     ptr = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     n_tests = int(sum(np.count_nonzero(b.x.freedom) for b in batches))
     found = criteria(options, n_tests, int(sizes.max(initial=1)))
-    tests = _table(adjustment, precision, batches, ptr, found)
+    tests = _table(adjustment, batches, ptr, found)
+    if isinstance(adjustment.precision, NamedPrecision) and len(ptr) > _LARGEST_NETWORK:
+        most_influences = 0
     return Reliability(
         found, tests, _ellipses(batches[0], found),
         _influences(adjustment, tests, batches, found, most_influences, system), _uncontrolled(adjustment, tests),
         adjustment.sigma0, adjustment.redundancy,
     )  # fmt: skip
+
+
+def _batches(adjustment: Adjustment, system: LinearSystem | None) -> list[_Batch]:
+    """Image points first."""
+    if isinstance(adjustment.precision, NamedPrecision):
+        none = np.zeros((0, 2, 2))
+        first = _Batch(np.zeros(0, dtype=np.int64), whitened(none[:, 0], none, np.zeros(0, dtype=np.bool_)), none, none)
+        found = network_whitening(adjustment, adjustment.precision)
+        backs = [np.asarray(np.linalg.inv(W), dtype=float) for _, _, _, W, _ in found]
+        return [first, *(_Batch(rows, whitened(e, M, used), W, back)
+                         for (rows, e, M, W, used), back in zip(found, backs, strict=True))]  # fmt: skip
+    precision = system.precision if system is not None else precision_of(adjustment)
+    return [_images(precision), *_others(precision), *_readings(precision)]
 
 
 def observation_name(adjustment: Adjustment, row: int) -> tuple[str, tuple[str, ...]]:
@@ -170,7 +187,7 @@ def _readings(precision: Precision) -> list[_Batch]:
 
 
 def _table(
-    adjustment: Adjustment, precision: Precision, batches: Sequence[_Batch], ptr: IntArray, found: Criteria
+    adjustment: Adjustment, batches: Sequence[_Batch], ptr: IntArray, found: Criteria
 ) -> ObservationTests:
     M, K = len(ptr) - 1, int(ptr[-1])
     of_row = {name: np.zeros(M) for name in _OF_ROWS}
@@ -191,7 +208,8 @@ def _table(
     if readings is not None:  # of joint readings: the shares of the degrees of freedom, not of a bias that shows
         of_row["redundancy"][M - len(readings.used) :] = readings.redundancy
     level = found.alpha[np.maximum(freedom, 1) - 1]
-    groups = observation_groups(precision.graph)
+    groups = [b.group for b in adjustment.survey.image_blocks for _ in range(len(b.uv))]
+    groups += [o.group for o in adjustment.other_residuals]
     names = tuple(dict.fromkeys(groups))
     number = {g: i for i, g in enumerate(names)}
     with np.errstate(invalid="ignore"):

@@ -5,20 +5,20 @@ influences, the search for outliers) needs them apart. Rows are linearised at th
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from gtsam import Values
+from gtsam import Pose3, Rot3, Values
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse.linalg import splu
 
 from adjust.datum import gauge
 from adjust.errors import SurveyError
-from adjust.graph import AdjustmentGraph, GraphBuilder
+from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.lens_kernels import MAX_LENS
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.pair_screen import values_of
 from adjust.precision import Precision, noise_of
 from adjust.result import Adjustment, ParameterName
@@ -217,11 +217,26 @@ def precision_of(adjustment: Adjustment) -> Precision:
     found = adjustment.precision
     if isinstance(found, Precision):
         return found
-    start = values_of(adjustment)
-    graph = GraphBuilder(adjustment.survey, start.lenses).build(start)
+    survey, start = adjustment.survey, values_of(adjustment)
+    if all(isinstance(p.b_from_a, Rot3) for p in survey.pairs):  # nothing tells where the stations are
+        survey, start = _turning_only(survey, start)
+    graph = GraphBuilder(survey, start.lenses).build(start)
     if [o.ids for o in graph.others] != [o.ids for o in adjustment.other_residuals[: len(graph.others)]]:
         raise SurveyError("the adjustment does not fit its survey; adjust the survey again")
     return Precision(graph, solve(graph))
+
+
+def _turning_only(survey: Survey, start: StartValues) -> tuple[Survey, StartValues]:
+    """A network of rotations with its stations held at the origin."""
+    poses = {n: Pose3(p.rotation(), np.zeros(3)) for n, p in start.poses.items()}
+    stations = []
+    for s in survey.stations:
+        given = s.world_from_station
+        held = given.held if given.treatment == "held" else ("tx", "ty", "tz")
+        own = poses.get(("world_from_station", s.station_id), given.value)
+        pose = given.value if given.treatment == "prior" else own
+        stations.append(replace(s, world_from_station=replace(given, value=pose, held=held)))
+    return replace(survey, stations=tuple(stations)), replace(start, poses=poses)
 
 
 def _columns(graph: AdjustmentGraph) -> Columns:

@@ -5,13 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gtsam import Pose3
 from scipy.stats import chi2, ncx2, norm
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
-from adjust.adjustment import AdjustOptions, assemble
+from adjust.adjustment import AdjustOptions, adjust, assemble
 from adjust.graph import StartValues
-from adjust.model import Datum, FloatArray, PointParameter, Survey
+from adjust.model import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
+from adjust.observations import FrameRef, Pair
+from adjust.pair_screen import adjust_with_pairs
+from adjust.pose_network.from_survey import NamedPrecision
 from adjust.result import Adjustment
 from adjust.statistics.criteria import criteria, noncentrality, sidak
 from adjust.statistics.influence import shifts
@@ -205,3 +209,34 @@ def test_a_bias_moves_the_unknowns_as_predicted() -> None:
         at = system.columns.at["point", point]
         change = np.asarray(after.estimates["point", point].value) - adjustment.estimates["point", point].value
         np.testing.assert_allclose(change, moved[at], atol=0.06 * np.abs(moved[at]).max())
+
+
+@pytest.mark.parametrize("turning", [False, True])
+def test_pose_networks_have_the_same_reliability_as_the_graph(turning: bool) -> None:
+    """A network of pairs, solved as a network and through the graph; of rotations alone where ``turning``."""
+    rng, cov = np.random.default_rng(1), np.diag([2e-5] * 3 + [1e-4] * 3) ** 2
+    poses = [h.pose(rng, 1.0) for _ in range(5)]
+    pairs = []
+    for i in range(5):
+        for j in range(i):
+            motion = poses[j].inverse() * poses[i] * Pose3.Expmap(rng.multivariate_normal(np.zeros(6), cov))
+            a, b = FrameRef("station", f"R{i}"), FrameRef("station", f"R{j}")
+            k = 3 if turning else 6
+            pairs.append(Pair(f"{i}-{j}", a, b, motion.rotation() if turning else motion, cov[:k, :k]))
+    stations = tuple(Station(f"R{i}", world_from_station=PoseParameter(p, "free" if i else "held"))
+                     for i, p in enumerate(poses))  # fmt: skip
+    survey = Survey(stations=stations, pairs=tuple(pairs))
+    network = adjust_with_pairs(survey)
+    assert isinstance(network.precision, NamedPrecision)
+    found = reliability(network)
+    if turning:
+        poses, axes = [Pose3(p.rotation(), np.zeros(3)) for p in poses], ("tx", "ty", "tz")
+        parameters = [PoseParameter(p, "free" if i else "held", held=axes if i else ()) for i, p in enumerate(poses)]
+        stations = tuple(Station(f"R{i}", world_from_station=p) for i, p in enumerate(parameters))
+    start = StartValues({}, {("world_from_station", f"R{i}"): p for i, p in enumerate(poses)}, {})
+    expected = reliability(adjust(replace(survey, stations=stations), start))
+    for name in ("statistic", "redundancy", "external", "detectable", "p_posterior"):
+        np.testing.assert_allclose(getattr(found.tests, name), getattr(expected.tests, name), rtol=1e-3, atol=1e-7)
+    np.testing.assert_allclose(found.tests.w, expected.tests.w, rtol=1e-2, atol=1e-3)
+    assert len(found.influences) == len(pairs)
+    assert all(0.0 < i.ratio <= found.tests.external[i.row] * (1.0 + 1e-6) for i in found.influences)
