@@ -1,7 +1,7 @@
 """A network while its file is being read: points axis by axis, readings, and what of them makes a survey."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -120,6 +120,13 @@ class NetworkDraft:
             )
         )  # fmt: skip
         return name
+
+    def correlate(self, names: list[str], cov: FloatArray) -> None:
+        """Give readings a joint covariance (n, n), which replaces their sigmas."""
+        sigma = dict(zip(names, np.sqrt(np.diagonal(cov)).tolist(), strict=True))
+        self.readings = [replace(r, sigma=sigma.get(r.reading_id, r.sigma)) for r in self.readings]
+        if np.count_nonzero(cov) > len(cov):
+            self.covariances.append((names, cov))
 
     def survey(self, bearings: Bearings) -> Survey:
         """The survey. What touches points without coordinates or status is left out, and said."""

@@ -154,7 +154,7 @@ class _Reader:
             scale = np.array(units)
             matrix = covariance(cov, len(names)) * np.outer(scale, scale)
             check_cov(matrix, "cov-mat", cov.where)
-            self.draft.covariances.append((names, matrix))
+            self.draft.correlate(names, matrix)
 
     def _directions_from(self, cluster: Element) -> str:
         stations = {c.get("from", cluster.attributes.get("from")) for c in cluster.children if c.tag == "direction"}
