@@ -12,10 +12,11 @@ from gtsam import Pose3
 
 from adjust.lens import MODELS, lens_constants, project
 from adjust.model import FloatArray, Survey
-from adjust.observations import Coordinates, Distance, FrameRef, ImageBlock, PositionRef
+from adjust.observations import FrameRef, ImageBlock
 from adjust.result import Adjustment
 from survey.adjusted_frames import AdjustedFrames
 from survey.files import SpotBlock
+from survey.parts import only_between
 
 _SECOND_BEST = 1.5
 
@@ -32,26 +33,17 @@ class Identification:
 
 def without_points(survey: Survey) -> Survey:
     """The survey without its world points: what can be adjusted before the spots have names."""
-
-    def concerns_point(ref: PositionRef) -> bool:
-        return ref.frame is None
-
-    distances: tuple[Distance, ...] = tuple(
-        d for d in survey.distances if not (concerns_point(d.a) or concerns_point(d.b))
-    )
-    coordinates: tuple[Coordinates, ...] = tuple(
-        c for c in survey.coordinates if not any(concerns_point(p) for p in c.positions)
-    )
     blocks = tuple(b for b in survey.image_blocks if b.target_id is not None)
-    return replace(survey, points=(), distances=distances, coordinates=coordinates, image_blocks=blocks)
+    return replace(only_between(survey, lambda ref: ref.frame is not None), points=(), image_blocks=blocks)
 
 
 def rough_positions(survey: Survey) -> dict[str, FloatArray]:
     """World points whose coordinates are known or observed, (3,) m."""
     known = {p.point_id: np.asarray(p.x_in_world.value) for p in survey.points if p.x_in_world.value is not None}
+    known = {point_id: x for point_id, x in known.items() if np.isfinite(x).all()}
     for observation in survey.coordinates:
         for ref, x in zip(observation.positions, observation.values, strict=True):
-            if ref.frame is None and ref.point_id is not None:
+            if ref.frame is None and ref.point_id is not None and np.isfinite(x).all():
                 known[ref.point_id] = x
     return known
 

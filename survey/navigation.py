@@ -30,6 +30,7 @@ from adjust.result import Adjustment
 from survey.files import Project, atomic_write, read
 from survey.files.table_writing import write_table
 from survey.files.text import natural_key
+from survey.parts import only_between, points_read
 from survey.quantities import ARCSEC_PER_RAD, pose_dict
 
 RESULTS = "results"
@@ -241,6 +242,7 @@ def _with_known_points(survey: Survey) -> Survey:
             for i in b.point_idx.tolist():
                 seen.setdefault(i, set()).add((b.camera_id, b.epoch_id))
     given = {r.point_id for c in survey.coordinates if c.used for r in c.positions if r.frame is None}
+    given |= points_read(survey)
     keep = [
         i for i, p in enumerate(survey.points)
         if len(seen.get(i, ())) >= 2 or p.point_id in given or p.x_in_world.treatment != "free"
@@ -257,14 +259,8 @@ def _with_known_points(survey: Survey) -> Survey:
             used = None if b.used is None else b.used[rows]
             index = np.array([new[int(i)] for i in b.point_idx[rows]], dtype=np.int64)
             blocks.append(replace(b, point_idx=index, uv=b.uv[rows], cov=b.cov[rows], used=used))
-    return replace(
-        survey,
-        points=tuple(survey.points[i] for i in keep),
-        image_blocks=tuple(blocks),
-        distances=tuple(
-            d for d in survey.distances if all(r.frame is not None or r.point_id in ids for r in (d.a, d.b))
-        ),
-    )
+    less = only_between(survey, lambda ref: ref.frame is not None or ref.point_id in ids)
+    return replace(less, points=tuple(survey.points[i] for i in keep), image_blocks=tuple(blocks))
 
 
 def _observed(
