@@ -157,7 +157,7 @@ def test_after_closing_it_opens_again(address: str) -> None:
             camera.get("Width")
 
 
-@pytest.mark.parametrize("driver", ["pylon", "gige", "gentl"])
+@pytest.mark.parametrize("driver", ["pylon", "gige", "u3v", "gentl"])
 def test_nothing_at_that_address(driver: str) -> None:
     with pytest.raises(DisconnectedError, match=f"{driver}:NOBODY: .*check"):
         open_camera(f"{driver}:NOBODY")

@@ -37,6 +37,10 @@ def test_all_passes_over_what_is_not_installed(monkeypatch: pytest.MonkeyPatch) 
     assert {"pylon:0815-0000", "pylon:0815-0001", "pylon:0815-0002"} <= {info.address for info in discover()}
 
 
+def test_all_drivers_are_asked() -> None:
+    assert "pylon:0815-0002" in {info.address for info in discover()}
+
+
 def test_an_address_that_was_discovered_opens() -> None:
     info = next(i for i in discover("pylon") if i.address == PYLON)
     with opened(info.address) as camera:

@@ -11,8 +11,15 @@ from capture.drivers.cameras.genicam_client import GenicamClientCamera, held_by_
 def discover() -> tuple[CameraInfo, ...]:
     """All cameras on the machine's USB."""
     return tuple(
-        CameraInfo(f"u3v:{d.serial}", d.manufacturer or "", d.model or "", d.serial or "") for d in vg.discover_u3v()
+        CameraInfo(f"u3v:{d.serial}", d.manufacturer or "", d.model or "", d.serial or "") for d in _devices()
     )
+
+
+def _devices() -> list[Any]:
+    try:
+        return list(vg.discover_u3v())
+    except vg.TransportError:  # a machine without USB
+        return []
 
 
 def camera(place: str, connect: Any = None) -> "U3vCamera":
@@ -31,7 +38,7 @@ class U3vCamera(GenicamClientCamera):
         if self._connect_to is not None:
             return self._connect_to()
         place = self.address.partition(":")[2]
-        devices = vg.discover_u3v()
+        devices = _devices()
         device = next((d for d in devices if d.serial == place), None)
         if device is None:
             raise not_found(self.address, [str(d.serial) for d in devices])
