@@ -17,7 +17,7 @@ from adjust.graph import GraphBuilder, StartValues
 from adjust.model import TILT, Beam, Bearings, Instrument, Point, Setup, Survey, VectorParameter, VectorPrior, Vertical
 from adjust.observations import Distance, FrameRef, LaserSpot, Level, PositionRef, Reading
 from adjust.result import Adjustment
-from adjust.solve import solve
+from adjust.solve import SolveOptions, solve
 from survey.simulate import beacons, resample
 
 ARCSEC = np.pi / 648000
@@ -205,7 +205,7 @@ def test_covers_over_re_solved_noise(lab) -> None:
     total = omega = 0.0
     for seed in range(RUNS):
         graph = graph_of(resample(survey, truth, 100 + seed), truth)
-        done = solve(graph)
+        done = solve(graph, SolveOptions(max_step=1e-3))  # a thousandth of a sigma is near enough here
         d = np.concatenate([_error(graph, done.values, name, truth) for name in free])
         total, omega = total + d @ np.linalg.solve(Q, d), omega + done.omega
     for value, freedom in ((total, RUNS * len(Q)), (omega, RUNS * ideal.redundancy)):
