@@ -117,6 +117,7 @@ def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision,
         replace(r, cov=f**2 * r.cov, sigma_distance=f * r.sigma_distance,
                 rotation_cov=None if r.rotation_cov is None else f**2 * r.rotation_cov)
         for r in relative_precision(adjustment, free[:MOST_NEIGHBOURS], PROBABILITY, posterior)
+        if r.ellipsoid.dimension  # rotations alone say nothing of positions
     )  # fmt: skip
 
 

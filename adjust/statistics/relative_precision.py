@@ -13,6 +13,7 @@ from adjust.graph import GraphBuilder
 from adjust.model import FloatArray
 from adjust.observations import FrameRef
 from adjust.pair_screen import values_of
+from adjust.pose_network.from_survey import NamedPrecision
 from adjust.result import Adjustment, ParameterName
 from adjust.statistics.result import Ellipsoid, RelativePrecision
 
@@ -52,7 +53,7 @@ def point_ellipsoid(
 def relative_precision(
     adjustment: Adjustment, pairs: Sequence[tuple[Place, Place]], level: float = 0.95, scaled: bool = False
 ) -> tuple[RelativePrecision, ...]:
-    """Of b relative to a, for every pair (a, b).
+    """Of b relative to a, for every pair (a, b); positions are nan in networks of rotations alone.
 
     Places are names of unknowns that are points or poses in the world, or frames (cameras, stations on a table ...).
     Raises SurveyError for a name that is no position.
@@ -92,11 +93,11 @@ class _Places:
         estimate = self.adjustment.estimates.get(what)
         if estimate is None or what[0] not in ("point", "world_from_station", "world_from_table"):
             raise SurveyError(f"{' '.join(what)}: no such position was adjusted; name a point, a station or a frame")
-        if isinstance(estimate.value, Pose3) and not np.isfinite(estimate.value.translation()).all():
-            raise SurveyError(f"{' '.join(what)}: only its rotation was measured; there is no position to compare")
         held = np.array([s == "held" for s in estimate.status], dtype=np.bool_)
         if isinstance(estimate.value, Pose3):
             R, x = estimate.value.rotation().matrix(), np.asarray(estimate.value.translation())
+            if _turning_only(self.adjustment):
+                return _Place(what, np.full(3, np.nan), R, {} if held.all() else {what: np.eye(6, 3)})
             J = np.zeros((6, 6))
             J[:3, :3], J[3:, 3:] = np.eye(3), R
             return _Place(what, x, R, {} if held.all() else {what: J * ~held})
@@ -122,6 +123,12 @@ class _Places:
         return _Place(called, np.asarray(pose.translation()), R, by)
 
 
+def _turning_only(adjustment: Adjustment) -> bool:
+    """Whether nothing but rotations was measured, so that nothing is where it seems to be."""
+    found = adjustment.precision
+    return isinstance(found, NamedPrecision) and found.solution.network.rotation_only
+
+
 def _scale(adjustment: Adjustment, scaled: bool) -> tuple[float | None, int]:
     known = scaled and adjustment.redundancy > 0
     return (adjustment.sigma0 if known else None), adjustment.redundancy
@@ -144,6 +151,10 @@ def _relative(adjustment: Adjustment, a: _Place, b: _Place, level: float, scaled
     length = float(np.linalg.norm(d))
     u = d / length if length > 0.0 else np.zeros(3)
     scale = _scale(adjustment, scaled)
+    if not np.isfinite(d).all():
+        nan, none = np.full((3, 3), np.nan), Ellipsoid(np.zeros(0), np.zeros((3, 0)), level, scaled)
+        return RelativePrecision(a.name, b.name, d, nan, float("nan"), float("nan"), none, None,
+                                 cov[:3, :3] if turned else None)  # fmt: skip
     flat = ellipsoid(own[:2, :2], level, *scale)
     return RelativePrecision(
         a.name, b.name, d, own, length, float(np.sqrt(max(0.0, float(u @ own @ u)))), ellipsoid(own, level, *scale),

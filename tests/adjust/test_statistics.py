@@ -19,6 +19,7 @@ from adjust.pose_network.from_survey import NamedPrecision
 from adjust.result import Adjustment
 from adjust.statistics.criteria import criteria, noncentrality, sidak
 from adjust.statistics.influence import shifts
+from adjust.statistics.relative_precision import relative_precision
 from adjust.statistics.reliability import observation_name, reliability
 from adjust.statistics.result import LevelOptions
 from adjust.statistics.system import linear_system
@@ -239,4 +240,8 @@ def test_pose_networks_have_the_same_reliability_as_the_graph(turning: bool) -> 
         np.testing.assert_allclose(getattr(found.tests, name), getattr(expected.tests, name), rtol=1e-3, atol=1e-7)
     np.testing.assert_allclose(found.tests.w, expected.tests.w, rtol=1e-2, atol=1e-3)
     assert len(found.influences) == len(pairs)
+    (pair,) = relative_precision(network, [(("world_from_station", "R1"), ("world_from_station", "R3"))])
+    assert pair.rotation_cov is not None
+    assert np.isfinite(pair.rotation_cov).all()
+    assert np.isfinite(pair.sigma_distance) == (not turning)
     assert all(0.0 < i.ratio <= found.tests.external[i.row] * (1.0 + 1e-6) for i in found.influences)
