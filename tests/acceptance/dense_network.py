@@ -250,3 +250,14 @@ def sparse_sigmas(survey: Survey, points: dict[str, FloatArray], chosen: list[tu
         unit[column] = 1.0
         out.append(scale[column] * np.sqrt(factors.solve(unit)[column]))
     return np.array(out)
+
+
+def gradient_at(
+    survey: Survey, points: dict[str, FloatArray], orientations: dict[str, float]
+) -> tuple[FloatArray, FloatArray]:
+    """A'P (observed - predicted) and the diagonal of A'PA; the first is zero at the least squares solution."""
+    model = _Model(survey, points)
+    model.orientations = {setup: orientations[setup] for setup in model.orientations}
+    A, w, _, cov = model.system()
+    P = _inverse(cov)
+    return A.T @ (P @ w), (A.T @ P @ A).diagonal()

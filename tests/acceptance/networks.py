@@ -17,7 +17,7 @@ from survey.interop.foreign import ForeignNetwork
 from survey.interop.gama import read_gama
 from survey.interop.krumm import read_adjusted, read_krumm
 from survey.interop.lgc import read_lgc
-from tests.acceptance.dense_network import DenseResult, dense_adjust, sparse_sigmas
+from tests.acceptance.dense_network import DenseResult, dense_adjust, gradient_at, sparse_sigmas
 from tests.acceptance.gama_results import GamaResult, gama_result
 
 GAMA = (
@@ -301,3 +301,27 @@ def with_start(survey: Survey, start: dict[str, FloatArray]) -> Survey:
         for p in survey.points
     )
     return replace(survey, points=points)
+
+
+# --- the railway: 833 points, no published result ---------------------------------------------------------------------
+
+RAILWAY = "railway-survey-with-aproximate-xy"
+
+
+def compare_railway(folder: Path) -> Compared:
+    """Whether v'Pv is at its minimum (steps left, in sigmas) and the datum's points have not moved as a whole (m)."""
+    network = read_gama(folder / f"{RAILWAY}.gkf")
+    survey = network.survey
+    result = adjust(survey)
+    points = core_points(result)
+    turned = {n[1]: float(np.asarray(e.value)[0]) for n, e in result.estimates.items() if n[0] == "orientation"}
+    gradient, diagonal = gradient_at(survey, points, turned)
+    start = np.array([p.x_in_world.value for p in survey.points if p.point_id in survey.datum.points])
+    moved = np.array([points[p] for p in survey.datum.points]) - start
+    centred = start - start.mean(axis=0)
+    turn = (centred[:, 0] * moved[:, 1] - centred[:, 1] * moved[:, 0]).sum() / np.linalg.norm(centred)
+    differences = {
+        "gradient": float(np.abs(gradient / np.sqrt(diagonal)).max()),
+        "datum_m": float(max(np.abs(moved.sum(axis=0)).max(), abs(turn))),
+    }
+    return Compared(RAILWAY, network, result, result.sigma0 * network.sigma0, None, differences)

@@ -12,6 +12,7 @@ from tests.acceptance.networks import (
     compare_krumm,
     compare_large,
     compare_lgc,
+    compare_railway,
     core_points,
     core_rows,
     core_sigmas,
@@ -145,3 +146,11 @@ def test_lgc_at_cerns_result():
     assert found.differences["sigma_m"] <= 5.01e-7
     result = found.result
     assert (result.n_observations, result.n_unknowns) == (258, 149)
+
+
+def test_the_railway_is_at_the_minimum_in_its_own_datum():
+    """833 points in 163 direction sets; no result is published."""
+    found = compare_railway(data_folder("network", "gama"))
+    assert found.result.datum_defect == 3
+    assert found.differences["gradient"] < 1e-3
+    assert found.differences["datum_m"] < 1e-6
