@@ -27,7 +27,12 @@ from survey.previous import Move, Previous, moves, read_previous
 from survey.replacing import complete, place_for, recover, replace_parts
 from survey.results import RESULTS
 
-_ID_COLUMNS = {"pairs": "pair_id", "distances": "distance_id", "coordinates": "point_id"}
+_ID_COLUMNS = {
+    "pairs": "pair_id", "distances": "distance_id", "coordinates": "point_id", "terrestrial": "reading_id",
+    "levels": "level_id", "alignments": "alignment_id", "laser_spots": "spot_id",
+    "coordinate_differences": "difference_id",
+}  # fmt: skip
+_WITH_SETS = ("coordinates", "coordinate_differences")
 _MOST_MOVES, _MOST_SHOWN = 200, 8
 
 
@@ -166,8 +171,9 @@ def _tables(folder: Path) -> dict[str, _Table]:
         if path is None:
             continue
         table = read_table(path, LAYOUTS[name])
-        ids = tuple(table.text(column).values())
-        sets = tuple(table.text("set_id").values()) if name == "coordinates" else ("",) * len(ids)
+        # readings without an id are called by their row, as everywhere
+        ids = tuple(one or f"r{row}" for row, one in enumerate(table.text(column).values(), 1))
+        sets = tuple(table.text("set_id").values()) if name in _WITH_SETS else ("",) * len(ids)
         header, rows = ([], []) if path.suffix == ".parquet" else table_rows(path)
         used = tuple(bool(x) for x in table.flags("used"))
         found = _Table(name, path, header, [row for _, row in rows], ids, sets, used)
@@ -191,8 +197,8 @@ def _chosen(folder: Path, tables: Mapping[str, _Table], ids: Sequence[str]) -> d
         if not holders:
             known = [key for t in tables.values() if prefix in ("", t.name) for key in t.by_id]
             raise SurveyError(
-                f"{folder / OBSERVATIONS_FOLDER}: no pair, distance or coordinates have the id {name!r}; "
-                f"{suggestion(name, known)}"
+                f"{folder / OBSERVATIONS_FOLDER}: no observation of these tables has the id "
+                f"{name!r}; {suggestion(name, known)}"
             )
         if len(holders) > 1:
             raise SurveyError(

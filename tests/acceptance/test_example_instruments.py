@@ -57,6 +57,11 @@ def test_commands(tmp_path, capsys):
         assert set(solution["setups"]) == {"S1a", "S2a", "S3a"}
         assert solution["instruments"]["total_station"]["sigma_distance_offset_mm"] < 0.3
         assert solution["vertical"]["up_in_world"] == [0.0, 0.0, 1.0]
+        # a reading without an id is called by its row
+        assert main(["remove", folder, "r11", "--quiet"]) in (0, 3)
+        assert "removed: terrestrial r11" in capsys.readouterr().out
+        rows = (tmp_path / name / "observations" / "terrestrial.csv").read_text().splitlines()
+        assert [row.endswith(",false") for row in rows].index(True) == 11
 
 
 def test_report_shows_instruments_surfaces_and_beams_in_both_languages(tmp_path):
