@@ -1,4 +1,4 @@
-"""The job ``compare``: two epochs of the same stations, adjusted each by itself, and what moved between them."""
+"""The job ``compare``: two epochs of the same points and stations, adjusted each by itself, and what moved between."""
 
 import math
 from dataclasses import dataclass
@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from adjust.congruence import CongruenceOptions, congruence
+from adjust.congruence_result import Congruence
 from adjust.deformation import Deformation, DeformationTest, station_deformations
 from adjust.errors import SurveyError
 from adjust.result import Adjustment
+from survey.congruence_text import congruence_dict, congruence_text
 from survey.files import read
 from survey.jobs import adjust_project
 from survey.quantities import ARCSEC_PER_RAD
@@ -20,11 +23,16 @@ ALPHA = 0.05
 
 @dataclass(frozen=True, eq=False)
 class CompareOutcome:
-    """Both folders with their adjustments, and the deformation of every pair of neighbouring stations."""
+    """Both folders with their adjustments, the deformation of neighbouring stations, and the congruence of all.
+
+    congruence: None where nothing common can be tested; ``why`` then says what is in the way.
+    """
 
     folders: tuple[Path, Path]
     adjustments: tuple[Adjustment, Adjustment]
     deformations: tuple[Deformation, ...]
+    congruence: Congruence | None = None
+    why: str = ""
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -41,11 +49,16 @@ class CompareOutcome:
             "sigmas": "a_priori",
             "alpha": ALPHA,
             "deformations": [_entry(d) for d in self.deformations],
+            "congruence": None if self.congruence is None else congruence_dict(self.congruence),
             "warnings": list(self.problems),
         }
 
     def text(self) -> str:
         """A table for people: rotation vectors and displacements with their sigmas; a star marks what is real."""
+        whole = self.why if self.congruence is None else congruence_text(self.congruence)
+        if not self.deformations:
+            problems = "".join(f"\n  ! {p}" for p in self.problems)
+            return f"{self.folders[0]} -> {self.folders[1]}{problems}\n{whole}"
         moved = sum(d.significant for d in self.deformations)
         width = max(7, *(len(f"{d.a} - {d.b}") for d in self.deformations))
         head = f"  {'':<{width}}  {'rotation, arcsec':^42}  {'displacement, mm':^42}"
@@ -56,7 +69,7 @@ class CompareOutcome:
             *(f"  ! {p}" for p in self.problems),
             "", head.rstrip(), f"  {'a - b':<{width}}  {axes}  {axes}{'p':>9}",
             *(_row(d, width) for d in self.deformations),
-            "", "  motion of a as seen from b, along the axes of a in the first epoch",
+            "", "  motion of a as seen from b, along the axes of a in the first epoch", "", whole,
         ])  # fmt: skip
 
 
@@ -64,7 +77,15 @@ def compare_job(folder_a: Path, folder_b: Path, *, progress: bool = True) -> Com
     """Adjust two project folders and compare their stations; writes nothing. Raises SurveyError."""
     folders = Path(folder_a), Path(folder_b)
     first, second = (_adjusted(folder, progress) for folder in folders)
-    return CompareOutcome(folders, (first, second), station_deformations(first, second, alpha=ALPHA))
+    options = CongruenceOptions(ALPHA, names=(folders[0].name, folders[1].name))
+    try:
+        found, why = congruence(first, second, options), ""
+    except SurveyError as error:
+        found, why = None, f"no congruence test: {error}"
+    stations = [{s.station_id for s in a.survey.stations if s.motion == "fixed"} for a in (first, second)]
+    if found is not None and len(stations[0] & stations[1]) < 2:
+        return CompareOutcome(folders, (first, second), (), found)
+    return CompareOutcome(folders, (first, second), station_deformations(first, second, alpha=ALPHA), found, why)
 
 
 def _adjusted(folder: Path, progress: bool) -> Adjustment:

@@ -11,10 +11,10 @@ def declare_compare(commands: Any, shaped: dict[str, Any]) -> None:
     """Add ``compare`` to the commands."""
     parser = commands.add_parser(
         "compare",
-        help="say how stations have turned and moved between two epochs",
+        help="say what has moved and turned between two epochs",
         usage="labsurvey compare spring autumn   (labsurvey compare A B)",
         description="Adjusts both project folders, writes nothing, and tests the motion of every station against the\n"
-        "next one of the same id in both.",
+        "next one of the same id in both, and of all common points and stations against those that are stable.",
         epilog="Next: labsurvey adjust B",
         **shaped,
     )

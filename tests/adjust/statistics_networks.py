@@ -33,14 +33,14 @@ def exact(kind: str, a: FloatArray, b: FloatArray, orientation: float = 0.0) -> 
 def hall(
     seed: int = 1, n_points: int = 12, n_stations: int = 3, n_tapes: int = 12,
     factors: Mapping[str, float] | None = None, noise: bool = True, kept: float = 1.0,
-    places: Mapping[str, FloatArray] | None = None,
+    places: Mapping[str, FloatArray] | None = None, sample: int = 0,
 ) -> tuple[Survey, StartValues]:  # fmt: skip
     """The first station and the bearing of the second are held.
 
     factors: true variance factors of the groups, on top of ``SIGMAS``. kept: share of the sights.
-    places: coordinates, instead of drawn ones.
+    places: coordinates, instead of drawn ones. sample: of the noise.
     """
-    x, rng = places or coordinates(seed, n_points, n_stations), np.random.default_rng(1000 + seed)
+    x, rng = places or coordinates(seed, n_points, n_stations), np.random.default_rng([1000 + seed, sample])
     factors = factors or {}
     readings, tapes = [], []
 
