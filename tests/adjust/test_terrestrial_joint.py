@@ -12,7 +12,6 @@ from adjust.graph import StartValues
 from adjust.model import (
     INSTRUMENT,
     Datum,
-    FloatArray,
     PoseParameter,
     Setup,
     Station,
@@ -33,18 +32,8 @@ TRIALS = 300
 POLAR = (("direction", 2e-5), ("zenith", 2e-5), ("slope_distance", 2e-4))
 
 
-def distances_squared(survey: Survey, truth: Truth, names: list[tuple[str, ...]], trials: int) -> FloatArray:
-    """d' inv(C) d of ``names`` over re-solved noise; of a free network in the datum of the truth."""
-    out = np.zeros(trials)
-    start = start_near(survey, truth, 0)
-    start = replace(start, vectors={k: v for k, v in start.vectors.items() if k[0] != "centring"})
-    for i in range(trials):
-        out[i] = squared(measured(survey, truth, 1000 + i), truth, start, names)
-    return out
-
-
 def squared(survey: Survey, truth: Truth, start: StartValues, names: list[tuple[str, ...]]) -> float:
-    """The same for one solution."""
+    """d' inv(C) d of the points ``names`` in one solution."""
     graph = h.build(survey, start)
     precision = Precision(graph, solve(graph))
     values, by_name = precision.solved.values, graph.unknowns.by_name
@@ -52,44 +41,40 @@ def squared(survey: Survey, truth: Truth, start: StartValues, names: list[tuple[
     return float(d @ np.linalg.solve(precision.joint(names), d))
 
 
-def network(case: str) -> tuple[Survey, Truth, list[tuple[str, ...]]]:
-    points: list[tuple[str, ...]] = [("point", "P4"), ("point", "P5")]
-    if case == "free":
-        survey, truth = polar_network(1, n=6, stations=3, held=0, extra=False, datum=Datum("inner"))
-        return survey, truth, points
-    if case == "correlated":
-        survey, truth = polar_network(2, n=6, stations=3)
-        ids = tuple(r.reading_id for r in survey.readings[:12])
-        sigmas = np.array([r.sigma for r in survey.readings[:12]])
-        cov = np.outer(sigmas, sigmas) * (0.6 + 0.4 * np.eye(12))
-        return replace(survey, reading_covariances=(ReadingCovariance(ids, cov),)), truth, points
+def test_covariances_of_a_free_network_are_the_scatter_of_resolved_noise() -> None:
+    """The mean of d' inv(C) d within 3.5 sigma of its degrees of freedom, in the datum of the truth."""
+    survey, truth = polar_network(1, n=6, stations=3, held=0, extra=False, datum=Datum("inner"))
+    names: list[tuple[str, ...]] = [("point", "P4"), ("point", "P5")]
+    start = start_near(survey, truth, 0)
+    ideal = measured(survey, truth, None)
+    rng = np.random.default_rng(11)
+    found = []
+    for _ in range(TRIALS):
+        readings = tuple(replace(r, value=r.value + r.sigma * rng.standard_normal()) for r in ideal.readings)
+        found.append(squared(replace(ideal, readings=readings), truth, start, names))
+    assert np.mean(found) == pytest.approx(6.0, abs=3.5 * np.sqrt(12.0 / TRIALS))
+
+
+def test_covariances_with_centring_refraction_and_correlated_readings() -> None:
+    """Every trial draws new centring errors and a new coefficient of refraction by their priors."""
     prior = VectorPrior(("refraction",), np.array([0.13]), np.array([[25.0]]))
-    values = np.array([0.0, 0.0, 0.13, 0.0])
-    instrument = VectorParameter(INSTRUMENT, values, free=("refraction",), prior=prior)
-    survey, truth = polar_network(3, n=6, stations=3, held=3, instrument=instrument, vertical=Vertical(radius=6.38e6))
-    truth["instrument", "T"] = values
-    return survey, truth, points
-
-
-@pytest.mark.parametrize("case", ["free", "correlated", "refraction"])
-def test_covariances_are_the_scatter_of_resolved_noise(case: str) -> None:
-    """The mean of d' inv(C) d within 3.5 sigma of its degrees of freedom."""
-    survey, truth, names = network(case)
-    found = distances_squared(survey, truth, names, TRIALS)
-    dof = 6
-    assert found.mean() == pytest.approx(dof, abs=3.5 * np.sqrt(2.0 * dof / TRIALS))
-
-
-def test_covariances_with_centring_errors() -> None:
-    """Every trial draws new centring errors by their sigmas, as the prior says."""
-    survey, truth = polar_network(4, n=6, stations=3, held=3, setup=Setup("", "T", centring_sigma=0.001, height_sigma=0.0005))
+    instrument = VectorParameter(INSTRUMENT, np.array([0.0, 0.0, 0.13, 0.0]), free=("refraction",), prior=prior)
+    survey, truth = polar_network(
+        4, n=6, stations=3, held=3, instrument=instrument, vertical=Vertical(radius=6.38e6),
+        setup=Setup("", "T", centring_sigma=0.001, height_sigma=0.0005),
+    )  # fmt: skip
+    first = survey.readings[:12]
+    sigmas = np.array([r.sigma for r in first])
+    cov = np.outer(sigmas, sigmas) * (0.6 + 0.4 * np.eye(12))
+    survey = replace(survey, reading_covariances=(ReadingCovariance(tuple(r.reading_id for r in first), cov),))
+    start = replace(start_near(survey, truth, 0), vectors={})
     rng = np.random.default_rng(8)
-    total = np.zeros(TRIALS)
+    found = []
     for i in range(TRIALS):
         drawn = {("centring", f"S{s}"): rng.normal(size=3) * (0.001, 0.001, 0.0005) for s in range(3)}
-        start = replace(start_near(survey, truth, 0), vectors={})
-        total[i] = squared(measured(survey, truth | drawn, i), truth, start, [("point", "P5")])
-    assert total.mean() == pytest.approx(3.0, abs=3.5 * np.sqrt(6.0 / TRIALS))
+        drawn["instrument", "T"] = np.array([0.0, 0.0, 0.13 + 5.0 * rng.standard_normal(), 0.0])
+        found.append(squared(measured(survey, truth | drawn, i), truth, start, [("point", "P5")]))
+    assert np.mean(found) == pytest.approx(3.0, abs=3.5 * np.sqrt(6.0 / TRIALS))
 
 
 # -- one lab -----------------------------------------------------------------------------------------------------------
