@@ -49,14 +49,14 @@ class DraftPoint:
     status: dict[str, str] = field(default_factory=dict)
 
     def parameter(self) -> PointParameter:
-        """As the survey takes it; an axis that is no unknown is held, at zero where nothing is said."""
+        """As the survey takes it: nan for an axis without start; one that is no unknown is held, at zero by default."""
         held = tuple(a for a in AXES if self.status.get(a, "fixed") == "fixed")
         missing = [a for a in AXES if a in self.status and a not in self.start]
         value = np.array([self.start.get(a, np.nan if a in missing else 0.0) for a in AXES])
         if len(held) == 3:
             return PointParameter(value, "held")
-        if missing and not any(self.start.get(a) for a in held):
-            return PointParameter(None, "free", held=held)
+        if not held and len(missing) == 3:
+            return PointParameter()
         return PointParameter(value, "free", held=held)
 
 
