@@ -326,3 +326,27 @@ def _warnings(pooled: tuple[float, float, float], last: CongruenceTest, options:
     if not last.passed:
         out.append("no set of stable points was found; what is shown as motion depends on the datum")
     return tuple(out)
+
+
+def joint_congruence(
+    adjustment: Adjustment, epochs: tuple[str, str], options: CongruenceOptions = DEFAULT_CONGRUENCE
+) -> Congruence:
+    """Two epochs of one joint adjustment (:func:`adjust.epochs.joint_survey`): the points that each has for itself.
+
+    Their covariance with each other counts; the shared points are the datum. Raises SurveyError where none is common.
+    """
+    state = epoch_state(adjustment)
+    ends = tuple(f"@{e}" for e in epochs)
+    both = [{n[1][: -len(end)] for n in state.names if n[0] == "point" and n[1].endswith(end)} for end in ends]
+    ids = sorted(both[0] & both[1])
+    if not ids:
+        raise SurveyError(f"no point was adjusted for both epochs {epochs[0]} and {epochs[1]}; see adjust.epochs")
+    named = [[("point", f"{i}{end}") for i in ids] for end in ends]
+    joined = state.part([*named[0], *named[1]])
+    n = 3 * len(ids)
+    names: tuple[ParameterName, ...] = tuple(("point", i) for i in ids)
+    first, second = (replace(state.part(part), names=names, directions=np.zeros((7, 0))) for part in named)
+    sigma0 = adjustment.sigma0 if options.scaled and adjustment.redundancy > 0 else 1.0
+    freedom = float(adjustment.redundancy) if options.scaled and adjustment.redundancy > 0 else float("inf")
+    return compare(names, first, second, np.zeros((7, 0)), (sigma0, freedom, float("nan")),
+                   replace(options, names=epochs), joined.cov[:n, n:])  # fmt: skip

@@ -8,8 +8,9 @@ from gtsam import Pose3
 from scipy.stats import binom
 
 from adjust.adjustment import adjust
-from adjust.congruence import CongruenceOptions, compare, congruence
+from adjust.congruence import CongruenceOptions, compare, congruence, joint_congruence
 from adjust.epoch_states import EpochState, aligned, epoch_state, moved
+from adjust.epochs import joint_survey
 from adjust.errors import SurveyError
 from adjust.graph import StartValues
 from adjust.model import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
@@ -157,3 +158,25 @@ def test_what_cannot_be_compared_is_said() -> None:
         congruence(first, first, CongruenceOptions(reference=(("point", names["P1"]),)))
     with pytest.raises(SurveyError, match="cannot carry the 4 motions"):
         congruence(first, adjust(survey, start), CongruenceOptions(reference=(("point", "P1"),)))
+
+
+def test_epochs_adjusted_together() -> None:
+    """Stable points shared: the same motions as of two adjustments in the datum of these points, and sharper."""
+    shift = {"P3": np.array([0.004, 0.0, 0.0]), "P7": np.array([0.0, -0.003, 0.003])}
+    surveys = {"a": free_hall(1)[0], "b": free_hall(2, shift)[0]}
+    stable = tuple(p.point_id for p in surveys["a"].points if p.point_id not in (*shift, "P5"))
+    joint = joint_survey(surveys, stable)
+    x = net.coordinates(1, 12, 3)
+    start = StartValues({}, {}, {p.point_id: x[p.point_id.split("@")[0]] for p in joint.points})
+    together = adjust(joint, start)
+    found = joint_congruence(together, ("a", "b"), CongruenceOptions(search=False))
+    assert {n[1] for n in found.moved} == {"P3", "P7"}
+    first, second = adjust(*free_hall(1)), adjust(*free_hall(2, shift))
+    reference = tuple(("point", p) for p in stable)
+    apart = {m.name: m for m in congruence(first, second, CongruenceOptions(reference=reference, search=False)).motions}
+    for m in found.motions:
+        d = m.displacement - apart[m.name].displacement
+        assert d @ np.linalg.solve(apart[m.name].cov, d) < 9.0
+        assert np.trace(m.cov) < np.trace(apart[m.name].cov)
+    with pytest.raises(SurveyError, match="stable point 'X'"):
+        joint_survey(surveys, ("X",))
