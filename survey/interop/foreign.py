@@ -26,7 +26,7 @@ class ForeignNetwork:
 
     sigma0: its a priori standard deviation of unit weight, in its own unit; weights do not depend on it.
     scaled: whether the program multiplies its sigmas by the a posteriori sigma0. alpha: level of its tests, or None.
-    reject: whether gross errors may be left out (False where the file's own selection is to be kept).
+    reject: whether gross errors may be left out; False keeps what the file's owner decided to use, as its program does.
     notes: what was left out or changed, for people.
     """
 
@@ -35,7 +35,7 @@ class ForeignNetwork:
     sigma0: float = 1.0
     scaled: bool = True
     alpha: float | None = None
-    reject: bool = True
+    reject: bool = False
     notes: tuple[str, ...] = ()
 
 

@@ -55,7 +55,7 @@ def read_plain_csv(path: Path) -> ForeignNetwork:
     if not names:
         raise Where(path, 1).error(f"the table is empty; its first line names the columns, as {', '.join(COLUMNS[:4])}")
     survey = reader.draft.survey(reader.bearings)
-    return ForeignNetwork(survey, path.stem, notes=tuple(reader.draft.notes))
+    return ForeignNetwork(survey, path.stem, reject=True, notes=tuple(reader.draft.notes))
 
 
 def _header(words: list[str], where: Where) -> list[str]:

@@ -43,6 +43,9 @@ Where a program calls its axes north and east (x, y), the frame is left-handed i
 then says how its angles count, and lengths, heights and angles come out the same. Before cameras join such a network,
 exchange x and y.
 
+A project made from another program's file keeps every observation that its owner used (`reject_points` and `reject_pairs`
+are false in its `survey.toml`), so that `adjust` gives that program's result; what does not fit is listed in the report.
+
 SINEX-like means: FILE/COMMENT, SITE/ID, SOLUTION/STATISTICS, SOLUTION/ESTIMATE (STAX, STAY, STAZ in m) and
 SOLUTION/MATRIX_ESTIMATE L COVA in their fixed columns, epochs and approximate longitudes zero; the frame is the
 laboratory's. Names longer than four characters get codes, which the comment lists.

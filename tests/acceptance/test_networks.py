@@ -1,13 +1,18 @@
 """Networks of other programs at their published results. A dense NumPy adjustment decides who is wrong."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from survey.cli import main
 from tests.acceptance.networks import (
     GAMA,
     KRUMM,
     LARGE,
     LGC_SIGMA0,
+    RAILWAY,
     SYNTHETIC,
     compare_krumm,
     compare_large,
@@ -154,3 +159,29 @@ def test_the_railway_is_at_the_minimum_in_its_own_datum():
     assert found.result.datum_defect == 3
     assert found.differences["gradient"] < 1e-3
     assert found.differences["datum_m"] < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("source", "sigma0", "r"),
+    [
+        ("gama/zoltan-test_2d_gon.gkf", 75.488517 / 10, 117),  # a network of Gama without start values, and 7.5 sigmas
+        ("gama/tst-tetrahedron-3-gon.gkf", 51.791759 / 10, 37),  # correlated baselines, a datum in z alone
+        ("lgc/MathisLGC_V1_20150709-141437.lgc", LGC_SIGMA0, 109),
+        ("krumm/1D/Niemeier_Height_free.dat", 3.3941763, 4),  # 0.0033941763 m over an a priori of 1 mm for 1 km
+    ],
+)
+def test_through_convert_and_adjust(tmp_path, source, sigma0, r):
+    """The folder gives what the program gave: nothing is lost on the way, and nothing rejected."""
+    folder, _, name = source.rpartition("/")
+    assert main(["convert", str(data_folder("network", *folder.split("/")) / name), str(tmp_path / "lab")]) == 0
+    assert main(["adjust", str(tmp_path / "lab"), "--quiet"]) == 3
+    summary = json.loads((tmp_path / "lab" / "results" / "solution.json").read_text())["summary"]
+    assert summary["redundancy"] == r
+    assert summary["sigma0"] == pytest.approx(sigma0, rel=1e-6)
+
+
+def test_the_page_lists_every_network():
+    page = (Path(__file__).parents[2] / "docs" / "networks.md").read_text(encoding="utf-8")
+    for name in (*GAMA, *SYNTHETIC, *LARGE, *KRUMM, RAILWAY, "HIE-ISOLDE"):
+        assert f"| {name} |" in page, name
+    assert "no start value" not in page
