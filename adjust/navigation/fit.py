@@ -8,17 +8,15 @@ calibration (see :class:`System`) do to them. The pose is the generalised least-
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotrs
 
-from adjust.closed_forms.rigid import rotation_exp
 from adjust.distributions import chi2
 from adjust.model import FloatArray, IntArray
-from adjust.navigation.pose_kernels import retracted, step_between
-from adjust.navigation.system import Sightings, System, evaluate
+from adjust.navigation.fit_kernels import DONE, gauss_newton
+from adjust.navigation.pose_kernels import retracted, step_between, step_derivative
+from adjust.navigation.system import Sightings, System
 
-MAX_ITERATIONS = 30
-_SETTLED = 1e-4
-_WEAK = 1e-9
+_NO_B: FloatArray = np.zeros((0, 0))
+_NO_ROWS: IntArray = np.zeros(0, dtype=np.int64)
 _LOG_2PI = float(np.log(2.0 * np.pi))
 
 
@@ -46,7 +44,7 @@ class PoseFit:
 
     G: (6, 2n) and G_prior (6, k): how noise of spots and prior moves the pose. B: (6, r). cov: (6, 6).
     chi_square: v' inv(Sigma) v. log_det: ln det Sigma. residual, Sigma, H: of spots, then prior rows.
-    in_front: beacons in front. converged: the last step was small against its sigma.
+    in_front: all beacons lie in front of their cameras.
     """
 
     pose: FloatArray
@@ -64,29 +62,6 @@ class PoseFit:
     H: FloatArray
     M: FloatArray
     in_front: bool
-    converged: bool
-
-
-def cho_factor(matrix: FloatArray) -> FloatArray:
-    """Lower Cholesky factor; raises LinAlgError. SciPy's own spends most of its time on checks of such small ones."""
-    factor, info = dpotrf(matrix, lower=1)
-    if info != 0:
-        raise np.linalg.LinAlgError("not positive definite")
-    return np.asarray(factor)
-
-
-def cho_solve(factor: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve by the factor of :func:`cho_factor`; right (n,) or (n, k)."""
-    return np.asarray(dpotrs(factor, right, lower=1)[0]).reshape(right.shape) if len(right) else right
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    residual: FloatArray
-    H: FloatArray
-    M: FloatArray
-    R: FloatArray
-    in_front: bool
 
 
 def retract(pose: FloatArray, step: FloatArray) -> FloatArray:
@@ -101,34 +76,7 @@ def local(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def local_derivative(step: FloatArray) -> FloatArray:
     """Derivative (6, 6) of ``local(a, retract(b, d))`` by d at zero, where ``step = local(a, b)``."""
-    w = step[:3]
-    angle = float(np.linalg.norm(w))
-    k = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-    # inverse of the right Jacobian of SO(3) (Chirikjian 2012, eq. 10.86)
-    beta = 1.0 / 12.0 if angle < 1e-4 else 1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
-    out = np.zeros((6, 6))
-    out[:3, :3] = np.eye(3) + 0.5 * k + beta * (k @ k)
-    out[3:, 3:] = rotation_exp(w)
-    return out
-
-
-def _rows(
-    system: System, seen: Sightings, used: IntArray, beacon: IntArray, pose: FloatArray, prior: Prior | None
-) -> _Rows:
-    residual, H, M, in_front = evaluate(system, pose, seen.camera[used], beacon, seen.uv[used])
-    n, k = 2 * len(used), 0 if prior is None else len(prior.rows)
-    R = np.zeros((n + k, n + k))
-    even = np.arange(0, n, 2)
-    cov = seen.cov[used]
-    R[even, even], R[even, even + 1] = cov[:, 0, 0], cov[:, 0, 1]
-    R[even + 1, even], R[even + 1, even + 1] = cov[:, 1, 0], cov[:, 1, 1]
-    if prior is not None:
-        step = local(prior.pose, pose)
-        residual = np.concatenate([residual, step[prior.rows]])
-        H = np.concatenate([H, local_derivative(step)[prior.rows]])
-        M = np.concatenate([M, -prior.B[prior.rows]])
-        R[n:, n:] = prior.cov[np.ix_(prior.rows, prior.rows)]
-    return _Rows(residual, H, M, R, in_front)
+    return np.asarray(step_derivative(step))
 
 
 def fit_pose(
@@ -138,69 +86,29 @@ def fit_pose(
 
     None where the observations leave a direction open, or the iteration does not settle.
     """
-    if 2 * len(used) + (0 if prior is None else len(prior.rows)) < 6:
+    n, k, r = 2 * len(used), 0 if prior is None else len(prior.rows), system.F.shape[1]
+    if n + k < 6:
         return None
-    pose, rows = start, _rows(system, seen, used, beacon, start, prior)
-    converged = False
-    for _ in range(MAX_ITERATIONS):
-        solved = _step(rows)
-        if solved is None:
-            return None
-        step, _, factor = solved
-        size = float(np.sqrt(max(float(step @ (rows.H.T @ cho_solve(factor, rows.H @ step))), 0.0)))
-        length = float(np.linalg.norm(step[:3]))
-        step = step * min(1.0, 0.5 / max(length, 0.5))
-        pose, rows, moved = _shortened(system, seen, used, beacon, prior, pose, rows, step, factor)
-        if size < _SETTLED or not moved:
-            converged = size < 1e-2
-            break
-    return _finished(pose, rows, used, beacon, converged) if converged else None
-
-
-def _step(rows: _Rows) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    try:
-        factor = cho_factor(rows.R + rows.M @ rows.M.T)
-        PH = cho_solve(factor, rows.H)
-        normal = rows.H.T @ PH
-        scale = 1.0 / np.sqrt(np.diag(normal))
-        values, vectors = np.linalg.eigh(normal * np.outer(scale, scale))
-    except (np.linalg.LinAlgError, ValueError):
+    R = np.zeros((n + k, n + k))
+    even = np.arange(0, n, 2)
+    cov = seen.cov[used]
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        R[even + i, even + j] = cov[:, i, j]
+    prior_pose, prior_B, prior_rows = start, _NO_B, _NO_ROWS
+    if prior is not None:
+        prior_pose, prior_B, prior_rows = prior.pose, np.ascontiguousarray(prior.B), prior.rows
+        R[n:, n:] = prior.cov[np.ix_(prior.rows, prior.rows)]
+    pose, C, gain = np.empty((4, 4)), np.empty((6, 6)), np.empty((6, n + k))
+    residual, H, M = np.empty(n + k), np.empty((n + k, 6)), np.empty((n + k, r))
+    state, in_front, chi_square, log_det = gauss_newton(
+        system.arrays, np.ascontiguousarray(start), seen.camera[used], beacon, seen.uv[used], R,
+        np.ascontiguousarray(prior_pose), prior_B, prior_rows, pose, residual, H, M, C, gain,
+    )  # fmt: skip
+    if state != DONE:
         return None
-    if not np.isfinite(values).all() or values[0] < _WEAK:
-        return None
-    C = (vectors / values) @ vectors.T * np.outer(scale, scale)
-    return -C @ (PH.T @ rows.residual), C, factor
-
-
-def _shortened(
-    system: System, seen: Sightings, used: IntArray, beacon: IntArray, prior: Prior | None, pose: FloatArray,
-    rows: _Rows, step: FloatArray, factor: FloatArray,
-) -> tuple[FloatArray, _Rows, bool]:  # fmt: skip
-    """The step, halved until it lowers the weighted squares; the last is whether there was such a step."""
-    before = float(rows.residual @ cho_solve(factor, rows.residual))
-    for _ in range(6):
-        trial = retract(pose, step)
-        new = _rows(system, seen, used, beacon, trial, prior)
-        after = float(new.residual @ cho_solve(factor, new.residual))
-        if after <= before * (1.0 + 1e-9) + 1e-9 and (new.in_front or not rows.in_front):
-            return trial, new, True
-        step = 0.5 * step
-    return pose, rows, False
-
-
-def _finished(pose: FloatArray, rows: _Rows, used: IntArray, beacon: IntArray, converged: bool) -> PoseFit | None:
-    solved = _step(rows)
-    if solved is None:
-        return None
-    _, C, factor = solved
-    gain = -C @ cho_solve(factor, rows.H).T
-    n = 2 * len(used)
-    Sigma = rows.R + rows.M @ rows.M.T
-    chi_square = float(rows.residual @ cho_solve(factor, rows.residual))
-    log_det = 2.0 * float(np.log(np.diag(factor)).sum())
     return PoseFit(
-        pose, used, beacon, C, gain[:, :n], gain[:, n:], gain @ rows.M, chi_square, len(rows.residual) - 6, log_det,
-        rows.residual, Sigma, rows.H, rows.M, rows.in_front, converged,
+        pose, used, beacon, C, gain[:, :n], gain[:, n:], gain @ M, float(chi_square), n + k - 6, float(log_det),
+        residual, R + M @ M.T, H, M, bool(in_front),
     )  # fmt: skip
 
 

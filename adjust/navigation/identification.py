@@ -18,8 +18,9 @@ from adjust.lens import MODELS, focal_length_px
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers, local, log_evidence
 from adjust.navigation.model import NavigateOptions
+from adjust.navigation.row_kernels import gates
 from adjust.navigation.search_kernels import search
-from adjust.navigation.system import Sightings, System, evaluate, station_rays, visible
+from adjust.navigation.system import Sightings, System, station_rays, visible
 
 _KEPT = 400
 _ADJUSTED = 60
@@ -29,6 +30,7 @@ _GATE = float(chi2.isf(1e-4, 2))
 _MOST_NAMINGS = 24
 _CROWDED = 3.0  # beacons near a spot beyond which naming in turn is hopeless
 _MOST_TRIPLES = 400
+_SAME = 1e-3  # rad and m; two roots of the minimal problem that one adjustment brings together
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,20 +140,22 @@ def gate_distances(
     The second (n, m): whether the beacon is a likelier origin of the spot than chance. A beacon of vague position may
     be near everything and explains nothing. A spot that came with its name needs no such proof.
     """
-    n, m = len(seen.uv), len(system.beacons.beacon_ids)
-    camera, beacon = np.repeat(seen.camera, m), np.tile(np.arange(m), n)
-    residual, H, M, _ = evaluate(system, prior.pose, camera, beacon, np.repeat(seen.uv, m, axis=0))
     margin = _MARGIN + 4.0 * float(np.sqrt(np.diag(prior.total)[:3].max()))
-    ahead = visible(system, prior.pose, margin)[camera, beacon]
-    H, M = H.reshape(-1, 2, 6), M.reshape(-1, 2, M.shape[-1])
-    common = H @ prior.B + M
-    S = np.repeat(seen.cov, m, axis=0) + H @ prior.cov @ H.swapaxes(1, 2) + common @ common.swapaxes(1, 2)
-    r = residual.reshape(-1, 2)
-    d2 = np.einsum("ni,ni->n", r, np.linalg.solve(S, r[:, :, None])[..., 0])
-    area = np.array([c.image_size[0] * c.image_size[1] for c in system.head.cameras], dtype=float)[camera]
-    vague = d2 + np.linalg.slogdet(2.0 * np.pi * S)[1] - 2.0 * np.log(options.detection / (1.0 - options.detection))
-    likely = (vague < 2.0 * np.log(area / options.false_spots)) | (np.repeat(seen.label, m) >= 0)
-    return np.where(ahead, d2, np.inf).reshape(n, m), likely.reshape(n, m)
+    ahead = visible(system, prior.pose, margin)
+    distance, log_det = np.empty((len(seen.uv), ahead.shape[1])), np.empty((len(seen.uv), ahead.shape[1]))
+    gates(
+        system.arrays, np.ascontiguousarray(prior.pose), np.ascontiguousarray(prior.cov),
+        np.ascontiguousarray(prior.B), seen.camera, np.ascontiguousarray(seen.uv), np.ascontiguousarray(seen.cov),
+        ahead, distance, log_det,
+    )  # fmt: skip
+    vague = distance + log_det - 2.0 * np.log(options.detection / (1.0 - options.detection))
+    by_chance = 2.0 * np.log(image_areas(system)[seen.camera] / options.false_spots)
+    return distance, (vague < by_chance[:, None]) | (seen.label >= 0)[:, None]
+
+
+def image_areas(system: System) -> FloatArray:
+    """(c,) px^2."""
+    return np.array([c.image_size[0] * c.image_size[1] for c in system.head.cameras], dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,12 +236,14 @@ def _judged(
     options: NavigateOptions,
 ) -> tuple[Candidate, ...]:  # fmt: skip
     """Adjust the trials, compare their evidence, and give each its probability."""
-    found: list[Candidate] = []
+    by_naming: dict[tuple[bytes, bytes], list[Candidate]] = {}
     for pose, match in trials[: _ADJUSTED if prior is None else _MOST_NAMINGS]:
         candidate = _adjusted(system, seen, pose, match, prior, options)
-        if candidate is not None and not any(_same(candidate, other) for other in found):
-            found.append(candidate)
-    found.sort(key=lambda c: c.score)
+        if candidate is not None:
+            alike = by_naming.setdefault((candidate.fit.used.tobytes(), candidate.fit.beacon.tobytes()), [])
+            if not any(np.linalg.norm(local(candidate.fit.pose, other.fit.pose)) < _SAME for other in alike):
+                alike.append(candidate)
+    found = sorted((c for alike in by_naming.values() for c in alike), key=lambda c: c.score)
     if not found:
         return ()
     weights = np.exp(-0.5 * (np.array([c.score for c in found]) - found[0].score))
@@ -248,13 +254,6 @@ def _judged(
         if c.score < found[0].score + _HOPELESS
     ]
     return tuple(kept)
-
-
-def _same(a: Candidate, b: Candidate) -> bool:
-    """Whether two candidates are one: the same spots have the same beacons, and the poses agree."""
-    if not np.array_equal(a.fit.used, b.fit.used) or not np.array_equal(a.fit.beacon, b.fit.beacon):
-        return False
-    return bool(np.linalg.norm(local(a.fit.pose, b.fit.pose)) < 1e-3)
 
 
 def _adjusted(
@@ -277,7 +276,7 @@ def _grown(
     system: System, seen: Sightings, fit: PoseFit, rejected: tuple[int, ...], options: NavigateOptions
 ) -> PoseFit:
     """Name the spots that the pose explains and the coarse consensus left out."""
-    for _ in range(len(seen.uv)):
+    for _ in range(len(seen.uv) - len(fit.used) - len(rejected)):
         prior = Prior(fit.pose, fit.G @ _spot_noise(seen, fit) @ fit.G.T, fit.B, np.arange(6))
         distance, likely = gate_distances(system, seen, prior, options)
         distance[~(allowed_namings(system, seen) & likely)] = np.inf
@@ -309,17 +308,16 @@ def score_of(system: System, seen: Sightings, fit: PoseFit, prior: Prior | None,
     A false spot may be anywhere in its image; what no prior knows of the pose is uniform over all rotations (8 pi^2)
     and the room.
     """
-    areas = np.array([c.image_size[0] * c.image_size[1] for c in system.head.cameras], dtype=float)
-    used = set(fit.used.tolist())
-    false = [i for i in range(len(seen.uv)) if i not in used]
+    false = np.ones(len(seen.uv), dtype=np.bool_)
+    false[fit.used] = False
     score = log_evidence(fit)
     known = set() if prior is None else set(prior.rows.tolist())
     score += 2.0 * np.log(8.0 * np.pi**2) * len({0, 1, 2} - known) / 3.0
     score += 2.0 * np.log(options.room_m) * len({3, 4, 5} - known)
-    score -= 2.0 * float(np.log(options.false_spots / areas[seen.camera[false]]).sum())
-    score -= 2.0 * len(used) * np.log(options.detection)
-    taken = {(int(seen.camera[i]), int(b)) for i, b in zip(fit.used, fit.beacon, strict=True)}
+    score -= 2.0 * float(np.log(options.false_spots / image_areas(system)[seen.camera[false]]).sum())
+    score -= 2.0 * len(fit.used) * np.log(options.detection)
     # only cameras that took part: the others may not have been triggered
     view = visible(system, fit.pose) & seen.present[:, None]
-    missing = sum((int(c), int(b)) not in taken for c, b in np.argwhere(view))
+    view[seen.camera[fit.used], fit.beacon] = False
+    missing = int(view.sum())
     return float(score - 2.0 * missing * np.log(1.0 - options.detection))

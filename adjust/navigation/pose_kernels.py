@@ -57,3 +57,23 @@ def step_between(a: FloatArray, b: FloatArray) -> FloatArray:
     factor = 2.0 if sine < 1e-12 else 2.0 * np.arctan2(sine, q[0]) / sine
     out[:3] = factor * q[1:]
     return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def step_derivative(step: FloatArray) -> FloatArray:
+    """Derivative (6, 6) of ``step_between(a, retracted(b, d))`` by d at zero, where ``step = step_between(a, b)``.
+
+    Source: inverse of the right Jacobian of SO(3) (Chirikjian 2012, eq. 10.86).
+    """
+    w0, w1, w2 = step[0], step[1], step[2]
+    angle = np.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
+    beta = 1.0 / 12.0
+    if angle >= 1e-4:
+        beta = 1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
+    k = np.array([[0.0, -w2, w1], [w2, 0.0, -w0], [-w1, w0, 0.0]])
+    out = np.zeros((6, 6))
+    out[:3, :3] = np.eye(3) + 0.5 * k + beta * (k @ k)
+    only_turn = np.zeros(6)
+    only_turn[:3] = step[:3]
+    out[3:, 3:] = retracted(np.eye(4), only_turn)[:3, :3]
+    return out

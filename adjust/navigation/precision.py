@@ -8,7 +8,8 @@ from gtsam import Pose3
 
 from adjust.lens import MODELS, project
 from adjust.model import FloatArray, IntArray
-from adjust.navigation.fit import PoseFit, Prior, fit_pose, retract
+from adjust.navigation import fit_kernels
+from adjust.navigation.fit import PoseFit, Prior, fit_pose
 from adjust.navigation.model import Beacons, Head, Shares
 from adjust.navigation.system import Sightings, System, evaluate, make_system, visible
 
@@ -116,18 +117,9 @@ def _named(direction: FloatArray, number: int, of: int) -> str:
 
 
 def some_pose(system: System, seen: Sightings, used: IntArray, beacon: IntArray, start: FloatArray) -> FloatArray:
-    """One of the many poses (4, 4) that explain too few spots, nearest to a start in a way (damped steps)."""
-    pose, damping = start, 1e-3
-    residual, H, _, _ = evaluate(system, pose, seen.camera[used], beacon, seen.uv[used])
-    for _ in range(60):
-        step = -H.T @ np.linalg.solve(H @ H.T + damping * np.eye(len(H)) * np.trace(H @ H.T) / len(H), residual)
-        step *= min(1.0, 0.3 / max(float(np.linalg.norm(step)), 1e-12))
-        trial = retract(pose, step)
-        new, new_H, _, in_front = evaluate(system, trial, seen.camera[used], beacon, seen.uv[used])
-        if in_front and new @ new < residual @ residual:
-            pose, residual, H, damping = trial, new, new_H, damping * 0.3
-        else:
-            damping *= 10.0
+    """One of the many poses (4, 4) that explain too few spots, nearest to a start in a way."""
+    pose = np.empty((4, 4))
+    fit_kernels.some_pose(system.arrays, np.ascontiguousarray(start), seen.camera[used], beacon, seen.uv[used], pose)
     return pose
 
 

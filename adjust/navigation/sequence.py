@@ -22,7 +22,7 @@ from adjust.navigation.model import (
 )
 from adjust.navigation.motion import MotionState, given_prior, predicted, started, table_prior, updated
 from adjust.navigation.precision import open_directions, own_covariance, shares, some_pose, spot_noise
-from adjust.navigation.system import Sightings, System, make_sightings, make_system, station_rays, visible
+from adjust.navigation.system import Sightings, System, make_sightings, make_system, station_rays, visible, with_rays
 
 _AGREES = 1e-6
 _WEAKEST_RAD = 0.2  # a covariance from first derivatives means nothing beyond
@@ -52,7 +52,7 @@ def navigate(
     """
     system = make_system(head, beacons)
     times = _times(epochs)
-    seen = [make_sightings(system, epoch) for epoch in epochs]
+    seen = with_rays(system, [make_sightings(system, epoch) for epoch in epochs])
     results: list[EpochPose] = []
     state: MotionState | None = None
     backwards: tuple[int, MotionState] | None = None

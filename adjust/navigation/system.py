@@ -1,6 +1,8 @@
 """Head and beacons as the arrays that the compiled code takes, checked once."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -9,7 +11,7 @@ from adjust.lens import MODELS, unit_rays
 from adjust.lens_kernels import FISHEYE, MAX_LENS
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.navigation.model import Beacons, Head, NavigationEpoch, Spots
-from adjust.navigation.row_kernels import spot_rows
+from adjust.navigation.row_kernels import SystemArrays, in_view, spot_rows
 
 _BORDER_PX = 3.0
 
@@ -38,6 +40,15 @@ class System:
     F_inverse: FloatArray
     field: FloatArray
 
+    @cached_property
+    def arrays(self) -> SystemArrays:
+        """What compiled code takes."""
+        x = np.ascontiguousarray(self.beacons.x_in_world, dtype=np.float64)
+        return (
+            self.kinds, self.lenses, self.constants, self.camera_R, self.camera_t, x, self.lens_at, self.n_lens,
+            self.beacon_at, self.F,
+        )  # fmt: skip
+
     @property
     def beacon_at(self) -> int:
         """Row of F at which the beacons begin."""
@@ -50,6 +61,7 @@ class Sightings:
 
     camera: (n,). uv: (n, 2) px. cov: (n, 2, 2). label: (n,) beacon, -1 unknown.
     block: (n,) which of the epoch's ``spots``. row: (n,) position there. present: (c,) whether a camera took part.
+    ray: (n, 3) in the station, where they were computed beforehand.
     """
 
     camera: IntArray
@@ -59,6 +71,7 @@ class Sightings:
     block: IntArray
     row: IntArray
     present: BoolArray
+    ray: FloatArray | None = None
 
 
 def make_system(head: Head, beacons: Beacons) -> System:
@@ -162,6 +175,8 @@ def make_sightings(system: System, epoch: NavigationEpoch) -> Sightings:
 
 def station_rays(system: System, seen: Sightings) -> tuple[FloatArray, FloatArray]:
     """Origins and unit rays (n, 3) of the spots in the station. Raises SurveyError for pixels that have no ray."""
+    if seen.ray is not None:
+        return np.ascontiguousarray(system.camera_t[seen.camera]), seen.ray
     ray = np.zeros((len(seen.uv), 3))
     for c, given in enumerate(system.head.cameras):
         rows = seen.camera == c
@@ -169,6 +184,19 @@ def station_rays(system: System, seen: Sightings) -> tuple[FloatArray, FloatArra
             own = unit_rays(MODELS[given.model], given.lens, given.constants, seen.uv[rows])
             ray[rows] = own @ system.camera_R[c].T
     return np.ascontiguousarray(system.camera_t[seen.camera]), ray
+
+
+def with_rays(system: System, sequence: Sequence[Sightings]) -> list[Sightings]:
+    """The same with the rays of all, computed at once: the lens is inverted by arrays, single spots would cost more."""
+    if not sequence:
+        return []
+    camera, uv = (np.concatenate([getattr(s, name) for s in sequence]) for name in ("camera", "uv"))
+    try:
+        _, ray = station_rays(system, replace(sequence[0], camera=camera, uv=uv))
+    except SurveyError:
+        return list(sequence)  # one spot has no ray: said where its epoch needs it
+    ends = np.cumsum([len(s.uv) for s in sequence])[:-1]
+    return [replace(s, ray=np.ascontiguousarray(r)) for s, r in zip(sequence, np.split(ray, ends), strict=True)]
 
 
 def _labels(spots: Spots, names: dict[str, int], epoch_id: str) -> list[int]:
@@ -190,11 +218,8 @@ def evaluate(
     n = len(camera)
     residual, H, M = np.empty(2 * n), np.empty((2 * n, 6)), np.empty((2 * n, system.F.shape[1]))
     in_front = spot_rows(
-        np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3]), camera, beacon,
-        np.ascontiguousarray(uv), system.kinds, system.lenses, system.constants, system.camera_R, system.camera_t,
-        np.ascontiguousarray(system.beacons.x_in_world, dtype=float), system.lens_at, system.n_lens, system.beacon_at,
-        system.F, residual, H, M,
-    )  # fmt: skip
+        system.arrays, np.ascontiguousarray(pose), camera, beacon, np.ascontiguousarray(uv), residual, H, M
+    )
     return residual, H, M, bool(in_front)
 
 
@@ -203,14 +228,7 @@ def visible(system: System, pose: FloatArray, margin: float = 0.0) -> BoolArray:
 
     margin: how far outside its border (tangent of the angle) counts as inside.
     """
-    x = np.asarray(system.beacons.x_in_world)
-    q = (x - pose[:3, 3]) @ pose[:3, :3]
-    p = np.einsum("cka,cmk->cma", system.camera_R, q[None] - system.camera_t[:, None, :])
-    f = system.field[:, None, :]
-    fisheye = f[..., 4] < 1.5
-    with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = p[..., 0] / p[..., 2], p[..., 1] / p[..., 2]
-        inside = (p[..., 2] > 0) & (a > f[..., 0] - margin) & (a < f[..., 1] + margin)
-        inside &= (b > f[..., 2] - margin) & (b < f[..., 3] + margin)
-        cone = p[..., 2] > (f[..., 4] - margin) * np.linalg.norm(p, axis=-1)
-    return np.asarray(np.where(fisheye, cone, inside), dtype=np.bool_)
+    arrays = system.arrays
+    out = np.empty((len(system.kinds), len(system.beacons.beacon_ids)), dtype=np.bool_)
+    in_view(arrays[3], arrays[4], arrays[5], system.field, np.ascontiguousarray(pose), margin, out)
+    return out
