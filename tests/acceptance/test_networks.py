@@ -107,10 +107,9 @@ def test_gama_adjusted_observations(case):
     np.testing.assert_allclose(ours / unit_of(case), printed / unit_of(case), rtol=2e-6, atol=2e-3)
 
 
-def test_gama_contradicts_itself_where_baselines_are_correlated(case):
+def test_gama_contradicts_itself_where_baselines_are_correlated():
     """The deviation of an adjusted dy from a fixed point is that of the other point's y, and Gama prints another."""
-    if case.name != "tst-tetrahedron-3-gon":
-        pytest.skip("only this network has correlated baselines")
+    case = gama_case(data_folder("network", "gama"), "tst-tetrahedron-3-gon")
     k = next(i for i, r in enumerate(case.published.rows) if (r.kind, r.ends) == ("dy", ("1", "4")))
     y = case.published_sigmas()[list(case.published.adjusted).index(("4", "y"))]
     assert case.published.rows[k].sigma == pytest.approx(19.959e-3, abs=1e-6)
