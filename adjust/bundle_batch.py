@@ -16,6 +16,7 @@ from scipy.linalg import block_diag, lapack
 from adjust.bundle_kernels import (
     add_direct,
     back_substitute,
+    block_squares,
     direct_influence,
     point_covariances,
     reduce_points,
@@ -30,6 +31,8 @@ from adjust.observations import ImageBlock
 from adjust.state import State
 from adjust.unknowns import Chain, Unknowns
 
+FLOOR = 1e-4
+"""Share of a pose's own diagonal that it is scaled with at least, when the points that it sees are reduced."""
 ROUNDING_PIVOT = 1e-11
 """Pivot of a scaled normal matrix below which there is nothing but rounding."""
 BLIND_MOTION = 1e-10
@@ -245,7 +248,7 @@ class BundleBatch:
         )
 
     def _reduce_hidden(self, N: FloatArray, gradient: FloatArray, rest: float, damping: float) -> None:
-        d = np.sqrt(np.maximum(np.diag(N), 1e-300))
+        d = np.sqrt(np.maximum(np.diag(N), FLOOR * self._without_points() + 1e-300))
         self.scale = d
         A = N / d[:, None] / d
         z = gradient / d
@@ -262,6 +265,19 @@ class BundleBatch:
             rest -= float(self.Y[:, -1] @ self.Y[:, -1])
         self.hidden_decrease = self.chi_square - rest
         self._serve(A, z, d[nh:], rest)
+
+    def _without_points(self) -> FloatArray:
+        """Diagonal (n_keys,) of the poses' normal matrix if all points were known: what rounding is measured by.
+
+        A pose that moves with all points it sees (a table, where everything stands on it) has nothing but rounding left
+        on its diagonal once these are reduced, and that may be of either sign.
+        """
+        n = len(self.blocks)
+        squares = np.zeros((n, 6, 6))
+        block_squares(self.block, self.A, squares)
+        of_poses = self.G[self.first_pose : self.first_pose + 6 * n]
+        diagonal = sparse.bsr_array((squares, np.arange(n), np.arange(n + 1)), shape=(6 * n, 6 * n))
+        return np.asarray((diagonal @ of_poses).multiply(of_poses).sum(axis=0)).ravel()
 
     def _undetermined_pose(self, column: int) -> IndeterminateError:
         key = max((k for k in self.hidden_poses if self.key_at[k] <= column), key=lambda k: self.key_at[k])
@@ -359,6 +375,36 @@ class BundleBatch:
         )  # fmt: skip
         for j, i in enumerate(self.reduced):
             delta.insert(self.point_key[i], dX[j])
+
+    def image_rows_along(self, V: FloatArray) -> FloatArray:
+        """Whitened Jacobian times directions V (n_interface, k) as rows (2K, k), what is hidden following best.
+
+        From the rows themselves: their normal equations would hide anything below the root of rounding.
+        """
+        nh, k = self.n_hidden, V.shape[1]
+        d = np.vstack([np.zeros((nh, k)), V])
+        if nh:
+            right = np.asfortranarray(self.Y[:, :-1] @ (V * self.scale[nh:, None]))
+            d[:nh] = -lapack.dtrtrs(self.C, right, lower=0)[0] / self.scale[:nh, None]
+        local = np.asarray(self.G @ d)
+        points = np.zeros((len(self.point_ids), 3, k))
+        for column in range(k):
+            dX = np.zeros((len(self.reduced), 3))
+            back_substitute(
+                self.ptr, self.pc_ptr, self.pc_camera, self.camera_of, self.state.lenses.n_free, self.lens_at,
+                self.pose_at, self.Vi, self.W3, self.WL, np.zeros_like(self.h),
+                np.ascontiguousarray(local[:, column]), dX,
+            )  # fmt: skip
+            points[self.reduced, :, column] = dX
+        for i, at in self.tied_at.items():
+            points[i] = local[at : at + 3]
+        poses = local[self.first_pose : self.first_pose + 6 * len(self.blocks)].reshape(-1, 6, k)
+        by_pose, by_point = self.A[:, :, MAX_LENS : MAX_LENS + 6], self.A[:, :, MAX_LENS + 3 : MAX_LENS + 6]
+        out = by_pose @ poses[self.block] + by_point @ points[self.point]
+        for camera in sorted(set(self.camera_of.tolist())):
+            mine, free = self.camera_of == camera, int(self.state.lenses.n_free[camera])
+            out[mine] += self.A[mine, :, :free] @ local[self.lens_at[camera] : self.lens_at[camera] + free]
+        return np.asarray(out.reshape(-1, k))
 
     def _hidden_poses_given_interface(self) -> tuple[FloatArray, FloatArray]:
         """Hidden poses by the interface (n_hidden, n_interface), and their covariance when that is known."""

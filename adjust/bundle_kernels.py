@@ -49,6 +49,17 @@ def rows(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def block_squares(block: IntArray, A: FloatArray, out: FloatArray) -> None:
+    """Normal matrix (B, 6, 6) of each block's pose by its own image points alone, all points known."""
+    out[:] = 0.0
+    for k in range(block.size):
+        for s in range(2):
+            for i in range(6):
+                for j in range(6):
+                    out[block[k], i, j] += A[k, s, MAX_LENS + i] * A[k, s, MAX_LENS + j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def invert3(V: FloatArray, out: FloatArray) -> bool:
     """Inverse of a symmetric positive definite V (3, 3); False where a pivot vanishes against its diagonal."""
     a, b, c = V[0, 0], V[0, 1], V[0, 2]

@@ -4,7 +4,6 @@ import gtsam
 import numpy as np
 from scipy.linalg import qr
 
-from adjust.bundle_batch import ROUNDING_PIVOT
 from adjust.datum import BLIND, Stacking, gauge, stacking, times, visible_keys
 from adjust.errors import IndeterminateError
 from adjust.graph import AdjustmentGraph
@@ -12,6 +11,8 @@ from adjust.model import FloatArray, Station
 from adjust.unknowns import Unknown
 
 _MOST_DIMS = 6000
+BLIND_BUNDLE = 2e-7
+"""As ``BLIND``, where poses and points are hidden; undetermined directions reach 3e-8, determined ones 6e-6."""
 _READABLE = {"rx": "rotation x", "ry": "rotation y", "rz": "rotation z", "tx": "x", "ty": "y", "tz": "z"}
 
 
@@ -48,12 +49,12 @@ def readable(unknown: Unknown) -> str:
 
 
 def null_space(
-    linear: gtsam.GaussianFactorGraph, stack: Stacking, limit: float = BLIND
+    linear: gtsam.GaussianFactorGraph, stack: Stacking, graph: AdjustmentGraph | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Null vectors (n, k) of the normal matrix of the visible unknowns, and its column scale (n,).
 
-    Candidates come from the scaled normal matrix; each is then judged by the length of the whitened Jacobian times it
-    against ``limit``, so that weak but determined directions are not taken for null ones.
+    Candidates come from the scaled normal matrix; each is then judged by the length of the whitened Jacobian times it,
+    so that weak but determined directions are not taken for null ones. graph: where a bundle is part of it.
     """
     N = np.zeros((stack.n, stack.n))
     for i in range(linear.size()):
@@ -68,7 +69,9 @@ def null_space(
     V = V[:, w < 1e-7] / scale[:, None]
     if V.shape[1] == 0:
         return V, scale
-    _, s, Vt = np.linalg.svd(times(linear, stack, V), full_matrices=False)
+    _, s, Vt = np.linalg.svd(_rows_along(linear, stack, V, graph), full_matrices=False)
+    # what is hidden in a bundle follows from its normal equations, to about the root of their rounding
+    limit = BLIND if graph is None or graph.bundle is None else BLIND_BUNDLE
     return V @ Vt[s < limit].T, scale
 
 
@@ -83,7 +86,7 @@ def describe_null_space(
             "the observations and the datum leave unknowns undetermined; the survey is too large "
             f"({stack.n} unknowns) to name them: try a part of it"
         )
-    null, scale = null_space(linear, stack, _limit(graph))
+    null, scale = null_space(linear, stack, graph)
     if null.shape[1] == 0:
         return None
     scaled = _without_weak_motions(graph, linear, stack, np.linalg.qr(null * scale[:, None])[0], scale, values)
@@ -98,9 +101,19 @@ def describe_null_space(
     return IndeterminateError("\n  - ".join([head, *lines]), tuple(names) or tuple(lines))
 
 
-def _limit(graph: AdjustmentGraph) -> float:
-    """Length that counts as none: through a bundle's normal equations the root of its rounding pivots."""
-    return BLIND if graph.bundle is None else 3.0 * ROUNDING_PIVOT**0.5
+def _rows_along(
+    linear: gtsam.GaussianFactorGraph, stack: Stacking, V: FloatArray, graph: AdjustmentGraph | None
+) -> FloatArray:
+    """The whitened Jacobian times V; a bundle's part from its image points, not through its normal equations."""
+    bundle = graph.bundle if graph is not None else None
+    if bundle is None:
+        return times(linear, stack, V)
+    out = [bundle.image_rows_along(V[stack.index(bundle.interface)])]
+    for i in range(linear.size()):
+        factor = linear.at(i)
+        if list(factor.keys()) != bundle.interface:
+            out.append(factor.jacobian()[0] @ V[stack.index(factor.keys())])
+    return np.concatenate(out)
 
 
 def _without_weak_motions(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from adjust.errors import IndeterminateError
-from adjust.graph import StartValues
+from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.model import Datum, PoseParameter, Survey
 from adjust.observations import Coordinates, Distance, PositionRef
 from adjust.precision import Precision
@@ -19,6 +19,10 @@ from tests.adjust import helpers as h
 
 def near(truth: Truth) -> StartValues:
     return h.shaken(h.start_at(truth), 1, 0.003, 0.003)
+
+
+def graph_at(survey: Survey, start: StartValues) -> AdjustmentGraph:
+    return GraphBuilder(survey, start.lenses).build(start)
 
 
 def calibrated(survey: Survey, truth: Truth) -> Survey:
@@ -199,3 +203,25 @@ def test_an_epoch_with_too_few_points_is_named(which: slice) -> None:
     blocks[2] = replace(b, point_idx=b.point_idx[which], uv=b.uv[which], cov=b.cov[which], used=None)
     with pytest.raises(IndeterminateError, match=r"head.* e2"):
         h.solved(replace(survey, image_blocks=tuple(blocks)), near(truth))
+
+
+def test_beacons_that_only_a_turning_head_sees_with_free_lenses() -> None:
+    """The table moves with all beacons it sees: reduced, nothing but rounding is left of it, and that is no weight."""
+    survey, truth = beacons(4, n_table_epochs=4, n_free_epochs=3, n_night_epochs=6)
+    survey = replace(survey, coordinates=(), distances=())
+    solved = solve(graph_at(survey, h.shaken(h.start_at(truth), 1, 0.001, 0.001)), SolveOptions(max_iterations=12))
+    assert solved.iterations < 9
+    n = sum(2 * len(b.uv) for b in survey.image_blocks) + 2 * len(survey.table_readings)
+    assert 0.8 * n < solved.omega < n
+
+
+def test_image_rows_along_a_direction_are_the_root_of_the_condensed_normal_equations() -> None:
+    survey, truth = h.network(1)
+    graph = graph_at(survey, near(truth))
+    graph.prepare(graph.start, jacobians=True)
+    bundle = graph.bundle
+    assert bundle is not None
+    V = np.random.default_rng(3).normal(size=(sum(graph.unknowns.by_key[k].dim for k in bundle.interface), 4))
+    R = np.concatenate(bundle.views, axis=1)
+    rows = bundle.image_rows_along(V)
+    np.testing.assert_allclose(rows.T @ rows, (R @ V).T @ (R @ V), rtol=1e-7)
