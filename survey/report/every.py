@@ -149,7 +149,7 @@ def _other_rows(c: Context) -> _Rows:
         for i, component in enumerate(o.components):
             unit, factor = unit_for_people(component, o.units[i])
             sigma_unit, sigma_factor = sigma_unit_for_people(o.units[i])
-            row = (known(o.kind), o.group, " · ".join(o.ids), "", component, unit, sigma_unit)
+            row = (known(o.kind.replace("_", " ")), o.group, " · ".join(o.ids), "", component, unit, sigma_unit)
             for k, value in zip(_NAMES, row, strict=True):
                 names[k].append(value)
             columns.append((o.observed[i], o.sigma[i], o.residual[i], o.redundancy[i], o.standardized[i], float(o.used),

@@ -5,7 +5,7 @@ import numpy as np
 from adjust.result import ObservationResidual
 from survey.quantities import sigma_unit_for_people, unit_for_people
 from survey.report.context import Context
-from survey.report.language import t
+from survey.report.language import known, t
 from survey.report.markup import count, esc, fixed, general, pill, section, sigma_text, table, value_text
 
 _MOST_OTHER = 200
@@ -52,7 +52,8 @@ def _other_row(o: ObservationResidual, i: int, suspect: bool) -> list[str]:
     residual, sigma = float(o.residual[i] * sigma_factor), float(o.sigma[i] * sigma_factor)
     # an r of zero means that nothing controls the observation: its residual says nothing
     redundancy = fixed(o.redundancy[i], 2) + ("" if o.redundancy[i] > 0.05 else " " + pill("warn", t("uncontrolled")))
-    kind = esc(o.kind) if o.group == o.kind else f"{esc(o.kind)} <small>{esc(o.group)}</small>"
+    word = esc(known(o.kind.replace("_", " ")))
+    kind = word if o.group == o.kind else f"{word} <small>{esc(o.group)}</small>"
     return [
         kind, esc(" · ".join(o.ids)), f"<code>{esc(o.components[i])}</code>",
         value_text(float(o.observed[i] * factor), shown_sigma), value_text(float(o.adjusted[i] * factor), shown_sigma),

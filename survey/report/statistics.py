@@ -5,7 +5,7 @@ import numpy as np
 from adjust.distributions import beta, norm
 from adjust.model import FloatArray
 from adjust.result import ParameterName
-from adjust.statistics.result import BudgetEntry, Component, Influence, RelativePrecision
+from adjust.statistics.result import BudgetEntry, Component, Influence, RelativePrecision, WeakDirection
 from survey.quantities import sigma_unit_for_people
 from survey.report import drawing as d
 from survey.report.context import Context
@@ -26,6 +26,7 @@ from survey.statistics import CorrelationMatrix
 
 _MOST_ROWS = 120
 _MOST_WEAK = 30
+_MOST_PARTS = 6
 
 
 def name_text(name: ParameterName) -> str:
@@ -107,7 +108,7 @@ def observation_text(c: Context, row: int) -> str:
         block = c.adjustment.survey.image_blocks[int(c.rows.block[row])]
         return f"{block.camera_id} · {block.epoch_id} · {c.rows.point_ids[c.rows.point[row]]}"
     o = c.adjustment.other_residuals[row - n_image]
-    return f"{known(o.kind)} {' · '.join(o.ids)}"
+    return f"{known(o.kind.replace('_', ' '))} {' · '.join(o.ids)}"
 
 
 def relative(c: Context) -> str:
@@ -181,10 +182,21 @@ def correlations(c: Context) -> str:
     if len(s.correlated) > _MOST_WEAK:
         pairs += f"<li>{t('{n} more in solution.json.', n=count(len(s.correlated) - _MOST_WEAK))}</li>"
     strong = f"<h3>{t('Correlated above 95 %')}</h3><ul>{pairs}</ul>" if pairs else ""
-    weak = "".join(f"<li>{esc(x.text())}</li>" for x in s.weak[:10])
+    weak = "".join(f"<li>{_weak_text(x)}</li>" for x in s.weak[:10])
     weakly = f"<h3>{t('Weak directions')}</h3><ul>{weak}</ul>" if weak else ""
     note = t("Blue: positive, red: negative; white: none. Lines separate the parameters.")
     return section("correlations", "Correlations", drawn + strong + weakly, note)
+
+
+def _weak_text(x: WeakDirection) -> str:
+    parts = []
+    for part in x.parts[:_MOST_PARTS]:
+        unit, factor = sigma_unit_for_people(part.unit)
+        amount = general(part.amount * factor, 2)
+        parts.append(f"{name_text(part.name)} <code>{esc(part.component)}</code> {amount} {esc(unit)}")
+    left_out = len(x.parts) - _MOST_PARTS
+    more = t(" and {n} more", n=left_out) if left_out > 0 else ""
+    return t("{n} times weaker together than alone: ", n=general(x.inflation, 3)) + ", ".join(parts) + more
 
 
 def heat_map(m: CorrelationMatrix) -> str:
