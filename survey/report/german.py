@@ -1,5 +1,7 @@
 """The report in German: texts by their English form, and patterns of messages that the adjustment makes."""
 
+from survey.report.german_batch import GERMAN_BATCH
+
 GERMAN = {
     # instruments and surfaces
     "Instruments and surfaces": "Instrumente und Flächen",
@@ -413,7 +415,7 @@ GERMAN = {
         "Standardisierte Verbesserungen jeder Gruppe der Größe nach, gegen die Quantile ebenso vieler "
         "normalverteilter. Das Band enthält je Punkt 95 % davon."
     ),
-}
+} | GERMAN_BATCH
 
 _WHERE = r"camera (\S+) at epoch (\S+), target (\S+)"
 GERMAN_MESSAGES = (
@@ -459,6 +461,14 @@ GERMAN_MESSAGES = (
     (
         r"Global test passed, but some observations disagree with the others; see the suspects\.",
         "Globaltest bestanden, aber einige Beobachtungen widersprechen den anderen; siehe die verdächtigen.",
+    ),
+    (
+        r"Observations contradict each other; the probable cause is named first among the warnings\.",
+        "Beobachtungen widersprechen einander; die wahrscheinliche Ursache steht als erste unter den Warnungen.",
+    ),
+    (
+        r"Gross errors were left out; what is left agrees\. They are named among the warnings\.",
+        "Grobe Fehler wurden ausgelassen; was bleibt, stimmt überein. Sie stehen unter den Warnungen.",
     ),
     (
         r"Global test passed, but tolerances are not met; see the tolerances\.",

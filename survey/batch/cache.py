@@ -1,0 +1,75 @@
+"""Whether a folder's results are still those of its inputs: then it need not be adjusted again."""
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+_BESIDE = ("covariance.npz", "residuals.csv", "residuals_other.csv", "report.html")
+
+
+def unchanged_solution(folder: Path) -> dict[str, Any] | None:
+    """What ``results/solution.json`` holds where it was made from the files that are there now, by these versions.
+
+    The files read, their sha256 and the versions stand in the solution itself; options are in ``survey.toml``. Images
+    count only through ``observations/image_points.csv``, which is what is adjusted once targets have been detected.
+    """
+    results = folder / "results"
+    try:
+        solution = json.loads((results / "solution.json").read_bytes())
+        inputs = solution["inputs"]
+        if not all((results / name).is_file() for name in _BESIDE) or not inputs["hashes"]:
+            return None
+        same = same_versions(inputs["versions"]) and _digests(folder, inputs["hashes"]) == inputs["hashes"]
+        return dict(solution) if same and _tables(folder) <= set(inputs["hashes"]) else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # no results, or not ours: adjusting says what is wrong
+
+
+def same_versions(versions: Mapping[str, str]) -> bool:
+    """Whether this Python and these packages are installed in these versions."""
+    for name, recorded in versions.items():
+        try:
+            now = platform.python_version() if name == "python" else version(name)
+        except PackageNotFoundError:
+            return False
+        if now != recorded:
+            return False
+    return bool(versions)
+
+
+def _digests(folder: Path, names: Mapping[str, str]) -> dict[str, str]:
+    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
+
+
+def _tables(folder: Path) -> set[str]:
+    """Tables of observations that a reader of the folder would take."""
+    place = folder / "observations"
+    found = place.iterdir() if place.is_dir() else ()
+    return {
+        p.relative_to(folder).as_posix()
+        for p in found
+        if p.suffix in (".csv", ".parquet") and not p.name.startswith(".")
+    }
+
+
+def fingerprint(folder: Path) -> str:
+    """One hash of all that decides how a folder fails: definition, tables, names of images, versions; "" for none."""
+    digest = hashlib.sha256(platform.python_version().encode())
+    for package in ("labsurvey", "gtsam", "numpy", "scipy", "numba"):
+        try:
+            digest.update(f"{package} {version(package)}\n".encode())
+        except PackageNotFoundError:
+            continue
+    try:
+        own = sorted(p for p in folder.iterdir() if p.suffix in (".toml", ".csv", ".parquet") and p.is_file())
+        for path in (*own, *(folder / name for name in sorted(_tables(folder)))):
+            digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+        for path in sorted((folder / "images").glob("*/*")):
+            digest.update(f"{path.relative_to(folder).as_posix()} {path.stat().st_size}\n".encode())
+    except OSError:
+        return ""
+    return digest.hexdigest()

@@ -1,0 +1,56 @@
+"""The journal of a batch: a line for every folder as soon as it is finished, so that a kill loses nothing."""
+
+import json
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from survey.batch.record import Record, record_from
+from survey.files.text import atomic_write
+
+JOURNAL = "journal.jsonl"
+
+
+class Journal:
+    """Appends to ``FOLDER/journal.jsonl``; each line is on the disk before the next folder is reported."""
+
+    def __init__(self, folder: Path, kept: list[dict[str, Any]]) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / JOURNAL
+        # written anew: the last line of a killed run may be half a line
+        atomic_write(path, "".join(json.dumps(entry) + "\n" for entry in kept))
+        self._file = path.open("a", encoding="utf-8")
+
+    def add(self, path: Path, inputs: str, record: Record) -> None:
+        """Note a finished folder; ``inputs`` is its fingerprint."""
+        self._file.write(json.dumps(entry_of(path, inputs, record)) + "\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._file.close()
+
+
+def entry_of(path: Path, inputs: str, record: Record) -> dict[str, Any]:
+    """A line of the journal."""
+    return {"path": str(path), "fingerprint": inputs, "record": record.plain()}
+
+
+def read_journal(folder: Path) -> dict[str, tuple[str, Record]]:
+    """Fingerprint and record of every finished folder, by its path; a line that was cut off is not there."""
+    out: dict[str, tuple[str, Record]] = {}
+    try:
+        lines = (folder / JOURNAL).read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return out
+    for line in lines:
+        try:
+            entry = json.loads(line)
+            out[entry["path"]] = (entry["fingerprint"], record_from(entry["record"]))
+        except (ValueError, KeyError, TypeError):
+            continue
+    return out

@@ -1,0 +1,240 @@
+"""The overview of a batch as one HTML page: what failed and why, what the tests say, trends with control charts."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+
+import survey.report
+from survey.batch.causes import CAUSES
+from survey.batch.charts import control_chart
+from survey.batch.control import ONE_SIDE, TREND, Chart
+from survey.batch.record import FAILED, TEST_FAILED, Record
+from survey.batch.run import counts
+from survey.batch.tables import short_names
+from survey.batch.trends import LEVEL, Trends
+from survey.report.language import known, language, message, speaking, t
+from survey.report.markup import (
+    MISSING,
+    count,
+    esc,
+    fixed,
+    general,
+    pill,
+    section,
+    sigma_text,
+    table,
+    value_text,
+)
+
+_MOST_CHARTS = 24
+_MOST_MORE = 120
+_MOST_WARNINGS = 3
+
+
+def overview_html(
+    records: Sequence[Record], trends: Trends, place: Path, date: str = "", in_language: str = "en"
+) -> str:
+    """The page, whose links are relative to its folder ``place``. Raises SurveyError for a language there is not."""
+    with speaking(in_language):
+        made = (
+            ("failures", "Failures", _failures(records, place)),
+            ("tests", "Global tests", _tests(records, place)),
+            ("control", "Control charts", _control(records, trends)),
+            ("numbers", "All numbers", _numbers(trends, records)),
+            ("folders", "Folders", _folders(records, place)),
+        )
+        nav = "".join(f'<a href="#{anchor}">{esc(t(name))}</a>' for anchor, name, body in made if body)
+        style = Path(survey.report.__file__).with_name("style.css").read_text(encoding="utf-8")
+        return (
+            f'<!doctype html>\n<html lang="{language()}"><head><meta charset="utf-8">'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            f"<title>{esc(t('Overview of {n} surveys', n=count(len(records))))}</title><style>{style}</style></head>\n"
+            f"<body><main>{_header(records, trends, date)}<nav>{nav}</nav>"
+            + "\n".join(body for _, _, body in made)
+            + "</main></body></html>\n"
+        )
+
+
+def _header(records: Sequence[Record], trends: Trends, date: str) -> str:
+    n = counts(records)
+    alarming = [c for c in trends.charts if trends.is_alarming(c)]
+    if n["failed"]:
+        kind, word = "failed", t("{n} failed", n=count(n["failed"]))
+    elif n["test_failed"] or alarming:
+        kind, word = "check", t("Needs a look")
+    else:
+        kind, word = "passed", t("In control")
+    said = t(
+        "{failed} of {n} surveys could not be adjusted, {tested} fail their global test; {k} of {m} numbers are not in "
+        "control over the epochs.",
+        failed=count(n["failed"]), n=count(n["folders"]), tested=count(n["test_failed"]), k=count(len(alarming)),
+        m=count(len(trends.charts)),
+    )  # fmt: skip
+    seconds = sum(r.seconds for r in records if r.origin == "adjusted")
+    cards = (
+        (count(n["folders"]), t("surveys")), (count(n["done"]), t("passed")),
+        (count(n["test_failed"]), t("global test failed")), (count(n["failed"]), t("not adjusted")),
+        (count(n["not_adjusted_again"]), t("unchanged, not adjusted again")),
+        (t("{n} s", n=fixed(seconds, 1)), t("time of all adjustments")),
+    )  # fmt: skip
+    shown = "".join(f"<div><b>{value}</b><span>{esc(name)}</span></div>" for value, name in cards)
+    return (
+        f'<header><p class="meta">{t("Overview of a batch")}</p>'
+        f"<h1>{t('Overview of {n} surveys', n=count(len(records)))}</h1>"
+        f'<p class="meta">{esc(date)}</p></header><div class="verdict {kind}"><b>{word}</b><span>{said}</span></div>'
+        f'<div class="cards">{shown}</div>'
+    )
+
+
+def _link(record: Record, name: str, place: Path) -> str:
+    report = record.written.get("report.html")
+    if not report:
+        return f"<b>{esc(name)}</b>"
+    return f'<a href="{esc(quote(Path(os.path.relpath(report, place)).as_posix()))}">{esc(name)}</a>'
+
+
+def _failures(records: Sequence[Record], place: Path) -> str:
+    rows = [
+        (_link(r, name, place), pill("bad", t(CAUSES[r.cause])), _wrapped(esc(message(r.error))), str(r.tries))
+        for r, name in zip(records, short_names(records), strict=True)
+        if r.state == FAILED
+    ]
+    note = t("What could not be adjusted, where the error is and what to do. Everything else was adjusted as usual.")
+    columns = ("<Survey", "<Why", "<Message", "Tries")
+    return section("failures", "Failures", table(columns, rows) if rows else "", note)
+
+
+def _wrapped(text: str) -> str:
+    return f'<div style="white-space: normal; max-width: 760px">{text.replace(chr(10), "<br>")}</div>'
+
+
+def _tests(records: Sequence[Record], place: Path) -> str:
+    rows = []
+    for r, name in zip(records, short_names(records), strict=True):
+        if r.state == TEST_FAILED:
+            test = r.summary["global_test"]
+            interval = f"{fixed(test['lower'], 0)} – {fixed(test['upper'], 0)}"
+            rows.append((_link(r, name, place), fixed(r.summary["sigma0"], 3), fixed(test["omega"], 1), interval,
+                         esc(_worst_group(r)), _wrapped(_why(r))))  # fmt: skip
+    columns = ("<Survey", "sigma0", "v'Pv", "expected", "<Worst group", "<Why")
+    note = t(
+        "Solved, but the residuals are larger than the sigmas say. Worst group: the one whose weighted square sum is "
+        "furthest above its expectation, with the factor that its sigmas would need."
+    )
+    return section("tests", "Global tests", table(columns, rows) if rows else "", note)
+
+
+def _worst_group(record: Record) -> str:
+    found = [(g.get("deviation") or 0.0, name, g.get("sigma_scale")) for name, g in record.groups.items()]
+    if not found:
+        return MISSING
+    _, name, scale = max(found)
+    return f"{name} × {fixed(scale, 2)}"
+
+
+def _why(record: Record) -> str:
+    said = [record.summary.get("reason", ""), *record.warnings[:_MOST_WARNINGS]]
+    more = len(record.warnings) - _MOST_WARNINGS
+    lines = [esc(message(s)) for s in said if s]
+    return "<br>".join(lines + ([t("{n} more warnings in solution.json.", n=count(more))] if more > 0 else []))
+
+
+def _control(records: Sequence[Record], trends: Trends) -> str:
+    if not trends.charts:
+        return ""
+    alarming = [c for c in trends.charts if trends.is_alarming(c)]
+    quality = [c for c in trends.charts if c.series.name == "sigma0" and c not in alarming]
+    shown = [*quality, *alarming[:_MOST_CHARTS]]
+    shown_names = {c.series.name for c in shown}
+    calm = [c for c in trends.charts if c.series.name not in shown_names]
+    note = t(
+        "Deviations from the weighted mean of the epochs in control (hollow: set aside). Band: three sigmas as each "
+        "epoch claims them; dashed: three sigmas from the scatter (median moving range). Red: outside of its own "
+        "sigmas, orange: outside of the scatter alone; orange line: {side} in a row on one side, or {trend} steadily "
+        "up or down. A cross is an epoch without result. Chance alone puts {expected} of all {n} points outside.",
+        side=ONE_SIDE, trend=TREND, expected=general(trends.expected, 2), n=count(trends.n_points),
+    )  # fmt: skip
+    body = _figures(shown, records)
+    if calm:
+        rest = t("{n} more charts", n=count(len(calm[:_MOST_MORE])))
+        body += f"<details><summary>{rest}</summary>{_figures(calm[:_MOST_MORE], records)}</details>"
+    return section("control", "Control charts", body, note)
+
+
+def _figures(charts: Sequence[Chart], records: Sequence[Record]) -> str:
+    names = short_names(records)
+    failed = [i for i, r in enumerate(records) if r.state == FAILED]
+    drawn = (f"<figure>{control_chart(c, names, failed, _title(c))}</figure>" for c in charts)
+    return f'<div class="figures">{"".join(drawn)}</div>'
+
+
+def _title(c: Chart) -> str:
+    kind, *rest = c.series.name.split("/")
+    return " · ".join((known(kind.replace("_", " ")), *rest))
+
+
+def _numbers(trends: Trends, records: Sequence[Record]) -> str:
+    names = short_names(records)
+    rows, classes = [], []
+    for c in trends.charts:
+        alarming = trends.is_alarming(c)
+        classes.append("suspect" if alarming else "")
+        spread = c.by_scatter / 3.0
+        rows.append((
+            f"<b>{esc(_title(c))}</b>", esc(c.series.unit), str(len(c.series.value)), value_text(c.mean, c.mean_sigma),
+            sigma_text(c.mean_sigma), sigma_text(float(np.median(c.series.sigma))), sigma_text(spread),
+            fixed(c.ratio, 2), general(c.p, 2), _slope(c), general(c.p_slope, 2), _alarm(trends, c, names),
+        ))  # fmt: skip
+    columns = ("<Number", "<Unit", "n", "Mean", "σ", "σ of one", "Scatter", "Ratio", "p", "Per epoch", "p", "<Finding")
+    note = t(
+        "σ of one: median of what the epochs claim. Scatter: sigma from the moving range. Ratio: deviations over their "
+        "sigmas, 1 where sigmas can be believed; p: that chance makes it so large. Per epoch: slope, and p of none. "
+        "Marked where a test fails at {level} % for all numbers together, or a run is too long for chance.",
+        level=general(100 * LEVEL),
+    )  # fmt: skip
+    return section("numbers", "All numbers", table(columns, rows, "", classes) if rows else "", note)
+
+
+def _slope(c: Chart) -> str:
+    return f'{value_text(c.slope, c.slope_sigma)}<span class="s">± {sigma_text(c.slope_sigma)}</span>'
+
+
+def _alarm(trends: Trends, c: Chart, names: Sequence[str]) -> str:
+    out = []
+    if trends.disagrees(c):
+        out.append(pill("bad", t("epochs disagree")))
+    if trends.drifts(c):
+        out.append(pill("warn", t("drift")))
+    outside = [names[int(c.series.epoch[i])] for i in np.flatnonzero(c.outside)]
+    if outside:
+        listed = ", ".join(outside[:4]) + (" …" if len(outside) > 4 else "")
+        out.append(f"{t('outside:')} {esc(listed)}")
+    for run in c.runs:
+        first, last = (esc(names[int(c.series.epoch[i])]) for i in (run.first, run.last))
+        word = {"one_side": t("on one side"), "rising": t("rising"), "falling": t("falling")}[run.kind]
+        out.append(f"{pill('soft', word)} {first} – {last}")
+    return " ".join(out)
+
+
+def _folders(records: Sequence[Record], place: Path) -> str:
+    rows, classes = [], []
+    for r, name in zip(records, short_names(records), strict=True):
+        s = r.summary
+        verdict = s.get("verdict", "failed")
+        word = {"passed": t("Passed"), "check": t("Needs a look"), "failed": t("Failed")}[verdict]
+        kind = {"passed": "good", "check": "warn", "failed": "bad"}[verdict]
+        origin = {"adjusted": t("adjusted"), "unchanged": t("unchanged"), "resumed": t("as before")}[r.origin]
+        numbers = [count(s[k]) if k in s else MISSING for k in ("n_observations", "n_unknowns", "redundancy")]
+        not_used = s.get("suspects", {}).get("n_not_used")
+        seconds = fixed(r.seconds, 2) if r.origin == "adjusted" else MISSING
+        said = esc(message(r.error or s.get("reason", "")).splitlines()[0]) if (r.error or s.get("reason")) else ""
+        classes.append("suspect" if r.state == FAILED else "")
+        rows.append((_link(r, name, place), esc(s.get("title", "")), pill(kind, word), fixed(s.get("sigma0"), 3),
+                     *numbers, MISSING if not_used is None else count(not_used), origin, seconds,
+                     _wrapped(said)))  # fmt: skip
+    columns = ("<Survey", "<Title", "<", "sigma0", "n", "u", "Redundancy", "Not used", "<", "s", "<Reason")
+    note = t("n observations, u unknowns. A name leads to the survey's own report.")
+    return section("folders", "Folders", table(columns, rows, "", classes), note)

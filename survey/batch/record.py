@@ -1,0 +1,143 @@
+"""What a batch keeps of one folder: how it went, its key figures, and the numbers whose trends are watched."""
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+DONE, TEST_FAILED, FAILED = "done", "test_failed", "failed"
+EXIT_CODES = {DONE: 0, FAILED: 1, TEST_FAILED: 3}
+_SINGLE_POSES = (
+    ("cameras", "station_from_camera"), ("stations", "mount_from_station"), ("stations", "world_from_station"),
+    ("tables", "world_from_table"), ("targets", "world_from_target"), ("targets", "station_from_target"),
+)  # fmt: skip
+_VECTORS = (("cameras", "lens"), ("tables", "geometry"), ("targets", "warp"))
+_UNIT = re.compile(r"px|mm|deg|arcsec|ppm|m|1|per_\w+|")
+
+
+@dataclass(frozen=True)
+class Number:
+    """An estimated number that is there once in a survey: name ``kind/id/component``, in the unit of result files."""
+
+    name: str
+    unit: str
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Turn:
+    """An estimated rotation: quaternion w x y z of ``a_from_b``, sigmas (arcsec) of small rotations about b's axes."""
+
+    name: str
+    wxyz: tuple[float, ...]
+    sigmas_arcsec: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Record:
+    """One folder of a batch.
+
+    folder: as it was named. state: ``done``, ``test_failed`` (residuals larger than the sigmas say) or ``failed``.
+    origin: ``adjusted`` now, ``unchanged`` (its results were there), ``resumed`` (failed in the run that is resumed).
+    cause: kind of a failure, a key of ``survey.batch.causes.CAUSES``. error: its message. summary, warnings, groups:
+    of the solution. tries: how often it was adjusted in this run. seconds: of the last try.
+    """
+
+    folder: str
+    state: str
+    origin: str = "adjusted"
+    cause: str = ""
+    error: str = ""
+    traceback: str = ""
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    groups: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    numbers: tuple[Number, ...] = ()
+    turns: tuple[Turn, ...] = ()
+    written: Mapping[str, str] = field(default_factory=dict)
+    tries: int = 1
+    seconds: float = 0.0
+
+    @property
+    def exit_code(self) -> int:
+        """As the command line has it."""
+        return EXIT_CODES[self.state]
+
+    def plain(self) -> dict[str, Any]:
+        """As plain values, for JSON."""
+        return asdict(self)
+
+
+def record_from(plain: Mapping[str, Any]) -> Record:
+    """The inverse of :meth:`Record.plain`."""
+    more = {
+        "warnings": tuple(plain["warnings"]),
+        "numbers": tuple(Number(**n) for n in plain["numbers"]),
+        "turns": tuple(Turn(t["name"], tuple(t["wxyz"]), tuple(t["sigmas_arcsec"])) for t in plain["turns"]),
+    }
+    return Record(**{**plain, **more})
+
+
+def solved_record(
+    folder: str, solution: Mapping[str, Any], written: Mapping[str, str], seconds: float = 0.0, origin: str = "adjusted"
+) -> Record:
+    """The record of a folder that was adjusted, from what ``solution.json`` holds."""
+    test = solution["summary"]["global_test"]
+    too_large = test is not None and test["omega"] > test["upper"]
+    return Record(
+        folder, TEST_FAILED if too_large else DONE, origin, summary=solution["summary"],
+        warnings=tuple(solution["warnings"]), groups=solution["groups"], numbers=tuple(_numbers(solution)),
+        turns=tuple(_turns(solution)), written=dict(written), seconds=seconds,
+    )  # fmt: skip
+
+
+def _numbers(solution: Mapping[str, Any]) -> Iterator[Number]:
+    for section, key in _VECTORS:
+        for name, entry in solution[section].items():
+            if key in entry:
+                yield from _components(f"{key}/{name}", entry[key])
+    for name, entry in solution["points"].items():
+        free = _free(entry["status"], ("x", "y", "z"))
+        for axis in "xyz":
+            if axis in free:
+                yield Number(f"point/{name}/{axis}", "mm", entry[f"{axis}_mm"], entry[f"sigma_{axis}_mm"])
+    for section, key in _SINGLE_POSES:
+        for name, entry in solution[section].items():
+            if entry.get(key, {}).get("status") == "free":
+                pose = entry[key]
+                for axis, value, sigma in zip("xyz", pose["translation_mm"], pose["sigma_translation_mm"], strict=True):
+                    yield Number(f"{key}/{name}/{axis}", "mm", value, sigma)
+
+
+def _free(status: Any, components: tuple[str, ...]) -> tuple[str, ...]:
+    """Components that the observations alone determine: a prior would be the same in every epoch."""
+    if isinstance(status, str):
+        return components if status == "free" else ()
+    return tuple(name for name, word in status.items() if word == "free")
+
+
+def _components(path: str, entry: Mapping[str, Any]) -> Iterator[Number]:
+    """Number and sigma of every free component of a lens, a table or a warp, whose keys end with their units."""
+    for component in _free(entry["status"], ()):
+        value_key, sigma_key = _key(entry, component), _key(entry, f"sigma_{component}")
+        if value_key and sigma_key and entry[value_key] is not None and entry[sigma_key] is not None:
+            unit = value_key[len(component) + 1 :]
+            factor = 3600.0 if unit == "deg" and sigma_key.endswith("_arcsec") else 1.0
+            yield Number(f"{path}/{component}", unit, entry[value_key], entry[sigma_key] / factor)
+
+
+def _key(entry: Mapping[str, Any], component: str) -> str:
+    for key in entry:
+        if key == component or (key.startswith(f"{component}_") and _UNIT.fullmatch(key[len(component) + 1 :])):
+            return key
+    return ""
+
+
+def _turns(solution: Mapping[str, Any]) -> Iterator[Turn]:
+    for section, key in _SINGLE_POSES:
+        for name, entry in solution[section].items():
+            if entry.get(key, {}).get("status") == "free":
+                pose = entry[key]
+                quaternion = tuple(pose["rotation_quaternion_wxyz"])
+                yield Turn(f"{key}/{name}", quaternion, tuple(pose["sigma_rotation_arcsec"]))

@@ -1,0 +1,118 @@
+"""The numbers of all folders of a batch as series over the epochs, and their control charts."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from adjust.distributions import norm
+from adjust.statistics.criteria import sidak
+from survey.batch.control import WIDTH, Chart, Run, Series, chart
+from survey.batch.record import Record
+
+LEVEL = 0.05
+"""Error probability of all charts together, for the tests of agreement and of slopes."""
+_ARCSEC = 180.0 * 3600.0 / np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class Trends:
+    """Charts of all numbers that two epochs or more have, most alarming first.
+
+    level: of a single test, so that all together have ``LEVEL``. n_points: of all charts. expected: points outside of
+    limits that chance alone would make of normally distributed numbers.
+    """
+
+    charts: tuple[Chart, ...]
+    level: float
+    n_points: int
+
+    @property
+    def expected(self) -> float:
+        """0.27 % of the points lie beyond three sigmas."""
+        return 0.0026998 * self.n_points
+
+    def disagrees(self, c: Chart) -> bool:
+        """Whether epochs differ by more than their sigmas say."""
+        return c.p < self.level
+
+    def drifts(self, c: Chart) -> bool:
+        """Whether there is a slope over the epochs."""
+        return bool(c.p_slope < self.level)
+
+    def strays(self, c: Chart) -> bool:
+        """Whether a single epoch is further off than chance makes one of all points of all charts."""
+        bound = float(norm.isf(0.5 * sidak(LEVEL, max(self.n_points, 1))))
+        return bool((WIDTH * np.abs(c.series.value - c.mean) > bound * c.by_sigma).any())
+
+    def unlikely(self, run: Run) -> bool:
+        """Whether chance makes a run as long or longer in all charts together at most as often as ``LEVEL`` says.
+
+        Of n points 2^-k n begin a run of k or more on one side of the mean (the one before is on the other side), and
+        2 n k / (k + 1)! a run of k or more steadily up or down (Levene and Wolfowitz 1944).
+        """
+        k = run.last - run.first + 1
+        share = 2.0**-k if run.kind == "one_side" else 2.0 * k / math.factorial(k + 1)
+        return self.n_points * share < LEVEL
+
+    def is_alarming(self, c: Chart) -> bool:
+        """Whether a person should look: a test of all charts together fails, or a run is too long for chance."""
+        return self.disagrees(c) or self.drifts(c) or self.strays(c) or any(self.unlikely(run) for run in c.runs)
+
+
+def trends_of(records: Sequence[Record]) -> Trends:
+    """Series of all numbers that are there in two epochs or more, and their charts."""
+    charts = [chart(s) for s in all_series(records) if len(s.value) >= 2]
+    level = sidak(LEVEL, max(2 * len(charts), 1))
+    made = Trends((), level, sum(len(c.series.value) for c in charts))
+    charts.sort(key=lambda c: (not made.is_alarming(c), -_alarm(c)))
+    return Trends(tuple(charts), level, made.n_points)
+
+
+def _alarm(c: Chart) -> float:
+    """How far the worst of a chart is beyond its limits, in sigmas."""
+    deviation = np.abs(c.series.value - c.mean)
+    own = float(np.max(WIDTH * deviation / np.maximum(c.by_sigma, 1e-300)))
+    return max(own, abs(c.slope) / c.slope_sigma if c.slope_sigma > 0.0 else 0.0)
+
+
+def all_series(records: Sequence[Record]) -> Iterator[Series]:
+    """sigma0, groups, then every number and rotation, in the order in which the first epoch has them."""
+    rows: dict[tuple[str, str], list[tuple[int, float, float]]] = {}
+    for epoch, record in enumerate(records):
+        for name, unit, value, sigma in (*_quality(record), *((n.name, n.unit, n.value, n.sigma)
+                                                              for n in record.numbers)):  # fmt: skip
+            if np.isfinite(value) and np.isfinite(sigma) and sigma > 0.0:
+                rows.setdefault((name, unit), []).append((epoch, value, sigma))
+    for name, unit, epoch, value, sigma in _turns(records):
+        rows.setdefault((name, unit), []).append((epoch, value, sigma))
+    for (name, unit), found in rows.items():
+        epochs, values, sigmas = (np.array(column) for column in zip(*found, strict=True))
+        yield Series(name, unit, epochs.astype(np.int64), values.astype(float), sigmas.astype(float))
+
+
+def _quality(record: Record) -> Iterator[tuple[str, str, float, float]]:
+    """sigma0 and the scale of each group, with their own sigmas s / sqrt(2 r) (Koch 1999, section 3.2)."""
+    r, sigma0 = record.summary.get("redundancy") or 0, record.summary.get("sigma0")
+    if r > 0 and sigma0:
+        yield "sigma0", "", sigma0, sigma0 / np.sqrt(2.0 * r)
+    for name, group in record.groups.items():
+        scale, freedom = group.get("sigma_scale"), group.get("redundancy") or 0.0
+        # a group hardly controlled has no scale worth a chart
+        if len(record.groups) > 1 and scale and freedom > 5.0:
+            yield f"group/{name}/sigma_scale", "", scale, scale / np.sqrt(2.0 * freedom)
+
+
+def _turns(records: Sequence[Record]) -> Iterator[tuple[str, str, int, float, float]]:
+    """Rotations against the first epoch that has them: a rotation vector about the axes of b, arcsec."""
+    first: dict[str, Rotation] = {}
+    for epoch, record in enumerate(records):
+        for turn in record.turns:
+            w, x, y, z = turn.wxyz
+            now = Rotation.from_quat([x, y, z, w])
+            vector = _ARCSEC * (first.setdefault(turn.name, now).inv() * now).as_rotvec()
+            for axis, value, sigma in zip(("rx", "ry", "rz"), vector, turn.sigmas_arcsec, strict=True):
+                if sigma > 0.0:
+                    yield f"{turn.name}/{axis}", "arcsec", epoch, float(value), sigma

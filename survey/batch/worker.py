@@ -1,0 +1,112 @@
+"""Worker processes: each adjusts one folder after the other, with one thread for linear algebra.
+
+A worker is a program that reads tasks as lines of JSON and answers with records as lines of JSON. So it is the same
+process whoever started it: the command line, a notebook, or a worker of a Dask cluster (which may not have children of
+multiprocessing's making). It ends when its owner has gone, also where that was killed.
+"""
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+from survey.batch.record import Record, record_from
+
+_START = "import sys; sys.path[:] = sys.argv[1:]; from survey.batch.worker import main; main()"
+_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class WorkerDiedError(Exception):
+    """A worker ended before it answered."""
+
+
+class Worker:
+    """One worker process; started when it gets its first task, and again after it died.
+
+    threads: for the compiled kernels. Libraries of linear algebra get one, so that results do not depend on it.
+    """
+
+    def __init__(self, threads: int = 1) -> None:
+        self.threads = threads
+        self._process: subprocess.Popen[bytes] | None = None
+        self._closed = False
+
+    @property
+    def pid(self) -> int | None:
+        """Of the running process."""
+        return self._process.pid if self._process is not None else None
+
+    def run(self, task: Mapping[str, Any]) -> Record:
+        """The record of a task. Raises WorkerDiedError where the process ended without one."""
+        process = self._running()
+        if process.stdin is None or process.stdout is None:
+            raise WorkerDiedError("it has no pipes")
+        try:
+            process.stdin.write(json.dumps(dict(task)).encode() + b"\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+        except OSError:
+            line = b""
+        if line.endswith(b"\n"):
+            return record_from(json.loads(line))
+        code = process.wait()
+        self._process = None
+        raise WorkerDiedError(_ending(code))
+
+    def _running(self) -> subprocess.Popen[bytes]:
+        if self._closed:
+            raise WorkerDiedError("it was stopped")
+        if self._process is None:
+            environment = os.environ | dict.fromkeys(_ONE_THREAD, "1") | {"LABSURVEY_THREADS": str(self.threads)}
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _START, *sys.path], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                env=environment,
+            )  # fmt: skip
+        return self._process
+
+    def stop(self) -> None:
+        """End the process now, whatever it does; it takes no more tasks."""
+        self._closed = True
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    pipe.close()
+
+
+def _ending(code: int) -> str:
+    if code >= 0:
+        return f"it exited with code {code}"
+    try:
+        return f"it was ended by {signal.Signals(-code).name}"
+    except ValueError:
+        return f"it was ended by signal {-code}"
+
+
+def main() -> None:
+    """The program of a worker: tasks from stdin, records to stdout."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what a library prints must not get between the answers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the owner says when to stop
+    tasks: queue.Queue[dict[str, Any]] = queue.Queue()
+    threading.Thread(target=_listen, args=(tasks,), daemon=True).start()
+    from survey.batch.task import adjust_task
+
+    while True:
+        record = adjust_task(tasks.get())
+        answers.write(json.dumps(record.plain()).encode() + b"\n")
+        answers.flush()
+
+
+def _listen(tasks: "queue.Queue[dict[str, Any]]") -> None:
+    """Take tasks in; when the owner is gone nobody wants the answer."""
+    for line in sys.stdin.buffer:
+        tasks.put(json.loads(line))
+    os._exit(0)
