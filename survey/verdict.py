@@ -50,6 +50,10 @@ def verdict(adjustment: Adjustment, found: Suspects, n_unmet: int = 0) -> tuple[
             f"Global test failed: residuals are {adjustment.sigma0:.2f} times what the sigmas of the observations "
             "allow. Look for blunders, wrong sigmas or a model that lacks something, starting with the groups."
         )
+    if any(w.startswith("probable cause") for w in adjustment.warnings):
+        return "check", "Observations contradict each other; the probable cause is named first among the warnings."
+    if any(d.action == "rejected" for d in adjustment.decisions):
+        return "check", "Gross errors were left out; what is left agrees. They are named among the warnings."
     if test is not None and test.omega < test.lower:
         return "check", (
             f"Global test failed on the low side: residuals are only {adjustment.sigma0:.2f} times the sigmas of the "

@@ -4,9 +4,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from adjust.adjustment import adjust
+from adjust.distributions import chi2
+from adjust.errors import SurveyError
 from adjust.graph import StartValues
 from adjust.model import Survey
 from adjust.pair_screen import PairOptions, adjust_with_pairs, is_pure, values_of
@@ -46,6 +47,20 @@ def adjust_cleaned(
 
     Raises as :func:`adjust.adjustment.adjust`. Networks of nothing but pairs have a search of their own.
     """
+    found = _cleaned(survey, options, progress, start)
+    if options.reject_others and _blamed_on_rays(survey, found):
+        # a wrong tape reading to a beacon that few images see is explained as well by leaving out its rays: the
+        # explanation that needs fewer observations left out is the likelier one
+        other = _others_first(survey, options, progress, start)
+        if other is not None and _left_out(survey, other) < _left_out(survey, found):
+            return other
+    return found
+
+
+def _cleaned(
+    survey: Survey, options: CleanOptions, progress: Callable[[int, float], None] | None, start: StartValues | None
+) -> Adjustment:
+    """Image points are screened before all others."""
     first = adjust_with_pairs(survey, options.pairs, progress, start)
     if is_pure(survey):
         return first
@@ -66,6 +81,49 @@ def adjust_cleaned(
         now = scaled.adjustment
         factors = {c.group: factors.get(c.group, 1.0) * c.factor for c in scaled.components.components}
     return _told(now, first, search, scaled, factors)
+
+
+def _blamed_on_rays(survey: Survey, found: Adjustment) -> bool:
+    """Whether rays were left out to points that observations of another kind touch."""
+    touched = {r.point_id for d in survey.distances if d.used for r in (d.a, d.b) if r.frame is None}
+    touched |= {r.point_id for c in survey.coordinates if c.used for r in c.positions if r.frame is None}
+    touched |= {r.point_id for d in survey.coordinate_differences if d.used for r in (*d.at, *d.to) if r.frame is None}
+    touched |= {p.point_id for x in survey.readings if x.used for p in (x.at, x.to) if p.frame is None}
+    names = [p.point_id for p in found.survey.points]
+    return any(
+        names[int(i)] in touched
+        for b in found.survey.image_blocks
+        if b.target_id is None and b.used is not None and b.used.any()
+        for i in b.point_idx[~b.used]
+    )
+
+
+def _others_first(
+    survey: Survey, options: CleanOptions, progress: Callable[[int, float], None] | None, start: StartValues | None
+) -> Adjustment | None:
+    """The other order: all other kinds before the image points; None where that leads nowhere."""
+    unscreened = replace(options.pairs, adjust=replace(options.pairs.adjust, reject_points=False))
+    try:
+        first = adjust_with_pairs(survey, unscreened, progress, start)
+        search = _searched(first, replace(options, pairs=unscreened), progress)
+        if search is None or not search.rejected:
+            return None
+        found = _cleaned(search.adjustment.survey, options, progress, values_of(search.adjustment))
+    except SurveyError:
+        return None
+    kept = search.log if not found.decisions else (*search.log, *found.decisions)
+    notes = tuple(n for n in search.notes if n not in found.warnings)
+    return replace(found, decisions=kept, warnings=found.warnings + notes)
+
+
+def _left_out(given: Survey, found: Adjustment) -> int:
+    """Number of observed components in use that take no part any more; a whole image counts like each of its points."""
+    before = sum(2 * int(len(b.uv) if b.used is None else b.used.sum()) for b in given.image_blocks)
+    after = 2 * int(found.image_residuals.used.sum())
+    out = sum(len(o.components) for o in found.other_residuals if not o.used)
+    unused = (given.distances, given.coordinates, given.pairs, given.coordinate_differences, given.readings,
+              given.levels, given.alignments, given.laser_spots, given.on_surfaces, given.table_readings)  # fmt: skip
+    return before - after + out - sum(1 for kind in unused for o in kind if not o.used)
 
 
 def _searched(

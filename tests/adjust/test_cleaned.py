@@ -1,41 +1,36 @@
-"""The whole adjustment: gross errors of all kinds out, variances estimated, both told."""
+"""Cleaning as a whole: which of several explanations of a contradiction is taken."""
 
 from dataclasses import replace
 
 import numpy as np
 
+from adjust.adjustment import AdjustOptions
+from adjust.pair_screen import PairOptions
 from adjust.statistics.cleaned import CleanOptions, adjust_cleaned
-from tests.adjust import statistics_networks as net
+from survey.simulate import beacons
+from tests.adjust import helpers as h
 
 
-def test_gross_errors_and_variances_together() -> None:
-    """Directions twice as good, distances three times as bad as they say, and two readings far off."""
-    survey, start = net.hall(9, n_points=20, n_stations=4, n_tapes=20, factors={"direction": 0.25, "slope_distance": 9.0})
-    wrong = survey
-    for i in (10, 101):
-        r = wrong.readings[i]
-        wrong = net.with_reading(wrong, i, value=r.value + 60.0 * r.sigma)
-    names = {wrong.readings[i].reading_id for i in (10, 101)}
-    found = adjust_cleaned(wrong, CleanOptions(variance_components=True), start=start)
-    out = {r.reading_id for r in found.survey.readings if not r.used}
-    assert out == names
-    assert sum(w.startswith("left out: ") for w in found.warnings) == 2
-    assert {d.ids[0] for d in found.decisions if d.action == "rejected"} >= names
-    for group, factor in (("direction", 0.25), ("slope_distance", 9.0), ("zenith", 1.0)):
-        c = next(c for c in found.variance_components.components if c.group == group)
-        assert abs(c.factor - factor) < 3.0 * c.sigma
-    assert any("variance component of group slope_distance: sigmas were 3" in w for w in found.warnings)
-    assert abs(found.sigma0 - 1.0) < 1e-3
-    kept = adjust_cleaned(wrong, CleanOptions(reject_others=False), start=start)
-    assert all(r.used for r in kept.survey.readings)
-    assert kept.decisions == ()
-    assert kept.variance_components is None
-
-
-def test_nothing_to_do_changes_nothing() -> None:
-    survey, start = net.hall(1)
-    found = adjust_cleaned(survey, CleanOptions(), start=start)
-    assert found.survey.readings == survey.readings
-    assert not any(w.startswith("left out") for w in found.warnings)
-    again = adjust_cleaned(replace(survey), CleanOptions(), start=start)
-    np.testing.assert_array_equal(again.omega, found.omega)
+def test_a_wrong_tape_is_not_blamed_on_the_few_rays_to_its_beacon() -> None:
+    """Two images see the beacon: leaving both rays out explains a wrong distance too, but needs twice as many."""
+    survey, truth = beacons(2, n_table_epochs=4, n_free_epochs=3, n_night_epochs=5)
+    names = [p.point_id for p in survey.points]
+    distance = survey.distances[0]
+    beacon = names.index(str(distance.a.point_id))
+    blocks, seen = [], 0
+    for block in survey.image_blocks:
+        keep = np.ones(len(block.uv), dtype=bool)
+        if block.target_id is None:
+            mine = block.point_idx == beacon
+            seen += int(mine.any())
+            keep = ~mine if seen > 2 else keep
+        blocks.append(replace(block, point_idx=block.point_idx[keep], uv=block.uv[keep], cov=block.cov[keep]))
+    coordinates = tuple(c for c in survey.coordinates if all(r.point_id != names[beacon] for r in c.positions))
+    wrong = replace(distance, value=distance.value + 60.0 * distance.sigma)
+    survey = replace(survey, image_blocks=tuple(b for b in blocks if len(b.uv)), coordinates=coordinates,
+                     distances=(wrong, *survey.distances[1:]))  # fmt: skip
+    options = CleanOptions(PairOptions(adjust=AdjustOptions(reject_points=True)))
+    start = h.shaken(h.start_at(truth), 1, 0.0005, 0.0005)
+    found = adjust_cleaned(survey, options, start=start)
+    assert [d.ids[0] for d in found.decisions if d.action == "rejected"] == [wrong.distance_id]
+    assert found.image_residuals.used.all()
