@@ -156,8 +156,9 @@ def test_board_numbered_from_the_wrong_corner(good, tmp_path, capsys):
 
 def test_board_with_rows_in_a_circle(good, tmp_path, capsys):
     text = said(tmp_path, renumbered(good[0], "t08", lambda i: (i + 11) % 88), capsys)
+    # refused by its own residuals, or recognised as the shift that a board allows nearly: both name the image
     assert "epoch 't08', target 'board'" in text
-    assert "mis-detected, or points in the wrong order" in text
+    assert "mis-detected" in text
 
 
 def test_board_one_column_off(good, tmp_path, capsys):
