@@ -13,21 +13,26 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import block_diag, lapack
 
+from adjust.bundle_covariance import direct_influence, point_from_local, reduced_influence, with_lenses, with_poses
 from adjust.bundle_kernels import (
     add_direct,
     back_substitute,
+    between_poses,
     block_squares,
-    direct_influence,
-    point_covariances,
+    fill_upper,
+    of_points,
+    pose_rows,
     reduce_points,
     rows,
+    symmetric_rows,
 )
 from adjust.errors import IndeterminateError
 from adjust.image_batch import Chains, square_root_information
 from adjust.lens_kernels import MAX_LENS
 from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.motions import motions_of, point_motions
+from adjust.motions import motions_of, points_motions
 from adjust.observations import ImageBlock
+from adjust.parallel import run_split, workers
 from adjust.state import State
 from adjust.unknowns import Chain, Unknowns
 
@@ -65,7 +70,10 @@ class BundleBatch:
         self._choose_interface(outside)
         self._sort_observations()
         self._place_local_unknowns()
+        self._place_derivatives()
         self._prepared: gtsam.Values | None = None
+        self._blind_directions: FloatArray | None = None
+        self._given_interface: tuple[FloatArray, FloatArray] | None = None
         self._damping = 0.0
         self._with_jacobians = False
         self.chi_square = 0.0
@@ -133,6 +141,13 @@ class BundleBatch:
         self.pc_of = (np.cumsum(new) - 1).astype(np.int64)
         self.pc_camera = pair[new, 1].astype(np.int64)
         self.pc_ptr = np.searchsorted(pair[new, 0], [*self.reduced, np.iinfo(np.int64).max]).astype(np.int64)
+        mine = self.block[: self.n_reduced]
+        self.point_of = np.repeat(np.arange(len(self.reduced)), np.diff(self.ptr))
+        self.by_block = np.argsort(mine, kind="stable").astype(np.int64)
+        self.by_ptr = np.searchsorted(mine[self.by_block], np.arange(len(self.blocks) + 1)).astype(np.int64)
+        # later images have more pairs with earlier ones: every worker takes some of all
+        count = workers() if self.n_reduced > 2000 else 1
+        self.runs = [np.arange(i, len(self.blocks), count) for i in range(min(count, len(self.blocks)))]
 
     def _place_local_unknowns(self) -> None:
         n_lens = self.state.lenses.n_free
@@ -155,36 +170,76 @@ class BundleBatch:
         self.Vi, self.h = np.zeros((p, 3, 3)), np.zeros((p, 3))
         self.W3, self.WL = np.zeros((k, 3, 6)), np.zeros((len(self.pc_camera), 3, MAX_LENS))
         self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
+        self._points_by_key = np.array(sorted(self.point_key, key=self.point_key.__getitem__), dtype=np.int64)
+
+    def _place_derivatives(self) -> None:
+        """Where the derivatives of the local unknowns by the keys stand; which hidden poses own one block alone."""
+        rows, columns, links, self._table_links = [], [], [], []
+        own: dict[int, list[tuple[int, int]]] = {key: [] for key in self.hidden_poses}
+        for b in range(len(self.blocks)):
+            for link in range(self.chains.ptr[b], self.chains.ptr[b + 1]):
+                slot = int(self.chains.slot[link])
+                if slot in self.unknowns.table_slots:
+                    self._table_links.append((self.first_pose + 6 * b, slot, link))
+                    continue
+                for key in self.unknowns.link_keys(slot):
+                    rows.append(self.first_pose + 6 * b)
+                    columns.append(self.key_at[key])
+                    links.append(link)
+                    if key in own:
+                        own[key].append((b, link))
+        keys = {i: self.state.lens_maps[i].key for i in sorted(set(self.camera.tolist()))}
+        fixed = [(int(self.lens_at[i]), self.key_at[key], int(self.state.lenses.n_free[i]))
+                 for i, key in keys.items() if key is not None]  # fmt: skip
+        fixed += [(at, self.key_at[self.point_key[i]], 3) for i, at in self.tied_at.items()]
+        at = np.array(rows, dtype=np.int64)[:, None, None] + np.arange(6)[:, None]
+        to = np.array(columns, dtype=np.int64)[:, None, None] + np.arange(6)
+        every = np.zeros((len(links), 6, 6), dtype=np.int64)
+        self._G_links = np.array(links, dtype=np.int64)
+        self._G_rows = np.concatenate([(at + every).ravel(), *(r + np.arange(n) for r, _, n in fixed)])
+        self._G_columns = np.concatenate([(to + every).ravel(), *(c + np.arange(n) for _, c, n in fixed)])
+        self._G_ones = np.ones(sum(n for _, _, n in fixed))
+        owners = [block for key in self.hidden_poses for block in own[key]]
+        blocks_of = [b for b, _ in owners]
+        per_block = np.bincount(np.array(rows, dtype=np.int64), minlength=self.n_local + 1)
+        # pure: a hidden pose is that of one block, and the only unknown behind that block's pose
+        self._pure = (
+            bool(owners) and not self._table_links and all(len(own[key]) == 1 for key in self.hidden_poses)
+            and bool(np.all(per_block[self.first_pose + 6 * np.array(blocks_of)] == 1))
+        )  # fmt: skip
+        self._own_links = np.array([link for _, link in owners], dtype=np.int64)
+        self._own_at = (self.first_pose + 6 * np.array(blocks_of, dtype=np.int64)).astype(np.int64)
 
     def _local_from_keys(self) -> sparse.csr_matrix:
         """Derivative (n_local, n_keys) of the local unknowns by the keys: lens and points direct, poses by chains."""
-        entries: list[tuple[int, int, FloatArray]] = []
-        for i in sorted(set(self.camera.tolist())):
-            key = self.state.lens_maps[i].key
-            if key is not None:
-                entries.append((int(self.lens_at[i]), self.key_at[key], np.eye(int(self.state.lenses.n_free[i]))))
-        for b in range(len(self.blocks)):
-            row = self.first_pose + 6 * b
-            for link in range(self.chains.ptr[b], self.chains.ptr[b + 1]):
-                by_key = self.state.by_keys(int(self.chains.slot[link]), self.chains.C[link])
-                entries += [(row, self.key_at[key], J) for key, J in by_key]
-        for i, at in self.tied_at.items():
-            entries.append((at, self.key_at[self.point_key[i]], np.eye(3)))
-        r = np.concatenate([np.repeat(row + np.arange(m.shape[0]), m.shape[1]) for row, _, m in entries])
-        c = np.concatenate([np.tile(col + np.arange(m.shape[1]), m.shape[0]) for _, col, m in entries])
-        v = np.concatenate([m.ravel() for _, _, m in entries])
-        return sparse.csr_matrix((v, (r, c)), shape=(self.n_local, self.n_keys))
+        r, c = [self._G_rows], [self._G_columns]
+        v = [self.chains.C[self._G_links].ravel(), self._G_ones]
+        for row, slot, link in self._table_links:
+            for key, J in self.state.by_keys(slot, self.chains.C[link]):
+                r.append(np.repeat(row + np.arange(6), J.shape[1]))
+                c.append(np.tile(self.key_at[key] + np.arange(J.shape[1]), 6))
+                v.append(J.ravel())
+        entries = (np.concatenate(v), (np.concatenate(r), np.concatenate(c)))
+        return sparse.csr_matrix(entries, shape=(self.n_local, self.n_keys))
 
     # -- evaluation --------------------------------------------------------------------------------------------------
 
     def _rows(self, values: gtsam.Values, W: FloatArray) -> None:
         s, c = self.state, self.chains
-        for i, key in self.point_key.items():
-            self.world[i] = values.atPoint3(key)
+        self._load_points(values)
         self.X[:] = self.world[self.point]
         rows(
             self.block, self.camera, s.lenses, c.R, c.t, self.X, self.uv, W, self.A, self.chi, self.depth,
         )  # fmt: skip
+
+    def _load_points(self, values: gtsam.Values) -> None:
+        """The free points: in one call where ``values`` hold no others, which it gives in the order of their keys."""
+        x = gtsam.utilities.extractPoint3(values)
+        if len(x) == len(self._points_by_key):
+            self.world[self._points_by_key] = x
+            return
+        for i, key in self.point_key.items():
+            self.world[i] = values.atPoint3(key)
 
     def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
         """Evaluate at ``values`` (already loaded into the state). Raises IndeterminateError for undetermined points."""
@@ -211,30 +266,79 @@ class BundleBatch:
             self.n_reduced, len(self.point), self.A, self.camera_of, s.lenses.n_free, self.lens_at, self.pose_at,
             self.point_at, S, g,
         )  # fmt: skip
-        S += np.triu(S, 1).T
+        run_split(
+            pose_rows, self.runs, self.by_block, self.by_ptr, self.ptr, self.pc_ptr, self.pc_camera, self.point_of,
+            self.block, self.camera_of, s.lenses.n_free, self.lens_at, self.first_pose, self.A, self.Vi, self.W3,
+            self.WL, S,
+        )  # fmt: skip
         self.G = self._local_from_keys()
-        N = np.asarray(self.G.T @ (self.G.T @ S).T)
         gradient = np.asarray(self.G.T @ g)
         rest = self.chi_square - float(np.einsum("ja,jab,jb->", self.h, self.Vi, self.h))
-        self.blind = self._blind_motions(values) if damping == 0.0 else np.zeros((self.n_keys, 0))
-        self._reduce_hidden(0.5 * (N + N.T), gradient, rest, damping)
+        self.blind = self._blind_motions(values) if damping == 0.0 else np.zeros((self.n_keys - self.n_hidden, 0))
+        floor = FLOOR * self._without_points() + 1e-300
+        if self._pure:
+            across = self._interface_rows(S)
+            inner = across[:, self.n_hidden :]
+            head, d = self._scaled_head(S, floor[: self.n_hidden])
+        else:
+            fill_upper(S)
+            N = np.asarray(self.G.T @ (self.G.T @ S).T)
+            d = np.sqrt(np.maximum(np.diag(N), floor)[: self.n_hidden])
+            head = N[: self.n_hidden, : self.n_hidden] / d[:, None] / d
+            across, inner = N[self.n_hidden :], N[self.n_hidden :, self.n_hidden :]
+        last = np.sqrt(np.maximum(np.diag(inner), floor[self.n_hidden :]))
+        self.scale = np.concatenate([d, last])
+        across = across / self.scale / last[:, None]
+        self._reduce_hidden(head, across, gradient / self.scale, rest, damping)
+
+    def _interface_rows(self, S: FloatArray) -> FloatArray:
+        """Rows (n_interface, n_keys) of the normal matrix, from the lower triangle of the local one."""
+        to_interface = self.G[:, self.n_hidden :]
+        mine = np.flatnonzero(np.diff(to_interface.indptr)).astype(np.int64)
+        R = np.empty((len(mine), self.n_local))
+        symmetric_rows(S, mine, R)
+        return np.asarray((self.G.T @ (to_interface[mine].T @ R).T).T)
+
+    def _scaled_head(self, S: FloatArray, floor: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Normal matrix of the hidden poses, lower triangle, scaled by its diagonal or ``floor``; the scales."""
+        J, at = self.chains.C[self._own_links], self._own_at[:, None] + np.arange(6)
+        own = S[at[:, :, None], at[:, None, :]]
+        d = np.sqrt(np.maximum(np.einsum("nij,nik,nkj->nj", J, own, J, optimize=True), floor.reshape(-1, 6)))
+        head = np.empty((self.n_hidden, self.n_hidden))
+        between_poses(S, self._own_at, J / d[:, None, :], True, True, head)
+        return head, d.ravel()
 
     def _blind_motions(self, values: gtsam.Values) -> FloatArray:
-        """Motions (n_keys, k) of the whole survey that no image point sees, from its rows before they are condensed."""
+        """How the interface moves (n_interface, k) with those motions of the whole survey that no image point sees."""
+        if self._blind_directions is None:
+            self._blind_directions = self._find_blind(values)
+        return self._motions(self.interface, values) @ self._blind_directions
+
+    def _motions(self, keys: Sequence[int], values: gtsam.Values) -> FloatArray:
         by_key = self.unknowns.by_key
         in_world = {"world_from_station", "world_from_table"}
-        Z = np.concatenate([motions_of(by_key[k], values, by_key[k].name[0] in in_world) for k in self.order])
+        return np.concatenate([motions_of(by_key[k], values, by_key[k].name[0] in in_world) for k in keys])
+
+    def _find_blind(self, values: gtsam.Values) -> FloatArray:
+        """Directions (7, k) of those motions, from the image rows before they are condensed.
+
+        What is held does not move with the solution, so they stay the same while the same points are used.
+        """
+        Z = self._motions(self.order, values)
         of_point = np.zeros((len(self.point_ids), 3, 7))
-        for i in self.point_key:
-            of_point[i] = point_motions(self.world[i])
+        free = list(self.point_key)
+        of_point[free] = points_motions(self.world[free])
         of_pose = np.asarray(self.G @ Z)[self.first_pose : self.first_pose + 6 * len(self.blocks)].reshape(-1, 6, 7)
         rows = self.A[:, :, MAX_LENS : MAX_LENS + 6]
         by_pose = (rows @ of_pose[self.block]).reshape(-1, 7)
         by_point = (rows[:, :, 3:] @ of_point[self.point]).reshape(-1, 7)
         lengths = np.sqrt((by_pose**2).sum(axis=0) + (by_point**2).sum(axis=0))
         usable = lengths > 0.0
-        _, s, Vt = np.linalg.svd((by_pose + by_point)[:, usable] / lengths[usable], full_matrices=False)
-        return np.asarray((Z[:, usable] / lengths[usable]) @ Vt[s < BLIND_MOTION].T)
+        triangular = np.linalg.qr((by_pose + by_point)[:, usable] / lengths[usable], mode="r")
+        _, s, Vt = np.linalg.svd(triangular, full_matrices=False)
+        out = np.zeros((7, int(np.count_nonzero(s < BLIND_MOTION))))
+        out[usable] = Vt[s < BLIND_MOTION].T / lengths[usable, None]
+        return out
 
     def _undetermined_point(self, bad: int) -> IndeterminateError:
         name = self.point_ids[self.reduced[bad]]
@@ -247,24 +351,26 @@ class BundleBatch:
             (f"point {name}",),
         )
 
-    def _reduce_hidden(self, N: FloatArray, gradient: FloatArray, rest: float, damping: float) -> None:
-        d = np.sqrt(np.maximum(np.diag(N), FLOOR * self._without_points() + 1e-300))
-        self.scale = d
-        A = N / d[:, None] / d
-        z = gradient / d
+    def _reduce_hidden(
+        self, head: FloatArray, across: FloatArray, z: FloatArray, rest: float, damping: float
+    ) -> None:  # fmt: skip
+        """head: (n_hidden, n_hidden), lower triangle; across: (n_interface, n_keys); scaled. Overwrites ``head``."""
         nh = self.n_hidden
+        A, last = across[:, nh:], z[nh:]
+        A = 0.5 * (A + A.T)
+        self._given_interface = None
         if nh:
-            head = A[:nh, :nh] + damping * np.eye(nh)
-            self.C, info = lapack.dpotrf(np.asfortranarray(head), lower=0)
+            head[np.arange(nh), np.arange(nh)] += damping
+            self.C, info = lapack.dpotrf(head.T, lower=0, clean=0, overwrite_a=1)
             if info != 0:
                 raise self._undetermined_pose(info - 1)
-            right = np.asfortranarray(np.column_stack([A[:nh, nh:], z[:nh]]))
-            self.Y = lapack.dtrtrs(self.C, right, lower=0, trans=1)[0]
-            A = A[nh:, nh:] - self.Y[:, :-1].T @ self.Y[:, :-1]
-            z = z[nh:] - self.Y[:, :-1].T @ self.Y[:, -1]
+            right = np.vstack([across[:, :nh], z[:nh]]).T
+            self.Y = lapack.dtrtrs(self.C, right, lower=0, trans=1, overwrite_b=1)[0]
+            A = A - self.Y[:, :-1].T @ self.Y[:, :-1]
+            last = last - self.Y[:, :-1].T @ self.Y[:, -1]
             rest -= float(self.Y[:, -1] @ self.Y[:, -1])
         self.hidden_decrease = self.chi_square - rest
-        self._serve(A, z, d[nh:], rest)
+        self._serve(A, last, self.scale[nh:], rest)
 
     def _without_points(self) -> FloatArray:
         """Diagonal (n_keys,) of the poses' normal matrix if all points were known: what rounding is measured by.
@@ -294,7 +400,7 @@ class BundleBatch:
         The root of rounding would outweigh a weak datum, so motions that no image point sees are taken out exactly.
         """
         n = len(z)
-        blind = np.linalg.qr(d[:, None] * self.blind[self.n_hidden :])[0]
+        blind = np.linalg.qr(d[:, None] * self.blind)[0]
         A = A - blind @ (blind.T @ A)
         A = A - (A @ blind) @ blind.T
         z = z - blind @ (blind.T @ z)
@@ -334,7 +440,7 @@ class BundleBatch:
 
     def set_weights(self, weights: FloatArray) -> None:
         """Weights (N,), blocks in their order, on top of the covariances; a point of weight zero is left out."""
-        self._prepared = None
+        self._prepared = self._blind_directions = None
         w = weights[self.sorted]
         self.used = w > 0.0
         self.W = self.W_all * np.sqrt(w)[:, None]
@@ -408,11 +514,16 @@ class BundleBatch:
 
     def _hidden_poses_given_interface(self) -> tuple[FloatArray, FloatArray]:
         """Hidden poses by the interface (n_hidden, n_interface), and their covariance when that is known."""
-        nh = self.n_hidden
-        T = -lapack.dtrtrs(self.C, np.asfortranarray(self.Y[:, :-1]), lower=0)[0]
-        P = lapack.dpotri(self.C.copy(order="F"), lower=0)[0]
-        scale = self.scale[:nh]
-        return T / scale[:, None] * self.scale[nh:], (np.triu(P) + np.triu(P, 1).T) / scale[:, None] / scale
+        if self._given_interface is None:
+            nh = self.n_hidden
+            scale = self.scale[:nh]
+            T = -lapack.dtrtrs(self.C, self.Y[:, :-1], lower=0)[0]
+            P = lapack.dpotri(self.C, lower=0)[0].T  # in C's order the lower triangle
+            fill_upper(P)
+            P /= scale
+            P /= scale[:, None]
+            self._given_interface = T / scale[:, None] * self.scale[nh:], P
+        return self._given_interface
 
     def covariances(self, Q_interface: FloatArray, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Covariances of everything hidden, from the interface's joint covariance (order ``interface``).
@@ -421,26 +532,53 @@ class BundleBatch:
         A Q A' (K, 3) of every image point (sorted order). The batch must be prepared with Jacobians at ``values``.
         """
         nh, n = self.n_hidden, self.n_keys
-        Q = np.zeros((n, n))
+        Q = np.empty((n, n))
         Q[nh:, nh:] = Q_interface
         if nh:
             T, P = self._hidden_poses_given_interface()
             Q[:nh, nh:] = T @ Q_interface
             Q[nh:, :nh] = Q[:nh, nh:].T
-            Q[:nh, :nh] = P + Q[:nh, nh:] @ T.T
-        Q_local = np.ascontiguousarray(self.G @ (self.G @ Q).T)
+            np.matmul(Q[:nh, nh:], T.T, out=Q[:nh, :nh])
+            Q[:nh, :nh] += P
         self._rows(values, self.W_all)
-        C = np.zeros((len(self.reduced), 3, 3))
+        return Q, *self._of_points_and_rows(self._local_covariance(Q))
+
+    def _local_covariance(self, Q: FloatArray) -> FloatArray:
+        """G Q G' (n_local, n_local)."""
+        nh = self.n_hidden
+        if not self._pure:
+            return np.ascontiguousarray(self.G @ (self.G @ Q).T)
+        out = np.zeros((self.n_local, self.n_local))
+        between_poses(Q, self._own_at, self.chains.C[self._own_links], False, False, out)
+        to_interface = self.G[:, nh:]
+        mine = np.flatnonzero(np.diff(to_interface.indptr))
+        across = np.asarray(to_interface[mine] @ (self.G @ np.ascontiguousarray(Q[:, nh:])).T)
+        out[mine], out[:, mine] = across, across.T
+        return out
+
+    def _of_points_and_rows(self, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Covariances (P, 3, 3) of the reduced points, A Q A' (K, 3) of all image points. Q: of the local unknowns."""
+        n_free, sees = self.state.lenses.n_free, (self.by_block, self.by_ptr)
+        Y, YL = np.empty_like(self.W3), np.zeros_like(self.WL)
+        point_from_local(self.ptr, self.pc_ptr, self.Vi, self.W3, self.WL, Y, YL)
+        B, BL, C = np.empty_like(self.W3), np.zeros_like(self.WL), np.zeros((len(self.reduced), 3, 3))
+        run_split(
+            with_poses, self.runs, *sees, self.ptr, self.pc_ptr, self.pc_camera, self.point_of, self.block, n_free,
+            self.lens_at, self.first_pose, Q, Y, YL, B,
+        )  # fmt: skip
+        with_lenses(
+            self.ptr, self.pc_ptr, self.pc_camera, n_free, self.lens_at, self.pose_at, self.Vi, Q, Y, YL, B, BL, C
+        )
         influence = np.zeros((len(self.point), 3))
-        point_covariances(
-            self.ptr, self.pc_ptr, self.pc_camera, self.pc_of, self.camera_of, self.state.lenses.n_free, self.lens_at,
-            self.pose_at, self.A, self.Vi, self.W3, self.WL, Q_local, C, influence,
+        run_split(
+            reduced_influence, self.runs, *sees, self.point_of, self.pc_of, self.camera_of, n_free, self.lens_at,
+            self.first_pose, self.A, Q, B, BL, C, influence,
         )  # fmt: skip
         direct_influence(
-            self.n_reduced, len(self.point), self.A, self.camera_of, self.state.lenses.n_free, self.lens_at,
-            self.pose_at, self.point_at, Q_local, influence,
+            self.n_reduced, len(self.point), self.A, self.camera_of, n_free, self.lens_at, self.pose_at, self.point_at,
+            Q, influence,
         )  # fmt: skip
-        return Q, C, influence
+        return C, influence
 
     def hidden_transposed(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
         """Rows on hidden unknowns, transposed (dim, k) per key, as rows on the interface (n_interface, k)."""
@@ -482,14 +620,10 @@ class BundleBatch:
         """Rows on hidden unknowns, transposed, as rows (n_keys, k) on the poses and the interface, points reduced."""
         g = self.Vi @ self._of_points(rows, k)
         local = np.zeros((self.n_local, k))
-        point = np.repeat(np.arange(len(self.reduced)), np.diff(self.ptr))
-        n = self.n_reduced
-        by_pose = -np.einsum("kaq,kam->kqm", self.W3[:n], g[point])
-        np.add.at(local, (self.pose_at[:n, None] + np.arange(6)), by_pose)
-        owner = np.repeat(np.arange(len(self.reduced)), np.diff(self.pc_ptr))
-        for i, camera in enumerate(self.pc_camera):
-            at, free = self.lens_at[camera], self.state.lenses.n_free[camera]
-            local[at : at + free] -= self.WL[i, :, :free].T @ g[owner[i]]
+        of_points(
+            self.ptr, self.pc_ptr, self.pc_camera, self.camera_of, self.state.lenses.n_free, self.lens_at, self.pose_at,
+            self.W3, self.WL, g, local,
+        )  # fmt: skip
         out = np.asarray(self.G.T @ local)
         for key in self.hidden_poses:
             if key in rows:

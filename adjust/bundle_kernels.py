@@ -89,7 +89,10 @@ def add_direct(
     first: int, last: int, A: FloatArray, camera_of: IntArray, n_lens: IntArray, lens_at: IntArray,
     pose_at: IntArray, point_at: IntArray, S: FloatArray, g: FloatArray,
 ) -> None:  # fmt: skip
-    """Add observations first..last as they are: points that stay (point_at >= 0) or are held (< 0)."""
+    """Add observations first..last as they are: points that stay (point_at >= 0) or are held (< 0).
+
+    To the lower triangle of S, and all of a pose's own block.
+    """
     index = np.empty(MAX_LENS + 9, np.int64)
     a = np.empty(MAX_LENS + 9)
     for k in range(first, last):
@@ -115,7 +118,7 @@ def add_direct(
             for i in range(n):
                 g[index[i]] += a[i] * r
                 for j in range(n):
-                    if index[j] >= index[i]:
+                    if index[j] <= index[i] or nl <= i < j < nl + 6:
                         S[index[i], index[j]] += a[i] * a[j]
 
 
@@ -125,9 +128,10 @@ def reduce_points(
     n_lens: IntArray, lens_at: IntArray, pose_at: IntArray, damping: float, S: FloatArray, g: FloatArray,
     Vi: FloatArray, W: FloatArray, WL: FloatArray, h: FloatArray,
 ) -> int:  # fmt: skip
-    """Schur complement over the points ptr[j]..ptr[j + 1], into the upper triangle of S and g; -1, or the bad point.
+    """Reduce the points ptr[j]..ptr[j + 1]: their share in g and among lenses in S (lower); -1, or the bad point.
 
-    W (K, 3, 6), WL (point-cameras, 3, MAX_LENS), Vi (P, 3, 3), h (P, 3) stay for the back-substitution.
+    W (K, 3, 6), WL (point-cameras, 3, MAX_LENS), Vi (P, 3, 3), h (P, 3) stay: for :func:`pose_rows`, which does the
+    rest of S, and for the back-substitution.
     """
     V = np.empty((3, 3))
     vh = np.empty(3)
@@ -141,7 +145,7 @@ def reduce_points(
                 for q in range(MAX_LENS):
                     WL[i, a, q] = 0.0
         for k in range(ptr[j], ptr[j + 1]):
-            nl, i = n_lens[camera_of[k]], pc_of[k]
+            nl, i, ol = n_lens[camera_of[k]], pc_of[k], lens_at[camera_of[k]]
             for s in range(2):
                 r = A[k, s, MAX_LENS + 6]
                 for a in range(3):
@@ -151,6 +155,10 @@ def reduce_points(
                         V[a, q] += x * A[k, s, MAX_LENS + 3 + q]
                     for q in range(nl):
                         WL[i, a, q] += x * A[k, s, q]
+                for p in range(nl):
+                    g[ol + p] += A[k, s, p] * r
+                    for q in range(p + 1):
+                        S[ol + p, ol + q] += A[k, s, p] * A[k, s, q]
             for a in range(3):
                 for q in range(6):
                     W[k, a, q] = (
@@ -163,6 +171,11 @@ def reduce_points(
             return j
         for a in range(3):
             vh[a] = Vi[j, a, 0] * h[j, 0] + Vi[j, a, 1] * h[j, 1] + Vi[j, a, 2] * h[j, 2]
+        for k in range(ptr[j], ptr[j + 1]):
+            o = pose_at[k]
+            for q in range(6):
+                own = A[k, 0, MAX_LENS + q] * A[k, 0, MAX_LENS + 6] + A[k, 1, MAX_LENS + q] * A[k, 1, MAX_LENS + 6]
+                g[o + q] += own - (W[k, 0, q] * vh[0] + W[k, 1, q] * vh[1] + W[k, 2, q] * vh[2])
         for i in range(pc_ptr[j], pc_ptr[j + 1]):
             ni, oi = n_lens[pc_camera[i]], lens_at[pc_camera[i]]
             for a in range(3):
@@ -172,57 +185,154 @@ def reduce_points(
                 g[oi + q] -= WL[i, 0, q] * vh[0] + WL[i, 1, q] * vh[1] + WL[i, 2, q] * vh[2]
             for m in range(pc_ptr[j], pc_ptr[j + 1]):
                 om = lens_at[pc_camera[m]]
-                for p in range(n_lens[pc_camera[m]]):
-                    for q in range(ni):
+                for q in range(ni):
+                    for p in range(n_lens[pc_camera[m]]):
                         if om + p <= oi + q:
-                            S[om + p, oi + q] -= WL[m, 0, p] * Y[0, q] + WL[m, 1, p] * Y[1, q] + WL[m, 2, p] * Y[2, q]
-        add_direct_reduced(ptr[j], ptr[j + 1], pc_ptr[j], pc_ptr[j + 1], pc_camera, A, camera_of, n_lens, lens_at,
-                           pose_at, Vi[j], vh, W, WL, S, g)  # fmt: skip
+                            S[oi + q, om + p] -= WL[m, 0, p] * Y[0, q] + WL[m, 1, p] * Y[1, q] + WL[m, 2, p] * Y[2, q]
     return -1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_direct_reduced(
-    first: int, last: int, pc0: int, pc1: int, pc_camera: IntArray, A: FloatArray, camera_of: IntArray,
-    n_lens: IntArray, lens_at: IntArray, pose_at: IntArray, Vi: FloatArray, vh: FloatArray, W: FloatArray,
-    WL: FloatArray, S: FloatArray, g: FloatArray,
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def pose_rows(
+    run: IntArray, by_block: IntArray, by_ptr: IntArray, ptr: IntArray, pc_ptr: IntArray, pc_camera: IntArray,
+    point_of: IntArray, block: IntArray, camera_of: IntArray, n_lens: IntArray, lens_at: IntArray, first_pose: int,
+    A: FloatArray, Vi: FloatArray, W: FloatArray, WL: FloatArray, S: FloatArray,
 ) -> None:  # fmt: skip
-    """The direct part of one point's observations, and minus its share in the poses."""
-    Y = np.empty((3, 6))
-    for k in range(first, last):
-        nl, o, ol = n_lens[camera_of[k]], pose_at[k], lens_at[camera_of[k]]
-        for s in range(2):
-            r = A[k, s, MAX_LENS + 6]
-            for p in range(nl):
-                ap = A[k, s, p]
-                g[ol + p] += ap * r
-                for q in range(p, nl):
-                    S[ol + p, ol + q] += ap * A[k, s, q]
+    """Rows of S, up to the diagonal block, of the poses of the blocks in ``run``: from the reduced points alone.
+
+    Image by image, so that what is written stays in the fastest cache; 6 x 6 by hand, so that it is vectorised.
+    """
+    T = np.empty((S.shape[0], 6))
+    for b in run:
+        o = first_pose + 6 * b
+        T[: o + 6] = 0.0
+        for i in range(by_ptr[b], by_ptr[b + 1]):
+            k = by_block[i]
+            j = point_of[k]
+            v00, v01, v02 = Vi[j, 0, 0], Vi[j, 0, 1], Vi[j, 0, 2]
+            v11, v12, v22 = Vi[j, 1, 1], Vi[j, 1, 2], Vi[j, 2, 2]
+            y00, y01, y02, y03, y04, y05 = _combine(v00, v01, v02, W, k)
+            y10, y11, y12, y13, y14, y15 = _combine(v01, v11, v12, W, k)
+            y20, y21, y22, y23, y24, y25 = _combine(v02, v12, v22, W, k)
+            for m in range(ptr[j], ptr[j + 1]):
+                if block[m] > b:
+                    continue
+                at = first_pose + 6 * block[m]
                 for q in range(6):
-                    S[ol + p, o + q] += ap * A[k, s, MAX_LENS + q]
+                    w0, w1, w2, r = W[m, 0, q], W[m, 1, q], W[m, 2, q], at + q
+                    T[r, 0] -= w0 * y00 + w1 * y10 + w2 * y20
+                    T[r, 1] -= w0 * y01 + w1 * y11 + w2 * y21
+                    T[r, 2] -= w0 * y02 + w1 * y12 + w2 * y22
+                    T[r, 3] -= w0 * y03 + w1 * y13 + w2 * y23
+                    T[r, 4] -= w0 * y04 + w1 * y14 + w2 * y24
+                    T[r, 5] -= w0 * y05 + w1 * y15 + w2 * y25
+            for n in range(pc_ptr[j], pc_ptr[j + 1]):
+                at = lens_at[pc_camera[n]]
+                for q in range(n_lens[pc_camera[n]]):
+                    w0, w1, w2, r = WL[n, 0, q], WL[n, 1, q], WL[n, 2, q], at + q
+                    T[r, 0] -= w0 * y00 + w1 * y10 + w2 * y20
+                    T[r, 1] -= w0 * y01 + w1 * y11 + w2 * y21
+                    T[r, 2] -= w0 * y02 + w1 * y12 + w2 * y22
+                    T[r, 3] -= w0 * y03 + w1 * y13 + w2 * y23
+                    T[r, 4] -= w0 * y04 + w1 * y14 + w2 * y24
+                    T[r, 5] -= w0 * y05 + w1 * y15 + w2 * y25
+            at = lens_at[camera_of[k]]
+            for s in range(2):
+                for q in range(n_lens[camera_of[k]]):
+                    for p in range(6):
+                        T[at + q, p] += A[k, s, q] * A[k, s, MAX_LENS + p]
+                for q in range(6):
+                    for p in range(6):
+                        T[o + q, p] += A[k, s, MAX_LENS + q] * A[k, s, MAX_LENS + p]
+        for p in range(6):
+            for c in range(o + 6):
+                S[o + p, c] += T[c, p]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _combine(
+    a: float, b: float, c: float, W: FloatArray, k: int
+) -> tuple[float, float, float, float, float, float]:  # fmt: skip
+    return (
+        a * W[k, 0, 0] + b * W[k, 1, 0] + c * W[k, 2, 0],
+        a * W[k, 0, 1] + b * W[k, 1, 1] + c * W[k, 2, 1],
+        a * W[k, 0, 2] + b * W[k, 1, 2] + c * W[k, 2, 2],
+        a * W[k, 0, 3] + b * W[k, 1, 3] + c * W[k, 2, 3],
+        a * W[k, 0, 4] + b * W[k, 1, 4] + c * W[k, 2, 4],
+        a * W[k, 0, 5] + b * W[k, 1, 5] + c * W[k, 2, 5],
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_upper(S: FloatArray) -> None:
+    """Copy the lower triangle of S (n, n) to the upper one, in squares that stay in the cache."""
+    n, side = S.shape[0], 32
+    for i0 in range(0, n, side):
+        for j0 in range(0, i0 + 1, side):
+            for i in range(i0, min(n, i0 + side)):
+                for j in range(j0, min(i, j0 + side)):
+                    S[j, i] = S[i, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def symmetric_rows(S: FloatArray, rows_of: IntArray, out: FloatArray) -> None:
+    """Rows of a symmetric S of which only the lower triangle is there, out (r, n)."""
+    for i in range(rows_of.size):
+        a = rows_of[i]
+        for c in range(S.shape[0]):
+            out[i, c] = S[a, c] if c <= a else S[c, a]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def between_poses(S: FloatArray, at: IntArray, J: FloatArray, transpose: bool, lower: bool, out: FloatArray) -> None:
+    """Blocks out[6a.., 6b..] of J_a' S J_b (``transpose``), S at rows at[a], at[b]: its lower triangle, a >= b.
+
+    Else the other way: out at at[a], at[b] of J_a S J_b', S at 6a, 6b. lower: only that of out, not mirrored.
+    """
+    M, K, C = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    for a in range(at.size):
+        for b in range(a + 1):
+            r, c = (at[a], at[b]) if transpose else (6 * a, 6 * b)
+            r_out, c_out = (6 * a, 6 * b) if transpose else (at[a], at[b])
             for p in range(6):
-                ap = A[k, s, MAX_LENS + p]
-                g[o + p] += ap * r
-                for q in range(p, 6):
-                    S[o + p, o + q] += ap * A[k, s, MAX_LENS + q]
-        for a in range(3):
-            for q in range(6):
-                Y[a, q] = Vi[a, 0] * W[k, 0, q] + Vi[a, 1] * W[k, 1, q] + Vi[a, 2] * W[k, 2, q]
-        for q in range(6):
-            g[o + q] -= W[k, 0, q] * vh[0] + W[k, 1, q] * vh[1] + W[k, 2, q] * vh[2]
-        for i in range(pc0, pc1):
-            oi = lens_at[pc_camera[i]]
-            for p in range(n_lens[pc_camera[i]]):
                 for q in range(6):
-                    S[oi + p, o + q] -= WL[i, 0, p] * Y[0, q] + WL[i, 1, p] * Y[1, q] + WL[i, 2, p] * Y[2, q]
-        for m in range(first, last):
-            om = pose_at[m]
-            if om > o:
-                continue
+                    if transpose and c > r:
+                        M[p, q] = S[c + q, r + p]
+                    else:
+                        M[p, q] = S[r + p, c + q]
+            if transpose:
+                for p in range(6):
+                    for q in range(6):
+                        K[p, q] = J[a, 0, p] * M[0, q]
+                    for i in range(1, 6):
+                        for q in range(6):
+                            K[p, q] += J[a, i, p] * M[i, q]
+                for p in range(6):
+                    for q in range(6):
+                        C[p, q] = K[p, 0] * J[b, 0, q]
+                    for i in range(1, 6):
+                        for q in range(6):
+                            C[p, q] += K[p, i] * J[b, i, q]
+            else:
+                for p in range(6):
+                    for q in range(6):
+                        K[p, q] = J[a, p, 0] * M[0, q]
+                    for i in range(1, 6):
+                        for q in range(6):
+                            K[p, q] += J[a, p, i] * M[i, q]
+                for p in range(6):
+                    for q in range(6):
+                        C[p, q] = K[p, 0] * J[b, q, 0]
+                    for i in range(1, 6):
+                        for q in range(6):
+                            C[p, q] += K[p, i] * J[b, q, i]
             for p in range(6):
                 for q in range(6):
-                    if om + p <= o + q:
-                        S[om + p, o + q] -= W[m, 0, p] * Y[0, q] + W[m, 1, p] * Y[1, q] + W[m, 2, p] * Y[2, q]
+                    out[r_out + p, c_out + q] = C[p, q]
+            if not lower and a != b:
+                for q in range(6):
+                    for p in range(6):
+                        out[c_out + q, r_out + p] = C[p, q]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -249,109 +359,19 @@ def back_substitute(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def point_covariances(
-    ptr: IntArray, pc_ptr: IntArray, pc_camera: IntArray, pc_of: IntArray, camera_of: IntArray, n_lens: IntArray,
-    lens_at: IntArray, pose_at: IntArray, A_all: FloatArray, Vi: FloatArray, W: FloatArray, WL: FloatArray,
-    Q: FloatArray, CX: FloatArray, influence: FloatArray,
+def of_points(
+    ptr: IntArray, pc_ptr: IntArray, pc_camera: IntArray, camera_of: IntArray, n_lens: IntArray, lens_at: IntArray,
+    pose_at: IntArray, W: FloatArray, WL: FloatArray, v: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Covariances CX (P, 3, 3) of the reduced points and whitened A Q A' (K, 3) of their observations.
-
-    Q: full covariance of the local unknowns. With Y = -V^-1 W: Q_XX = V^-1 + Y Q Y', Q_Xc = Y Q. A_all: rows whitened
-    as if all observations were used.
-    """
+    """Subtract W' v from ``out`` (n_local, k), for v (P, 3, k): what reduced points carry over to the others."""
     for j in range(ptr.size - 1):
-        m = ptr[j + 1] - ptr[j]
-        n_pc = 0
         for i in range(pc_ptr[j], pc_ptr[j + 1]):
-            n_pc += n_lens[pc_camera[i]]
-        n = n_pc + 6 * m
-        index = np.empty(n, np.int64)
-        Y = np.empty((3, n))
-        at = np.empty(pc_ptr[j + 1] - pc_ptr[j], np.int64)
-        o = 0
-        for i in range(pc_ptr[j], pc_ptr[j + 1]):
-            at[i - pc_ptr[j]] = o
+            o = lens_at[pc_camera[i]]
             for q in range(n_lens[pc_camera[i]]):
-                index[o] = lens_at[pc_camera[i]] + q
-                for a in range(3):
-                    Y[a, o] = -(Vi[j, a, 0] * WL[i, 0, q] + Vi[j, a, 1] * WL[i, 1, q] + Vi[j, a, 2] * WL[i, 2, q])
-                o += 1
+                for c in range(out.shape[1]):
+                    out[o + q, c] -= WL[i, 0, q] * v[j, 0, c] + WL[i, 1, q] * v[j, 1, c] + WL[i, 2, q] * v[j, 2, c]
         for k in range(ptr[j], ptr[j + 1]):
+            o = pose_at[k]
             for q in range(6):
-                index[o] = pose_at[k] + q
-                for a in range(3):
-                    Y[a, o] = -(Vi[j, a, 0] * W[k, 0, q] + Vi[j, a, 1] * W[k, 1, q] + Vi[j, a, 2] * W[k, 2, q])
-                o += 1
-        B = np.zeros((3, n))
-        for c in range(n):
-            for b in range(n):
-                v = Q[index[c], index[b]]
-                for a in range(3):
-                    B[a, b] += Y[a, c] * v
-        for a in range(3):
-            for b in range(3):
-                v = Vi[j, a, b]
-                for c in range(n):
-                    v += B[a, c] * Y[b, c]
-                CX[j, a, b] = v
-        local = np.empty(MAX_LENS + 6, np.int64)
-        r = np.empty((2, MAX_LENS + 6))
-        for k in range(ptr[j], ptr[j + 1]):
-            nl = n_lens[camera_of[k]]
-            for q in range(nl):
-                local[q] = at[pc_of[k] - pc_ptr[j]] + q
-            for q in range(6):
-                local[nl + q] = n_pc + 6 * (k - ptr[j]) + q
-            for s in range(2):
-                for q in range(nl):
-                    r[s, q] = A_all[k, s, q]
-                for q in range(6):
-                    r[s, nl + q] = A_all[k, s, MAX_LENS + q]
-            for e in range(3):
-                s, u = (0, 0) if e == 0 else ((0, 1) if e == 1 else (1, 1))
-                v = 0.0
-                for p in range(nl + 6):
-                    for q in range(nl + 6):
-                        v += r[s, p] * r[u, q] * Q[index[local[p]], index[local[q]]]
-                for a in range(3):
-                    xs, xu = A_all[k, s, MAX_LENS + 3 + a], A_all[k, u, MAX_LENS + 3 + a]
-                    for q in range(nl + 6):
-                        v += B[a, local[q]] * (xs * r[u, q] + xu * r[s, q])
-                    for b in range(3):
-                        v += xs * CX[j, a, b] * A_all[k, u, MAX_LENS + 3 + b]
-                influence[k, e] = v
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def direct_influence(
-    first: int, last: int, A_all: FloatArray, camera_of: IntArray, n_lens: IntArray, lens_at: IntArray,
-    pose_at: IntArray, point_at: IntArray, Q: FloatArray, influence: FloatArray,
-) -> None:  # fmt: skip
-    """Whitened A Q A' of observations whose point stays or is held."""
-    index = np.empty(MAX_LENS + 9, np.int64)
-    r = np.empty((2, MAX_LENS + 9))
-    for k in range(first, last):
-        nl = n_lens[camera_of[k]]
-        n = nl + 6
-        for j in range(nl):
-            index[j] = lens_at[camera_of[k]] + j
-        for j in range(6):
-            index[nl + j] = pose_at[k] + j
-        for s in range(2):
-            for j in range(nl):
-                r[s, j] = A_all[k, s, j]
-            for j in range(6):
-                r[s, nl + j] = A_all[k, s, MAX_LENS + j]
-        if point_at[k] >= 0:
-            for j in range(3):
-                index[n + j] = point_at[k] + j
-                for s in range(2):
-                    r[s, n + j] = A_all[k, s, MAX_LENS + 3 + j]
-            n += 3
-        for e in range(3):
-            s, u = (0, 0) if e == 0 else ((0, 1) if e == 1 else (1, 1))
-            v = 0.0
-            for p in range(n):
-                for q in range(n):
-                    v += r[s, p] * Q[index[p], index[q]] * r[u, q]
-            influence[k, e] = v
+                for c in range(out.shape[1]):
+                    out[o + q, c] -= W[k, 0, q] * v[j, 0, c] + W[k, 1, q] * v[j, 1, c] + W[k, 2, q] * v[j, 2, c]

@@ -19,7 +19,7 @@ from adjust.errors import SurveyError
 from adjust.geometry.motions import MOVED, vector_motions
 from adjust.graph import AdjustmentGraph, inner_datum_keys
 from adjust.model import FloatArray, IntArray
-from adjust.motions import motions_of
+from adjust.motions import motions_of, points_motions
 from adjust.result import ParameterName
 from adjust.terrestrial.motions import MOVED as READINGS_MOVED
 from adjust.terrestrial.motions import reading_motions
@@ -149,11 +149,7 @@ def survey_motions(graph: AdjustmentGraph, values: gtsam.Values, directions: Flo
     unknowns = graph.unknowns.by_name.values()
     points = [u.key for u in unknowns if u.kind == "point"]
     x = np.array([values.atPoint3(key) for key in points]).reshape(-1, 3)
-    B = np.zeros((len(points), 3, 7))
-    B[:, :, :3], B[:, :, 6] = np.eye(3), x
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # w x x, by w
-        B[:, i, 3 + j], B[:, j, 3 + i] = x[:, k], -x[:, k]
-    out = dict(zip(points, B @ directions, strict=True))
+    out = dict(zip(points, points_motions(x) @ directions, strict=True))
     for u in unknowns:
         if u.kind != "point":
             out[u.key] = gauge(graph, u, values) @ directions

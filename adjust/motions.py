@@ -17,6 +17,15 @@ def point_motions(x: FloatArray) -> FloatArray:
     return np.column_stack([np.eye(3), -skew(x), x])
 
 
+def points_motions(x: FloatArray) -> FloatArray:
+    """How points (n, 3) m of the world move, (n, 3, 7)."""
+    B = np.zeros((len(x), 3, 7))
+    B[:, :, :3], B[:, :, 6] = np.eye(3), x
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # w x x, by w
+        B[:, i, 3 + j], B[:, j, 3 + i] = x[:, k], -x[:, k]
+    return B
+
+
 def motions_of(unknown: Unknown, values: gtsam.Values, in_world: bool) -> FloatArray:
     """How an unknown moves, (dim, 7). in_world: whether a pose is that of something in the world."""
     out = np.zeros((unknown.dim, 7))
