@@ -4,6 +4,7 @@
 >>> outcome = convert_job(Path("garage"), Path("adjusted.g2o"))
 >>> outcome = convert_job(Path("tunnel.gkf"), Path("tunnel"))
 >>> outcome = convert_job(Path("tunnel"), Path("tunnel.snx"))
+>>> outcome = convert_job(Path("head"), Path("head.yaml"), format="kalibr", station="head")
 """
 
 from collections.abc import Callable
@@ -19,8 +20,10 @@ from survey.converting_g2o import project_to_g2o, survey_from_g2o
 from survey.files import AdjustmentOptions, Project, atomic_write, read, write_project
 from survey.files.project import DEFINITION_FILE
 from survey.files.text import suggestion
+from survey.interop import camera_formats
 from survey.interop.aicon import ENDINGS as AICON_ENDINGS
 from survey.interop.aicon import read_aicon
+from survey.interop.camera_values import camera_values
 from survey.interop.dbat import read_dbat
 from survey.interop.foreign import ForeignNetwork
 from survey.interop.g2o import Information
@@ -45,8 +48,9 @@ READERS: dict[str, Callable[[Path], ForeignNetwork]] = {
     "csv": read_plain_csv,
     "dbat": read_dbat,
     "aicon": read_aicon,
+    **camera_formats.READERS,
 }
-WRITERS = ("g2o", "gama", "csv", "json", "sinex")
+WRITERS = ("g2o", "gama", "csv", "json", "sinex", *camera_formats.WRITERS)
 _ENDINGS = {
     ".g2o": "g2o",
     ".gkf": "gama",
@@ -58,6 +62,7 @@ _ENDINGS = {
     **dict.fromkeys(AICON_ENDINGS, "aicon"),
     ".json": "json",
     ".snx": "sinex",
+    **camera_formats.ENDINGS,
 }
 FORMATS = tuple(dict.fromkeys((*READERS, *WRITERS, "project")))
 
@@ -93,21 +98,27 @@ class ConvertOutcome:
 
 
 def convert_job(
-    source: Path, target: Path, *, format: str | None = None, information: Information = "tangent"
+    source: Path,
+    target: Path,
+    *,
+    format: str | None = None,
+    information: Information = "tangent",
+    station: str | None = None,
 ) -> ConvertOutcome:
     """Write ``source`` in another format at ``target``: the one a project folder, the other a file.
 
     format: of the file; by default by its ending. information: what the rotation part of g2o's information matrices
-    refers to. Raises SurveyError for what the other format cannot hold, and where there is something at ``target``.
+    refers to. station: whose cameras or poses are written, for the formats that hold those of one. Raises SurveyError
+    for what the other format cannot hold, and where there is something at ``target``.
     """
     source, target = Path(source), Path(target)
-    if source.is_dir():
-        return _to_file(source, target, _file_format(target, format, WRITERS), information)
+    if source.is_dir() and not (format in camera_formats.FOLDERS and not (source / DEFINITION_FILE).exists()):
+        return _to_file(source, target, _file_format(target, format, WRITERS), information, station)
     if format in (None, "project") and target.suffix.lower() in _ENDINGS and not target.is_dir():
         known = _ENDINGS[target.suffix.lower()]
         if known in WRITERS:
             raise SurveyError(f"{source}: is no project folder; only a project is converted to {known}")
-    if not source.is_file():
+    if not source.exists():
         raise SurveyError(f"{source}: there is no such file; give a file of another program, or a project folder")
     if format in ("json", "sinex"):
         raise SurveyError(f"{source}: the format {format} is only written; give a project folder")
@@ -116,7 +127,14 @@ def convert_job(
 
 
 def _file_format(path: Path, given: str | None, known: tuple[str, ...]) -> str:
-    found = given or _ENDINGS.get(path.suffix.lower())
+    ending = path.suffix.lower()
+    found = given or _ENDINGS.get(ending)
+    possible = [f for f in camera_formats.AMBIGUOUS.get(ending, ()) if f in known]
+    if len(possible) == 1 and found is None:
+        found = possible[0]
+    if possible and given in (None, "project") and found not in known:
+        raise SurveyError(f"{path}: {ending} is the ending of several formats; say which with --format: "
+                          f"{', '.join(possible)}")  # fmt: skip
     if found == "project" or found is None:
         endings = ", ".join(sorted(e for e, f in _ENDINGS.items() if f in known))
         raise SurveyError(f"{path}: the ending tells no format; end the name with {endings} or give --format")
@@ -139,7 +157,8 @@ def _to_project(source: Path, target: Path, format: str, information: Informatio
     survey, renamed = with_safe_ids(network.survey)
     reject = network.reject
     options = AdjustmentOptions(network.alpha or AdjustmentOptions.alpha, reject, reject, reject)
-    write_project(target, survey, title=network.title or source.stem, options=options)
+    title = network.title or source.stem
+    write_project(target, survey, title=title, options=options, target_kinds=network.target_kinds)
     counts = {
         "points": len(survey.points),
         "readings": len(survey.readings),
@@ -147,18 +166,28 @@ def _to_project(source: Path, target: Path, format: str, information: Informatio
         "coordinates": sum(len(o.positions) for o in survey.coordinates),
         "image_points": sum(len(b.uv) for b in survey.image_blocks),
         "distances": len(survey.distances),
+        "cameras": len(survey.cameras),
+        "targets": len(survey.targets),
+        "stations": len(survey.stations),
     }
-    shown = {what: n for what, n in counts.items() if n or what == "points"}
+    shown = {what: n for what, n in counts.items() if n} or {"points": 0}
     return ConvertOutcome(source, target, "project", shown, "as in the file", (*network.notes, *renamed))
 
 
-def _to_file(source: Path, target: Path, format: str, information: Information) -> ConvertOutcome:
+def _to_file(
+    source: Path, target: Path, format: str, information: Information, station: str | None
+) -> ConvertOutcome:
     if target.exists():
         raise SurveyError(f"{target}: is there already; give another name")
     if format == "g2o":
         n_stations, n_pairs, poses, rest = project_to_g2o(source, target, information)
         return ConvertOutcome(source, target, "g2o", {"stations": n_stations, "pairs": n_pairs}, poses, rest)
     project = read(source)
+    if format in camera_formats.WRITERS:
+        values = camera_values(project)
+        counts, notes = camera_formats.write_cameras(values, target, format, station)
+        said = "adjusted" if values.adjusted else "start values, not adjusted"
+        return ConvertOutcome(source, target, format, counts, said, notes)
     require_network(project.survey, str(source), format)
     network = _adjusted(project) if format == "sinex" else _as_it_stands(project)
     rest = left_out(project.survey)
@@ -167,8 +196,8 @@ def _to_file(source: Path, target: Path, format: str, information: Information) 
     text = {"gama": gama_text, "csv": plain_csv, "json": network_json, "sinex": sinex_text}[format](network)
     atomic_write(target, text)
     counts = {"points": len(project.survey.points), "readings": len(project.survey.readings)}
-    values = "adjusted" if network.adjusted else "start values, not adjusted"
-    return ConvertOutcome(source, target, format, counts, values, () if format == "sinex" else rest)
+    said = "adjusted" if network.adjusted else "start values, not adjusted"
+    return ConvertOutcome(source, target, format, counts, said, () if format == "sinex" else rest)
 
 
 def _as_it_stands(project: Project) -> NetworkValues:

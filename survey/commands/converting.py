@@ -6,7 +6,11 @@ from typing import Any
 
 from survey.commands.common import DONE, is_set, print_json, require_project
 
-FORMATS = ("gama", "krumm", "lgc", "csv", "dbat", "aicon", "g2o", "json", "sinex", "project")
+FORMATS = (
+    "gama", "krumm", "lgc", "csv", "dbat", "aicon", "g2o", "json", "sinex", "colmap", "colmap-text", "opencv", "ros",
+    "ros-industrial", "kalibr", "kalibr-target", "mrcal", "mc-calib", "nerf", "urdf", "sdf", "tum", "kitti", "ply",
+    "glb", "project",
+)  # fmt: skip
 
 
 def declare_convert(commands: Any, shaped: dict[str, Any]) -> None:
@@ -18,13 +22,17 @@ def declare_convert(commands: Any, shaped: dict[str, Any]) -> None:
         description="FROM a file: it becomes a project folder. Read are GNU Gama's .gkf, Krumm's .dat, LGC's .lgc, a\n"
         "plain .csv, DBAT's .xml, AICON's .phc .ior .eor .obc .scale (any of them, or the report .htm), and g2o.\n"
         "FROM a project: TO ends with .gkf .csv .json .snx or .g2o, with adjusted values where there are results;\n"
-        ".snx (SINEX) holds the full covariance and adjusts for it. TO must be new.",
+        ".snx (SINEX) holds the full covariance and adjusts for it. TO must be new.\n"
+        "Cameras, both ways: COLMAP's models (folders), OpenCV, ROS, ROS-Industrial, Kalibr, mrcal, MC-Calib,\n"
+        "transforms.json, URDF, SDF, TUM, KITTI; only written: PLY and GLB. Most of them need --format.",
         epilog="Next: labsurvey adjust TO",
         **shaped,
     )
     parser.add_argument("source", type=Path, metavar="FROM", help="file of another program, or project folder")
     parser.add_argument("target", type=Path, metavar="TO", help="new project folder, or new file")
-    parser.add_argument("--format", choices=FORMATS, help="of the file; default: by its ending")
+    parser.add_argument("--format", choices=FORMATS, metavar="NAME",
+                        help=f"of the file; default: by its ending. One of {', '.join(FORMATS)}")
+    parser.add_argument("--station", metavar="ID", help="whose cameras or poses, where the format holds those of one")
     parser.add_argument(
         "--information", choices=("tangent", "quaternion"), default="tangent",
         help="rotation part of g2o's information: of the rotation vector, or of the quaternion as g2o itself means it",
@@ -33,13 +41,14 @@ def declare_convert(commands: Any, shaped: dict[str, Any]) -> None:
 
 
 def _convert(arguments: argparse.Namespace) -> int:
-    if arguments.source.is_dir():
+    if arguments.source.is_dir() and ((arguments.source / "survey.toml").exists() or arguments.format is None):
         require_project(arguments.source)
     from survey.converting import convert_job
 
     outcome = convert_job(
-        arguments.source, arguments.target, format=arguments.format, information=arguments.information
-    )
+        arguments.source, arguments.target, format=arguments.format, information=arguments.information,
+        station=arguments.station,
+    )  # fmt: skip
     if is_set(arguments, "json"):
         print_json(outcome.summary())
     else:

@@ -1,8 +1,8 @@
 """What the files of other network programs have in common: their lines, numbers and what a reader hands back."""
 
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from adjust.errors import SurveyError
 from adjust.model import Survey
 from survey.files.text import decode, read_bytes
+from survey.targets import TargetKind
 
 GON = np.pi / 200.0
 CC = 1e-4 * GON
@@ -27,7 +28,7 @@ class ForeignNetwork:
     sigma0: its a priori standard deviation of unit weight, in its own unit; weights do not depend on it.
     scaled: whether the program multiplies its sigmas by the a posteriori sigma0. alpha: level of its tests, or None.
     reject: whether gross errors may be left out; False keeps what the file's owner decided to use, as its program does.
-    notes: what was left out or changed, for people.
+    notes: what was left out or changed, for people. target_kinds: of targets that are more than a list of points.
     """
 
     survey: Survey
@@ -37,6 +38,7 @@ class ForeignNetwork:
     alpha: float | None = None
     reject: bool = False
     notes: tuple[str, ...] = ()
+    target_kinds: Mapping[str, TargetKind] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
