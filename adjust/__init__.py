@@ -1,1 +1,69 @@
-"""The mathematics of a photogrammetric survey adjustment: values in, values out."""
+"""The mathematics of a photogrammetric survey adjustment: values in, values out.
+
+    adjustment = adjust.solve(survey)     a solved survey with its precision, from start values that are found
+    adjustment.estimates["point", "B3"]   value, covariance, status
+    adjustment.precision.joint([...])     joint covariances
+
+The names in ``__all__`` stay; everything is loaded when it is first used. :func:`adjust.solve` takes a whole survey;
+the submodule of the same name holds one of its steps, the least squares on a graph.
+"""
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from adjust.adjustment import AdjustOptions
+    from adjust.adjustment import adjust as solve
+    from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
+    from adjust.model import Survey
+    from adjust.result import Adjustment, Estimate
+
+_PLACES = {
+    "AdjustOptions": ("adjust.adjustment", "AdjustOptions"),
+    "Adjustment": ("adjust.result", "Adjustment"),
+    "Estimate": ("adjust.result", "Estimate"),
+    "IndeterminateError": ("adjust.errors", "IndeterminateError"),
+    "NotConvergedError": ("adjust.errors", "NotConvergedError"),
+    "Survey": ("adjust.model", "Survey"),
+    "SurveyError": ("adjust.errors", "SurveyError"),
+    "solve": ("adjust.adjustment", "adjust"),
+}
+
+__all__ = [
+    "AdjustOptions",
+    "Adjustment",
+    "Estimate",
+    "IndeterminateError",
+    "NotConvergedError",
+    "Survey",
+    "SurveyError",
+    "solve",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, loaded now."""
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, attribute = _PLACES[name]
+    value = getattr(import_module(module), attribute)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Public names first."""
+    return sorted(__all__)
+
+
+class _Package(ModuleType):
+    """Keeps ``adjust.solve`` the function: importing a submodule would put the module under that name."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _PLACES and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -126,7 +126,7 @@ class GlobalTest:
         return self.lower <= self.omega <= self.upper
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Adjustment:
     """A solved survey with its precision.
 
@@ -158,3 +158,11 @@ class Adjustment:
     reading_residuals: ReadingResiduals | None = None
     variance_components: Any = None
     decisions: tuple[Any, ...] = ()
+
+    def __repr__(self) -> str:
+        """The key figures in one line."""
+        said = "" if self.global_test is None else f", global test {'passed' if self.global_test.passed else 'failed'}"
+        return (
+            f"Adjustment(sigma0 {self.sigma0:.4f}, {self.n_observations} observations, {self.n_unknowns} unknowns, "
+            f"redundancy {self.redundancy}{said})"
+        )

@@ -1,1 +1,76 @@
-"""The jobs around the adjustment: project folders, target detection, reports, the command ``labsurvey``."""
+"""The jobs around the adjustment: project folders, target detection, reports, the command ``labsurvey``.
+
+In Python the five steps of the command line are five calls over values that never change:
+
+    project = survey.read("lab")          what the folder holds
+    problem = survey.problem(project)     what is observed and what is asked for
+    solution = survey.solve(problem)      the adjustment; survey.adjust(project) is both steps
+    solution.precision                    tests, reliability, budget; data frames such as solution.points
+    solution.report("lab")                everything into lab/results
+
+See docs/python.md. The names in ``__all__`` stay; everything is loaded when it is first used, so that importing this
+package costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from adjust.errors import SurveyError
+    from survey.batch.python import Batch, adjust_many
+    from survey.examples import write_example
+    from survey.files import Project, write_project
+    from survey.notebook.covariance import Covariance
+    from survey.notebook.plots import Plot
+    from survey.notebook.solution import Solution
+    from survey.notebook.steps import Problem, adjust, detect, problem, read, solve
+
+_PLACES = {
+    "Batch": "survey.batch.python",
+    "Covariance": "survey.notebook.covariance",
+    "Plot": "survey.notebook.plots",
+    "Problem": "survey.notebook.steps",
+    "Project": "survey.files",
+    "Solution": "survey.notebook.solution",
+    "SurveyError": "adjust.errors",
+    "adjust": "survey.notebook.steps",
+    "adjust_many": "survey.batch.python",
+    "detect": "survey.notebook.steps",
+    "problem": "survey.notebook.steps",
+    "read": "survey.notebook.steps",
+    "solve": "survey.notebook.steps",
+    "write_example": "survey.examples",
+    "write_project": "survey.files",
+}
+
+__all__ = [
+    "Batch",
+    "Covariance",
+    "Plot",
+    "Problem",
+    "Project",
+    "Solution",
+    "SurveyError",
+    "adjust",
+    "adjust_many",
+    "detect",
+    "problem",
+    "read",
+    "solve",
+    "write_example",
+    "write_project",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, loaded now."""
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_PLACES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Public names first."""
+    return sorted(__all__)

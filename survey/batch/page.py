@@ -29,7 +29,7 @@ from survey.report.markup import (
     value_text,
 )
 
-_MOST_CHARTS = 24
+_MOST_CHARTS, _LEAST_CHARTS = 24, 6
 _MOST_MORE = 120
 _MOST_WARNINGS = 3
 
@@ -136,8 +136,9 @@ def _worst_group(record: Record) -> str:
 
 
 def _why(record: Record) -> str:
-    said = [record.summary.get("reason", ""), *record.warnings[:_MOST_WARNINGS]]
-    more = len(record.warnings) - _MOST_WARNINGS
+    warnings = [w for w in record.warnings if not w.startswith("global test failed")]  # which the reason says
+    said = [record.summary.get("reason", ""), *warnings[:_MOST_WARNINGS]]
+    more = len(warnings) - _MOST_WARNINGS
     lines = [esc(message(s)) for s in said if s]
     return "<br>".join(lines + ([t("{n} more warnings in solution.json.", n=count(more))] if more > 0 else []))
 
@@ -148,6 +149,7 @@ def _control(records: Sequence[Record], trends: Trends) -> str:
     alarming = [c for c in trends.charts if trends.is_alarming(c)]
     quality = [c for c in trends.charts if c.series.name == "sigma0" and c not in alarming]
     shown = [*quality, *alarming[:_MOST_CHARTS]]
+    shown += [c for c in trends.charts if c not in shown][: max(0, _LEAST_CHARTS - len(shown))]
     shown_names = {c.series.name for c in shown}
     calm = [c for c in trends.charts if c.series.name not in shown_names]
     note = t(

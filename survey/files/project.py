@@ -157,7 +157,7 @@ class Definition:
     alignment_tasks: tuple[AlignmentTask, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Project(Definition):
     """A definition whose ``survey`` holds the observations too; ``spots`` are image points without identity.
 
@@ -166,3 +166,9 @@ class Project(Definition):
 
     spots: tuple[SpotBlock, ...] = ()
     image_points_where: ImagePointsWhere = ImagePointsWhere()
+
+    def __repr__(self) -> str:
+        """What is in the folder, in a few lines: a notebook prints it."""
+        from survey.notebook.steps import project_text  # the adjustment is not needed to read a folder
+
+        return project_text(self)

@@ -1,0 +1,76 @@
+"""Names of estimated things as people write them: "X", "lens/X", "lens/X/fx", ("world_from_station", "head")."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.errors import SurveyError
+from adjust.result import Estimate, ParameterName
+from survey.files.text import suggestion
+
+Component = tuple[ParameterName, str]
+Estimates = Mapping[ParameterName, Estimate]
+
+
+def components(estimates: Estimates, names: Sequence[str | tuple[str, ...]]) -> tuple[Component, ...]:
+    """Estimated components that the names mean, each once, in their order.
+
+    A name is the id of a thing (all that is estimated of it; where that is only there per epoch, all epochs), a path
+    ``kind/id[/epoch][/component]`` as in ``covariance.npz``, or the same as a tuple. Raises SurveyError for a name that
+    there is not, with the nearest, and for one of which nothing is estimated.
+    """
+    out: dict[Component, None] = {}
+    for name in names:
+        found = [(n, c) for n, wanted in _meant(estimates, name) for c in wanted]
+        if not found:
+            raise SurveyError(f"{_shown(name)}: nothing of it is estimated, it is held; name something that is free")
+        out.update(dict.fromkeys(found))
+    return tuple(out)
+
+
+def _meant(estimates: Estimates, name: str | tuple[str, ...]) -> Iterator[tuple[ParameterName, tuple[str, ...]]]:
+    parts = tuple(name.split("/")) if isinstance(name, str) else tuple(name)
+    if parts in estimates:
+        return iter([(parts, estimated(estimates[parts]))])
+    if parts[:-1] in estimates and parts[-1] in estimates[parts[:-1]].components:
+        whole = parts[:-1]
+        return iter([(whole, tuple(c for c in estimated(estimates[whole]) if c == parts[-1]))])
+    every: list[ParameterName]
+    if len(parts) == 1:
+        once: list[ParameterName] = [
+            n for n in estimates if len(n) == 2 and n[1] == parts[0] and estimated(estimates[n])
+        ]
+        every = once or [n for n in estimates if len(n) > 1 and n[1] == parts[0]]
+    else:
+        every = [n for n in estimates if n[: len(parts)] == parts]
+    if not every:
+        hint = suggestion(_shown(name), _known(estimates))
+        raise SurveyError(f"{_shown(name)}: nothing of that name was adjusted; {hint}")
+    return iter([(n, estimated(estimates[n])) for n in every])
+
+
+def _shown(name: str | tuple[str, ...]) -> str:
+    return name if isinstance(name, str) else "/".join(name)
+
+
+def _known(estimates: Estimates) -> list[str]:
+    return [*dict.fromkeys(n[1] for n in estimates if len(n) > 1), *("/".join(n) for n in estimates)]
+
+
+def estimated(estimate: Estimate) -> tuple[str, ...]:
+    """The components of an estimate that are not held or tied to others."""
+    return tuple(c for c, s in zip(estimate.components, estimate.status, strict=True) if s in ("free", "prior"))
+
+
+def in_joint(estimate: Estimate) -> tuple[str, ...]:
+    """The components that stand in a joint covariance: all of a pose or point, the estimated ones of a vector."""
+    whole = isinstance(estimate.value, Pose3) or estimate.name[0] == "point"
+    return estimate.components if whole else estimated(estimate)
+
+
+def rows_in_joint(estimates: Estimates, wanted: Sequence[Component]) -> tuple[list[ParameterName], list[int]]:
+    """The parameters whose joint covariance holds the wanted components, and their rows in it."""
+    names = list(dict.fromkeys(name for name, _ in wanted))
+    starts = dict(zip(names, np.cumsum([0] + [len(in_joint(estimates[n])) for n in names]).tolist()[:-1], strict=True))
+    return names, [starts[n] + in_joint(estimates[n]).index(c) for n, c in wanted]

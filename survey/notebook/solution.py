@@ -1,0 +1,189 @@
+"""A solved survey as a notebook user wants it: data frames, covariances and plots by name, and its report."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from adjust.errors import SurveyError
+from adjust.result import Adjustment
+from survey.files import Project
+from survey.notebook import frames
+from survey.notebook.covariance import Covariance
+from survey.notebook.html import heading, html_table
+from survey.notebook.names import components, rows_in_joint
+from survey.notebook.plots import Plot
+from survey.notebook.plots import plot as plot_by_name
+from survey.quantities import Scale, scale_of
+from survey.results import ReportOptions, RunInfo, summary_text, write_results
+from survey.solution import solution_dict
+from survey.statistics import Statistics, statistics_of
+
+_VECTOR_KINDS = {"lenses": ("lens",), "tables": ("table_geometry",), "warps": ("warp",),
+                 "instruments": ("instrument",), "surfaces": ("surface",)}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """An adjusted project. Data frames are made new each time they are asked for; nothing in here changes.
+
+    Sigmas are those of the report (a posteriori: times sigma0, where there is redundancy).
+    """
+
+    project: Project
+    adjustment: Adjustment
+    run: RunInfo
+
+    @property
+    def sigma0(self) -> float:
+        """A posteriori standard deviation of unit weight; 1 where residuals are as the sigmas say."""
+        return self.adjustment.sigma0
+
+    @property
+    def redundancy(self) -> int:
+        """Observations more than needed."""
+        return self.adjustment.redundancy
+
+    @property
+    def passed(self) -> bool | None:
+        """Whether the global test is passed; None where nothing is redundant."""
+        return None if self.adjustment.global_test is None else self.adjustment.global_test.passed
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What its owner should know first."""
+        return self.adjustment.warnings
+
+    @cached_property
+    def scale(self) -> Scale:
+        """What covariances are multiplied with."""
+        return scale_of(self.adjustment, self.run.sigmas)
+
+    @cached_property
+    def precision(self) -> Statistics:
+        """The fourth step: tests, reliability, weak directions, relative precision, budget, tolerances."""
+        return statistics_of(self.adjustment, self.project.options.tolerances, self.scale)
+
+    @cached_property
+    def as_dict(self) -> Mapping[str, Any]:
+        """All that ``solution.json`` holds."""
+        return solution_dict(self.adjustment, self.run, self.precision)
+
+    @property
+    def points(self) -> Any:
+        """Data frame: coordinates, sigmas, 95 % ellipsoids of points (mm)."""
+        return frames.points(self.adjustment, self.scale)
+
+    @property
+    def stations(self) -> Any:
+        """Data frame: poses of stations in the world or on their mount, by epoch where they move."""
+        return frames.poses(self.adjustment, self.scale, ("world_from_station", "mount_from_station"))
+
+    @property
+    def poses(self) -> Any:
+        """Data frame: all poses."""
+        return frames.poses(self.adjustment, self.scale)
+
+    @property
+    def cameras(self) -> Any:
+        """Data frame: images, points, RMS residual (px) and pose of each camera."""
+        return frames.cameras(self.adjustment, self.scale)
+
+    @property
+    def lenses(self) -> Any:
+        """Data frame: parameters of lenses by (camera, parameter)."""
+        return self._vectors("lenses")
+
+    @property
+    def tables(self) -> Any:
+        """Data frame: geometry of turntables by (table, parameter)."""
+        return self._vectors("tables")
+
+    @property
+    def unknowns(self) -> Any:
+        """Data frame: every component of every estimate in SI units."""
+        return frames.unknowns(self.adjustment, self.scale)
+
+    @property
+    def image_residuals(self) -> Any:
+        """Data frame: one row per image point."""
+        return frames.image_residuals(self.adjustment)
+
+    @property
+    def readings(self) -> Any:
+        """Data frame: one row per component of every observation that is no image point."""
+        return frames.readings(self.adjustment)
+
+    @property
+    def groups(self) -> Any:
+        """Data frame: redundancy and variance factor of the groups of observations."""
+        return frames.groups(self.adjustment)
+
+    @property
+    def reliability(self) -> Any:
+        """Data frame: tests, redundancy, least detectable bias of every observation."""
+        return frames.reliability(self.adjustment, self.precision)
+
+    @property
+    def relative_precision(self) -> Any:
+        """Data frame: of neighbouring points and stations (mm)."""
+        return frames.relative(self.precision)
+
+    @property
+    def budget(self) -> Any:
+        """Data frame: uncertainty budget of the results."""
+        return frames.budget(self.precision)
+
+    def _vectors(self, what: str) -> Any:
+        return frames.vectors(self.adjustment, self.scale, _VECTOR_KINDS[what])
+
+    def covariance(
+        self, *names: str | tuple[str, ...], sigmas: Literal["a_priori", "a_posteriori"] | None = None
+    ) -> Covariance:
+        """Joint covariance of what the names mean: ids ("head", "X"), paths ("lens/X/fx") or tuples of them.
+
+        sigmas: as in the report where None. Raises SurveyError for a name that there is not or that is held.
+        """
+        estimates = self.adjustment.estimates
+        wanted = components(estimates, names)
+        if not wanted:
+            raise SurveyError("the covariance of what? name things, such as covariance('B3') or covariance('lens/X')")
+        scale = self.scale if sigmas is None else scale_of(self.adjustment, sigmas)
+        parameters, rows = rows_in_joint(estimates, wanted)
+        joint = np.asarray(self.adjustment.precision.joint(parameters))
+        units = tuple(dict(zip(estimates[n].components, estimates[n].units, strict=True))[c] for n, c in wanted)
+        matrix = scale.factor**2 * joint[np.ix_(rows, rows)]
+        return Covariance(wanted, units, matrix, scale.sigmas == "a_posteriori")
+
+    def plot(self, name: str, **chosen: str) -> Plot:
+        """A picture by name. Raises SurveyError for one that there is not.
+
+        ``residuals``, ``mean_residuals``, ``histogram`` of a ``camera=``, ``map``, ``perspective``, ``correlations``,
+        ``quantiles`` of a ``group=`` of observations.
+        """
+        return plot_by_name(name, self.adjustment, self.scale, **chosen)
+
+    def report(self, folder: str | Path, *, language: str = "en", pdf: bool = False) -> dict[str, Path]:
+        """The last step: write everything into ``folder/results``; the paths by file name. Raises SurveyError."""
+        return write_results(
+            Path(folder), self.adjustment, self.run, self.precision, ReportOptions(language, pdf)
+        )
+
+    def __repr__(self) -> str:
+        """The summary that the command line prints."""
+        return summary_text(self.adjustment, self.run, solution_dict(self.adjustment, self.run))
+
+    def _repr_html_(self) -> str:
+        a, test = self.adjustment, self.adjustment.global_test
+        said = "nothing redundant" if test is None else "global test passed" if test.passed else "global test failed"
+        colour = "#7b858f" if test is None else "#2f7d4f" if test.passed else "#b3261e"
+        rows = [("sigma0", f"{a.sigma0:.4f}"), ("observations", f"{a.n_observations}"), ("unknowns", f"{a.n_unknowns}"),
+                ("redundancy", f"{a.redundancy}"), ("iterations", f"{a.iterations}")]  # fmt: skip
+        rows += [(f"group {g.group}", f"{g.n_observations} observations, × {np.sqrt(max(g.factor, 0.0)):.3f}")
+                 for g in a.groups]  # fmt: skip
+        warned = html_table(("warnings",), [(w,) for w in self.warnings[:10]]) if self.warnings else ""
+        title = heading(f"Solution {self.run.title or self.run.folder}")
+        return f'{title}<div style="color:{colour}"><b>{said}</b></div>{html_table(("", ""), rows)}{warned}'

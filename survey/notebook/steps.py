@@ -1,0 +1,125 @@
+"""The five steps over frozen values: read -> problem -> solve -> precision -> report. Each step returns a new value."""
+
+from collections import Counter
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from adjust.errors import SurveyError
+from adjust.model import Survey
+from survey.files import AdjustmentOptions, Project
+from survey.files import read as read_project
+from survey.files.text import suggestion
+from survey.jobs import DetectOutcome, adjust_project, detect_job, run_info
+from survey.notebook.html import heading, html_table
+from survey.notebook.solution import Solution
+
+_SEVERAL = {"table_readings": "table readings", "reading_covariances": "covariances of readings",
+            "coordinate_differences": "coordinate differences", "laser_spots": "laser spots",
+            "on_surfaces": "points on surfaces"}  # fmt: skip
+_OBSERVED = ("table_readings", "pairs", "distances", "coordinates", "readings", "coordinate_differences", "levels",
+             "alignments", "laser_spots", "on_surfaces")  # fmt: skip
+_OWNERS = ("cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces")
+
+
+def read(folder: str | Path) -> Project:
+    """Read a project folder; nothing is computed and nothing written. Raises SurveyError."""
+    return read_project(Path(folder))
+
+
+def detect(folder: str | Path, *, progress: bool = False, jobs: int | None = None) -> DetectOutcome:
+    """Find targets and spots in the images of a folder and write their tables there. Raises SurveyError."""
+    return detect_job(Path(folder), jobs=jobs, progress=progress)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is to be adjusted: a project and how. It shows what is observed and what is asked for."""
+
+    project: Project
+
+    @property
+    def survey(self) -> Survey:
+        """Cameras, stations, points and all observations, as :func:`adjust.solve` takes them."""
+        return self.project.survey
+
+    @property
+    def options(self) -> AdjustmentOptions:
+        """How it will be adjusted."""
+        return self.project.options
+
+    def with_options(self, **changed: Any) -> "Problem":
+        """The same problem with other options, such as ``reject_points=False``; raises SurveyError for unknown ones."""
+        known = [f.name for f in fields(AdjustmentOptions)]
+        for name in changed:
+            if name not in known:
+                raise SurveyError(f"there is no option {name!r}; {suggestion(name, known)}")
+        return Problem(replace(self.project, options=replace(self.options, **changed)))
+
+    @property
+    def observed(self) -> dict[str, int]:
+        """How many observations of each kind there are."""
+        s = self.survey
+        found = {"image points": sum(len(b.uv) for b in s.image_blocks), "images": len(
+            {(b.camera_id, b.epoch_id) for b in s.image_blocks})}  # fmt: skip
+        found |= {_SEVERAL.get(name, name): len(getattr(s, name)) for name in _OBSERVED}
+        found["spots to identify"] = sum(len(b.uv) for b in self.project.spots)
+        return {name: n for name, n in found.items() if n}
+
+    @property
+    def owners(self) -> dict[str, int]:
+        """How many cameras, stations, points ... there are."""
+        return {name: len(getattr(self.survey, name)) for name in _OWNERS if getattr(self.survey, name)}
+
+    def solve(self, *, progress: bool = False) -> Solution:
+        """The next step; see :func:`solve`."""
+        return solve(self, progress=progress)
+
+    def _lines(self) -> list[tuple[str, str]]:
+        return [("observed", _counted(self.observed)), ("of", _counted(self.owners)),
+                ("datum", self.survey.datum.kind)]  # fmt: skip
+
+    def __repr__(self) -> str:
+        """Counts for people."""
+        return "\n".join([f"Problem {self.project.title or self.project.folder.name}",
+                          *(f"  {name:<9} {said}" for name, said in self._lines())])  # fmt: skip
+
+    def _repr_html_(self) -> str:
+        return heading("Problem", self.project.title or self.project.folder.name) + html_table(
+            ("", ""), [(name, (said, "text-align:left")) for name, said in self._lines()]
+        )
+
+
+def _counted(found: dict[str, int]) -> str:
+    return ", ".join(f"{n} {name if n != 1 else name.removesuffix('s')}" for name, n in found.items()) or "nothing"
+
+
+def problem(project: Project | str | Path) -> Problem:
+    """What is to be adjusted, of a project or its folder. Raises SurveyError where targets are not detected yet."""
+    project = project if isinstance(project, Project) else read(project)
+    made = Problem(project)
+    if not made.observed:
+        what = f"survey.detect({str(project.folder)!r})" if project.images else "tables in observations/"
+        raise SurveyError(f"{project.folder}: nothing is observed yet; first {what}")
+    return made
+
+
+def solve(problem: Problem, *, progress: bool = False) -> Solution:
+    """Adjust: start values, least squares, gross errors left out as the options say. Raises SurveyError."""
+    adjustment = adjust_project(problem.project, progress)
+    return Solution(problem.project, adjustment, run_info(problem.project, {}))
+
+
+def adjust(project: Project | Problem | str | Path, *, progress: bool = False) -> Solution:
+    """Problem and solution in one step, of a project or its folder; nothing is written. Raises SurveyError."""
+    return solve(project if isinstance(project, Problem) else problem(project), progress=progress)
+
+
+def project_text(project: Project) -> str:
+    """A project as its owner knows it; used where it is printed."""
+    kinds = Counter(type(k).__name__ for k in project.target_kinds.values())
+    targets = f", targets {', '.join(f'{n} {kind}' for kind, n in kinds.items())}" if kinds else ""
+    images = f", {len(project.images)} images" if project.images else ""
+    return f"Project {project.title or project.folder.name!r} in {project.folder}{images}{targets}\n" + "\n".join(
+        f"  {name:<9} {said}" for name, said in Problem(project)._lines()
+    )
