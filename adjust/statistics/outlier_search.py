@@ -19,8 +19,9 @@ from adjust.pair_screen import values_of
 from adjust.result import Adjustment
 from adjust.statistics.candidates import Candidates, candidates, without
 from adjust.statistics.criteria import criteria, sidak
+from adjust.statistics.exchange import better_set, equal_sets
 from adjust.statistics.reliability import observation_name
-from adjust.statistics.result import Decision, LevelOptions
+from adjust.statistics.result import Alternative, Decision, LevelOptions
 from adjust.statistics.snooping import Snooping, robust_squares, typical_factors
 from adjust.statistics.system import LinearSystem, linear_system
 
@@ -53,7 +54,8 @@ class OutlierSearch:
 
     rejected: what is out in the end, worst first. log: every decision in order, also those taken back. suspects: what
     fails its test but cannot be left out, because something would be undetermined without it, or because it is a prior
-    or of a kind that is kept. converged: whether the last round changed nothing.
+    or of a kind that is kept. converged: whether the last round changed nothing. alternatives: where other observations
+    could be the wrong ones.
     """
 
     adjustment: Adjustment
@@ -63,11 +65,12 @@ class OutlierSearch:
     suspects: tuple[Decision, ...]
     rounds: int
     converged: bool
+    alternatives: tuple[Alternative, ...] = ()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """For people, worst first."""
-        notes = tuple(d.text() for d in self.rejected)
+        notes = tuple(d.text() for d in self.rejected) + tuple(a.text() for a in self.alternatives)
         return notes + tuple(
             f"fails its test, but cannot be left out: {d.text().split(': ', 1)[1]}" for d in self.suspects
         )
@@ -105,7 +108,7 @@ def search_outliers(
             now = adjust(without(survey, found, out), values_of(now), options.adjust, progress)
     rejected = _decisions("rejected", out, snooping, now, rounds, "test")
     return OutlierSearch(now, now.survey, tuple(sorted(rejected, key=lambda d: -d.statistic / d.limit)), tuple(log),
-                         _suspects(snooping, now, rounds), rounds, converged)  # fmt: skip
+                         _suspects(snooping, now, rounds), rounds, converged, _alternatives(snooping, now))  # fmt: skip
 
 
 def replace_used(system: LinearSystem, used: BoolArray) -> LinearSystem:
@@ -133,7 +136,33 @@ def _searched(
     if options.typical and begin:
         snooping.factors = typical_factors(snooping, G)
     _settle(snooping, log, now, round_)
+    for _ in range(2 * len(snooping.sizes) + 2):
+        if not _exchanged(snooping, log, now, round_):
+            break
+        _settle(snooping, log, now, round_)
     return snooping
+
+
+def _exchanged(snooping: Snooping, log: list[Decision], now: Adjustment, round_: int) -> bool:
+    """Put good observations back in place of bad ones; whether there were any."""
+    found = better_set(snooping)
+    if found is None:
+        return False
+    log += _decisions("readmitted", found.kept, snooping, now, round_, "exchange")
+    snooping.take_back(found.kept)
+    for o in found.instead:
+        log.append(_decision("rejected", o, snooping, now, round_, "exchange"))
+        snooping.leave_out(o)
+    return True
+
+
+def _alternatives(snooping: Snooping, now: Adjustment) -> tuple[Alternative, ...]:
+    def names(observations: Iterable[int]) -> tuple[tuple[str, ...], ...]:
+        return tuple((kind, *ids) for kind, ids in (observation_name(now, o) for o in observations))
+
+    return tuple(
+        Alternative(names(x.kept), names(x.instead), float(np.exp(0.5 * x.more))) for x in equal_sets(snooping)
+    )
 
 
 def _allowed(system: LinearSystem, found: Candidates, now: Adjustment, options: SearchOptions) -> BoolArray:

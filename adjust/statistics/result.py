@@ -180,7 +180,7 @@ class Decision:
 
     kind, ids: as ``ObservationResidual``; of image points kind "image", ids (camera, epoch, target or "points",
     point). statistic, freedom, p, limit: the test that decided. error: estimated gross error in sigmas of the
-    observation. round: of the non-linear solutions, counted from 1. how: "test", "robust".
+    observation. round: of the non-linear solutions, counted from 1. how: "test", "robust", "exchange".
     """
 
     action: Literal["rejected", "readmitted"]
@@ -201,6 +201,26 @@ class Decision:
         return (
             f"{did}: {self.kind} {' '.join(self.ids)}: off by {self.error:.1f} sigma, test {self.statistic:.1f} "
             f"(limit {self.limit:.1f}), p {self.p:.2g}"
+        )
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Two explanations that the data hardly tell apart: with ``instead`` out, ``kept`` would fit.
+
+    Both hold (kind, *ids) of observations. odds: how many times likelier the explanation is that was chosen.
+    """
+
+    kept: tuple[tuple[str, ...], ...]
+    instead: tuple[tuple[str, ...], ...]
+    odds: float
+
+    def text(self) -> str:
+        """For people."""
+        chosen, other = (" and ".join(" ".join(x) for x in part) for part in (self.kept, self.instead))
+        return (
+            f"either {chosen} (left out) or {other} (kept): the first is {self.odds:.1f} times as likely; "
+            "measure both again"
         )
 
 

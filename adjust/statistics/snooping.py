@@ -126,6 +126,10 @@ class Snooping:
         F = (T / q) / (rest / left)
         return np.asarray(np.where(freedom > 0, F / fisher.isf(self.level, q, left), 0.0))
 
+    def excess_outside(self, T: FloatArray, freedom: IntArray, rows: IntArray) -> FloatArray:
+        """Tests (k,) of observations that are out over their limits, above 1 where they fail."""
+        return self._excess(T, freedom, rows, inside=False)
+
     def failing(self) -> tuple[FloatArray, BoolArray]:
         """Excess (M,) of all observations in use, and which of them (M,) can be left out."""
         T, freedom, whole = self.statistics()
@@ -165,7 +169,7 @@ class Snooping:
         """Give the observation a bias of its own."""
         s = self.system
         rows = np.arange(int(s.ptr[observation]), int(s.ptr[observation + 1]))
-        column = self._column(rows)
+        column = self.start_column(rows)
         for before in self.out:
             U = self.columns[before][0]
             column -= U @ U[rows].T
@@ -186,7 +190,7 @@ class Snooping:
         for o in kept:
             self.leave_out(o)
 
-    def _column(self, rows: IntArray) -> FloatArray:
+    def start_column(self, rows: IntArray) -> FloatArray:
         """Columns (m, k) of R at the start."""
         s = self.system
         right = self.A[rows].T.toarray()
@@ -232,7 +236,7 @@ class Snooping:
             return []
         rows = np.array(list(found))
         T = np.array([found[int(r)][0] for r in rows])
-        excess = self._excess(T, self.sizes[rows], rows, inside=False)
+        excess = self.excess_outside(T, self.sizes[rows], rows)
         return [int(r) for r, x in zip(rows, excess, strict=True) if x <= 1.0]
 
 

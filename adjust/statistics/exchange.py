@@ -1,0 +1,225 @@
+"""The smallest set of gross errors that explains the data: good observations that went out for bad ones come back.
+
+Which set S is out is judged by ``J(S) = omega(S) + sum of the limits of the tests of S``. One more out lowers omega by
+its statistic T, so J is smaller if and only if its test fails: no single step improves what data snooping leaves.
+Several errors near each other can still have changed places with good observations. Hence for every rejected one all
+sets among those that share its residuals are compared, with ``omega(S) = omega(0) - g_S' inv(R_SS) g_S`` (Kok 1984;
+Knight, Wang and Rizos 2010 for sets of errors). ``exp(-J/2)`` is the likelihood of an explanation, penalised by its
+size: two of nearly the same J cannot be told apart.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+
+import numpy as np
+
+from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.statistics.single_tests import CONTROLLED
+from adjust.statistics.snooping import Snooping
+
+_POOL = 12
+"""Observations among which all sets are compared: 4095 sets."""
+_MINE = (4, 7)
+"""Of them, most that are out now: few with many others, then many with few."""
+_LINKED = 0.15
+"""Correlation of two tests from which an error of one shows in the other."""
+_EVEN = 2.0 * float(np.log(20.0))
+"""Difference of J up to which an explanation is less than 20 times as likely as another one."""
+_MOST = 600
+"""Rejected components beyond which sets are not compared any more: the survey itself is wrong then."""
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """Another explanation: ``instead`` out and ``kept`` back in use; more: by how much its J is larger."""
+
+    kept: tuple[int, ...]
+    instead: tuple[int, ...]
+    more: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Near:
+    """Pool (p,) of observations, those of them that are out, and g (r,), R (r, r) of their rows with all of them in."""
+
+    pool: list[int]
+    mine: frozenset[int]
+    g: FloatArray
+    R: FloatArray
+    at: list[IntArray]
+
+
+def better_set(snooping: Snooping) -> Exchange | None:
+    """The exchange that lowers J most at the first rejected observation that has one."""
+    state = _state(snooping)
+    if state is None:
+        return None
+    for o in snooping.out:
+        found = [x for x in _exchanges(state, o) if x.more < -1e-6]
+        if found:
+            return min(found, key=lambda x: x.more)
+    return None
+
+
+def equal_sets(snooping: Snooping) -> list[Exchange]:
+    """Other explanations that the data hardly tell from what is out now, the likeliest first; none in another."""
+    state = _state(snooping)
+    if state is None:
+        return []
+    found: dict[tuple[frozenset[int], frozenset[int]], Exchange] = {}
+    for o in snooping.out:
+        for x in _exchanges(state, o):
+            if x.kept and x.instead and -1e-6 <= x.more < _EVEN:
+                found[frozenset(x.kept), frozenset(x.instead)] = x
+    smallest = [
+        x for (kept, instead), x in found.items()
+        if not any((k, i) != (kept, instead) and k <= kept and i <= instead for k, i in found)
+    ]  # fmt: skip
+    return sorted(smallest, key=lambda x: x.more)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """A search with r rejected components. K: (r, r) covariance of their errors, bias: (r,) these themselves.
+
+    rows: of every rejected observation among the r. U: (m, r) its columns; B: (m, r) what an error of each puts into
+    the residuals of all observations. possible: (M,) may go out. link: (M, r) correlation of tests, 0 where it may not.
+    """
+
+    snooping: Snooping
+    rows: dict[int, IntArray]
+    K: FloatArray
+    bias: FloatArray
+    U: FloatArray
+    B: FloatArray
+    possible: BoolArray
+    link: FloatArray
+
+
+def _state(snooping: Snooping) -> _State | None:
+    out, ptr = snooping.out, snooping.system.ptr
+    index = [np.arange(int(ptr[x]), int(ptr[x + 1])) for x in out]
+    ends = np.cumsum([0] + [len(r) for r in index])
+    if not out or ends[-1] > _MOST:
+        return None
+    U = np.hstack([snooping.columns[x][0] for x in out])
+    inverse = np.linalg.inv(U[np.concatenate(index)])  # of the Cholesky factor of their own R
+    K, B, possible = inverse.T @ inverse, U @ inverse, snooping.failing()[1]
+    bias = inverse.T @ np.concatenate([snooping.columns[x][1] for x in out])
+    link = np.zeros((len(possible), len(K)))
+    for members, at, R in _by_size(snooping, possible):
+        shared = B[at] ** 2 / np.diag(K)  # (n, k, r), what R grows by when one of them is back in
+        link[members] = np.sqrt(shared / (np.einsum("nii->ni", R)[..., None] + shared)).max(axis=1)
+    return _State(snooping, {x: np.arange(*ends[i : i + 2]) for i, x in enumerate(out)}, K, bias, U, B, possible, link)
+
+
+def _by_size(snooping: Snooping, wanted: BoolArray) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:
+    """Observations (n,), their rows (n, k) and R (n, k, k), of each size k."""
+    for k, R in zip(np.unique(snooping.sizes), snooping.R, strict=True):
+        members = np.flatnonzero(snooping.sizes == k)
+        mine = wanted[members]
+        yield members[mine], snooping.system.ptr[members[mine]][:, None] + np.arange(k), R[mine]
+
+
+def limits_of(snooping: Snooping, observations: Sequence[int]) -> FloatArray:
+    """What a statistic may be (k,) in the tests as they stand."""
+    rows = np.array(observations, dtype=np.int64)
+    T = np.ones(len(rows))
+    return np.asarray(T / snooping.excess_outside(T, snooping.sizes[rows], rows))
+
+
+def _exchanges(state: _State, o: int) -> list[Exchange]:
+    """All sets near a rejected observation, as exchanges with what is out now."""
+    pools = {frozenset(n.pool): n for most in _MINE if (n := _near(state, o, most)) is not None}
+    return [x for near in pools.values() for x in _exchanges_among(state, near)]
+
+
+def _exchanges_among(state: _State, near: _Near) -> list[Exchange]:
+    limits = limits_of(state.snooping, near.pool)
+    here = tuple(i for i, x in enumerate(near.pool) if x in near.mine)
+    J = {s: v for size in range(len(near.pool) + 1) for s, v in _criteria(near, limits, size)}
+    if here not in J:
+        return []
+    out = []
+    for s, value in J.items():
+        if s != here and value < J[here] + _EVEN:
+            kept = tuple(near.pool[i] for i in here if i not in s)
+            out.append(Exchange(kept, tuple(near.pool[i] for i in s if i not in here), value - J[here]))
+    return out
+
+
+def _criteria(near: _Near, limits: FloatArray, size: int) -> list[tuple[tuple[int, ...], float]]:
+    """J, less omega with all in use, of every set of this size that leaves nothing open."""
+    if size == 0:
+        return [((), 0.0)]
+    sets = list(combinations(range(len(near.pool)), size))
+    by_length: dict[int, list[tuple[int, ...]]] = {}
+    for s in sets:
+        by_length.setdefault(sum(len(near.at[i]) for i in s), []).append(s)
+    out = []
+    for alike in by_length.values():
+        rows = np.array([np.concatenate([near.at[i] for i in s]) for s in alike])
+        R, g = near.R[rows[:, :, None], rows[:, None, :]], near.g[rows]
+        values, vectors = np.linalg.eigh(R)
+        along = np.einsum("nij,ni->nj", vectors, g)
+        fine = values[:, 0] > CONTROLLED
+        share = np.sum(along**2 / np.where(fine[:, None], values, 1.0), axis=1)
+        cost = limits[np.array(alike)].sum(axis=1)
+        out += [(s, float(c - x)) for s, c, x, ok in zip(alike, cost, share, fine, strict=True) if ok]
+    return out
+
+
+def _near(state: _State, o: int, most: int) -> _Near | None:
+    """Whom an observation that is out could have changed places with; None where there is nobody."""
+    links = _rejected_near(state, o)
+    mine = sorted(links, key=lambda x: -links[x])[:most]
+    N = np.concatenate([state.rows[x] for x in mine])
+    of_N = np.linalg.inv(state.K[np.ix_(N, N)])  # their own R with the others out
+    closeness = np.concatenate([np.full(len(state.rows[x]), links[x]) for x in mine])
+    free = _suspects(state, mine, N, of_N, (state.link[:, N] * closeness).max(axis=1))
+    if not free and len(mine) == 1:
+        return None
+    return _joined(state, mine, free, N, of_N)
+
+
+def _rejected_near(state: _State, o: int) -> dict[int, float]:
+    """How close what is out is to this one: its error is correlated with this one's, or shows where this one's does."""
+    own = state.rows[o]
+    scale = np.sqrt(np.diag(state.K))
+    between = np.abs(state.K[own] / np.outer(scale[own], scale)).max(axis=0)
+    to_own = state.link[:, own].max(axis=1)
+    shown = state.link[to_own > _LINKED]
+    through = (to_own[to_own > _LINKED, None] * shown).max(axis=0, initial=0.0)
+    links = {x: float(np.maximum(between, through)[at].max()) for x, at in state.rows.items()}
+    return {o: 1.0} | {x: link for x, link in links.items() if link > _LINKED**2 and x != o}
+
+
+def _suspects(state: _State, mine: list[int], N: IntArray, of_N: FloatArray, link: FloatArray) -> list[int]:
+    """In use and linked to one of those: half with the largest tests once all of these are in, half the closest."""
+    T = np.zeros(len(link))
+    B, g = state.B[:, N], state.snooping.g + state.B[:, N] @ (of_N @ state.bias[N])
+    back = B @ np.linalg.cholesky(of_N)  # R grows by back back'
+    for members, at, R in _by_size(state.snooping, state.possible & (link > _LINKED)):
+        grown = R + np.einsum("nia,nja->nij", back[at], back[at])
+        T[members] = np.einsum("ni,ni->n", g[at], np.linalg.solve(grown, g[at][..., None])[..., 0])
+    room = _POOL - len(mine)
+    free = np.flatnonzero(link > _LINKED)
+    by_test = free[np.argsort(-T[free], kind="stable")][: (room + 1) // 2]
+    by_link = free[np.argsort(-link[free], kind="stable")]
+    return list(dict.fromkeys([*by_test.tolist(), *by_link.tolist()]))[:room]
+
+
+def _joined(state: _State, mine: list[int], free: list[int], N: IntArray, of_N: FloatArray) -> _Near:
+    """G and R of all of them, with those that are out taken back."""
+    snooping, ptr = state.snooping, state.snooping.system.ptr
+    rows = [np.arange(int(ptr[x]), int(ptr[x + 1])) for x in free]
+    F = np.concatenate([np.zeros(0, dtype=np.int64), *rows])
+    cross = state.B[np.ix_(F, N)] @ of_N
+    R_F = np.hstack([np.zeros((len(F), 0)), *(snooping.start_column(r)[F] for r in rows)])
+    R_F = R_F - state.U[F] @ state.U[F].T + cross @ state.B[np.ix_(F, N)].T
+    R = np.block([[of_N, cross.T], [cross, 0.5 * (R_F + R_F.T)]])
+    g = np.concatenate([of_N @ state.bias[N], snooping.g[F] + cross @ state.bias[N]])
+    pool = [*mine, *free]
+    ends = np.cumsum([0] + [int(snooping.sizes[x]) for x in pool])
+    return _Near(pool, frozenset(mine), g, R, [np.arange(a, b) for a, b in pairwise(ends)])
