@@ -32,7 +32,9 @@ from tests.data import data_folder
 from tests.docs_pages import ROOT, Block, Page, pages, slug
 
 PAGES = pages()
-RUN = [p for p in PAGES if p.run is not None]
+RUN = [p for p in PAGES if p.run == "scratch"]
+ON_LAB = [p for p in PAGES if p.run == "lab"]
+LAB = os.environ.get("LABSURVEY_DOCS_LAB")
 COMMANDS = {"labsurvey": (labsurvey, survey_parser), "labcapture": (labcapture, capture_parser)}
 SHELLS = ("sh", "")
 # pages whose blocks are carried out by tests of their own
@@ -52,21 +54,22 @@ def named(page: Page) -> str:
 @pytest.mark.parametrize("page", RUN, ids=named)
 def test_a_page_runs_from_top_to_bottom(page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    if page.run == "lab":
-        _copied_lab(tmp_path)
-    ports = _free_ports(page)
-    with Runner(ports) as runner:
+    _run(page)
+
+
+@pytest.mark.skipif(not LAB, reason="LABSURVEY_DOCS_LAB names no adjusted example full-lab")
+@pytest.mark.parametrize("page", ON_LAB, ids=named)
+def test_a_page_on_the_example_runs(page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(Path(str(LAB)).resolve(), tmp_path / "lab")
+    monkeypatch.chdir(tmp_path)
+    _run(page)
+
+
+def _run(page: Page) -> None:
+    with Runner(_free_ports(page)) as runner:
         for block in page.blocks:
             runner.take(block, page)
     assert runner.n_commands > 0
-
-
-def _copied_lab(place: Path) -> None:
-    """The example, adjusted already, without what its pages are to make anew."""
-    lab = os.environ.get("LABSURVEY_DOCS_LAB")
-    if not lab:
-        pytest.skip("LABSURVEY_DOCS_LAB names no adjusted example full-lab")
-    shutil.copytree(lab, place / "lab")
 
 
 def _free_ports(page: Page) -> dict[str, str]:
@@ -286,6 +289,17 @@ def _commands_of(parser: argparse.ArgumentParser) -> Iterator[str]:
     for action in parser._actions:  # noqa: SLF001 - argparse has no other way to its subcommands
         if isinstance(action, argparse._SubParsersAction):  # noqa: SLF001
             yield from action.choices
+
+
+def test_numbers_of_readme_stand_in_the_pages_it_links() -> None:
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    checked = 0
+    for line in (x for x in lines if x.startswith("- ") and "](docs/" in x):
+        text = "".join((ROOT / link).read_text(encoding="utf-8") for link in re.findall(r"\]\((docs/[\w/-]+\.md)\)", line))
+        for number in re.findall(r"\*\*([\d.,]*\d)[^*]*\*\*", line):
+            assert number in text, f"README.md says {number}, the pages it names do not"
+            checked += 1
+    assert checked >= 5
 
 
 @pytest.mark.parametrize("name", COMMANDS)
