@@ -43,7 +43,8 @@ class PoseFit:
     """A pose (4, 4) from spots ``used`` (n,) of beacons ``beacon`` (n,) and perhaps a prior.
 
     G: (6, 2n) and G_prior (6, k): how noise of spots and prior moves the pose. B: (6, r). cov: (6, 6).
-    chi_square: v' inv(Sigma) v. log_det: ln det Sigma. residual, Sigma, H: of spots, then prior rows.
+    chi_square: v' inv(Sigma) v. log_det: ln det Sigma. log_det_cov: ln det cov.
+    residual, Sigma, H: of spots, then prior rows.
     in_front: all beacons lie in front of their cameras.
     """
 
@@ -57,6 +58,7 @@ class PoseFit:
     chi_square: float
     redundancy: int
     log_det: float
+    log_det_cov: float
     residual: FloatArray
     Sigma: FloatArray
     H: FloatArray
@@ -100,7 +102,7 @@ def fit_pose(
         R[n:, n:] = prior.cov[np.ix_(prior.rows, prior.rows)]
     pose, C, gain = np.empty((4, 4)), np.empty((6, 6)), np.empty((6, n + k))
     residual, H, M = np.empty(n + k), np.empty((n + k, 6)), np.empty((n + k, r))
-    state, in_front, chi_square, log_det = gauss_newton(
+    state, in_front, chi_square, log_det, log_det_cov = gauss_newton(
         system.arrays, np.ascontiguousarray(start), seen.camera[used], beacon, seen.uv[used], R,
         np.ascontiguousarray(prior_pose), prior_B, prior_rows, pose, residual, H, M, C, gain,
     )  # fmt: skip
@@ -108,15 +110,14 @@ def fit_pose(
         return None
     return PoseFit(
         pose, used, beacon, C, gain[:, :n], gain[:, n:], gain @ M, float(chi_square), n + k - 6, float(log_det),
-        residual, R + M @ M.T, H, M, bool(in_front),
+        float(log_det_cov), residual, R + M @ M.T, H, M, bool(in_front),
     )  # fmt: skip
 
 
 def log_evidence(fit: PoseFit) -> float:
     """-2 ln of the integral of the likelihood over the pose (Laplace's approximation), flat where nothing is known."""
     n = len(fit.residual)
-    log_cov = float(np.linalg.slogdet(fit.cov)[1])
-    return fit.chi_square + fit.log_det + n * _LOG_2PI - (log_cov + 6.0 * _LOG_2PI)
+    return fit.chi_square + fit.log_det + n * _LOG_2PI - (fit.log_det_cov + 6.0 * _LOG_2PI)
 
 
 def spot_tests(fit: PoseFit) -> FloatArray:

@@ -130,11 +130,11 @@ def gauss_newton(
     system: SystemArrays, start: FloatArray, camera: IntArray, beacon: IntArray, uv: FloatArray, R: FloatArray,
     prior_pose: FloatArray, prior_B: FloatArray, prior_rows: IntArray, pose: FloatArray, residual: FloatArray,
     H: FloatArray, M: FloatArray, C: FloatArray, gain: FloatArray,
-) -> tuple[int, bool, float, float]:  # fmt: skip
+) -> tuple[int, bool, float, float, float]:  # fmt: skip
     """Fill pose (4, 4), residual (n,), H (n, 6), M (n, r), covariance C (6, 6) and gain (6, n) at the solution.
 
     R (n, n): covariance of spots and prior without the errors common to all epochs. Returns DONE, OPEN (a direction is)
-    or UNSETTLED, whether all beacons are in front, v' inv(Sigma) v and ln det Sigma.
+    or UNSETTLED, whether all beacons are in front, v' inv(Sigma) v, ln det Sigma and ln det C.
     """
     n, r = M.shape
     L, step = np.empty((n, n)), np.empty(6)
@@ -144,7 +144,7 @@ def gauss_newton(
     converged = False
     for _ in range(MAX_ITERATIONS):
         if not _solved(R, residual, H, M, L, C, step):
-            return OPEN, in_front, 0.0, 0.0
+            return OPEN, in_front, 0.0, 0.0, 0.0
         size = np.sqrt(_squares(L, H @ step))
         step *= min(1.0, 0.5 / max(np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2), 0.5))
         before, moved = _squares(L, residual), False
@@ -161,14 +161,18 @@ def gauss_newton(
             converged = size < 1e-2
             break
     if not converged:
-        return UNSETTLED, in_front, 0.0, 0.0
+        return UNSETTLED, in_front, 0.0, 0.0, 0.0
     if not _solved(R, residual, H, M, L, C, step):
-        return OPEN, in_front, 0.0, 0.0
+        return OPEN, in_front, 0.0, 0.0, 0.0
     gain[:] = -C @ _back(L, _whitened(L, H)).T
-    log_det = 0.0
+    log_det, log_det_C, root = 0.0, 0.0, C.copy()
     for i in range(n):
         log_det += 2.0 * np.log(L[i, i])
-    return DONE, in_front, _squares(L, residual), log_det
+    if not _cholesky(root):
+        return OPEN, in_front, 0.0, 0.0, 0.0
+    for i in range(6):
+        log_det_C += 2.0 * np.log(root[i, i])
+    return DONE, in_front, _squares(L, residual), log_det, log_det_C
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -24,10 +24,13 @@ from adjust.navigation.system import Sightings, System, station_rays, visible
 
 _KEPT = 400
 _ADJUSTED = 60
+_COARSE = 25.0  # difference in the coarse score, about ln of the evidence, beyond which nobody looks
 _HOPELESS = 40.0  # difference in -2 ln evidence beyond which a candidate is of no interest
 _MARGIN = 0.05  # tangent of an angle; a beacon just outside may be the one of a spot at the border
 _GATE = float(chi2.isf(1e-4, 2))
 _MOST_NAMINGS = 24
+_DOUBTED = 6
+_BEYOND_DOUBT = 20.0  # 2 ln of a likelihood ratio
 _CROWDED = 3.0  # beacons near a spot beyond which naming in turn is hopeless
 _MOST_TRIPLES = 400
 _SAME = 1e-3  # rad and m; two roots of the minimal problem that one adjustment brings together
@@ -35,12 +38,16 @@ _SAME = 1e-3  # rad and m; two roots of the minimal problem that one adjustment 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose that explains an epoch: its fit, what was rejected (spots), -2 ln evidence and posterior probability."""
+    """A pose that explains an epoch: its fit, what was rejected (spots), -2 ln evidence and posterior probability.
+
+    more: whether there were more explanations than were adjusted.
+    """
 
     fit: PoseFit
     rejected: tuple[int, ...]
     score: float
     probability: float = 1.0
+    more: bool = False
 
 
 def allowed_namings(system: System, seen: Sightings) -> BoolArray:
@@ -81,6 +88,7 @@ def _hypotheses(
         R, t, score, match,
     )  # fmt: skip
     order = np.argsort(-score[:kept], kind="stable")
+    order = order[score[order] > score[order[:1]] - _COARSE]
     return rigid(R[order], t[order]), match[order]
 
 
@@ -108,15 +116,53 @@ def with_prior(system: System, seen: Sightings, prior: Prior, options: NavigateO
     """Explanations near a prior, best first. One that leaves components open needs names, or three spots."""
     if len(prior.rows) < 6:
         return _with_partial_prior(system, seen, prior, options)
-    distance, likely = gate_distances(system, seen, prior, options)
-    near = (distance < _GATE) & allowed_namings(system, seen) & likely
+    distance, support = gate_distances(system, seen, prior, options)
+    near = (distance < _GATE) & allowed_namings(system, seen) & (support > 0.0)
     if len(seen.uv) >= 3 and near.sum() > _CROWDED * near.any(axis=1).sum():
         poses, matches = _hypotheses(system, seen, near, options)
-        found = _judged(system, seen, list(zip(poses, matches, strict=True)), prior, options)
+        trials = _doubted(list(zip(poses, matches, strict=True)), support)
+        found = _judged(system, seen, trials, prior, options)
         if found:
-            return found
-    trials = _in_turn(system, seen, prior, near, distance, options)
-    return _judged(system, seen, trials, prior, options)
+            return _agreed(system, seen, prior, found, options)
+    trials = _doubted(_in_turn(system, seen, prior, near, distance, options), support)
+    return _agreed(system, seen, prior, _judged(system, seen, trials, prior, options), options)
+
+
+def _doubted(trials: list[tuple[FloatArray, IntArray]], support: FloatArray) -> list[tuple[FloatArray, IntArray]]:
+    """The likeliest trials, and each again without one of the spots that the prior alone does not tell from chance."""
+    out = trials[: _MOST_NAMINGS // 3]
+    known = {match.tobytes() for _, match in out}
+    for pose, match in trials[:_DOUBTED]:
+        for i in np.flatnonzero(match >= 0):
+            less = match.copy()
+            less[i] = -1
+            if support[i, match[i]] < _BEYOND_DOUBT and less.tobytes() not in known:
+                known.add(less.tobytes())
+                out.append((pose, less))
+    return out
+
+
+def _agreed(
+    system: System, seen: Sightings, prior: Prior, candidates: tuple[Candidate, ...], options: NavigateOptions
+) -> tuple[Candidate, ...]:
+    """Where no candidate is certain: what all agree on that together are. Spots in doubt are not used at all.
+
+    The prior and the spots that are beyond doubt give a pose, less precise, whose covariance holds whichever is true.
+    """
+    if not candidates or candidates[0].probability >= options.probability:
+        return candidates
+    total, likely = 0.0, []
+    for c in candidates:
+        likely.append(set(zip(c.fit.used.tolist(), c.fit.beacon.tolist(), strict=True)))
+        total += c.probability
+        if total >= options.probability:
+            break
+    pairs = np.array(sorted(set.intersection(*likely)), dtype=np.int64).reshape(-1, 2)
+    used, beacon = np.ascontiguousarray(pairs[:, 0]), np.ascontiguousarray(pairs[:, 1])
+    fit = fit_pose(system, seen, used, beacon, prior.pose, prior)
+    if fit is None or not fit.in_front:
+        return candidates
+    return (Candidate(fit, (), score_of(system, seen, fit, prior, options), total),)
 
 
 def _with_partial_prior(
@@ -132,13 +178,13 @@ def _with_partial_prior(
 
 def gate_distances(
     system: System, seen: Sightings, prior: Prior, options: NavigateOptions
-) -> tuple[FloatArray, BoolArray]:
+) -> tuple[FloatArray, FloatArray]:
     """Squared distance (n, m) of every spot from where the prior expects every beacon, in sigmas.
 
     Infinite for a beacon far outside the field of view, where the distortion may fold it back into the image.
 
-    The second (n, m): whether the beacon is a likelier origin of the spot than chance. A beacon of vague position may
-    be near everything and explains nothing. A spot that came with its name needs no such proof.
+    The second (n, m): 2 ln of how much likelier an origin of the spot the beacon is than chance. A beacon of vague
+    position may be near everything and explains nothing. A spot that came with its name needs no such proof.
     """
     margin = _MARGIN + 4.0 * float(np.sqrt(np.diag(prior.total)[:3].max()))
     ahead = visible(system, prior.pose, margin)
@@ -150,7 +196,7 @@ def gate_distances(
     )  # fmt: skip
     vague = distance + log_det - 2.0 * np.log(options.detection / (1.0 - options.detection))
     by_chance = 2.0 * np.log(image_areas(system)[seen.camera] / options.false_spots)
-    return distance, (vague < by_chance[:, None]) | (seen.label >= 0)[:, None]
+    return distance, np.where((seen.label >= 0)[:, None], np.inf, by_chance[:, None] - vague)
 
 
 def image_areas(system: System) -> FloatArray:
@@ -187,8 +233,8 @@ def _in_turn(
             posterior = _posterior(system, seen, match, prior) if np.any(match != partial.match) else partial.prior
             if posterior is None:
                 continue
-            new, likely = gate_distances(system, seen, posterior, options)
-            free = (new < _GATE) & allowed & likely & ~decided[:, None]
+            new, support = gate_distances(system, seen, posterior, options)
+            free = (new < _GATE) & allowed & (support > 0.0) & ~decided[:, None]
             for i in np.flatnonzero(match >= 0):
                 free[seen.camera == seen.camera[i], match[i]] = False
             decided = decided | ~free.any(axis=1)
@@ -237,7 +283,9 @@ def _judged(
 ) -> tuple[Candidate, ...]:  # fmt: skip
     """Adjust the trials, compare their evidence, and give each its probability."""
     by_naming: dict[tuple[bytes, bytes], list[Candidate]] = {}
-    for pose, match in trials[: _ADJUSTED if prior is None else _MOST_NAMINGS]:
+    # three spots fit many namings exactly, and all of them are to be named
+    most = 2 * _MOST_NAMINGS if prior is not None else (_ADJUSTED if len(seen.uv) > 3 else _KEPT)
+    for pose, match in trials[:most]:
         candidate = _adjusted(system, seen, pose, match, prior, options)
         if candidate is not None:
             alike = by_naming.setdefault((candidate.fit.used.tobytes(), candidate.fit.beacon.tobytes()), [])
@@ -249,7 +297,7 @@ def _judged(
     weights = np.exp(-0.5 * (np.array([c.score for c in found]) - found[0].score))
     weights /= weights.sum()
     kept = [
-        Candidate(c.fit, c.rejected, c.score, float(w))
+        Candidate(c.fit, c.rejected, c.score, float(w), len(trials) > most or len(trials) == _KEPT)
         for c, w in zip(found, weights, strict=True)
         if c.score < found[0].score + _HOPELESS
     ]
@@ -278,8 +326,8 @@ def _grown(
     """Name the spots that the pose explains and the coarse consensus left out."""
     for _ in range(len(seen.uv) - len(fit.used) - len(rejected)):
         prior = Prior(fit.pose, fit.G @ _spot_noise(seen, fit) @ fit.G.T, fit.B, np.arange(6))
-        distance, likely = gate_distances(system, seen, prior, options)
-        distance[~(allowed_namings(system, seen) & likely)] = np.inf
+        distance, support = gate_distances(system, seen, prior, options)
+        distance[~(allowed_namings(system, seen) & (support > 0.0))] = np.inf
         distance[fit.used] = np.inf
         distance[list(rejected)] = np.inf
         for i, b in zip(fit.used, fit.beacon, strict=True):

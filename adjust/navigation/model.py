@@ -121,7 +121,7 @@ class NavigateOptions:
     probability: what a solution needs to be taken for the only one. alpha: level of the outlier test of an epoch.
     gate_deg: how far a beacon may be from a spot in a hypothesis of three. nearest_m, farthest_m: distances of beacons;
     farthest None: ten times their extent. room_m: edge of the cube in which the head is, where no prior says more.
-    max_hypotheses: three-point problems solved for one epoch at most.
+    max_hypotheses: three-point problems solved for one epoch at most. max_alternatives: solutions listed at most.
     """
 
     motion: Motion | None = field(default_factory=Motion)
@@ -135,7 +135,7 @@ class NavigateOptions:
     farthest_m: float | None = None
     room_m: float = 3.0
     max_hypotheses: int = 40_000
-    max_alternatives: int = 8
+    max_alternatives: int = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +171,9 @@ class EpochPose:
     """The pose of one epoch and how far it can be trusted.
 
     status: ``fixed`` by its own spots alone; ``bridged`` with the help of ``bridge``; ``ambiguous``: the best of
-    several solutions that cannot be told apart, all in ``alternatives``; ``undetermined``: some directions are open,
-    named in ``undetermined`` (their variances are infinite); ``none``: nothing is known (no pose).
+    several solutions that cannot be told apart, all in ``alternatives`` (where not all could be listed,
+    ``undetermined`` says so); ``undetermined``: some directions are open, named in ``undetermined`` (their variances are infinite);
+    ``none``: nothing is known (no pose).
     labels: per ``NavigationEpoch.spots`` the beacon of each spot, None for a false spot or one that was rejected.
     rejected: (camera, spot) that had a beacon and failed the outlier test.
     """

@@ -117,7 +117,9 @@ def search(
     for number in range(triples.shape[0]):
         if most_named >= 4:
             inliers = most_named / n
-            if number > np.log(1e-6) / np.log(1.0 - min(inliers**3, 0.999999)) + 3:
+            # four named spots may still be chance: some more triples. All named leaves nothing to look for
+            more = 0 if most_named == n and n > 4 else 3
+            if number > np.log(1e-6) / np.log(1.0 - min(inliers**3, 0.9999999)) - 1 + more:
                 break
         i, j, k = triples[number]
         o[0], o[1], o[2] = origin[i], origin[j], origin[k]
@@ -150,17 +152,21 @@ def search(
                             if match[e] >= 0:
                                 count += 1
                         most_named = max(most_named, count)
-                        kept = _keep(R[s], t[s], score, match, kept, room, out_R, out_t, out_score, out_match)
+                        kept = _keep(R[s], t[s], score, match, count, kept, room, out_R, out_t, out_score,
+                                     out_match)  # fmt: skip
     return kept, solved
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _keep(
-    R: FloatArray, t: FloatArray, score: float, match: IntArray, kept: int, room: int, out_R: FloatArray,
-    out_t: FloatArray, out_score: FloatArray, out_match: IntArray,
+    R: FloatArray, t: FloatArray, score: float, match: IntArray, count: int, kept: int, room: int,
+    out_R: FloatArray, out_t: FloatArray, out_score: FloatArray, out_match: IntArray,
 ) -> int:  # fmt: skip
-    """Put a pose among the best; one naming may stand for several poses (mirror solutions), told by their turn."""
-    place = -1
+    """Put a pose among the best; one naming may stand for several poses (mirror solutions), told by their turn.
+
+    Of four spots or more (``count``) different triples give about the same pose; three give all theirs at once.
+    """
+    place, alike = -1, 2.9 if count > 3 else 3.0 - 1e-9
     for e in range(kept):
         same = True
         for i in range(match.size):
@@ -172,7 +178,7 @@ def _keep(
             for a in range(3):
                 for b in range(3):
                     trace += out_R[e, a, b] * R[a, b]
-            if trace > 2.9:
+            if trace > alike:
                 if out_score[e] >= score:
                     return kept
                 place = e

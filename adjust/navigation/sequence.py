@@ -210,7 +210,11 @@ def _result(
     )  # fmt: skip
     if status == "bridged":
         return replace(result, status="bridged")
-    return result if status == "fixed" else replace(result, status="ambiguous", alternatives=several)
+    if status == "fixed":
+        return result
+    cut = best.more or len(several) < len(candidates)
+    notes = (f"more solutions fit than the {len(several)} likeliest, which are listed",) if cut else ()
+    return replace(result, status="ambiguous", alternatives=several, undetermined=notes)
 
 
 def _from_little(

@@ -135,13 +135,17 @@ def _draw(cov, rng):
 
 @dataclass(frozen=True)
 class Sight:
-    """What an epoch's simulation does to its spots."""
+    """What an epoch's simulation does to its spots.
+
+    false_share: of all spots of an epoch, anywhere in the images of all cameras. most: beacons left in view.
+    """
 
     sigma_px: float = 0.2
     named: bool = True
     false_share: float = 0.0
     missing: float = 0.0
     only: tuple = ()
+    most: int = 0
 
 
 def project(camera, world_from_station, x):
@@ -160,17 +164,27 @@ def project(camera, world_from_station, x):
 
 def simulated(head, beacons, world_from_station, rng, sight=Sight(), epoch_id="e", **more):
     """The epoch that true head and beacons give, and the true labels."""
-    spots, truth = [], []
+    views = []
     for camera in head.cameras:
         uv, inside = project(camera, world_from_station, beacons.x_in_world)
         inside &= rng.random(len(inside)) >= sight.missing
         if sight.only:
             inside &= np.isin(beacons.beacon_ids, sight.only)
+        views.append((uv, inside))
+    if sight.most:
+        in_view = np.flatnonzero(np.any([inside for _, inside in views], axis=0))
+        kept = np.isin(np.arange(len(beacons.beacon_ids)), rng.permutation(in_view)[: sight.most])
+        views = [(uv, inside & kept) for uv, inside in views]
+    n_true = sum(int(inside.sum()) for _, inside in views)
+    n_false = rng.binomial(n_true, sight.false_share / (1 - sight.false_share)) if sight.false_share else 0
+    where = rng.integers(0, len(views), n_false)
+    spots, truth = [], []
+    for c, (camera, (uv, inside)) in enumerate(zip(head.cameras, views, strict=True)):
         names = [b for b, ok in zip(beacons.beacon_ids, inside, strict=True) if ok]
         points = uv[inside] + rng.normal(0, sight.sigma_px, (len(names), 2))
-        n_false = rng.binomial(len(names), sight.false_share / (1 - sight.false_share)) if sight.false_share else 0
-        points = np.vstack([points, rng.uniform((5, 5), np.array(SIZE) - 5, (n_false, 2))])
-        names += [None] * n_false
+        extra = int((where == c).sum())
+        points = np.vstack([points, rng.uniform((5, 5), np.array(SIZE) - 5, (extra, 2))])
+        names += [None] * extra
         order = rng.permutation(len(names))
         names = tuple(names[i] for i in order)
         cov = np.tile(np.eye(2) * sight.sigma_px**2, (len(names), 1, 1))
