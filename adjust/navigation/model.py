@@ -172,8 +172,8 @@ class EpochPose:
 
     status: ``fixed`` by its own spots alone; ``bridged`` with the help of ``bridge``; ``ambiguous``: the best of
     several solutions that cannot be told apart, all in ``alternatives`` (where not all could be listed,
-    ``undetermined`` says so); ``undetermined``: some directions are open, named in ``undetermined`` (their variances are infinite);
-    ``none``: nothing is known (no pose).
+    ``undetermined`` says so); ``undetermined``: some directions are open, named in ``undetermined`` (their variances
+    are infinite); ``none``: nothing is known (no pose).
     labels: per ``NavigationEpoch.spots`` the beacon of each spot, None for a false spot or one that was rejected.
     rejected: (camera, spot) that had a beacon and failed the outlier test.
     """

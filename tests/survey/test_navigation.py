@@ -68,7 +68,7 @@ def test_table_names_the_spots(unnamed, lab):
     outcome = navigate_job(unnamed, progress=False)
     truth = {(b.camera_id, b.epoch_id): b for b in lab[0].image_blocks if b.target_id is None}
     names = [p.point_id for p in lab[0].points]
-    known = {b.point_id for b in outcome.calibration.survey.points}
+    known = set(outcome.calibration.beacons.beacon_ids)
     checked = 0
     for epoch in outcome.trajectory.epochs:
         cameras = [c for c, e in truth if e == epoch.epoch_id]
@@ -142,3 +142,34 @@ def test_epochs_come_in_the_order_of_their_times(folder):
 def test_bad_times_are_named(folder, rows, words):
     with pytest.raises(SurveyError, match=words):
         navigate_job(folder, NavigateRequest(times=_table_of_times(folder, rows)), progress=False)
+
+
+def _poses(outcome):
+    return np.array([e.world_from_station.matrix() for e in outcome.trajectory.epochs])
+
+
+def test_calibration_is_used_again_until_something_changes(folder, capsys):
+    first = navigate_job(folder, progress=False)
+    again = navigate_job(folder, progress=False)
+    assert (first.calibration.reused, again.calibration.reused) == (False, True)
+    np.testing.assert_array_equal(_poses(first), _poses(again))
+    for a, b in zip(first.trajectory.epochs, again.trajectory.epochs, strict=True):
+        np.testing.assert_array_equal(a.cov, b.cov)
+    assert "has not changed" in again.text()
+    # fewer navigated epochs: the others calibrate too
+    fewer = NavigateRequest(epochs=tuple(e.epoch_id for e in first.trajectory.epochs[:3]))
+    assert not navigate_job(folder, fewer, progress=False).calibration.reused
+    readings = folder / "observations/table_angles.csv"
+    text = readings.read_text().splitlines()
+    header, row = text[0].split(","), text[1].split(",")
+    k = next(i for i, name in enumerate(header) if name.startswith("axis1"))
+    row[k] = repr(float(row[k]) + 1e-4)
+    readings.write_text("\n".join([text[0], ",".join(row), *text[2:]]) + "\n")
+    assert not navigate_job(folder, fewer, progress=False).calibration.reused
+
+
+def test_damaged_calibration_is_made_anew(folder):
+    navigate_job(folder, progress=False)
+    path = folder / "results/navigation_calibration.npz"
+    path.write_bytes(path.read_bytes()[:100])
+    assert not navigate_job(folder, progress=False).calibration.reused
