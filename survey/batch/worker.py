@@ -5,6 +5,7 @@ process whoever started it: the command line, a notebook, or a worker of a Dask 
 multiprocessing's making). It ends when its owner has gone, also where that was killed.
 """
 
+import contextlib
 import json
 import os
 import queue
@@ -34,7 +35,7 @@ class Worker:
     def __init__(self, threads: int = 1) -> None:
         self.threads = threads
         self._process: subprocess.Popen[bytes] | None = None
-        self._closed = False
+        self._closed = self._busy = False
 
     @property
     def pid(self) -> int | None:
@@ -43,7 +44,13 @@ class Worker:
 
     def run(self, task: Mapping[str, Any]) -> Record:
         """The record of a task. Raises WorkerDiedError where the process ended without one."""
-        process = self._running()
+        self._busy = True
+        try:
+            return self._answer(self._running(), task)
+        finally:
+            self._busy = False
+
+    def _answer(self, process: "subprocess.Popen[bytes]", task: Mapping[str, Any]) -> Record:
         if process.stdin is None or process.stdout is None:
             raise WorkerDiedError("it has no pipes")
         try:
@@ -54,9 +61,8 @@ class Worker:
             line = b""
         if line.endswith(b"\n"):
             return record_from(json.loads(line))
-        code = process.wait()
         self._process = None
-        raise WorkerDiedError(_ending(code))
+        raise WorkerDiedError(_ending(_waited(process)))
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._closed:
@@ -76,9 +82,18 @@ class Worker:
         if process is not None:
             process.kill()
             process.wait()
-            for pipe in (process.stdin, process.stdout):
-                if pipe is not None:
-                    pipe.close()
+            if not self._busy:  # else the thread that waits for an answer sees the end of it
+                _waited(process)
+
+
+def _waited(process: "subprocess.Popen[bytes]") -> int:
+    """Exit code of a process that has ended or will, its pipes closed."""
+    code = process.wait()
+    for pipe in (process.stdin, process.stdout):
+        with contextlib.suppress(OSError):  # what was not written any more has no reader
+            if pipe is not None:
+                pipe.close()
+    return code
 
 
 def _ending(code: int) -> str:

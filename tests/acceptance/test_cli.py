@@ -174,24 +174,6 @@ def test_json_is_one_object_wherever_the_flag_stands(jobs, project, capsys, plac
     assert json.loads(capsys.readouterr().out)["summary"]["redundancy"] == 77
 
 
-def test_a_batch_goes_on_past_failures_and_lists_all(jobs, project, capsys):
-    folders = [project(name) for name in ("good", "bad", "bug", "poor", "last")]
-    assert main(["adjust", *folders]) == 1
-    out, err = capsys.readouterr()
-    assert [line.split()[1] for line in out.splitlines()[1:]] == ["done", "error", "error", "global", "done"]
-    assert "bad/survey.toml:3: no such thing" in err
-    assert err.count("Traceback") == 1  # of the bug alone
-    assert "ZeroDivisionError" in err
-    assert [call.folder.name for call in jobs] == ["good", "bad", "bug", "poor", "last"]
-
-
-def test_a_batch_without_errors_is_3_where_a_global_test_failed(jobs, project, capsys):
-    assert main(["--json", "--quiet", "adjust", project("good"), project("poor")]) == 3
-    rows = json.loads(capsys.readouterr().out)["folders"]
-    assert [row["exit_code"] for row in rows] == [0, 3]
-    assert [Path(row["folder"]).name for row in rows] == ["good", "poor"]
-
-
 @pytest.mark.parametrize("arguments", [["--help"], ["adjust", "--help"], ["--version"]])
 def test_a_reader_that_leaves_is_no_noise(arguments):
     command = [sys.executable, "-m", "survey", *arguments]
