@@ -9,7 +9,6 @@ from typing import Any
 from docutils import nodes
 from docutils.parsers.rst import Directive
 from docutils.statemachine import StringList
-from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -24,7 +23,6 @@ html_title = "labsurvey"
 html_show_sphinx = False
 html_show_copyright = False
 myst_heading_anchors = 4
-myst_enable_extensions = ["dollarmath"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
@@ -83,16 +81,15 @@ def _entry(package: str, name: str, value: Any) -> list[str]:
     return [f".. autodata:: {package}.{name}", ""]
 
 
-def math_as_mathml(self: Any, node: nodes.Node) -> None:
-    """Formulas without a script from elsewhere: browsers draw MathML themselves."""
-    display = "block" if isinstance(node, nodes.math_block) else "inline"
-    self.body.append(convert(node.astext(), display=display))
-    raise nodes.SkipNode
+def literal_blocks(_app: Sphinx, _what: str, _name: str, _value: Any, _options: Any, lines: list[str]) -> None:
+    """What is indented below a line that ends with a colon is code, as it stands."""
+    for i in range(len(lines) - 2):
+        if lines[i].endswith(":") and not lines[i].endswith("::") and not lines[i + 1] and lines[i + 2].startswith("  "):
+            lines[i] += ":"
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Hooks of this file."""
     app.add_directive("public-names", PublicNames)
-    for node in (nodes.math, nodes.math_block):
-        app.add_node(node, override=True, html=(math_as_mathml, None))
+    app.connect("autodoc-process-docstring", literal_blocks)
     return {"parallel_read_safe": True}
