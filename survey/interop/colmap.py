@@ -49,6 +49,8 @@ def read_colmap(path: Path) -> ForeignNetwork:
     """A model from its folder, text or binary, as a free network. Raises SurveyError for what cannot be read."""
     folder = path if path.is_dir() else path.parent
     model = read_model(folder)
+    if not model.images or not (model.cameras and model.points):
+        raise SurveyError(f"{folder}: the model has no cameras, images or points; give another one")
     _complete(model)
     names = _point_names(folder / NAMES_FILE, model)
     cameras, stations, epochs = _bodies(model)
@@ -72,8 +74,6 @@ def read_colmap(path: Path) -> ForeignNetwork:
 
 def _complete(model: ColmapModel) -> None:
     """Rigs of one camera and frames of one image, where the model (of COLMAP 3) has none; images without a frame go."""
-    if not model.images:
-        raise SurveyError("the model holds no image; give another one")
     if not model.rigs:
         model.rigs = {c: {c: Pose3()} for c in model.cameras}
         model.frames = {i: (image.camera, image.cam_from_world, (i,)) for i, image in model.images.items()}

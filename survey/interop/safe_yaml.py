@@ -156,6 +156,8 @@ class _Builder:
             raise where.error(f"the tag {tag} is not read; remove it")
         if tag is not None and "python" in tag:
             raise where.error(f"the tag {tag} is not read; remove it")
+        if self.stack and (key := self.stack[-1][1]) is not None:
+            where = key.where  # what a block holds begins a line later
         if isinstance(event, yaml.ScalarEvent):
             self._add(Entry(where, self._name(event.value), event.value), where)
         elif isinstance(event, yaml.CollectionStartEvent):
