@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import qr
@@ -11,7 +12,19 @@ from adjust.design.rows import DesignMatrix, Rows, design_matrix
 from adjust.errors import SurveyError
 from adjust.graph import GraphBuilder, StartValues
 from adjust.model import BoolArray, FloatArray, IntArray, Point, Survey
-from adjust.observations import Coordinates, Distance, ImageBlock, Pair, TableReading
+from adjust.observations import (
+    Alignment,
+    CoordinateDifferences,
+    Coordinates,
+    Distance,
+    ImageBlock,
+    LaserSpot,
+    Level,
+    OnSurface,
+    Pair,
+    Reading,
+    TableReading,
+)
 from adjust.result import ParameterName
 
 _RANK = 1e-10
@@ -19,7 +32,7 @@ _RANK = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Something to measure in addition: an epoch with its images and reading, a beacon, a distance, a pair.
+    """Something to measure in addition: an epoch with its images and reading, a beacon, a distance, a pair, readings.
 
     image_blocks of world points count the survey's points first, then ``points``, which are new. What only this
     candidate observes (a new beacon, the angles of a new epoch) comes with it as new unknowns.
@@ -33,6 +46,20 @@ class Candidate:
     distances: tuple[Distance, ...] = ()
     coordinates: tuple[Coordinates, ...] = ()
     points: tuple[Point, ...] = ()
+    readings: tuple[Reading, ...] = ()
+    coordinate_differences: tuple[CoordinateDifferences, ...] = ()
+    levels: tuple[Level, ...] = ()
+    alignments: tuple[Alignment, ...] = ()
+    laser_spots: tuple[LaserSpot, ...] = ()
+    on_surfaces: tuple[OnSurface, ...] = ()
+
+
+_LISTS = {
+    "pair": "pairs", "distance": "distances", "coordinates": "coordinates", "level": "levels",
+    "alignment": "alignments", "laser": "laser_spots", "surface": "on_surfaces",
+    "coordinate_difference": "coordinate_differences", "reading": "readings", "table": "table_readings",
+}  # fmt: skip
+"""Fields of a survey by the kind of their rows."""
 
 
 def with_candidates(survey: Survey, candidates: Sequence[Candidate]) -> Survey:
@@ -44,15 +71,11 @@ def with_candidates(survey: Survey, candidates: Sequence[Candidate]) -> Survey:
         for b in c.image_blocks:
             moved = np.where(b.point_idx >= n, b.point_idx + shift, b.point_idx) if b.target_id is None else b.point_idx
             blocks.append(replace(b, point_idx=moved))
-    return replace(
-        survey,
-        points=tuple(points),
-        image_blocks=tuple(blocks),
-        table_readings=survey.table_readings + tuple(r for c in candidates for r in c.table_readings),
-        pairs=survey.pairs + tuple(p for c in candidates for p in c.pairs),
-        distances=survey.distances + tuple(d for c in candidates for d in c.distances),
-        coordinates=survey.coordinates + tuple(x for c in candidates for x in c.coordinates),
-    )
+    lists: dict[str, Any] = {
+        name: getattr(survey, name) + tuple(x for c in candidates for x in getattr(c, name))
+        for name in _LISTS.values()
+    }
+    return replace(survey, points=tuple(points), image_blocks=tuple(blocks), **lists)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,21 +124,18 @@ def _names_of(survey: Survey, start: StartValues) -> tuple[ParameterName, ...]:
 def _owners(survey: Survey, candidates: Sequence[Candidate], design: DesignMatrix) -> list[int | None]:
     """For each of the design's rows the candidate that brings it, None for what is planned anyway."""
     images: list[int | None] = [None] * len(survey.image_blocks)
-    ordered: dict[str, list[int | None]] = {
-        "pair": [None] * len(survey.pairs),
-        "distance": [None] * len(survey.distances),
-        "coordinates": [None] * len(survey.coordinates),
-    }
+    in_order = {kind: name for kind, name in _LISTS.items() if kind != "table"}
+    ordered: dict[str, list[int | None]] = {k: [None] * len(getattr(survey, name)) for k, name in in_order.items()}
     readings: dict[tuple[str, ...], int] = {}
     points: dict[tuple[str, ...], int] = {}
     for i, c in enumerate(candidates):
         images += [i] * len(c.image_blocks)
-        ordered["pair"] += [i] * len(c.pairs)
-        ordered["distance"] += [i] * len(c.distances)
-        ordered["coordinates"] += [i] * len(c.coordinates)
+        for kind, name in in_order.items():
+            ordered[kind] += [i] * len(getattr(c, name))
         readings |= {(r.table_id, r.epoch_id): i for r in c.table_readings}
         points |= {("point", p.point_id): i for p in c.points}
     others = design.predictor.graph.others
+    # readings are not among the others and count from 0
     first = {kind: next((k for k, o in enumerate(others) if o.kind == kind), 0) for kind in ordered}
     out: list[int | None] = []
     for rows in design.rows:

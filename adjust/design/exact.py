@@ -7,6 +7,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.design.prediction import Predictor
+from adjust.design.readings import exact_readings
 from adjust.graph import StartValues
 from adjust.lens import MODELS, camera_constants, project
 from adjust.model import (
@@ -28,7 +29,8 @@ from adjust.result import ParameterName
 def exact(survey: Survey, start: StartValues) -> Survey:
     """The survey with every observation and prior as the model predicts it at ``start``: no residual is left.
 
-    Raises SurveyError for an image point that these values put behind its camera.
+    Raises SurveyError for an image point that these values put behind its camera, and for a point that should lie on a
+    line but does not.
     """
     p = Predictor(survey, start)
     return replace(
@@ -43,6 +45,7 @@ def exact(survey: Survey, start: StartValues) -> Survey:
         pairs=tuple(_pair(p, pair) for pair in survey.pairs),
         distances=tuple(_distance(p, d) for d in survey.distances),
         coordinates=tuple(_coordinates(p, c) for c in survey.coordinates),
+        **exact_readings(p),
     )
 
 

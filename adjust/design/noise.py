@@ -6,22 +6,27 @@ from dataclasses import replace
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.design.readings import disturbed_readings, draw
 from adjust.model import FloatArray, PoseParameter, Survey, VectorParameter, VectorPrior
 from adjust.observations import ImageBlock, Pair
 
 Rng = np.random.Generator
 
 
-def disturbed(survey: Survey, rng: Rng) -> Survey:
-    """The survey with noisy observations; means of priors are observations too."""
+def disturbed(survey: Survey, rng: Rng, sigmas: FloatArray | None = None) -> Survey:
+    """The survey with noisy observations; means of priors are observations too.
+
+    sigmas: (N,) of the readings, where they are not simply those that each has.
+    """
+    of_readings = np.array([r.sigma for r in survey.readings]) if sigmas is None else sigmas
     return replace(
         survey,
         image_blocks=tuple(_block(b, rng) for b in survey.image_blocks),
-        table_readings=tuple(replace(r, angles=r.angles + _draw(r.cov, rng)) for r in survey.table_readings),
+        table_readings=tuple(replace(r, angles=r.angles + draw(r.cov, rng)) for r in survey.table_readings),
         pairs=tuple(_pair(p, rng) for p in survey.pairs),
         distances=tuple(replace(d, value=d.value + d.sigma * rng.standard_normal()) for d in survey.distances),
         coordinates=tuple(
-            replace(c, values=c.values + _draw(c.cov, rng).reshape(-1, 3)) for c in survey.coordinates
+            replace(c, values=c.values + draw(c.cov, rng).reshape(-1, 3)) for c in survey.coordinates
         ),
         cameras=tuple(
             replace(
@@ -54,11 +59,12 @@ def disturbed(survey: Survey, rng: Rng) -> Survey:
             for t in survey.targets
         ),
         points=tuple(
-            replace(p, x_in_world=replace(p.x_in_world, value=p.x_in_world.value + _draw(p.x_in_world.prior_cov, rng)))
+            replace(p, x_in_world=replace(p.x_in_world, value=p.x_in_world.value + draw(p.x_in_world.prior_cov, rng)))
             if p.x_in_world.prior_cov is not None and p.x_in_world.value is not None
             else p
             for p in survey.points
         ),
+        **disturbed_readings(survey, of_readings, rng),
     )  # fmt: skip
 
 
@@ -68,7 +74,7 @@ def _block(block: ImageBlock, rng: Rng) -> ImageBlock:
 
 
 def _pair(pair: Pair, rng: Rng) -> Pair:
-    return replace(pair, b_from_a=_moved(pair.b_from_a, _draw(pair.cov, rng)))
+    return replace(pair, b_from_a=_moved(pair.b_from_a, draw(pair.cov, rng)))
 
 
 def _moved(value: Pose3 | Rot3, tangent: FloatArray) -> Pose3 | Rot3:
@@ -77,19 +83,10 @@ def _moved(value: Pose3 | Rot3, tangent: FloatArray) -> Pose3 | Rot3:
     return value.compose(Pose3.Expmap(tangent))
 
 
-def _draw(cov: FloatArray, rng: Rng) -> FloatArray:
-    """(n,) with covariance (n, n); zero where nothing is known (infinite) and where a component is exact."""
-    noise = np.zeros(len(cov))
-    known = np.flatnonzero(np.isfinite(np.diag(cov)) & (np.diag(cov) > 0.0))
-    if len(known):
-        noise[known] = np.linalg.cholesky(cov[np.ix_(known, known)]) @ rng.standard_normal(len(known))
-    return noise
-
-
 def _pose(parameter: PoseParameter, rng: Rng) -> PoseParameter:
     if parameter.treatment != "prior" or parameter.value is None or parameter.prior_cov is None:
         return parameter
-    return replace(parameter, value=parameter.value.compose(Pose3.Expmap(_draw(parameter.prior_cov, rng))))
+    return replace(parameter, value=parameter.value.compose(Pose3.Expmap(draw(parameter.prior_cov, rng))))
 
 
 def _poses(parameters: Mapping[str, PoseParameter], rng: Rng) -> dict[str, PoseParameter]:
@@ -97,7 +94,7 @@ def _poses(parameters: Mapping[str, PoseParameter], rng: Rng) -> dict[str, PoseP
 
 
 def _prior(prior: VectorPrior | None, rng: Rng) -> VectorPrior | None:
-    return None if prior is None else replace(prior, mean=prior.mean + _draw(prior.cov, rng))
+    return None if prior is None else replace(prior, mean=prior.mean + draw(prior.cov, rng))
 
 
 def _vector(parameter: VectorParameter, rng: Rng) -> VectorParameter:

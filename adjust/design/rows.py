@@ -23,8 +23,9 @@ from adjust.result import ParameterName
 class Rows:
     """Whitened rows A (m, k) of one observation and the columns (k,) of the unknowns they touch.
 
-    kind, number: image block ``survey.image_blocks[number]``, or ``graph.others[number]`` under its kind. group: of
-    the variance component.
+    kind, number: image block ``survey.image_blocks[number]``, or ``graph.others[number]`` under its kind, or
+    ``survey.readings[number]`` under kind "reading" (the first of those with a joint covariance). group: of the
+    variance component.
     """
 
     kind: str
@@ -71,7 +72,25 @@ def design_matrix(survey: Survey, start: StartValues) -> DesignMatrix:
             linear = item.factor.linearize(p.values)
             columns = _ranges([by_key[k] for k in list(linear.keys())])
             rows.append(Rows(item.kind, i, item.group, np.asarray(linear.jacobian()[0]), columns))
+    rows += _readings(p, by_key)
     return DesignMatrix(p, tuple(names), at, n, tuple(r for r in rows if len(r.A)))
+
+
+def _readings(p: Predictor, by_key: dict[int, slice]) -> list[Rows]:
+    """Rows of used readings, one by one, those with a joint covariance together."""
+    batch, out = p.graph.terrestrial, list[Rows]()
+    if batch is None:
+        return out
+    batch.update_sigmas(p.values)
+    batch.unweighted(p.values)
+    for c, chunk in enumerate(batch.layout.chunks):
+        columns, A = _ranges([by_key[k] for k in chunk.keys]), batch.jacobian(c)
+        parts = [np.arange(len(chunk.rows))] if chunk.whitener is not None else np.arange(len(chunk.rows))[:, None]
+        for part in parts:
+            first = int(chunk.rows[part[0]])
+            if p.survey.readings[first].used and len(columns):
+                out.append(Rows("reading", first, p.survey.readings[first].group, A[part], columns))
+    return out
 
 
 def _image(p: Predictor, number: int, block: ImageBlock, by_key: dict[int, slice]) -> Rows:

@@ -80,7 +80,17 @@ def _cleaned(
         scaled = estimate_variance_components(now.survey, options=how, progress=progress, first=now)
         now = scaled.adjustment
         factors = {c.group: factors.get(c.group, 1.0) * c.factor for c in scaled.components.components}
-    return _told(now, first, search, scaled, factors)
+    return _told(now, first, search, scaled, factors, _unsearched(now, options))
+
+
+def _unsearched(now: Adjustment, options: CleanOptions) -> tuple[str, ...]:
+    """That nothing was searched although something fails, in one line."""
+    if not options.reject_others or now.n_unknowns <= _LARGEST or not _fails(now):
+        return ()
+    return (
+        f"observations fail their tests, but gross errors were not searched for: {now.n_unknowns} unknowns are more "
+        f"than {_LARGEST}; leave out what the list of tests shows, worst first",
+    )
 
 
 def _blamed_on_rays(survey: Survey, found: Adjustment) -> bool:
@@ -145,13 +155,14 @@ def _fails(now: Adjustment) -> bool:
 
 
 def _told(
-    now: Adjustment, first: Adjustment, search: OutlierSearch | None, scaled: Scaled | None, factors: dict[str, float]
-) -> Adjustment:
+    now: Adjustment, first: Adjustment, search: OutlierSearch | None, scaled: Scaled | None, factors: dict[str, float],
+    unsearched: tuple[str, ...] = (),
+) -> Adjustment:  # fmt: skip
     """With its history, and the warnings of the first adjustment that are not about the solution itself."""
     known = set(now.warnings)
     about_first = ("left out", "camera", "pair")
     kept = tuple(w for w in first.warnings if w not in known and w.startswith(about_first))
-    notes = search.notes if search is not None else ()
+    notes = search.notes if search is not None else unsearched
     components = None
     if scaled is not None:
         components = replace(scaled.components, components=_total(scaled.components.components, factors))

@@ -15,6 +15,7 @@ from adjust.observations import Coordinates, Distance, ImageBlock, Pair, Positio
 from adjust.result import Adjustment, ParameterName
 from survey.files import Project
 from survey.planning.plan_file import ByHand, Measurements, Moment, Moments, Plan
+from survey.planning.plan_readings import Terrestrial, lengths_between, terrestrial_candidates, with_usual_sigmas
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +78,7 @@ def build_plan(project: Project, plan: Plan, existing: Adjustment | None, notes:
     )
     extra = {p.name: p.x_in_world for p in plan.candidates.points}
     start = replace(start, points={**start.points, **extra})
+    whole = _terrestrial(plan.planned, whole, start, project).added_to(whole)
     candidates, blind = _candidates(whole, everything, start, possible, plan, project, lit)
     if blind:
         said.append(f"candidates that show nothing, left out: {_listed(blind)}")
@@ -111,6 +113,9 @@ def _gather(survey: Survey, existing: Adjustment | None) -> _Values:
         for ref, x in zip(co.positions, co.values, strict=True):
             if ref.frame is None and ref.point_id is not None:
                 v.points.setdefault(ref.point_id, np.asarray(x))
+    for beam in survey.beams:  # else it would be fitted to spots that are not measured yet
+        if np.isfinite(beam.parameters.values).all():
+            v.vectors["beam", beam.beam_id] = np.asarray(beam.parameters.values, dtype=float)
     for name, e in estimates.items():
         if isinstance(e.value, Pose3):
             v.poses[name] = e.value
@@ -330,7 +335,13 @@ def _candidates(
     ]
     out += [Candidate(p.name, "coordinates", coordinates=(_coordinates(p.position, p.sigma),)) for p in c.coordinates]
     out += [Candidate(p.name, "pair", pairs=(Pair(p.name, p.a, p.b, Pose3(), p.cov),)) for p in c.pairs]
-    return tuple(out), blind
+    return tuple(out + terrestrial_candidates(_terrestrial(c, whole, start, project))), blind
+
+
+def _terrestrial(part: Measurements, survey: Survey, start: StartValues, project: Project) -> Terrestrial:
+    """Of a part of the plan, with sigmas."""
+    lengths = lengths_between(survey, start)
+    return replace(part.terrestrial, readings=with_usual_sigmas(part.terrestrial.readings, survey, project, lengths))
 
 
 def _epoch_text(m: Moment) -> str:

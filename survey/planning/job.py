@@ -133,7 +133,8 @@ def planning_job(
 def _existing(project: Project, progress: bool) -> tuple[Adjustment | None, list[str]]:
     """What is observed already, adjusted for its values; without, where it does not suffice for that."""
     survey = project.survey
-    if not (survey.image_blocks or project.spots or survey.pairs):
+    terrestrial = (survey.readings, survey.coordinate_differences, survey.levels, survey.on_surfaces)
+    if not (survey.image_blocks or project.spots or survey.pairs or any(terrestrial)):
         lying = len(project.images)
         return None, [f"{lying} images without detections are not counted; detect them first"] if lying else []
     try:

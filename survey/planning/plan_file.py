@@ -15,6 +15,7 @@ from survey.files.poses import POSE_KEYS, read_pose, rotation_from_euler
 from survey.files.references import NameProblemError, Names, read_frame, read_position
 from survey.files.text import id_problem
 from survey.files.units import to_si
+from survey.planning.plan_readings import TERRESTRIAL_KEYS, Terrestrial, read_terrestrial
 
 PLAN_FILE = "plan.toml"
 _EPOCH_KEYS = (
@@ -117,6 +118,7 @@ class Measurements:
     coordinates: tuple[PlannedPoint, ...] = ()
     pairs: tuple[PlannedPair, ...] = ()
     points: tuple[NewPoint, ...] = ()
+    terrestrial: Terrestrial = field(default_factory=Terrestrial)
 
 
 @dataclass(frozen=True)
@@ -169,16 +171,16 @@ def read_plan(folder: Path, survey: Survey) -> Plan:
     """Read ``plan.toml`` of a project folder. Raises SurveyError with file and line."""
     root, digest = read_toml(Path(folder) / PLAN_FILE)
     root.allow("image_sigma_px", "seen", "epochs", "distances", "coordinates", "pairs", "candidates", "required",
-               "wanted", "navigation")  # fmt: skip
+               "wanted", "navigation", *TERRESTRIAL_KEYS)  # fmt: skip
     names = Names.of(survey)
     candidates = root.table("candidates")
-    candidates.allow("epochs", "distances", "coordinates", "pairs", "points")
+    candidates.allow("epochs", "distances", "coordinates", "pairs", "points", *TERRESTRIAL_KEYS)
     return Plan(
         path=Path(folder) / PLAN_FILE,
         image_sigma_px=root.number("image_sigma_px", positive=True) if root.has("image_sigma_px") else None,
         seeing=_seeing(root.table("seen"), survey),
-        planned=_measurements(root, survey, names),
-        candidates=_measurements(candidates, survey, names),
+        planned=_measurements(root, survey, names, "p"),
+        candidates=_measurements(candidates, survey, names, "c"),
         required=tuple(_requirement(node) for node in _tables(root, "required")),
         wanted=root.names("wanted", ()),
         navigation=_navigation(root.table("navigation"), survey) if root.has("navigation") else None,
@@ -208,13 +210,14 @@ def _seeing(node: Node, survey: Survey) -> Seeing:
     )
 
 
-def _measurements(node: Node, survey: Survey, names: Names) -> Measurements:
+def _measurements(node: Node, survey: Survey, names: Names, prefix: str) -> Measurements:
     return Measurements(
         tuple(_moments(n, survey, i) for i, n in enumerate(_tables(node, "epochs"))),
         tuple(_distance(n, names) for n in _tables(node, "distances")),
         tuple(p for n in _tables(node, "coordinates") for p in _coordinates(n, names)),
         tuple(_pair(n, names) for n in _tables(node, "pairs")),
-        tuple(_new_point(n, survey) for n in _tables(node, "points")),
+        tuple(_new_point(n, survey) for n in _tables(node, "points")) if prefix == "c" else (),
+        read_terrestrial(lambda key: _tables(node, key), names, prefix),
     )
 
 

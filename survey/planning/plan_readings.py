@@ -1,0 +1,245 @@
+"""Readings, levels, alignments, laser spots, surfaces and differences of ``plan.toml``; values are predicted later."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, cast
+
+import numpy as np
+
+from adjust.design import Candidate
+from adjust.errors import SurveyError
+from adjust.graph import StartValues
+from adjust.model import FloatArray, Survey
+from adjust.observations import (
+    Alignment,
+    CoordinateDifferences,
+    FrameRef,
+    LaserSpot,
+    Level,
+    OnSurface,
+    PositionRef,
+    Reading,
+    ReadingKind,
+)
+from survey.files.instruments import setup_problem
+from survey.files.node import Node
+from survey.files.project import Accuracy, Project
+from survey.files.references import (
+    NameProblemError,
+    Names,
+    check_epochs,
+    position_text,
+    read_frame,
+    read_position,
+)
+from survey.files.units import to_si
+
+READING_KINDS = ("direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance",
+                 "height_difference")  # fmt: skip
+_ANGLES = READING_KINDS[:4]
+_KEYS = (
+    *("setup", "from", "to", "second", "kinds", "sigma_arcsec", "sigma_mm", "instrument_height_mm"),
+    "target_height_mm",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Terrestrial:
+    """Planned observations by field of the survey; sigmas of readings are nan where the instrument's hold."""
+
+    readings: tuple[Reading, ...] = ()
+    levels: tuple[Level, ...] = ()
+    alignments: tuple[Alignment, ...] = ()
+    laser_spots: tuple[LaserSpot, ...] = ()
+    on_surfaces: tuple[OnSurface, ...] = ()
+    coordinate_differences: tuple[CoordinateDifferences, ...] = ()
+
+
+    def added_to(self, survey: Survey) -> Survey:
+        """The survey with these observations too."""
+        lists: dict[str, Any] = {f.name: getattr(survey, f.name) + getattr(self, f.name) for f in fields(self)}
+        return replace(survey, **lists)
+
+
+def read_terrestrial(nodes: Callable[[str], list[Node]], names: Names, prefix: str) -> Terrestrial:
+    """Everything of these kinds; nodes: the tables of a list by its key. prefix: of the ids. Raises SurveyError."""
+    parts = {key: nodes(key) for key in TERRESTRIAL_KEYS}
+    return Terrestrial(
+        tuple(r for i, n in enumerate(parts["readings"]) for r in _readings(n, names, f"{prefix}{i + 1}")),
+        tuple(_level(n, names, f"{prefix}level{i + 1}") for i, n in enumerate(parts["levels"])),
+        tuple(_alignment(n, names, f"{prefix}alignment{i + 1}") for i, n in enumerate(parts["alignments"])),
+        tuple(_spot(n, names, f"{prefix}spot{i + 1}") for i, n in enumerate(parts["laser_spots"])),
+        tuple(o for n in parts["surfaces"] for o in _on_surface(n, names)),
+        tuple(d for n in parts["coordinate_differences"] for d in _differences(n, names)),
+    )
+
+
+TERRESTRIAL_KEYS = ("readings", "levels", "alignments", "laser_spots", "surfaces", "coordinate_differences")
+
+
+def terrestrial_candidates(part: Terrestrial) -> list[Candidate]:
+    """Readings of a set-up with one target are one candidate, everything else stands for itself."""
+    sights: dict[str, list[Reading]] = {}
+    for r in part.readings:
+        ends = [position_text(x) for x in (r.at, r.to, r.second) if x is not None]
+        sights.setdefault(" ".join(dict.fromkeys(["sight", *ends])), []).append(r)
+    out = [Candidate(name, "sight", readings=tuple(group)) for name, group in sights.items()]
+    out += [Candidate(x.level_id, "level", levels=(x,)) for x in part.levels]
+    out += [Candidate(x.alignment_id, "alignment", alignments=(x,)) for x in part.alignments]
+    out += [Candidate(x.spot_id, "laser", laser_spots=(x,)) for x in part.laser_spots]
+    out += [
+        Candidate(f"{position_text(x.position)} on {x.surface_id}", "surface", on_surfaces=(x,))
+        for x in part.on_surfaces
+    ]
+    return out + [
+        Candidate(f"baseline {position_text(x.at[0])} {position_text(x.to[0])}", "coordinate difference",
+                  coordinate_differences=(x,)) for x in part.coordinate_differences
+    ]  # fmt: skip
+
+
+def lengths_between(survey: Survey, start: StartValues) -> Callable[[Reading], float]:
+    """Distances (m) between the ends of readings; 0 where one of them is no point of the world."""
+    held = {p.point_id: p.x_in_world.value for p in survey.points if p.x_in_world.treatment == "held"}
+    places: dict[str, Any] = {**held, **start.points}
+
+    def length(r: Reading) -> float:
+        a, b = (places.get(x.point_id or "") if x.frame is None else None for x in (r.at, r.to))
+        return 0.0 if a is None or b is None else float(np.linalg.norm(np.asarray(b) - np.asarray(a)))
+
+    return length
+
+
+def with_usual_sigmas(
+    readings: tuple[Reading, ...], survey: Survey, project: Project, distance: Callable[[Reading], float]
+) -> tuple[Reading, ...]:
+    """Readings with the sigmas of their instruments where the plan gives none. Raises SurveyError where none is known.
+
+    distance: m between the ends of a reading, for what depends on it.
+    """
+    instruments = {s.setup_id: s.instrument_id for s in survey.setups}
+    out = []
+    for r in readings:
+        accuracy = project.sigmas.instruments.get(instruments.get(r.setup_id) or "", Accuracy())
+        sigma: float | None = r.sigma if np.isfinite(r.sigma) else _usual(r.kind, accuracy, distance(r))
+        if sigma is None:
+            raise SurveyError(
+                f"{project.folder}/plan.toml: reading {r.reading_id} ({r.kind}) has no sigma; give sigma_arcsec or "
+                "sigma_mm, or the sigmas of the instrument in survey.toml"
+            )
+        scale = project.sigmas.scale.get(r.group, 1.0)
+        out.append(replace(r, sigma=scale * sigma, target_centring_sigma=accuracy.target_centring))
+    return tuple(out)
+
+
+def _usual(kind: str, accuracy: Accuracy, distance: float) -> float | None:
+    match kind:
+        case "slope_distance" | "horizontal_distance":
+            return None if accuracy.distance is None else accuracy.distance + accuracy.distance_slope * distance
+        case "angle" if accuracy.angle is None and accuracy.direction is not None:
+            return float(np.sqrt(2.0)) * accuracy.direction
+        case "height_difference" if accuracy.levelling is not None:
+            return float(np.hypot(accuracy.height_difference or 0.0, accuracy.levelling * (distance / 1000.0) ** 0.5))
+    return cast("float | None", getattr(accuracy, kind))
+
+
+def _readings(node: Node, names: Names, prefix: str) -> list[Reading]:
+    """One reading of every kind to every target."""
+    node.allow(*_KEYS)
+    setup = node.text("setup", "")
+    if setup and (problem := setup_problem(setup, names.survey.setups)):
+        raise node.error(problem, "setup")
+    kinds = node.names("kinds")
+    at, targets = _position(node, "from", names), _positions(node, "to", names)
+    second = _position(node, "second", names) if node.has("second") else None
+    sigma = {True: _length(node, "sigma_arcsec", "arcsec"), False: _length(node, "sigma_mm", "mm")}
+    heights = [float(to_si(node.number(f"{x}_height_mm", 0.0), "mm")) for x in ("instrument", "target")]
+    out: list[Reading] = []
+    for i, kind in enumerate(kinds):
+        if kind not in READING_KINDS:
+            raise node.error(f"unknown kind {kind!r}; there are {', '.join(READING_KINDS)}", "kinds", i)
+        if kind == "direction" and not setup:
+            raise node.error("directions of one set-up share an orientation; name it with setup", "kinds", i)
+        if (kind == "angle") != (second is not None):
+            raise node.error("an angle, and nothing else, has a right-hand target; give it as second", "kinds", i)
+        for to in targets:
+            if to in (at, second):
+                raise node.error("stands in the same reading twice; its positions must differ", "to")
+            name = f"plan {prefix} {kind} {to.point_id or len(out) + 1}"
+            out.append(Reading(name, cast("ReadingKind", kind), at, to, 1.0, sigma[kind in _ANGLES], setup, second,
+                               heights[0], heights[1], heights[1], group=kind))  # fmt: skip
+    return out
+
+
+def _length(node: Node, key: str, unit: str) -> float:
+    return float(to_si(node.number(key, positive=True), unit)) if node.has(key) else float("nan")
+
+
+def _position(node: Node, key: str, names: Names) -> PositionRef:
+    return _read_position(node, key, node.text(key), names)
+
+
+def _positions(node: Node, key: str, names: Names) -> list[PositionRef]:
+    if isinstance(node.values.get(key), str):
+        return [_position(node, key, names)]
+    return [_read_position(node, key, text, names) for text in node.names(key)]
+
+
+def _read_position(node: Node, key: str, text: str, names: Names) -> PositionRef:
+    try:
+        return read_position(text, names)
+    except NameProblemError as problem:
+        raise node.error(str(problem), key) from problem
+
+
+def _frame(node: Node, key: str, names: Names) -> FrameRef:
+    try:
+        frame = read_frame(node.text(key), names)
+        check_epochs(frame, None, names)
+    except NameProblemError as problem:
+        raise node.error(str(problem), key) from problem
+    return frame
+
+
+def _axis(node: Node, key: str) -> FloatArray:
+    text = node.text(key)
+    name, sign = (text[1:], -1.0) if text.startswith("-") else (text, 1.0)
+    if name not in ("x", "y", "z"):
+        raise node.error(f"found {text!r}; write x, y, z, -x, -y or -z", key)
+    return np.asarray(sign * np.eye(3)["xyz".index(name)])
+
+
+def _level(node: Node, names: Names, name: str) -> Level:
+    node.allow("frame", "axis", "sigma_arcsec")
+    sigma = float(to_si(node.number("sigma_arcsec", positive=True), "arcsec"))
+    return Level(node.text("name", name), _frame(node, "frame", names), _axis(node, "axis"), 0.0, sigma)
+
+
+def _alignment(node: Node, names: Names, name: str) -> Alignment:
+    node.allow("a", "axis_a", "b", "axis_b", "sigma_arcsec")
+    sigma = float(to_si(node.number("sigma_arcsec", positive=True), "arcsec"))
+    a, b = _frame(node, "a", names), _frame(node, "b", names)
+    return Alignment(name, a, _axis(node, "axis_a"), b, _axis(node, "axis_b"), np.zeros(2), sigma**2 * np.eye(2))
+
+
+def _spot(node: Node, names: Names, name: str) -> LaserSpot:
+    node.allow("beam", "target", "epoch", "sigma_mm")
+    beam = node.reference("beam", (b.beam_id for b in names.survey.beams), "beam")
+    target = node.reference("target", (t.target_id for t in names.survey.targets), "target")
+    sigma = float(to_si(node.number("sigma_mm", positive=True), "mm"))
+    return LaserSpot(name, beam, node.text("epoch"), target, np.zeros(2), sigma**2 * np.eye(2))
+
+
+def _on_surface(node: Node, names: Names) -> list[OnSurface]:
+    node.allow("surface", "of", "sigma_mm")
+    surface = node.reference("surface", (s.surface_id for s in names.survey.surfaces), "surface")
+    sigma = float(to_si(node.number("sigma_mm", positive=True), "mm"))
+    return [OnSurface(surface, p, sigma) for p in _positions(node, "of", names)]
+
+
+def _differences(node: Node, names: Names) -> list[CoordinateDifferences]:
+    node.allow("from", "to", "sigma_mm")
+    at, sigma = _position(node, "from", names), float(to_si(node.number("sigma_mm", positive=True), "mm"))
+    return [
+        CoordinateDifferences((at,), (to,), np.zeros((1, 3)), sigma**2 * np.eye(3))
+        for to in _positions(node, "to", names)
+    ]
