@@ -119,7 +119,9 @@ class Runner:
         elif block.language == "python":
             self._python(text, where)
         elif block.language in SHELLS:
-            self.printed = "".join(self._line(line, where) for line in commands(text))
+            lines = commands(text)
+            if block.language or lines[0].split()[0] in (*COMMANDS, "python"):  # other plain blocks are no commands
+                self.printed = "".join(self._line(line, where) for line in lines)
 
     def _python(self, text: str, where: str) -> None:
         self.n_commands += 1
