@@ -25,7 +25,7 @@ from survey import simulate
 from survey.simulate.scene import Truth
 from tests.adjust import helpers as h
 
-REPLICAS = 300
+REPLICAS = int(os.environ.get("LABSURVEY_REPLICAS", "150"))  # more is better, and slower
 LEVEL = 1e-3  # of all tests of one survey together
 SURVEYS: dict[str, Callable[[], tuple[Survey, Truth]]] = {
     "single_camera": lambda: simulate.single_camera(11),

@@ -23,7 +23,7 @@ from survey.simulate import beacons, resample
 ARCSEC = np.pi / 648000
 TABLE = ("world_from_table", "turntable")
 UP = np.array([0.05, -0.99, 0.1]) / np.linalg.norm([0.05, -0.99, 0.1])
-RUNS = 100
+RUNS = 60
 
 
 def laboratory() -> tuple[Survey, dict]:
