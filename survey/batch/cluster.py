@@ -46,7 +46,7 @@ def on_cluster(
             client.submit(run_on_worker, dict(task), retries, pure=False, retries=retries): i
             for i, task in tasks.items()
         }
-        for future in library.as_completed(list(futures)):
+        for future in library.as_completed(list(futures), loop=client.loop):
             i = futures[future]
             if future.status == "finished":
                 yield i, record_from(future.result())

@@ -132,10 +132,11 @@ def test_without_pandas_it_is_said_what_to_install(solution: survey.Solution, mo
 def test_covariances_by_name(solution: survey.Solution) -> None:
     factor = solution.scale.factor**2
     cov = solution.covariance("head", "X")
-    # head: its place on the mount; X: lens and place in the head
-    kinds = list(dict.fromkeys(name[:2] for name, _ in cov.components))
-    assert kinds[0] == ("mount_from_station", "head")
-    assert {("lens", "X")} < set(kinds)
+    # head: where it was held by hand, epoch by epoch (on the table it is held); X: its lens and more
+    kinds = list(dict.fromkeys(name for name, _ in cov.components))
+    assert kinds[0][:2] == ("world_from_station", "head")
+    assert len(kinds[0]) == 3
+    assert ("lens", "X") in kinds
     # the blocks on the diagonal are those of the estimates, which other code put together
     for kind in kinds:
         rows = [i for i, (name, _) in enumerate(cov.components) if name == kind]
@@ -201,7 +202,7 @@ def test_every_plot_is_a_picture_of_its_own(solution: survey.Solution, name: str
     plot = solution.plot(name, **chosen)
     root = ET.fromstring(plot.save(tmp_path / f"{name}.svg").read_text(encoding="utf-8"))
     assert root.tag == "{http://www.w3.org/2000/svg}svg"
-    assert len(list(root.iter())) > 10
+    assert len(list(root.iter())) > 5
     assert plot._repr_svg_() == plot.svg
 
 
@@ -244,7 +245,8 @@ def test_a_step_changes_nothing_before_it(folder: Path) -> None:
 
 
 def test_nothing_observed_is_told(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "survey.toml").write_text((folder / "survey.toml").read_text())
+    for path in (p for p in folder.iterdir() if p.is_file()):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
     with pytest.raises(survey.SurveyError, match="nothing is observed yet"):
         survey.adjust(tmp_path)
 
