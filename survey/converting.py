@@ -133,7 +133,7 @@ def _file_format(path: Path, given: str | None, known: tuple[str, ...]) -> str:
     if len(possible) == 1 and found is None:
         found = possible[0]
     if possible and given in (None, "project") and found not in known:
-        raise SurveyError(f"{path}: {ending} is the ending of several formats; say which with --format: "
+        raise SurveyError(f"{path}: the ending tells no format, {ending} belongs to several; say which with --format: "
                           f"{', '.join(possible)}")  # fmt: skip
     if found == "project" or found is None:
         endings = ", ".join(sorted(e for e, f in _ENDINGS.items() if f in known))
