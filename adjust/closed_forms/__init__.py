@@ -1,6 +1,14 @@
 """Solutions without a start: pure functions of arrays, each with the source of its formula."""
 
-from adjust.closed_forms.absolute_pose import PoseCandidates, absolute_pose, pose_solutions, refine_poses, view_errors
+from adjust.closed_forms.absolute_pose import (
+    PLANAR,
+    WIDEST,
+    PoseCandidates,
+    absolute_pose,
+    pose_solutions,
+    refine_poses,
+    view_errors,
+)
 from adjust.closed_forms.averaging import mean_pose, mean_rotation, pose_distance
 from adjust.closed_forms.hand_eye import degenerate_direction, relative_motions, solve_ax_xb, solve_ax_zb
 from adjust.closed_forms.homography import apply_homography, homography
@@ -9,6 +17,8 @@ from adjust.closed_forms.triangulation import Intersection, intersect
 from adjust.closed_forms.zhang import PinholeStart, pinhole_from_homographies, radial_distortion
 
 __all__ = [
+    "PLANAR",
+    "WIDEST",
     "Intersection",
     "PinholeStart",
     "PoseCandidates",

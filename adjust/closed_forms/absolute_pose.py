@@ -10,8 +10,8 @@ from adjust.closed_forms.view_kernels import errors_of_views, plane_poses, refin
 from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
 
-_PLANAR = 1e-4  # thickness against extent below which points count as a plane
-_WIDEST = float(np.cos(np.deg2rad(80.0)))  # rays further off the mean direction are left to the refinement
+PLANAR = 1e-4  # thickness against extent below which points count as a plane
+WIDEST = float(np.cos(np.deg2rad(80.0)))  # rays further off the mean direction are left to the refinement
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +41,12 @@ def pose_solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
     if len(x) < 3:
         raise SurveyError(f"a camera pose needs 3 known points, got {len(x)}: observe more of them")
     both = np.empty((2, 4, 4))
-    if len(x) > 3 and plane_poses(_flat(x), _flat(rays), _PLANAR, _WIDEST, both) == 2:
+    if len(x) > 3 and plane_poses(_flat(x), _flat(rays), PLANAR, WIDEST, both) == 2:
         return both
     mean = rays.mean(axis=0)
     front_from_camera = rotation_to(mean, np.array([0.0, 0.0, 1.0]))
     turned = rays @ front_from_camera.T
-    near = turned[:, 2] > _WIDEST
+    near = turned[:, 2] > WIDEST
     if near.sum() < 3:
         raise SurveyError("fewer than 3 rays within 80 degrees of their mean: split the view, or observe more points")
     centre, axes, thin = _principal_axes(x[near])
@@ -78,7 +78,7 @@ def _principal_axes(x: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
     if s[1] <= 1e-6 * s[0]:
         raise SurveyError(f"{len(x)} points on one line do not determine a camera pose: add one off the line")
     axes = vt * np.array([[1.0], [1.0], [np.linalg.det(vt)]])
-    return centre, axes, bool(s[2] < _PLANAR * s[0])
+    return centre, axes, bool(s[2] < PLANAR * s[0])
 
 
 def _solutions(x: FloatArray, xy: FloatArray, centre: FloatArray, axes: FloatArray, thin: bool) -> list[FloatArray]:

@@ -173,6 +173,31 @@ def _map_rms(h: FloatArray, x: FloatArray, u: FloatArray) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _add_map_rows(x0: float, x1: float, x2: float, u: float, v: float, N: FloatArray) -> None:
+    """Add (x, 0, -u x) and (0, x, -v x), each times itself, to N (9, 9): the lower triangles that differ."""
+    uv = u * u + v * v
+    for a in range(3):
+        xa = x0 if a == 0 else x1 if a == 1 else x2
+        for b in range(a + 1):
+            xx = xa * (x0 if b == 0 else x1 if b == 1 else x2)
+            N[a, b] += xx
+            N[6 + a, b] -= u * xx
+            N[6 + a, 3 + b] -= v * xx
+            N[6 + a, 6 + b] += uv * xx
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _complete_map_rows(N: FloatArray) -> None:
+    for a in range(3):
+        for b in range(a + 1):
+            N[3 + a, 3 + b] = N[a, b]
+            N[6 + b, a], N[6 + b, 3 + a] = N[6 + a, b], N[6 + a, 3 + b]
+    for i in range(9):
+        for j in range(i):
+            N[j, i] = N[i, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def plane_to_image(xy: FloatArray, uv: FloatArray, refinements: int, h: FloatArray) -> float:
     """Homography h (3, 3) of a plane and the rms of its residuals in the unit of uv; negative where it is singular.
 
@@ -182,13 +207,9 @@ def plane_to_image(xy: FloatArray, uv: FloatArray, refinements: int, h: FloatArr
     Tx, Tu = np.empty((3, 3)), np.empty((3, 3))
     x, u = _normalised(xy, Tx), _normalised(uv, Tu)
     N = np.zeros((9, 9))
-    row = np.empty((2, 9))
     for i in range(n):
-        row[:] = 0.0
-        for k in range(2):
-            row[k, 3 * k], row[k, 3 * k + 1], row[k, 3 * k + 2] = x[i, 0], x[i, 1], 1.0
-            row[k, 6], row[k, 7], row[k, 8] = -u[i, k] * x[i, 0], -u[i, k] * x[i, 1], -u[i, k]
-        N += row.T @ row
+        _add_map_rows(x[i, 0], x[i, 1], 1.0, u[i, 0], u[i, 1], N)
+    _complete_map_rows(N)
     values, vectors = np.linalg.eigh(N)
     if values[1] < 1e-13 * values[8]:
         return -1.0
@@ -204,14 +225,19 @@ def plane_to_image(xy: FloatArray, uv: FloatArray, refinements: int, h: FloatArr
         for i in range(n):
             for a in range(3):
                 p[a] = best_h[a, 0] * x[i, 0] + best_h[a, 1] * x[i, 1] + best_h[a, 2]
-            row[:] = 0.0
+            x0, x1, x2 = x[i, 0] / p[2], x[i, 1] / p[2], 1.0 / p[2]
+            v0, v1 = p[0] / p[2], p[1] / p[2]
+            _add_map_rows(x0, x1, x2, v0, v1, N)
             for k in range(2):
-                v = p[k] / p[2]
-                row[k, 3 * k], row[k, 3 * k + 1], row[k, 3 * k + 2] = x[i, 0] / p[2], x[i, 1] / p[2], 1.0 / p[2]
-                row[k, 6], row[k, 7], row[k, 8] = -v * x[i, 0] / p[2], -v * x[i, 1] / p[2], -v / p[2]
-                for a in range(9):
-                    g[a] += row[k, a] * (v - u[i, k])
-            N += row.T @ row
+                v = v0 if k == 0 else v1
+                e = v - u[i, k]
+                g[3 * k] += x0 * e
+                g[3 * k + 1] += x1 * e
+                g[3 * k + 2] += x2 * e
+                g[6] -= v * x0 * e
+                g[7] -= v * x1 * e
+                g[8] -= v * x2 * e
+        _complete_map_rows(N)
         # the scale of h has no effect: one more row holds it
         flat = best_h.copy().reshape(9)
         N += np.outer(flat, flat)
@@ -349,3 +375,67 @@ def median_offset(pose: FloatArray, x: FloatArray, rays: FloatArray) -> float:
         across2 = max(p[0] ** 2 + p[1] ** 2 + p[2] ** 2 - along**2, 0.0)
         out[i] = np.sqrt(across2) / along if along > 0 else np.inf
     return float(np.median(out)) if len(out) else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def first_poses(x: FloatArray, rays: FloatArray, ptr: IntArray, thickness: float, widest: float, poses: FloatArray,
+                rms: FloatArray, in_front: BoolArray, found: BoolArray) -> None:  # fmt: skip
+    """Both poses (B, 2, 4, 4) of the plane in every view, as :func:`plane_poses` finds them, and how good they are.
+
+    rms, in_front: (B, 2) as of :func:`errors_of_views`. found: (B,), False where there is no plane.
+    """
+    whole = np.empty(2, np.int64)
+    for view in range(len(ptr) - 1):
+        a, b = ptr[view], ptr[view + 1]
+        found[view] = b - a > 3 and plane_poses(x[a:b], rays[a:b], thickness, widest, poses[view]) == 2
+        if not found[view]:
+            continue
+        whole[0], whole[1] = 0, b - a
+        for k in range(2):
+            errors_of_views(
+                poses[view, k : k + 1], x[a:b], rays[a:b], whole, rms[view, k : k + 1], in_front[view, k : k + 1]
+            )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def offsets_of_views(poses: FloatArray, x: FloatArray, rays: FloatArray, ptr: IntArray, out: FloatArray,
+                     medians: FloatArray) -> None:  # fmt: skip
+    """Tangents (N,) of the angles between rays and points, infinite for points behind, and their medians (B,)."""
+    p = np.empty(3)
+    for view in range(len(ptr) - 1):
+        pose = poses[view]
+        for i in range(ptr[view], ptr[view + 1]):
+            for a in range(3):
+                p[a] = pose[a, 0] * x[i, 0] + pose[a, 1] * x[i, 1] + pose[a, 2] * x[i, 2] + pose[a, 3]
+            along = p[0] * rays[i, 0] + p[1] * rays[i, 1] + p[2] * rays[i, 2]
+            across2 = max(p[0] ** 2 + p[1] ** 2 + p[2] ** 2 - along**2, 0.0)
+            out[i] = np.sqrt(across2) / along if along > 0 else np.inf
+        medians[view] = np.median(out[ptr[view] : ptr[view + 1]])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def plane_misfits(x: FloatArray, uv: FloatArray, ptr: IntArray, out: FloatArray) -> None:
+    """Per view the median distance (B,) from the image of the points' best plane, relative to their extent there.
+
+    Infinite where the points lie on one line or are fewer than four.
+    """
+    h = np.empty((3, 3))
+    for view in range(len(ptr) - 1):
+        a, b = ptr[view], ptr[view + 1]
+        out[view] = np.inf
+        if b - a < 4:
+            continue
+        mean = np.array([x[a:b, 0].mean(), x[a:b, 1].mean(), x[a:b, 2].mean()])
+        centred = x[a:b] - mean
+        vectors = np.linalg.eigh(centred.T @ centred)[1]
+        xy = np.ascontiguousarray((centred @ vectors)[:, :0:-1])
+        if plane_to_image(xy, uv[a:b], 0, h) < 0:
+            continue
+        miss = np.empty(b - a)
+        for i in range(b - a):
+            w = h[2, 0] * xy[i, 0] + h[2, 1] * xy[i, 1] + h[2, 2]
+            du = (h[0, 0] * xy[i, 0] + h[0, 1] * xy[i, 1] + h[0, 2]) / w - uv[a + i, 0]
+            dv = (h[1, 0] * xy[i, 0] + h[1, 1] * xy[i, 1] + h[1, 2]) / w - uv[a + i, 1]
+            miss[i] = np.sqrt(du * du + dv * dv)
+        extent = np.sqrt(np.ptp(uv[a:b, 0]) ** 2 + np.ptp(uv[a:b, 1]) ** 2)
+        out[view] = np.median(miss) / max(extent, 1e-9)

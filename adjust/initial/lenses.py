@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.closed_forms import absolute_pose, apply_homography, homography, pinhole_from_homographies
+from adjust.closed_forms import absolute_pose, homography, pinhole_from_homographies
+from adjust.closed_forms.view_kernels import plane_misfits
 from adjust.errors import SurveyError
 from adjust.initial.lens_refinement import LensFit, fit_lens
 from adjust.lens import (
@@ -114,12 +115,9 @@ class _LensSearch:
 
     def _screen(self, flat: Sequence[Sighting]) -> tuple[list[Sighting], dict[int, str]]:
         """Images whose points lie as on a plane; a wrong point order misses by a good part of the image."""
-        misfit = []
-        for s in flat:
-            try:
-                misfit.append(_homography_misfit(s))
-            except SurveyError:
-                misfit.append(np.inf)
+        misfit = np.empty(len(flat))
+        ptr = np.cumsum([0] + [len(s.x) for s in flat])
+        plane_misfits(np.concatenate([s.x for s in flat]), np.concatenate([s.uv for s in flat]), ptr, misfit)
         limit = max(0.02, 6.0 * float(np.median(misfit)))
         good = [s for s, m in zip(flat, misfit, strict=True) if m <= limit]
         excluded = {
@@ -292,14 +290,6 @@ def _plane_coordinates(x: FloatArray) -> FloatArray:
 
 def _unit(xy: FloatArray) -> FloatArray:
     return np.asarray(xy / np.max(np.linalg.norm(xy, axis=1)))
-
-
-def _homography_misfit(s: Sighting) -> float:
-    """Median distance from the plane's image, relative to the extent of the points in the image."""
-    xy = _plane_coordinates(s.x)
-    h, _ = homography(xy, s.uv, refinements=0)
-    extent = float(np.linalg.norm(np.ptp(s.uv, axis=0)))
-    return float(np.median(np.linalg.norm(apply_homography(h, xy) - s.uv, axis=1))) / max(extent, 1e-9)
 
 
 def _every(images: Sequence[Sighting], n: int) -> list[Sighting]:

@@ -18,11 +18,12 @@ from adjust.initial.relative import orient_second, scale_lengths
 from adjust.initial.result import Start
 from adjust.initial.undetermined import undetermined
 from adjust.initial.views import (
+    Sight,
     View,
     all_rays,
     block_text,
     focal_px,
-    make_view,
+    make_views,
     refine_views,
     target_points,
     untrustworthy,
@@ -125,7 +126,7 @@ class _Search:
         rays, failed = all_rays(self.survey, self.lenses)
         focal = {c.camera_id: focal_px(c, self.lenses[c.camera_id]) for c in self.survey.cameras}
         target_x = {t.target_id: target_points(t) for t in self.survey.targets}
-        views: list[View] = []
+        sights: list[Sight] = []
         for i, block in enumerate(self.survey.image_blocks):
             used = used_rows(block)
             if i in failed:
@@ -133,11 +134,11 @@ class _Search:
             elif block.target_id is None:
                 self.points.add(self.survey, i, rays[i], focal[block.camera_id], self.chains[i])
             elif used.sum() >= 3:  # fewer give no pose, but may well serve in the adjustment
-                try:
-                    x = target_x[block.target_id][block.point_idx[used]]
-                    views.append(make_view(i, x, rays[i][used], focal[block.camera_id]))
-                except SurveyError as error:
-                    self.reasons.setdefault(i, f"{block_text(block)}: {error}")
+                x = target_x[block.target_id][block.point_idx[used]]
+                sights.append(Sight(i, x, rays[i][used], focal[block.camera_id]))
+        views, without = make_views(sights)
+        for i, reason in without.items():
+            self.reasons.setdefault(i, f"{block_text(self.survey.image_blocks[i])}: {reason}")
         refined = refine_views(views)
         reasons, notes = untrustworthy([v for v in refined if v.block_idx not in self.reasons], self.survey)
         self.reasons = {**reasons, **self.reasons}

@@ -1,12 +1,13 @@
 """Blocks of image points as rays, and the camera poses that each explains by itself."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from adjust.closed_forms import pose_solutions, refine_poses, view_errors
+from adjust.closed_forms import PLANAR, WIDEST, pose_solutions, refine_poses, view_errors
+from adjust.closed_forms.view_kernels import first_poses, offsets_of_views
 from adjust.errors import SurveyError
 from adjust.lens import camera_constants, focal_length_px, lens_model, unit_rays
 from adjust.model import BoolArray, Camera, FloatArray, IntArray, Survey, Target
@@ -91,6 +92,40 @@ def all_rays(survey: Survey, lenses: dict[str, FloatArray]) -> tuple[dict[int, F
     return rays, failed
 
 
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """One block to make a view of: the same fields."""
+
+    block_idx: int
+    x: FloatArray
+    rays: FloatArray
+    focal_px: float
+
+
+def make_views(sights: Sequence[Sight]) -> tuple[list[View], dict[int, str]]:
+    """Views with their unrefined candidate poses, and for every block that has none the reason."""
+    rows = [_sample(len(s.x)) for s in sights]
+    n = len(sights)
+    ptr = np.cumsum([0] + [len(r) for r in rows])
+    poses, error = np.empty((n, 2, 4, 4)), np.empty((n, 2))
+    in_front, planar = np.empty((n, 2), dtype=np.bool_), np.empty(n, dtype=np.bool_)
+    if n:
+        x = np.concatenate([s.x[r] for s, r in zip(sights, rows, strict=True)])
+        rays = np.concatenate([s.rays[r] for s, r in zip(sights, rows, strict=True)])
+        first_poses(x, rays, ptr, PLANAR, WIDEST, poses, error, in_front, planar)
+    views: list[View] = []
+    failed: dict[int, str] = {}
+    for i, s in enumerate(sights):
+        if planar[i]:
+            views.append(_ranked(s, poses[i], error[i] * s.focal_px, in_front[i]))
+            continue
+        try:
+            views.append(make_view(s.block_idx, s.x, s.rays, s.focal_px))
+        except SurveyError as reason:
+            failed[s.block_idx] = str(reason)
+    return views, failed
+
+
 def make_view(block_idx: int, x: FloatArray, rays: FloatArray, focal: float) -> View:
     """A view with its unrefined candidate poses; raises SurveyError where there are none."""
     few = _sample(len(x))
@@ -99,7 +134,7 @@ def make_view(block_idx: int, x: FloatArray, rays: FloatArray, focal: float) -> 
         raise SurveyError(f"no camera pose explains its {len(x)} points; check their order and coordinates")
     ptr = np.arange(len(poses) + 1) * len(few)
     error, in_front = view_errors(poses, np.tile(x[few], (len(poses), 1)), np.tile(rays[few], (len(poses), 1)), ptr)
-    return _ranked(View(block_idx, x, rays, focal, poses, error * focal), poses, error * focal, in_front)
+    return _ranked(Sight(block_idx, x, rays, focal), poses, error * focal, in_front)
 
 
 @lru_cache(maxsize=256)
@@ -135,27 +170,13 @@ def _refined(views: Sequence[View], rows: Sequence[IntArray], iterations: int) -
     ]
 
 
-def _ranked(view: View, poses: FloatArray, error_px: FloatArray, in_front: BoolArray) -> View:
-    order = [int(i) for i in np.lexsort((error_px, ~in_front))]
-    best = error_px[order[0]]
-    keep = [i for i in order if in_front[i] and error_px[i] <= max(_RIVAL * best, best + _NOISE_PX)]
+def _ranked(view: View | Sight, poses: FloatArray, error_px: FloatArray, in_front: BoolArray) -> View:
+    errors, front = error_px.tolist(), in_front.tolist()
+    order = sorted(range(len(errors)), key=lambda i: (not front[i], errors[i]))
+    best = errors[order[0]]
+    keep = [i for i in order if front[i] and errors[i] <= max(_RIVAL * best, best + _NOISE_PX)]
     keep = keep or order[:1]
-    return replace(view, poses=poses[keep], error_px=error_px[keep])
-
-
-def point_errors_px(view: View, camera_from_target: FloatArray) -> FloatArray:
-    """Offsets (n,) px of the points of a view at a pose; infinite for points behind."""
-    return ray_errors(camera_from_target, view.x, view.rays) * view.focal_px
-
-
-def ray_errors(camera_from_x: FloatArray, x: FloatArray, rays: FloatArray) -> FloatArray:
-    """Tangents (n,) of the angles between rays and points; infinite for points behind."""
-    p = x @ camera_from_x[:3, :3].T + camera_from_x[:3, 3]
-    along = np.einsum("ij,ij->i", p, rays)
-    across2 = np.maximum(np.einsum("ij,ij->i", p, p) - along**2, 0.0)
-    out = np.full(len(p), np.inf)
-    np.divide(np.sqrt(across2), along, out=out, where=along > 0)
-    return out
+    return View(view.block_idx, view.x, view.rays, view.focal_px, poses[keep], error_px[keep])
 
 
 def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str], list[str]]:
@@ -165,14 +186,22 @@ def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str]
     """
     reasons: dict[int, str] = {}
     notes: list[str] = []
-    by_camera: dict[str, list[View]] = {}
-    for view in views:
-        by_camera.setdefault(survey.image_blocks[view.block_idx].camera_id, []).append(view)
+    if not views:
+        return reasons, notes
+    ptr = np.cumsum([0] + [len(v.x) for v in views])
+    offsets, medians = np.empty(int(ptr[-1])), np.empty(len(views))
+    offsets_of_views(
+        np.array([v.poses[0] for v in views]), np.concatenate([v.x for v in views]),
+        np.concatenate([v.rays for v in views]), ptr, offsets, medians,
+    )  # fmt: skip
+    focal = np.array([v.focal_px for v in views])
+    by_camera: dict[str, list[int]] = {}
+    for i, view in enumerate(views):
+        by_camera.setdefault(survey.image_blocks[view.block_idx].camera_id, []).append(i)
     for mine in by_camera.values():
-        errors = [point_errors_px(v, v.poses[0]) for v in mine]
-        limit = max(3.0, 10.0 * float(np.median([np.median(e) for e in errors])))
-        for view, error in zip(mine, errors, strict=True):
-            bad = error > limit
+        limit = max(3.0, 10.0 * float(np.median(medians[mine] * focal[mine])))
+        for i in mine:
+            view, bad = views[i], offsets[ptr[i] : ptr[i + 1]] * focal[i] > limit
             text = block_text(survey.image_blocks[view.block_idx])
             if bad.mean() > _GROSS_SHARE:
                 reasons[view.block_idx] = (
