@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import platform
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
@@ -83,7 +84,7 @@ def one_camera(session: Session) -> None:
 
 def unknown_points(session: Session) -> None:
     """Bundles."""
-    ours, colmap = "ours: build, solve, precision", "COLMAP bundle adjustment"
+    ours, colmap = "ours: build, solve, precision", "COLMAP: solve, covariance"
     warm = bundle.simulated(20, 300, 6)
     session.say("", "## Bundle with unknown points", "")
     folder = data_folder("network", "jaicov")
@@ -96,18 +97,21 @@ def unknown_points(session: Session) -> None:
         f"S0 = {s0:.9e} mm, published {bundle.AICON_S0:.7e}; v'Pv = {numbers['omega']:.5f}, published 12359.40759; "
         f"redundancy {numbers['redundancy']:.0f}, published 18804."
     )
-    sizes = (40, 800) if session.quick else (100, 3000)
-    case = bundle.simulated(*sizes, 8)
-    session.say("", f"Simulated: {sizes[0]} images, {len(case.points)} points, {len(case.uv)} image points.", "")
-    found = session.compete(f"{sizes[0]} x {len(case.points)}", case, warm, [ours, colmap])
-    session.say(tables.times(list(found.values()), found[ours]), "")
-    session.say(tables.stages([found[ours]]), "")
-    if found[colmap].seconds:
-        d = np.abs(found[colmap].solution["lens"] - [0, 0, 0.5, 0.5, 0, 0, 0, 0] - bundle.free(found[ours].solution))
-        session.say(
-            f"COLMAP estimates no covariances. Lenses differ by {d[:4].max():.1e} px; v'Pv is "
-            f"{found[ours].numbers['omega']:.6f} (ours), {found[colmap].numbers['omega']:.6f} (COLMAP)."
-        )
+    session.say(
+        "", "Simulated, all round a hall. Ours: inner constraints over some ten points, all covariances, redundancy "
+        "numbers and tests. COLMAP: two cameras fixed, all covariances (`estimate_ba_covariance`), nothing else.",
+    )  # fmt: skip
+    for sizes in ((40, 800, 8),) if session.quick else ((100, 3000, 8), (500, 3000, 34)):
+        case = bundle.simulated(*sizes)
+        session.say("", f"### {sizes[0]} images, {len(case.points)} points, {len(case.uv)} image points", "")
+        found = session.compete(f"{sizes[0]} x {len(case.points)}", case, warm, [ours, colmap])
+        session.say(tables.times(list(found.values()), found[ours]), "")
+        session.say(tables.stages(list(found.values())), "")
+        if found[colmap].seconds:
+            lens = found[colmap].solution["lens"] - [0, 0, 0.5, 0.5, 0, 0, 0, 0]
+            d = np.abs(lens - bundle.free(found[ours].solution))
+            omega = [found[name].numbers["omega"] for name in (ours, colmap)]
+            session.say(f"Lenses differ by {d[:4].max():.1e} px; v'Pv is {omega[0]:.6f}, COLMAP's {omega[1]:.6f}.")
 
 
 def scaling(session: Session) -> None:
@@ -136,8 +140,26 @@ def stages(session: Session) -> None:
     session.say(where_time_goes(sizes))
 
 
+def networks(session: Session) -> None:
+    """Readings and pose networks, each in a process of its own."""
+    session.say("", "## Networks of readings and of poses")
+    small, large = (("200", "200free"), ("grow", "300", "2")), (("1000", "1000free", "3000"), ("grow", "5000", "2"))
+    readings, poses = small if session.quick else large
+    runs = [("terrestrial", readings), ("networks", poses)]
+    runs += [] if session.quick else [("networks", ("batch", "1000", "10"))]
+    threads = {"OPENBLAS_NUM_THREADS": "1", "LABSURVEY_THREADS": str(session.threads)}
+    for module, arguments in runs:
+        command = ["-m", f"tests.benchmarks.{module}", *arguments]
+        print("running:", *command, file=sys.stderr)
+        done = subprocess.run(
+            [sys.executable, *command], capture_output=True, text=True, check=True, env=os.environ | threads
+        )
+        session.say("", "`python " + " ".join(command) + "`", "", "```text", done.stdout.rstrip(), "```")
+
+
 CASES: dict[str, Callable[[Session], None]] = {
     "several": several_cameras, "one": one_camera, "bundle": unknown_points, "scaling": scaling, "stages": stages,
+    "networks": networks,
 }  # fmt: skip
 
 
