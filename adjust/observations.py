@@ -50,7 +50,7 @@ class ImageBlock:
 
 @dataclass(frozen=True, eq=False)
 class TableReading:
-    """Angles (k,) rad read off a table's axes at an epoch, with covariance (k, k); they are a start even if not used."""
+    """Angles (k,) rad read off a table's axes at an epoch, with covariance (k, k); a start even if not used."""
 
     table_id: str
     epoch_id: str

@@ -136,8 +136,8 @@ class TreeCovariance:
     def full(self) -> FloatArray:
         """The whole covariance matrix (n, n) of all unknowns, rows as :meth:`places` says, parents before children.
 
-        From the roots down: with Q of all that comes before, Q_f, = T Q_s, and Q_ff = R^-1 R^-T + T Q_sf. Costs the size
-        of the factor times n, by matrix products.
+        From the roots down: with Q of all that comes before, Q_f, = T Q_s, and Q_ff = R^-1 R^-T + T Q_sf. Costs the
+        size of the factor times n, by matrix products.
         """
         Q = np.zeros((self.n, self.n))
         keys, ptr, first, dims = self._keys, self._key_ptr, self._first, self._dims
