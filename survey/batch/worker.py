@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import threading
+import weakref
 from collections.abc import Mapping
 from typing import Any
 
@@ -73,6 +74,8 @@ class Worker:
                 [sys.executable, "-c", _START, *sys.path], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 env=environment,
             )  # fmt: skip
+            # a thread of a cluster goes without a word; its worker goes with it
+            weakref.finalize(self, _ended, self._process)
         return self._process
 
     def stop(self) -> None:
@@ -84,6 +87,11 @@ class Worker:
             process.wait()
             if not self._busy:  # else the thread that waits for an answer sees the end of it
                 _waited(process)
+
+
+def _ended(process: "subprocess.Popen[bytes]") -> None:
+    process.kill()
+    _waited(process)
 
 
 def _waited(process: "subprocess.Popen[bytes]") -> int:
