@@ -45,10 +45,10 @@ def control_chart(c: Chart, names: Sequence[str], failed: Sequence[int], title: 
 
 
 def _reach(c: Chart, deviation: FloatArray) -> float:
-    """Half the height in the series' unit: all limits, and what is outside up to three times as far."""
+    """Half the height in the series' unit: all limits, and what is outside up to six times as far."""
     limits = [float(np.max(c.by_sigma)), c.by_scatter if np.isfinite(c.by_scatter) else 0.0]
     most = float(np.max(np.abs(deviation) + c.series.sigma))
-    return max(1.08 * min(max(most, *limits), 3.0 * max(limits)), 1e-300)
+    return max(1.08 * min(max(most, *limits), 6.0 * max(limits)), 1e-300)
 
 
 def _heading(c: Chart, title: str) -> str:
@@ -103,7 +103,7 @@ def _names(c: Chart, x: FloatArray, y: FloatArray, names: Sequence[str]) -> list
     for i in np.argsort(-own).tolist():
         if not c.outside[i] or len(out) == 6:
             break
-        if all(abs(x[i] - k) > 60 for k in taken):
+        if all(abs(x[i] - k) > 72 for k in taken):
             taken.append(x[i])
             side = "end" if x[i] > 0.7 * _WIDE else "start"
             below = y[i] < _TOP + 12

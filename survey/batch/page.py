@@ -108,7 +108,7 @@ def _failures(records: Sequence[Record], place: Path) -> str:
 
 
 def _wrapped(text: str) -> str:
-    return f'<div style="white-space: normal; max-width: 760px">{text.replace(chr(10), "<br>")}</div>'
+    return f'<div style="white-space: normal; max-width: 760px; min-width: 240px">{text.replace(chr(10), "<br>")}</div>'
 
 
 def _tests(records: Sequence[Record], place: Path) -> str:
@@ -175,7 +175,7 @@ def _figures(charts: Sequence[Chart], records: Sequence[Record]) -> str:
 
 def _title(c: Chart) -> str:
     kind, *rest = c.series.name.split("/")
-    return " · ".join((known(kind.replace("_", " ")), *rest))
+    return " · ".join((known(kind.replace("_", " ")).rstrip(":"), *rest))
 
 
 def _numbers(trends: Trends, records: Sequence[Record]) -> str:
@@ -218,7 +218,7 @@ def _alarm(trends: Trends, c: Chart, names: Sequence[str]) -> str:
         first, last = (esc(names[int(c.series.epoch[i])]) for i in (run.first, run.last))
         word = {"one_side": t("on one side"), "rising": t("rising"), "falling": t("falling")}[run.kind]
         out.append(f"{pill('soft', word)} {first} – {last}")
-    return " ".join(out)
+    return _wrapped(" ".join(out)) if out else ""
 
 
 def _folders(records: Sequence[Record], place: Path) -> str:
