@@ -202,8 +202,8 @@ class BundleBatch:
         owners = [block for key in self.hidden_poses for block in own[key]]
         blocks_of = [b for b, _ in owners]
         per_block = np.bincount(np.array(rows, dtype=np.int64), minlength=self.n_local + 1)
-        # pure: a hidden pose is that of one block, and the only unknown behind that block's pose
-        self._pure = (
+        # every hidden pose is that of one block, and the only unknown behind that block's pose
+        self.alone = (
             bool(owners) and not self._table_links and all(len(own[key]) == 1 for key in self.hidden_poses)
             and bool(np.all(per_block[self.first_pose + 6 * np.array(blocks_of)] == 1))
         )  # fmt: skip
@@ -276,7 +276,7 @@ class BundleBatch:
         rest = self.chi_square - float(np.einsum("ja,jab,jb->", self.h, self.Vi, self.h))
         self.blind = self._blind_motions(values) if damping == 0.0 else np.zeros((self.n_keys - self.n_hidden, 0))
         floor = FLOOR * self._without_points() + 1e-300
-        if self._pure:
+        if self.alone:
             across = self._interface_rows(S)
             inner = across[:, self.n_hidden :]
             head, d = self._scaled_head(S, floor[: self.n_hidden])
@@ -546,7 +546,7 @@ class BundleBatch:
     def _local_covariance(self, Q: FloatArray) -> FloatArray:
         """G Q G' (n_local, n_local)."""
         nh = self.n_hidden
-        if not self._pure:
+        if not self.alone:
             return np.ascontiguousarray(self.G @ (self.G @ Q).T)
         out = np.zeros((self.n_local, self.n_local))
         between_poses(Q, self._own_at, self.chains.C[self._own_links], False, False, out)

@@ -66,6 +66,22 @@ def test_bundle_equals_the_dense_adjustment(options: dict[str, object], reduced:
     assert len(bundle.hidden_poses) == 4
 
 
+@pytest.mark.parametrize(("n_cameras", "alone"), [(1, True), (2, False)])
+def test_cameras_fixed_to_their_stations(n_cameras: int, alone: bool) -> None:
+    """A hidden pose behind one image alone takes the short way, one behind several images the general one."""
+    survey, truth = h.network(1, n_cameras=n_cameras)
+    cameras = []
+    for c in survey.cameras:
+        pose = truth["station_from_camera", c.camera_id]
+        assert isinstance(pose, gtsam.Pose3)
+        cameras.append(replace(c, station_from_camera=PoseParameter(pose, "held")))
+    precision, _ = h.check_against_dense(replace(survey, cameras=tuple(cameras)), near(truth))
+    bundle = precision.graph.bundle
+    assert bundle is not None
+    assert bundle.hidden_poses
+    assert bundle.alone == alone
+
+
 def test_points_between_known_cameras() -> None:
     """Intersection alone: nothing but points is unknown."""
     survey, truth = h.network(1, distances=0)
