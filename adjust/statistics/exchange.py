@@ -105,12 +105,16 @@ def _state(snooping: Snooping) -> _State | None:
         return None
     U = np.hstack([snooping.columns[x][0] for x in out])
     inverse = np.linalg.inv(U[np.concatenate(index)])  # of the Cholesky factor of their own R
-    K, B, possible = inverse.T @ inverse, U @ inverse, snooping.failing()[1]
+    K, B = inverse.T @ inverse, U @ inverse
+    possible = snooping.system.used & snooping.candidates  # also what only the others left in place cannot check
+    possible[out] = False
     bias = inverse.T @ np.concatenate([snooping.columns[x][1] for x in out])
     link = np.zeros((len(possible), len(K)))
     for members, at, R in _by_size(snooping, possible):
         shared = B[at] ** 2 / np.diag(K)  # (n, k, r), what R grows by when one of them is back in
-        link[members] = np.sqrt(shared / (np.einsum("nii->ni", R)[..., None] + shared)).max(axis=1)
+        grown = np.einsum("nii->ni", R)[..., None] + shared
+        seen = grown > CONTROLLED
+        link[members] = np.sqrt(np.where(seen, shared, 0.0) / np.where(seen, grown, 1.0)).max(axis=1)
     return _State(snooping, {x: np.arange(*ends[i : i + 2]) for i, x in enumerate(out)}, K, bias, U, B, possible, link)
 
 
@@ -201,7 +205,7 @@ def _suspects(state: _State, mine: list[int], N: IntArray, of_N: FloatArray, lin
     B, g = state.B[:, N], state.snooping.g + state.B[:, N] @ (of_N @ state.bias[N])
     back = B @ np.linalg.cholesky(of_N)  # R grows by back back'
     for members, at, R in _by_size(state.snooping, state.possible & (link > _LINKED)):
-        grown = R + np.einsum("nia,nja->nij", back[at], back[at])
+        grown = R + np.einsum("nia,nja->nij", back[at], back[at]) + CONTROLLED**2 * np.eye(R.shape[1])
         T[members] = np.einsum("ni,ni->n", g[at], np.linalg.solve(grown, g[at][..., None])[..., 0])
     room = _POOL - len(mine)
     free = np.flatnonzero(link > _LINKED)

@@ -82,7 +82,7 @@ def terrestrial_candidates(part: Terrestrial) -> list[Candidate]:
     sights: dict[str, list[Reading]] = {}
     for r in part.readings:
         ends = [position_text(x) for x in (r.at, r.to, r.second) if x is not None]
-        sights.setdefault(" ".join(dict.fromkeys(["sight", *ends])), []).append(r)
+        sights.setdefault(" ".join(dict.fromkeys(ends)), []).append(r)
     out = [Candidate(name, "sight", readings=tuple(group)) for name, group in sights.items()]
     out += [Candidate(x.level_id, "level", levels=(x,)) for x in part.levels]
     out += [Candidate(x.alignment_id, "alignment", alignments=(x,)) for x in part.alignments]

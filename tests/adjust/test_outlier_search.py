@@ -8,8 +8,9 @@ from gtsam import Pose3
 from scipy.stats import binom
 
 from adjust.adjustment import adjust
-from adjust.model import FloatArray, PointParameter, Survey
-from adjust.observations import Distance, FrameRef, Pair, PositionRef, ReadingCovariance
+from adjust.graph import StartValues
+from adjust.model import FloatArray, Point, PointParameter, Survey
+from adjust.observations import Distance, FrameRef, Pair, PositionRef, Reading, ReadingCovariance
 from adjust.statistics.candidates import candidates, without
 from adjust.statistics.outlier_search import SearchOptions, search_outliers
 from adjust.statistics.reliability import reliability
@@ -219,3 +220,32 @@ def test_joint_covariances_are_split() -> None:
     assert not less.readings[1].used
     np.testing.assert_array_equal(less.reading_covariances[0].cov, cov[np.ix_([0, 2, 3], [0, 2, 3])])
     assert adjust(less, start).redundancy == adjustment.redundancy - 1
+
+
+@pytest.mark.parametrize(("seed", "least"), [(14, 3.0), (29, 2.5), (46, 1.6)])
+def test_good_observations_that_went_out_for_a_bad_one_come_back(seed: int, least: float) -> None:
+    """Surveys in which data snooping alone keeps a large error and leaves out good readings of a point."""
+    _, wrong, sizes = planted(seed)
+    _, start = net.hall(seed, n_points=20, n_stations=4, n_tapes=20)
+    found = search_outliers(wrong, start, SearchOptions(LevelOptions(family_alpha=0.05)))
+    named = {d.ids[0] for d in found.rejected}
+    assert {i for i, size in sizes.items() if size > 1.5} <= named
+    assert not named - set(sizes)
+    back = [d for d in found.log if d.how == "exchange"]
+    assert {d.ids[0] for d in back if d.action == "rejected"} & {i for i, size in sizes.items() if size > least}
+
+
+def test_two_explanations_that_cannot_be_told_apart_are_both_named() -> None:
+    """A point seen by two distances and nothing else along their line: either may be the wrong one."""
+    x = {"S1": np.zeros(3), "S2": np.array([10.0, 0.0, 0.0]), "P1": np.array([4.0, 0.0, 0.0])}
+    points = tuple(Point(n, PointParameter(v, "free" if n == "P1" else "held", held=("y", "z") if n == "P1" else ()))
+                   for n, v in x.items())  # fmt: skip
+    readings = tuple(Reading(s, "slope_distance", PositionRef(s), PositionRef("P1"), d, 1e-4)
+                     for s, d in (("S1", 4.0), ("S2", 6.01)))  # fmt: skip
+    found = search_outliers(Survey(points=points, readings=readings), StartValues({}, {}, x))
+    assert len(found.rejected) == 1
+    assert len(found.alternatives) == 1
+    other = found.alternatives[0]
+    assert {other.kept[0][1], other.instead[0][1]} == {"S1", "S2"}
+    assert other.odds == pytest.approx(1.0, abs=1e-6)
+    assert any("either" in n and "S1" in n and "S2" in n for n in found.notes)
