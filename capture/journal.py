@@ -85,9 +85,12 @@ def read_journal(path: Path) -> tuple[list[Record], int, bool]:
 def _parsed(line: bytes) -> dict[str, Any] | None:
     try:
         record = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
-    return record if isinstance(record, dict) and isinstance(record.get("kind"), str) else None
+    if not isinstance(record, dict) or not isinstance(record.get("kind"), str):
+        return None
+    named = record["kind"] not in ("set", "lost") or isinstance(record.get("epoch_id"), str)
+    return record if named else None
 
 
 def taken_sets(records: list[Record]) -> dict[str, Record]:

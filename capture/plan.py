@@ -15,6 +15,7 @@ from capture.plan_table import TablePlan, read_table
 from survey.files.node import Node, read_toml
 
 FORMAT = 1
+_MOST_REPEATS = 10_000
 _TOP = ("format", "project", "survey", "table", "cameras", "capture", "poses")
 _CAPTURE = (
     "repeats",
@@ -169,6 +170,8 @@ def _options(node: Node) -> CaptureOptions:
         overhead_s=node.number("overhead_s", default.overhead_s),
         quality=node.flag("quality", default.quality),
     )
+    if options.repeats > _MOST_REPEATS:
+        raise node.error(f"found {options.repeats}; at most {_MOST_REPEATS}", "repeats")
     for key in ("wait_s", "retry_pause_s", "overhead_s"):
         if getattr(options, key) < 0:
             raise node.error(f"found {getattr(options, key)}; it cannot be negative", key)

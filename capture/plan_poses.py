@@ -1,5 +1,6 @@
 """The poses of a capture plan: grids, lists, and those that cover a camera's image with a board."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from survey.files import Definition
 
 _KINDS = ("grid", "list", "cover", "still")
+_MOST_POSES = 100_000
 _COVER = ("cameras", "target", "count", "margin_px", "steps", "steepest_deg")
 
 
@@ -57,7 +59,7 @@ def _angles(node: Node, table: TablePlan | None, survey: Path | None) -> FloatAr
         node.allow("kind", "count")
         if table is not None:
             raise node.error('"still" is for plans without a table; use a list of one pose and repeats', "kind")
-        return np.zeros((node.integer("count", 1, 1), 0))
+        return np.zeros((_count(node, 1), 0))
     if table is None:
         raise node.error('poses of a table, but the plan has no [table]; add it, or use kind = "still"', "kind")
     if kind == "grid":
@@ -77,6 +79,8 @@ def _grid(node: Node, table: TablePlan) -> FloatArray:
     values = [_values(node, key) for key in keys]
     if len(values) == 1:
         return np.radians(values[0])[:, None]
+    if math.prod(map(len, values)) > _MOST_POSES:
+        raise node.error(f"more than {_MOST_POSES} poses; take fewer", *keys[:1])
     rows = [
         (outer, inner)
         for i, outer in enumerate(values[0])
@@ -94,7 +98,14 @@ def _values(node: Node, key: str) -> FloatArray:
         return node.numbers(key, (len(value),))
     range_ = node.table(key)
     range_.allow("from", "to", "count")
-    return np.linspace(range_.number("from"), range_.number("to"), range_.integer("count", 1))
+    return np.linspace(range_.number("from"), range_.number("to"), _count(range_))
+
+
+def _count(node: Node, *default: int) -> int:
+    count = node.integer("count", 1, *default)
+    if count > _MOST_POSES:
+        raise node.error(f"found {count}; a plan has at most {_MOST_POSES} poses", "count")
+    return count
 
 
 def _cover(node: Node, table: TablePlan, survey: Path | None) -> FloatArray:

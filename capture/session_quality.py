@@ -36,8 +36,8 @@ def read_qualities(folder: Path) -> list[dict[str, Any]]:
     """All lines that are whole, the last of each image."""
     path = quality_path(folder)
     rows: dict[tuple[str, str], dict[str, Any]] = {}
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
-        with suppress(ValueError, KeyError, TypeError):
+    for line in path.read_bytes().split(b"\n") if path.exists() else []:
+        with suppress(ValueError, KeyError, TypeError, RecursionError):
             row = json.loads(line)
             rows[row["camera_id"], row["epoch_id"]] = row
     return list(rows.values())

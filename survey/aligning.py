@@ -10,6 +10,7 @@ from typing import Any
 from adjust.errors import SurveyError
 from adjust.result import Adjustment
 from survey.files import atomic_write, read
+from survey.files.text import decode, read_bytes
 from survey.jobs import adjust_project
 from survey.report.working_sheet import ROUND_COLUMNS, sheet_html, sheet_text, steps
 from survey.working_sheet import ARCSEC, Sheet, working_sheets
@@ -78,9 +79,11 @@ def align_job(folder: Path, *, out: Path | None = None, progress: bool = True) -
 def _rounds(path: Path) -> list[list[str]]:
     if not path.is_file():
         return []
-    with path.open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.reader(stream))
-    if not rows or tuple(rows[0]) != ROUND_COLUMNS:
+    try:
+        rows = list(csv.reader(io.StringIO(decode(path, read_bytes(path)[0]), newline=""), strict=True))
+    except csv.Error as error:
+        raise SurveyError(f"{path}: this is no list of rounds ({error}); remove the file") from error
+    if not rows or tuple(rows[0]) != ROUND_COLUMNS or any(len(row) != len(ROUND_COLUMNS) for row in rows):
         raise SurveyError(f"{path}:1: this is no list of rounds; remove the file")
     return rows[1:]
 

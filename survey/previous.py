@@ -14,9 +14,12 @@ from adjust.model import FloatArray
 from adjust.result import Adjustment, ParameterName
 from survey.files import Project
 from survey.files.poses import rotation_from_quaternion
+from survey.files.text import read_bytes
 from survey.quantities import ARCSEC_PER_RAD
 from survey.results import RESULTS, read_covariances
 
+# what damaged or foreign content makes the readers below raise
+_NOT_OURS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError, OSError)
 _POSES = {
     "cameras": ("station_from_camera",),
     "stations": ("world_from_station", "mount_from_station"),
@@ -54,23 +57,42 @@ def read_previous(project: Project) -> Previous:
     """The results of a project. Raises SurveyError where it was not adjusted, or has changed since."""
     path = project.folder / RESULTS / "solution.json"
     again = f"run 'labsurvey adjust {project.folder}' first"
+    archive = path.with_name("covariance.npz")
+    for file in (path, archive):
+        if not file.is_file():
+            raise SurveyError(f"{file}: is not there, the project is not adjusted yet; {again}")
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        covs = read_covariances(path.with_name("covariance.npz"))
-    except FileNotFoundError as error:
-        raise SurveyError(f"{error.filename}: is not there, the project is not adjusted yet; {again}") from error
-    except (ValueError, KeyError, OSError) as error:
+        found = json.loads(read_bytes(path)[0])
+        previous = _previous(found, read_covariances(archive))
+        hashes = {str(name): str(digest) for name, digest in found["inputs"]["hashes"].items()}
+    except _NOT_OURS as error:
         raise SurveyError(f"{path}: cannot be read as a solution ({error}); {again}") from error
-    hashes = found["inputs"]["hashes"]
     changed = sorted(k for k in {*hashes, *project.inputs} if hashes.get(k) != project.inputs.get(k))
     if changed:
         raise SurveyError(f"{project.folder}: {', '.join(changed)} changed since the project was adjusted; {again}")
+    return previous
+
+
+def _previous(found: Mapping[str, Any], covs: Mapping[str, FloatArray]) -> Previous:
+    """What the files say; raises what a file that is not one of ours makes it raise."""
     summary = found["summary"]
+    points = {p: 1e-3 * _numbers([e[f"{a}_mm"] for a in "xyz"], 3) for p, e in found["points"].items()}
+    by_name = {tuple(k.split("/")): v for k, v in covs.items()}
+    sizes = {"point": 3, "world_from_station": 6}
+    if any(len(cov) != sizes.get(name[0], len(cov)) for name, cov in by_name.items()):
+        raise ValueError("a covariance has not the size of its parameter")
+    int(summary["redundancy"]), float(summary["sigma0"] or 0.0)
+    factor = float(_numbers([summary["sigma_factor"]], 1)[0])
     return Previous(
-        dict(_poses(found)), {p: 1e-3 * np.array([e[f"{a}_mm"] for a in "xyz"]) for p, e in found["points"].items()},
-        {tuple(k.split("/")): v for k, v in covs.items()}, float(summary["sigma_factor"]), summary,
-        summary["suspects"]["n_not_used"] == 0,
+        dict(_poses(found)), points, by_name, factor, summary, summary["suspects"]["n_not_used"] == 0
     )  # fmt: skip
+
+
+def _numbers(values: Any, n: int) -> FloatArray:
+    out = np.array(values)
+    if out.shape != (n,) or out.dtype.kind not in "if" or not np.isfinite(out).all():
+        raise ValueError(f"expected {n} numbers")
+    return np.asarray(out, dtype=float)
 
 
 def _poses(found: Mapping[str, Any]) -> list[tuple[ParameterName, Pose3]]:
@@ -88,10 +110,10 @@ def _poses(found: Mapping[str, Any]) -> list[tuple[ParameterName, Pose3]]:
 
 
 def _pose(entry: Mapping[str, Any]) -> Pose3:
-    rotation = rotation_from_quaternion(np.array(entry["rotation_quaternion_wxyz"]))
+    rotation = rotation_from_quaternion(_numbers(entry["rotation_quaternion_wxyz"], 4))
     if rotation is None:
-        raise SurveyError("solution.json: a quaternion is not of unit length; adjust the project again")
-    return Pose3(rotation, 1e-3 * np.array(entry["translation_mm"]))
+        raise ValueError("a quaternion is not of unit length")
+    return Pose3(rotation, 1e-3 * _numbers(entry["translation_mm"], 3))
 
 
 def moves(previous: Previous, adjustment: Adjustment) -> tuple[Move, ...]:

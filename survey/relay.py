@@ -115,7 +115,7 @@ def read_trajectory(text: str, eye_id: str, name: str = "trajectory") -> Traject
         if rows and values[0] <= rows[-1][0]:
             what = "comes twice with different poses" if values[0] == rows[-1][0] else "goes backwards"
             raise SurveyError(f"{name}:{line}: time {values[0]} {what}; sort the poses and keep one for each time")
-        if not np.isfinite(values).all() or abs(np.linalg.norm(values[4:]) - 1.0) > 1e-3:
+        if not all(abs(x) < 1e15 for x in values) or abs(np.linalg.norm(values[4:]) - 1.0) > 1e-3:
             raise SurveyError(f"{name}:{line}: qx,qy,qz,qw is not a unit quaternion, or a value is not finite")
         rows.append(values)
     if len(rows) < 3:

@@ -13,8 +13,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from adjust.errors import SurveyError
 from survey.files.project import OBSERVATIONS_FOLDER
-from survey.files.text import atomic_write
+from survey.files.text import atomic_write, read_bytes
 from survey.results import RESULTS
 from survey.whole_folder import whole_folder
 
@@ -24,6 +25,9 @@ ADDING, BEFORE, LIST = ".adding", ".before", "entries.json"
 def replace_parts(folder: Path, entries: Sequence[str]) -> None:
     """Move ``folder/.adding/<entry>`` (files or folders) to ``folder/<entry>``, in this order, all or none."""
     adding, before = folder / ADDING, folder / BEFORE
+    outside = next((entry for entry in entries if not _is_inside(folder, entry)), None)
+    if outside is not None:  # could not be undone
+        raise SurveyError(f"{folder / outside}: lies behind a link; put what it leads to into the project, or use --out")
     before.mkdir()
     had = {entry: (folder / entry).exists() for entry in entries}
     for entry in entries:
@@ -55,8 +59,7 @@ def recover(folder: Path) -> bool:
     adding, before = folder / ADDING, folder / BEFORE
     found = unfinished(folder)
     if found:
-        had: dict[str, bool] = json.loads((before / LIST).read_text(encoding="utf-8"))
-        for entry, was_there in had.items():
+        for entry, was_there in _entries(folder).items():
             if (before / entry).is_file():
                 os.replace(before / entry, folder / entry)
             elif (before / entry).exists():
@@ -69,8 +72,36 @@ def recover(folder: Path) -> bool:
     return found
 
 
+def _entries(folder: Path) -> dict[str, bool]:
+    """What was to be replaced, and whether it was there. Raises SurveyError for a list that no run has written.
+
+    The list may come with a folder from anywhere, and what it names is removed: it must lie inside the project.
+    """
+    path = folder / BEFORE / LIST
+    try:
+        had = json.loads(read_bytes(path, 2**20)[0])
+    except (ValueError, RecursionError):
+        had = None
+    known = isinstance(had, dict) and all(isinstance(flag, bool) for flag in had.values())
+    if not known or not all(_is_inside(folder, entry) for entry in had):
+        raise SurveyError(f"{path}: is no list that labsurvey has written; look into {folder / BEFORE} for what was "
+                          "replaced, copy back what is missing, then remove that folder")  # fmt: skip
+    return dict(had)
+
+
+def _is_inside(folder: Path, entry: str) -> bool:
+    """Whether an entry names something in the project itself, by no detour and through no link."""
+    parts = entry.split("/")
+    if not entry.isprintable() or any(part in ("", ".", "..") or "\\" in part or ":" in part for part in parts):
+        return False
+    if parts[0] in (ADDING, BEFORE):
+        return False
+    above = [folder.joinpath(*parts[:k]) for k in range(1, len(parts))]
+    return not any(path.is_symlink() for path in (*above, folder / BEFORE, folder / ADDING))
+
+
 def _remove(path: Path) -> None:
-    if path.is_dir():
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)

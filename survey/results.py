@@ -14,6 +14,7 @@ from survey.quantities import SigmaKind, scale_of
 from survey.report import report_html, summary_text
 from survey.report.pdf import report_pdf
 from survey.residual_tables import image_residuals_csv, other_residuals_csv
+from survey.safe_npz import read_arrays
 from survey.solution import RunInfo, solution_dict, solution_json
 from survey.statistics import Statistics
 
@@ -62,13 +63,21 @@ def covariance_npz(adjustment: Adjustment, sigmas: SigmaKind = "a_posteriori") -
 
 
 def read_covariances(path: Path) -> dict[str, Any]:
-    """The blocks of a ``covariance.npz`` by ``kind/id[/epoch]``, each (n, n), as they were written."""
-    with np.load(path) as found:
-        sizes, block, flat = np.diff(found["start"]), found["block"], found["covariance"]
-        return {
-            str(name): flat[block[k] : block[k + 1]].reshape(sizes[k], sizes[k])
-            for k, name in enumerate(found["parameters"])
-        }
+    """The blocks of a ``covariance.npz`` by ``kind/id[/epoch]``, each (n, n), as they were written.
+
+    Raises ValueError or OSError for what is no such file.
+    """
+    found = read_arrays(path, ("start", "block", "covariance", "parameters"))
+    start, block, flat, names = found["start"], found["block"], found["covariance"], found["parameters"]
+    n = len(names) + 1 if names.ndim == 1 and names.dtype.kind == "U" else -1
+    if not (start.shape == block.shape == (n,) and start.dtype == block.dtype == np.int64 and flat.dtype == float):
+        raise ValueError(f"{path.name}: start, block and covariance do not fit the parameters")
+    sizes = np.diff(start)
+    if (sizes < 0).any() or (np.diff(block) != sizes**2).any() or flat.shape != (block[-1],) or block[0] != 0:
+        raise ValueError(f"{path.name}: the blocks do not fit the sizes of the parameters")
+    return {
+        str(name): flat[block[k] : block[k + 1]].reshape(sizes[k], sizes[k]) for k, name in enumerate(names)
+    }  # fmt: skip
 
 
 @dataclass(frozen=True)

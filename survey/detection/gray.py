@@ -7,10 +7,14 @@ import numpy as np
 import numpy.typing as npt
 
 from adjust.errors import SurveyError
+from survey.detection.image_header import image_size
 
 Gray8 = npt.NDArray[np.uint8]
 Gray32 = npt.NDArray[np.float32]
 AnyImage = npt.NDArray[np.generic]
+LARGEST_PIXELS = 400_000_000  # the largest sensors have a third of that
+_LARGEST_BYTES = 2**32
+_HEAD = 2**20  # bytes in which the size is looked for
 
 
 def read_image(path: Path) -> AnyImage:
@@ -20,8 +24,16 @@ def read_image(path: Path) -> AnyImage:
     """
     if not path.is_file():
         raise SurveyError(f"{path}: there is no such file; correct the name or take it out of the project")
+    if not path.stat().st_size <= _LARGEST_BYTES:
+        raise SurveyError(f"{path}: {path.stat().st_size / 1e9:.1f} GB are more than an image has; take it out")
     data = np.fromfile(path, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    size = image_size(data[:_HEAD].tobytes())
+    if size is not None and size[0] * size[1] > LARGEST_PIXELS:
+        raise SurveyError(f"{path}: {size[0]} x {size[1]} px are more than {LARGEST_PIXELS:.0e}; cut the image")
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    except cv2.error:  # its own limits; what it says names its source code, not the user's file
+        image = None
     if image is None:
         raise SurveyError(
             f"{path}: not an image that OpenCV can read ({len(data)} bytes); export it again as PNG or TIFF"

@@ -22,6 +22,7 @@ _KEYS = {
     "marker_block": ("dictionary", "markers"),
     "points": ("file",),
 }
+_MOST_ON_BOARD = 250_000  # squares or markers
 WARP = ("warp_x", "warp_y")
 POINTS_LAYOUT = Layout("points of a target", ("point_id",), ("x_mm", "y_mm", "z_mm"))
 
@@ -63,8 +64,16 @@ def _metres(node: Node, key: str) -> float:
     return float(to_si(node.number(key, positive=True), "mm"))
 
 
+def _counts(node: Node, keys: tuple[str, str], smallest: int) -> tuple[int, int]:
+    """How many there are across and down; refused where no board can have so many."""
+    across, down = (node.integer(key, smallest) for key in keys)
+    if across * down > _MOST_ON_BOARD:
+        raise node.error(f"found {across} x {down}; a board has at most {_MOST_ON_BOARD}", keys[0])
+    return across, down
+
+
 def _checkerboard(node: Node) -> TargetKind:
-    return Checkerboard(node.integer("columns", 2), node.integer("rows", 2), _metres(node, "square_mm"))
+    return Checkerboard(*_counts(node, ("columns", "rows"), 2), _metres(node, "square_mm"))
 
 
 def _dictionary(node: Node) -> str:
@@ -80,14 +89,13 @@ def _charuco(node: Node) -> TargetKind:
     square, marker = _metres(node, "square_mm"), _metres(node, "marker_mm")
     if marker >= square:
         raise node.error("the marker is not smaller than the square; correct marker_mm or square_mm", "marker_mm")
-    columns, rows = node.integer("squares_x", 2), node.integer("squares_y", 2)
+    columns, rows = _counts(node, ("squares_x", "squares_y"), 2)
     return Charuco(columns, rows, square, marker, _dictionary(node), node.flag("legacy", False))
 
 
 def _marker_grid(node: Node) -> TargetKind:
     return MarkerGrid(
-        node.integer("columns", 1),
-        node.integer("rows", 1),
+        *_counts(node, ("columns", "rows"), 1),
         _metres(node, "marker_mm"),
         _metres(node, "gap_mm"),
         _dictionary(node),
@@ -99,7 +107,7 @@ def _marker_block(node: Node) -> TargetKind:
     markers = node.table("markers")
     corners: dict[int, FloatArray] = {}
     for key in markers.values:
-        if not (key.isascii() and key.isdecimal()) or int(key) in corners:
+        if not (key.isascii() and key.isdecimal() and len(key) < 10) or int(key) in corners:
             raise markers.error("expected the number of a marker, each once", key)
         corners[int(key)] = to_si(markers.numbers(key, (4, 3)), "mm")
     if not corners:

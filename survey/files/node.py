@@ -12,28 +12,63 @@ import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
-from survey.files.text import decode, id_problem, read_bytes, suggestion
+from survey.files.text import LARGEST_NUMBER, decode, id_problem, read_bytes, suggestion
 from survey.files.toml_lines import KeyPath, key_lines
 from survey.files.units import to_si
 
 _REQUIRED: Any = object()
+_LARGEST_TOML = 16 * 2**20  # bytes
+_DEEPEST_KEY = 32  # parts between dots; time and memory grow with their square
+_LONGEST_INTEGER = 1000  # bits: all that a double can hold, and less than what cannot be printed
+_KEY_PART = re.compile(r"[ \t]*([A-Za-z0-9_-]+|\"[^\"\n]*\"|'[^'\n]*')[ \t]*")
 
 
 def read_toml(path: Path) -> tuple["Node", str]:
     """The root table of a TOML file and the sha256 of the file."""
-    data, digest = read_bytes(path)
+    data, digest = read_bytes(path, _LARGEST_TOML)
     text = decode(path, data)
     if not text.strip():
         raise SurveyError(f"{path}:1: the file is empty; it starts with 'format = 1'")
+    _check_keys(path, text)
     try:
         values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        root = Node(path, key_lines(text), (), values)
+        _check_integers(root, values, ())
+    except ValueError as error:  # of tomllib, or of the interpreter for an integer of thousands of digits
         found = re.search(r"at line (\d+)", str(error))
-        line = int(found.group(1)) if found else text.count("\n") + 1
+        line = int(found[1]) if found else _line_of_digits(text) or text.count("\n") + 1
         raise SurveyError(f"{path}:{line}: not valid TOML: {error}; correct this line") from error
     except RecursionError as error:
         raise SurveyError(f"{path}:1: lists or tables are nested too deeply; remove the brackets") from error
-    return Node(path, key_lines(text), (), values), digest
+    return root, digest
+
+
+def _check_keys(path: Path, text: str) -> None:
+    """Refuse keys of very many parts before anything tries to take them apart."""
+    run = at = 0
+    for part in text.split("."):
+        run = run + 1 if _KEY_PART.fullmatch(part) else 0
+        if run >= _DEEPEST_KEY:
+            raise SurveyError(f"{path}:{_line_at(text, at)}: a key has too many dots; shorten it")
+        at += len(part) + 1
+
+
+def _line_of_digits(text: str) -> int | None:
+    found = re.search(r"[0-9_]{4000}", text)
+    return _line_at(text, found.start()) if found else None
+
+
+def _line_at(text: str, at: int) -> int:
+    return text.count("\n", 0, at) + 1
+
+
+def _check_integers(root: "Node", value: Any, keys: KeyPath) -> None:
+    """Refuse integers beyond every number that can be meant; some could not even be shown in a message."""
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            _check_integers(root, item, (*keys, key))
+    elif isinstance(value, int) and value.bit_length() > _LONGEST_INTEGER:
+        raise root.error("the number is too large to be meant; correct it", *keys)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +151,8 @@ class Node:
         value = self._number(self.value(key, default), key)
         if not math.isfinite(value):
             raise self.error(f"found {value}; it must be a finite number", key)
+        if abs(value) > LARGEST_NUMBER:
+            raise self.error(f"found {value:g}, which is too large to be meant; correct it", key)
         if positive and value <= 0:
             raise self.error(f"found {value}; it must be positive", key)
         return value
@@ -128,6 +165,8 @@ class Node:
         self._fill(array, self.value(key, default), (key,))
         if (not blank and np.isnan(array).any()) or (not infinite and np.isinf(array).any()):
             raise self.error("found a number that is not finite; give finite numbers", key)
+        if (np.abs(array[np.isfinite(array)]) > LARGEST_NUMBER).any():
+            raise self.error(f"found a number above {LARGEST_NUMBER:g}, too large to be meant; correct it", key)
         return array
 
     def names(self, key: str, default: Any = _REQUIRED) -> tuple[str, ...]:

@@ -14,8 +14,10 @@ import numpy.typing as npt
 from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
 from survey.files.csv_chunks import Chunk, csv_chunks
-from survey.files.text import decode, id_problem, read_bytes, suggestion
+from survey.files.text import LARGEST_NUMBER, decode, id_problem, read_bytes, suggestion
 
+LARGEST_ROWS = 50_000_000  # of one table: ten times what the largest surveys have
+_LARGEST_DECODED = 8 * 2**30  # bytes of the columns of a Parquet file
 FLAGS = ("group", "used")  # optional text columns of every table of observations
 
 
@@ -147,9 +149,15 @@ def read_table(path: Path, layout: Layout) -> Table:
     text = decode(path, data)
     if not text.strip():
         raise SurveyError(f"{path}:1: the file is empty; the first line names the columns: {','.join(layout.required)}")
+    _check_rows(path, text.count("\n"))
     header, chunks = csv_chunks(path, text)
     check_header(path, header, layout)
     return _assemble(path, layout, digest, header, chunks)
+
+
+def _check_rows(path: Path, n: int) -> None:
+    if n > LARGEST_ROWS:
+        raise SurveyError(f"{path}: found {n} rows, at most {LARGEST_ROWS} are read; split the survey into projects")
 
 
 def _assemble(path: Path, layout: Layout, digest: str, header: Sequence[str], chunks: Iterable[Chunk]) -> Table:
@@ -229,9 +237,11 @@ class _NumberBuilder:
                     values[row] = float(text.replace("_", "?"))
                 except ValueError:
                     return row, "is blank; fill it in" if text == "" else f"found {text!r}, expected a number"
-        bad = ~np.isfinite(values)
+        bad = ~(np.abs(values) <= LARGEST_NUMBER)
         if bad.any():
-            return first_row(bad), f"found {column[first_row(bad)]!r}; it must be a finite number"
+            row = first_row(bad)
+            problem = "too large to be meant; correct it" if np.isfinite(values[row]) else "it must be a finite number"
+            return row, f"found {column[row][:40]!r}; {problem}"
         if not is_required and "" in column:
             values[np.fromiter((text == "" for text in column), bool, len(column))] = np.nan
         self.parts.append(values)
@@ -249,8 +259,15 @@ def _read_parquet(path: Path, layout: Layout, data: bytes, digest: str) -> Table
         message = "Parquet needs pyarrow; install it with: pip install 'labsurvey[parquet]', or use CSV"
         raise SurveyError(f"{path}: {message}") from error
     try:
-        content = pq.read_table(pa.BufferReader(data))
-    except pa.ArrowException as error:
+        file = pq.ParquetFile(pa.BufferReader(data))
+        _check_rows(path, file.metadata.num_rows)
+        sizes = (file.metadata.row_group(i).total_byte_size for i in range(file.metadata.num_row_groups))
+        if sum(sizes) > _LARGEST_DECODED:
+            raise SurveyError(f"{path}: its columns take more than {_LARGEST_DECODED >> 30} GB; split the survey")
+        check_header(path, file.schema_arrow.names, layout)
+        content = file.read()
+        content.validate(full=True)
+    except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
         raise SurveyError(f"{path}:1: not a Parquet file ({error}); write it again") from error
     check_header(path, content.column_names, layout)
     texts: dict[str, TextColumn] = {}
@@ -271,7 +288,10 @@ def _parquet_text(path: Path, name: str, array: Any, is_required: bool) -> TextC
     if not (pa.types.is_string(value_type) or pa.types.is_large_string(value_type)):
         raise SurveyError(f"{path}:1: {name}: the column holds {value_type}, expected text; write it as strings")
     column = array.cast(value_type).fill_null("").dictionary_encode()
-    names = tuple(column.dictionary.to_pylist())
+    try:
+        names = tuple(column.dictionary.to_pylist())
+    except ValueError as error:
+        raise SurveyError(f"{path}:1: {name}: a text is not UTF-8 ({error}); write it again") from error
     codes = np.asarray(column.indices.to_numpy(zero_copy_only=False), dtype=np.int64)
     if is_required and "" in names:
         raise SurveyError(f"{path}:{first_row(codes == names.index('')) + 1}: {name}: is blank; fill it in")
@@ -285,7 +305,7 @@ def _parquet_numbers(path: Path, name: str, array: Any, is_required: bool) -> Fl
         raise SurveyError(f"{path}:1: {name}: the column holds {array.type}, expected numbers; write it as doubles")
     blank = np.asarray(array.is_null().to_numpy(zero_copy_only=False), dtype=bool)
     values = np.array(array.cast(pa.float64()).fill_null(0.0).to_numpy(zero_copy_only=False), dtype=float)
-    bad = ~np.isfinite(values) | (blank & is_required)
+    bad = ~(np.abs(values) <= LARGEST_NUMBER) | (blank & is_required)
     if bad.any():
         row = first_row(bad)
         found = "is blank; fill it in" if blank[row] else f"found {values[row]}; it must be a finite number"

@@ -4,13 +4,18 @@ import difflib
 import hashlib
 import os
 import re
+import stat
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
 from adjust.errors import SurveyError
 
+LARGEST_FILE = 4 * 2**30  # bytes; longer observations go into several projects
+LARGEST_NUMBER = 1e15  # its square and what is made of it stay finite
 _FORBIDDEN_IN_IDS = set('/\\:@,;"|<>*?')
+_LONGEST_ID = 120  # bytes: an id with a prefix and an ending is still the name of a file
+_DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{i}" for port in ("COM", "LPT") for i in range(1, 10))}
 
 
 def atomic_write(path: Path, content: bytes | str) -> None:
@@ -36,9 +41,15 @@ def _umask() -> int:
     return mask
 
 
-def read_bytes(path: Path) -> tuple[bytes, str]:
-    """Content of a file and its sha256; raises SurveyError where it cannot be read."""
+def read_bytes(path: Path, largest: int = LARGEST_FILE) -> tuple[bytes, str]:
+    """Content of a file and its sha256; raises SurveyError where it cannot be read, is no file, or over ``largest``."""
     try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):  # a pipe would never end
+            raise SurveyError(f"{path}: is a device, a pipe or a socket; put a file in its place")
+        if status.st_size > largest:
+            found = f"{status.st_size / 1e6:.0f} MB, more than the {largest / 1e6:.0f} MB that are read"
+            raise SurveyError(f"{path}: the file has {found}; check whether it is the right one, or split it")
         data = path.read_bytes()
     except OSError as error:
         raise SurveyError(f"{path}: cannot be read ({error.strerror}); check the name and the permissions") from error
@@ -60,7 +71,8 @@ def decode(path: Path, data: bytes) -> str:
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Key that sorts ``e2`` before ``e10``; different names have different keys."""
     parts = re.split(r"(\d+)", name)
-    numbers = [(0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts if part]
+    # 4000: the interpreter refuses to take longer numbers apart
+    numbers = [(0, int(part[:4000]), part) if part.isdecimal() else (1, 0, part) for part in parts if part]
     return tuple(numbers)
 
 
@@ -73,12 +85,16 @@ def id_problem(name: str) -> str | None:
         return f"{name!r} cannot be an id; {allowed}"
     if name != name.strip():
         return f"{name!r} cannot be an id; remove the blanks around it"
+    if len(name.encode()) > _LONGEST_ID:
+        return f"{name[:40]!r}... cannot be an id; use at most {_LONGEST_ID} bytes"
+    if name.endswith(".") or name.partition(".")[0].upper() in _DEVICES:
+        return f"{name!r} cannot be an id; Windows has no files of that name, choose another"
     return None
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
     """What to do about an unknown name: the nearest known one, else the known ones."""
-    names = list(dict.fromkeys(known))
+    names, name = list(dict.fromkeys(known)), name[:80]  # the time to compare grows with the square of the length
     with_unit = [candidate for candidate in names if candidate.startswith(f"{name}_")]
     near = with_unit[:1] or difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     if near:

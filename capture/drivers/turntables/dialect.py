@@ -6,9 +6,11 @@ shipped, and any path to a file may be given instead. ``docs/capture.md`` descri
 
 import math
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from string import Formatter
 
 from adjust.errors import SurveyError
 from survey.files.node import Node, read_toml
@@ -18,6 +20,7 @@ FOLDER = Path(__file__).parent / "dialects"
 _DEG = math.pi / 180
 _UNITS = {"deg": _DEG, "arcmin": _DEG / 60, "arcsec": _DEG / 3600, "mdeg": _DEG / 1000, "rad": 1.0}
 _COMMANDS = ("init", "move", "position", "status", "stop", "home", "errors")
+_SPEC = re.compile(r"[-+ #0]{0,3}[0-9]{0,2}(\.[0-9]{1,2})?[bdeEfFgGxX]?")  # of a number, at most 99 characters wide
 _PLACES = {"axis": "1", "value": 1.0, "delta": 1.0, "counts": 1, "delta_counts": 1}
 
 
@@ -136,6 +139,10 @@ def _command(name: str, node: Node) -> Command:
     node.allow("send", "reply", "each_axis", *(("moving", "fault") if name == "status" else ()), *_good(name))
     send = node.text("send")
     try:
+        fields = [(name, spec) for _, name, spec, _ in Formatter().parse(send) if name is not None]
+        wrong = next((name for name, spec in fields if name not in _PLACES or not _SPEC.fullmatch(spec or "")), None)
+        if wrong is not None:  # attributes of values, or a width that fills the memory
+            raise ValueError(wrong)
         send.format(**_PLACES)
     except (KeyError, IndexError, ValueError) as error:
         places = ", ".join(f"{{{place}}}" for place in _PLACES)
@@ -160,8 +167,11 @@ def _good(name: str) -> tuple[str, ...]:
 def _pattern(node: Node, key: str, groups: tuple[str, ...] = ()) -> re.Pattern[str]:
     text = node.text(key)
     try:
-        pattern = re.compile(text)
-    except re.error as error:
+        with warnings.catch_warnings(action="error"):
+            pattern = re.compile(text)
+    except (FutureWarning, DeprecationWarning) as error:
+        raise node.error(f"{text!r} is ambiguous ({error}); write a backslash before brackets", key) from error
+    except (re.error, OverflowError, RecursionError) as error:
         raise node.error(f"{text!r} is not a pattern ({error}); correct it", key) from error
     for group in groups:
         if group not in pattern.groupindex:
