@@ -15,8 +15,11 @@ DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
 def message(error: SurveyError | OSError) -> str:
     """An error as its reader should see it."""
     if isinstance(error, OSError):
-        return f"{error.filename}: {error.strerror}; check the name, the permissions and the free space"
-    return str(error)
+        text = f"{error.filename}: {error.strerror}; check the name, the permissions and the free space"
+    else:
+        text = str(error)
+    # names out of a file must not drive the reader's terminal
+    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
 def positive(text: str) -> int:

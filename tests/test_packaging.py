@@ -1,0 +1,103 @@
+"""What is shipped: the wheel's contents, lower bounds, licences, completion, help."""
+
+import configparser
+import re
+import shutil
+import subprocess
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from survey.cli import build_parser, main
+from survey.completion import SHELLS, commands_of, completion_script
+
+ROOT = Path(__file__).parents[1]
+_LEFT_OUT = {"tests", "docs", "examples", ".git", ".ci", ".venv", "lab", "build", "dist"}
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    """Names in the wheel, built from a copy of the sources by setuptools itself."""
+    folder = tmp_path_factory.mktemp("wheel")
+    for name in ("adjust", "survey", "capture"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, folder)
+    (folder / "tests").mkdir()
+    (folder / "tests" / "__init__.py").touch()
+    code = "from setuptools import build_meta; print(build_meta.build_wheel('.'))"
+    done = subprocess.run([__import__("sys").executable, "-c", code], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    with zipfile.ZipFile(next(folder.glob("*.whl"))) as archive:
+        return set(archive.namelist())
+
+
+def test_wheel_has_every_source_and_nothing_else(wheel: set[str]) -> None:
+    wanted = {
+        p.relative_to(ROOT).as_posix()
+        for package in ("adjust", "survey", "capture")
+        for p in (ROOT / package).rglob("*")
+        if p.is_file() and "__pycache__" not in p.parts
+    }
+    found = {name for name in wheel if ".dist-info/" not in name}
+    assert wanted - found == set()
+    assert found - wanted == set()
+    assert {f"{package}/py.typed" for package in ("adjust", "survey", "capture")} <= found
+    assert any(name.endswith("licenses/LICENSE") for name in wheel)
+
+
+def test_every_dependency_has_a_lower_bound_and_a_licence() -> None:
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / "setup.cfg", encoding="utf-8")
+    extras = setup["options.extras_require"].values()
+    lines = "\n".join([setup["options"]["install_requires"], *extras]).split("\n")
+    wanted = [line.strip() for line in lines if line.strip()]
+    unbound = [line for line in wanted if not re.search(r"(>=|==)\s*\d", line.split(";")[0])]
+    assert unbound == []
+    page = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8").lower()
+    names = {re.split(r"[\[<>=; ]", line)[0].lower() for line in wanted}
+    assert [n for n in sorted(names) if f"| {n} |" not in page] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["labsurvey", "adj"], ["adjust"]),
+        (["labsurvey", "re"], ["report", "remove"]),
+        (["labsurvey", "convert", "a", "b", "--format", "kr"], ["krumm"]),
+        (["labsurvey", "remove", "--ou"], ["--out"]),
+        (["labsurvey", "completion", ""], ["bash", "zsh", "fish"]),
+        (["labsurvey", "adjust", "so"], []),
+    ],
+)
+def test_bash_completes(tmp_path: Path, words: list[str], expected: list[str]) -> None:
+    script = tmp_path / "completion"
+    script.write_text(completion_script(build_parser(), "bash"))
+    quoted = " ".join(f"'{w}'" for w in words)
+    code = f"source {script}; COMP_WORDS=({quoted}); COMP_CWORD={len(words) - 1}; _labsurvey; echo ${{COMPREPLY[@]}}"
+    done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    assert done.stdout.split() == expected
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_scripts_name_every_command_and_parse(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    for command in commands_of(build_parser()):
+        assert re.search(rf"\b{command.name}\b", script)
+        assert all(flag.names[-1].lstrip("-") in script for flag in command.flags)
+    if shutil.which(shell):
+        (tmp_path / "s").write_text(script)
+        subprocess.run([shell, "-n", str(tmp_path / "s")], check=True)
+
+
+def test_help_opens_with_a_command_and_names_the_next(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in commands_of(build_parser()):
+        with pytest.raises(SystemExit) as stopped:
+            main([command.name, "--help"])
+        assert stopped.value.code == 0
+        out = capsys.readouterr().out
+        assert out.startswith(f"usage: labsurvey {command.name}")
+        assert "Next: " in out
