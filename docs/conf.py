@@ -84,7 +84,8 @@ def _entry(package: str, name: str, value: Any) -> list[str]:
 def literal_blocks(_app: Sphinx, _what: str, _name: str, _value: Any, _options: Any, lines: list[str]) -> None:
     """What is indented below a line that ends with a colon is code, as it stands."""
     for i in range(len(lines) - 2):
-        if lines[i].endswith(":") and not lines[i].endswith("::") and not lines[i + 1] and lines[i + 2].startswith("  "):
+        opens = lines[i].endswith(":") and not lines[i].endswith("::")
+        if opens and not lines[i + 1] and lines[i + 2].startswith("  "):
             lines[i] += ":"
 
 

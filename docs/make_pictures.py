@@ -1,5 +1,6 @@
-"""Pictures of these pages, taken from reports with Chromium: python docs/make_pictures.py PAGE.html SECTION OUT.png
+"""Pictures of these pages, taken from reports with Chromium.
 
+Run: python docs/make_pictures.py PAGE.html SECTION OUT.png [TALLEST]
 SECTION is the anchor of a section, or "head" for everything above the second one. Needs Chromium or Chrome.
 """
 

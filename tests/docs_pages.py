@@ -1,7 +1,7 @@
 """The pages of the documentation as data: fenced blocks, what is said before them, links and anchors.
 
-A page that begins with ``<!-- run -->`` is carried out from top to bottom in a scratch folder (``<!-- run: lab -->``: in
-a copy of the adjusted example full-lab). In front of a block stand, as comments that readers do not see:
+A page that begins with ``<!-- run -->`` is carried out from top to bottom in a scratch folder (``<!-- run: lab -->``:
+beside a copy of the adjusted example full-lab). In front of a block stand, as comments that readers do not see:
 
 ``<!-- file: PATH -->``        the block is written there
 ``<!-- append: PATH -->``      the block is added to that file
