@@ -23,8 +23,8 @@ from tests.data import data_folder
 def test_w_and_tau_at_their_nominal_rates_over_10000_observations() -> None:
     """5 % and 0.1 %, a priori and a posteriori. Tests of one network are correlated: the bounds are generous."""
     p_w, p_tau = [], []
-    for seed in range(75):
-        survey, start = net.hall(seed)
+    for seed in range(16):
+        survey, start = net.hall(seed, n_points=40, n_stations=5)
         tests = reliability(adjust(survey, start), most_influences=0).tests
         p_w.append(tests.p_w)
         p_tau.append(tests.p_tau)
@@ -42,7 +42,7 @@ def test_the_detectable_bias_is_found_with_its_power() -> None:
     tests = reliability(adjust(clean, start), most_influences=0)
     first = len(tests.tests.used) - len(clean.readings)
     critical = tests.criteria.critical[0]
-    rng, found, n = np.random.default_rng(3), 0, 250
+    rng, found, n = np.random.default_rng(3), 0, 100
     for sample in range(n):
         noisy, _ = net.hall(1, factors=None, noise=True, sample=sample)
         i = int(rng.integers(len(noisy.readings)))

@@ -28,7 +28,7 @@ from survey.simulate import beacons
 from tests.adjust import helpers as h
 from tests.adjust.terrestrial_networks import P, Truth, measured, polar_network, start_near
 
-TRIALS = 300
+TRIALS = 100
 POLAR = (("direction", 2e-5), ("zenith", 2e-5), ("slope_distance", 2e-4))
 
 
