@@ -61,7 +61,7 @@ def _feed(update: Callable[[bytes], None], value: Any) -> None:
 def kept(path: Path, key: str) -> Calibration | None:
     """The calibration in a file, None where there is none, it cannot be read, or its key is another."""
     try:
-        with np.load(path) as found:
+        with path.open("rb") as file, np.load(file) as found:  # a damaged file leaves numpy without closing its own
             about = json.loads(str(found["about"]))
             arrays = {name: found[name] for name in found.files if name != "about"}
         return _restored(about, arrays) if about["key"] == key else None
