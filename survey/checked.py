@@ -7,6 +7,7 @@ from adjust.errors import SurveyError
 from adjust.model import Survey
 from adjust.result import Adjustment
 from adjust.table_checks import probable_causes, sign_warnings
+from survey.epoch_names import separate_epochs
 
 
 def checked(survey: Survey, run: Callable[[], Adjustment]) -> Adjustment:
@@ -17,7 +18,7 @@ def checked(survey: Survey, run: Callable[[], Adjustment]) -> Adjustment:
     try:
         result = run()
     except SurveyError as error:
-        causes = probable_causes(survey)
+        causes = separate_epochs(survey) + probable_causes(survey)
         if not causes:
             raise
         lines = "\n  - ".join(["probable cause:", *causes])

@@ -1,0 +1,35 @@
+"""Images of one moment that have different names: the first thing that goes wrong with one's own images."""
+
+from dataclasses import replace
+
+import pytest
+
+from adjust.adjustment import adjust
+from adjust.errors import SurveyError
+from survey.checked import checked
+from survey.epoch_names import separate_epochs
+from survey.simulate import stereo
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return stereo(seed=1)[0]
+
+
+def renamed(survey):
+    """Images called after their camera, as cameras' software likes to do."""
+    blocks = tuple(replace(b, epoch_id=f"{b.camera_id}{b.epoch_id}") for b in survey.image_blocks)
+    return replace(survey, image_blocks=blocks)
+
+
+def test_nothing_is_said_of_a_rig_whose_images_belong_together(rig):
+    assert separate_epochs(rig) == ()
+
+
+def test_the_error_names_the_cameras_and_what_to_do(rig):
+    wrong = renamed(rig)
+    with pytest.raises(SurveyError, match="share no epoch") as raised:
+        checked(wrong, lambda: adjust(wrong))
+    said = str(raised.value)
+    assert "give images of one moment the same name" in said
+    assert said.index("share no epoch") < said.index("undetermined")
