@@ -1,5 +1,6 @@
 """The jobs behind the commands: read, detect, adjust, write."""
 
+import os
 import platform
 import sys
 import time
@@ -309,6 +310,7 @@ def run_info(project: Project, seconds: dict[str, float]) -> RunInfo:
     chosen = replace(project.options, tolerances=(), identification=())
     options = {k: v for k, v in asdict(chosen).items() if v != ()} | {"datum": project.survey.datum.kind}
     date = datetime.now(UTC).isoformat(timespec="seconds")
-    name = project.folder.resolve().name  # the name alone: results of a copied folder stay the same
+    # the name alone: results of a copied folder stay the same; by its bytes: a terminal without UTF-8 garbles it
+    name = os.fsencode(project.folder.resolve().name).decode("utf-8", "replace")
     said = project.options.identification
     return RunInfo(name, project.title, project.inputs, options, versions, date, seconds, identification=said)

@@ -27,7 +27,7 @@ def replace_parts(folder: Path, entries: Sequence[str]) -> None:
     adding, before = folder / ADDING, folder / BEFORE
     outside = next((entry for entry in entries if not _is_inside(folder, entry)), None)
     if outside is not None:  # could not be undone
-        raise SurveyError(f"{folder / outside}: lies behind a link; put what it leads to into the project, or use --out")
+        raise SurveyError(f"{folder / outside}: lies behind a link; move that into the project, or use --out")
     before.mkdir()
     had = {entry: (folder / entry).exists() for entry in entries}
     for entry in entries:
