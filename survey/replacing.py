@@ -94,7 +94,7 @@ def _is_inside(folder: Path, entry: str) -> bool:
     parts = entry.split("/")
     if not entry.isprintable() or any(part in ("", ".", "..") or "\\" in part or ":" in part for part in parts):
         return False
-    if parts[0] in (ADDING, BEFORE):
+    if parts[0] in (ADDING, BEFORE) or max(len(part.encode()) for part in parts) > 200 or len(parts) > 20:
         return False
     above = [folder.joinpath(*parts[:k]) for k in range(1, len(parts))]
     return not any(path.is_symlink() for path in (*above, folder / BEFORE, folder / ADDING))

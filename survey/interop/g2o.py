@@ -63,7 +63,7 @@ def _numbers(words: Sequence[str], n: int, where: str) -> FloatArray:
         out = np.array(words, dtype=float)
     except ValueError:
         raise SurveyError(f"{where}: expected {n} numbers, found {' '.join(words)[:60]!r}") from None
-    if len(out) != n or not np.isfinite(out).all():
+    if len(out) != n or not (np.abs(out) < 1e100).all():
         raise SurveyError(f"{where}: expected {n} finite numbers, found {len(out)}")
     if np.linalg.norm(out[3:7]) < 1e-9:
         raise SurveyError(f"{where}: the quaternion is zero")
