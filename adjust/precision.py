@@ -10,9 +10,9 @@ from typing import Any
 import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
-from scipy.stats import chi2
 
 from adjust.datum import stacking, survey_motions
+from adjust.distributions import chi2
 from adjust.graph import AdjustmentGraph
 from adjust.model import BoolArray, FloatArray
 from adjust.observation_factor import ObservationFactor

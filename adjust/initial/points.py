@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import pycolmap
 
 from adjust.closed_forms import intersect, inverse
 from adjust.errors import SurveyError
@@ -123,6 +122,8 @@ def _generalised_pose(
     network: PoseNetwork, points: PointField, group: Sequence[tuple[Sight, int]]
 ) -> FloatArray | None:
     """Pose (4, 4) of the link that all these chains lack (GP3P inside RANSAC with a fixed seed, COLMAP), or None."""
+    import pycolmap  # slow to load, and few surveys come here
+
     uv, x = [], []
     index: list[int] = []
     rigs: list[pycolmap.Rigid3d] = []
