@@ -173,7 +173,11 @@ def test_a_run_killed_by_its_user_says_interrupted(nights: list[Path], tmp_path:
     """Ctrl-C ends the workers too, and leaves a journal to go on from."""
     command = [sys.executable, "-m", "survey", "adjust", "--fresh", "--quiet", "--report", str(tmp_path),
                *map(str, nights[5:9])]  # fmt: skip
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    # a test run in the background of a shell inherits an ignored SIGINT
+    with subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # one thread at this point
+    ) as process:  # fmt: skip
         while not children(process.pid) and process.poll() is None:
             time.sleep(0.02)
         workers = children(process.pid)

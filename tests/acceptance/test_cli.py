@@ -202,7 +202,7 @@ def test_readme_has_exactly_two_set_up_commands():
 
 @pytest.mark.parametrize("line", _readme_command_lines())
 def test_every_command_line_of_the_readme_is_understood(line, capsys):
-    arguments = shlex.split(line.replace("NAME", "stereo"))[1:]
+    arguments = shlex.split(line.replace("NAME", "stereo").replace("SHELL", "bash"))[1:]
     if "--help" in arguments:
         with pytest.raises(SystemExit) as stop:
             build_parser().parse_args(arguments)
