@@ -5,19 +5,16 @@ messages to stderr. Heavy imports happen inside the commands.
 """
 
 import argparse
-import json
-import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adjust.errors import SurveyError
+from survey.commands.common import DONE, is_set, print_json, run_command, say
 
 if TYPE_CHECKING:
     from capture.camera import CameraInfo
-
-DONE, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 
 _OPENING = "labcapture run plan.toml"
 _DESCRIPTION = """\
@@ -36,28 +33,7 @@ Exit codes: 0 done, 1 error, 2 wrong usage, 130 interrupted.
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; the exit code."""
-    try:
-        try:
-            arguments = build_parser().parse_args(argv)
-            return int(arguments.run(arguments))
-        finally:
-            sys.stdout.flush()
-    except BrokenPipeError:
-        # whoever read our output has left; a second complaint at exit would be noise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
-    except SurveyError as error:
-        print(f"labcapture: error: {error}", file=sys.stderr)
-        return INTERRUPTED if getattr(error, "interrupted", False) else FAILED
-    except OSError as error:
-        if error.filename is None:
-            raise  # not about a file of the user
-        advice = "check the name, the permissions and the free space"
-        print(f"labcapture: error: {error.filename}: {error.strerror}; {advice}", file=sys.stderr)
-        return FAILED
-    except KeyboardInterrupt:
-        print("\nlabcapture: interrupted", file=sys.stderr)
-        return INTERRUPTED
+    return run_command("labcapture", build_parser, argv)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -165,19 +141,6 @@ def _add_export(commands: Any, shaped: dict[str, Any]) -> None:
     parser.set_defaults(run=_export, parser=parser)
 
 
-def _is(arguments: argparse.Namespace, flag: str) -> bool:
-    return bool(getattr(arguments, flag, False))
-
-
-def _say(arguments: argparse.Namespace, line: str) -> None:
-    if not _is(arguments, "quiet"):
-        print(line, file=sys.stderr)
-
-
-def _print_json(value: Mapping[str, Any]) -> None:
-    print(json.dumps(value, indent=1, allow_nan=False))
-
-
 def _run(arguments: argparse.Namespace) -> int:
     from capture.plan import read_plan
 
@@ -185,16 +148,16 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.dry_run:
         from capture.plan_report import plan_summary, plan_text
 
-        if _is(arguments, "json"):
-            _print_json(plan_summary(plan))
+        if is_set(arguments, "json"):
+            print_json(plan_summary(plan))
         else:
             print(f"{plan_text(plan)}\nNext: labcapture run {arguments.plan}")
         return DONE
     from capture.session_run import run_plan
 
-    outcome = run_plan(plan, shown=not _is(arguments, "quiet"))
-    if _is(arguments, "json"):
-        _print_json(outcome.summary())
+    outcome = run_plan(plan, shown=not is_set(arguments, "quiet"))
+    if is_set(arguments, "json"):
+        print_json(outcome.summary())
         return DONE
     now = f"{outcome.taken} of {outcome.planned} epochs taken"
     now += f", {outcome.before} were there" if outcome.before else ""
@@ -217,11 +180,11 @@ def _cameras(arguments: argparse.Namespace) -> int:
         except SurveyError as error:
             if arguments.driver != "all":
                 raise
-            _say(arguments, f"{name}: {error}")
+            say(arguments, f"{name}: {error}")
         except Exception as error:  # one maker's library that fails must not hide the cameras of the others
-            _say(arguments, f"{name}: its library failed: {type(error).__name__}: {error}")
-    if _is(arguments, "json"):
-        _print_json({"cameras": [asdict(info) for info in found]})
+            say(arguments, f"{name}: its library failed: {type(error).__name__}: {error}")
+    if is_set(arguments, "json"):
+        print_json({"cameras": [asdict(info) for info in found]})
         return DONE
     for info in found:
         use = "  in use" if info.in_use else ""
@@ -230,7 +193,7 @@ def _cameras(arguments: argparse.Namespace) -> int:
         print("no camera answered")
         for driver in DRIVERS.values():
             extra = f"  (pip install 'labsurvey[{driver.extra}]')" if driver.extra else ""
-            _say(arguments, f"  {driver.name:<10}{driver.reaches}: {driver.address}{extra}")
+            say(arguments, f"  {driver.name:<10}{driver.reaches}: {driver.address}{extra}")
     return DONE
 
 
@@ -245,8 +208,8 @@ def _table(arguments: argparse.Namespace) -> int:
     if (arguments.jog is not None) + arguments.home + arguments.stop > 1:
         arguments.parser.error("--jog, --home and --stop exclude each other")
     status = table_job(arguments.plan, jog=arguments.jog, home=arguments.home, stop=arguments.stop)
-    if _is(arguments, "json"):
-        _print_json(status)
+    if is_set(arguments, "json"):
+        print_json(status)
         return DONE
     print(f"{status['table']} at {status['address']}")
     for axis in status["axes"]:
@@ -265,7 +228,7 @@ def _view(arguments: argparse.Namespace) -> int:
         port=arguments.port,
         live=arguments.live,
         allow_move=arguments.allow_move,
-        say=lambda line: _say(arguments, line),
+        say=lambda line: say(arguments, line),
     )
 
 
@@ -273,8 +236,8 @@ def _export(arguments: argparse.Namespace) -> int:
     from capture.nexus import export
 
     summary = export(arguments.folder, arguments.file)
-    if _is(arguments, "json"):
-        _print_json(summary)
+    if is_set(arguments, "json"):
+        print_json(summary)
     else:
         print(f"{arguments.file}: {summary['epochs']} epochs, {summary['images']} images")
     return DONE

@@ -6,16 +6,13 @@ Results go to stdout, progress and messages to stderr. Heavy imports happen insi
 """
 
 import argparse
-import io
-import os
 import sys
 from collections.abc import Sequence
 from typing import Any
 
-from adjust.errors import SurveyError
 from survey.commands.adjusting import declare_adjust
 from survey.commands.aligning import declare_align
-from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, message
+from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, run_command
 from survey.commands.comparing import declare_compare
 from survey.commands.completing import declare_completion
 from survey.commands.converting import declare_convert
@@ -59,26 +56,7 @@ _COMMANDS = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; the exit code."""
-    if isinstance(sys.stdout, io.TextIOWrapper):  # a name that the terminal cannot show is no reason to stop
-        sys.stdout.reconfigure(errors="backslashreplace")
-    try:
-        try:
-            arguments = build_parser().parse_args(argv)
-            return int(arguments.run(arguments))
-        finally:
-            sys.stdout.flush()
-    except BrokenPipeError:
-        # whoever read our output has left; a second complaint at exit would be noise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
-    except (SurveyError, OSError) as error:
-        if isinstance(error, OSError) and error.filename is None:
-            raise  # not about a file of the user
-        print(f"labsurvey: error: {message(error)}", file=sys.stderr)
-        return FAILED
-    except KeyboardInterrupt:
-        print("\nlabsurvey: interrupted", file=sys.stderr)
-        return INTERRUPTED
+    return run_command("labsurvey", build_parser, argv)
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -1,9 +1,11 @@
 """What all commands share: exit codes, flags, output, and the check of a project folder."""
 
 import argparse
+import io
 import json
+import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,30 @@ def message(error: SurveyError | OSError) -> str:
         text = str(error)
     # names out of a file must not drive the reader's terminal
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
+
+
+def run_command(program: str, build_parser: Callable[[], argparse.ArgumentParser], argv: Sequence[str] | None) -> int:
+    """Parse and run a command line of ``program``; its exit code. What its owner can mend is one line on stderr."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a name that the terminal cannot show is no reason to stop
+        sys.stdout.reconfigure(errors="backslashreplace")
+    try:
+        try:
+            arguments = build_parser().parse_args(argv)
+            return int(arguments.run(arguments))
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # whoever read our output has left; a second complaint at exit would be noise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except (SurveyError, OSError) as error:
+        if isinstance(error, OSError) and error.filename is None:
+            raise  # not about a file of the user
+        print(f"{program}: error: {message(error)}", file=sys.stderr)
+        return INTERRUPTED if getattr(error, "interrupted", False) else FAILED
+    except KeyboardInterrupt:
+        print(f"\n{program}: interrupted", file=sys.stderr)
+        return INTERRUPTED
 
 
 def positive(text: str) -> int:
