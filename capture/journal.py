@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from adjust.errors import SurveyError
+from survey.files.text import sync_folder
 
 Record = Mapping[str, Any]
 
@@ -108,12 +109,3 @@ def taken_sets(records: list[Record]) -> dict[str, Record]:
 def clocks() -> dict[str, int]:
     """When it is now, for a record: differences are taken of the monotonic clock; the other, UTC, may jump."""
     return {"monotonic_ns": time.monotonic_ns(), "time_ns": time.time_ns()}
-
-
-def sync_folder(folder: Path) -> None:
-    """Make names in a folder last: what was renamed or created there is on disk on return."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -5,25 +5,22 @@ copied from the plan's template where there is none yet; capture/journal.jsonl, 
 """
 
 import csv
-import fcntl
 import hashlib
-import json
 import os
-import socket
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import cv2
 import numpy as np
 
-from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from capture.camera import GrayImage
-from capture.journal import Record, sync_folder
+from capture.journal import Record
+from survey.files.locking import SESSION_LOCK, FileLock, holder_of
 from survey.files.project import DEFINITION_FILE, IMAGES_FOLDER, OBSERVATIONS_FOLDER
 from survey.files.table_writing import write_table
-from survey.files.text import atomic_write
+from survey.files.text import atomic_write, sync_folder
 
 CAPTURE_FOLDER = "capture"
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # lossless at any level; this one is fast
@@ -34,58 +31,16 @@ def journal_path(folder: Path) -> Path:
     return folder / CAPTURE_FOLDER / "journal.jsonl"
 
 
-class FolderLock:
-    """Keeps a folder for one session; the system frees it when the process dies, so that a lock cannot be left over."""
-
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / CAPTURE_FOLDER / "lock"
-        self._stream: TextIO | None = None
-
-    def acquire(self) -> None:
-        """Take the lock; raises SurveyError naming who has it."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        stream = self.path.open("a+", encoding="utf-8")
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            holder = _holder(stream)
-            stream.close()
-            raise SurveyError(
-                f"{self.path.parent.parent}: another session works on this folder ({holder}); wait for it or stop it"
-            ) from error
-        stream.truncate(0)
-        stream.write(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
-        stream.flush()
-        self._stream = stream
-
-    def release(self) -> None:
-        """Give it back."""
-        stream, self._stream = self._stream, None
-        if stream is not None:
-            stream.truncate(0)
-            stream.close()
+def session_lock(folder: Path) -> FileLock:
+    """What keeps a folder for one session; see :func:`survey.files.locking.FileLock`."""
+    path = folder / SESSION_LOCK
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return FileLock(path, folder, "session")
 
 
 def lock_holder(folder: Path) -> str | None:
     """Who works on a folder now; None where nobody does, whatever a dead process has left behind."""
-    path = folder / CAPTURE_FOLDER / "lock"
-    if not path.exists():
-        return None
-    with path.open("r", encoding="utf-8") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except OSError:
-            return _holder(stream)
-        return None
-
-
-def _holder(stream: TextIO) -> str:
-    try:
-        stream.seek(0)
-        who = json.loads(stream.read())
-        return f"process {who['pid']} on {who['host']}"
-    except (ValueError, KeyError, TypeError):
-        return "it has not said who it is"
+    return holder_of(folder / SESSION_LOCK)
 
 
 def write_image(folder: Path, camera_id: str, epoch_id: str, image: GrayImage) -> dict[str, Any]:

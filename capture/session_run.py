@@ -19,7 +19,7 @@ from capture.plan_table import make_table
 from capture.session import CameraSet, Outcome, Session, Taken
 from capture.session_cameras import PlannedCameras
 from capture.session_control import Control
-from capture.session_folder import FolderLock
+from capture.session_folder import session_lock
 from capture.session_progress import Progress
 from capture.session_quality import QualityWatch
 from capture.session_resume import last_readback
@@ -35,7 +35,7 @@ def run_plan(plan: CapturePlan, *, shown: bool = True) -> Outcome:
     """
     check_plan_limits(plan)
     with ExitStack() as stack:
-        lock = FolderLock(plan.project)
+        lock = session_lock(plan.project)
         lock.acquire()
         stack.callback(lock.release)
         progress = Progress(plan.project, len(plan.shots), shown)

@@ -13,7 +13,7 @@ from capture.drivers.turntables.dialect import read_dialect, shipped_dialects
 from capture.drivers.turntables.moving import MovingTable
 from capture.plan import CapturePlan, read_plan
 from capture.plan_table import DRIVERS, make_table
-from capture.session_folder import FolderLock
+from capture.session_folder import session_lock
 from capture.session_resume import last_readback
 from survey.files.text import suggestion
 
@@ -34,7 +34,7 @@ def table_job(
         raise SurveyError(f"{path}: the plan has no [table]")
     if stop:  # also while a session runs: whoever says stop means it
         return _with_table(plan, lambda table: table.stop())
-    lock = FolderLock(plan.project)
+    lock = session_lock(plan.project)
     if jog is not None or home:
         lock.acquire()
     try:

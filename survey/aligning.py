@@ -10,8 +10,10 @@ from typing import Any
 from adjust.errors import SurveyError
 from adjust.result import Adjustment
 from survey.files import atomic_write, read
+from survey.files.project import RESULTS
 from survey.files.text import decode, read_bytes
 from survey.jobs import adjust_project
+from survey.replacing import changing, replace_parts
 from survey.report.working_sheet import ROUND_COLUMNS, sheet_html, sheet_text, steps
 from survey.working_sheet import ARCSEC, Sheet, working_sheets
 
@@ -57,7 +59,16 @@ class AlignOutcome:
 
 def align_job(folder: Path, *, out: Path | None = None, progress: bool = True) -> AlignOutcome:
     """Adjust a project and say how its bodies are to be turned; a new round where its inputs have changed."""
-    project = read(Path(folder))
+    target = Path(out if out is not None else folder)
+    with changing(target) as place:
+        adjustment, sheets = _made(Path(folder), target, place, progress)
+        replace_parts(target)
+    return AlignOutcome(adjustment, sheets, target / RESULTS / PAGE)
+
+
+def _made(folder: Path, target: Path, place: Path, progress: bool) -> tuple[Adjustment, tuple[Sheet, ...]]:
+    """The sheets, with their files in ``place``."""
+    project = read(folder)
     if not project.alignment_tasks:
         raise SurveyError(
             f"{folder}/survey.toml: it does not say what is to be aligned; add for instance\n"
@@ -65,15 +76,15 @@ def align_job(folder: Path, *, out: Path | None = None, progress: bool = True) -
         )
     adjustment = adjust_project(project, progress)
     sheets = working_sheets(adjustment, project.alignment_tasks, project.options.alpha)
-    place = (Path(out) if out is not None else Path(folder)) / "results"
     date = datetime.now(UTC).isoformat(timespec="seconds")
-    rounds = _with_round(_rounds(place / ROUNDS), sheets, date)
+    rounds = _with_round(_rounds(target / RESULTS / ROUNDS), sheets, date)
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerows([ROUND_COLUMNS, *rounds])
-    atomic_write(place / ROUNDS, stream.getvalue())
-    atomic_write(place / PAGE, sheet_html(sheets, project.title or Path(folder).resolve().name, date, rounds))
-    return AlignOutcome(adjustment, sheets, place / PAGE)
+    atomic_write(place / RESULTS / ROUNDS, stream.getvalue())
+    page = sheet_html(sheets, project.title or folder.resolve().name, date, rounds)
+    atomic_write(place / RESULTS / PAGE, page)
+    return adjustment, sheets
 
 
 def _rounds(path: Path) -> list[list[str]]:

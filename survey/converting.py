@@ -39,6 +39,7 @@ from survey.interop.sinex import sinex_text
 from survey.jobs import adjust_project
 from survey.previous import read_previous
 from survey.quantities import scale_of
+from survey.replacing import filling
 from survey.results import RESULTS
 
 READERS: dict[str, Callable[[Path], ForeignNetwork]] = {
@@ -150,7 +151,8 @@ def _to_project(source: Path, target: Path, format: str, information: Informatio
         raise SurveyError(f"{target}: there is a project already; choose another folder")
     if format == "g2o":
         survey = survey_from_g2o(source, information)
-        write_project(target, survey, title=source.stem)
+        with filling(target) as place:
+            write_project(place, survey, title=source.stem)
         counts = {"stations": len(survey.stations), "pairs": len(survey.pairs)}
         return ConvertOutcome(source, target, "project", counts, "as in the file")
     network = READERS[format](source)
@@ -158,7 +160,8 @@ def _to_project(source: Path, target: Path, format: str, information: Informatio
     reject = network.reject
     options = AdjustmentOptions(network.alpha or AdjustmentOptions.alpha, reject, reject, reject)
     title = network.title or source.stem
-    write_project(target, survey, title=title, options=options, target_kinds=network.target_kinds)
+    with filling(target) as place:
+        write_project(place, survey, title=title, options=options, target_kinds=network.target_kinds)
     counts = {
         "points": len(survey.points),
         "readings": len(survey.readings),

@@ -28,9 +28,11 @@ from survey.checked import checked
 from survey.cleaning import clean_options
 from survey.detection import DetectionTask, ImageReport, SpotOptions, detect_images
 from survey.files import Definition, Project, SpotBlock, read, read_definition, write_image_points, write_spots
+from survey.files.project import RESULTS
 from survey.identify import Identification, identify_spots, without_points
 from survey.quantities import scale_of
-from survey.results import ENGLISH_PAGE, ReportOptions, RunInfo, solution_dict, summary_text, write_results
+from survey.replacing import changing, replace_parts
+from survey.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, solution_dict, summary_text
 from survey.statistics import Statistics, statistics_of
 from survey.targets import DetectableTarget, PointList
 
@@ -100,6 +102,10 @@ class AdjustOutcome:
         """The summary for people."""
         return summary_text(self.adjustment, self.run, self.solution)
 
+    def at(self, target: Path) -> "AdjustOutcome":
+        """The same with its files where they are now."""
+        return replace(self, paths={name: target / RESULTS / name for name in self.paths})
+
     @cached_property
     def solution(self) -> dict[str, Any]:
         """All that ``solution.json`` holds."""
@@ -113,6 +119,11 @@ def detect_job(
 
     Raises SurveyError where there is nothing to look at or to look for.
     """
+    with changing(folder) as place:
+        return _detect(Path(folder), place, jobs, pictures, progress)
+
+
+def _detect(folder: Path, place: Path, jobs: int | None, pictures: bool, progress: bool) -> DetectOutcome:
     definition = read_definition(folder)
     tasks = list(_tasks(definition))
     if not definition.images:
@@ -122,16 +133,17 @@ def detect_job(
             f"{folder}/survey.toml: nothing to look for; name a target that can be detected (checkerboard, charuco, "
             "marker_grid, marker_block) or a table [spots]"
         )
-    folder = Path(folder)
-    reports = detect_images(tasks, jobs=jobs, progress=progress, pictures=folder / PICTURES if pictures else None)
+    reports = detect_images(tasks, jobs=jobs, progress=progress, pictures=place / PICTURES if pictures else None)
     blocks, spots = _blocks(definition, reports)
     if not blocks and not spots:
         lines = "\n".join(f"  {r.path}: {r.message}" for r in reports[:10])
         raise SurveyError(f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}")
     # an empty table is written too: one of an earlier run must not stay behind
-    paths = [write_image_points(folder, blocks, definition.survey)]
-    paths += [write_spots(folder, spots)] if definition.spots_request is not None else []
-    return DetectOutcome(folder, tuple(reports), tuple(paths))
+    files = [write_image_points(place, blocks, definition.survey)]
+    files += [write_spots(place, spots)] if definition.spots_request is not None else []
+    names = [path.relative_to(place) for path in files]
+    replace_parts(folder, gone=[name.with_suffix(".parquet").as_posix() for name in names])
+    return DetectOutcome(folder, tuple(reports), tuple(folder / name for name in names))
 
 
 def _tasks(definition: Definition) -> Iterator[DetectionTask]:
@@ -198,33 +210,42 @@ def adjust_job(
 ) -> AdjustOutcome:
     """The main job: detect where that has not been done, adjust everything, write the results. Raises SurveyError."""
     clock, folder = Clock(), Path(folder)
+    target = folder if out is None else Path(out)
     messages: tuple[str, ...] = ()
-    if redetect:
-        with clock.step("detect"):
-            messages = detect_job(folder, progress=progress).problems
-    with clock.step("read"):
-        project = read(folder)
-    if project.images and not redetect and not (project.survey.image_blocks or project.spots):
-        with clock.step("detect"):
-            messages = detect_job(folder, progress=progress).problems
+    with changing(target) as place:
+
+        def detected() -> tuple[str, ...]:
+            with clock.step("detect"):
+                if out is None:
+                    return _detect(folder, place, None, False, progress).problems
+                return detect_job(folder, progress=progress).problems
+
+        if redetect:
+            messages = detected()
         with clock.step("read"):
             project = read(folder)
-    with clock.step("adjust"):
-        adjustment = adjust_project(project, progress)
-    notes = tuple(f"detection: {m}" for m in messages)
-    adjustment = replace(adjustment, warnings=adjustment.warnings + notes)
-    return written(project, adjustment, out if out is not None else folder, clock, report)
+        if project.images and not redetect and not (project.survey.image_blocks or project.spots):
+            messages = detected()
+            with clock.step("read"):
+                project = read(folder)
+        with clock.step("adjust"):
+            adjustment = adjust_project(project, progress)
+        notes = tuple(f"detection: {m}" for m in messages)
+        adjustment = replace(adjustment, warnings=adjustment.warnings + notes)
+        outcome = made(project, adjustment, place, clock, report)
+        replace_parts(target)
+    return outcome.at(target)
 
 
-def written(
+def made(
     project: Project, adjustment: Adjustment, place: Path, clock: Clock, report: ReportOptions = ENGLISH_PAGE
 ) -> AdjustOutcome:
-    """The statistics of an adjusted project, and everything written to ``place``."""
+    """The statistics of an adjusted project, and its result files made in ``place``."""
     run = run_info(project, clock.seconds)
     with clock.step("statistics"):
         found = statistics_of(adjustment, project.options.tolerances, scale_of(adjustment, run.sigmas))
     with clock.step("report"):
-        paths = write_results(place, adjustment, run, found, report)
+        paths = make_results(place, adjustment, run, found, report)
     return AdjustOutcome(adjustment, run, paths, found)
 
 

@@ -85,6 +85,7 @@ def _merge_definition(merged: Merged) -> None:
     if new_path.is_file():
         added, lines = _new_sections(merged, new_path, key_lines(text), tomllib.loads(text))
         text, origins = text + added, origins + lines
+        merged.entries.append(DEFINITION_FILE)
         try:
             tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
@@ -93,7 +94,6 @@ def _merge_definition(merged: Merged) -> None:
                 "line in braces"
             ) from error
     merged.origins[DEFINITION_FILE] = origins
-    merged.entries.append(DEFINITION_FILE)
     atomic_write(merged.place / DEFINITION_FILE, text)
 
 
@@ -154,7 +154,7 @@ def _merge_tables(merged: Merged) -> None:
         if path.suffix == ".parquet" or (old / f"{path.stem}.parquet").exists():
             raise SurveyError(f"{path}: Parquet tables cannot be added to; write both tables as CSV")
         _merge_table(merged, old / path.name, path, target / path.name)
-    merged.entries.append(OBSERVATIONS_FOLDER)
+        merged.entries.append(f"{OBSERVATIONS_FOLDER}/{path.name}")
 
 
 def point_files(folder: Path) -> list[str]:

@@ -26,6 +26,7 @@ from survey.navigation_task import (
     observed_epoch,
 )
 from survey.quantities import ARCSEC_PER_RAD
+from survey.replacing import changing, replace_parts
 from survey.results import RESULTS
 from survey.trajectory_files import write_trajectory
 
@@ -106,13 +107,21 @@ def navigate_job(
     covariance of cameras, table and beacons goes into every pose. It is kept in ``results`` and used again while
     that survey, options and versions are the same. (The solution of ``adjust`` has the navigated spots in it.)
     """
+    target = Path(out or folder)
+    with changing(target) as place:
+        outcome = _navigated(Path(folder), request, target / RESULTS, place / RESULTS, progress)
+        replace_parts(target)
+    return replace(outcome, paths={name: target / RESULTS / name for name in outcome.paths})
+
+
+def _navigated(folder: Path, request: NavigateRequest, there: Path, place: Path, progress: bool) -> NavigateOutcome:
+    """With its files in ``place``; what was kept from before is ``there``."""
     begin = time.perf_counter()
-    results = (out or Path(folder)) / RESULTS
-    project = read(Path(folder))
+    project = read(folder)
     station = request.station or chosen_station(project)
     epochs = chosen_epochs(project, station, request)
     times = chosen_times(epochs, request)
-    calibration = _calibrate(project, station, epochs, results / CALIBRATION)
+    calibration = _calibrate(project, station, epochs, there / CALIBRATION, place / CALIBRATION)
     calibrated = time.perf_counter()
     named = set(calibration.beacons.beacon_ids)
     order = range(len(epochs)) if times is None else sorted(range(len(epochs)), key=times.__getitem__)
@@ -126,9 +135,9 @@ def navigate_job(
             calibration.head, calibration.beacons, observed, options, lambda _done, _all: bar.update() and None
         )
     seconds = {"calibrate": calibrated - begin, "navigate": time.perf_counter() - calibrated}
-    outcome = NavigateOutcome(Path(folder), station, calibration, trajectory, _notes(project, calibration), seconds)
+    outcome = NavigateOutcome(folder, station, calibration, trajectory, _notes(project, calibration), seconds)
     summary = {k: v for k, v in outcome.summary().items() if k not in ("written", "folder", "notes")}
-    return replace(outcome, paths=write_trajectory(trajectory, observed, summary, results))
+    return replace(outcome, paths=write_trajectory(trajectory, observed, summary, place))
 
 
 def _notes(project: Project, calibration: Calibration) -> tuple[str, ...]:
@@ -141,13 +150,13 @@ def _notes(project: Project, calibration: Calibration) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _calibrate(project: Project, station: str, epochs: Sequence[str], path: Path) -> Calibration:
-    """Head and beacons, from a file where it was made from the same survey with the same options and versions."""
+def _calibrate(project: Project, station: str, epochs: Sequence[str], there: Path, new: Path) -> Calibration:
+    """Head and beacons, from the file ``there`` where it was made from the same survey, options and versions."""
     survey = calibrating(project, station, epochs)
     run = run_info(project, {})
     options = AdjustOptions(project.options.alpha, project.options.reject_blocks, project.options.reject_points)
     key = digest(survey, options, run.versions, station)
-    found = kept(path, key)
+    found = kept(there, key)
     if found is not None:
         return found
     try:
@@ -160,5 +169,5 @@ def _calibrate(project: Project, station: str, epochs: Sequence[str], path: Path
         ) from error
     head, beacons = head_and_beacons(adjustment, station)
     calibration = Calibration(head, beacons, adjustment.sigma0 if adjustment.redundancy > 0 else None)
-    keep(path, key, calibration)
+    keep(new, key, calibration)
     return calibration

@@ -1,6 +1,5 @@
 """The jobs ``plan`` (what a network of pairs will tell, before it is measured) and ``add`` (let one grow)."""
 
-import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -17,11 +16,11 @@ from survey.files.pairs import COVARIANCE_COLUMNS, EULER, PAIRS, QUATERNION, SIG
 from survey.files.project import OBSERVATIONS_FOLDER
 from survey.files.references import NameProblemError, Names, check_epochs, read_frame
 from survey.files.tables import Table, read_table
-from survey.jobs import AdjustOutcome, Clock, adjust_project, written
+from survey.jobs import AdjustOutcome, Clock, adjust_project, made
 from survey.merging import Merged, merge
 from survey.network_summary import network_dict, pair_network
 from survey.previous import Move, Previous, moves, read_previous
-from survey.replacing import complete, place_for, recover, replace_parts
+from survey.replacing import complete, place_for, replace_parts
 from survey.results import RESULTS
 from survey.warm_start import warm_adjustment
 
@@ -192,23 +191,19 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
     """
     begin = time.perf_counter()
     folder, new = Path(folder), Path(new)
-    recover(folder)
-    project = read(folder)
-    before = read_previous(project)
     with place_for(folder, out) as place:
+        project = read(folder)
+        before = read_previous(project)
         merged = merge(folder, new, place)
         grown = _read_merged(merged)
         grown = replace(grown, folder=out or folder, title=project.title)
         adjustment, start = warm_adjustment(grown, before, lambda p: adjust_project(p, progress), progress)
-        if (folder / RESULTS).is_dir():  # what others put there stays
-            shutil.copytree(folder / RESULTS, place / RESULTS)
-        outcome = written(grown, adjustment, place, Clock({"adjust": time.perf_counter() - begin}))
+        outcome = made(grown, adjustment, place, Clock({"adjust": time.perf_counter() - begin}))
         if out is None:
             replace_parts(folder, [*merged.entries, RESULTS])
         else:
             complete(folder, place)
-    target = out or folder
-    outcome = replace(outcome, paths={name: target / RESULTS / name for name in outcome.paths})
+    outcome = outcome.at(out or folder)
     added = {**merged.new_ids, **merged.rows}
     return AddOutcome(outcome, added, moves(before, adjustment), before, start, time.perf_counter() - begin)
 

@@ -13,6 +13,7 @@ from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from adjust.result import Adjustment, ParameterName
 from survey.files import Project
+from survey.files.locking import settled
 from survey.files.poses import rotation_from_quaternion
 from survey.files.text import read_bytes
 from survey.quantities import ARCSEC_PER_RAD
@@ -55,6 +56,11 @@ class Move:
 
 def read_previous(project: Project) -> Previous:
     """The results of a project. Raises SurveyError where it was not adjusted, or has changed since."""
+    with settled(project.folder):
+        return _read_previous(project)
+
+
+def _read_previous(project: Project) -> Previous:
     path = project.folder / RESULTS / "solution.json"
     again = f"run 'labsurvey adjust {project.folder}' first"
     archive = path.with_name("covariance.npz")

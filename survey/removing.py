@@ -21,10 +21,10 @@ from survey.files.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.files.reading import LAYOUTS
 from survey.files.tables import read_table
 from survey.files.text import atomic_write, suggestion
-from survey.jobs import AdjustOutcome, Clock, adjust_project, written
+from survey.jobs import AdjustOutcome, Clock, adjust_project, made
 from survey.merging import point_files, table_rows
 from survey.previous import Move, Previous, moves, read_previous
-from survey.replacing import complete, place_for, recover, replace_parts
+from survey.replacing import complete, place_for, replace_parts
 from survey.results import RESULTS
 
 _ID_COLUMNS = {
@@ -107,12 +107,11 @@ def remove_job(
     before whatever goes wrong.
     """
     begin, folder = time.perf_counter(), Path(folder)
-    recover(folder)
-    project = read(folder)
-    before, why = _previous(project)
-    tables = _tables(folder)
-    chosen = _chosen(folder, tables, ids)
     with place_for(folder, out) as place:
+        project = read(folder)
+        before, why = _previous(project)
+        tables = _tables(folder)
+        chosen = _chosen(folder, tables, ids)
         _copy(folder, place)
         for name, rows in chosen.items():
             _write(tables[name], rows, place)
@@ -124,14 +123,12 @@ def remove_job(
             if isinstance(error, IndeterminateError):
                 raise IndeterminateError(said, error.parameters) from error
             raise type(error)(said) from error
-        if (folder / RESULTS).is_dir():  # what others put there stays
-            shutil.copytree(folder / RESULTS, place / RESULTS)
-        outcome = written(reduced, adjustment, place, Clock({"adjust": time.perf_counter() - begin}))
+        outcome = made(reduced, adjustment, place, Clock({"adjust": time.perf_counter() - begin}))
         if out is None:
             replace_parts(folder, [*(f"{OBSERVATIONS_FOLDER}/{name}.csv" for name in chosen), RESULTS])
         else:
             complete(folder, place)
-    outcome = replace(outcome, paths={name: (out or folder) / RESULTS / name for name in outcome.paths})
+    outcome = outcome.at(out or folder)
     moved = () if before is None else moves(before, adjustment)
     removed = {name: tables[name].named(rows) for name, rows in chosen.items()}
     return RemoveOutcome(outcome, removed, moved, before, why, time.perf_counter() - begin)

@@ -10,7 +10,9 @@ import numpy as np
 
 from adjust.result import Adjustment
 from survey.files import atomic_write
+from survey.files.project import RESULTS
 from survey.quantities import SigmaKind, scale_of
+from survey.replacing import changing, replace_parts
 from survey.report import report_html, summary_text
 from survey.report.pdf import report_pdf
 from survey.residual_tables import image_residuals_csv, other_residuals_csv
@@ -23,6 +25,7 @@ __all__ = [
     "ReportOptions",
     "RunInfo",
     "covariance_npz",
+    "make_results",
     "read_covariances",
     "solution_dict",
     "solution_json",
@@ -30,7 +33,6 @@ __all__ = [
     "write_results",
 ]
 
-RESULTS = "results"
 _README = (
     "names[i] is kind/id[/epoch]/component; units[i] its unit; parameters[k] is kind/id[/epoch].",
     "Parameter k has the components start[k]:start[k+1] of names; its covariance is covariance[block[k]:block[k+1]], "
@@ -98,11 +100,26 @@ def write_results(
     statistics: Statistics | None = None,
     options: ReportOptions = ENGLISH_PAGE,
 ) -> dict[str, Path]:
-    """Write everything into ``folder/results``, each file whole or not at all; the paths by file name.
+    """Write everything into ``folder/results``, all files or none; the paths by file name.
 
-    Raises SurveyError for a language that there is not, or where no PDF can be made; nothing has been written then.
+    Raises SurveyError for a language that there is not, where no PDF can be made, and while a command has the folder;
+    nothing has been written then.
     """
-    results = folder / RESULTS
+    with changing(folder) as place:
+        made = make_results(place, adjustment, run, statistics, options)
+        replace_parts(folder)
+    return {name: folder / RESULTS / name for name in made}
+
+
+def make_results(
+    place: Path,
+    adjustment: Adjustment,
+    run: RunInfo,
+    statistics: Statistics | None = None,
+    options: ReportOptions = ENGLISH_PAGE,
+) -> dict[str, Path]:
+    """Make everything in ``place/results``; the paths by file name. Raises as :func:`write_results`."""
+    results = place / RESULTS
     solution = solution_dict(adjustment, run, statistics)
     page = report_html(adjustment, run, solution, statistics, options.language)
     pdf = report_pdf(page) if options.pdf else b""
@@ -113,7 +130,6 @@ def write_results(
         "residuals_other.csv": lambda: other_residuals_csv(adjustment),
         "report.html": page.encode,
         **({"report.pdf": lambda: pdf} if options.pdf else {}),
-        # last: whoever waits for the solution finds the rest beside it
         "solution.json": lambda: solution_json(solution).encode(),
     }
     paths = {name: results / name for name in makers}

@@ -19,7 +19,7 @@ from capture.plan import CapturePlan
 from capture.plan_table import make_table
 from capture.quality import Coverage, image_quality
 from capture.session_cameras import PlannedCameras
-from capture.session_folder import FolderLock, lock_holder
+from capture.session_folder import lock_holder, session_lock
 from capture.session_progress import status_path
 from capture.session_quality import coverages, read_qualities, targets_by_camera
 from capture.session_resume import last_readback
@@ -128,7 +128,7 @@ class LiveView:
         self._quality: dict[str, Any] = {}
         self._coverage: dict[str, Coverage] = {}
         self._message, self._ending = "", threading.Event()
-        self._lock = FolderLock(plan.project)
+        self._lock = session_lock(plan.project)
         self._lock.acquire()
         self._table: MovingTable | None = None
         trigger = "free" if plan.options.trigger == "hardware" else plan.options.trigger

@@ -3,6 +3,7 @@
 import re
 
 from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
+from survey.files.locking import BusyError
 
 CAUSES = {
     "project": "no project",
@@ -11,6 +12,7 @@ CAUSES = {
     "convergence": "did not converge",
     "survey": "cannot be adjusted",
     "access": "file or folder not accessible",
+    "busy": "another command works on it",
     "memory": "out of memory",
     "process": "its process ended abruptly",
     "cluster": "lost on the cluster",
@@ -18,7 +20,7 @@ CAUSES = {
 }
 """Kind of failure and how it is called."""
 
-MAY_PASS = frozenset({"access", "memory", "process"})
+MAY_PASS = frozenset({"access", "busy", "memory", "process"})
 """What a second try may mend: everything else would end the same way again."""
 
 _LINE_OF_FILE = re.compile(r"\.(toml|csv|parquet)(:|\b)")
@@ -30,6 +32,8 @@ def cause_of(error: BaseException) -> str:
         return "undetermined"
     if isinstance(error, NotConvergedError):
         return "convergence"
+    if isinstance(error, BusyError):
+        return "busy"
     if isinstance(error, SurveyError):
         text = str(error)
         if "no such folder" in text or "there is no survey.toml" in text:

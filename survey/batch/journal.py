@@ -7,17 +7,23 @@ from types import TracebackType
 from typing import Any, Self
 
 from survey.batch.record import Record, record_from
+from survey.files.locking import FileLock
 from survey.files.text import atomic_write
 
-JOURNAL = "journal.jsonl"
+JOURNAL, _LOCK = "journal.jsonl", ".journal.lock"
 
 
 class Journal:
-    """Appends to ``FOLDER/journal.jsonl``; each line is on the disk before the next folder is reported."""
+    """Appends to ``FOLDER/journal.jsonl``; each line is on the disk before the next folder is reported.
+
+    Raises BusyError while another batch writes it.
+    """
 
     def __init__(self, folder: Path, kept: list[dict[str, Any]]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / JOURNAL
+        self._lock = FileLock(folder / _LOCK, folder, "batch")
+        self._lock.acquire()
         # written anew: the last line of a killed run may be half a line
         atomic_write(path, "".join(json.dumps(entry) + "\n" for entry in kept))
         self._file = path.open("a", encoding="utf-8")
@@ -33,6 +39,7 @@ class Journal:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._file.close()
+        self._lock.release()
 
 
 def entry_of(path: Path, inputs: str, record: Record) -> dict[str, Any]:

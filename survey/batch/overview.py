@@ -8,7 +8,7 @@ from survey.batch.page import overview_html
 from survey.batch.record import Record
 from survey.batch.tables import folders_csv, overview_json, trends_csv
 from survey.batch.trends import Trends
-from survey.files.text import atomic_write
+from survey.replacing import write_set
 
 
 def write_overview(place: Path, records: Sequence[Record], trends: Trends, language: str = "en") -> dict[str, Path]:
@@ -21,6 +21,4 @@ def write_overview(place: Path, records: Sequence[Record], trends: Trends, langu
         "overview.html": overview_html(records, trends, place, date, language),
         "overview.json": overview_json(records, trends),
     }
-    for name, text in texts.items():
-        atomic_write(place / name, text)
-    return {name: place / name for name in texts}
+    return write_set(place, texts)

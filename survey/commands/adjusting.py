@@ -57,7 +57,7 @@ def _adjust(arguments: argparse.Namespace) -> int:
 
 
 def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
-    require_project(folder)
+    require_project(folder, arguments.out)
     from survey.jobs import adjust_job
 
     outcome = adjust_job(

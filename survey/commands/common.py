@@ -81,19 +81,25 @@ def print_json(value: Mapping[str, Any]) -> None:
     print(json.dumps(value, indent=1, allow_nan=False))
 
 
-def require_project(folder: Path) -> None:
-    """Raises SurveyError where a folder is no project; undoes an ``add`` that was killed half way."""
-    if (folder / ".before").is_dir():
-        from survey.replacing import recover, unfinished
-
-        if unfinished(folder):  # a mixture of old and new must not be taken for a project
-            recover(folder)
-            print(f"labsurvey: {folder}: an 'add' that was killed has been undone", file=sys.stderr)
+def require_project(folder: Path, out: Path | None = None) -> None:
+    """Raises SurveyError where a folder is no project; there and in ``out`` undoes what was killed half way."""
+    for place in (folder, *([out] if out is not None else [])):
+        undo_killed(place)
     if not folder.is_dir():
         hint = "; 'labsurvey example full-lab lab' writes a ready one"
         raise SurveyError(f"{folder}: no such folder{hint}")
     if not (folder / "survey.toml").is_file():
         raise SurveyError(f"{folder}: there is no survey.toml in it; give the folder that holds one")
+
+
+def undo_killed(folder: Path) -> None:
+    """A mixture of old and new must not be taken for a project."""
+    if (folder / ".before").is_dir():
+        from survey.replacing import recover_killed
+
+        if recover_killed(folder):
+            print(f"labsurvey: {folder}: a command that was killed while it replaced files has been undone",
+                  file=sys.stderr)  # fmt: skip
 
 
 def tested(omega_test: Any) -> int:

@@ -57,7 +57,7 @@ def declare_trackers(commands: Any, shaped: dict[str, Any]) -> None:
 
 
 def _add(arguments: argparse.Namespace) -> int:
-    require_project(arguments.folder)
+    require_project(arguments.folder, arguments.out)
     from survey.network import add_job
 
     outcome = add_job(arguments.folder, arguments.new, out=arguments.out, progress=not is_set(arguments, "quiet"))
@@ -70,7 +70,7 @@ def _add(arguments: argparse.Namespace) -> int:
 
 
 def _remove(arguments: argparse.Namespace) -> int:
-    require_project(arguments.folder)
+    require_project(arguments.folder, arguments.out)
     from survey.removing import remove_job
 
     progress = not is_set(arguments, "quiet")

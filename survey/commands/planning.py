@@ -47,7 +47,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         return _error_analysis(arguments)
     if arguments.folder is None:
         raise SurveyError("name the project folder: labsurvey plan FOLDER; or labsurvey plan --error-analysis")
-    require_project(arguments.folder)
+    require_project(arguments.folder, arguments.out)
     if not (arguments.folder / "plan.toml").is_file():
         return _network(arguments)
     from survey.planning.job import PlanRequest, planning_job

@@ -27,7 +27,7 @@ def declare_report(commands: Any, shaped: dict[str, Any]) -> None:
 
 
 def _report(arguments: argparse.Namespace) -> int:
-    require_project(arguments.folder)
+    require_project(arguments.folder, arguments.out)
     from survey.jobs import adjust_job
     from survey.results import ReportOptions
 

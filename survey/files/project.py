@@ -15,6 +15,7 @@ FORMAT = 1
 DEFINITION_FILE = "survey.toml"
 OBSERVATIONS_FOLDER = "observations"
 IMAGES_FOLDER = "images"
+RESULTS = "results"
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from survey.files.image_points import IMAGE_POINTS, SPOTS, read_image_blocks, re
 from survey.files.images import find_images
 from survey.files.instruments import read_bearings, read_instruments, read_setups, read_vertical
 from survey.files.kinds import read_targets
+from survey.files.locking import settled
 from survey.files.measurements import (
     ANGLES,
     COORDINATES,
@@ -98,13 +99,15 @@ _TOP_LEVEL = (
 
 def read_definition(folder: Path) -> Definition:
     """Read survey.toml and list the images; raises SurveyError."""
-    return _read_definition(Path(folder))[0]
+    with settled(Path(folder)):
+        return _read_definition(Path(folder))[0]
 
 
 def read(folder: Path) -> Project:
     """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError."""
-    definition, root = _read_definition(Path(folder))
-    tables = _read_tables(definition.folder / OBSERVATIONS_FOLDER)
+    with settled(Path(folder)):
+        definition, root = _read_definition(Path(folder))
+        tables = _read_tables(definition.folder / OBSERVATIONS_FOLDER)
     _check_scales(root, definition.sigmas, tables)
     survey = _with_tie_points(definition, tables, flat_point(root.integer("dimensions", 1, 3)))
     _check_datum_points(root, survey)

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from adjust.errors import SurveyError
+from survey.files.locking import hold, remove_unheld
 
 LARGEST_FILE = 4 * 2**30  # bytes; longer observations go into several projects
 LARGEST_NUMBER = 1e15  # its square and what is made of it stay finite
@@ -19,20 +20,50 @@ _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{i}" for port in ("COM", "LPT"
 
 
 def atomic_write(path: Path, content: bytes | str) -> None:
-    """Write ``content`` (text as UTF-8) under a temporary name beside ``path``, then rename: all of it or nothing."""
+    """Write ``content`` (text as UTF-8) under a temporary name beside ``path``, then rename: all of it or nothing.
+
+    What killed runs left of the same file goes.
+    """
     data = content.encode("utf-8") if isinstance(content, str) else content
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    remove_leftovers(path.parent, path.name)
+    handle, temporary = _temporary(path)
     try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(data)
             stream.flush()
-            os.fsync(stream.fileno())
+            os.fsync(handle)
         os.chmod(temporary, 0o666 & ~_umask())  # mkstemp makes files that only their owner can read
         os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
+
+
+def _temporary(path: Path) -> tuple[int, str]:
+    while True:
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+        if hold(handle, Path(temporary)):
+            return handle, temporary
+        os.close(handle)
+
+
+def remove_leftovers(folder: Path, name: str = "") -> None:
+    """Remove temporary files of ``atomic_write``, of one name or all, that no living process writes."""
+    pattern = re.compile(rf"\.{re.escape(name) or '.+'}\.[a-z0-9_]{{8}}\.tmp")
+    with os.scandir(folder) as entries:
+        found = [entry.path for entry in entries if pattern.fullmatch(entry.name)]
+    for path in found:
+        remove_unheld(Path(path))
+
+
+def sync_folder(folder: Path) -> None:
+    """Make names in a folder last: what was renamed or created there is on disk on return."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _umask() -> int:

@@ -18,6 +18,7 @@ from survey.interop.robots import read_sdf, read_urdf, sdf_files, urdf_files
 from survey.interop.ros import industrial_files, read_industrial, read_ros, ros_files
 from survey.interop.scene import glb_files, ply_files
 from survey.interop.trajectories import kitti_files, read_kitti, read_tum, tum_files
+from survey.whole_folder import whole_folder
 
 Files = tuple[Mapping[str, str | bytes], tuple[str, ...]]
 
@@ -71,22 +72,20 @@ def write_cameras(
 ) -> tuple[dict[str, int], tuple[str, ...]]:
     """Write a survey in a camera format at ``target``, which must be new; counts and notes for people."""
     if format in COLMAP:
-        target.mkdir(parents=True)
-        try:
-            return write_colmap(values, target, text=format == "colmap-text")
-        except BaseException:
-            for path in target.iterdir():
-                path.unlink()
-            target.rmdir()
-            raise
+        with whole_folder(target) as place:
+            return write_colmap(values, place, text=format == "colmap-text")
     if format == KALIBR_TARGET:
         files, notes = _target_files(values)
     elif format == "opencv":
         files, notes = opencv_files(values, station, json=target.suffix.lower() == ".json")
     else:
         files, notes = FORMATS[format].write(values, station)
-    for name, content in files.items():
-        atomic_write(target / name if name else target, content)
+    if "" in files:
+        atomic_write(target, files[""])
+        return {"files": 1, "cameras": len(values.survey.cameras)}, notes
+    with whole_folder(target) as place:
+        for name, content in files.items():
+            atomic_write(place / name, content)
     return {"files": len(files), "cameras": len(values.survey.cameras)}, notes
 
 

@@ -10,10 +10,10 @@ import numpy as np
 from adjust.design.error_figures import ErrorFigure, error_figures
 from adjust.error_analysis import BeaconField, tolerance
 from adjust.errors import SurveyError
-from survey.files import atomic_write
 from survey.planning.page import html_page
 from survey.planning.plots import Series, chart
 from survey.planning.summary import number
+from survey.replacing import write_set
 from survey.report import drawing as d
 from survey.report.markup import esc, fixed, general, section, table
 
@@ -108,15 +108,13 @@ def error_analysis_job(
     bounded, paper = error_figures((BOUNDED, PAPER), n_trials, seed)
     result = ErrorAnalysis(bounded, paper, rms_px, n_trials, seed, time.perf_counter() - begin)
     if out is not None:
-        out = Path(out)
-        out.mkdir(parents=True, exist_ok=True)
-        for f in bounded:
-            path = out / f"figure_{_NUMBERS[f.kind]}.svg"
-            atomic_write(path, _drawn(f).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1))
-            result.paths[path.name] = path
-        result.paths["error_analysis.html"] = out / "error_analysis.html"
-        atomic_write(result.paths["error_analysis.html"], _page(result))
+        files = {f"figure_{_NUMBERS[f.kind]}.svg": _picture(f) for f in bounded}
+        result.paths.update(write_set(Path(out), {**files, "error_analysis.html": _page(result)}))
     return result
+
+
+def _picture(f: ErrorFigure) -> str:
+    return _drawn(f).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
 
 
 def _drawn(f: ErrorFigure) -> str:

@@ -27,6 +27,7 @@ from adjust.design.selection import Component, Criterion
 from adjust.errors import SurveyError
 from adjust.result import Adjustment
 from survey.files import Project, atomic_write, read
+from survey.files.project import RESULTS
 from survey.jobs import adjust_project
 from survey.network_summary import network_dict, pair_network
 from survey.planning.building import Planned, build_plan
@@ -34,8 +35,7 @@ from survey.planning.navigation import NavigationOutcome, plan_navigation
 from survey.planning.plan_file import Plan, read_plan
 from survey.planning.summary import plan_summary, plan_text
 from survey.planning.wanted import required_sigmas, wanted_components
-
-RESULTS = "results"
+from survey.replacing import changing, replace_parts
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,17 @@ def planning_job(
 
     Raises SurveyError, and IndeterminateError naming what the plan leaves open.
     """
-    begin, folder = time.perf_counter(), Path(folder)
+    target = Path(out or folder)
+    with changing(target) as place:
+        outcome = _planned(Path(folder), request, progress)
+        names = _make(outcome, place / RESULTS)
+        replace_parts(target)
+    outcome.paths.update({name: target / RESULTS / name for name in names})
+    return outcome
+
+
+def _planned(folder: Path, request: PlanRequest, progress: bool) -> PlanningOutcome:
+    begin = time.perf_counter()
     project = read(folder)
     plan = read_plan(folder, project.survey)
     existing, notes = _existing(project, progress)
@@ -122,12 +132,10 @@ def planning_job(
         navigation = plan_navigation(plan, expected, request.place)
     seconds = {"predict": built - begin, "expect": solved - built, "choose": chosen - solved,
                "simulate and navigate": time.perf_counter() - chosen}  # fmt: skip
-    outcome = PlanningOutcome(
+    return PlanningOutcome(
         folder, project.title, plan, planned, expected, weak_directions(expected), wanted, selection, required, shares,
         allowed, trials, network, navigation, seconds,
     )  # fmt: skip
-    outcome.paths.update(_write(outcome, (out or folder) / RESULTS))
-    return outcome
 
 
 def _existing(project: Project, progress: bool) -> tuple[Adjustment | None, list[str]]:
@@ -154,12 +162,10 @@ def _trials(planned: Planned, expected: Adjustment, request: PlanRequest, progre
         return run_trials(ideal, planned.start, expected, request.trials, request.seed, request.workers, step)
 
 
-def _write(outcome: PlanningOutcome, folder: Path) -> dict[str, Path]:
+def _make(outcome: PlanningOutcome, place: Path) -> tuple[str, ...]:
     from survey.planning.page import plan_page
 
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = {name: folder / name for name in ("plan.html", "plan.json")}
-    atomic_write(paths["plan.html"], plan_page(outcome))
+    atomic_write(place / "plan.html", plan_page(outcome))
     content = {k: v for k, v in outcome.summary().items() if k not in ("folder", "written", "seconds")}
-    atomic_write(paths["plan.json"], json.dumps(content, indent=1, allow_nan=False) + "\n")
-    return paths
+    atomic_write(place / "plan.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+    return ("plan.html", "plan.json")

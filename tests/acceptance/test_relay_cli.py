@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import survey.replacing
 from survey.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -309,48 +308,6 @@ def test_only_an_adjusted_project_grows(lab, capsys):
     _write(lab, _rows(lab)[:-1])
     assert main(["add", str(lab), str(lab / "more"), "--quiet"]) == 1
     assert "observations/pairs.csv changed since the project was adjusted" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("step", range(1, 6))
-def test_a_disk_that_fails_on_the_way_leaves_the_old_state(lab, step, monkeypatch, capsys):
-    before, calls, rename = _files(lab), [], survey.replacing.os.rename
-
-    def failing(source, target):
-        calls.append(source)
-        if len(calls) == step:
-            raise OSError(28, "No space left on device", str(target))
-        rename(source, target)
-
-    monkeypatch.setattr(survey.replacing.os, "rename", failing)
-    assert main(["add", str(lab), str(lab / "more"), "--quiet"]) == 1
-    assert "No space left on device" in capsys.readouterr().err
-    assert _files(lab) == before
-
-
-@pytest.mark.parametrize("step", range(1, 6))
-def test_a_run_that_was_killed_on_the_way_is_undone_by_the_next(lab, step, monkeypatch, capsys):
-    before, calls, rename = _files(lab), [], survey.replacing.os.rename
-
-    class KilledError(BaseException):
-        pass
-
-    def killed(source, target):
-        calls.append(source)
-        if len(calls) == step:
-            raise KilledError
-        rename(source, target)
-
-    monkeypatch.setattr(survey.replacing.os, "rename", killed)
-    monkeypatch.setattr(survey.replacing, "recover", lambda _: None)  # the killed process does nothing more
-    monkeypatch.setattr("survey.network.shutil.rmtree", lambda *_, **__: None)
-    with pytest.raises(KilledError):
-        main(["add", str(lab), str(lab / "more"), "--quiet"])
-    monkeypatch.undo()
-    assert (lab / ".before").is_dir()
-    capsys.readouterr()
-    assert main(["plan", str(lab), "--quiet"]) == 0
-    assert "an 'add' that was killed has been undone" in capsys.readouterr().err
-    assert _files(lab) == before
 
 
 def test_commands_of_the_page_work(tmp_path, monkeypatch, capsys):

@@ -15,7 +15,7 @@ from adjust.errors import SurveyError
 from capture.journal import read_journal
 from capture.plan import read_plan
 from capture.session import SessionStoppedError
-from capture.session_folder import FolderLock, lock_holder
+from capture.session_folder import lock_holder, session_lock
 from capture.session_run import run_plan
 from capture.turntable import LimitError
 from tests.capture.session_runs import processes, require_complete, run_to_end, write_plan
@@ -196,7 +196,7 @@ def test_pause_and_go_on(tmp_path):
 
 def test_two_sessions_on_one_folder_are_refused(tmp_path):
     plan = write_plan(tmp_path)
-    holder = "import sys,time,pathlib; from capture.session_folder import FolderLock as L\n"
+    holder = "import sys,time,pathlib; from capture.session_folder import session_lock as L\n"
     holder += f"lock = L(pathlib.Path({str(tmp_path / 'lab')!r})); lock.acquire()\n"
     holder += "print('held', flush=True); time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", holder], stdout=subprocess.PIPE, text=True) as other:
@@ -215,12 +215,12 @@ def test_two_sessions_on_one_folder_are_refused(tmp_path):
 
 
 def test_lock_is_given_back(tmp_path):
-    first = FolderLock(tmp_path)
+    first = session_lock(tmp_path)
     first.acquire()
     with pytest.raises(SurveyError, match="another session"):
-        FolderLock(tmp_path).acquire()
+        session_lock(tmp_path).acquire()
     first.release()
-    second = FolderLock(tmp_path)
+    second = session_lock(tmp_path)
     second.acquire()
     second.release()
 
