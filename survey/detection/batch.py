@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from functools import partial
@@ -39,15 +39,18 @@ def detect_images(
 ) -> list[ImageReport]:
     """Reports of all tasks, in their order.
 
-    jobs: processes (None: as many as there are processors, and one where images are few). Processes are spawned: a
-    script that calls this with more than one guards its main part by ``if __name__ == "__main__"``.
+    jobs: processes. None: as many as there are processors, and threads instead where images are few. Processes are
+    spawned: a script that calls this with more than one guards its main part by ``if __name__ == "__main__"``.
     progress: a bar on stderr. pictures: folder for a PNG of each image that was read, with what was found in it.
     """
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
-    if jobs is None:
-        jobs = min(len(os.sched_getaffinity(0)), len(tasks) // _IMAGES_PER_PROCESS)
-    run = _in_processes if jobs > 1 and len(tasks) > 1 else _here
+    cores = len(os.sched_getaffinity(0))
+    if jobs is None and min(cores, len(tasks)) > 1 and len(tasks) < 2 * _IMAGES_PER_PROCESS:
+        jobs, run = cores, _in_threads
+    else:
+        jobs = min(cores, len(tasks) // _IMAGES_PER_PROCESS) if jobs is None else jobs
+        run = _in_processes if jobs > 1 and len(tasks) > 1 else _here
     reports: dict[int, ImageReport] = {}
     with tqdm(total=len(tasks), desc="detect", unit="image", disable=not progress) as bar:
         for position, report in run(tasks, jobs, pictures):
@@ -59,6 +62,14 @@ def detect_images(
 def _here(tasks: Sequence[DetectionTask], jobs: int, pictures: Path | None) -> Iterator[tuple[int, ImageReport]]:
     for position, task in enumerate(tasks):
         yield position, detect_task(task, pictures)
+
+
+def _in_threads(tasks: Sequence[DetectionTask], jobs: int, pictures: Path | None) -> Iterator[tuple[int, ImageReport]]:
+    """What takes time holds no lock: OpenCV's finders and the compiled fits."""
+    with ThreadPoolExecutor(min(jobs, len(tasks))) as pool:
+        futures = {pool.submit(detect_task, task, pictures): position for position, task in enumerate(tasks)}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
 
 
 def _in_processes(

@@ -5,7 +5,7 @@ import numpy as np
 
 from adjust.model import BoolArray, FloatArray
 from survey.detection.corners import CornerFit, refine_corners
-from survey.detection.gray import Gray8, Gray32
+from survey.detection.gray import Gray8, Gray32, reduced
 from survey.detection.results import Detection, nothing_found
 from survey.targets import Checkerboard
 
@@ -56,10 +56,7 @@ def _measured(gray: Gray32, gray8: Gray8, rough: FloatArray) -> Detection:
 
 def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
     """Corners (n, 2) px to about a pixel: classic and sector finder on a reduced image, then the full one."""
-    scale = max(1.0, max(gray8.shape) / _COARSE_PX)
-    size = (round(gray8.shape[1] / scale), round(gray8.shape[0] / scale))
-    coarse = cv2.resize(gray8, size, interpolation=cv2.INTER_AREA) if scale > 1.0 else gray8
-    factor = np.array([gray8.shape[1] / coarse.shape[1], gray8.shape[0] / coarse.shape[0]])
+    coarse, factor = reduced(gray8, _COARSE_PX)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     pattern = (columns, rows)
     ok, corners = cv2.findChessboardCorners(coarse, pattern, flags=flags)
@@ -67,7 +64,7 @@ def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
         ok, corners = cv2.findChessboardCornersSB(coarse, pattern, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
     if ok:
         return np.asarray((np.reshape(corners, (-1, 2)).astype(float) + 0.5) * factor - 0.5)
-    if scale > 1.0:
+    if coarse is not gray8:
         ok, corners = cv2.findChessboardCorners(gray8, pattern, flags=flags | cv2.CALIB_CB_FAST_CHECK)
     return np.reshape(corners, (-1, 2)).astype(float) if ok else None
 

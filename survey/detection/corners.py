@@ -14,6 +14,7 @@ from survey.detection.corner_kernels import fit_corners
 CROSSING_FLOOR_PX = 0.002
 MARKER_FLOOR_PX = 0.003
 _PIXEL_VARIANCE = 1.0 / 12.0
+_ROUGH_PX, _FINE_PX = 1e-2, 2e-5  # where the first and the second fit may stop
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +50,13 @@ def refine_corners(
     blur = np.full(len(start), 1.0)
     # a second pass from the first one's result: its window is centred and turned to the corner itself
     shapes = _window_shapes(edges, free, crossing, blur)
-    first, _, _, _, status = fit_corners(gray, start, angles, blur, shapes, crossing, 3.0)
+    first, _, _, _, status = fit_corners(gray, start, angles, blur, shapes, crossing, 3.0, _ROUGH_PX)
     again = status == 0
     centred = np.where(again[:, None], first[:, :2], start)
     angles = np.where(again[:, None], first[:, 2:4], angles)
     blur = np.where(again, np.exp(first[:, 6]), blur)
     shapes = _window_shapes(edges, free, crossing, blur)
-    p, cov, _, rms, status = fit_corners(gray, centred, angles, blur, shapes, crossing, 0.5)
+    p, cov, _, rms, status = fit_corners(gray, centred, angles, blur, shapes, crossing, 0.5, _FINE_PX)
     floor = CROSSING_FLOOR_PX if crossing else MARKER_FLOOR_PX
     cov = cov + floor**2 * np.eye(2)
     contrast = np.abs(p[:, 5]) * (2.0 if crossing else 1.0)

@@ -1,5 +1,7 @@
 """One image, one target."""
 
+import numpy as np
+
 from survey.detection.checkerboard import find_checkerboard
 from survey.detection.gray import AnyImage, for_finding, gray_values
 from survey.detection.markers import find_charuco, find_markers
@@ -14,7 +16,7 @@ def detect_image(image: AnyImage, target: DetectableTarget) -> Detection:
     that cannot exist (unknown dictionary, marker larger than its square).
     """
     gray = gray_values(image)
-    gray8 = for_finding(gray)
+    gray8 = for_finding(np.asarray(image, np.uint8) if image.dtype == np.uint8 and image.ndim == 2 else gray)
     if isinstance(target, Checkerboard):
         return find_checkerboard(gray, gray8, target)
     if isinstance(target, Charuco):

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from adjust.errors import SurveyError
+from adjust.model import FloatArray
 from survey.detection.image_header import image_size
 
 Gray8 = npt.NDArray[np.uint8]
@@ -15,6 +16,7 @@ AnyImage = npt.NDArray[np.generic]
 LARGEST_PIXELS = 400_000_000  # the largest sensors have a third of that
 _LARGEST_BYTES = 2**32
 _HEAD = 2**20  # bytes in which the size is looked for
+_SAMPLE = 60_000  # pixels whose percentiles stand for those of the image
 
 
 def read_image(path: Path) -> AnyImage:
@@ -61,11 +63,33 @@ def saturation_level(image: AnyImage) -> float:
     return float(next((2**bits - 1 for bits in (8, 10, 12, 14, 16) if top <= 2**bits - 1), top))
 
 
-def for_finding(gray: Gray32) -> Gray8:
+def for_finding(gray: Gray32 | Gray8) -> Gray8:
     """8 bit for OpenCV's finders; deeper images and dim ones are stretched between their 0.1 and 99.9 percentiles."""
-    sample = gray[::7, ::7]
-    low, high = np.percentile(sample, [0.1, 99.9])
+    step = max(7, int(np.sqrt(gray.size / _SAMPLE)))
+    low, high = (float(level) for level in np.percentile(gray[::step, ::step], [0.1, 99.9]))
     if low >= 0.0 and high - low >= 60.0 and high <= 255.0:
-        return np.asarray(np.rint(np.clip(gray, 0.0, 255.0)), np.uint8)
-    scaled = (gray - low) * (255.0 / max(high - low, 1.0))
-    return np.asarray(np.rint(np.clip(scaled, 0.0, 255.0)), np.uint8)
+        if gray.dtype == np.uint8:
+            return np.asarray(gray, np.uint8)
+        low, high = 0.0, 255.0
+    scale = 255.0 / max(high - low, 1.0)
+    # one pass over the image that scales, shifts, rounds and clips
+    return np.asarray(cv2.addWeighted(gray, scale, gray, 0.0, -low * scale, dtype=cv2.CV_8U), np.uint8)
+
+
+def reduced(gray8: Gray8, longest_px: int) -> tuple[Gray8, FloatArray]:
+    """The image with at most so many pixels along its longer side, itself where it has, and the factor (2,) back.
+
+    ``u = (u_reduced + 0.5) * factor - 0.5``. Halving is fast, so as much as can be is done by it.
+    """
+    factor = np.ones(2)
+    while max(gray8.shape) >= 2 * longest_px:
+        w, h = gray8.shape[1] // 2, gray8.shape[0] // 2
+        # an odd row or column is cut off: every pixel is the mean of four, and the factor is two
+        gray8 = np.asarray(cv2.resize(gray8[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA), np.uint8)
+        factor *= 2.0
+    scale = max(gray8.shape) / longest_px
+    if scale <= 1.0:
+        return gray8, factor
+    size = (round(gray8.shape[1] / scale), round(gray8.shape[0] / scale))
+    factor *= [gray8.shape[1] / size[0], gray8.shape[0] / size[1]]
+    return np.asarray(cv2.resize(gray8, size, interpolation=cv2.INTER_AREA), np.uint8), factor

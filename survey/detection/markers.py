@@ -12,15 +12,17 @@ import numpy as np
 from adjust.model import FloatArray, IntArray
 from survey.detection.corners import CornerFit, refine_corners
 from survey.detection.dictionaries import charuco_board, marker_dictionary
-from survey.detection.gray import Gray8, Gray32
+from survey.detection.gray import Gray8, Gray32, reduced
 from survey.detection.results import Detection, nothing_found
 from survey.targets import Charuco, MarkerBlock, MarkerGrid
+
+_COARSE_PX = 1300  # longer side of the image in which markers are looked for first; the full one where some are missing
 
 
 def find_markers(gray: Gray32, gray8: Gray8, target: MarkerGrid | MarkerBlock) -> Detection:
     """The corners of those of the target's markers that are in the image; a marker seen twice is left out."""
     wanted = _first_indices(target)
-    markers, quads = _seen_markers(gray8, target.dictionary)
+    markers, quads = _seen_markers(gray8, target.dictionary, set(wanted))
     notes: tuple[str, ...] = ()
     twice = sorted(m for m, count in Counter(markers.tolist()).items() if count > 1 and m in wanted)
     if twice:
@@ -38,19 +40,28 @@ def find_markers(gray: Gray32, gray8: Gray8, target: MarkerGrid | MarkerBlock) -
 def find_charuco(gray: Gray32, gray8: Gray8, target: Charuco) -> Detection:
     """The board's inner corners that are seen, part of the board being enough."""
     detector = cv2.aruco.CharucoDetector(charuco_board(target))
-    corners, ids, _, marker_ids = detector.detectBoard(gray8)
-    n_markers = 0 if marker_ids is None else len(np.ravel(marker_ids))
-    if ids is None or len(np.ravel(ids)) < 4:
-        n = 0 if ids is None else len(np.ravel(ids))
+    coarse, factor = reduced(gray8, _COARSE_PX)
+    point_idx, start, n_markers = _board_corners(detector, coarse)
+    start = (start + 0.5) * factor - 0.5
+    if coarse is not gray8 and len(point_idx) < len(target.points()[0]):
+        point_idx, start, n_markers = _board_corners(detector, gray8)
+    if (n := len(point_idx)) < 4:
         return nothing_found(f"{n} corners by {n_markers} markers ({target.dictionary}) found; at least 4 are needed")
-    point_idx = np.ravel(ids).astype(np.int64)
-    start = np.reshape(corners, (-1, 2)).astype(float)
     edges = _board_edges(target, point_idx, start)
     if edges is None:
         return nothing_found(f"the {len(point_idx)} corners found lie on one line")
     margin = (target.square_m - target.marker_m) / (2.0 * target.square_m)
     fit = refine_corners(gray, start, edges, margin * _across(edges))
     return _detection(point_idx, fit, (), "corners")
+
+
+def _board_corners(detector: cv2.aruco.CharucoDetector, gray8: Gray8) -> tuple[IntArray, FloatArray, int]:
+    """Positions (n,) and places (n, 2) px of a board's corners, and how many of its markers were seen."""
+    corners, ids, _, marker_ids = detector.detectBoard(gray8)
+    n_markers = 0 if marker_ids is None else len(np.ravel(marker_ids))
+    if ids is None or corners is None:
+        return np.zeros(0, np.int64), np.zeros((0, 2)), n_markers
+    return np.ravel(ids).astype(np.int64), np.reshape(corners, (-1, 2)).astype(float), n_markers
 
 
 def _first_indices(target: MarkerGrid | MarkerBlock) -> dict[int, int]:
@@ -67,11 +78,20 @@ def _gap_cells(target: MarkerGrid | MarkerBlock, cells: int) -> float:
     return 1.0
 
 
-def _seen_markers(gray8: Gray8, dictionary: str) -> tuple[IntArray, FloatArray]:
+def _seen_markers(gray8: Gray8, dictionary: str, wanted: set[int]) -> tuple[IntArray, FloatArray]:
     """Ids (n,) and corners (n, 4, 2) px of all markers of a dictionary, in ascending id."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
-    corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters).detectMarkers(gray8)
+    detector = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters)
+    coarse, factor = reduced(gray8, _COARSE_PX)
+    markers, quads = _markers_in(detector, coarse)
+    if coarse is not gray8 and not wanted.issubset(markers.tolist()):
+        return _markers_in(detector, gray8)
+    return markers, (quads + 0.5) * factor - 0.5
+
+
+def _markers_in(detector: cv2.aruco.ArucoDetector, gray8: Gray8) -> tuple[IntArray, FloatArray]:
+    corners, ids, _ = detector.detectMarkers(gray8)
     if ids is None or len(np.ravel(ids)) == 0:
         return np.zeros(0, np.int64), np.zeros((0, 4, 2))
     markers = np.ravel(ids).astype(np.int64)
