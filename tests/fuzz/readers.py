@@ -3,45 +3,20 @@
 import io
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from tests.fuzz.camera_readers import CAMERA_READERS
+from tests.fuzz.capture_readers import CAPTURE_READERS
+from tests.fuzz.job_readers import JOB_READERS
+from tests.fuzz.reader import Read, Reader, in_file
+from tests.fuzz.small import adjusted, put
 from tests.survey import faults
 from tests.survey.interop_samples import AICON, CSV, DBAT, DBAT_FILES, GKF, KRUMM, LGC
-
-Read = Callable[[bytes], object]
-
-
-@dataclass(frozen=True)
-class Reader:
-    """prepare: makes the folder around the file, gives a function that writes the file and reads it."""
-
-    seeds: Callable[[], Sequence[bytes]]
-    prepare: Callable[[Path], Read]
-    is_text: bool = True
-    dictionary: Sequence[bytes] = ()
-
-
-def _file(name: str, read: Callable[[Path], object], beside: dict[str, str] | None = None) -> Callable[[Path], Read]:
-    """Reads one file of a folder with others beside it."""
-
-    def prepare(folder: Path) -> Read:
-        for other, text in (beside or {}).items():
-            (folder / other).write_text(text, encoding="utf-8")
-        path = folder / name
-
-        def run(data: bytes) -> object:
-            path.write_bytes(data)
-            return read(path)
-
-        return run
-
-    return prepare
 
 
 @cache
@@ -92,7 +67,7 @@ def _definition(folder: Path) -> Read:
     for name, data in _projects()[1].items():
         if "/" not in name and name.endswith(".csv"):
             (folder / name).write_bytes(data)
-    return _file("survey.toml", lambda path: read_definition(path.parent))(folder)
+    return in_file("survey.toml", lambda path: read_definition(path.parent))(folder)
 
 
 def _table(name: str, number: int) -> Callable[[Path], Read]:
@@ -135,7 +110,7 @@ def _points(folder: Path) -> Read:
     from survey.files import read_definition
 
     (folder / "survey.toml").write_text('format = 1\n[targets.sheet]\nkind = "points"\nfile = "sheet_points.csv"\n')
-    return _file("sheet_points.csv", lambda path: read_definition(path.parent))(folder)
+    return in_file("sheet_points.csv", lambda path: read_definition(path.parent))(folder)
 
 
 def _images() -> list[bytes]:
@@ -150,31 +125,7 @@ def _images() -> list[bytes]:
 def _image(folder: Path) -> Read:
     from survey.detection.gray import read_image
 
-    return _file("image.png", read_image)(folder)
-
-
-@cache
-def _adjusted() -> tuple[bytes, bytes, dict[str, bytes]]:
-    """solution.json and covariance.npz of a small adjusted project, and its files."""
-    from survey.jobs import adjust_job
-
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name) / "small"
-        small_project(folder)
-        adjust_job(folder, progress=False)
-        results = folder / "results"
-        return (results / "solution.json").read_bytes(), (results / "covariance.npz").read_bytes(), _texts(folder)
-
-
-def small_project(folder: Path) -> None:
-    """Three tripods and all their relative poses; adjusts in milliseconds."""
-    rows = ["pair_id,a_id,b_id,qw,qx,qy,qz,tx_mm,ty_mm,tz_mm,sigma_rotation_arcsec,sigma_translation_mm"]
-    rows += ["p1,a,b,1,0,0,0,-1000,0,0,10,0.1", "p2,b,c,1,0,0,0,0,-1000.05,0,10,0.1"]
-    rows += ["p3,a,c,1,0,0,0,-1000,-1000,0.05,10,0.1"]
-    (folder / "observations").mkdir(parents=True)
-    (folder / "observations" / "pairs.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    text = 'format = 1\n[stations.a]\nworld_from_station = { treatment = "held" }\n[stations.b]\n[stations.c]\n'
-    (folder / "survey.toml").write_text(text, encoding="utf-8")
+    return in_file("image.png", read_image)(folder)
 
 
 def _results(which: str) -> Callable[[Path], Read]:
@@ -182,10 +133,7 @@ def _results(which: str) -> Callable[[Path], Read]:
         from survey.files import read
         from survey.previous import read_previous
 
-        solution, covariance, texts = _adjusted()
-        for name, data in {**texts, "results/solution.json": solution, "results/covariance.npz": covariance}.items():
-            (folder / name).parent.mkdir(exist_ok=True)
-            (folder / name).write_bytes(data)
+        put(folder, adjusted())
         project = read(folder)
         path = folder / "results" / which
 
@@ -200,88 +148,14 @@ def _results(which: str) -> Callable[[Path], Read]:
 
 def _npz() -> list[bytes]:
     """Compressed as written, and stored: a flipped byte of a compressed one mostly fails its checksum alone."""
-    with np.load(io.BytesIO(_adjusted()[1])) as found:
+    with np.load(io.BytesIO(adjusted()["results/covariance.npz"])) as found:
         out = io.BytesIO()
         np.savez(out, **{k: found[k] for k in found.files})
     lone = io.BytesIO()
     np.save(lone, np.zeros(3))
     pickled = io.BytesIO()
     np.savez(pickled, covariance=np.array([{}], dtype=object))
-    return [_adjusted()[1], out.getvalue(), lone.getvalue(), pickled.getvalue()][:2]
-
-
-_CAPTURE = b"""format = 1
-project = "lab"
-[table]
-id = "turntable"
-driver = "ascii"
-address = "socket://localhost:1"
-dialect = "two-axis"
-sigma_arcsec = 8.0
-axes.axis1 = { limits_deg = [-60, 60], speed_deg_s = 200, acceleration_deg_s2 = 4000, sign = -1, zero_deg = 3 }
-axes.axis2 = { limits_deg = [-60, 60], wraps = true, channel = "2" }
-settle = { window_s = 0.01, stall_s = 0.3, poll_s = 0.003 }
-home = true
-[cameras.X]
-address = "simulated:X"
-settings = { Width = 96, Height = 64, ExposureTime = 500.0 }
-[capture]
-repeats = 2
-trigger = "software"
-fetch_timeout_s = 0.1
-retry_pause_s = 0.02
-quality = false
-[poses.t]
-kind = "grid"
-axis1_deg = { from = -12, to = 12, count = 2 }
-axis2_deg = { from = -12, to = 12, count = 3 }
-[poses.l]
-kind = "list"
-angles_deg = [[1, 2], [3, 4]]
-"""
-
-
-def _capture_plan(path: Path) -> object:
-    from capture.plan import check_plan_limits, estimate, read_plan
-
-    plan = read_plan(path)
-    check_plan_limits(plan)
-    return plan.shots, estimate(plan)
-
-
-def _dialect(path: Path) -> object:
-    from capture.drivers.turntables.dialect import read_dialect
-
-    return read_dialect(path.name, path.parent)
-
-
-def _dialects() -> list[bytes]:
-    from capture.drivers.turntables.dialect import FOLDER
-
-    return [p.read_bytes() for p in sorted(FOLDER.glob("*.toml"))]
-
-
-def _journal() -> list[bytes]:
-    one = b'{"n": 0, "kind": "session", "time_ns": 1}\n{"n": 1, "kind": "set", "epoch_id": "t01", "angles_rad": [0], '
-    one += b'"images": {"X": {"path": "images/X/t01.png", "sha256": "ab"}}}\n'
-    return [one + b'{"n": 2, "kind": "lost", "epoch_id": "t01"}\n', one + b'{"n": 2, "kind": "ev']
-
-
-def _read_journal(path: Path) -> object:
-    from capture.journal import read_journal, taken_sets
-
-    return taken_sets(read_journal(path)[0])
-
-
-def _qualities(path: Path) -> object:
-    from capture.session_quality import read_qualities
-
-    return read_qualities(path.parent.parent)
-
-
-def _quality(folder: Path) -> Read:
-    (folder / "capture").mkdir()
-    return _file("capture/quality.jsonl", _qualities)(folder)
+    return [adjusted()["results/covariance.npz"], out.getvalue(), lone.getvalue(), pickled.getvalue()][:2]
 
 
 def _planning(folder: Path) -> Read:
@@ -291,7 +165,7 @@ def _planning(folder: Path) -> Read:
 
     write_lab(folder / "lab")
     survey = read(folder / "lab").survey
-    return _file("lab/plan.toml", lambda path: read_plan(path.parent, survey))(folder)
+    return in_file("lab/plan.toml", lambda path: read_plan(path.parent, survey))(folder)
 
 
 @cache
@@ -399,26 +273,25 @@ READERS: dict[str, Reader] = {
     "points-file": Reader(lambda: [_projects()[0]["sheet_points.csv"]], _points),
     **_tables(),
     "image": Reader(_images, _image, is_text=False),
-    "solution": Reader(lambda: [_adjusted()[0]], _results("solution.json")),
+    "solution": Reader(lambda: [adjusted()["results/solution.json"]], _results("solution.json")),
     "covariance": Reader(_npz, _results("covariance.npz"), is_text=False),
     "replaced-list": Reader(lambda: [b'{"survey.toml": true, "results": false, "observations/pairs.csv": true}'],
                             _recover, dictionary=[b"../victim", b"..", b".", b"images/../..", b"victim"]),
-    "alignment-rounds": Reader(_alignment_rounds, _file("alignment_rounds.csv", _rounds)),
+    "alignment-rounds": Reader(_alignment_rounds, in_file("alignment_rounds.csv", _rounds)),
     "planning": Reader(_plan_seed, _planning),
-    "trajectory": Reader(lambda: [_TRAJECTORY, _TRAJECTORY.replace(b",", b" ")], _file("a.csv", _trajectory)),
-    "g2o": Reader(lambda: [_G2O], _file("net.g2o", _g2o)),
-    "gama": Reader(lambda: [GKF.encode()], _file("net.gkf", _foreign("gama"))),
-    "krumm": Reader(lambda: [KRUMM.encode()], _file("net.dat", _foreign("krumm"))),
-    "krumm-adjusted": Reader(lambda: [b"A 1.0 2.0 3.0\nB 1 2 3 4 5 6 7\n"], _file("net.adj", _adjusted_krumm)),
-    "lgc": Reader(lambda: [LGC.encode()], _file("net.lgc", _foreign("lgc"))),
-    "csv": Reader(lambda: [CSV.encode()], _file("net.csv", _foreign("csv"))),
+    "trajectory": Reader(lambda: [_TRAJECTORY, _TRAJECTORY.replace(b",", b" ")], in_file("a.csv", _trajectory)),
+    "g2o": Reader(lambda: [_G2O], in_file("net.g2o", _g2o)),
+    "gama": Reader(lambda: [GKF.encode()], in_file("net.gkf", _foreign("gama"))),
+    "krumm": Reader(lambda: [KRUMM.encode()], in_file("net.dat", _foreign("krumm"))),
+    "krumm-adjusted": Reader(lambda: [b"A 1.0 2.0 3.0\nB 1 2 3 4 5 6 7\n"], in_file("net.adj", _adjusted_krumm)),
+    "lgc": Reader(lambda: [LGC.encode()], in_file("net.lgc", _foreign("lgc"))),
+    "csv": Reader(lambda: [CSV.encode()], in_file("net.csv", _foreign("csv"))),
     "dbat": Reader(lambda: [DBAT.encode()], lambda folder: _dbat(folder, "net.xml")),
     **{f"dbat-{n.split('.')[0]}": Reader(lambda t=t: [t.encode()], lambda folder, n=n: _dbat(folder, n))
        for n, t in DBAT_FILES.items()},
     **{f"aicon-{n.split('.')[1]}": Reader(lambda t=t: [t.encode()], lambda folder, n=n: _aicon(folder, n))
        for n, t in AICON.items()},
-    "capture-plan": Reader(lambda: [_CAPTURE], _file("plan.toml", _capture_plan)),
-    "dialect": Reader(_dialects, _file("mine.toml", _dialect)),
-    "journal": Reader(_journal, _file("journal.jsonl", _read_journal)),
-    "quality": Reader(lambda: [b'{"camera_id": "X", "epoch_id": "t01", "sharpness": 1.0, "points": []}\n'], _quality),
+    **CAMERA_READERS,
+    **JOB_READERS,
+    **CAPTURE_READERS,
 }

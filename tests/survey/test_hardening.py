@@ -25,8 +25,8 @@ from survey.files.text import id_problem, natural_key, read_bytes
 from survey.jobs import adjust_job
 from survey.previous import read_previous
 from survey.replacing import recover
-from tests.fuzz.readers import small_project
 from tests.fuzz.replaced import unfinished_project
+from tests.fuzz.small import small_project
 
 LAYOUT = Layout("some", ("a_id",), ("x_mm",))
 
