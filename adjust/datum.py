@@ -46,8 +46,8 @@ def in_world(graph: AdjustmentGraph, name: ParameterName) -> bool:
 
 
 def visible_keys(graph: AdjustmentGraph) -> list[int]:
-    """The unknowns that GTSAM sees, in a fixed order."""
-    seen = set(graph.graph.keyVector())
+    """The unknowns of the system that GTSAM solves, in a fixed order."""
+    seen = set(graph.system.keyVector())
     return [u.key for u in graph.unknowns.by_name.values() if u.key in seen]
 
 
@@ -185,7 +185,7 @@ def inner_datum(graph: AdjustmentGraph, base: gtsam.Values) -> InnerDatum | None
     if not keys:
         raise SurveyError("datum kind 'inner' needs free points or free fixed stations; name some, or hold something")
     graph.prepare(base, jacobians=True)
-    linear = graph.graph.linearize(base)
+    linear = graph.system.linearize(base)
     stack = stacking(graph, visible_keys(graph))
     weights = normal_diagonal(linear, stack)
     directions = defects(graph, linear, base)

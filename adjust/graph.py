@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TypeVar
 
 import gtsam
@@ -23,6 +24,7 @@ from adjust.factors import (
 )
 from adjust.geometry.building import GeometryFactors, position_refs
 from adjust.image_batch import ImageBatch, warp_shape
+from adjust.image_reduction import PoseReduction, reduction
 from adjust.model import BoolArray, FloatArray, Survey, VectorPrior
 from adjust.observation_factor import ObservationFactor, frame_text, position_text
 from adjust.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef
@@ -48,12 +50,15 @@ class StartValues:
 
 @dataclass(eq=False)
 class AdjustmentGraph:
-    """The graph, its start and the batches that serve it. Held together with the survey only by the solver."""
+    """The graph, its start and the batches that serve it. Held together with the survey only by the solver.
+
+    reduction: of the poses that only image points touch, while ``system`` is without them; None where nothing is
+    reduced, or no longer.
+    """
 
     survey: Survey
     unknowns: Unknowns
     state: State
-    graph: gtsam.NonlinearFactorGraph
     start: gtsam.Values
     images: ImageBatch
     bundle: BundleBatch | None
@@ -61,11 +66,41 @@ class AdjustmentGraph:
     others: list[ObservationFactor]
     others_graph: gtsam.NonlinearFactorGraph
     terrestrial: TerrestrialBatch | None = None
+    reduction: PoseReduction | None = None
+
+    @cached_property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """All factors, right at any values and in any of GTSAM's algorithms (but for what a bundle hides)."""
+        return self._factors(None)
+
+    @cached_property
+    def _reduced(self) -> gtsam.NonlinearFactorGraph:
+        return self._factors(self.reduction)
+
+    @property
+    def system(self) -> gtsam.NonlinearFactorGraph:
+        """What the solver linearises, after :meth:`prepare` at the same values."""
+        return self.graph if self.reduction is None else self._reduced
+
+    def _factors(self, reduction: PoseReduction | None) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph(self.others_graph)
+        self.images.add_factors(graph, None if reduction is None else reduction.others)
+        if self.terrestrial is not None:
+            self.terrestrial.add_factors(graph)
+        if self.bundle is not None:
+            self.bundle.add_factors(graph)
+        if reduction is not None:
+            reduction.add_factor(graph)
+        return graph
 
     def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
-        """Evaluate all batches at ``values``."""
+        """Evaluate all batches at ``values``. Where the reduction finds no inverse, it is given up: all is shown."""
         self.state.load(values)
         self.images.prepare(values, jacobians)
+        if jacobians:
+            if self.reduction is not None and not self.reduction.reduce(damping):
+                self.reduction = None
+            self.images.serve(None if self.reduction is None else self.reduction.others)
         if self.terrestrial is not None:
             self.terrestrial.prepare(values, jacobians)
         if self.bundle is not None:
@@ -166,30 +201,28 @@ class GraphBuilder:
                 others.add(item.factor)
         for factor in self._holds():
             others.add(factor)
-        graph = gtsam.NonlinearFactorGraph(others)
         known = [(i, b) for i, free, b in split if not free]
         images = ImageBatch(
             self.survey, self.unknowns, state, [b for _, b in known], [chains[i] for i, _ in known],
             [self._known_points(b) for _, b in known], [self._n_warp(b) for _, b in known],
         )  # fmt: skip
-        images.add_factors(graph)
-        if readings is not None:
-            readings.add_factors(graph)
         # unused observations too: they are predicted with the joint covariance of their unknowns
-        outside = {k for item in self.others for k in list(item.factor.keys())}
-        outside |= {k for keys in images.keys for k in keys} | (readings.keys if readings is not None else set())
-        outside |= set(self.unknowns.held)
+        outside = {k for item in self.others for k in list(item.factor.keys())} | set(self.unknowns.held)
+        outside |= readings.keys if readings is not None else set()
+        of_images = {k for keys in images.keys for k in keys}
         unknown = [(i, b) for i, free, b in split if free]
         bundle = None
         if unknown:
             bundle = BundleBatch(
-                self.unknowns, state, [b for _, b in unknown], [chains[i] for i, _ in unknown], self.point_ids, outside
-            )
-            bundle.add_factors(graph)
+                self.unknowns, state, [b for _, b in unknown], [chains[i] for i, _ in unknown], self.point_ids,
+                outside | of_images,
+            )  # fmt: skip
+            outside |= set(bundle.order) | set(bundle.point_key.values())
+        # a free datum is found and completed with all unknowns in sight
+        reduced = None if survey.datum.kind == "inner" else reduction(images, self.unknowns, outside)
         order = [(i, free) for i, free, _ in split]
         return AdjustmentGraph(
-            survey, self.unknowns, state, graph, values, images, bundle, order, self.others,
-            others, readings,
+            survey, self.unknowns, state, values, images, bundle, order, self.others, others, readings, reduced,
         )  # fmt: skip
 
     def _register_points(self) -> None:

@@ -18,14 +18,18 @@ from adjust.image_kernels import (
     BlockArrays,
     PointArrays,
     SegmentArrays,
-    condense,
     errors,
-    statistics,
+    local_by_keys,
+    normal_equations,
+    serve,
 )
+from adjust.image_statistics_kernels import all_statistics
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations import ImageBlock
 from adjust.parallel import run_split, split_blocks
 from adjust.state import State
+from adjust.tree_covariance import TreeCovariance
+from adjust.tree_kernels import TreeArrays
 from adjust.unknowns import Chain, Unknowns
 
 
@@ -105,20 +109,6 @@ class Segments:
         self.width.append(width)
         self.ptr.append(len(self.rows))
 
-    def layout(self, n_rows: IntArray) -> tuple[IntArray, list[list[tuple[int, int, int]]], int]:
-        """Offsets of every segment in one flat buffer; per block (offset, rows, columns) of every key; total size."""
-        offset, places = 0, []
-        out = np.zeros(len(self.rows), dtype=np.int64)
-        for b, widths in enumerate(self.width):
-            starts = []
-            for width in widths:
-                starts.append((offset, int(n_rows[b]), width))
-                offset += int(n_rows[b]) * width
-            for s in range(self.ptr[b], self.ptr[b + 1]):
-                out[s] = starts[self.rows[s][6]][0]
-            places.append(starts)
-        return out, places, offset
-
     def column(self, i: int) -> IntArray:
         """Column ``i`` of the segment table."""
         return np.array([row[i] for row in self.rows], dtype=np.int64)
@@ -153,51 +143,54 @@ class ImageBatch:
             dtype=np.int64,
         )
         self.n_warp = np.array(n_warp, dtype=np.int64)
-        self.X = np.concatenate(points) if n else np.zeros((0, 3))
-        self.shape = np.zeros((len(self.X), 2))
-        self.uv = np.concatenate([b.uv for b in blocks]) if n else np.zeros((0, 2))
+        self.n_points = int(self.ptr[-1])
+        X = _columns(points, 3)
+        shape, uv = np.zeros((2, self.n_points)), _columns([b.uv for b in blocks], 2)
         self.W_all = square_root_information(np.concatenate([b.cov for b in blocks])) if n else np.zeros((0, 3))
         self.used: BoolArray = np.concatenate(
             [b.used if b.used is not None else np.ones(len(b.uv), dtype=np.bool_) for b in blocks]
         ) if n else np.zeros(0, dtype=np.bool_)
-        self.W = self.W_all * self.used[:, None]
+        self.W_all_columns = np.ascontiguousarray(self.W_all.T)
+        self.W = self.W_all_columns * self.used
         for i, block in enumerate(blocks):
             if self.warp_id[i] >= 0:
                 target = survey.targets[self.warp_id[i]]
-                self.shape[self.ptr[i] : self.ptr[i + 1]] = warp_shape(target.x_in_target)[block.point_idx]
+                shape[:, self.ptr[i] : self.ptr[i + 1]] = warp_shape(target.x_in_target)[block.point_idx].T
         self.arrays = BlockArrays(self.ptr, self.camera, self.warp_id, self.n_warp)
-        self.points = PointArrays(self.X, self.shape, self.uv)
-        self._columns(unknowns)
+        self.points = PointArrays(X, shape, uv)
+        self._place_keys(unknowns)
 
-    def _columns(self, unknowns: Unknowns) -> None:
+    def _place_keys(self, unknowns: Unknowns) -> None:
         segments = Segments()
         for b, block in enumerate(self.blocks):
             target = self.state.targets[block.target_id or ""] if self.n_warp[b] else None
             segments.block(unknowns, self.state, self.chains, b, int(self.camera[b]), target)
         self.n_rows: IntArray = self.state.lenses.n_free[self.camera] + 6 + self.n_warp + 1
-        self.keys, self.width = segments.keys, segments.width
-        seg_out, places, size = segments.layout(self.n_rows)
+        self.keys = segments.keys
+        starts = [np.cumsum([0, *width]).tolist() for width in segments.width]
+        self.width = np.array([start[-1] for start in starts], dtype=np.int64)
         self.seg_key = segments.column(6)
         ptr = np.array(segments.ptr, dtype=np.int64)
         kind, link, table, start, n = (segments.column(i) for i in (1, 2, 3, 4, 5))
-        self.segments = SegmentArrays(ptr, kind, link, table, start, n, seg_out)
+        place = np.array([starts[row[0]][row[6]] for row in segments.rows], dtype=np.int64)
+        self.segments = SegmentArrays(ptr, kind, link, table, start, n, place)
+        self.key_ptr = np.cumsum([0] + [len(keys) for keys in self.keys]).astype(np.int64)
+        self._key_place = np.array([at for start in starts for at in start[:-1]], dtype=np.int64)
+        self._key_width = np.array([w for width in segments.width for w in width], dtype=np.int64)
         most = int(self.n_rows.max(initial=1))
-        self.flat, self.r = np.zeros(size), np.zeros((len(self.blocks), most))
+        self.H = np.zeros((len(self.blocks), most, most))
         self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
-        self._views = [
-            [self.flat[offset : offset + rows * columns].reshape(rows, columns) for offset, rows, columns in place]
-            for place in places
-        ]
-        # without Jacobians only the length of a residual is asked for: zeros, then the length
-        self.length = np.zeros_like(self.r)
-        self._length_views = [self.length[b, most - self.n_rows[b] :] for b in range(len(self.blocks))]
-        self._r_views = [self.r[b, : self.n_rows[b]] for b in range(len(self.blocks))]
+        self._flat: FloatArray | None = None
+        self._served = np.zeros(len(self.blocks), dtype=np.bool_)
         self._prepared: gtsam.Values | None = None
         self._with_jacobians = False
         self._all = split_blocks(self.ptr)
 
     def prepare(self, values: gtsam.Values, jacobians: bool) -> None:
-        """Evaluate all blocks at ``values``; ``state`` must have been loaded from the same values."""
+        """Evaluate all blocks at ``values``; ``state`` must have been loaded from the same values.
+
+        With ``jacobians`` the normal equations of every block, from which rows are served and poses are reduced.
+        """
         if values is self._prepared and self._with_jacobians >= jacobians:
             return
         self.chains.evaluate(self.state)
@@ -208,9 +201,33 @@ class ImageBatch:
         s, c = self.state, self.chains
         given = (self.arrays, self.points, self.W, s.lenses, c.R, c.t, s.warp)
         if jacobians:
-            run_split(condense, runs, *given, self.segments, c.C, s.D, self.flat, self.r, self.chi, self.depth)
+            run_split(normal_equations, runs, *given, self.H, self.chi, self.depth)
+            self._served[:] = False
         else:
             run_split(errors, runs, *given, self.chi, self.depth)
+
+    def serve(self, which: IntArray | None = None) -> None:
+        """Condense these blocks, or all, for their factors, as last prepared with Jacobians."""
+        if self._flat is None:
+            self._make_room()
+        runs = self._all if which is None else [which]
+        run_split(serve, runs, self.arrays, self.state.lenses, self.segments, self.chains.C, self.state.D, self.width,
+                  self._at, self.H, self._flat, self.r)  # fmt: skip
+        for run in runs:
+            self._served[run] = True
+
+    def _make_room(self) -> None:
+        """Where the rows of all factors are written, and views of them for GTSAM."""
+        sizes = self.n_rows * self.width
+        self._at = np.cumsum(np.append(0, sizes))[:-1].astype(np.int64)
+        self._flat, self.r = np.zeros(int(sizes.sum())), np.zeros((len(self.blocks), int(self.n_rows.max(initial=1))))
+        self._views: list[list[FloatArray]] = []
+        for b in range(len(self.blocks)):
+            rows, views = int(self.n_rows[b]), []
+            for i in range(self.key_ptr[b], self.key_ptr[b + 1]):
+                at, k = int(self._at[b] + rows * self._key_place[i]), int(self._key_width[i])
+                views.append(self._flat[at : at + rows * k].reshape(rows, k))
+            self._views.append(views)
 
     def _evaluate_alone(self, b: int, values: gtsam.Values, jacobians: bool) -> None:
         links = slice(self.chains.ptr[b], self.chains.ptr[b + 1])
@@ -223,59 +240,64 @@ class ImageBatch:
         """What GTSAM's custom factor of block ``b`` returns: its condensed residual, and its rows by key."""
         if values is not self._prepared or (jacobians is not None and not self._with_jacobians):
             self._evaluate_alone(b, values, jacobians is not None)
-        if jacobians is None:
-            self.length[b, -1] = np.sqrt(self.chi[b])
-            return self._length_views[b]
+        if jacobians is None:  # only the length of a residual is asked for: zeros, then the length
+            length = np.zeros(int(self.n_rows[b]))
+            length[-1] = np.sqrt(self.chi[b])
+            return length
+        if not self._served[b]:
+            self.serve(np.array([b], dtype=np.int64))
         for i, view in enumerate(self._views[b]):
             jacobians[i] = view
-        return self._r_views[b]
+        return np.asarray(self.r[b, : self.n_rows[b]])
 
     def set_weights(self, weights: FloatArray) -> None:
         """Weights (N,) on top of the covariances; a point of weight zero is left out, the others are used."""
         self._prepared = None
         self.used = weights > 0.0
-        self.W[:] = self.W_all * np.sqrt(weights)[:, None]
+        self.W = self.W_all_columns * np.sqrt(weights)
 
     def whitened_squares(self) -> FloatArray:
         """Weighted squares v' inv(Q_ll) v (N,) of all points where the chains were last evaluated."""
-        residual, influence = np.zeros((len(self.X), 2)), np.zeros((len(self.X), 3))
-        for b in range(len(self.blocks)):
-            n = int(self.n_rows[b]) - 1
-            self.block_statistics(b, np.zeros((n, n)), residual, influence)
-        return whitened_squares(residual, self.W_all)
+        return whitened_squares(self.statistics(None)[0], self.W_all)
 
-    def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        """One custom factor per block that has an unknown."""
+    def add_factors(self, graph: gtsam.NonlinearFactorGraph, which: IntArray | None = None) -> None:
+        """One custom factor for each of these blocks, or of all, that has an unknown."""
         noise = {int(n): gtsam.noiseModel.Unit.Create(int(n)) for n in np.unique(self.n_rows)}
-        for b, keys in enumerate(self.keys):
+        for b in range(len(self.blocks)) if which is None else which.tolist():
+            keys = self.keys[b]
             if keys:
                 graph.add(gtsam.CustomFactor(noise[int(self.n_rows[b])], keys, _callback(self, b)))
 
     def local_from_keys(self, b: int) -> FloatArray:
         """Derivative (n_lens + 6 + n_warp, sum of key dims) of the block's local unknowns by its keys."""
-        nl, n = int(self.state.lenses.n_free[self.camera[b]]), int(self.n_rows[b]) - 1
-        starts = np.cumsum([0] + self.width[b])
-        G = np.zeros((n, int(starts[-1])))
-        for s in range(self.segments.ptr[b], self.segments.ptr[b + 1]):
-            o = int(starts[self.seg_key[s]])
-            k, start = int(self.segments.n[s]), int(self.segments.start[s])
-            if self.segments.kind[s] == SEGMENT_LENS:
-                G[:nl, o : o + k] += np.eye(k)
-            elif self.segments.kind[s] == SEGMENT_WARP:
-                G[nl + 6 : nl + 6 + k, o : o + k] += np.eye(k)
-            elif self.segments.kind[s] == SEGMENT_POSE:
-                G[nl : nl + 6, o : o + 6] += self.chains.C[self.segments.link[s]]
-            else:
-                D = self.state.D[self.segments.table[s]][:, start : start + k]
-                G[nl : nl + 6, o : o + k] += self.chains.C[self.segments.link[s]] @ D
+        nl = int(self.state.lenses.n_free[self.camera[b]])
+        G = np.zeros((int(self.n_rows[b]) - 1, int(self.width[b])))
+        local_by_keys(b, nl, self.segments, self.chains.C, self.state.D, G)
         return G
 
-    def block_statistics(self, b: int, Q_local: FloatArray, residual: FloatArray, influence: FloatArray) -> None:
-        """Fill residuals (N, 2) px and whitened A Q A' (N, 3) of block ``b``; the batch must be prepared."""
+    def statistics(self, tree: TreeCovariance | None) -> tuple[FloatArray, FloatArray]:
+        """Residuals (N, 2) px and whitened A Q A' (N, 3) of all points, where the chains were last evaluated.
+
+        tree: covariances of the unknowns; without it, A Q A' is zero.
+        """
+        residual, influence = np.zeros((self.n_points, 2)), np.zeros((self.n_points, 3))
+        number = tree.number if tree is not None else {}
+        keys = np.array([number.get(k, -1) for mine in self.keys for k in mine], dtype=np.int64)
         s, c = self.state, self.chains
-        statistics(
-            b, self.arrays, self.points, self.W_all, s.lenses, c.R, c.t, s.warp, Q_local, residual, influence
-        )
+        lost = np.zeros(len(self.blocks), dtype=np.int64)
+        run_split(
+            all_statistics, self._all, self.arrays, self.points, self.W_all_columns, s.lenses, c.R, c.t, s.warp,
+            self.segments, c.C, s.D, self.width, self.key_ptr, keys, self._key_place,
+            tree.arrays() if tree is not None else TreeArrays.nothing(), residual, influence, lost,
+        )  # fmt: skip
+        if lost.any() and tree is not None:
+            raise KeyError(f"unknowns of block {int(np.argmax(lost))} share no clique")
+        return residual, influence
+
+
+def _columns(rows: Sequence[FloatArray], n: int) -> FloatArray:
+    """Rows (N, n), given in parts, as columns (n, N)."""
+    return np.ascontiguousarray(np.concatenate([np.zeros((0, n)), *rows]).T)
 
 
 def _callback(batch: ImageBatch, b: int):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped

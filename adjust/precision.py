@@ -39,7 +39,7 @@ class Precision:
             tree = solved.linear.eliminateMultifrontal(solved.ordering, gtsam.EliminateQR)
         else:
             tree = solved.linear.eliminateMultifrontal(solved.ordering)
-        self.tree = TreeCovariance(tree, dims)
+        self.tree = TreeCovariance(tree, dims, solved.leaves)
         self.hidden: dict[int, FloatArray] = {}
         self.bundle_influence = np.zeros((0, 3))
         if graph.bundle is not None:
@@ -143,14 +143,7 @@ def image_residuals(precision: Precision) -> ImageResiduals:
     """Residuals and their statistics of all image points, in the order of ``Survey.image_blocks``."""
     graph = precision.graph
     images, bundle = graph.images, graph.bundle
-    n = len(images.X)
-    residual, influence = np.zeros((n, 2)), np.zeros((n, 3))
-    for b in range(len(images.blocks)):
-        Q_local = np.zeros((int(images.n_rows[b]) - 1,) * 2)
-        if images.keys[b]:
-            G = images.local_from_keys(b)
-            Q_local = np.ascontiguousarray(G @ precision.tree.joint(images.keys[b]) @ G.T)
-        images.block_statistics(b, Q_local, residual, influence)
+    residual, influence = images.statistics(precision.tree)
     parts = [_test(residual, influence, images.W_all, images.used)]
     if bundle is not None:
         stats = _test(bundle.residuals_px(), precision.bundle_influence, bundle.W_all, bundle.used)

@@ -18,7 +18,9 @@ _READABLE = {"rx": "rotation x", "ry": "rotation y", "rz": "rotation z", "tx": "
 
 def unobserved_unknowns(graph: AdjustmentGraph) -> list[str]:
     """Unknowns that occur in no factor at all."""
-    seen = set(graph.graph.keyVector())
+    seen = set(graph.system.keyVector())
+    if graph.reduction is not None:
+        seen |= set(graph.reduction.hidden)
     if graph.bundle is not None:
         seen |= set(graph.bundle.hidden_poses) | {graph.bundle.point_key[i] for i in graph.bundle.reduced}
     return [readable(u) for u in graph.unknowns.by_name.values() if u.key not in seen]

@@ -14,6 +14,7 @@ from adjust.datum import InnerDatum, inner_datum, normal_diagonal, stacking, vis
 from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.graph import AdjustmentGraph
 from adjust.rank import describe_null_space, unobserved_unknowns
+from adjust.tree_covariance import Leaves
 
 _SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
 """Sigmas that depend on distances (target centring) follow the solution until they change by no more than this."""
@@ -48,6 +49,8 @@ class Solved:
     iterations: int
     max_step: float
     datum: InnerDatum | None
+    leaves: Leaves | None = None
+    """The poses that were reduced before, as cliques of the Bayes tree of ``linear``."""
 
 
 class _Loop:
@@ -57,23 +60,31 @@ class _Loop:
         self._set_datum()
         self.damping = 0.0
         self.use_qr = False
-        self.ordering: gtsam.Ordering | None = None
+        self._ordering: tuple[gtsam.NonlinearFactorGraph, gtsam.Ordering] | None = None
 
     def _set_datum(self) -> None:
         self.datum = inner_datum(self.graph, self.values)
 
-    def linearize(self) -> gtsam.GaussianFactorGraph:
-        """The linearised graph at the present values, with the minimal datum where the survey has an inner one."""
-        linear = self.graph.graph.linearize(self.values)
+    def linearize(self) -> None:
+        """``linear``: the system at the present values, with the minimal datum where the survey has an inner one."""
+        self.linear = self.graph.system.linearize(self.values)
         if self.datum is not None:
-            self.datum.add_to(linear)
-        return linear
+            self.datum.add_to(self.linear)
 
-    def completed(self, delta: gtsam.VectorValues) -> gtsam.VectorValues:
-        """The step of all unknowns in the survey's datum, from that of the visible ones in the minimal datum."""
+    def completed(self, delta: gtsam.VectorValues) -> tuple[gtsam.VectorValues, float]:
+        """The step of all unknowns in the survey's datum, from that of the visible ones in the minimal datum.
+
+        Also by how much what was hidden lowers chi-square (to first order) beside what the visible step does.
+        """
+        decrease = 0.0
+        if self.graph.reduction is not None:
+            decrease += self.graph.reduction.complete(delta)
         if self.graph.bundle is not None:
             self.graph.bundle.complete(delta)
-        return delta if self.datum is None else self.datum.completed(self.graph, self.values, delta)
+            decrease += self.graph.bundle.hidden_decrease
+        if self.datum is not None:
+            delta = self.datum.completed(self.graph, self.values, delta)
+        return delta, decrease
 
     def evaluate(self, values: gtsam.Values) -> float:
         """Weighted square sum at ``values``; everything is ready to be linearised there, since most steps are good."""
@@ -85,44 +96,53 @@ class _Loop:
             return np.inf  # a step that made a point undetermined is no step
         return self.graph.objective(values)
 
-    def step(self, linear: gtsam.GaussianFactorGraph) -> gtsam.VectorValues:
-        """The (damped) step; raises IndeterminateError by name where there is none."""
-        if self.ordering is None:
+    @property
+    def ordering(self) -> gtsam.Ordering:
+        """In which GTSAM eliminates the system as it is now."""
+        system = self.graph.system
+        if self._ordering is None or self._ordering[0] is not system:
             last = self._last_keys()
-            self.ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(self.graph.graph, last)
-        system = linear if self.damping == 0.0 else damped(self.graph, linear, self.damping)
+            self._ordering = system, gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(system, last)
+        return self._ordering[1]
+
+    def step(self) -> gtsam.VectorValues:
+        """The (damped) step of ``linear``; raises IndeterminateError by name where there is none."""
+        system = self.linear if self.damping == 0.0 else damped(self.graph, self.linear, self.damping)
         try:
             how = (self.ordering, gtsam.EliminateQR) if self.use_qr else (self.ordering,)
             delta = system.optimize(*how)
         except RuntimeError as error:
             if "ndetermin" not in str(error) or self.use_qr:
                 raise
-            names = describe_null_space(self.graph, linear, self.values)
+            if self.graph.reduction is not None:  # what is weak is judged, and named, with all unknowns in sight
+                self.graph.reduction = None
+                self.graph.prepare(self.values, True, self.damping)
+                self.linearize()
+                return self.step()
+            names = describe_null_space(self.graph, self.linear, self.values)
             if names is not None:
                 raise names from None
             self.use_qr = True  # weak, but determined: GTSAM's Cholesky refuses pivots that QR still resolves
-            return self.step(linear)
+            return self.step()
         if not np.isfinite(delta.norm()):
             raise SurveyError("the normal equations have no finite solution; check the sigmas and start values")
         return delta
 
     def _last_keys(self) -> list[int]:
-        by_key, all_keys = self.graph.unknowns.by_key, list(self.graph.graph.keyVector())
+        by_key, all_keys = self.graph.unknowns.by_key, list(self.graph.system.keyVector())
         keys = [k for k in all_keys if k in by_key and by_key[k].name[0] in _LATE]
         keys += [k for k in (self.datum.minimal if self.datum is not None else ()) if k not in keys]
         return keys if len(keys) < len(all_keys) else []
 
     def run(self) -> Solved:
         omega = self.evaluate(self.values)
-        linear = self.linearize()
+        self.linearize()
         moved = before = np.inf
         for iteration in range(1, self.options.max_iterations + 1):
-            delta = self.step(linear)
-            gradient = linear.gradientAtZero()
-            decrease = -float(delta.dot(gradient))
-            if self.graph.bundle is not None:
-                decrease += self.graph.bundle.hidden_decrease
-            delta = self.completed(delta)
+            delta = self.step()
+            decrease = -float(delta.dot(self.linear.gradientAtZero()))
+            delta, hidden = self.completed(delta)
+            decrease += hidden
             before, moved = moved, np.sqrt(max(0.0, decrease))
             trial = self.values.retract(delta)
             used, new = self.damping, self.evaluate(trial)
@@ -142,7 +162,7 @@ class _Loop:
                     raise self._stuck(iteration, moved)
             if self.damping != used or self.values is not trial:
                 self.graph.prepare(self.values, True, self.damping)
-            linear = self.linearize()
+            self.linearize()
         raise self._stuck(self.options.max_iterations, moved)
 
     @staticmethod
@@ -162,12 +182,14 @@ class _Loop:
         if self.datum is not None:
             self._set_datum()  # about the solution, where the covariances belong; the solution stays
             self.graph.prepare(self.values, True)
-        linear = self.linearize()
-        if self.ordering is None:
-            raise ValueError("no ordering before the first step")
+        self.linearize()
         # the covariances need this linearisation anyway: its step costs one elimination and brings the last digits
-        self.values = self.values.retract(self.completed(self.step(linear)))
-        return Solved(self.values, linear, self.ordering, self.use_qr, omega, iteration, moved, self.datum)
+        delta, _ = self.completed(self.step())
+        self.values = self.values.retract(delta)
+        leaves = None if self.graph.reduction is None else self.graph.reduction.leaves()
+        return Solved(
+            self.values, self.linear, self.ordering, self.use_qr, omega, iteration, moved, self.datum, leaves
+        )
 
 
 def damped(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.GaussianFactorGraph:

@@ -6,20 +6,37 @@ lie together in one clique, so all redundancy numbers follow from it.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from adjust.model import FloatArray, IntArray
-from adjust.tree_kernels import covariance_rows, fill_block, invert_cliques, joint_blocks, solve_cliques
+from adjust.tree_kernels import TreeArrays, covariance_rows, fill_block, invert_cliques, joint_blocks, solve_cliques
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """Cliques of one frontal key each, eliminated before a tree: blocks [R S] and keys, those of S from one clique."""
+
+    blocks: list[FloatArray]
+    keys: list[list[int]]
 
 
 class TreeCovariance:
     """Marginal and joint covariances. ``dims`` gives the dimension of every key; keys are also counted 0, 1, ..."""
 
-    def __init__(self, tree: gtsam.GaussianBayesTree, dims: Mapping[int, int]) -> None:
+    def __init__(self, tree: gtsam.GaussianBayesTree, dims: Mapping[int, int], leaves: Leaves | None = None) -> None:
         self.dims = dims
         blocks, clique_keys, fronts, parents = _collect(tree)
+        if leaves is not None:
+            home: dict[int, int] = {}
+            for c, keys in enumerate(clique_keys):  # parents first: a key is frontal where it first appears
+                for k in keys:
+                    home.setdefault(k, c)
+            parents += [max(home[k] for k in keys[1:]) for keys in leaves.keys]
+            fronts += [len(b) for b in leaves.blocks]
+            blocks, clique_keys = blocks + leaves.blocks, clique_keys + leaves.keys
         order = list(dict.fromkeys(k for keys in clique_keys for k in keys))
         self.number = {key: i for i, key in enumerate(order)}
         self._dims = np.array([dims[k] for k in order], dtype=np.int64)
@@ -60,9 +77,11 @@ class TreeCovariance:
                            self._cov, out)  # fmt: skip
         return out if found else None
 
-    def arrays(self) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray, IntArray, IntArray, FloatArray]:
-        """What :func:`adjust.tree_kernels.fill_block` needs beside the numbers of two keys, in its order."""
-        return (self._home, self._key_ptr, self._keys, self._dims, self._front, self._width, self._at, self._cov)
+    def arrays(self) -> TreeArrays:
+        """What the compiled look-up of two keys' covariance needs."""
+        return TreeArrays(
+            self._home, self._key_ptr, self._keys, self._dims, self._front, self._width, self._at, self._cov
+        )
 
     def marginal(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""

@@ -8,10 +8,31 @@ children. Row-major blocks of nf x n numbers begin at ``at[c]``: in ``data`` fir
 # mypy: disable-error-code="untyped-decorator"
 # reason: numba ships no types, so its decorator leaves every function below untyped
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
 from adjust.model import FloatArray, IntArray
+
+
+class TreeArrays(NamedTuple):
+    """What :func:`fill_block` needs beside the numbers of two keys, in its order."""
+
+    home: IntArray
+    key_ptr: IntArray
+    keys: IntArray
+    dims: IntArray
+    front: IntArray
+    width: IntArray
+    at: IntArray
+    cov: FloatArray
+
+    @staticmethod
+    def nothing() -> "TreeArrays":
+        """A tree without unknowns."""
+        none = np.zeros(0, dtype=np.int64)
+        return TreeArrays(none, none, none, none, none, none, none, np.zeros(0))
 
 
 @njit(cache=True, nogil=True)

@@ -108,13 +108,7 @@ def image_whitened(precision: Precision) -> tuple[FloatArray, FloatArray, FloatA
     graph, values = precision.graph, precision.solved.values
     graph.prepare(values, jacobians=True)
     images, bundle = graph.images, graph.bundle
-    v, M3 = np.zeros((len(images.X), 2)), np.zeros((len(images.X), 3))
-    for b in range(len(images.blocks)):
-        Q = np.zeros((int(images.n_rows[b]) - 1,) * 2)
-        if images.keys[b]:
-            G = images.local_from_keys(b)
-            Q = np.ascontiguousarray(G @ precision.tree.joint(images.keys[b]) @ G.T)
-        images.block_statistics(b, Q, v, M3)
+    v, M3 = images.statistics(precision.tree)
     parts = [(v, M3, images.W_all)]
     if bundle is not None:
         bundle.whitened_squares(values)
@@ -132,7 +126,7 @@ def _image_order(precision: Precision) -> IntArray:
     """Where the image points (N,), in the order of the survey's blocks, stand: known targets first, then the bundle."""
     graph = precision.graph
     out: list[IntArray] = [np.zeros(0, dtype=np.int64)]
-    at = [0, len(graph.images.X)]
+    at = [0, graph.images.n_points]
     for i, free in graph.image_order:
         n = len(graph.survey.image_blocks[i].uv)
         out.append(np.arange(at[int(free)], at[int(free)] + n))

@@ -24,10 +24,10 @@ def block_rows(
     X, uv, shape = points.X, points.uv, points.shape
     first = blocks.ptr[b]
     for p in range(first, blocks.ptr[b + 1]):
-        s0, s1 = shape[p, 0], shape[p, 1]
+        s0, s1 = shape[0, p], shape[1, p]
         at = 2 * (p - first)
         local_row(
-            lenses.kind[c], lenses.values[c], lenses.constants[c], R[b], t[b], X[p, 0], X[p, 1],
-            X[p, 2] + warp_x * s0 + warp_y * s1, uv[p, 0], uv[p, 1], W[p, 0], W[p, 1], W[p, 2], lenses.n_map[c],
+            lenses.kind[c], lenses.values[c], lenses.constants[c], R[b], t[b], X[0, p], X[1, p],
+            X[2, p] + warp_x * s0 + warp_y * s1, uv[0, p], uv[1, p], W[0, p], W[1, p], W[2, p], lenses.n_map[c],
             lenses.source[c], lenses.column[c], lenses.factor[c], nl, s0, s1, nw, row, out[at : at + 2],
         )  # fmt: skip

@@ -305,11 +305,11 @@ def _image_rows(graph: AdjustmentGraph, n: int, key_columns: dict[int, IntArray]
 def _known_rows(graph: AdjustmentGraph, n: int, key_columns: dict[int, IntArray]) -> Rows:
     images, entries = graph.images, _Entries()
     s, c = images.state, images.chains
-    e = np.zeros(2 * len(images.X))
+    e = np.zeros(2 * images.n_points)
     for b, keys in enumerate(images.keys):
         rows = np.arange(2 * int(images.ptr[b]), 2 * int(images.ptr[b + 1]))
         local = np.zeros((len(rows), int(images.n_rows[b])))
-        block_rows(b, images.arrays, images.points, images.W_all, s.lenses, c.R, c.t, s.warp, local)
+        block_rows(b, images.arrays, images.points, images.W_all_columns, s.lenses, c.R, c.t, s.warp, local)
         e[rows] = local[:, -1]
         if keys:
             columns = np.concatenate([key_columns[k] for k in keys])

@@ -1,0 +1,161 @@
+"""Poses that only image points of known targets touch, reduced before GTSAM sees the rest.
+
+The station or board of an epoch stands in hundreds of blocks' worth of factors, and in nothing else. Its six unknowns
+are eliminated here, block by block, by Schur complements; GTSAM gets one factor on what the epochs share (lenses, poses
+of cameras on their station), and the reduced poses come back as leaves of its Bayes tree: the same step and the same
+covariances as if it had eliminated them first (Triggs et al. 2000, section 6).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.linalg import lapack
+
+from adjust.image_batch import ImageBatch
+from adjust.model import FloatArray, IntArray
+from adjust.parallel import run_split, split_blocks
+from adjust.reduction_kernels import WEAKEST_PIVOT, ReductionArrays, pose_steps, reduce_poses
+from adjust.tree_covariance import Leaves
+from adjust.unknowns import Unknowns
+
+_FEWEST_POSES = 8
+_WIDEST_INTERFACE = 700
+"""Components that the epochs may share: their normal matrix is dense here."""
+_AT_EPOCHS = ("world_from_station", "carrier_from_target")
+
+
+@dataclass(frozen=True)
+class Interface:
+    """What the reduced poses share with everything else: keys, and the first column of each."""
+
+    keys: tuple[int, ...]
+    at: dict[int, int]
+    n: int
+
+
+def hidden_poses(batch: ImageBatch, unknowns: Unknowns, outside: set[int]) -> list[int]:
+    """Keys of the poses that can be reduced: of one epoch, in no other factor, and never two in the same block."""
+    at_epochs = {
+        key for key, u in unknowns.by_key.items() if u.name[0] in _AT_EPOCHS and len(u.name) == 3 and key not in outside
+    }
+    of_blocks = [[key for key in keys if key in at_epochs] for keys in batch.keys]
+    if any(len(keys) > 1 for keys in of_blocks):
+        return []
+    return list(dict.fromkeys(key for keys in of_blocks for key in keys))
+
+
+class PoseReduction:
+    """The reduction of ``hidden`` poses of an image batch, and the one factor that is left of their blocks."""
+
+    def __init__(self, batch: ImageBatch, unknowns: Unknowns, hidden: Sequence[int]) -> None:
+        self.batch, self.hidden = batch, list(hidden)
+        number = {key: j for j, key in enumerate(self.hidden)}
+        owner = np.array([next((number[k] for k in keys if k in number), -1) for keys in batch.keys], dtype=np.int64)
+        self.others: IntArray = np.flatnonzero(owner < 0)
+        """Blocks without such a pose: they keep factors of their own."""
+        order = np.argsort(owner, kind="stable")[len(self.others) :].astype(np.int64)
+        block_ptr = np.searchsorted(owner[order], np.arange(len(self.hidden) + 1)).astype(np.int64)
+        shared = [dict.fromkeys(k for b in order[block_ptr[j] : block_ptr[j + 1]] for k in batch.keys[b] if k != key)
+                  for j, key in enumerate(self.hidden)]  # fmt: skip
+        keys = tuple(dict.fromkeys(k for mine in shared for k in mine))
+        starts = np.cumsum([0] + [unknowns.by_key[k].dim for k in keys])
+        self.interface = Interface(keys, {k: int(starts[i]) for i, k in enumerate(keys)}, int(starts[-1]))
+        self._shared = [sorted(mine, key=self.interface.at.__getitem__) for mine in shared]
+        self._place(unknowns, order, block_ptr, owner)
+        self._runs = split_blocks(np.concatenate([[0], np.cumsum(np.diff(batch.ptr)[order])])[block_ptr])
+        self.ready = False
+
+    def _place(self, unknowns: Unknowns, order: IntArray, block_ptr: IntArray, owner: IntArray) -> None:
+        segments, n = self.batch.segments, self.interface.n
+        place = np.zeros(len(segments.kind), dtype=np.int64)
+        columns: list[IntArray] = []
+        for j, (key, mine) in enumerate(zip(self.hidden, self._shared, strict=True)):
+            dims = [unknowns.by_key[k].dim for k in mine]
+            first = dict(zip(mine, 6 + np.cumsum([0, *dims])[:-1], strict=True)) | {key: 0}
+            for b in order[block_ptr[j] : block_ptr[j + 1]].tolist():
+                for s in range(segments.ptr[b], segments.ptr[b + 1]):
+                    k = self.batch.keys[b][int(self.batch.seg_key[s])]
+                    place[s] = first[k]
+            columns += [self.interface.at[k] + np.arange(d) for k, d in zip(mine, dims, strict=True)]
+        col_ptr = np.cumsum([0] + [sum(unknowns.by_key[k].dim for k in mine) for mine in self._shared])
+        col = np.concatenate(columns) if columns else np.zeros(0)
+        self.arrays = ReductionArrays(block_ptr, order, col_ptr.astype(np.int64), col.astype(np.int64), place)
+        self.L = np.zeros((len(self.hidden), 6, 6))
+        self.T = np.zeros(6 * (int(col_ptr[-1]) + len(self.hidden)))
+        self._views: list[FloatArray] = []
+        self._r, self._length = np.zeros(n + 1), np.zeros(n + 1)
+
+    def reduce(self, damping: float) -> bool:
+        """Reduce at the values the batch was last prepared at; False where something has no inverse to speak of."""
+        batch, n, count = self.batch, self.interface.n, len(self._runs)
+        rest, diagonal = np.zeros((count, n + 1, n + 1)), np.zeros((count, n))
+        bad = np.full(count, -1, dtype=np.int64)
+        self.ready = False
+        run_split(
+            reduce_poses, [np.append(turn, run) for turn, run in enumerate(self._runs)], self.arrays, batch.arrays,
+            batch.state.lenses, batch.segments, batch.chains.C, batch.state.D, damping, batch.H, self.L, self.T,
+            diagonal, rest, bad,
+        )  # fmt: skip
+        return bool((bad < 0).all()) and self._serve(rest.sum(axis=0), diagonal.sum(axis=0))
+
+    def _serve(self, N: FloatArray, diagonal: FloatArray) -> bool:
+        """Square root of what is left, as the rows of the factor."""
+        n = self.interface.n
+        if not (diagonal > 0.0).all():
+            return False
+        scale = np.sqrt(diagonal)
+        U, info = lapack.dpotrf(N[:n, :n] / scale[:, None] / scale, lower=0, clean=1)
+        if info != 0 or not np.diag(U).min() ** 2 > WEAKEST_PIVOT:
+            return False
+        y = lapack.dtrtrs(U, N[:n, n] / scale, lower=0, trans=1)[0]
+        self._r[:n], self._r[n] = y, np.sqrt(max(0.0, N[n, n] - float(y @ y)))
+        R = np.zeros((n + 1, n))
+        R[:n] = U * scale
+        ends = [*list(self.interface.at.values())[1:], n]
+        self._views = [
+            np.ascontiguousarray(R[:, at:end]) for at, end in zip(self.interface.at.values(), ends, strict=True)
+        ]
+        self.ready = True
+        return True
+
+    def add_factor(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """The one factor, which only serves what :meth:`reduce` left."""
+
+        def residual(_factor, _values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
+            if jacobians is None or not self.ready:
+                raise RuntimeError("a reduced factor serves linearised rows only")
+            for i, view in enumerate(self._views):
+                jacobians[i] = view
+            return self._r
+
+        noise = gtsam.noiseModel.Unit.Create(self.interface.n + 1)
+        graph.add(gtsam.CustomFactor(noise, list(self.interface.keys), residual))
+
+    def complete(self, delta: gtsam.VectorValues) -> float:
+        """Insert the steps of the reduced poses; returns by how much these alone lower chi-square."""
+        d = np.concatenate([delta.at(key) for key in self.interface.keys])
+        steps = np.empty((len(self.hidden), 6))
+        decrease = pose_steps(self.arrays, self.L, self.T, d, steps)
+        for key, step in zip(self.hidden, steps, strict=True):
+            delta.insert(key, step)
+        return float(decrease)
+
+    def leaves(self) -> Leaves:
+        """The reduced poses as cliques below that of the interface: blocks [L' T]."""
+        a = self.arrays
+        blocks = []
+        for j in range(len(self.hidden)):
+            k, at = int(a.col_ptr[j + 1] - a.col_ptr[j]), 6 * int(a.col_ptr[j] + j)
+            blocks.append(np.hstack([self.L[j], self.T[at : at + 6 * (k + 1)].reshape(6, k + 1)[:, :k]]))
+        return Leaves(blocks, [[key, *mine] for key, mine in zip(self.hidden, self._shared, strict=True)])
+
+
+def reduction(batch: ImageBatch, unknowns: Unknowns, outside: set[int]) -> PoseReduction | None:
+    """The reduction of a batch, or None where it would not pay or has nothing to hang on."""
+    hidden = hidden_poses(batch, unknowns, outside)
+    if len(hidden) < _FEWEST_POSES:
+        return None
+    found = PoseReduction(batch, unknowns, hidden)
+    return found if 0 < found.interface.n <= _WIDEST_INTERFACE else None

@@ -1,0 +1,185 @@
+"""Compiled reduction of poses that only image points of known targets touch; see :mod:`adjust.image_reduction`.
+
+A pose's columns are its own six, then those of the keys its blocks share with others, then the residual.
+"""
+
+# mypy: disable-error-code="untyped-decorator"
+# reason: numba ships no types, so its decorator leaves every function below untyped
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from adjust.image_kernels import (
+    MAX_LOCAL,
+    SEGMENT_LENS,
+    SEGMENT_WARP,
+    BlockArrays,
+    LensArrays,
+    SegmentArrays,
+    pose_by_key,
+)
+from adjust.model import FloatArray, IntArray
+
+WEAKEST_PIVOT = 2.0**-24
+"""Share of a diagonal that must be left when the columns before it are eliminated: as GTSAM's Cholesky asks."""
+
+
+class ReductionArrays(NamedTuple):
+    """Poses j: blocks ``block[block_ptr[j]:block_ptr[j + 1]]``; their columns of the interface, ascending, in col.
+
+    T of pose j begins at ``6 (col_ptr[j] + j)``: one column more, of the residual. place (segments): first column of a
+    segment among those of its pose.
+    """
+
+    block_ptr: IntArray
+    block: IntArray
+    col_ptr: IntArray
+    col: IntArray
+    place: IntArray
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_block(
+    b: int, n: int, nl: int, last: int, segments: SegmentArrays, place: IntArray, C: FloatArray, D: FloatArray,
+    H: FloatArray, K: FloatArray, E: FloatArray, M: FloatArray,
+) -> None:  # fmt: skip
+    """Add G' H G of block b and its residual to the upper triangle of M; K (MAX_LOCAL, 6) and E are scratch."""
+    first, end = segments.ptr[b], segments.ptr[b + 1]
+    for s in range(first, end):
+        if segments.kind[s] != SEGMENT_LENS and segments.kind[s] != SEGMENT_WARP:
+            pose_by_key(s, segments, C, D, E[s - first])
+    for s in range(first, end):
+        k, ps = segments.n[s], place[s]
+        at = _first_column(s, nl, segments)
+        if at >= 0:
+            for i in range(n):
+                for j in range(k):
+                    K[i, j] = H[b, i, at + j]
+        else:
+            K[:n, :k] = 0.0
+            for i in range(n):
+                for a in range(6):
+                    h = H[b, i, nl + a]
+                    for j in range(k):
+                        K[i, j] += h * E[s - first, a, j]
+        for r in range(first, end):
+            if place[r] > ps:
+                continue
+            pr, at = place[r], _first_column(r, nl, segments)
+            for i in range(segments.n[r]):
+                if at >= 0:
+                    for j in range(k):
+                        M[pr + i, ps + j] += K[at + i, j]
+                    continue
+                for a in range(6):
+                    e = E[r - first, a, i]
+                    for j in range(k):
+                        M[pr + i, ps + j] += e * K[nl + a, j]
+        for j in range(k):
+            M[ps + j, last] += K[n - 1, j]
+    M[last, last] += H[b, n - 1, n - 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _first_column(s: int, nl: int, segments: SegmentArrays) -> int:
+    """First of the block's own columns that a segment is; -1 for poses, which reach it by the chain."""
+    if segments.kind[s] == SEGMENT_LENS:
+        return 0
+    return nl + 6 + segments.start[s] if segments.kind[s] == SEGMENT_WARP else -1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _eliminate_pose(M: FloatArray, m: int) -> bool:
+    """First six rows of M (m, m) to [L' T] with L L' their own block; the rest loses T' T; upper triangles.
+
+    False where the block has no inverse to speak of.
+    """
+    for i in range(6):
+        given, p = M[i, i], M[i, i]
+        for k in range(i):
+            p -= M[k, i] * M[k, i]
+        if not p > WEAKEST_PIVOT * given:
+            return False
+        root = np.sqrt(p)
+        M[i, i] = root
+        for k in range(i):
+            a = M[k, i]
+            for j in range(i + 1, m):
+                M[i, j] -= a * M[k, j]
+        for j in range(i + 1, m):
+            M[i, j] /= root
+    for i in range(6, m):
+        for k in range(6):
+            a = M[k, i]
+            if a != 0.0:
+                for j in range(i, m):
+                    M[i, j] -= a * M[k, j]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def reduce_poses(
+    run: IntArray, a: ReductionArrays, blocks: BlockArrays, lenses: LensArrays, segments: SegmentArrays,
+    C: FloatArray, D: FloatArray, damping: float, H: FloatArray, L: FloatArray, T: FloatArray, diagonal: FloatArray,
+    rest: FloatArray, bad: IntArray,
+) -> None:  # fmt: skip
+    """Reduce the poses in run[1:]: L (J, 6, 6) upper and T stay for what follows; the sums are those of turn = run[0].
+
+    rest (runs, n + 1, n + 1): upper triangle of the normal matrix of the interface and the residual, diagonal that
+    before anything was reduced. damping: share of its own diagonal that is added to a pose's. bad[turn]: a pose without
+    an inverse, else left alone.
+    """
+    most, turn = 0, run[0]
+    for j in run[1:]:
+        most = max(most, a.col_ptr[j + 1] - a.col_ptr[j])
+    M, K, E = np.empty((most + 7, most + 7)), np.empty((MAX_LOCAL, MAX_LOCAL)), np.empty((MAX_LOCAL, 6, 6))
+    end = rest.shape[1] - 1
+    for j in run[1:]:
+        k = a.col_ptr[j + 1] - a.col_ptr[j]
+        m = k + 7
+        M[:m, :m] = 0.0
+        for i in range(a.block_ptr[j], a.block_ptr[j + 1]):
+            b = a.block[i]
+            nl = lenses.n_free[blocks.camera[b]]
+            _add_block(b, nl + 7 + blocks.n_warp[b], nl, m - 1, segments, a.place, C, D, H, K, E, M)
+        for i in range(6):
+            M[i, i] *= 1.0 + damping
+        columns = a.col[a.col_ptr[j] : a.col_ptr[j + 1]]
+        for i in range(k):
+            diagonal[turn, columns[i]] += M[6 + i, 6 + i]
+        if not _eliminate_pose(M, m):
+            bad[turn] = j
+            return
+        at = 6 * (a.col_ptr[j] + j)
+        for i in range(6):
+            for c in range(6):
+                L[j, i, c] = M[i, c] if c >= i else 0.0
+            for c in range(k + 1):
+                T[at + i * (k + 1) + c] = M[i, 6 + c]
+        for i in range(k):
+            for c in range(i, k):
+                rest[turn, columns[i], columns[c]] += M[6 + i, 6 + c]
+            rest[turn, columns[i], end] += M[6 + i, m - 1]
+        rest[turn, end, end] += M[m - 1, m - 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pose_steps(a: ReductionArrays, L: FloatArray, T: FloatArray, d: FloatArray, out: FloatArray) -> float:
+    """Steps (J, 6) of the reduced poses from that of the interface (n,); by how much they alone lower chi-square."""
+    decrease = 0.0
+    for j in range(out.shape[0]):
+        k = a.col_ptr[j + 1] - a.col_ptr[j]
+        at = 6 * (a.col_ptr[j] + j)
+        for i in range(6):
+            v = T[at + i * (k + 1) + k]
+            decrease += v * v
+            for c in range(k):
+                v += T[at + i * (k + 1) + c] * d[a.col[a.col_ptr[j] + c]]
+            out[j, i] = -v
+        for i in range(5, -1, -1):
+            for c in range(i + 1, 6):
+                out[j, i] -= L[j, i, c] * out[j, c]
+            out[j, i] /= L[j, i, i]
+    return decrease
