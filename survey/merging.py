@@ -18,6 +18,7 @@ from survey.files.tables import read_table
 from survey.files.text import atomic_write, decode, read_bytes, suggestion
 from survey.files.toml_lines import KeyPath, key_lines
 from survey.files.toml_text import toml_text
+from survey.replacing import copy_folder
 
 _KINDS = ("cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces")
 Origin = tuple[Path, int]
@@ -140,7 +141,7 @@ def _take_point_list(merged: Merged, entry: Mapping[str, Any]) -> None:
 def _merge_tables(merged: Merged) -> None:
     old, target = merged.folder / OBSERVATIONS_FOLDER, merged.place / OBSERVATIONS_FOLDER
     if old.is_dir():
-        shutil.copytree(old, target)
+        copy_folder(old, target)
     target.mkdir(exist_ok=True)
     for path in sorted((merged.folder / name for name in point_files(merged.folder)), key=str):
         _link_into(path, merged)

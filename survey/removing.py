@@ -24,7 +24,7 @@ from survey.files.text import atomic_write, suggestion
 from survey.jobs import AdjustOutcome, Clock, adjust_project, made
 from survey.merging import point_files, table_rows
 from survey.previous import Move, Previous, moves, read_previous
-from survey.replacing import complete, place_for, replace_parts
+from survey.replacing import complete, copy_folder, place_for, replace_parts
 from survey.results import RESULTS
 
 _ID_COLUMNS = {
@@ -223,7 +223,7 @@ def _rows_of(table: _Table, name: str) -> list[int]:
 def _copy(folder: Path, place: Path) -> None:
     """All that is read of a project, except images, which no adjustment reads."""
     if (folder / OBSERVATIONS_FOLDER).is_dir():
-        shutil.copytree(folder / OBSERVATIONS_FOLDER, place / OBSERVATIONS_FOLDER)
+        copy_folder(folder / OBSERVATIONS_FOLDER, place / OBSERVATIONS_FOLDER)
     for name in (DEFINITION_FILE, *point_files(folder)):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(folder / name, place / name)

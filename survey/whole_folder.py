@@ -3,11 +3,11 @@
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from adjust.errors import SurveyError
-from survey.files.locking import FileLock
+from survey.files.locking import LOCK, FileLock
 from survey.files.text import sync_folder
 
 
@@ -15,22 +15,50 @@ from survey.files.text import sync_folder
 def whole_folder(folder: Path) -> Iterator[Path]:
     """A temporary place beside ``folder`` that takes its name in the end; SurveyError where something is there.
 
-    The place is kept by a lock beside it: what a killed command has left there goes, what a living one makes does not.
+    The place is kept by a lock in it: what a killed command has left there goes, what a living one makes does not.
     """
     target = Path(os.path.realpath(folder))  # a link to an empty folder stays a link
     _require_empty(folder, target)
     target.parent.mkdir(parents=True, exist_ok=True)
     place = target.with_name(f".{target.name}.partial")
-    with FileLock(target.with_name(f".{target.name}.lock"), folder, "command"):
+    lock = _locked(place, folder)
+    try:
+        _empty(place)
         _require_empty(folder, target)  # another may have made it before the lock was free
-        shutil.rmtree(place, ignore_errors=True)
-        place.mkdir()
-        try:
-            yield place
-            place.rename(target)  # takes the place of an empty folder, too
+        yield place
+        place.rename(target)  # takes the place of an empty folder, too
+        lock.path = target / LOCK
+        with suppress(OSError):  # it is complete; only a cut of the power could still undo it
             sync_folder(target.parent)
-        finally:
-            shutil.rmtree(place, ignore_errors=True)
+    finally:
+        _empty(place)
+        lock.release()
+        with suppress(OSError):  # is gone, or another command has it already
+            place.rmdir()
+
+
+def _locked(place: Path, folder: Path) -> FileLock:
+    lock = FileLock(place / LOCK, folder, "command")
+    while True:
+        try:
+            place.mkdir(exist_ok=True)
+            lock.acquire()
+            return lock
+        except FileNotFoundError:  # the last holder has just removed it
+            continue
+        except BaseException:
+            with suppress(OSError):
+                place.rmdir()
+            raise
+
+
+def _empty(place: Path) -> None:
+    """Remove everything but the lock, which goes last: until then nobody else may work there."""
+    for path in place.iterdir() if place.is_dir() else ():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        elif path.name != LOCK:
+            path.unlink(missing_ok=True)
 
 
 def _require_empty(folder: Path, target: Path) -> None:

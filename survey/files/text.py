@@ -1,6 +1,7 @@
 """Files as text: reading with clear errors, writing that never leaves half a file, names for messages."""
 
 import difflib
+import errno
 import hashlib
 import os
 import re
@@ -62,6 +63,9 @@ def sync_folder(folder: Path) -> None:
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # some file systems cannot, and need not
+            raise
     finally:
         os.close(handle)
 

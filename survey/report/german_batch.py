@@ -87,6 +87,7 @@ GERMAN_BATCH = {
     "cannot be adjusted": "nicht ausgleichbar",
     "file or folder not accessible": "Datei oder Ordner nicht erreichbar",
     "out of memory": "Speicher reicht nicht",
+    "another command works on it": "ein anderer Befehl arbeitet daran",
     "its process ended abruptly": "Prozess brach ab",
     "lost on the cluster": "im Cluster verloren",
     "internal error": "interner Fehler",
