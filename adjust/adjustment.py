@@ -199,18 +199,19 @@ def warnings(graph: AdjustmentGraph, result: Adjustment) -> tuple[str, ...]:
 
 
 def _image_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
-    out, images = [], result.image_residuals
+    out, images, blocks = [], result.image_residuals, graph.survey.image_blocks
     bound = limit(len(images.test)) * max(1.0, result.sigma0**2)
-    for i, block in enumerate(graph.survey.image_blocks):
-        rows = slice(images.block_ptr[i], images.block_ptr[i + 1])
+    of_point = np.repeat(np.arange(len(blocks)), np.diff(images.block_ptr))
+    used = np.bincount(of_point[images.used], minlength=len(blocks))
+    with np.errstate(invalid="ignore"):
+        bad = np.bincount(of_point[images.used & (images.test > bound)], minlength=len(blocks))
+    for i in np.flatnonzero((used == 0) | (bad > 0)).tolist():
+        block = blocks[i]
         what = f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}"
-        if not images.used[rows].any() and len(block.uv):
+        if used[i] == 0 and len(block.uv):
             out.append(f"{what}: not used")
-            continue
-        bad = int(np.sum(images.test[rows][images.used[rows]] > bound))
-        if bad:
-            n = int(images.used[rows].sum())
-            out.append(f"{what}: {bad} of {n} image points do not fit (probable gross errors)")
+        elif bad[i]:
+            out.append(f"{what}: {bad[i]} of {used[i]} image points do not fit (probable gross errors)")
     return out
 
 
@@ -233,5 +234,5 @@ def _lens_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
 
 
 def _largest_radius(graph: AdjustmentGraph, camera_id: str, centre: FloatArray) -> float:
-    blocks = [b.uv for b in graph.survey.image_blocks if b.camera_id == camera_id and len(b.uv)]
-    return max((float(np.linalg.norm(uv - centre, axis=1).max()) for uv in blocks), default=0.0)
+    parts = [np.zeros((0, 2)), *(b.uv for b in graph.survey.image_blocks if b.camera_id == camera_id)]
+    return float(np.linalg.norm(np.concatenate(parts) - centre, axis=1).max(initial=0.0))

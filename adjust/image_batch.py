@@ -4,7 +4,8 @@ A block's rows are the upper triangular square root of its augmented normal matr
 warp | residual]: the same linear system and chi-square as its 2n rows, for any n (Lawson and Hanson 1974, chapter 27).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import accumulate
 
 import gtsam
 import numpy as np
@@ -60,10 +61,16 @@ class Chains:
     def __init__(self, chains: Sequence[Chain]) -> None:
         links = [link for chain in chains for link in chain]
         self.ptr: IntArray = np.cumsum([0] + [len(chain) for chain in chains])
-        self.slot = np.array([link.slot for link in links], dtype=np.int64)
+        self._slots = [link.slot for link in links]
+        self.slot = np.array(self._slots, dtype=np.int64)
         self.inverse: BoolArray = np.array([link.inverse for link in links], dtype=np.bool_)
         n = len(chains)
         self.R, self.t, self.C = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((len(links), 6, 6))
+
+    def links(self, b: int) -> Iterator[tuple[int, int]]:
+        """Number and slot of every link of chain ``b``."""
+        first, end = self.ptr[b : b + 2].tolist()
+        return zip(range(first, end), self._slots[first:end], strict=True)
 
     def evaluate(self, state: State) -> None:
         """Fill R (B, 3, 3), t (B, 3) and C (links, 6, 6)."""
@@ -81,37 +88,35 @@ class Segments:
 
     def block(self, unknowns: Unknowns, state: State, chains: Chains, b: int, camera: int, target: int | None) -> None:
         """Append the segments of block ``b``."""
-        keys: list[int] = []
-        width: list[int] = []
-
-        def add(key: int | None, kind: int, ref: int, d: int, start: int, n: int) -> None:
-            if key is None or n == 0:
-                return
-            if key not in keys:
-                keys.append(key)
-                width.append(n)
-            self.rows.append((b, kind, ref, d, start, n, keys.index(key)))
-
-        add(state.lens_maps[camera].key, SEGMENT_LENS, -1, -1, 0, int(state.lenses.n_free[camera]))
-        for link in range(chains.ptr[b], chains.ptr[b + 1]):
-            slot = int(chains.slot[link])
+        found: list[tuple[int | None, int, int, int, int, int]] = []  # key, type, ref, d, start, n
+        found.append((state.lens_maps[camera].key, SEGMENT_LENS, -1, -1, 0, int(state.lenses.n_free[camera])))
+        for link, slot in chains.links(b):
             table = unknowns.table_slots.get(slot)
             if table is None:
-                add(unknowns.slot_key[slot], SEGMENT_POSE, link, -1, 0, 6)
+                found.append((unknowns.slot_key[slot], SEGMENT_POSE, link, -1, 0, 6))
             else:
                 d, k = int(state.table_index[slot]), len(table.axes)
-                add(table.angles_key, SEGMENT_TABLE, link, d, 0, k)
-                add(table.geometry.key, SEGMENT_TABLE, link, d, k, len(table.geometry.free))
+                found.append((table.angles_key, SEGMENT_TABLE, link, d, 0, k))
+                found.append((table.geometry.key, SEGMENT_TABLE, link, d, k, len(table.geometry.free)))
         warp = state.warp_maps[target] if target is not None else None
         if warp is not None:
-            add(warp.key, SEGMENT_WARP, -1, -1, 0, len(warp.free))
-        self.keys.append(keys)
+            found.append((warp.key, SEGMENT_WARP, -1, -1, 0, len(warp.free)))
+        position: dict[int, int] = {}
+        width: list[int] = []
+        for key, kind, ref, d, start, n in found:
+            if key is None or n == 0:
+                continue
+            if key not in position:
+                position[key] = len(width)
+                width.append(n)
+            self.rows.append((b, kind, ref, d, start, n, position[key]))
+        self.keys.append(list(position))
         self.width.append(width)
         self.ptr.append(len(self.rows))
 
-    def column(self, i: int) -> IntArray:
-        """Column ``i`` of the segment table."""
-        return np.array([row[i] for row in self.rows], dtype=np.int64)
+    def table(self) -> IntArray:
+        """The segments (S, 7): block, type, reference, table slot, start, width, position of the key."""
+        return np.array(self.rows, dtype=np.int64).reshape(-1, 7)
 
 
 class ImageBatch:
@@ -167,15 +172,15 @@ class ImageBatch:
             segments.block(unknowns, self.state, self.chains, b, int(self.camera[b]), target)
         self.n_rows: IntArray = self.state.lenses.n_free[self.camera] + 6 + self.n_warp + 1
         self.keys = segments.keys
-        starts = [np.cumsum([0, *width]).tolist() for width in segments.width]
+        starts = [list(accumulate(width, initial=0)) for width in segments.width]
         self.width = np.array([start[-1] for start in starts], dtype=np.int64)
-        self.seg_key = segments.column(6)
-        ptr = np.array(segments.ptr, dtype=np.int64)
-        kind, link, table, start, n = (segments.column(i) for i in (1, 2, 3, 4, 5))
-        place = np.array([starts[row[0]][row[6]] for row in segments.rows], dtype=np.int64)
-        self.segments = SegmentArrays(ptr, kind, link, table, start, n, place)
         self.key_ptr = np.cumsum([0] + [len(keys) for keys in self.keys]).astype(np.int64)
         self._key_place = np.array([at for start in starts for at in start[:-1]], dtype=np.int64)
+        ptr = np.array(segments.ptr, dtype=np.int64)
+        block, kind, link, table, start, n, position = np.ascontiguousarray(segments.table().T)
+        self.seg_key_number = self.key_ptr[block] + position
+        place = self._key_place[self.seg_key_number]
+        self.segments = SegmentArrays(ptr, kind, link, table, start, n, place)
         self._key_width = np.array([w for width in segments.width for w in width], dtype=np.int64)
         most = int(self.n_rows.max(initial=1))
         self.H = np.zeros((len(self.blocks), most, most))
@@ -208,6 +213,8 @@ class ImageBatch:
 
     def serve(self, which: IntArray | None = None) -> None:
         """Condense these blocks, or all, for their factors, as last prepared with Jacobians."""
+        if which is not None and len(which) == 0:
+            return
         if self._flat is None:
             self._make_room()
         runs = self._all if which is None else [which]

@@ -16,7 +16,7 @@ from scipy.linalg import lapack
 from adjust.image_batch import ImageBatch
 from adjust.model import FloatArray, IntArray
 from adjust.parallel import run_split, split_blocks
-from adjust.reduction_kernels import WEAKEST_PIVOT, ReductionArrays, pose_steps, reduce_poses
+from adjust.reduction_kernels import WEAKEST_PIVOT, ReductionArrays, leaf_rows, pose_steps, reduce_poses
 from adjust.tree_covariance import Leaves
 from adjust.unknowns import Unknowns
 
@@ -63,29 +63,34 @@ class PoseReduction:
         starts = np.cumsum([0] + [unknowns.by_key[k].dim for k in keys])
         self.interface = Interface(keys, {k: int(starts[i]) for i, k in enumerate(keys)}, int(starts[-1]))
         self._shared = [sorted(mine, key=self.interface.at.__getitem__) for mine in shared]
-        self._place(unknowns, order, block_ptr, owner)
+        self._place(unknowns, order, block_ptr)
         self._runs = split_blocks(np.concatenate([[0], np.cumsum(np.diff(batch.ptr)[order])])[block_ptr])
         self.ready = False
 
-    def _place(self, unknowns: Unknowns, order: IntArray, block_ptr: IntArray, owner: IntArray) -> None:
-        segments, n = self.batch.segments, self.interface.n
-        place = np.zeros(len(segments.kind), dtype=np.int64)
-        columns: list[IntArray] = []
+    def _place(self, unknowns: Unknowns, order: IntArray, block_ptr: IntArray) -> None:
+        at = self.interface.at
+        dims = {k: unknowns.by_key[k].dim for k in at}
+        of_key, place = np.zeros(int(self.batch.key_ptr[-1]), dtype=np.int64), self.batch.key_ptr.tolist()
+        columns, col_ptr = [], [0]
+        ptr, blocks = block_ptr.tolist(), order.tolist()
         for j, (key, mine) in enumerate(zip(self.hidden, self._shared, strict=True)):
-            dims = [unknowns.by_key[k].dim for k in mine]
-            first = dict(zip(mine, 6 + np.cumsum([0, *dims])[:-1], strict=True)) | {key: 0}
-            for b in order[block_ptr[j] : block_ptr[j + 1]].tolist():
-                for s in range(segments.ptr[b], segments.ptr[b + 1]):
-                    k = self.batch.keys[b][int(self.batch.seg_key[s])]
-                    place[s] = first[k]
-            columns += [self.interface.at[k] + np.arange(d) for k, d in zip(mine, dims, strict=True)]
-        col_ptr = np.cumsum([0] + [sum(unknowns.by_key[k].dim for k in mine) for mine in self._shared])
+            first, o = {key: 0}, 6
+            for k in mine:
+                first[k] = o
+                o += dims[k]
+                columns.append(np.arange(at[k], at[k] + dims[k]))
+            col_ptr.append(col_ptr[-1] + o - 6)
+            for b in blocks[ptr[j] : ptr[j + 1]]:
+                of_key[place[b] : place[b + 1]] = [first[k] for k in self.batch.keys[b]]
         col = np.concatenate(columns) if columns else np.zeros(0)
-        self.arrays = ReductionArrays(block_ptr, order, col_ptr.astype(np.int64), col.astype(np.int64), place)
+        self.arrays = ReductionArrays(
+            block_ptr, order, np.array(col_ptr, dtype=np.int64), col.astype(np.int64),
+            of_key[self.batch.seg_key_number],
+        )  # fmt: skip
         self.L = np.zeros((len(self.hidden), 6, 6))
-        self.T = np.zeros(6 * (int(col_ptr[-1]) + len(self.hidden)))
+        self.T = np.zeros(6 * (col_ptr[-1] + len(self.hidden)))
         self._views: list[FloatArray] = []
-        self._r, self._length = np.zeros(n + 1), np.zeros(n + 1)
+        self._r = np.zeros(self.interface.n + 1)
 
     def reduce(self, damping: float) -> bool:
         """Reduce at the values the batch was last prepared at; False where something has no inverse to speak of."""
@@ -144,12 +149,11 @@ class PoseReduction:
 
     def leaves(self) -> Leaves:
         """The reduced poses as cliques below that of the interface: blocks [L' T]."""
-        a = self.arrays
-        blocks = []
-        for j in range(len(self.hidden)):
-            k, at = int(a.col_ptr[j + 1] - a.col_ptr[j]), 6 * int(a.col_ptr[j] + j)
-            blocks.append(np.hstack([self.L[j], self.T[at : at + 6 * (k + 1)].reshape(6, k + 1)[:, :k]]))
-        return Leaves(blocks, [[key, *mine] for key, mine in zip(self.hidden, self._shared, strict=True)])
+        width = 6 + np.diff(self.arrays.col_ptr)
+        data = np.empty(6 * int(width.sum()))
+        leaf_rows(self.arrays, self.L, self.T, data)
+        keys = [[key, *mine] for key, mine in zip(self.hidden, self._shared, strict=True)]
+        return Leaves(keys, np.full(len(keys), 6, dtype=np.int64), width, data)
 
 
 def reduction(batch: ImageBatch, unknowns: Unknowns, outside: set[int]) -> PoseReduction | None:

@@ -229,12 +229,9 @@ def group_summaries(
         total = sums.setdefault(group, [0.0, 0.0, 0.0])
         total[0], total[1], total[2] = total[0] + n, total[1] + r, total[2] + omega
 
-    for i, block in enumerate(graph.survey.image_blocks):
-        rows = slice(images.block_ptr[i], images.block_ptr[i + 1])
-        used = images.used[rows]
-        v = images.residuals[rows][used]
-        omega = float(np.einsum("ni,nij,nj->", v, np.linalg.inv(block.cov[used]), v)) if used.any() else 0.0
-        add(block.group, 2 * int(used.sum()), float(images.redundancy[rows].sum()), omega)
+    names = list(dict.fromkeys(block.group for block in graph.survey.image_blocks))
+    for group, *sums_of_group in zip(names, *_image_sums(graph, images, names), strict=True):
+        add(group, *sums_of_group)
     for item, factor in zip(others, graph.others, strict=True):
         if item.used:
             e = noise_of(factor).whiten(item.residual)
@@ -248,6 +245,26 @@ def group_summaries(
             squares = float(readings.weighted_square[taken].sum())
             add(group, len(taken), float(readings.redundancy[taken].sum()), squares)
     return tuple(GroupSummary(g, int(n), r, omega) for g, (n, r, omega) in sums.items())
+
+
+def _image_sums(
+    graph: AdjustmentGraph, images: ImageResiduals, names: Sequence[str]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of each of these groups of image points: components used, redundancy, weighted square sum."""
+    blocks = graph.survey.image_blocks
+    if not blocks:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    number = {name: i for i, name in enumerate(names)}
+    of_point = np.repeat([number[block.group] for block in blocks], np.diff(images.block_ptr))[images.used]
+    cov = np.concatenate([block.cov for block in blocks])[images.used]
+    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    x, y = images.residuals[images.used].T
+    squares = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
+
+    def total(of_points: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(of_point, of_points, len(names)), dtype=np.float64)
+
+    return total(np.full(len(of_point), 2.0)), total(images.redundancy[images.used].sum(axis=1)), total(squares)
 
 
 def global_test(omega: float, redundancy: int, alpha: float) -> GlobalTest | None:

@@ -45,8 +45,9 @@ def _add_block(
     b: int, n: int, nl: int, last: int, segments: SegmentArrays, place: IntArray, C: FloatArray, D: FloatArray,
     H: FloatArray, K: FloatArray, E: FloatArray, M: FloatArray,
 ) -> None:  # fmt: skip
-    """Add G' H G of block b and its residual to the upper triangle of M; K (MAX_LOCAL, 6) and E are scratch."""
+    """Add G' H G of block b and its residual to the upper triangle of M; K and E are scratch."""
     first, end = segments.ptr[b], segments.ptr[b + 1]
+    Hb = H[b]
     for s in range(first, end):
         if segments.kind[s] != SEGMENT_LENS and segments.kind[s] != SEGMENT_WARP:
             pose_by_key(s, segments, C, D, E[s - first])
@@ -56,12 +57,12 @@ def _add_block(
         if at >= 0:
             for i in range(n):
                 for j in range(k):
-                    K[i, j] = H[b, i, at + j]
+                    K[i, j] = Hb[i, at + j]
         else:
             K[:n, :k] = 0.0
             for i in range(n):
                 for a in range(6):
-                    h = H[b, i, nl + a]
+                    h = Hb[i, nl + a]
                     for j in range(k):
                         K[i, j] += h * E[s - first, a, j]
         for r in range(first, end):
@@ -79,7 +80,7 @@ def _add_block(
                         M[pr + i, ps + j] += e * K[nl + a, j]
         for j in range(k):
             M[ps + j, last] += K[n - 1, j]
-    M[last, last] += H[b, n - 1, n - 1]
+    M[last, last] += Hb[n - 1, n - 1]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -183,3 +184,18 @@ def pose_steps(a: ReductionArrays, L: FloatArray, T: FloatArray, d: FloatArray, 
                 out[j, i] -= L[j, i, c] * out[j, c]
             out[j, i] /= L[j, i, i]
     return decrease
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def leaf_rows(a: ReductionArrays, L: FloatArray, T: FloatArray, out: FloatArray) -> None:
+    """Rows [L' T] of all poses, without the residual, one after the other."""
+    o = 0
+    for j in range(L.shape[0]):
+        k = a.col_ptr[j + 1] - a.col_ptr[j]
+        at = 6 * (a.col_ptr[j] + j)
+        for i in range(6):
+            for c in range(6):
+                out[o + c] = L[j, i, c]
+            for c in range(k):
+                out[o + 6 + c] = T[at + i * (k + 1) + c]
+            o += 6 + k

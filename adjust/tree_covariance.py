@@ -17,10 +17,15 @@ from adjust.tree_kernels import TreeArrays, covariance_rows, fill_block, invert_
 
 @dataclass(frozen=True)
 class Leaves:
-    """Cliques of one frontal key each, eliminated before a tree: blocks [R S] and keys, those of S from one clique."""
+    """Cliques of one frontal key each, eliminated before a tree: those of S, the others, lie in one of its cliques.
 
-    blocks: list[FloatArray]
+    width: columns of the blocks [R S], one after the other and row by row in ``data``.
+    """
+
     keys: list[list[int]]
+    front: IntArray
+    width: IntArray
+    data: FloatArray
 
 
 class TreeCovariance:
@@ -29,28 +34,30 @@ class TreeCovariance:
     def __init__(self, tree: gtsam.GaussianBayesTree, dims: Mapping[int, int], leaves: Leaves | None = None) -> None:
         self.dims = dims
         blocks, clique_keys, fronts, parents = _collect(tree)
+        front, width = ([b.shape[i] for b in blocks] for i in (0, 1))
+        data = [b.ravel() for b in blocks]
         if leaves is not None:
             home: dict[int, int] = {}
             for c, keys in enumerate(clique_keys):  # parents first: a key is frontal where it first appears
                 for k in keys:
                     home.setdefault(k, c)
             parents += [max(home[k] for k in keys[1:]) for keys in leaves.keys]
-            fronts += [len(b) for b in leaves.blocks]
-            blocks, clique_keys = blocks + leaves.blocks, clique_keys + leaves.keys
+            fronts += leaves.front.tolist()
+            front, width, data = front + leaves.front.tolist(), width + leaves.width.tolist(), [*data, leaves.data]
+            clique_keys = clique_keys + leaves.keys
         order = list(dict.fromkeys(k for keys in clique_keys for k in keys))
         self.number = {key: i for i, key in enumerate(order)}
         self._dims = np.array([dims[k] for k in order], dtype=np.int64)
         self._first = np.concatenate([[0], np.cumsum(self._dims)]).astype(np.int64)
         self._keys = np.array([self.number[k] for keys in clique_keys for k in keys], dtype=np.int64)
         self._key_ptr = np.cumsum([0] + [len(keys) for keys in clique_keys]).astype(np.int64)
-        self._front = np.array([b.shape[0] for b in blocks], dtype=np.int64)
-        self._width = np.array([b.shape[1] for b in blocks], dtype=np.int64)
-        self._at = np.cumsum([0] + [b.size for b in blocks])[:-1].astype(np.int64)
-        self._data = np.concatenate([b.ravel() for b in blocks]) if blocks else np.zeros(0)
+        self._front, self._width = np.array(front, dtype=np.int64), np.array(width, dtype=np.int64)
+        self._at = np.cumsum(np.append(0, self._front * self._width))[:-1].astype(np.int64)
+        self._data = np.concatenate(data) if data else np.zeros(0)
         self._parents = np.array(parents, dtype=np.int64)
         self._n_front = self._frontal_keys(fronts)
         self._home = np.zeros(len(order), dtype=np.int64)
-        for c in range(len(blocks)):
+        for c in range(len(front)):
             start = self._key_ptr[c]
             self._home[self._keys[start : start + self._n_front[c]]] = c
         if invert_cliques(self._front, self._width, self._at, self._data) >= 0:
