@@ -18,8 +18,8 @@ from adjust.observations import Distance, ImageBlock, PositionRef
 from adjust.result import ParameterName
 from adjust.solve import solve
 from tests.acceptance import published
-from tests.benchmarks.competitors import Competitor, Outcome
 from tests.benchmarks.data import FREE, SIZE, TRUE_LENS, free_lens, matrix, pixels
+from tests.benchmarks.outcome import Competitor, Outcome
 
 AICON_PIXEL_MM = 0.004
 AICON_SIZE = (8688, 5792)

@@ -13,12 +13,10 @@ from typing import Any
 import numpy as np
 
 from adjust.model import FloatArray
-from tests.benchmarks.bundle import Bundle
-from tests.benchmarks.data import Calibration
+from tests.benchmarks.kinds import Case, kind_of
 
 SYSTEM_PYTHON = "/usr/bin/python3"
 MRCAL = "mrcal optimize"
-Case = Calibration | Bundle
 
 
 @dataclass(eq=False)
@@ -47,10 +45,12 @@ class Measured:
     def take(self, answer: dict[str, Any]) -> None:
         """Add one run."""
         self.seconds.append(sum(answer["stages"].values()))
-        self.cpu.append(answer["cpu"])
+        self.cpu.append(answer["numbers"].pop("child_cpu", answer["cpu"]))
         for stage, seconds in answer["stages"].items():
             self.stages.setdefault(stage, []).append(seconds)
         self.idle_mb, self.peak_mb, self.note = answer["idle_mb"], answer["peak_mb"], answer["note"]
+        if "child_mb" in answer["numbers"]:
+            self.idle_mb, self.peak_mb = 0.0, answer["numbers"].pop("child_mb")
         self.numbers = answer["numbers"]
 
 
@@ -111,20 +111,25 @@ class Child:
 
 
 def compete(
-    label: str, case: Case, warm: Case, names: Sequence[str], rounds: int = 5,
+    label: str, case: Case, warm: Case | None, names: Sequence[str], rounds: int = 5,
     threads: int = 1, budget: float = 60.0,
 ) -> list[Measured]:  # fmt: skip
-    """All competitors on one case, in turn; one that has used its ``budget`` (s) drops out of the later rounds."""
-    kind = "calibration" if isinstance(case, Calibration) else "bundle"
+    """All competitors on one case, in turn; one that has used its ``budget`` (s) drops out of the later rounds.
+
+    A competitor that works alone on a case of its own needs no ``warm`` one.
+    """
     found = [Measured(label, name) for name in names]
     with tempfile.TemporaryDirectory() as folder:
         paths = Path(folder) / "case.npz", Path(folder) / "warm.npz"
         case.save(paths[0])
-        warm.save(paths[1])
+        if warm is None:
+            paths = paths[0], Path("-")
+        else:
+            warm.save(paths[1])
         children = []
         for m in found:
             reason = why_no_mrcal() if m.name == MRCAL else ""
-            child = None if reason else Child(kind, m.name, *paths, threads)
+            child = None if reason else Child(kind_of(case), m.name, *paths, threads)
             answer = child.answer() if child else reason
             m.failed = answer if isinstance(answer, str) else ""
             children.append(child)

@@ -1,7 +1,6 @@
 """What is timed: one function per competitor, from a case to its solution and the seconds of its stages."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
@@ -16,19 +15,9 @@ from adjust.solve import SolveOptions, solve
 from adjust.unknowns import Unknowns
 from tests.benchmarks import least_squares
 from tests.benchmarks.data import SIZE, Calibration, free_lens, matrix, rough_start, survey
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """stages: seconds by name, whose sum is what counts. solution: lens, camera_from_head, head_from_board."""
-
-    stages: dict[str, float]
-    solution: dict[str, FloatArray]
-    note: str = ""
-    numbers: dict[str, float] = field(default_factory=dict)
-
-
-Competitor = Callable[[], Outcome]
+from tests.benchmarks.mrcal_tool import mrcal_tool
+from tests.benchmarks.native_gtsam import native_gtsam
+from tests.benchmarks.outcome import Competitor, Outcome
 
 
 def ours_solve(case: Calibration) -> Competitor:
@@ -217,6 +206,8 @@ CALIBRATION: dict[str, Callable[[Calibration], Competitor]] = {
     "ours: to the last digit": ours_tight,
     "OpenCV calibrateCamera": opencv_cameras,
     "OpenCV calibrateMultiview": opencv_multiview,
+    "mrcal-calibrate-cameras": mrcal_tool,
+    "plain GTSAM: solve, marginals": native_gtsam,
     "scipy least_squares": scipy_trust_region,
     "scipy.sparse Gauss-Newton": scipy_gauss_newton,
 }

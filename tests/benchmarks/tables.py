@@ -86,3 +86,9 @@ def stages(found: Sequence[Measured]) -> str:
         for m in found
     ]
     return table(("case", "", *names), rows)
+
+
+def against(found: dict[str, Measured], ours: str, others: Sequence[str]) -> str:
+    """One sentence: how many times as long as ours the others take, run by run."""
+    parts = [f"{name} {ratio(found[name], found[ours])}" for name in others if name in found and found[name].seconds]
+    return f"“{ours}” (build, solve, precision) against: {'; '.join(parts)} times its time."

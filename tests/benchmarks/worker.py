@@ -12,9 +12,7 @@ from time import perf_counter, process_time
 import cv2
 import numpy as np
 
-from tests.benchmarks import bundle, competitors
-from tests.benchmarks.competitors import Competitor
-from tests.benchmarks.data import Calibration
+from tests.benchmarks.kinds import make
 
 
 def memory_mb(what: str) -> float:
@@ -25,19 +23,13 @@ def memory_mb(what: str) -> float:
     return float("nan")
 
 
-def make(kind: str, name: str, path: Path) -> Competitor:
-    """The competitor on the case of that file."""
-    if kind == "calibration":
-        return competitors.CALIBRATION[name](Calibration.load(path))
-    return bundle.BUNDLE[name](bundle.Bundle.load(path))
-
-
 def main() -> None:
     """Serve until stdin ends."""
     kind, name, case, warm, out = sys.argv[1:]
     cv2.setNumThreads(int(os.environ["LABSURVEY_THREADS"]))
     answers, sys.stdout = sys.stdout, sys.stderr  # what a library prints must not disturb the answers
-    make(kind, name, Path(warm))()
+    if warm != "-":
+        make(kind, name, Path(warm))()
     run = make(kind, name, Path(case))
     idle = memory_mb("VmRSS")
     print(json.dumps({"ready": True}), file=answers, flush=True)

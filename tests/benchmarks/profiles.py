@@ -1,0 +1,181 @@
+"""Where our time goes: wall seconds inside the parts of build, solve and precision, each without what it calls."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from time import perf_counter
+from typing import Any
+
+import gtsam
+
+from adjust import adjustment
+from adjust.adjustment import AdjustOptions, assemble
+from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.initial import find_start
+from adjust.pose_network import NetworkOptions, solve_network
+from adjust.pose_network import precision as pose_precision
+from adjust.pose_network import solution as pose_solution
+from adjust.pose_network import solve as pose_solve
+from adjust.precision import Precision
+from adjust.solve import _Loop, solve
+from adjust.state import State
+from adjust.tree_covariance import TreeCovariance
+from survey.interop.g2o import read_g2o
+from tests.benchmarks import tables, terrestrial
+from tests.benchmarks.data import calibration, rough_start, survey
+from tests.data import data_folder
+
+Part = tuple[str, Any, str]
+PARTS: list[Part] = [
+    ("load values", State, "load"),
+    ("prepare (kernels)", AdjustmentGraph, "prepare"),
+    ("linearise (GTSAM)", gtsam.NonlinearFactorGraph, "linearize"),
+    ("eliminate (GTSAM)", _Loop, "step"),
+    ("weighted square sum", AdjustmentGraph, "objective"),
+    ("retract", gtsam.Values, "retract"),
+    ("precision: Bayes tree", Precision, "__init__"),
+    ("covariances of the tree", TreeCovariance, "__init__"),
+    ("redundancy of image points", adjustment, "image_residuals"),
+    ("redundancy of readings and others", adjustment, "other_residuals"),
+    ("estimates", adjustment, "estimates"),
+    ("groups", adjustment, "group_summaries"),
+    ("whole covariance matrix", TreeCovariance, "full"),
+]
+POSE_PARTS: list[Part] = [
+    ("start values", pose_solve, "find_network_start"),
+    ("checks", pose_solve, "check_determined"),
+    ("graph", pose_solve, "network_graph"),
+    ("values", pose_solve, "network_values"),
+    ("order of elimination", pose_solve, "network_ordering"),
+    ("linearise", gtsam.NonlinearFactorGraph, "linearize"),
+    ("eliminate (GTSAM)", pose_solve.GaussNewton, "solve"),
+    ("v'Pv", gtsam.NonlinearFactorGraph, "error"),
+    ("retract", gtsam.Values, "retract"),
+    ("eliminate for the covariances (GTSAM)", pose_precision, "_eliminated"),
+    ("covariances of the tree", TreeCovariance, "__init__"),
+    ("Jacobians of pairs", pose_precision, "pair_jacobians"),
+    ("Jacobians of pairs", pose_solution, "pair_jacobians"),
+    ("quadratic forms of tests", pose_precision, "_quadratic"),
+]
+
+
+class Clock:
+    """Exclusive times of nested parts."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, float] = {}
+        self.open: list[str] = []
+        self.last = perf_counter()
+
+    def switch(self, enter: str | None) -> None:
+        """Charge the time since the last switch to what was open; then open or close a part."""
+        now = perf_counter()
+        if self.open:
+            self.spent[self.open[-1]] = self.spent.get(self.open[-1], 0.0) + now - self.last
+        self.last = now
+        if enter is None:
+            self.open.pop()
+        else:
+            self.open.append(enter)
+
+    def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, with its time charged to ``name``."""
+
+        def wrapper(*arguments: Any, **more: Any) -> Any:
+            self.switch(name)
+            try:
+                return function(*arguments, **more)
+            finally:
+                self.switch(None)
+
+        return wrapper
+
+
+@contextmanager
+def watched(clock: Clock, parts: Sequence[Part]) -> Iterator[None]:
+    """Times the parts while the block runs; parts that the program no longer has are left out."""
+    kept = [(name, owner, attribute, getattr(owner, attribute)) for name, owner, attribute in parts
+            if hasattr(owner, attribute)]  # fmt: skip
+    for name, owner, attribute, function in kept:
+        setattr(owner, attribute, clock.timed(name, function))
+    try:
+        yield
+    finally:
+        for _, owner, attribute, function in kept:
+            setattr(owner, attribute, function)
+
+
+def best_of(run: Callable[[Clock], None], parts: Sequence[Part], times: int = 3) -> dict[str, float]:
+    """Seconds by part in the fastest run."""
+    best: Clock | None = None
+    for _ in range(times):
+        clock = Clock()
+        with watched(clock, parts):
+            run(clock)
+        if best is None or sum(clock.spent.values()) < sum(best.spent.values()):
+            best = clock
+    return best.spent if best else {}
+
+
+def milliseconds(columns: dict[str, dict[str, float]]) -> str:
+    """A table, one column a run."""
+    for spent in columns.values():
+        spent["sum"] = sum(spent.values())
+    names = list(dict.fromkeys(n for c in columns.values() for n in c if n != "sum")) + ["sum"]
+    rows = [[n, *[f"{1e3 * c[n]:.1f}" if n in c else "" for c in columns.values()]] for n in names]
+    return tables.table(("ms", *columns), rows)
+
+
+def cameras(sizes: Sequence[tuple[int, int, tuple[int, int]]]) -> str:
+    """For (cameras, epochs, shape of the board)."""
+    columns = {}
+    for n_cameras, epochs, shape in sizes:
+        case = calibration(n_cameras, epochs, shape)
+        given, start = survey(case), rough_start(case)
+
+        def run(clock: Clock, given: Any = given, start: Any = start) -> None:
+            graph = clock.timed("build", GraphBuilder(given, start.lenses).build)(start)
+            solved = clock.timed("the loop's own", solve)(graph)
+            clock.timed("tests and warnings", assemble)(graph, solved, AdjustOptions())
+
+        spent = best_of(run, PARTS)
+        if n_cameras * epochs <= 2000:
+            clock = Clock()
+            clock.timed("start values, where none are given", find_start)(given)
+            spent |= clock.spent
+        columns[f"{n_cameras} x {epochs}"] = spent
+    return milliseconds(columns)
+
+
+def readings(sizes: Sequence[int]) -> str:
+    """For networks of so many points."""
+    columns = {}
+    for n in sizes:
+        given = terrestrial.network(n, False)
+        start = StartValues({}, {}, terrestrial.rough(given))
+
+        def run(clock: Clock, given: Any = given, start: Any = start) -> None:
+            graph = clock.timed("build", GraphBuilder(given, {}).build)(start)
+            solved = clock.timed("the loop's own", solve)(graph)
+            precision = Precision(graph, solved)
+            result = clock.timed("tests and warnings", assemble)(graph, solved, AdjustOptions(), (), precision)
+            if result.n_unknowns <= terrestrial.FULL_UP_TO:
+                precision.tree.full()
+
+        columns[f"{n} points"] = best_of(run, PARTS, 3 if n <= 3000 else 1)
+    return milliseconds(columns)
+
+
+def pose_graphs(names: Sequence[str]) -> str:
+    """For published graphs."""
+    columns = {}
+    for name in names:
+        network = read_g2o(data_folder("calibration", "pose_graphs") / f"{name}.g2o")
+
+        def run(clock: Clock, network: Any = network) -> None:
+            fresh = network.with_used(network.used)
+            solution = clock.timed("the rest of the solution", solve_network)(fresh, None, NetworkOptions(robust="off"))
+            clock.timed("covariances of stations", lambda s: s.precision.station_cov)(solution)
+            clock.timed("the rest of the tests", lambda s: s.precision.pairs)(solution)
+
+        columns[name] = best_of(run, POSE_PARTS)
+    return milliseconds(columns)

@@ -1,0 +1,47 @@
+"""Targets in images, and where our time goes."""
+
+import numpy as np
+
+from tests.benchmarks import finding, profiles, tables
+from tests.benchmarks.session import Session
+from tests.data import data_folder
+
+
+def targets(session: Session) -> None:
+    """Finding boards."""
+    session.say("", "## Targets in images", "")
+    session.say(
+        "Grey images in memory. Ours fits two blurred edges to every corner and gives its covariance; rms: distance "
+        "from where OpenCV projects the points. `findChessboardCornersSB` is slow in large images: left out at 12 "
+        "megapixels."
+    )  # fmt: skip
+    boards = [finding.OURS, finding.TWO, finding.CLASSIC, finding.SECTOR]
+    runs = [("26 photographs of 640 x 480", finding.photographs(data_folder("calibration", "opencv_samples")), boards)]
+    for width, height in () if session.quick else ((2592, 1944), (4096, 3000)):
+        names = boards if width < 3000 else boards[:-1]
+        size = f"{width} x {height}"
+        runs.append((f"board, {size}", finding.rendered(width, height, False), names))
+        runs.append((f"ChArUco, {size}", finding.rendered(width, height, True), [*boards[:2], finding.ARUCO]))
+    rows = []
+    for label, case, names in runs:
+        # the same images once before: kernels are compiled, caches warm
+        found = session.compete(label, case, case, names, budget=6.0)
+        for m in found.values():
+            per = 1e3 / len(case.images)
+            ratio = tables.ratio(m, found[finding.OURS])
+            rms = m.numbers.get("rms_px", np.nan)
+            rows.append([label, m.name, f"{per * m.median:.1f}", ratio, f"{m.numbers.get('found', 0):.0f} of "
+                         f"{len(case.images)}", "" if np.isnan(rms) else f"{rms:.4f}"])  # fmt: skip
+    session.say("", tables.table(("", "", "ms an image", "ratio to ours", "found", "rms px"), rows))
+
+
+def stages(session: Session) -> None:
+    """Where our time goes."""
+    session.say("", "## Where our time goes", "")
+    session.say("One thread, best of three runs, each part without what it calls.", "")
+    sizes = [(1, 50, (8, 11))] if session.quick else [(1, 200, (8, 11)), (3, 500, (10, 10)), (12, 300, (10, 10))]
+    session.say("Cameras:", "", profiles.cameras(sizes), "")
+    points = (200,) if session.quick else (1000, 3000, 10000)
+    session.say("Networks of readings:", "", profiles.readings(points), "")
+    names = ("parking-garage",) if session.quick else ("parking-garage", "sphere2500", "torus3D")
+    session.say("Pose graphs, start values included:", "", profiles.pose_graphs(names))
