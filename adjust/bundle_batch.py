@@ -30,7 +30,7 @@ from adjust.errors import IndeterminateError
 from adjust.image_batch import Chains, square_root_information
 from adjust.lens_kernels import MAX_LENS
 from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.motions import motions_of, points_motions
+from adjust.motions import motions_of, points_motions, poses_at, poses_motions
 from adjust.observations import ImageBlock
 from adjust.parallel import run_split, workers
 from adjust.state import State
@@ -161,7 +161,9 @@ class BundleBatch:
         self.first_pose = offset
         offset += 6 * len(self.blocks)
         self.tied_at = {i: offset + 3 * q for q, i in enumerate(self.tied)}
-        self.point_at = np.array([self.tied_at.get(int(i), -1) for i in self.point], dtype=np.int64)
+        of_point = np.full(len(self.point_ids), -1, dtype=np.int64)
+        of_point[list(self.tied_at)] = list(self.tied_at.values())
+        self.point_at = of_point[self.point]
         self.n_local = offset + 3 * len(self.tied)
         k, p = len(self.point), len(self.reduced)
         self.A = np.zeros((k, 2, MAX_LENS + 7))
@@ -316,8 +318,11 @@ class BundleBatch:
 
     def _motions(self, keys: Sequence[int], values: gtsam.Values) -> FloatArray:
         by_key = self.unknowns.by_key
-        in_world = {"world_from_station", "world_from_table"}
-        return np.concatenate([motions_of(by_key[k], values, by_key[k].name[0] in in_world) for k in keys])
+        poses = [k for k in keys if by_key[k].kind == "pose"]
+        names = [by_key[k].name[0] for k in poses]
+        in_world = np.array([name in ("world_from_station", "world_from_table") for name in names], dtype=np.bool_)
+        moved = dict(zip(poses, poses_motions(*poses_at(values, poses), in_world), strict=True))
+        return np.concatenate([moved[k] if k in moved else motions_of(by_key[k], values, False) for k in keys])
 
     def _find_blind(self, values: gtsam.Values) -> FloatArray:
         """Directions (7, k) of those motions, from the image rows before they are condensed.

@@ -19,7 +19,7 @@ from adjust.errors import SurveyError
 from adjust.geometry.motions import MOVED, vector_motions
 from adjust.graph import AdjustmentGraph, inner_datum_keys
 from adjust.model import FloatArray, IntArray
-from adjust.motions import motions_of, points_motions
+from adjust.motions import motions_of, points_motions, poses_at, poses_motions
 from adjust.result import ParameterName
 from adjust.terrestrial.motions import MOVED as READINGS_MOVED
 from adjust.terrestrial.motions import reading_motions
@@ -150,8 +150,12 @@ def survey_motions(graph: AdjustmentGraph, values: gtsam.Values, directions: Flo
     points = [u.key for u in unknowns if u.kind == "point"]
     x = np.array([values.atPoint3(key) for key in points]).reshape(-1, 3)
     out = dict(zip(points, points_motions(x) @ directions, strict=True))
+    poses = [u for u in unknowns if u.kind == "pose"]
+    world = np.array([in_world(graph, u.name) for u in poses], dtype=np.bool_)
+    moved = poses_motions(*poses_at(values, [u.key for u in poses]), world) @ directions
+    out |= dict(zip([u.key for u in poses], moved, strict=True))
     for u in unknowns:
-        if u.kind != "point":
+        if u.kind == "vector":
             out[u.key] = gauge(graph, u, values) @ directions
         for i in graph.unknowns.held.get(u.key, ()):
             out[u.key][i] = 0.0
