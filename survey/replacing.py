@@ -9,6 +9,7 @@ list of what was to be moved; the next command restores the old state (:func:`re
 Nothing is written through a link that lies in the project.
 """
 
+import errno
 import json
 import os
 import shutil
@@ -189,7 +190,14 @@ def _move(new: Path, there: Path) -> None:
         there.unlink(missing_ok=True)
         return
     there.parent.mkdir(parents=True, exist_ok=True)
-    os.rename(new, there)
+    try:
+        os.rename(new, there)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise
+        moving = new.with_name(f".{new.name}.moving")  # a folder in between is mounted
+        os.rename(new, moving)  # from here on the old one is to come back
+        atomic_write(there, moving.read_bytes())
 
 
 def recover(folder: Path) -> bool:
@@ -239,7 +247,12 @@ def _restore(folder: Path, entry: str, was_there: bool) -> None:
         os.rename(old, there)
     elif os.path.lexists(old):
         there.parent.mkdir(parents=True, exist_ok=True)
-        os.replace(old, there)
+        try:
+            os.replace(old, there)
+        except OSError as error:
+            if error.errno != errno.EXDEV:
+                raise
+            atomic_write(there, old.read_bytes())
     elif not was_there:
         _remove(there)
 

@@ -1,6 +1,7 @@
 """What all commands share: exit codes, flags, output, and the check of a project folder."""
 
 import argparse
+import errno
 import io
 import json
 import os
@@ -12,12 +13,14 @@ from typing import Any
 from adjust.errors import SurveyError
 
 DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
+_OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # writing does not say which file
 
 
 def message(error: SurveyError | OSError) -> str:
     """An error as its reader should see it."""
     if isinstance(error, OSError):
-        text = f"{error.filename}: {error.strerror}; check the name, the permissions and the free space"
+        where = "" if error.filename is None else f"{error.filename}: "
+        text = f"{where}{error.strerror}; check the name, the permissions and the free space"
     else:
         text = str(error)
     # names out of a file must not drive the reader's terminal
@@ -39,7 +42,7 @@ def run_command(program: str, build_parser: Callable[[], argparse.ArgumentParser
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except (SurveyError, OSError) as error:
-        if isinstance(error, OSError) and error.filename is None:
+        if isinstance(error, OSError) and error.filename is None and error.errno not in _OF_THE_DISK:
             raise  # not about a file of the user
         print(f"{program}: error: {message(error)}", file=sys.stderr)
         return INTERRUPTED if getattr(error, "interrupted", False) else FAILED

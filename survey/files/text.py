@@ -36,8 +36,10 @@ def atomic_write(path: Path, content: bytes | str) -> None:
             os.fsync(handle)
         os.chmod(temporary, 0o666 & ~_umask())  # mkstemp makes files that only their owner can read
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         Path(temporary).unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:  # writing does not say which file
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
 

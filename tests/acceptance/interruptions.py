@@ -139,6 +139,17 @@ class Ended:
 
 def start(argv: list[str], home: Path, happens: Happens | None = None) -> int:
     """Run a command line in a copy of this process; its pid. ``happens`` is told every step below ``home``."""
+
+    def command() -> int:
+        if happens is not None:
+            _tell(home, happens)
+        return main([*argv, "--quiet"])
+
+    return in_a_copy(command, home)
+
+
+def in_a_copy(action: Callable[[], int], home: Path) -> int:
+    """Run something in a copy of this process, which ends with the code that it returns; the pid of the copy."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # no thread of this process holds a lock now
         pid = os.fork()
@@ -150,9 +161,7 @@ def start(argv: list[str], home: Path, happens: Happens | None = None) -> int:
         os.dup2(handle, 1)
         os.dup2(handle, 2)
         sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
-        if happens is not None:
-            _tell(home, happens)
-        code = main([*argv, "--quiet"])
+        code = action()
     except BaseException:
         traceback.print_exc()
     finally:
