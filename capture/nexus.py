@@ -9,12 +9,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from adjust.errors import SurveyError
 from capture.journal import Record, read_journal, taken_sets
+from capture.recorded import require_recorded
 from capture.session_folder import damaged, journal_path
+from survey.detection.gray import read_image
 
 
 def export(folder: Path, file: Path) -> dict[str, Any]:
@@ -24,6 +25,7 @@ def export(folder: Path, file: Path) -> dict[str, Any]:
     if file.exists():
         raise SurveyError(f"{file}: it exists already; name a new file, or remove it")
     records, _, _ = read_journal(journal_path(folder))
+    require_recorded(journal_path(folder), records)
     sets = taken_sets(records)
     if not sets:
         raise SurveyError(f"{folder}: nothing is recorded there; run a plan first: labcapture run PLAN")
@@ -31,7 +33,7 @@ def export(folder: Path, file: Path) -> dict[str, Any]:
         problem = damaged(folder, record)
         if problem is not None:
             raise SurveyError(f"{folder}: {epoch_id}: {problem}; run the plan again, it takes what is damaged anew")
-    started = next(record for record in reversed(records) if record["kind"] == "session")
+    started = _start_of(folder, records, list(sets.values()))
     temporary = file.with_name(f".{file.name}.tmp")
     try:
         with h5py.File(temporary, "w") as root:
@@ -40,6 +42,22 @@ def export(folder: Path, file: Path) -> dict[str, Any]:
     finally:
         temporary.unlink(missing_ok=True)
     return {"file": str(file), "epochs": len(sets), "images": n_images}
+
+
+def _start_of(folder: Path, records: Sequence[Record], sets: Sequence[Record]) -> Record:
+    """The last start of a session. Raises SurveyError where not all sets are of its cameras and axes."""
+    started = next((record for record in reversed(records) if record["kind"] == "session"), None)
+    if started is None:
+        raise SurveyError(f"{journal_path(folder)}: no start of a session is in it; restore the file from a copy")
+    axes = [] if started["table"] is None else started["table"]["axes"]
+    first = sets[0]["images"]
+    for record in sets:
+        sizes = {c: (i["height"], i["width"], i["bits"] > 8) for c, i in record["images"].items()}
+        same = sizes == {c: (i["height"], i["width"], i["bits"] > 8) for c, i in first.items()}
+        if not same or len(record["planned_deg"]) != len(axes):
+            raise SurveyError(f"{folder}: {record['epoch_id']} has other cameras, images or axes than the rest; a file "
+                              "holds one kind of session: export a folder for each")  # fmt: skip
+    return started
 
 
 def _h5py() -> Any:
@@ -122,8 +140,8 @@ def _write_detector(
     )
     stack.attrs["interpretation"] = "image"
     for i, image in enumerate(images):
-        pixels = cv2.imread(str(folder / image["path"]), cv2.IMREAD_UNCHANGED)
-        if pixels is None or pixels.shape != shape[1:]:
+        pixels = read_image(folder / image["path"])
+        if pixels.shape != shape[1:]:
             raise SurveyError(f"{folder / image['path']}: not an image of {shape[2]} x {shape[1]} px as the others")
         stack[i] = pixels
     exposures = [image["features"].get("ExposureTime", np.nan) for image in images]

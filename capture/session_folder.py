@@ -6,6 +6,7 @@ copied from the plan's template where there is none yet; capture/journal.jsonl, 
 
 import csv
 import hashlib
+import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,13 +15,14 @@ from typing import Any
 import cv2
 import numpy as np
 
+from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from capture.camera import GrayImage
 from capture.journal import Record
 from survey.files.locking import SESSION_LOCK, FileLock, holder_of
 from survey.files.project import DEFINITION_FILE, IMAGES_FOLDER, OBSERVATIONS_FOLDER
 from survey.files.table_writing import write_table
-from survey.files.text import atomic_write, sync_folder
+from survey.files.text import atomic_write, decode, read_bytes, sync_folder
 
 CAPTURE_FOLDER = "capture"
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # lossless at any level; this one is fast
@@ -142,5 +144,11 @@ def _foreign_rows(folder: Path) -> list[dict[str, str]]:
     path = folder / OBSERVATIONS_FOLDER / "table_angles.csv"
     if not path.is_file():
         return []
-    with path.open(encoding="utf-8-sig", newline="") as stream:
-        return list(csv.DictReader(stream))
+    try:
+        rows = list(csv.DictReader(io.StringIO(decode(path, read_bytes(path)[0]), newline=""), strict=True))
+    except csv.Error as error:
+        raise SurveyError(f"{path}: this is no table ({error}); correct it, or remove it") from error
+    for line, row in enumerate(rows, 2):
+        if None in row or None in row.values() or not row.get("epoch_id"):
+            raise SurveyError(f"{path}:{line}: not as long as its header, or without an epoch_id; correct the table")
+    return rows

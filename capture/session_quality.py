@@ -20,10 +20,19 @@ from capture.camera import Frame
 from capture.plan import CapturePlan
 from capture.plan_poses import definition_of
 from capture.quality import Coverage, image_quality
+from capture.recorded import is_size
 from capture.session_folder import CAPTURE_FOLDER
+from survey.shapes import NUMBER, Each, misfit
 from survey.targets import DetectableTarget, PointList
 
 Qualities = Mapping[str, Mapping[str, Any]]
+
+
+def _is_uv(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(NUMBER, value))
+
+
+_ROW = {"camera_id": str, "epoch_id": str, "width": is_size, "height": is_size, "points": Each([_is_uv])}
 _BEHIND = 4  # epochs that may wait; more, and the session waits for the oldest
 
 
@@ -39,7 +48,8 @@ def read_qualities(folder: Path) -> list[dict[str, Any]]:
     for line in path.read_bytes().split(b"\n") if path.exists() else []:
         with suppress(ValueError, KeyError, TypeError, RecursionError):
             row = json.loads(line)
-            rows[row["camera_id"], row["epoch_id"]] = row
+            if misfit(row, _ROW) is None:
+                rows[row["camera_id"], row["epoch_id"]] = row
     return list(rows.values())
 
 

@@ -9,6 +9,7 @@ from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from capture.journal import Journal, Record, clocks, read_journal
 from capture.plan import CapturePlan, Shot
+from capture.recorded import require_recorded
 from capture.session_folder import damaged, journal_path
 
 _SAME = np.radians(1e-7)  # rad; two planned angles that differ by less are the same pose
@@ -17,8 +18,9 @@ _SAME = np.radians(1e-7)  # rad; two planned angles that differ by less are the 
 def verified_sets(plan: CapturePlan, journal: Journal, note: Callable[[str], None]) -> dict[str, Record]:
     """Recorded epochs whose images are there with the right hash; the others are struck off in the journal.
 
-    Raises SurveyError where the plan now wants another pose under the name of one that is recorded.
+    Raises SurveyError for a damaged journal, and where the plan now wants another pose under the name of one in it.
     """
+    require_recorded(journal.path, journal.records)
     planned = {shot.epoch_id: shot for shot in plan.shots}
     camera_ids = {camera.camera_id for camera in plan.cameras}
     valid = {}
@@ -51,5 +53,7 @@ def _require_same(plan: CapturePlan, shot: Shot, record: Record, camera_ids: set
 
 def last_readback(folder: Path) -> FloatArray | None:
     """(n,) rad: where the table was at the last recorded set, for readbacks that lose turns."""
-    sets = [record for record in read_journal(journal_path(folder))[0] if record["kind"] == "set"]
+    records = read_journal(journal_path(folder))[0]
+    require_recorded(journal_path(folder), records)
+    sets = [record for record in records if record["kind"] == "set"]
     return np.radians(sets[-1]["after"]["readback_deg"]) if sets else None

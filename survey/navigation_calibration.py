@@ -3,7 +3,6 @@
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -12,9 +11,12 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3
 
+from adjust.lens import MODELS
 from adjust.model import FloatArray
 from adjust.navigation import Beacons, Head, HeadCamera, HeadTable
 from survey.files import atomic_write
+from survey.safe_npz import read_arrays
+from survey.shapes import POSITIVE, WHOLE, Either, misfit
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +63,12 @@ def _feed(update: Callable[[bytes], None], value: Any) -> None:
 def kept(path: Path, key: str) -> Calibration | None:
     """The calibration in a file, None where there is none, it cannot be read, or its key is another."""
     try:
-        with path.open("rb") as file, np.load(file) as found:  # a damaged file leaves numpy without closing its own
-            about = json.loads(str(found["about"]))
-            arrays = {name: found[name] for name in found.files if name != "about"}
-        return _restored(about, arrays) if about["key"] == key else None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+        arrays = read_arrays(path)
+        about = json.loads(str(arrays.pop("about")))
+        if _problem(about, arrays) is not None or about["key"] != key:
+            return None
+        return _restored(about, arrays)
+    except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError):
         return None  # whatever is wrong with the file, the calibration is only made anew
 
 
@@ -94,6 +97,32 @@ def keep(path: Path, key: str, calibration: Calibration) -> None:
     np.savez(buffer, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(path, buffer.getvalue())
+
+
+_ABOUT = {
+    "key": str, "sigma0": Either((POSITIVE, None)), "beacon_ids": [str], "axes": Either(([str], None)),
+    "cameras": [{"camera_id": str, "image_size": [WHOLE], "model": lambda name: name in MODELS}],
+}  # fmt: skip
+
+
+def _problem(about: Any, arrays: dict[str, FloatArray]) -> str | None:
+    """Why these are no calibration that this program has kept."""
+    if (said := misfit(about, _ABOUT)) is not None:
+        return said
+    shapes: dict[str, tuple[int, ...]] = {}
+    p, n = 0, 3 * len(about["beacon_ids"])
+    for i, camera in enumerate(about["cameras"]):
+        if len(camera["image_size"]) != 2:
+            return "image_size"
+        lens = len(MODELS[camera["model"]].names)
+        shapes |= {f"lens{i}": (lens,), f"constants{i}": (4,), f"pose{i}": (4, 4)}
+        p += lens + 6
+    if about["axes"] is not None:
+        shapes |= {"base": (4, 4), "mount": (4, 4), "geometry": (4,)}
+        p += 16
+    shapes |= {"cov": (p, p), "x": (n // 3, 3), "cov_x": (n, n)} | ({"cross": (p, n)} if "cross" in arrays else {})
+    fits = (k in arrays and arrays[k].shape == shape and arrays[k].dtype == float for k, shape in shapes.items())
+    return None if all(fits) else "an array has not the size that its cameras and beacons say"
 
 
 def _restored(about: dict[str, Any], arrays: dict[str, FloatArray]) -> Calibration:

@@ -2,6 +2,7 @@
 
 import math
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -11,19 +12,23 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-_MOST_MEMBERS = 100
+_MOST_MEMBERS = 1000
 _LARGEST = 4 * 2**30  # bytes of all arrays
 _SMALL, _RATIO = 64 * 2**20, 100  # what numbers are packed to: no less than a hundredth, unless there are few of them
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, struct.error, TypeError,
-           KeyError, IndexError, OverflowError, SyntaxError)  # fmt: skip
+           KeyError, IndexError, OverflowError, SyntaxError, tokenize.TokenError)  # fmt: skip
 
 
-def read_arrays(path: Path, names: Iterable[str]) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of these names. Raises ValueError for a file that is no such archive, or too large; OSError."""
+def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of these names, by default all.
+
+    Raises ValueError for a file that is no such archive, or too large; OSError.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             _check_sizes(archive, path.stat().st_size)
-            return {name: _array(archive, f"{name}.npy") for name in names}
+            wanted = [n.removesuffix(".npy") for n in archive.namelist()] if names is None else names
+            return {name: _array(archive, f"{name}.npy") for name in wanted}
     except _DAMAGE as error:
         raise ValueError(f"{path.name} is damaged: {error}") from error
 

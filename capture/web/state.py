@@ -18,14 +18,22 @@ from capture.drivers.turntables.moving import MovingTable
 from capture.plan import CapturePlan
 from capture.plan_table import make_table
 from capture.quality import Coverage, image_quality
+from capture.recorded import LOCATION, is_id
 from capture.session_cameras import PlannedCameras
 from capture.session_folder import lock_holder, session_lock
 from capture.session_progress import status_path
 from capture.session_quality import coverages, read_qualities, targets_by_camera
 from capture.session_resume import last_readback
 from capture.table_jobs import jog_target, table_status
+from survey.detection.gray import read_image
+from survey.files.project import IMAGES_FOLDER
+from survey.shapes import NUMBER, WHOLE, Each, misfit
 
 _LIVE_S = 0.3
+_STATUS = {
+    "state": str, "message?": str, "done?": WHOLE, "total?": WHOLE, "seconds_left?": NUMBER, "epoch_id?": is_id,
+    "after?": LOCATION, "images?": Each(str), "quality?": Each(dict),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +84,9 @@ class FolderView:
     def status(self) -> dict[str, Any]:
         """See ``View``."""
         told: dict[str, Any] = {}
-        with suppress(OSError, ValueError):
-            told = json.loads(status_path(self._plan.project).read_text(encoding="utf-8"))
+        with suppress(OSError, ValueError, RecursionError):
+            said = json.loads(status_path(self._plan.project).read_text(encoding="utf-8"))
+            told = said if misfit(said, _STATUS) is None else {}
         running = lock_holder(self._plan.project)
         if running is None and told.get("state") in ("running", "paused"):
             told |= {"state": "broken off", "message": "the session's process has ended; start it again to go on"}
@@ -95,12 +104,16 @@ class FolderView:
     def shown(self, camera_id: str) -> Shown | None:
         """See ``View``."""
         status = self.status()
-        path = status.get("images", {}).get(camera_id)
-        read = None if path is None else cv2.imread(str(self._plan.project / path), cv2.IMREAD_UNCHANGED)
-        if read is None:
+        epoch_id, planned = status.get("epoch_id"), {camera.camera_id for camera in self._plan.cameras}
+        if epoch_id is None or camera_id not in planned:
+            return None
+        try:
+            read = read_image(self._plan.project / IMAGES_FOLDER / camera_id / f"{epoch_id}.png")
+        except SurveyError:
+            return None
+        if read.ndim != 2:
             return None
         image: GrayImage = np.asarray(read, np.uint16) if read.dtype == np.uint16 else np.asarray(read, np.uint8)
-        epoch_id = status["epoch_id"]
         for row in reversed(read_qualities(self._plan.project)):
             if (row["camera_id"], row["epoch_id"]) == (camera_id, epoch_id):
                 points = [np.array(uv, float).reshape(-1, 2) for uv in row["points"].values()]

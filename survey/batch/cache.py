@@ -25,7 +25,7 @@ def unchanged_solution(folder: Path) -> dict[str, Any] | None:
             return None
         same = same_versions(inputs["versions"]) and _digests(folder, inputs["hashes"]) == inputs["hashes"]
         return dict(solution) if same and _tables(folder) <= set(inputs["hashes"]) else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None  # no results, or not ours: adjusting says what is wrong
 
 

@@ -6,10 +6,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from adjust.errors import SurveyError
 from survey.batch.record import Record, record_from
 from survey.files.locking import FileLock
-from survey.files.text import atomic_write
+from survey.files.text import atomic_write, read_bytes
+from survey.shapes import misfit
 
+_ENTRY = {"path": str, "fingerprint": str, "record": dict}
 JOURNAL, _LOCK = "journal.jsonl", ".journal.lock"
 
 
@@ -51,13 +54,14 @@ def read_journal(folder: Path) -> dict[str, tuple[str, Record]]:
     """Fingerprint and record of every finished folder, by its path; a line that was cut off is not there."""
     out: dict[str, tuple[str, Record]] = {}
     try:
-        lines = (folder / JOURNAL).read_text(encoding="utf-8").splitlines()
-    except OSError:
+        lines = read_bytes(folder / JOURNAL)[0].split(b"\n")
+    except SurveyError:
         return out
     for line in lines:
         try:
             entry = json.loads(line)
-            out[entry["path"]] = (entry["fingerprint"], record_from(entry["record"]))
-        except (ValueError, KeyError, TypeError):
+            if misfit(entry, _ENTRY) is None:
+                out[entry["path"]] = (entry["fingerprint"], record_from(entry["record"]))
+        except (ValueError, TypeError, RecursionError):
             continue
     return out

@@ -5,7 +5,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from survey.batch.causes import CAUSES
+from survey.shapes import NUMBER, POSITIVE, REAL, WHOLE, Each, Either, misfit
+
 DONE, TEST_FAILED, FAILED = "done", "test_failed", "failed"
+ORIGINS, VERDICTS = ("adjusted", "unchanged", "resumed"), ("passed", "check", "failed")
 EXIT_CODES = {DONE: 0, FAILED: 1, TEST_FAILED: 3}
 _SINGLE_POSES = (
     ("cameras", "station_from_camera"), ("stations", "mount_from_station"), ("stations", "world_from_station"),
@@ -13,6 +17,28 @@ _SINGLE_POSES = (
 )  # fmt: skip
 _VECTORS = (("cameras", "lens"), ("tables", "geometry"), ("targets", "warp"))
 _UNIT = re.compile(r"px|mm|deg|arcsec|ppm|m|1|per_\w+|")
+
+
+_SUMMARY = {
+    "sigma0?": Either((POSITIVE, None)), "redundancy?": WHOLE, "n_observations?": WHOLE, "n_unknowns?": WHOLE,
+    "verdict?": lambda word: word in VERDICTS, "title?": str, "reason?": str, "suspects?": {"n_not_used?": WHOLE},
+}  # fmt: skip
+_SOLVED = {"redundancy": WHOLE, "sigma0": Either((POSITIVE, None)),
+           "global_test": Either((None, {"omega": POSITIVE, "lower": POSITIVE, "upper": POSITIVE}))}  # fmt: skip
+_GROUP = {name: Either((REAL, None)) for name in ("deviation?", "sigma_scale?", "redundancy?")}
+_RECORD = {
+    "folder": str, "state": lambda word: word in EXIT_CODES, "origin": lambda word: word in ORIGINS,
+    "cause": lambda word: word == "" or word in CAUSES, "error": str,
+    "traceback": str, "summary": _SUMMARY, "warnings": [str], "groups": Each(_GROUP), "written": Each(str),
+    "numbers": [{"name": str, "unit": str, "value": REAL, "sigma": REAL}], "tries": WHOLE, "seconds": POSITIVE,
+    "turns": [{"name": str, "wxyz": lambda q: _is_turn(q, 4), "sigmas_arcsec": lambda s: _is_turn(s, 3)}],
+}  # fmt: skip
+
+
+def _is_turn(values: Any, n: int) -> bool:
+    """Three sigmas, or a quaternion whose length is about 1."""
+    found = isinstance(values, list | tuple) and len(values) == n and all(map(NUMBER if n == 4 else REAL, values))
+    return found and (n == 3 or abs(sum(v * v for v in values) - 1.0) < 1e-3)
 
 
 @dataclass(frozen=True)
@@ -70,7 +96,12 @@ class Record:
 
 
 def record_from(plain: Mapping[str, Any]) -> Record:
-    """The inverse of :meth:`Record.plain`."""
+    """The inverse of :meth:`Record.plain`. Raises ValueError for what is no record of this program."""
+    said = misfit(plain, _RECORD)
+    if said is None and plain["state"] != FAILED:
+        said = misfit(plain["summary"], _SOLVED)
+    if said is not None:
+        raise ValueError(f"no record of a batch: {said}")
     more = {
         "warnings": tuple(plain["warnings"]),
         "numbers": tuple(Number(**n) for n in plain["numbers"]),

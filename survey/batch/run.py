@@ -16,7 +16,7 @@ from adjust.errors import SurveyError
 from survey.batch.cache import fingerprint, unchanged_solution
 from survey.batch.causes import MAY_PASS
 from survey.batch.journal import Journal, entry_of, read_journal
-from survey.batch.record import DONE, FAILED, TEST_FAILED, Record, solved_record
+from survey.batch.record import DONE, FAILED, TEST_FAILED, Record, record_from, solved_record
 from survey.batch.worker import Worker, WorkerDiedError
 
 Told = Callable[[Record], None]
@@ -83,7 +83,8 @@ def _known(folder: str, path: Path, options: BatchOptions, before: Mapping[str, 
     solution = unchanged_solution(path)
     if solution is not None:
         written = {p.name: str(p) for p in sorted((path / "results").iterdir()) if not p.name.startswith(".")}
-        return solved_record(folder, solution, written, origin="unchanged")
+        with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError):  # not as we write it: adjust anew
+            return record_from(solved_record(folder, solution, written, origin="unchanged").plain())
     found = before.get(str(path))
     if found is None or found[1].state != FAILED or found[1].cause in MAY_PASS:
         return None

@@ -83,6 +83,8 @@ def opencv_lens(matrix: FloatArray, distortion: FloatArray, fisheye: bool, where
 def pose_of(matrix: FloatArray, where: Where) -> Pose3:
     """A pose from a matrix (4, 4) or (3, 4); raises SurveyError where its rotation is none."""
     matrix = np.asarray(matrix, dtype=float)
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise where.error(f"a matrix of {' x '.join(map(str, matrix.shape))} is no pose; expected 4 x 4 or 3 x 4")
     R = nearest_rotation(matrix[:3, :3])
     off = float(np.abs(R - matrix[:3, :3]).max())
     if not off < _ROTATION_TOLERANCE or (len(matrix) == 4 and not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9)):
