@@ -85,7 +85,6 @@ CAMERA_READERS: dict[str, Reader] = {
     **{format: _one(format) for format in _SINGLE},
     "ros": Reader(lambda: [_samples()["ros"]["left.yaml"]], in_file("net", partial(_network, "ros"))),
     "ros-folder": _in_folder("ros", "extrinsics.yaml"),
-    "ros-industrial-folder": _in_folder("ros-industrial", "left.yaml"),
     "mrcal-folder": _in_folder("mrcal", "left.cameramodel"),
     **_colmap("colmap", "bin"),
     **_colmap("colmap-text", "txt"),

@@ -40,7 +40,7 @@ _TEMPLATE = b"""format = 1
 [cameras.X]
 station = "head"
 image_size_px = [96, 64]
-lens = { model = "brown", values = [100.0, 100.0, 0.0, 48.0, 32.0], free = ["fx", "fy"] }
+lens = { model = "brown", free = ["fx", "fy", "u0", "v0"] }
 [stations.head]
 motion = "table"
 table = "turntable"
@@ -48,7 +48,8 @@ table = "turntable"
 axes = ["x", "z"]
 [targets.board]
 kind = "checkerboard"
-corners = [4, 3]
+columns = 5
+rows = 4
 square_mm = 30.0
 """
 
@@ -73,11 +74,12 @@ def _dialects() -> list[bytes]:
     return [p.read_bytes() for p in sorted(FOLDER.glob("*.toml"))]
 
 
-def _template(path: Path) -> object:
+def _template(folder: Path) -> Read:
     """A survey.toml that a plan names: copied, and read in an empty folder."""
     from capture.plan_poses import definition_of
 
-    return definition_of(path)
+    tempfile.tempdir = str(folder)
+    return in_file("lab/template.toml", definition_of)(folder)
 
 
 @cache
@@ -179,7 +181,7 @@ _LAB = (b'{"format": 1, "seed": 3, "poses": [{"epoch_id": "t1", "axis1_rad": 0.1
         b'["X", "Y"], "exposure_us": 500.0}]}')  # fmt: skip
 CAPTURE_READERS: dict[str, Reader] = {
     "capture-plan": Reader(lambda: [_PLAN], in_file("plan.toml", _plan)),
-    "capture-template": Reader(lambda: [_TEMPLATE], in_file("template.toml", _template)),
+    "capture-template": Reader(lambda: [_TEMPLATE], _template),
     "dialect": Reader(_dialects, in_file("mine.toml", _dialect)),
     "journal": Reader(_journals, _in_run("lab/capture/journal.jsonl", _resumed)),
     "nexus": Reader(_journals, _in_run("lab/capture/journal.jsonl", _exported)),

@@ -161,20 +161,20 @@ def _npz() -> list[bytes]:
 def _planning(folder: Path) -> Read:
     from survey.files import read
     from survey.planning.plan_file import read_plan
-    from tests.survey.planning_lab import write_lab
 
-    write_lab(folder / "lab")
+    put(folder / "lab", _planned_lab())
     survey = read(folder / "lab").survey
     return in_file("lab/plan.toml", lambda path: read_plan(path.parent, survey))(folder)
 
 
 @cache
-def _plan_seed() -> list[bytes]:
+def _planned_lab() -> dict[str, bytes]:
+    """A project with values for everything and its plan, by name; simulating it takes seconds."""
     from tests.survey.planning_lab import write_lab
 
     with tempfile.TemporaryDirectory() as folder:
         write_lab(Path(folder) / "lab")
-        return [(Path(folder) / "lab" / "plan.toml").read_bytes()]
+        return _texts(Path(folder) / "lab")
 
 
 def _trajectory(path: Path) -> object:
@@ -278,7 +278,7 @@ READERS: dict[str, Reader] = {
     "replaced-list": Reader(lambda: [b'{"survey.toml": true, "results": false, "observations/pairs.csv": true}'],
                             _recover, dictionary=[b"../victim", b"..", b".", b"images/../..", b"victim"]),
     "alignment-rounds": Reader(_alignment_rounds, in_file("alignment_rounds.csv", _rounds)),
-    "planning": Reader(_plan_seed, _planning),
+    "planning": Reader(lambda: [_planned_lab()["plan.toml"]], _planning),
     "trajectory": Reader(lambda: [_TRAJECTORY, _TRAJECTORY.replace(b",", b" ")], in_file("a.csv", _trajectory)),
     "g2o": Reader(lambda: [_G2O], in_file("net.g2o", _g2o)),
     "gama": Reader(lambda: [GKF.encode()], in_file("net.gkf", _foreign("gama"))),
