@@ -2,12 +2,15 @@
 
     python -m tests.fuzz                                # every reader, 1000 inputs each
     python -m tests.fuzz --reader gama,lgc --count 100000 --seed 7 --findings /tmp/findings
+    python -m tests.fuzz --count 20000 --cpu-s 10       # many of what is read fast, fewer of the rest
     python -m tests.fuzz --replay tests/fuzz/corpus     # what was found before
 
 Exit code 1 where anything was found. A finding is kept as a file, with the message beside it.
 """
 
 import argparse
+import itertools
+import math
 import multiprocessing
 import os
 import sys
@@ -35,6 +38,7 @@ def main() -> int:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
     parser.add_argument("--reader", default=",".join(READERS), help="names, with commas between")
     parser.add_argument("--count", type=int, default=1000, help="inputs for each reader")
+    parser.add_argument("--cpu-s", type=float, default=math.inf, help="most of the processor for each reader")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--limit-s", type=float, default=5.0, help="for one input")
     parser.add_argument("--findings", type=Path, default=Path(tempfile.gettempdir()) / "labsurvey-findings")
@@ -103,7 +107,9 @@ def fuzz(name: str, arguments: argparse.Namespace) -> dict:
             inputs = [p.read_bytes() for p in sorted((arguments.replay / name).glob("*")) if p.is_file()]
         else:
             mutator = Mutator([*seeds, *_corpus(name)], arguments.seed, reader.is_text, reader.dictionary)
-            inputs = (mutator.next() for _ in range(arguments.count))
+            end = time.process_time() + arguments.cpu_s
+            made = (mutator.next() for _ in range(arguments.count))
+            inputs = itertools.takewhile(lambda _: time.process_time() < end, made)
         return _loop(inputs, read, watch, kept)
 
 

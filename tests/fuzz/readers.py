@@ -76,8 +76,9 @@ def _table(name: str, number: int) -> Callable[[Path], Read]:
     def prepare(folder: Path) -> Read:
         from survey.files import reading
 
+        beside = {reading._EXTRA.get(Path(name).stem)} | ({"table_angles"} if "laser_spots" in name else set())
         for other, data in _projects()[number].items():
-            if "/" not in other or Path(other).stem == reading._EXTRA.get(Path(name).stem):
+            if "/" not in other or Path(other).stem in beside:
                 (folder / other).parent.mkdir(exist_ok=True)
                 (folder / other).write_bytes(data)
         known = reading._read_definition(folder)
