@@ -93,7 +93,7 @@ def readings(session: Session) -> None:
     """Total stations."""
     session.say("", "## Networks of total station readings", "")
     session.say(
-        "Directions, zenith angles, slope distances; a quarter of the points set up; decimetres off at the start. "
+        "Directions, zenith angles, slope distances; a quarter of the points set up; 3 cm off at the start. "
         "Ours: variances, redundancy numbers and tests of everything, and the whole covariance matrix up to "
         f"{terrestrial.FULL_UP_TO} unknowns. Dense NumPy: normal equations as one matrix, LAPACK's Cholesky and "
         "inverse; its rows are made in Python, so its own share is “solve” and “precision”. “free”: inner constraints "
@@ -112,7 +112,7 @@ def readings(session: Session) -> None:
         for m in found.values():
             rows.append([label, m.name, tables.seconds(m.median), *_parts(m.stages), m.note, f"{m.peak_mb:.0f}"])
         if dense in found and found[dense].seconds:
-            session.say("", f"{label}: {_agreement(found[ours], found[dense])}")
+            session.say("", f"{label}: {_agreement(found[ours], found[dense], free)}")
     session.say("", tables.table(("points", "", "s (median)", *_NAMES, "", "peak MB"), rows))
     sizes = np.array([float(n) for n, _ in sums])
     times = [Line(k, sizes, np.array([f[k].median if k in f else np.nan for _, f in sums]), k == ours)
@@ -122,12 +122,14 @@ def readings(session: Session) -> None:
     session.picture("readings-memory", memory, "Networks of readings, memory", "points", "MB")
 
 
-def _agreement(ours: Measured, dense: Measured) -> str:
+def _agreement(ours: Measured, dense: Measured, free: bool) -> str:
     known = dense.solution["sigmas"] > 0
     x, s = ([m.solution[name][known] for m in (ours, dense)] for name in ("x", "sigmas"))
     apart, wider = (np.abs(x[0] - x[1]) / s[1]).max(), np.abs(s[0] / s[1] - 1.0).max()
     more = ours.numbers["omega"] / dense.numbers["omega"] - 1.0
-    return f"coordinates differ by {apart:.1e} sigmas, sigmas by {wider:.1e} of them, v'Pv by {more:.1e} of it."
+    # where a free network lies is that of its start, to which the two refer in other ways
+    first = "" if free else f"coordinates differ by {apart:.1e} sigmas, "
+    return f"{first}sigmas differ by {wider:.1e} of them, v'Pv by {more:.1e} of it."
 
 
 _NAMES = ("build", "rows in Python", "solve", "tree", "statistics", "precision", "full covariance")

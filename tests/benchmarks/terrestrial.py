@@ -22,7 +22,7 @@ from tests.acceptance.dense_network import _Model
 from tests.benchmarks.cases import Arrays
 from tests.benchmarks.outcome import Competitor, Outcome
 
-NEIGHBOURS, SPACING_M, OFF_M = 14, 20.0, 0.3
+NEIGHBOURS, SPACING_M, OFF_M = 14, 20.0, 0.03
 KINDS = (("direction", 5e-6), ("zenith", 8e-6), ("slope_distance", 1e-3))
 FULL_UP_TO = 10_000  # unknowns; the whole covariance matrix of more would fill the memory
 
@@ -71,7 +71,7 @@ def network(n: int, free: bool, seed: int = 1) -> Survey:
 
 
 def rough(survey: Survey) -> dict[str, FloatArray]:
-    """Start of all points, some decimetres off; held points at their places."""
+    """Start of all points, some centimetres off; held points at their places."""
     rng = np.random.default_rng(2)
     return {
         p.point_id: np.asarray(p.x_in_world.value)
