@@ -5,22 +5,20 @@ Values, and :meth:`BundleBatch.complete` puts their steps into GTSAM's delta. Th
 remains on the interface: the reduced camera system, condensed once more.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TypeVar
 
 import gtsam
 import numpy as np
 from scipy import sparse
-from scipy.linalg import block_diag, lapack
+from scipy.linalg import lapack
 
-from adjust.bundle_covariance import direct_influence, point_from_local, reduced_influence, with_lenses, with_poses
 from adjust.bundle_kernels import (
     add_direct,
     back_substitute,
     between_poses,
     block_squares,
     fill_upper,
-    of_points,
     pose_rows,
     reduce_points,
     rows,
@@ -73,7 +71,6 @@ class BundleBatch:
         self._place_derivatives()
         self._prepared: gtsam.Values | None = None
         self._blind_directions: FloatArray | None = None
-        self._given_interface: tuple[FloatArray, FloatArray] | None = None
         self._damping = 0.0
         self._with_jacobians = False
         self.chi_square = 0.0
@@ -209,8 +206,8 @@ class BundleBatch:
             bool(owners) and not self._table_links and all(len(own[key]) == 1 for key in self.hidden_poses)
             and bool(np.all(per_block[self.first_pose + 6 * np.array(blocks_of)] == 1))
         )  # fmt: skip
-        self._own_links = np.array([link for _, link in owners], dtype=np.int64)
-        self._own_at = (self.first_pose + 6 * np.array(blocks_of, dtype=np.int64)).astype(np.int64)
+        self.own_links = np.array([link for _, link in owners], dtype=np.int64)
+        self.own_at = (self.first_pose + 6 * np.array(blocks_of, dtype=np.int64)).astype(np.int64)
 
     def _local_from_keys(self) -> sparse.csr_matrix:
         """Derivative (n_local, n_keys) of the local unknowns by the keys: lens and points direct, poses by chains."""
@@ -226,7 +223,8 @@ class BundleBatch:
 
     # -- evaluation --------------------------------------------------------------------------------------------------
 
-    def _rows(self, values: gtsam.Values, W: FloatArray) -> None:
+    def evaluate_rows(self, values: gtsam.Values, W: FloatArray) -> None:
+        """Fill A with the rows of all image points at ``values``, whitened by W (K, 3); chi-square and least depths."""
         s, c = self.state, self.chains
         self._load_points(values)
         self.X[:] = self.world[self.point]
@@ -249,7 +247,7 @@ class BundleBatch:
             return
         self._prepared = None
         self.chains.evaluate(self.state)
-        self._rows(values, self.W)
+        self.evaluate_rows(values, self.W)
         self.chi_square = float(self.chi.sum())
         if jacobians:
             self._condense(values, damping)
@@ -303,11 +301,11 @@ class BundleBatch:
 
     def _scaled_head(self, S: FloatArray, floor: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Normal matrix of the hidden poses, lower triangle, scaled by its diagonal or ``floor``; the scales."""
-        J, at = self.chains.C[self._own_links], self._own_at[:, None] + np.arange(6)
+        J, at = self.chains.C[self.own_links], self.own_at[:, None] + np.arange(6)
         own = S[at[:, :, None], at[:, None, :]]
         d = np.sqrt(np.maximum(np.einsum("nij,nik,nkj->nj", J, own, J, optimize=True), floor.reshape(-1, 6)))
         head = np.empty((self.n_hidden, self.n_hidden))
-        between_poses(S, self._own_at, J / d[:, None, :], True, True, head)
+        between_poses(S, self.own_at, J / d[:, None, :], True, True, head)
         return head, d.ravel()
 
     def _blind_motions(self, values: gtsam.Values) -> FloatArray:
@@ -363,7 +361,6 @@ class BundleBatch:
         nh = self.n_hidden
         A, last = across[:, nh:], z[nh:]
         A = 0.5 * (A + A.T)
-        self._given_interface = None
         if nh:
             head[np.arange(nh), np.arange(nh)] += damping
             self.C, info = lapack.dpotrf(head.T, lower=0, clean=0, overwrite_a=1)
@@ -458,7 +455,7 @@ class BundleBatch:
 
     def whitened_squares(self, values: gtsam.Values) -> FloatArray:
         """Weighted squares v' inv(Q_ll) v (N,) of all image points at ``values``, blocks in their order."""
-        self._rows(values, self.W_all)
+        self.evaluate_rows(values, self.W_all)
         self._prepared = None
         return self.unsorted((self.A[:, :, MAX_LENS + 6] ** 2).sum(axis=1))
 
@@ -479,196 +476,21 @@ class BundleBatch:
             d[:nh] = -lapack.dtrtrs(self.C, right, lower=0)[0] / self.scale[:nh]
             for key in self.hidden_poses:
                 delta.insert(key, d[self.key_at[key] : self.key_at[key] + 6])
-        dX = np.zeros((len(self.reduced), 3))
-        back_substitute(
-            self.ptr, self.pc_ptr, self.pc_camera, self.camera_of, self.state.lenses.n_free, self.lens_at, self.pose_at,
-            self.Vi, self.W3, self.WL, self.h, self.G @ d, dX,
-        )  # fmt: skip
+        dX = self.points_following((self.G @ d)[:, None], self.h)[:, :, 0]
         for j, i in enumerate(self.reduced):
             delta.insert(self.point_key[i], dX[j])
 
-    def image_rows_along(self, V: FloatArray) -> FloatArray:
-        """Whitened Jacobian times directions V (n_interface, k) as rows (2K, k), what is hidden following best.
-
-        From the rows themselves: their normal equations would hide anything below the root of rounding.
-        """
-        nh, k = self.n_hidden, V.shape[1]
-        d = np.vstack([np.zeros((nh, k)), V])
-        if nh:
-            right = np.asfortranarray(self.Y[:, :-1] @ (V * self.scale[nh:, None]))
-            d[:nh] = -lapack.dtrtrs(self.C, right, lower=0)[0] / self.scale[:nh, None]
-        local = np.asarray(self.G @ d)
-        points = np.zeros((len(self.point_ids), 3, k))
-        for column in range(k):
-            dX = np.zeros((len(self.reduced), 3))
+    def points_following(self, local: FloatArray, h: FloatArray | None = None) -> FloatArray:
+        """Steps (P, 3, k) of the reduced points from those of the local unknowns (n_local, k); h: their own part."""
+        out = np.empty((len(self.reduced), 3, local.shape[1]))
+        own, one = np.zeros_like(self.h) if h is None else h, np.empty((len(self.reduced), 3))
+        for i in range(local.shape[1]):
             back_substitute(
                 self.ptr, self.pc_ptr, self.pc_camera, self.camera_of, self.state.lenses.n_free, self.lens_at,
-                self.pose_at, self.Vi, self.W3, self.WL, np.zeros_like(self.h),
-                np.ascontiguousarray(local[:, column]), dX,
+                self.pose_at, self.Vi, self.W3, self.WL, own, np.ascontiguousarray(local[:, i]), one,
             )  # fmt: skip
-            points[self.reduced, :, column] = dX
-        for i, at in self.tied_at.items():
-            points[i] = local[at : at + 3]
-        poses = local[self.first_pose : self.first_pose + 6 * len(self.blocks)].reshape(-1, 6, k)
-        by_pose, by_point = self.A[:, :, MAX_LENS : MAX_LENS + 6], self.A[:, :, MAX_LENS + 3 : MAX_LENS + 6]
-        out = by_pose @ poses[self.block] + by_point @ points[self.point]
-        for camera in sorted(set(self.camera_of.tolist())):
-            mine, free = self.camera_of == camera, int(self.state.lenses.n_free[camera])
-            out[mine] += self.A[mine, :, :free] @ local[self.lens_at[camera] : self.lens_at[camera] + free]
-        return np.asarray(out.reshape(-1, k))
-
-    def _hidden_poses_given_interface(self) -> tuple[FloatArray, FloatArray]:
-        """Hidden poses by the interface (n_hidden, n_interface), and their covariance when that is known."""
-        if self._given_interface is None:
-            nh = self.n_hidden
-            scale = self.scale[:nh]
-            T = -lapack.dtrtrs(self.C, self.Y[:, :-1], lower=0)[0]
-            P = lapack.dpotri(self.C, lower=0)[0].T  # in C's order the lower triangle
-            fill_upper(P)
-            P /= scale
-            P /= scale[:, None]
-            self._given_interface = T / scale[:, None] * self.scale[nh:], P
-        return self._given_interface
-
-    def covariances(self, Q_interface: FloatArray, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Covariances of everything hidden, from the interface's joint covariance (order ``interface``).
-
-        Returns that of all poses and tied points (order ``order``), of the reduced points (P, 3, 3), and the whitened
-        A Q A' (K, 3) of every image point (sorted order). The batch must be prepared with Jacobians at ``values``.
-        """
-        nh, n = self.n_hidden, self.n_keys
-        Q = np.empty((n, n))
-        Q[nh:, nh:] = Q_interface
-        if nh:
-            T, P = self._hidden_poses_given_interface()
-            Q[:nh, nh:] = T @ Q_interface
-            Q[nh:, :nh] = Q[:nh, nh:].T
-            np.matmul(Q[:nh, nh:], T.T, out=Q[:nh, :nh])
-            Q[:nh, :nh] += P
-        self._rows(values, self.W_all)
-        return Q, *self._of_points_and_rows(self._local_covariance(Q))
-
-    def _local_covariance(self, Q: FloatArray) -> FloatArray:
-        """G Q G' (n_local, n_local)."""
-        nh = self.n_hidden
-        if not self.alone:
-            return np.ascontiguousarray(self.G @ (self.G @ Q).T)
-        out = np.zeros((self.n_local, self.n_local))
-        between_poses(Q, self._own_at, self.chains.C[self._own_links], False, False, out)
-        to_interface = self.G[:, nh:]
-        mine = np.flatnonzero(np.diff(to_interface.indptr))
-        across = np.asarray(to_interface[mine] @ (self.G @ np.ascontiguousarray(Q[:, nh:])).T)
-        out[mine], out[:, mine] = across, across.T
+            out[:, :, i] = one
         return out
-
-    def _of_points_and_rows(self, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Covariances (P, 3, 3) of the reduced points, A Q A' (K, 3) of all image points. Q: of the local unknowns."""
-        n_free, sees = self.state.lenses.n_free, (self.by_block, self.by_ptr)
-        Y, YL = np.empty_like(self.W3), np.zeros_like(self.WL)
-        point_from_local(self.ptr, self.pc_ptr, self.Vi, self.W3, self.WL, Y, YL)
-        B, BL, C = np.empty_like(self.W3), np.zeros_like(self.WL), np.zeros((len(self.reduced), 3, 3))
-        run_split(
-            with_poses, self.runs, *sees, self.ptr, self.pc_ptr, self.pc_camera, self.point_of, self.block, n_free,
-            self.lens_at, self.first_pose, Q, Y, YL, B,
-        )  # fmt: skip
-        with_lenses(
-            self.ptr, self.pc_ptr, self.pc_camera, n_free, self.lens_at, self.pose_at, self.Vi, Q, Y, YL, B, BL, C
-        )
-        influence = np.zeros((len(self.point), 3))
-        run_split(
-            reduced_influence, self.runs, *sees, self.point_of, self.pc_of, self.camera_of, n_free, self.lens_at,
-            self.first_pose, self.A, Q, B, BL, C, influence,
-        )  # fmt: skip
-        direct_influence(
-            self.n_reduced, len(self.point), self.A, self.camera_of, n_free, self.lens_at, self.pose_at, self.point_at,
-            Q, influence,
-        )  # fmt: skip
-        return C, influence
-
-    def hidden_transposed(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
-        """Rows on hidden unknowns, transposed (dim, k) per key, as rows on the interface (n_interface, k)."""
-        nh, u = self.n_hidden, self._by_keys(rows, k)
-        out = u[nh:]
-        return out + self._hidden_poses_given_interface()[0].T @ u[:nh] if nh else out
-
-    def hidden_products(self, interface: FloatArray, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
-        """Covariance times rows of every hidden unknown (dim, k), from that of the interface (n_interface, k).
-
-        rows: what the rows are on hidden unknowns, transposed (dim, k) per key. The batch must be prepared.
-        """
-        nh, k = self.n_hidden, interface.shape[1]
-        d = np.zeros((self.n_keys, k))
-        d[nh:] = interface
-        if nh:
-            T, P = self._hidden_poses_given_interface()
-            d[:nh] = T @ interface + P @ self._by_keys(rows, k)[:nh]
-        dX, local = np.zeros((len(self.reduced), 3, k)), self.G @ d
-        for i in range(k):
-            one = np.zeros((len(self.reduced), 3))
-            back_substitute(
-                self.ptr, self.pc_ptr, self.pc_camera, self.camera_of, self.state.lenses.n_free, self.lens_at,
-                self.pose_at, self.Vi, self.W3, self.WL, np.zeros_like(self.h), np.ascontiguousarray(local[:, i]), one,
-            )  # fmt: skip
-            dX[:, :, i] = one
-        dX += self.Vi @ self._of_points(rows, k)
-        out = {key: d[self.key_at[key] : self.key_at[key] + 6] for key in self.hidden_poses}
-        return out | {self.point_key[i]: dX[j] for j, i in enumerate(self.reduced)}
-
-    def _of_points(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
-        out = np.zeros((len(self.reduced), 3, k))
-        for j, i in enumerate(self.reduced):
-            if self.point_key[i] in rows:
-                out[j] = rows[self.point_key[i]]
-        return out
-
-    def _by_keys(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
-        """Rows on hidden unknowns, transposed, as rows (n_keys, k) on the poses and the interface, points reduced."""
-        g = self.Vi @ self._of_points(rows, k)
-        local = np.zeros((self.n_local, k))
-        of_points(
-            self.ptr, self.pc_ptr, self.pc_camera, self.camera_of, self.state.lenses.n_free, self.lens_at, self.pose_at,
-            self.W3, self.WL, g, local,
-        )  # fmt: skip
-        out = np.asarray(self.G.T @ local)
-        for key in self.hidden_poses:
-            if key in rows:
-                out[self.key_at[key] : self.key_at[key] + 6] += rows[key]
-        return out
-
-    def hidden_from_interface(self, keys: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """How hidden poses and points follow from the interface, stacked: M (n, n_interface), and their own scatter.
-
-        Their covariance is M Q_interface M' plus the second matrix (n, n); with any unknown b outside it is
-        M Cov(interface, b). The batch must be prepared with Jacobians.
-        """
-        nh, n = self.n_hidden, self.n_keys
-        T, own = np.zeros((n, n - nh)), np.zeros((n, n))
-        T[nh:] = np.eye(n - nh)
-        if nh:
-            T[:nh], own[:nh, :nh] = self._hidden_poses_given_interface()
-        reduced = {self.point_key[i]: j for j, i in enumerate(self.reduced)}
-        rows, V = [], []
-        for key in keys:
-            if key in reduced:
-                rows.append(self._point_from_local(reduced[key]) @ self.G)
-                V.append(self.Vi[reduced[key]])
-            else:
-                at = self.key_at[key]
-                rows.append(sparse.csr_matrix((np.ones(6), (np.arange(6), at + np.arange(6))), shape=(6, n)))
-                V.append(np.zeros((6, 6)))
-        L = sparse.vstack(rows).tocsr()
-        scatter = np.asarray(L @ (L @ own).T) + block_diag(*V)
-        return np.asarray(L @ T), scatter
-
-    def _point_from_local(self, j: int) -> sparse.csr_matrix:
-        """Derivative (3, n_local) of reduced point ``j`` by the local unknowns: -V^-1 W."""
-        Y = np.zeros((3, self.n_local))
-        for i in range(self.pc_ptr[j], self.pc_ptr[j + 1]):
-            at, n = self.lens_at[self.pc_camera[i]], self.state.lenses.n_free[self.pc_camera[i]]
-            Y[:, at : at + n] -= self.Vi[j] @ self.WL[i, :, :n]
-        for k in range(self.ptr[j], self.ptr[j + 1]):
-            Y[:, self.pose_at[k] : self.pose_at[k] + 6] -= self.Vi[j] @ self.W3[k]
-        return sparse.csr_matrix(Y)
 
     def residuals_px(self) -> FloatArray:
         """Unwhitened residuals (K, 2) px, sorted order, of the last :meth:`covariances`."""

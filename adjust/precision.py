@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.bundle_hidden import BundleHidden
 from adjust.datum import stacking, survey_motions
 from adjust.distributions import chi2
 from adjust.graph import AdjustmentGraph
@@ -42,8 +43,9 @@ class Precision:
         self.tree = TreeCovariance(tree, dims, solved.leaves)
         self.hidden: dict[int, FloatArray] = {}
         self.bundle_influence = np.zeros((0, 3))
-        if graph.bundle is not None:
-            self._bundle()
+        self._hidden = None if graph.bundle is None else BundleHidden(graph.bundle)
+        if self._hidden is not None:
+            self._add_hidden(self._hidden)
         self.transformation: STransformation | None = None
         if solved.datum is not None:
             motions = survey_motions(graph, solved.values, solved.datum.directions)
@@ -51,7 +53,7 @@ class Precision:
 
     def products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
         """Covariance, as solved, times the transpose of ``rows`` (k, dim per key): (dim, k) for every unknown."""
-        tree, bundle = self.tree, self.graph.bundle
+        tree, below = self.tree, self._hidden
         k = next(iter(rows.values())).shape[0]
         right = np.zeros((tree.n, k))
         hidden = {}
@@ -60,13 +62,13 @@ class Precision:
                 hidden[key] = row.T
             else:
                 right[tree.rows([key])] += row.T
-        if bundle is not None and self.hidden:
-            right[tree.rows(bundle.interface)] += bundle.hidden_transposed(hidden, k)
+        if below is not None:
+            right[tree.rows(below.batch.interface)] += below.transposed(hidden, k)
         product = tree.times(right)
         at = tree.places()
         out = {key: product[place] for key, place in at.items()}
-        if bundle is not None and self.hidden:
-            out |= bundle.hidden_products(product[tree.rows(bundle.interface)], hidden)
+        if below is not None:
+            out |= below.products(product[tree.rows(below.batch.interface)], hidden)
         return out
 
     def datum_products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
@@ -79,11 +81,9 @@ class Precision:
         return {key: H - t.motions[key] @ spread.T - t.spread[key] @ moved.T + t.motions[key] @ t.core @ moved.T
                 for key, H in found.items()}  # fmt: skip
 
-    def _bundle(self) -> None:
-        bundle = self.graph.bundle
-        if bundle is None:
-            return
-        Q, points, self.bundle_influence = bundle.covariances(self.tree.joint(bundle.interface), self.solved.values)
+    def _add_hidden(self, hidden: BundleHidden) -> None:
+        bundle = hidden.batch
+        Q, points, self.bundle_influence = hidden.covariances(self.tree.joint(bundle.interface), self.solved.values)
         self.bundle_order_cov = Q
         for key in bundle.hidden_poses:
             at = bundle.key_at[key]
@@ -109,13 +109,13 @@ class Precision:
         """
         keys = [self.graph.unknowns.by_name[name].key for name in names]
         hidden = [k for k in keys if k in self.hidden]
-        bundle = self.graph.bundle
-        if not hidden or bundle is None:
+        if not hidden or self._hidden is None:
             return self._in_datum(keys, self.tree.joint(keys))
+        bundle = self._hidden.batch
         seen = [k for k in keys if k not in self.hidden]
         outer = list(dict.fromkeys(bundle.interface + seen))
         Q, at = self.tree.joint(outer), stacking(self.graph, outer)
-        M, own = bundle.hidden_from_interface(hidden)
+        M, own = self._hidden.from_interface(hidden)
         interface, mine = at.index(bundle.interface), stacking(self.graph, hidden)
         L = np.zeros((sum(self.tree.dims[k] for k in keys), at.n))
         scatter, place = np.zeros((len(L), len(L))), stacking(self.graph, keys)

@@ -4,6 +4,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import qr
 
+from adjust.bundle_hidden import BundleHidden
 from adjust.datum import BLIND, Stacking, gauge, stacking, times, visible_keys
 from adjust.errors import IndeterminateError
 from adjust.graph import AdjustmentGraph
@@ -110,7 +111,7 @@ def _rows_along(
     bundle = graph.bundle if graph is not None else None
     if bundle is None:
         return times(linear, stack, V)
-    out = [bundle.image_rows_along(V[stack.index(bundle.interface)])]
+    out = [BundleHidden(bundle).rows_along(V[stack.index(bundle.interface)])]
     for i in range(linear.size()):
         factor = linear.at(i)
         if list(factor.keys()) != bundle.interface:

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from adjust.bundle_hidden import BundleHidden
 from adjust.errors import IndeterminateError
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.model import Datum, PoseParameter, Survey
@@ -239,5 +240,5 @@ def test_image_rows_along_a_direction_are_the_root_of_the_condensed_normal_equat
     assert bundle is not None
     V = np.random.default_rng(3).normal(size=(sum(graph.unknowns.by_key[k].dim for k in bundle.interface), 4))
     R = np.concatenate(bundle.views, axis=1)
-    rows = bundle.image_rows_along(V)
+    rows = BundleHidden(bundle).rows_along(V)
     np.testing.assert_allclose(rows.T @ rows, (R @ V).T @ (R @ V), rtol=1e-7)
