@@ -9,8 +9,8 @@ forward link i reaches T through ``Ad((A_{i+1} ... A_n)^-1)``; of an inverted li
 # reason: numba ships no types, so its decorator leaves every function below untyped
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.model import BoolArray, FloatArray, IntArray
 
 

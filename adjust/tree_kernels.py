@@ -11,8 +11,8 @@ children. Row-major blocks of nf x n numbers begin at ``at[c]``: in ``data`` fir
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.model import FloatArray, IntArray
 
 

@@ -14,8 +14,8 @@ from typing import Literal
 import gtsam
 import numpy as np
 from gtsam import Rot3
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.errors import SurveyError
 from adjust.model import FloatArray, Survey, Vertical, tilt_axes
 from adjust.unknowns import Unknowns, VectorMap, vector_map

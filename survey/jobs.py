@@ -12,7 +12,7 @@ from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -26,7 +26,6 @@ from adjust.result import Adjustment
 from adjust.statistics.cleaned import adjust_cleaned
 from survey.checked import checked
 from survey.cleaning import clean_options
-from survey.detection import DetectionTask, ImageReport, SpotOptions, detect_images
 from survey.files import Definition, Project, SpotBlock, read, read_definition, write_image_points, write_spots
 from survey.files.project import RESULTS
 from survey.identify import Identification, identify_spots, without_points
@@ -35,6 +34,9 @@ from survey.replacing import changing, replace_parts
 from survey.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, solution_dict, summary_text
 from survey.statistics import Statistics, statistics_of
 from survey.targets import DetectableTarget, PointList
+
+if TYPE_CHECKING:  # brings in OpenCV, which a folder that is detected already does without
+    from survey.detection import DetectionTask, ImageReport
 
 PICTURES = "detected"
 _PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-headless", "numba")
@@ -45,7 +47,7 @@ class DetectOutcome:
     """What detection did: one report per image, and the files written."""
 
     folder: Path
-    reports: tuple[ImageReport, ...]
+    reports: "tuple[ImageReport, ...]"
     paths: tuple[Path, ...]
 
     @property
@@ -124,6 +126,8 @@ def detect_job(
 
 
 def _detect(folder: Path, place: Path, jobs: int | None, pictures: bool, progress: bool) -> DetectOutcome:
+    from survey.detection import detect_images
+
     definition = read_definition(folder)
     tasks = list(_tasks(definition))
     if not definition.images:
@@ -146,8 +150,10 @@ def _detect(folder: Path, place: Path, jobs: int | None, pictures: bool, progres
     return DetectOutcome(folder, tuple(reports), tuple(folder / name for name in names))
 
 
-def _tasks(definition: Definition) -> Iterator[DetectionTask]:
+def _tasks(definition: Definition) -> "Iterator[DetectionTask]":
     """Every image with what may be in it: all targets, except on images that are reserved for spots."""
+    from survey.detection import DetectionTask, SpotOptions
+
     request = definition.spots_request
     targets: dict[str, DetectableTarget] = {
         target_id: kind for target_id, kind in definition.target_kinds.items() if not isinstance(kind, PointList)
@@ -164,7 +170,7 @@ def _tasks(definition: Definition) -> Iterator[DetectionTask]:
             yield DetectionTask(path, camera_id, epoch_id, here, spots)
 
 
-def _blocks(definition: Definition, reports: Sequence[ImageReport]) -> tuple[list[ImageBlock], list[SpotBlock]]:
+def _blocks(definition: Definition, reports: "Sequence[ImageReport]") -> tuple[list[ImageBlock], list[SpotBlock]]:
     sizes = {c.camera_id: c.image_size for c in definition.survey.cameras}
     blocks, spots = [], []
     for report in reports:

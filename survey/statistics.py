@@ -4,9 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from gtsam import Pose3
-from scipy.spatial import cKDTree
 
-from adjust.model import FloatArray
+from adjust.model import FloatArray, IntArray
 from adjust.result import Adjustment, Estimate, ParameterName
 from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.relative_precision import relative_precision
@@ -60,6 +59,8 @@ MOST_CORRELATED = 110
 """Components that the picture of correlations shows: what there is once before what there is at every epoch."""
 MOST_BUDGETS = 60
 """Parameters with a budget: cameras, tables and stations first, then points."""
+_FEW_PLACES = 300
+"""Places whose neighbours are found without a tree."""
 MOST_NEIGHBOURS = 150
 LARGE = 300_000
 """Observed components above which correlations, weak directions and budgets are left out: they need minutes there."""
@@ -97,6 +98,18 @@ def _scaled_budget(entry: BudgetEntry, factor: float) -> BudgetEntry:
     return replace(entry, u=factor * entry.u, expanded=factor * entry.expanded, lines=lines)
 
 
+def _nearest(x: FloatArray, k: int) -> IntArray:
+    """Of each of n places (n, 3) the k nearest ones (n, k), itself first."""
+    if len(x) <= _FEW_PLACES:
+        squares = np.sum((x[:, None] - x) ** 2, axis=2)
+        squares[np.arange(len(x)), np.arange(len(x))] = -1.0
+        return np.argsort(squares, axis=1, kind="stable")[:, :k]
+    from scipy.spatial import cKDTree  # here: it takes longer to load than a small survey to adjust
+
+    return np.asarray(cKDTree(x).query(x, k=k)[1])
+
+
+
 def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision, ...]:
     """Relative precision of every point and fixed station to its two nearest; sigmas scaled as the others are."""
     names, places = [], []
@@ -108,7 +121,7 @@ def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision,
                 places.append(x)
     if len(names) < 2:
         return ()
-    _, near = cKDTree(np.array(places)).query(np.array(places), k=min(3, len(names)))
+    near = _nearest(np.array(places), min(3, len(names)))
     pairs = dict.fromkeys((min(i, int(k)), max(i, int(k))) for i, row in enumerate(near) for k in row if int(k) != i)
     free = [(names[i], names[k]) for i, k in pairs if _is_free(adjustment, names[i]) or _is_free(adjustment, names[k])]
     posterior = scale.sigmas == "a_posteriori"

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from adjust.closed_forms.rigid import rigid, rotation_exp, rotation_to
@@ -83,6 +82,8 @@ def _principal_axes(x: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
 
 def _solutions(x: FloatArray, xy: FloatArray, centre: FloatArray, axes: FloatArray, thin: bool) -> list[FloatArray]:
     """Poses (4, 4) of the target in the turned camera, unrefined."""
+    import cv2  # here: networks without images start without it
+
     scale = float(np.max(np.linalg.norm(x - centre, axis=1)))
     local = (x - centre) @ axes.T / scale  # unit size and the plane at z = 0: what IPPE asks for
     if thin and len(x) > 3:
@@ -105,6 +106,8 @@ def _solutions(x: FloatArray, xy: FloatArray, centre: FloatArray, axes: FloatArr
 
 
 def _methods(n: int, thin: bool) -> tuple[int | None, ...]:
+    import cv2
+
     if n == 3:
         return (None,)
     if thin:

@@ -1,8 +1,8 @@
 """The work on single views, compiled: refining poses, judging them, and the homography of a plane."""
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.model import BoolArray, FloatArray, IntArray
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
 from adjust.closed_forms import intersect, inverse, rigid
@@ -46,6 +45,8 @@ def orient_second(network: PoseNetwork, points: PointField) -> str | None:
 
 def _relative_pose(first: Sight, second: Sight) -> tuple[float, FloatArray] | None:
     """Score and pose (4, 4) second_from_first with unit distance, or None."""
+    import cv2  # here: networks without images start without it
+
     _, i, j = np.intersect1d(first.rows, second.rows, return_indices=True)
     ahead = (first.rays[i, 2] > 0.1) & (second.rays[j, 2] > 0.1)
     a, b = first.rays[i][ahead], second.rays[j][ahead]

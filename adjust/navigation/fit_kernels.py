@@ -4,8 +4,8 @@
 # reason: numba ships no types, so its decorator leaves every function below untyped
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.model import FloatArray, IntArray
 from adjust.navigation.pose_kernels import retracted, step_between, step_derivative
 from adjust.navigation.row_kernels import SystemArrays, spot_rows

@@ -10,8 +10,8 @@ polished on the three equations, so that the polynomial only has to find the nei
 # reason: numba ships no types, so its decorator leaves every function below untyped
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.model import FloatArray
 
 MAX_SOLUTIONS = 8

@@ -8,8 +8,8 @@ Derivatives by poses are in GTSAM's tangent (rotation, translation, in the frame
 # reason: numba ships no types, so its decorator leaves every function below untyped
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.lens_kernels import MAX_LENS, N_COLUMNS, lens_row
 from adjust.model import BoolArray, FloatArray, IntArray
 

@@ -13,8 +13,8 @@ import heapq
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.model import IntArray
 
 Bits = npt.NDArray[np.uint64]

@@ -8,8 +8,8 @@ A network is given by compressed adjacency: the neighbours of station v, and the
 # reason: numba ships no types, so its decorator leaves every function below untyped
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.model import IntArray
 
 

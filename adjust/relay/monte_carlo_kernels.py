@@ -4,8 +4,8 @@
 # reason: numba ships no types, so its decorator leaves every function below untyped
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.model import FloatArray, IntArray
 
 

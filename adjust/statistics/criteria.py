@@ -4,10 +4,10 @@ A bias of non-centrality ``lambda0`` is found by a chi-square test of q componen
 Baarda's B-method asks the same lambda0 of all tests, so that a bias is found equally well whatever it is tested with.
 """
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import brentq
 
 from adjust.distributions import chi2, ncx2
 from adjust.statistics.result import Criteria, LevelOptions
@@ -25,13 +25,25 @@ def noncentrality(alpha: float, power: float, q: int) -> float:
     high = 1.0
     while ncx2.sf(critical, q, high) < power:
         high *= 2.0
-    return float(brentq(lambda x: float(ncx2.sf(critical, q, x)) - power, 1e-12, high, xtol=1e-12, rtol=1e-12))
+    return _crossing(lambda x: float(ncx2.sf(critical, q, x)) < power, high)
 
 
 def _critical(lambda0: float, power: float, q: int) -> float:
     """What chi-square (q, lambda0) exceeds with probability ``power``."""
     high = lambda0 + q
-    return float(brentq(lambda x: float(ncx2.sf(x, q, lambda0)) - power, 0.0, high, xtol=1e-12, rtol=1e-12))
+    return _crossing(lambda x: float(ncx2.sf(x, q, lambda0)) > power, high)
+
+
+def _crossing(beyond_low: Callable[[float], bool], high: float) -> float:
+    """Where between 0 and ``high`` a predicate changes, to 1e-15 of ``high``, by bisection.
+
+    ``scipy.optimize`` takes longer to load than a small survey to adjust.
+    """
+    low, at_low = 0.0, beyond_low(0.0)
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if beyond_low(middle) == at_low else (low, middle)
+    return 0.5 * (low + high)
 
 
 def criteria(options: LevelOptions, n_tests: int, most_components: int = 6) -> Criteria:

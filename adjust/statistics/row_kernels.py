@@ -4,8 +4,8 @@
 # reason: numba ships no types, so its decorator leaves every function below untyped
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.image_kernels import BlockArrays, LensArrays, PointArrays, local_row
 from adjust.lens_kernels import MAX_LENS
 from adjust.model import FloatArray

@@ -9,8 +9,8 @@ axes. Axes that turn by a small w, about the world's axes, change ``F d`` by ``F
 # reason: numba ships no types, so its decorator leaves every function below untyped
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.vertical import horizon_at
 

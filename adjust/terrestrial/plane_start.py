@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from adjust.terrestrial.sights import Node, Sights
 
@@ -255,6 +254,8 @@ def positions(
 
     One: it is unique. Several: each fits as well. Found from starts all round, as few points are concerned.
     """
+    from scipy.optimize import least_squares  # here: few surveys come this way, and it takes long to load
+
     centres = np.array([z for z, _ in rays] + [z for z, _ in circles] + [z for s in sets for z, _ in s])
     size = max(float(np.abs(centres - centres.mean()).max()), max((d for _, d in circles), default=0.0), 1e-3)
 

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from adjust.model import FloatArray
 from adjust.terrestrial.sights import Node, Sights
@@ -79,6 +78,8 @@ def _grow(distance: Mapping[Node, Mapping[Node, float]], known: dict[Node, Float
 
 def places(mine: Mapping[Node, float], known: Mapping[Node, FloatArray]) -> list[FloatArray]:
     """Where a point with these distances to known points can be: one place, two mirrored ones, or none certain."""
+    from scipy.optimize import least_squares  # here: few surveys come this way, and it takes long to load
+
     nodes = [n for n in mine if n in known]
     if len(nodes) < 3:
         return []

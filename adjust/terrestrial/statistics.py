@@ -12,8 +12,8 @@ from typing import overload
 
 import gtsam
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.model import FloatArray, IntArray, Survey
 from adjust.observation_factor import position_text
 from adjust.result import ObservationResidual, ReadingResiduals

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from survey.commands.common import is_set, not_negative, positive, print_json, require_project, say, tested
+from survey.commands.common import is_set, not_negative, positive, postpone, print_json, require_project, say, tested
 
 if TYPE_CHECKING:
     from survey.batch.record import Record
@@ -57,6 +57,7 @@ def _adjust(arguments: argparse.Namespace) -> int:
 
 
 def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
+    postpone()
     require_project(folder, arguments.out)
     from survey.jobs import adjust_job
 

@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import importlib.util
 import io
 import json
 import os
@@ -49,6 +50,19 @@ def run_command(program: str, build_parser: Callable[[], argparse.ArgumentParser
     except KeyboardInterrupt:
         print(f"\n{program}: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def postpone(names: Sequence[str] = ("numpy.f2py", "numpy.testing")) -> None:
+    """Modules that load when their contents are first looked at: SciPy imports all of NumPy and needs little of it."""
+    for name in names:
+        spec = importlib.util.find_spec(name)
+        if name not in sys.modules and spec is not None and spec.loader is not None:
+            spec.loader = importlib.util.LazyLoader(spec.loader)
+            module = importlib.util.module_from_spec(spec)
+            sys.modules[name] = module
+            spec.loader.exec_module(module)
+            parent, _, child = name.rpartition(".")
+            setattr(sys.modules[parent], child, module)
 
 
 def positive(text: str) -> int:

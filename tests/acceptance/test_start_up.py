@@ -1,0 +1,46 @@
+"""What a small network loads: the clock is for benchmarks, the list of modules does not depend on the machine."""
+
+import subprocess
+import sys
+
+import pytest
+
+from survey.cli import main
+
+NEEDLESS = (
+    "cv2", "matplotlib", "pycolmap", "pandas", "pyarrow", "distributed", "scipy.stats", "scipy.optimize",
+    "scipy.spatial", "scipy.fft", "numpy.f2py.crackfortran", "survey.detection", "survey.simulate",
+)  # fmt: skip
+COMPILER = ("numba.cpython.cmathimpl", "numba.misc.cffiimpl")
+"""Loaded by numba when it registers what it can compile."""
+CODE = """
+import sys
+from survey.cli import main
+code = main(["adjust", sys.argv[1], "--quiet"])
+print("CODE", code, "LOADED", *sorted(set(sys.argv[2:]) & set(sys.modules)))
+"""
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("start") / "network"
+    assert main(["example", "total-station", str(folder), "--quiet"]) == 0
+    return folder
+
+
+def loaded(folder, names):
+    run = subprocess.run(
+        [sys.executable, "-c", CODE, str(folder), *names], capture_output=True, text=True, timeout=300, check=True
+    )
+    last = run.stdout.splitlines()[-1].split()
+    assert last[:3] == ["CODE", "0", "LOADED"]
+    return last[3:]
+
+
+def test_a_network_of_readings_loads_nothing_that_it_does_not_need(network):
+    assert loaded(network, NEEDLESS) == []
+
+
+def test_cached_kernels_open_without_the_compiler(network):
+    loaded(network, ())  # fills the cache where it is empty
+    assert loaded(network, COMPILER) == []
