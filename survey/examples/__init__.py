@@ -6,7 +6,6 @@
 from pathlib import Path
 
 from adjust.errors import SurveyError
-from survey.whole_folder import whole_folder
 
 EXAMPLES = {
     "full-lab": "three-camera head on a two-axis table, board, wall plates, beacons, relay station of four cameras",
@@ -32,6 +31,8 @@ def write_example(name: str, folder: Path, *, seed: int = 1, jobs: int | None = 
     from survey.examples.plain import WITHOUT_IMAGES
 
     draft, files = MAKERS[name](seed) if name in MAKERS else (None, WITHOUT_IMAGES[name](seed))
+    from survey.whole_folder import whole_folder  # here: the command line asks this module for its names alone
+
     with whole_folder(Path(folder)) as place:
         for path, text in files.items():
             (place / path).parent.mkdir(parents=True, exist_ok=True)
