@@ -100,8 +100,8 @@ class PoseReduction:
         self.ready = False
         run_split(
             reduce_poses, [np.append(turn, run) for turn, run in enumerate(self._runs)], self.arrays, batch.arrays,
-            batch.state.lenses, batch.segments, batch.chains.C, batch.state.D, damping, batch.H, self.L, self.T,
-            diagonal, rest, bad,
+            batch.state.lenses, batch.segments, batch.width, batch.chains.C, batch.state.D, damping, batch.H, self.L,
+            self.T, diagonal, rest, bad,
         )  # fmt: skip
         return bool((bad < 0).all()) and self._serve(rest.sum(axis=0), diagonal.sum(axis=0))
 

@@ -41,54 +41,71 @@ class ReductionArrays(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_block(
-    b: int, n: int, nl: int, last: int, segments: SegmentArrays, place: IntArray, C: FloatArray, D: FloatArray,
-    H: FloatArray, K: FloatArray, E: FloatArray, M: FloatArray,
+def _by_own_columns(
+    b: int, w: int, segments: SegmentArrays, place: IntArray, C: FloatArray, D: FloatArray,
+    to: IntArray, G: FloatArray, E: FloatArray,
 ) -> None:  # fmt: skip
-    """Add G' H G of block b and its residual to the upper triangle of M; K and E are scratch."""
-    first, end = segments.ptr[b], segments.ptr[b + 1]
-    Hb = H[b]
-    for s in range(first, end):
+    """For the ``w`` columns of a block's keys: where they stand among those of its pose, and the pose's derivative G.
+
+    ``to`` (w + 1): also of the residual, the last one. G (6, w): zero for columns that are the block's own ones.
+    """
+    G[:, :w] = 0.0
+    for s in range(segments.ptr[b], segments.ptr[b + 1]):
+        o = segments.place[s]
+        for j in range(segments.n[s]):
+            to[o + j] = place[s] + j
         if segments.kind[s] != SEGMENT_LENS and segments.kind[s] != SEGMENT_WARP:
-            pose_by_key(s, segments, C, D, E[s - first])
-    for s in range(first, end):
-        k, ps = segments.n[s], place[s]
-        at = _first_column(s, nl, segments)
-        if at >= 0:
-            for i in range(n):
-                for j in range(k):
-                    K[i, j] = Hb[i, at + j]
-        else:
-            K[:n, :k] = 0.0
-            for i in range(n):
-                for a in range(6):
-                    h = Hb[i, nl + a]
-                    for j in range(k):
-                        K[i, j] += h * E[s - first, a, j]
-        for r in range(first, end):
-            if place[r] > ps:
-                continue
-            pr, at = place[r], _first_column(r, nl, segments)
-            for i in range(segments.n[r]):
-                if at >= 0:
-                    for j in range(k):
-                        M[pr + i, ps + j] += K[at + i, j]
-                    continue
-                for a in range(6):
-                    e = E[r - first, a, i]
-                    for j in range(k):
-                        M[pr + i, ps + j] += e * K[nl + a, j]
-        for j in range(k):
-            M[ps + j, last] += K[n - 1, j]
-    M[last, last] += Hb[n - 1, n - 1]
+            pose_by_key(s, segments, C, D, E)
+            for i in range(6):
+                for j in range(segments.n[s]):
+                    G[i, o + j] += E[i, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _first_column(s: int, nl: int, segments: SegmentArrays) -> int:
-    """First of the block's own columns that a segment is; -1 for poses, which reach it by the chain."""
-    if segments.kind[s] == SEGMENT_LENS:
-        return 0
-    return nl + 6 + segments.start[s] if segments.kind[s] == SEGMENT_WARP else -1
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _add_block(
+    b: int, n: int, nl: int, w: int, segments: SegmentArrays, H: FloatArray, to: IntArray, G: FloatArray,
+    K: FloatArray, N: FloatArray, M: FloatArray,
+) -> None:  # fmt: skip
+    """Add a block's normal matrix H (n, n) by its ``w`` columns, and its residual, to the upper triangle of M.
+
+    K, N: scratch (MAX_LOCAL, w + 1) and (w + 1, w + 1): H times the derivative, and that from both sides.
+    """
+    for i in range(n):
+        K[i, :w] = 0.0
+        K[i, w] = H[i, n - 1]
+        for a in range(6):
+            h = H[i, nl + a]
+            for j in range(w):
+                K[i, j] += h * G[a, j]
+    N[: w + 1, : w + 1] = 0.0
+    for s in range(segments.ptr[b], segments.ptr[b + 1]):
+        lens = segments.kind[s] == SEGMENT_LENS
+        if lens or segments.kind[s] == SEGMENT_WARP:
+            at, o = 0 if lens else nl + 6 + segments.start[s], segments.place[s]
+            for j in range(segments.n[s]):
+                for i in range(n):
+                    K[i, o + j] += H[i, at + j]
+    for s in range(segments.ptr[b], segments.ptr[b + 1]):
+        lens = segments.kind[s] == SEGMENT_LENS
+        if lens or segments.kind[s] == SEGMENT_WARP:
+            at, o = 0 if lens else nl + 6 + segments.start[s], segments.place[s]
+            for i in range(segments.n[s]):
+                for j in range(w + 1):
+                    N[o + i, j] += K[at + i, j]
+    for i in range(w):
+        for a in range(6):
+            g = G[a, i]
+            if g != 0.0:
+                for j in range(w + 1):
+                    N[i, j] += g * K[nl + a, j]
+    N[w, w] = H[n - 1, n - 1]
+    for i in range(w + 1):
+        for j in range(i, w + 1):
+            x, y = to[i], to[j]
+            if x <= y:
+                M[x, y] += N[i, j]
+            else:
+                M[y, x] += N[i, j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -123,8 +140,8 @@ def _eliminate_pose(M: FloatArray, m: int) -> bool:
 @njit(cache=True, nogil=True, error_model="numpy")
 def reduce_poses(
     run: IntArray, a: ReductionArrays, blocks: BlockArrays, lenses: LensArrays, segments: SegmentArrays,
-    C: FloatArray, D: FloatArray, damping: float, H: FloatArray, L: FloatArray, T: FloatArray, diagonal: FloatArray,
-    rest: FloatArray, bad: IntArray,
+    width: IntArray, C: FloatArray, D: FloatArray, damping: float, H: FloatArray, L: FloatArray, T: FloatArray,
+    diagonal: FloatArray, rest: FloatArray, bad: IntArray,
 ) -> None:  # fmt: skip
     """Reduce the poses in run[1:]: L (J, 6, 6) upper and T stay for what follows; the sums are those of turn = run[0].
 
@@ -135,7 +152,8 @@ def reduce_poses(
     most, turn = 0, run[0]
     for j in run[1:]:
         most = max(most, a.col_ptr[j + 1] - a.col_ptr[j])
-    M, K, E = np.empty((most + 7, most + 7)), np.empty((MAX_LOCAL, MAX_LOCAL)), np.empty((MAX_LOCAL, 6, 6))
+    M, E, to = np.empty((most + 7, most + 7)), np.empty((6, 6)), np.empty(most + 7, dtype=np.int64)
+    G, K, N = np.empty((6, most + 7)), np.empty((MAX_LOCAL, most + 7)), np.empty((most + 7, most + 7))
     end = rest.shape[1] - 1
     for j in run[1:]:
         k = a.col_ptr[j + 1] - a.col_ptr[j]
@@ -144,7 +162,10 @@ def reduce_poses(
         for i in range(a.block_ptr[j], a.block_ptr[j + 1]):
             b = a.block[i]
             nl = lenses.n_free[blocks.camera[b]]
-            _add_block(b, nl + 7 + blocks.n_warp[b], nl, m - 1, segments, a.place, C, D, H, K, E, M)
+            n, w = nl + 7 + blocks.n_warp[b], width[b]
+            to[w] = m - 1
+            _by_own_columns(b, w, segments, a.place, C, D, to, G, E)
+            _add_block(b, n, nl, w, segments, H[b], to, G, K, N, M)
         for i in range(6):
             M[i, i] *= 1.0 + damping
         columns = a.col[a.col_ptr[j] : a.col_ptr[j + 1]]
