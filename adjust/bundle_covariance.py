@@ -3,12 +3,9 @@
 With Y = -V^-1 W of a reduced point: Q_XX = V^-1 + Y Q Y', Q_Xc = Y Q, for Q of lenses and poses (Triggs et al. 2000).
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.lens_kernels import MAX_LENS
 from adjust.model import FloatArray, IntArray
 

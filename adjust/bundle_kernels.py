@@ -5,12 +5,9 @@ then the points that stay (tied to other observations). The other points are red
 al. 2000, "Bundle adjustment - a modern synthesis", section 6). Observations are sorted by point, then camera.
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.image_kernels import LensArrays, local_row
 from adjust.lens_kernels import MAX_LENS
 from adjust.model import FloatArray, IntArray

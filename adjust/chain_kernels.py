@@ -5,9 +5,6 @@ forward link i reaches T through ``Ad((A_{i+1} ... A_n)^-1)``; of an inverted li
 (Sola, Deray, Atchuthan 2018, "A micro Lie theory", section II.G).
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
 
 from adjust.compiling import njit

@@ -4,14 +4,11 @@ A block is what one camera saw of one target at one epoch. Its local unknowns ar
 camera, the six of ``camera_from_target`` (tangent on the right) and, where the target has them, two of its warp.
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.lens_columns import (
     BY_POINT_U,
     BY_POINT_V,

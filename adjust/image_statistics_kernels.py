@@ -1,11 +1,8 @@
 """Compiled residuals of image points, and what the adjustment takes of their noise: A Q A', block after block."""
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.image_kernels import (
     CHUNK,
     BlockArrays,

@@ -1,14 +1,10 @@
 """The forward Brown model of many image points at once, column by column: short loops that are vectorised.
 
 Every loop writes one array from a few others, which is what a compiler turns into vector instructions; the same
-arithmetic as ``adjust.lens_kernels``, point by point, takes some eight times as long.
+arithmetic as ``adjust.lens_kernels``, point by point, takes several times as long.
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
-from numba import njit
-
+from adjust.compiling import njit
 from adjust.lens_kernels import SMALLEST_DEPTH
 from adjust.model import FloatArray
 

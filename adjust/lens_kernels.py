@@ -12,14 +12,11 @@ A compiled caller with ``cache=True`` keeps its own copy of these functions: aft
 until its own file changes.
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import math
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.model import FloatArray
 
 BROWN = 0

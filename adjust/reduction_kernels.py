@@ -3,14 +3,11 @@
 A pose's columns are its own six, then those of the keys its blocks share with others, then the residual.
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.image_kernels import (
     MAX_LOCAL,
     SEGMENT_LENS,

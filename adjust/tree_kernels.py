@@ -5,9 +5,6 @@ children. Row-major blocks of nf x n numbers begin at ``at[c]``: in ``data`` fir
 ``cov`` the rows of the covariance that belong to the frontal keys.
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,9 +5,6 @@ horizontal axis is the axis ``zero`` of the world, turned by the tilt and laid i
 degrees counter-clockwise of it, seen from above.
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,8 +1,5 @@
 """The pose of an epoch by Gauss-Newton, compiled; what it computes is said in ``adjust.navigation.fit``."""
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
 
 from adjust.compiling import njit

@@ -6,9 +6,6 @@ polynomial of degree 8 in one depth; its positive roots are bracketed by those o
 polished on the three equations, so that the polynomial only has to find the neighbourhood.
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
 
 from adjust.compiling import njit

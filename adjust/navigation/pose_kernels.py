@@ -1,8 +1,5 @@
 """Steps between poses, compiled: the same formulas as ``adjust.closed_forms.rigid``, for one pose at a time."""
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
 
 from adjust.compiling import njit

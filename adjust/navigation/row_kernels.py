@@ -4,9 +4,6 @@
 Derivatives by poses are in GTSAM's tangent (rotation, translation, in the frame on the right).
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
 
 from adjust.compiling import njit

@@ -1,8 +1,5 @@
 """Hypotheses of which spot is which beacon, compiled: three spots named at a time, all poses, consensus of the rest."""
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
 
 from adjust.compiling import njit

@@ -6,9 +6,6 @@ ones before are one. His proof asks of v only that it lies on the loop, so v nee
 meets every loop (Mehlhorn and Michail 2009, ACM J. Exp. Algorithmics 14).
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import heapq
 
 import numpy as np

@@ -4,9 +4,6 @@ A network is given by compressed adjacency: the neighbours of station v, and the
 ``ptr[v]:ptr[v + 1]`` of ``neighbour`` and ``pair``. Two stations may be measured more than once.
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
 
 from adjust.compiling import njit

@@ -1,8 +1,5 @@
 """Compiled least squares for many complete networks of rotations at once: the parametric form, station 0 held."""
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
 
 from adjust.compiling import njit

@@ -1,8 +1,5 @@
 """Compiled: the whitened rows of single image points, which the batches condense and do not keep."""
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
 
 from adjust.compiling import njit

@@ -5,9 +5,6 @@ instrument (rows: zero, counter-clockwise, up), with heights h along the plumb l
 axes. Axes that turn by a small w, about the world's axes, change ``F d`` by ``F (d x w)``.
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 import numpy as np
 
 from adjust.compiling import njit
