@@ -11,9 +11,14 @@ MISSING = "–"
 MINUS = "−"
 
 
+TURNING = {ord(sign): f"\\u{ord(sign):04x}" for sign in "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e"
+           "\u2066\u2067\u2068\u2069"}  # fmt: skip
+"""Signs that let what follows them be shown in another order, with what stands for them on a page."""
+
+
 def esc(value: object) -> str:
-    """Text that cannot be taken for markup."""
-    return html.escape(str(value), quote=True)
+    """Text that cannot be taken for markup, and shows its characters in the order in which they stand."""
+    return html.escape(str(value).translate(TURNING), quote=True)
 
 
 def fixed(value: float | None, decimals: int) -> str:
