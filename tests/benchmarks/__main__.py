@@ -36,6 +36,7 @@ def main() -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     session = Session(options)
     session.say("# Benchmarks", "", f"Measured by `{_command()}`.", "", _machine(options.threads))
+    session.top = len(session.text)
     for name in options.only:
         begin = time.perf_counter()
         try:
@@ -46,6 +47,7 @@ def main() -> int:
             session.say("", f"The case “{name}” failed: {error}.")
         print(f"  {name}: {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
         session.write(options.json)
+    print(*session.summary(), sep="\n")
     return 1 if session.failures else 0
 
 

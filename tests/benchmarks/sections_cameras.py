@@ -45,6 +45,11 @@ def several_cameras(session: Session) -> None:
         session.say("", f"### {frames} frames", "", tables.times(list(found.values()), found[STAGES]), "")
         session.say(tables.optima(case, list(found.values()), found[TIGHT], found[PRECISION].solution["sigmas"]))
         session.say("", tables.against(found, STAGES, [MRCAL, MULTIVIEW, PLAIN]))
+        what = f"3 cameras x {frames}, solution and every covariance: times as long takes"
+        session.claim(f"{what} mrcal's optimiser", tables.times_as_long(found[MRCAL], found[STAGES]), 4.0, "", True)
+        if frames == 500:
+            wide = tables.times_as_long(found[MULTIVIEW], found[STAGES])
+            session.claim(f"{what} calibrateMultiview", wide, 100.0, "", True)
     shown = [STAGES, SOLVE, ALL, MRCAL, CAMERAS, MULTIVIEW, PLAIN]
     session.picture("cameras", lines(list(sizes), runs, shown), "Three cameras", "frames")
 
@@ -60,7 +65,11 @@ def one_camera(session: Session) -> None:
         names += [NATIVE, TRUST] if n == 50 else []
         found = session.compete(f"1 x {n}", case, calibration(1, 10, (8, 11)), names, budget=12.0)
         session.say("", f"### {n} images", "", tables.times(list(found.values()), found[STAGES]), "")
-        session.say(tables.optima(case, list(found.values()), found[TIGHT], found[PRECISION].solution["sigmas"]))
+        sigmas = found[PRECISION].solution["sigmas"]
+        session.say(tables.optima(case, list(found.values()), found[TIGHT], sigmas))
+        if found[CAMERAS].seconds:
+            apart = np.abs(found[CAMERAS].solution["lens"] - found[SOLVE].solution["lens"]) / sigmas
+            session.claim(f"1 camera x {n}: lens from OpenCV's", float(apart.max()), 1e-6, "sigmas")
 
 
 def unknown_points(session: Session) -> None:
@@ -79,6 +88,7 @@ def unknown_points(session: Session) -> None:
         f"v'Pv = {numbers['omega']:.5f}, published 12359.40759; "
         f"redundancy {numbers['redundancy']:.0f}, published 18804."
     )
+    session.claim("AICON's bundle with every covariance and redundancy number", found[ours].median, 0.3, "s")
     session.say(
         "", "Simulated, all round a hall. Ours: inner constraints over some ten points, all covariances, redundancy "
         "numbers and tests. COLMAP: two cameras fixed, all covariances (`estimate_ba_covariance`), nothing else.",
@@ -89,6 +99,8 @@ def unknown_points(session: Session) -> None:
         session.say("", f"### {size[0]} images, {len(case.points)} points, {len(case.uv)} image points", "")
         found = session.compete(f"{size[0]} x {len(case.points)}", case, warm, [ours, colmap], budget=40.0)
         runs.append(found)
+        what = f"{size[0]} images x {len(case.points)} points: times as long takes COLMAP"
+        session.claim(what, tables.times_as_long(found[colmap], found[ours]), 2.0 if size[0] == 500 else 1.0, "", True)
         session.say(tables.times(list(found.values()), found[ours]), "")
         session.say(tables.stages(list(found.values())), "")
         if found[colmap].seconds:
@@ -115,7 +127,12 @@ def scaling(session: Session) -> None:
                      f"{(m.peak_mb - m.idle_mb) / (1.2 * frames):.2f}"])  # fmt: skip
     head = ("images", "image points", *found[0].stages, "sum", "peak MB", "kB per image point")
     session.say(tables.table(head, rows))
+    last = found[-1]
+    if sizes[-1] == 1000:
+        session.claim("12 cameras x 1000 images, solution, sigmas, redundancy numbers", last.median, 10.0, "s")
+        session.claim("12 cameras x 1000 images, memory", last.peak_mb, 1500.0, "MB")
     images = np.array([12.0 * frames for frames in sizes])
     every = [Line("sum", images, np.array([m.median for m in found]), True)]
     every += [Line(s, images, np.array([float(np.median(m.stages[s])) for m in found])) for s in found[0].stages]
+    session.claim("12 cameras: exponent of time by images", every[0].exponent, 1.1)
     session.picture("scaling", every, "Twelve cameras", "images")

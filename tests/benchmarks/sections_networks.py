@@ -25,6 +25,8 @@ def published_graphs(session: Session) -> None:
     for name in names:
         case = pose_graphs.read(folder / f"{name}.g2o")
         found = session.compete(name, case, warm, list(pose_graphs.GRAPHS), budget=8.0)
+        what = f"{name} with covariances: times as long takes GTSAM"
+        session.claim(what, tables.times_as_long(found[gauss], found[ours]), 1.0, "", True)
         session.say("", f"### {name}: {len(case.start)} poses, {len(case.a)} pairs", "")
         session.say(tables.times(list(found.values()), found[ours]), "", tables.stages(list(found.values())), "")
         apart = {n: pose_graphs.difference(case, found[ours].solution, found[n].solution)
@@ -55,6 +57,7 @@ def additions(session: Session) -> None:
     session.say("A corridor, two stations a row, every one with its pairs to those before; ms an addition.", "")
     session.say(tables.table(("stations before", "median", "95 %", "worst"), table), "")
     last, second = float(np.median(parts[-1])), float(np.median(parts[1]))
+    session.claim(f"{2 * rows} additions: last tenth against the second", last / second, 1.25)
     session.say(
         f"The last tenth takes {last / second:.2f} times as long as the second. Difference to the batch solution: "
         f"{m.numbers['before_sigma']:.1e} sigmas while it grows, {m.numbers['after_sigma']:.1e} after finishing "
@@ -109,6 +112,7 @@ def readings(session: Session) -> None:
         found = session.compete(label, terrestrial.case(n, free), warm, names, budget=12.0)
         if not free:
             sums.append((n, found))
+        _reading_claims(session, n, free, found[ours])
         for m in found.values():
             rows.append([label, m.name, tables.seconds(m.median), *_parts(m.stages), m.note, f"{m.peak_mb:.0f}"])
         if dense in found and found[dense].seconds:
@@ -120,6 +124,16 @@ def readings(session: Session) -> None:
     session.picture("readings", times, "Networks of readings", "points")
     memory = [Line(ours, sizes, np.array([f[ours].peak_mb for _, f in sums]), True)]
     session.picture("readings-memory", memory, "Networks of readings, memory", "points", "MB")
+
+
+def _reading_claims(session: Session, n: int, free: bool, m: Measured) -> None:
+    what = f"{n} points{', free' if free else ''}"
+    if n == 1000:
+        session.claim(f"{what}: every statistic and the whole covariance", m.median, 3.0, "s")
+    if n == 3000:
+        session.claim(f"{what}: memory", m.peak_mb, 2400.0, "MB")
+    if n == 10000:
+        session.claim(f"{what}: solution and variances", m.median, 60.0, "s")
 
 
 def _agreement(ours: Measured, dense: Measured, free: bool) -> str:
@@ -146,8 +160,10 @@ def simulations(session: Session) -> None:
     found = session.compete(
         "table 1", trials.Trials(np.array(trial)), trials.Trials(np.array(10)), [trials.TABLE_1, trials.TABLE_1_GTSAM]
     )
+    session.claim(f"Table 1, {trial} trials", found[trials.TABLE_1].median, 2.0, "s")
     session.say(f"Table 1 of the relay paper, four cameras, {trial} trials:", "")
     session.say(tables.times(list(found.values()), found[trials.TABLE_1]), "")
     found = session.compete("curves", trials.Trials(np.array(points)), trials.Trials(np.array(10)), [trials.ERRORS])
+    session.claim(f"Error analysis, {points} trials a point", found[trials.ERRORS].median, 10.0, "s")
     session.say(f"Error analysis of the head's paper, {points} trials a point:", "")
     session.say(tables.times(list(found.values()), found[trials.ERRORS]))

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.benchmarks import plots
+from tests.benchmarks import plots, tables
 from tests.benchmarks.children import Measured, compete
 from tests.benchmarks.kinds import Case
 
@@ -23,6 +23,8 @@ class Session:
         self.measured: list[Measured] = []
         self.text: list[str] = []
         self.failures: list[str] = []
+        self.claims: list[tuple[str, ...]] = []
+        self.top = 0
 
     def say(self, *lines: str) -> None:
         """To the terminal now and to the document later."""
@@ -54,13 +56,29 @@ class Session:
             plots.write(self.doc.parent / "pictures", name, plots.loglog(lines, title, x_label, y_label))
             self.say("", f"![{title}](pictures/benchmark-{name}.svg)")
 
+    def claim(self, what: str, measured: float, wanted: float, unit: str = "", least: bool = False) -> None:
+        """One line of the summary: the measured number is to be at most (or at least) the wanted one."""
+        if measured != measured:
+            met = "not measured"
+        else:
+            met = "yes" if (measured >= wanted if least else measured <= wanted) else "no"
+        bound = f"{'at least' if least else 'at most'} {wanted:g} {unit}".strip()
+        self.claims.append((what, f"{measured:.3g} {unit}".strip(), bound, met))
+
+    def summary(self) -> list[str]:
+        """The claims as a table."""
+        if not self.claims:
+            return []
+        return ["", "## In short", "", tables.table(("", "measured", "wanted", "met"), self.claims)]
+
     def write(self, path: Path | None) -> None:
         """All measurements as JSON, and the document."""
         if path:
             path.write_text(json.dumps([_plain(m) for m in self.measured], indent=1))
         if self.doc:
             self.doc.parent.mkdir(parents=True, exist_ok=True)
-            self.doc.write_text("\n".join(self.text) + "\n")
+            text = [*self.text[: self.top], *self.summary(), *self.text[self.top :]]
+            self.doc.write_text("\n".join(text) + "\n")
 
 
 def _plain(m: Measured) -> dict[str, object]:

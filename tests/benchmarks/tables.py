@@ -33,6 +33,12 @@ def ratio(measured: Measured, reference: Measured) -> str:
     return f"{np.median(each):.2f} ({each.min():.2f} to {each.max():.2f})"
 
 
+def times_as_long(measured: Measured, reference: Measured) -> float:
+    """Median of the ratios, run by run; nan where one of them did not run."""
+    n = min(len(measured.seconds), len(reference.seconds))
+    return float(np.median(np.array(measured.seconds[:n]) / np.array(reference.seconds[:n]))) if n else float("nan")
+
+
 def times(found: Sequence[Measured], reference: Measured) -> str:
     """Time, spread, processor time, ratio and memory of all competitors."""
     rows = []
