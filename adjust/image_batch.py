@@ -202,6 +202,10 @@ class ImageBatch:
         self._evaluate(self._all, jacobians)
         self._prepared, self._with_jacobians = values, jacobians
 
+    def forget(self) -> None:
+        """Evaluate again when next asked, whatever the values."""
+        self._prepared = None
+
     def _evaluate(self, runs: list[IntArray], jacobians: bool) -> None:
         s, c = self.state, self.chains
         given = (self.arrays, self.points, self.W, s.lenses, c.R, c.t, s.warp)
@@ -259,7 +263,7 @@ class ImageBatch:
 
     def set_weights(self, weights: FloatArray) -> None:
         """Weights (N,) on top of the covariances; a point of weight zero is left out, the others are used."""
-        self._prepared = None
+        self.forget()
         self.used = weights > 0.0
         self.W = self.W_all_columns * np.sqrt(weights)
 
