@@ -30,7 +30,7 @@ class AnglesFile:
         try:
             told = json.loads(self.path.read_text(encoding="utf-8"))
             return float(told["axis1_rad"]), float(told["axis2_rad"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             raise SurveyError(
                 f"{self.path}: does not tell the table's angles ({error}); start the simulated table first"
             ) from error

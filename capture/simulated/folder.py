@@ -61,7 +61,7 @@ def read_lab(folder: Path, noise_seed: int | None = None) -> SimulatedLab:
         poses = (LabPose(**{**pose, "camera_ids": tuple(pose["camera_ids"])}) for pose in told["poses"])
         noise_seed = secrets.randbits(32) if noise_seed is None else noise_seed
         return furnished_lab(int(told["seed"]), tuple(poses), noise_seed)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise SurveyError(f"{file}: no simulated laboratory ({error}); write one first") from error
 
 

@@ -10,6 +10,7 @@ Exit code 1 where anything was found. A finding is kept as a file, with the mess
 
 import argparse
 import itertools
+import json
 import math
 import multiprocessing
 import os
@@ -22,6 +23,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from adjust.errors import SurveyError
+from tests.fuzz.called import functions_called
 from tests.fuzz.mutate import Mutator
 from tests.fuzz.readers import READERS
 from tests.fuzz.watch import ForbiddenError, HangError, Watch, limit_memory
@@ -43,6 +45,7 @@ def main() -> int:
     parser.add_argument("--limit-s", type=float, default=5.0, help="for one input")
     parser.add_argument("--findings", type=Path, default=Path(tempfile.gettempdir()) / "labsurvey-findings")
     parser.add_argument("--replay", type=Path, help="corpus folder: read its inputs once instead of new ones")
+    parser.add_argument("--called", type=Path, help="write which functions of the packages read the good files")
     parser.add_argument("--jobs", type=int, default=1, help="readers at the same time")
     arguments = parser.parse_args()
     names = arguments.reader.split(",")
@@ -55,6 +58,9 @@ def main() -> int:
     begin = time.perf_counter()
     with ThreadPoolExecutor(arguments.jobs) as pool:
         results = list(pool.map(lambda name: outside(name, arguments), names))
+    if arguments.called:
+        called = sorted(set().union(*(r["called"] for r in results)))
+        arguments.called.write_text(json.dumps(called, indent=0), encoding="utf-8")
     total, found = sum(r["inputs"] for r in results), sum(len(r["findings"]) for r in results)
     print(f"{total} inputs, {found} findings, seed {arguments.seed}, {time.perf_counter() - begin:.0f} s, "
           f"findings in {arguments.findings}")  # fmt: skip
@@ -75,7 +81,7 @@ def outside(name: str, arguments: argparse.Namespace) -> dict:
     process.join()
     if result is None:
         kept = arguments.findings / name
-        result = {"inputs": 0, "refused": 0, "slowest_s": 0.0,
+        result = {"inputs": 0, "refused": 0, "slowest_s": 0.0, "called": [],
                   "findings": {f"process ended with {process.exitcode}, see {kept}.log": 1}}  # fmt: skip
     lines = [f"{name:<40}{result['inputs']:>9} inputs {result['refused']:>9} refused "
              f"{time.perf_counter() - begin:>8.1f} s   slowest {result['slowest_s']:.2f} s"]  # fmt: skip
@@ -101,6 +107,7 @@ def fuzz(name: str, arguments: argparse.Namespace) -> dict:
         seeds = reader.seeds()
         for good in seeds:  # warm: compiles kernels, imports what is imported late
             read(good)
+        called = functions_called(read, seeds) if arguments.called else []
         watch = Watch(place, arguments.limit_s)
         limit_memory(_MEMORY)
         if arguments.replay:
@@ -110,7 +117,7 @@ def fuzz(name: str, arguments: argparse.Namespace) -> dict:
             end = time.process_time() + arguments.cpu_s
             made = (mutator.next() for _ in range(arguments.count))
             inputs = itertools.takewhile(lambda _: time.process_time() < end, made)
-        return _loop(inputs, read, watch, kept)
+        return _loop(inputs, read, watch, kept) | {"called": called}
 
 
 def _loop(inputs, read, watch, kept) -> dict:

@@ -1,6 +1,7 @@
-"""Fuzzing guided by coverage: ``python -m tests.fuzz.guided READER [options of libFuzzer]``; needs atheris.
+"""Fuzzing guided by coverage: ``python -m tests.fuzz.guided READER [options of libFuzzer] [FOLDER]``; needs atheris.
 
-New inputs that reach new code are kept in the folder of a last argument, as libFuzzer does.
+Inputs that reach new code are kept in the folder of a last argument, as libFuzzer does. What counts as a finding is
+the same as without guidance; it ends the run and its input is written as ``crash-...``.
 """
 
 import contextlib
@@ -10,33 +11,43 @@ from pathlib import Path
 
 import atheris
 
-from adjust.errors import SurveyError
-
-with atheris.instrument_imports(include=["survey.files", "survey.interop", "survey.previous", "capture.plan", "csv"]):
-    from tests.fuzz.readers import READERS
+_PACKAGES = ["survey", "capture", "csv", "tomllib", "json", "zipfile", "ast"]
 
 
 def main() -> None:
-    """Run until libFuzzer's options say stop; a finding ends the run and is written as ``crash-...``."""
+    """Run until libFuzzer's options say stop."""
     name, *options = sys.argv[1:]
-    reader = READERS[name]
-    with tempfile.TemporaryDirectory() as folder:
-        place, seeds = Path(folder) / "place", Path(folder) / "seeds"
-        place.mkdir()
-        seeds.mkdir()
-        read = reader.prepare(place)
-        for i, data in enumerate(reader.seeds()):
-            (seeds / str(i)).write_bytes(data)
-            read(data)
+    with atheris.instrument_imports(include=_PACKAGES):
+        from adjust.errors import SurveyError
+        from tests.fuzz.readers import READERS
+        from tests.fuzz.watch import Watch
 
-        def one(data: bytes) -> None:
-            with contextlib.suppress(SurveyError):
+        reader = READERS[name]
+        with tempfile.TemporaryDirectory() as folder:
+            place, seeds = Path(folder).resolve() / "place", Path(folder) / "seeds"
+            place.mkdir()
+            seeds.mkdir()
+            good = reader.seeds()
+            read = reader.prepare(place)
+            for i, data in enumerate(good):  # imports what is imported late, instrumented too
+                (seeds / str(i)).write_bytes(data)
                 read(data)
+            words = Path(folder) / "words"
+            words.write_text("".join(f'"{_quoted(word)}"\n' for word in reader.dictionary), encoding="ascii")
+            watch = Watch(place, 5.0)
 
-        kept = [o for o in options if not o.startswith("-")]
-        flags = [o for o in options if o.startswith("-")]
-        atheris.Setup([sys.argv[0], *flags, *kept, str(seeds)], one)
-        atheris.Fuzz()
+            def one(data: bytes) -> None:
+                with contextlib.suppress(SurveyError), watch.reading():
+                    read(data)
+
+            flags = [o for o in options if o.startswith("-")] + [f"-dict={words}"] * bool(reader.dictionary)
+            kept = [o for o in options if not o.startswith("-")]
+            atheris.Setup([sys.argv[0], *flags, *kept, str(seeds)], one)
+            atheris.Fuzz()
+
+
+def _quoted(word: bytes) -> str:
+    return "".join(f"\\x{byte:02x}" for byte in word)
 
 
 if __name__ == "__main__":

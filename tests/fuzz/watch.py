@@ -17,6 +17,9 @@ _CHANGES = ("os.remove", "os.rename", "os.rmdir", "os.mkdir", "os.link", "os.sym
 _BESIDE = ("os.remove", "os.rmdir", "os.rename")  # these may be told a folder by its handle
 
 
+_WAITING = 10.0  # times the limit by the clock on the wall
+
+
 class ForbiddenError(BaseException):
     """Not an Exception: no reader can mistake it for a fault of its file."""
 
@@ -33,18 +36,21 @@ class Watch:
         self._code = tuple(os.path.realpath(p) for p in {sys.prefix, sys.base_prefix, str(Path(__file__).parents[2])})
         self._armed = False
         sys.addaudithook(self._event)
-        signal.signal(signal.SIGALRM, self._late)
+        for number in (signal.SIGALRM, signal.SIGPROF):
+            signal.signal(number, self._late)
         warnings.simplefilter("error")  # a warning out of a reader is a fault that nobody thought of
 
     @contextmanager
     def reading(self) -> Iterator[None]:
         """While one input is read."""
-        signal.setitimer(signal.ITIMER_REAL, self._limit_s)
+        signal.setitimer(signal.ITIMER_PROF, self._limit_s)  # of the processor: others may be busy with it
+        signal.setitimer(signal.ITIMER_REAL, _WAITING * self._limit_s)  # and whoever waits takes none
         self._armed = True
         try:
             yield
         finally:
             self._armed = False
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
             signal.setitimer(signal.ITIMER_REAL, 0.0)
 
     def _late(self, *_: Any) -> None:
