@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adjust.errors import SurveyError
-from survey.commands.common import DONE, is_set, print_json, run_command, say
+from survey.commands.common import DONE, Version, is_set, print_json, run_command, say
+from survey.commands.completing import declare_completion_of
 
 if TYPE_CHECKING:
     from capture.camera import CameraInfo
@@ -50,12 +51,14 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "labcapture", usage=f"{_OPENING}   (labcapture COMMAND ...)", description=_DESCRIPTION, epilog=_EPILOG, **shaped
     )
+    parser.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_run(commands, shaped)
     _add_cameras(commands, shaped)
     _add_table(commands, shaped)
     _add_view(commands, shaped)
     _add_export(commands, shaped)
+    declare_completion_of("labcapture", build_parser, commands, shaped)
     return parser
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from survey.commands.adjusting import declare_adjust
 from survey.commands.aligning import declare_align
-from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, run_command
+from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, Version, run_command
 from survey.commands.comparing import declare_compare
 from survey.commands.completing import declare_completion
 from survey.commands.converting import declare_convert
@@ -74,24 +74,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "labsurvey", usage=f"{_OPENING}   (labsurvey COMMAND ...)", description=_DESCRIPTION, epilog=_EPILOG, **shaped
     )
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and stop")
+    parser.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for declare in _COMMANDS:
         declare(commands, shaped)
     return parser
-
-
-class _Version(argparse.Action):
-    """Prints the version, which is looked up only when it is asked for."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        from importlib.metadata import PackageNotFoundError, version
-
-        try:
-            print(f"labsurvey {version('labsurvey')}")
-        except PackageNotFoundError:
-            print("labsurvey, run from its source folder without being installed")
-        parser.exit()
 
 
 if __name__ == "__main__":

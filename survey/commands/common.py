@@ -65,6 +65,20 @@ def postpone(names: Sequence[str] = ("numpy.f2py", "numpy.testing")) -> None:
             setattr(sys.modules[parent], child, module)
 
 
+class Version(argparse.Action):
+    """Prints the version, which is looked up only when it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        """Print it and stop."""
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            print(f"{parser.prog} {version('labsurvey')}")
+        except PackageNotFoundError:
+            print(f"{parser.prog}, run from its source folder without being installed")
+        parser.exit()
+
+
 def positive(text: str) -> int:
     """A count from the command line, 1 or more."""
     value = int(text)

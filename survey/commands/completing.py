@@ -1,34 +1,44 @@
-"""The command ``completion``."""
+"""The command ``completion``, of ``labsurvey`` and of ``labcapture``."""
 
 import argparse
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from survey.commands.common import DONE
 
 _EPILOG = """\
-bash: labsurvey completion bash > ~/.local/share/bash-completion/completions/labsurvey
-zsh:  labsurvey completion zsh > a file named _labsurvey in a folder of $fpath
-fish: labsurvey completion fish > ~/.config/fish/completions/labsurvey.fish
-Next: open a new shell, type labsurvey and press Tab
+bash: {program} completion bash > ~/.local/share/bash-completion/completions/{program}
+zsh:  {program} completion zsh > a file named _{program} in a folder of $fpath
+fish: {program} completion fish > ~/.config/fish/completions/{program}.fish
+Next: open a new shell, type {program} and press Tab
 """
 
 
 def declare_completion(commands: Any, shaped: dict[str, Any]) -> None:
-    """Add ``completion`` to the commands."""
+    """Add ``completion`` to the commands of ``labsurvey``."""
+    from survey.cli import build_parser
+
+    declare_completion_of("labsurvey", build_parser, commands, shaped)
+
+
+def declare_completion_of(
+    program: str, build_parser: Callable[[], argparse.ArgumentParser], commands: Any, shaped: dict[str, Any]
+) -> None:
+    """Add ``completion`` to the commands of a program whose parser ``build_parser`` makes."""
     parser = commands.add_parser(
         "completion",
         help="print what makes Tab complete commands and flags in bash, zsh or fish",
-        usage="labsurvey completion bash   (labsurvey completion SHELL)",
+        usage=f"{program} completion bash   ({program} completion SHELL)",
         description="Prints a script for the shell; nothing is installed.",
-        epilog=_EPILOG,
+        epilog=_EPILOG.format(program=program),
         **shaped,
     )
     parser.add_argument("shell", choices=("bash", "zsh", "fish"), metavar="SHELL", help="bash, zsh or fish")
-    parser.set_defaults(run=_completion, parser=parser)
+    parser.set_defaults(run=partial(_completion, build_parser))
 
 
-def _completion(arguments: argparse.Namespace) -> int:
-    from survey.cli import build_parser
+def _completion(build_parser: Callable[[], argparse.ArgumentParser], arguments: argparse.Namespace) -> int:
     from survey.completion import completion_script
 
     print(completion_script(build_parser(), arguments.shell), end="")
