@@ -150,6 +150,7 @@ def start(argv: list[str], home: Path, happens: Happens | None = None) -> int:
 
 def in_a_copy(action: Callable[[], int], home: Path) -> int:
     """Run something in a copy of this process, which ends with the code that it returns; the pid of the copy."""
+    (home / "said.txt").touch()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # no thread of this process holds a lock now
         pid = os.fork()
