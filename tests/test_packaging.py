@@ -11,6 +11,7 @@ import pytest
 
 from survey.cli import build_parser, main
 from survey.completion import SHELLS, commands_of, completion_script
+from tests.lower_bounds import pins, requirements
 
 ROOT = Path(__file__).parents[1]
 
@@ -43,16 +44,23 @@ def test_wheel_has_every_source_and_nothing_else(installed: set[str]) -> None:
 
 
 def test_every_dependency_has_a_lower_bound_and_a_licence() -> None:
+    """``pins`` raises for a requirement without a bound; packaging_smoke.py --lowest installs what it gives."""
     setup = configparser.ConfigParser()
     setup.read(ROOT / "setup.cfg", encoding="utf-8")
-    extras = setup["options.extras_require"].values()
-    lines = "\n".join([setup["options"]["install_requires"], *extras]).split("\n")
-    wanted = [line.strip() for line in lines if line.strip()]
-    unbound = [line for line in wanted if not re.search(r"(>=|==)\s*\d", line.split(";")[0])]
-    assert unbound == []
+    wanted = list(requirements(setup["options.extras_require"]))
+    assert len(pins(wanted)) > 20
     page = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8").lower()
-    names = {re.split(r"[\[<>=; ]", line)[0].lower() for line in wanted}
-    assert [n for n in sorted(names) if f"| {n} |" not in page] == []
+    rows = {tuple(re.split(r"(?=[<>=])", line, maxsplit=1)) for line in wanted}
+    assert [row for row in sorted(rows) if f"| {row[0].lower()} | {row[1]} |" not in page] == []
+
+
+def test_lower_bounds_are_taken_as_they_stand() -> None:
+    assert pins(["Some.Name>=2.0", "other[fast]>=1.2.3; python_version > '3'", "fixed==3.1.1"]) == [
+        "Some.Name==2.0", "fixed==3.1.1", "other==1.2.3",
+    ]  # fmt: skip
+    for line in ("free", "below<3", "after>2.0"):
+        with pytest.raises(ValueError, match=r"no lower bound"):
+            pins([line])
 
 
 @pytest.mark.parametrize(
