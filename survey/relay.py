@@ -130,7 +130,7 @@ def read_trajectories(paths: Mapping[str, Path]) -> tuple[Trajectory, ...]:
     out = []
     for eye_id, path in paths.items():
         try:
-            text = Path(path).read_text(encoding="utf-8")
+            text = Path(path).read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
             raise SurveyError(f"{path}: cannot be read: {error}") from error
         out.append(read_trajectory(text, eye_id, str(path)))

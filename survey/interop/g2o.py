@@ -33,7 +33,7 @@ def read_g2o(path: Path, information: Information = "tangent", use_vertices: boo
     stations: dict[str, FloatArray] = {}
     edges: list[tuple[str, str, FloatArray]] = []
     fixed: list[str] = []
-    with Path(path).open(encoding="utf-8", errors="replace") as lines:
+    with Path(path).open(encoding="utf-8-sig", errors="replace") as lines:
         for number, line in enumerate(lines, 1):
             words = line.split()
             if not words or words[0].startswith("#"):
