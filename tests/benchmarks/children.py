@@ -128,11 +128,12 @@ def compete(
             warm.save(paths[1])
         children = []
         for m in found:
-            reason = why_no_mrcal() if m.name == MRCAL else ""
-            child = None if reason else Child(kind_of(case), m.name, *paths, threads)
-            answer = child.answer() if child else reason
-            m.failed = answer if isinstance(answer, str) else ""
-            children.append(child)
+            m.failed = why_no_mrcal() if m.name == MRCAL else ""
+            children.append(None if m.failed else Child(kind_of(case), m.name, *paths, threads))
+        for m, child in zip(found, children, strict=True):  # they warm up side by side, which is not measured
+            if child is not None:
+                answer = child.answer()
+                m.failed = answer if isinstance(answer, str) else ""
         for _ in range(rounds):
             for m, child in zip(found, children, strict=True):
                 if child is None or m.failed or sum(m.seconds) > budget:

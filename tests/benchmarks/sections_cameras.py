@@ -97,7 +97,7 @@ def unknown_points(session: Session) -> None:
     for size in sizes:
         case = bundle.simulated(*size)
         session.say("", f"### {size[0]} images, {len(case.points)} points, {len(case.uv)} image points", "")
-        found = session.compete(f"{size[0]} x {len(case.points)}", case, warm, [ours, colmap], budget=40.0)
+        found = session.compete(f"{size[0]} x {len(case.points)}", case, warm, [ours, colmap], budget=30.0)
         runs.append(found)
         what = f"{size[0]} images x {len(case.points)} points: times as long takes COLMAP"
         session.claim(what, tables.times_as_long(found[colmap], found[ours]), 2.0 if size[0] == 500 else 1.0, "", True)
