@@ -51,7 +51,7 @@ def read_dbat(path: Path) -> ForeignNetwork:
     least = _least_rays(root)
     counts: dict[str, int] = {}
     for block in rows.values():
-        for point in {row[0] for row in block}:
+        for point in dict.fromkeys(row[0] for row in block):
             counts[point] = counts.get(point, 0) + 1
     keep = {p for p, n in counts.items() if n >= least or p in points}
     rows = {key: [row for row in block if row[0] in keep] for key, block in rows.items()}
