@@ -1,5 +1,6 @@
 """``plan.toml``: what is to be measured, what could be measured in addition, and the precision that is wanted."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +19,7 @@ from survey.files.units import to_si
 from survey.planning.plan_readings import TERRESTRIAL_KEYS, Terrestrial, read_terrestrial
 
 PLAN_FILE = "plan.toml"
+_MOST = 100_000  # of whatever is counted in one place: more nobody measures, and memory ends
 _EPOCH_KEYS = (
     *("name", "cameras", "targets", "points", "table", "angles_deg", "grid_deg", "station", "target", "poses"),
     *("count", "by_hand", "each_camera"),
@@ -248,7 +250,7 @@ def _moments(node: Node, survey: Survey, number: int) -> Moments:
 def _places(node: Node, survey: Survey, kind: str) -> tuple[list[dict[str, Any]], ByHand | None]:
     """What moves where, one entry per epoch."""
     if kind == "count":
-        return [{}] * node.integer("count", 1), None
+        return [{}] * _few(node, node.integer("count", 1), "count"), None
     if kind == "by_hand":
         hand = _by_hand(node.table("by_hand"), survey)
         return [{}] * hand.count, hand
@@ -271,6 +273,13 @@ def _places(node: Node, survey: Survey, kind: str) -> tuple[list[dict[str, Any]]
     return out, None
 
 
+def _few(node: Node, n: Any, key: str) -> Any:
+    """The number itself. Raises SurveyError where it is more than can be meant."""
+    if n > _MOST:
+        raise node.error(f"makes {n:.3g}; at most {_MOST} are planned in one place, take fewer", key)
+    return n
+
+
 def _angles(node: Node, axes: int) -> list[FloatArray]:
     if node.has("angles_deg") == node.has("grid_deg"):
         raise node.error("give the table's angles once, as angles_deg or as grid_deg", "table")
@@ -282,6 +291,7 @@ def _angles(node: Node, axes: int) -> list[FloatArray]:
     for i, (low, high, step) in enumerate(ranges.tolist()):
         if step <= 0 or high < low:
             raise node.error(f"found [{low:g}, {high:g}, {step:g}]; expected [from, to, step] upwards", "grid_deg", i)
+    _few(node, math.prod((high - low) / step + 1.0 for low, high, step in ranges.tolist()), "grid_deg")
     lines = [np.arange(low, high + 1e-9, step) for low, high, step in ranges]
     grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, axes)
     return list(to_si(grid, "deg"))
@@ -295,7 +305,7 @@ def _by_hand(node: Node, survey: Survey) -> ByHand:
     return ByHand(
         node.reference("camera", (c.camera_id for c in survey.cameras), "camera"),
         node.reference("target", (t.target_id for t in survey.targets), "target"),
-        node.integer("count", 1), (near, far), float(to_si(node.number("tilt_deg", 40.0), "deg")),
+        _few(node, node.integer("count", 1), "count"), (near, far), float(to_si(node.number("tilt_deg", 40.0), "deg")),
         node.integer("seed", 0, 1),
     )  # fmt: skip
 
@@ -405,9 +415,11 @@ def _navigation_poses(node: Node) -> tuple[Pose3, ...]:
         return tuple(out)
     box = to_si(node.numbers("volume_mm", (3, 2)), "mm")
     steps = [int(v) for v in node.numbers("steps", (3,), [2, 2, 2])]
+    attitudes = _attitudes(node)
+    _few(node, math.prod(max(n, 1) for n in steps) * len(attitudes), "steps")
     lines = [_line(low, high, n) for (low, high), n in zip(box.tolist(), steps, strict=True)]
     places = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
-    return (*out, *(Pose3(R, x) for x in places.reshape(-1, 3) for R in _attitudes(node)))
+    return (*out, *(Pose3(R, x) for x in places.reshape(-1, 3) for R in attitudes))
 
 
 def _line(low: float, high: float, n: int) -> FloatArray:
@@ -422,6 +434,7 @@ def _attitudes(node: Node) -> list[Rot3]:
         return first
     axis = "xyz".index(node.choice("turn_about", ("x", "y", "z")))
     count = node.integer("turn_steps", 1, 8)
+    _few(node, count * len(first), "turn_steps")
     turns = [rotation_from_euler(np.eye(3)[axis] * 2 * np.pi * k / count) for k in range(count)]
     return [turn * start for start in first for turn in turns]
 
@@ -432,6 +445,7 @@ def _beacon_places(node: Node) -> FloatArray:
         return np.zeros((0, 3))
     box = to_si(node.numbers("room_mm", (3, 2)), "mm")
     n = node.integer("places", 2, 6)
+    _few(node, 6 * n**2, "places")
     out = []
     for axis in range(3):
         u, v = (i for i in range(3) if i != axis)

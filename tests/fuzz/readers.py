@@ -100,12 +100,12 @@ def _in_pieces(folder: Path) -> Read:
     from survey.files import csv_chunks
 
     csv_chunks.CHUNK = 3
-    return _table("distances.csv", 0)(folder)
+    return _table("table_angles.csv", 0)(folder)
 
 
 def _quoted() -> bytes:
-    head, *rows = _projects()[0]["observations/distances.csv"].splitlines()
-    return b"\n".join([head, *(b",".join(b'"%s"' % word for word in row.split(b",")) for row in rows * 4)]) + b"\n"
+    head, *rows = _projects()[0]["observations/table_angles.csv"].splitlines()
+    return b"\n".join([head, *(b",".join(b'"%s"' % word for word in row.split(b",")) for row in rows)]) + b"\n"
 
 
 def _tables() -> dict[str, Reader]:
