@@ -77,7 +77,7 @@ def chosen_times(epochs: Sequence[str], request: NavigateRequest) -> list[float]
     if request.interval_s is not None:
         raise SurveyError("give either the interval between epochs or a table of their times, not both")
     try:
-        rows = list(csv.DictReader(request.times.read_text().splitlines()))
+        rows = list(csv.DictReader(request.times.read_text("utf-8-sig").splitlines()))
     except (OSError, UnicodeDecodeError) as error:
         raise SurveyError(f"{request.times}: cannot be read as a table of epoch_id and time_s ({error})") from error
     if not rows or not {"epoch_id", "time_s"} <= set(rows[0]):

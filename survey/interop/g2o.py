@@ -6,8 +6,6 @@ rotation vector); GTSAM, SE-Sync and the authors of most published files mean th
 ``information`` chooses.
 """
 
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -18,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from adjust.pose_network.network import PoseNetwork, pose_network
+from survey.files.text import atomic_write
 
 Information = Literal["tangent", "quaternion"]
 _UPPER = np.triu_indices(6)
@@ -146,10 +145,7 @@ def write_g2o(
         f"EDGE_SE3:QUAT {ids[network.b_idx[e]]} {ids[network.a_idx[e]]} {_text(row)}"
         for e, row in zip(rows, edges, strict=True)
     ]
-    path = Path(path)
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False, encoding="utf-8") as out:
-        out.write("\n".join(lines) + "\n")
-    os.replace(out.name, path)
+    atomic_write(Path(path), "\n".join(lines) + "\n")
 
 
 def _text(row: FloatArray) -> str:

@@ -25,6 +25,7 @@ from gtsam import Pose3, Rot3
 import survey.trading
 from adjust.model import PoseParameter, Station, Survey
 from adjust.observations import FrameRef, Pair
+from survey.aligning import align_job
 from survey.cli import main
 from survey.converting import convert_job
 from survey.examples.alignment import alignment_files
@@ -106,7 +107,7 @@ def _align(home: Path) -> list[str]:
             (home / "lab" / name).parent.mkdir(parents=True, exist_ok=True)
             (home / "lab" / name).write_text(text)
         if seed == 1:
-            main(["align", str(home / "lab"), "--quiet", "--json"])
+            align_job(home / "lab", progress=False)
     return ["align", str(home / "lab")]
 
 
@@ -116,12 +117,19 @@ def _convert(home: Path) -> list[str]:
     return ["convert", str(home / "ring.g2o"), str(home / "lab")]
 
 
+def _export(home: Path) -> list[str]:
+    adjusted_ring(home)
+    (home / "out").mkdir()
+    return ["convert", str(home / "lab"), str(home / "out" / "ring.g2o")]
+
+
 CASES = {
     "adjust": Case(_adjust),
     "add": Case(_add),
     "remove": Case(_remove),
     "align": Case(_align),
     "convert": Case(_convert),
+    "export": Case(_export, "out"),
 }
 
 
