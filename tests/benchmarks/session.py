@@ -69,7 +69,8 @@ class Session:
         """The claims as a table."""
         if not self.claims:
             return []
-        return ["", "## In short", "", tables.table(("", "measured", "wanted", "met"), self.claims)]
+        how = "Times are those that passed, ratios those of processor time, which a busy machine disturbs least."
+        return ["", "## In short", "", how, "", tables.table(("", "measured", "wanted", "met"), self.claims)]
 
     def write(self, path: Path | None) -> None:
         """All measurements as JSON, and the document."""

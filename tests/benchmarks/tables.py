@@ -34,9 +34,12 @@ def ratio(measured: Measured, reference: Measured) -> str:
 
 
 def times_as_long(measured: Measured, reference: Measured) -> float:
-    """Median of the ratios, run by run; nan where one of them did not run."""
-    n = min(len(measured.seconds), len(reference.seconds))
-    return float(np.median(np.array(measured.seconds[:n]) / np.array(reference.seconds[:n]))) if n else float("nan")
+    """Median of the ratios of processor time, run by run; nan where one of them did not run.
+
+    By processor time, since a busy machine disturbs it least; alone, with one thread, it is the time that passes.
+    """
+    n = min(len(measured.cpu), len(reference.cpu))
+    return float(np.median(np.array(measured.cpu[:n]) / np.array(reference.cpu[:n]))) if n else float("nan")
 
 
 def times(found: Sequence[Measured], reference: Measured) -> str:
