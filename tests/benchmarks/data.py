@@ -70,7 +70,7 @@ def calibration(
     """Cameras 80 mm apart, turned a little towards each other. single: image points rounded to float32."""
     rng = np.random.default_rng(seed)
     v, u = (index.ravel() for index in np.mgrid[: shape[0], : shape[1]])
-    board = np.column_stack([u, v, np.zeros_like(u)]) * 0.02
+    board = np.column_stack([u, v, np.zeros_like(u)]) * (5 / 256)  # m; exact in float32 too, which OpenCV takes
     lenses = TRUE_LENS + rng.normal(size=(cameras, 8)) * [3, 3, 5, 5, 0.005, 0.01, 1e-4, 1e-4]
     heads = [matrix(rng.normal(size=3) * 0.02 * (c > 0), np.array([-0.08 * (c % 4), -0.08 * (c // 4), 0.0]))
              for c in range(cameras)]  # fmt: skip
