@@ -93,7 +93,7 @@ def _link(record: Record, name: str, place: Path) -> str:
     report = record.written.get("report.html")
     if not report:
         return f"<b>{esc(name)}</b>"
-    return f'<a href="{esc(quote(Path(os.path.relpath(report, place)).as_posix()))}">{esc(name)}</a>'
+    return f'<a href="{esc(quote(os.fsencode(Path(os.path.relpath(report, place)).as_posix())))}">{esc(name)}</a>'
 
 
 def _failures(records: Sequence[Record], place: Path) -> str:

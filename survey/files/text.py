@@ -25,7 +25,7 @@ def atomic_write(path: Path, content: bytes | str) -> None:
 
     What killed runs left of the same file goes.
     """
-    data = content.encode("utf-8") if isinstance(content, str) else content
+    data = _utf8(content) if isinstance(content, str) else content
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path.parent, path.name)
     handle, temporary = _temporary(path)
@@ -41,6 +41,14 @@ def atomic_write(path: Path, content: bytes | str) -> None:
         if isinstance(error, OSError) and error.filename is None:  # writing does not say which file
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
+
+
+def _utf8(text: str) -> bytes:
+    """Where the system knows no UTF-8, names of files in a text stand for their bytes."""
+    try:
+        return text.encode("utf-8")
+    except UnicodeEncodeError:
+        return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace").encode("utf-8")
 
 
 def _temporary(path: Path) -> tuple[int, str]:

@@ -482,6 +482,46 @@ def test_a_new_folder_behind_a_link(tmp_path: Path) -> None:
     assert (tmp_path / "real" / "survey.toml").is_file()
 
 
+# odd locales
+
+
+def test_names_of_bytes(tmp_path: Path) -> None:
+    """As the C locale gives them: UTF-8 comes out as what it is, anything else as unknown."""
+    atomic_write(tmp_path / "a", os.fsencode("Süd").decode("ascii", "surrogateescape") + " ä")
+    atomic_write(tmp_path / "b", b"S\xfcd".decode("ascii", "surrogateescape"))
+    assert (tmp_path / "a").read_text("utf-8") == "Süd ä"
+    assert (tmp_path / "b").read_text("utf-8") == "S\ufffdd"
+
+
+_COMMANDS = """
+import sys
+from survey.cli import main
+lab = sys.argv[1]
+for argv in (["remove", lab, "p0-2"], ["adjust", lab, "--json"], ["report", lab, "--language", "de"], ["plan", lab],
+             ["convert", lab, lab + ".g2o"], ["convert", lab + ".g2o", lab + " back"], ["detect", lab]):
+    code = main(argv)
+    sys.stderr.flush()
+    if code != (argv[0] == "detect"):
+        sys.exit(f"{argv[0]}: {code}")
+"""
+
+
+def test_a_terminal_that_knows_few_letters(tmp_path: Path) -> None:
+    """The C locale, output in Latin-1: names of another alphabet, all commands after one another."""
+    folder = adjusted_ring(tmp_path).rename(tmp_path / "実験室 Süd's")
+    text = (folder / "survey.toml").read_text("utf-8")
+    (folder / "survey.toml").write_text(text.replace('title = ""', 'title = "лаборатория"'), encoding="utf-8")
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0",
+                   "PYTHONIOENCODING": "latin-1"}  # fmt: skip
+    command = [sys.executable, "-c", _COMMANDS, os.fsencode(folder)]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, env=environment, capture_output=True, cwd=root, check=False)
+    assert b"Traceback" not in done.stderr
+    assert done.returncode == 0, done.stderr
+    assert "лаборатория" in (folder / "results" / "report.html").read_text("utf-8")
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([folder.name + end for end in ("", ".g2o", " back")])
+
+
 def test_steps_are_counted(grounds: dict[str, Ground]) -> None:
     """The harness sees what it is to interrupt."""
     ground = grounds["remove"]
