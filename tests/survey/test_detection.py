@@ -8,7 +8,7 @@ from adjust.errors import SurveyError
 from survey.detection import detect_image
 from survey.detection.corner_kernels import corner_row
 from survey.detection.corners import CROSSING_FLOOR_PX, MARKER_FLOOR_PX
-from survey.detection.gray import gray_values, saturation_level
+from survey.detection.gray import gray_values, reduced, saturation_level
 from survey.rendering import BrownCamera, Imaging, PlacedTarget, render
 from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid
 from tests.data import data_folder
@@ -209,3 +209,39 @@ def test_nothing_found_is_no_error_and_says_what_was_looked_for():
         detect_image(empty, Charuco(5, 4, 0.01, 0.02, "4X4_50"))
     with pytest.raises(SurveyError, match="shape"):
         detect_image(np.zeros((2, 2, 2, 2)), BOARD)
+
+
+@pytest.mark.parametrize("size", [(2600, 1951), (2599, 1300), (1801, 900), (901, 700)])
+def test_reduced_images_say_where_their_pixels_were(size):
+    # a straight line fits the centres of bright spots, whatever is cut off at odd sizes
+    image = np.zeros(size[::-1], np.uint8)
+    spots = np.array([[40.0, 50.0], [size[0] - 60.0, 90.0], [size[0] / 2, size[1] - 70.0]]).round()
+    for u, v in spots.astype(int):
+        image[v - 16 : v + 17, u - 16 : u + 17] = 255
+    small, factor = reduced(image, 900)
+    assert max(small.shape) <= 900
+    for u, v in spots:
+        a, b = (int((x + 0.5) / f - 0.5) for x, f in zip((u, v), factor, strict=True))
+        near = small[max(b - 25, 0) : b + 26, max(a - 25, 0) : a + 26].astype(float)
+        rows, columns = np.indices(near.shape)
+        place = np.array([(columns * near).sum(), (rows * near).sum()]) / near.sum()
+        place += [max(a - 25, 0), max(b - 25, 0)]
+        assert (place + 0.5) * factor - 0.5 == pytest.approx([u, v], abs=0.05)
+
+
+@pytest.mark.parametrize("target", [BOARD, CHARUCO, ARUCO])
+def test_large_images_are_searched_reduced_and_measured_in_full(target):
+    image = render(CAMERA, [placed(target, VIEWS[1])], imaging=NORMAL)
+    alone = detect_image(image, target)
+    # three times as large, of odd size: the same points three times as far apart
+    large = cv2.resize(image, None, fx=3.0, fy=3.0, interpolation=cv2.INTER_CUBIC)[:-1, :-1]
+    found = detect_image(large, target)
+    assert found.point_idx.tolist() == alone.point_idx.tolist()
+    # 0.03 px and 0.07 px of the small image: with the enlarged noise, and at markers with edges bent a little
+    assert np.abs(found.uv - ((alone.uv + 0.5) * 3.0 - 0.5)).max() < (0.2 if target is ARUCO else 0.1)
+    # a small part of a large image, where a reduced one shows too little: the very same points
+    wide = np.full((2200, 2900), 120, np.uint8)
+    wide[1300 : 1300 + image.shape[0], 500 : 500 + image.shape[1]] = image
+    found = detect_image(wide, target)
+    assert found.point_idx.tolist() == alone.point_idx.tolist()
+    assert np.abs(found.uv - alone.uv - [500, 1300]).max() < 1e-3
