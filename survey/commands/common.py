@@ -7,9 +7,11 @@ import io
 import json
 import os
 import sys
+import unicodedata
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO, cast
 
 from adjust.errors import SurveyError
 
@@ -24,8 +26,32 @@ def message(error: SurveyError | OSError) -> str:
         text = f"{where}{error.strerror}; check the name, the permissions and the free space"
     else:
         text = str(error)
-    # names out of a file must not drive the reader's terminal
-    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
+    return shown(text)
+
+
+def shown(text: str) -> str:
+    """A text with escapes for what is no letter: names and titles out of a file must not drive a terminal."""
+    if text.isprintable():
+        return text
+    return "".join(c if _is_harmless(c) else c.encode("unicode_escape").decode() for c in text)
+
+
+def _is_harmless(sign: str) -> bool:
+    return sign.isprintable() or sign in "\n\t" or unicodedata.category(sign) == "Zs"  # narrow spaces
+
+
+class _Shown:
+    """An output that shows what is written to it."""
+
+    def __init__(self, out: TextIO) -> None:
+        self._out = out
+
+    def write(self, text: str) -> int:
+        """As that of a file."""
+        return self._out.write(shown(text))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._out, name)
 
 
 def run_command(program: str, build_parser: Callable[[], argparse.ArgumentParser], argv: Sequence[str] | None) -> int:
@@ -35,7 +61,8 @@ def run_command(program: str, build_parser: Callable[[], argparse.ArgumentParser
     try:
         try:
             arguments = build_parser().parse_args(argv)
-            return int(arguments.run(arguments))
+            with redirect_stdout(cast(TextIO, _Shown(sys.stdout))):
+                return int(arguments.run(arguments))
         finally:
             sys.stdout.flush()
     except BrokenPipeError:

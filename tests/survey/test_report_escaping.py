@@ -1,6 +1,7 @@
 """Names that mean harm stay text on every page, in English and in German."""
 
 import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from survey.aligning import align_job
 from survey.batch.page import overview_html
 from survey.batch.record import FAILED, TEST_FAILED, Number, Record, Turn
 from survey.batch.trends import trends_of
+from survey.cli import main
 from survey.examples import write_example
 from survey.examples.alignment import alignment_files
 from survey.files import AdjustmentOptions, Project, Sigmas, read
@@ -185,3 +187,11 @@ def test_the_look_finds_what_it_is_to_find() -> None:
                  '<a href="javascript:alert(1)">', "<iframe>"):  # fmt: skip
         assert faults_of(page) != []
     assert tags_of("<p><b>x</b></p>") != tags_of("<p>x</p>")
+
+
+def test_a_title_does_not_drive_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_example("alignment", tmp_path / "lab")
+    path = tmp_path / "lab" / "survey.toml"
+    path.write_text(re.sub(r"^title = .*$", r'title = "\\u001b[2J\\u202etxt"', path.read_text("utf-8"), flags=re.M))
+    assert main(["adjust", str(tmp_path / "lab"), "--quiet"]) == 0
+    assert capsys.readouterr().out.startswith("\\x1b[2J\\u202etxt: ")
