@@ -364,28 +364,14 @@ def _shift(R: FloatArray, local: FloatArray, xy: FloatArray) -> FloatArray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def median_offset(pose: FloatArray, x: FloatArray, rays: FloatArray) -> float:
-    """Median of the tangents of the angles between rays (n, 3) and points (n, 3); infinite for points behind."""
-    out = np.empty(len(x))
-    p = np.empty(3)
-    for i in range(len(x)):
-        for a in range(3):
-            p[a] = pose[a, 0] * x[i, 0] + pose[a, 1] * x[i, 1] + pose[a, 2] * x[i, 2] + pose[a, 3]
-        along = p[0] * rays[i, 0] + p[1] * rays[i, 1] + p[2] * rays[i, 2]
-        across2 = max(p[0] ** 2 + p[1] ** 2 + p[2] ** 2 - along**2, 0.0)
-        out[i] = np.sqrt(across2) / along if along > 0 else np.inf
-    return float(np.median(out)) if len(out) else 0.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def first_poses(x: FloatArray, rays: FloatArray, ptr: IntArray, thickness: float, widest: float, poses: FloatArray,
-                rms: FloatArray, in_front: BoolArray, found: BoolArray) -> None:  # fmt: skip
-    """Both poses (B, 2, 4, 4) of the plane in every view, as :func:`plane_poses` finds them, and how good they are.
+def first_poses(run: IntArray, x: FloatArray, rays: FloatArray, ptr: IntArray, thickness: float, widest: float,
+                poses: FloatArray, rms: FloatArray, in_front: BoolArray, found: BoolArray) -> None:  # fmt: skip
+    """Both poses (B, 2, 4, 4) of the plane in the views of a run, as :func:`plane_poses` finds them, and how good.
 
     rms, in_front: (B, 2) as of :func:`errors_of_views`. found: (B,), False where there is no plane.
     """
     whole = np.empty(2, np.int64)
-    for view in range(len(ptr) - 1):
+    for view in run:
         a, b = ptr[view], ptr[view + 1]
         found[view] = b - a > 3 and plane_poses(x[a:b], rays[a:b], thickness, widest, poses[view]) == 2
         if not found[view]:
@@ -398,11 +384,56 @@ def first_poses(x: FloatArray, rays: FloatArray, ptr: IntArray, thickness: float
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def offsets_of_views(poses: FloatArray, x: FloatArray, rays: FloatArray, ptr: IntArray, out: FloatArray,
+def refine_candidates(run: IntArray, x: FloatArray, rays: FloatArray, ptr: IntArray, few: IntArray, few_ptr: IntArray,
+                      first: IntArray, iterations: int, rival: float, noise: FloatArray, poses: FloatArray,
+                      rms: FloatArray, in_front: BoolArray, kept: BoolArray) -> None:  # fmt: skip
+    """Candidate poses first[v] ... first[v + 1] of the views of a run, refined in place, robustly.
+
+    A view's rows ``few`` of x and rays, where they are not all of its points, decide which candidates are refined on
+    all of them: those of :func:`_plausible`, which are marked in ``kept`` (K,). rms, in_front: (K,) of the kept ones.
+    """
+    whole = np.empty(2, np.int64)
+    for view in run:
+        a, b = ptr[view], ptr[view + 1]
+        c, d = first[view], first[view + 1]
+        rows = few[few_ptr[view] : few_ptr[view + 1]]
+        sampled = len(rows) < b - a
+        whole[0], whole[1] = 0, len(rows)
+        some_x, some_rays = x[rows], rays[rows]
+        for k in range(c, d):
+            _refine(poses[k], some_x, some_rays, iterations, True)
+            errors_of_views(poses[k : k + 1], some_x, some_rays, whole, rms[k : k + 1], in_front[k : k + 1])
+        kept[c:d] = True
+        _plausible(rms[c:d], in_front[c:d], rival, noise[view], kept[c:d])
+        if not sampled:
+            continue
+        whole[1] = b - a
+        for k in range(c, d):
+            if kept[k]:
+                _refine(poses[k], x[a:b], rays[a:b], 2, True)
+                errors_of_views(poses[k : k + 1], x[a:b], rays[a:b], whole, rms[k : k + 1], in_front[k : k + 1])
+        _plausible(rms[c:d], in_front[c:d], rival, noise[view], kept[c:d])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _plausible(rms: FloatArray, in_front: BoolArray, rival: float, noise: float, kept: BoolArray) -> None:
+    """Keep of the kept those in front that are within a factor or the noise of the best; the best where none is."""
+    best = -1
+    for k in range(len(rms)):
+        if kept[k] and (best < 0 or (in_front[k] and not in_front[best])
+                        or (in_front[k] == in_front[best] and rms[k] < rms[best])):  # fmt: skip
+            best = k
+    limit = max(rival * rms[best], rms[best] + noise)
+    for k in range(len(rms)):
+        kept[k] = kept[k] and (k == best or (in_front[k] and in_front[best] and rms[k] <= limit))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def offsets_of_views(run: IntArray, poses: FloatArray, x: FloatArray, rays: FloatArray, ptr: IntArray, out: FloatArray,
                      medians: FloatArray) -> None:  # fmt: skip
     """Tangents (N,) of the angles between rays and points, infinite for points behind, and their medians (B,)."""
     p = np.empty(3)
-    for view in range(len(ptr) - 1):
+    for view in run:
         pose = poses[view]
         for i in range(ptr[view], ptr[view + 1]):
             for a in range(3):
@@ -410,7 +441,8 @@ def offsets_of_views(poses: FloatArray, x: FloatArray, rays: FloatArray, ptr: In
             along = p[0] * rays[i, 0] + p[1] * rays[i, 1] + p[2] * rays[i, 2]
             across2 = max(p[0] ** 2 + p[1] ** 2 + p[2] ** 2 - along**2, 0.0)
             out[i] = np.sqrt(across2) / along if along > 0 else np.inf
-        medians[view] = np.median(out[ptr[view] : ptr[view + 1]])
+        mine = out[ptr[view] : ptr[view + 1]]
+        medians[view] = np.median(mine) if len(mine) else np.nan
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

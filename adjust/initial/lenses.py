@@ -80,6 +80,7 @@ class _LensSearch:
     def __init__(self, camera: Camera, model: LensModel) -> None:
         self.camera, self.model, self.size = camera, model, camera.image_size
         self.constants = camera_constants(camera)
+        self._flat: dict[int, bool] = {}
         self.prior = {}
         if camera.lens.prior is not None:
             self.prior = dict(zip(camera.lens.prior.names, camera.lens.prior.mean, strict=True))
@@ -102,7 +103,7 @@ class _LensSearch:
                 " show it a target, or give lens values"
             )
         # the other images of a long series are screened by their poses
-        flat = _every([s for s in usable if _is_plane(s.x)], _MOST_SCREENED)
+        flat = _every([s for s in usable if self._is_flat(s)], _MOST_SCREENED)
         good, excluded = self._screen(flat) if flat else ([], {})
         chosen = spread_out(good) or [s for s in usable if s.block_idx not in excluded][:_MOST_IMAGES]
         if not chosen:
@@ -110,8 +111,15 @@ class _LensSearch:
                 f"camera {self.camera.camera_id!r}: none of its {len(flat)} images fits a plane; the first: "
                 + next(iter(excluded.values()))
             )
-        start, how = self._focal_length([s for s in chosen if _is_plane(s.x)], chosen)
+        start, how = self._focal_length([s for s in chosen if self._is_flat(s)], chosen)
         return self._refine(start, how, chosen, excluded)
+
+    def _is_flat(self, sighting: Sighting) -> bool:
+        """Whether the points are a plane; asked once for all images that show the same array of points."""
+        key = id(sighting.x)
+        if key not in self._flat:
+            self._flat[key] = _is_plane(sighting.x)
+        return self._flat[key]
 
     def _screen(self, flat: Sequence[Sighting]) -> tuple[list[Sighting], dict[int, str]]:
         """Images whose points lie as on a plane; a wrong point order misses by a good part of the image."""
@@ -302,7 +310,7 @@ def spread_out(images: Sequence[Sighting], n: int = _MOST_IMAGES) -> list[Sighti
     """At most n images that differ most in place, size and tilt of the target (farthest-point sampling)."""
     if len(images) <= n:
         return list(images)
-    features = np.array([_feature(s) for s in images])
+    features = _features(images)
     features = (features - features.mean(axis=0)) / np.maximum(features.std(axis=0), 1e-9)
     chosen = [int(np.argmax([len(s.x) for s in images]))]
     distance = np.linalg.norm(features - features[chosen[0]], axis=1)
@@ -312,8 +320,12 @@ def spread_out(images: Sequence[Sighting], n: int = _MOST_IMAGES) -> list[Sighti
     return [images[i] for i in sorted(chosen)]
 
 
-def _feature(s: Sighting) -> FloatArray:
-    """Centroid, logarithm of the size, and shape of the covariance of the image points."""
-    cov = np.cov(s.uv.T)
-    size = np.sqrt(np.trace(cov))
-    return np.array([*s.uv.mean(axis=0) / size, np.log(size), (cov[0, 0] - cov[1, 1]) / size**2, cov[0, 1] / size**2])
+def _features(images: Sequence[Sighting]) -> FloatArray:
+    """Of every image centroid, logarithm of the size, and shape of the covariance of the image points, (B, 5)."""
+    counts = np.array([len(s.uv) for s in images])
+    first, uv = np.cumsum([0, *counts[:-1]]), np.concatenate([s.uv for s in images])
+    mean = np.add.reduceat(uv, first) / counts[:, None]
+    u, v = (uv - np.repeat(mean, counts, axis=0)).T
+    uu, uv_, vv = (np.add.reduceat(p, first) / (counts - 1) for p in (u * u, u * v, v * v))
+    size = np.sqrt(uu + vv)
+    return np.column_stack([mean / size[:, None], np.log(size), (uu - vv) / size**2, uv_ / size**2])

@@ -5,6 +5,7 @@ from it; where none is, what is symmetric is fixed (:mod:`adjust.initial.gauge`)
 between them (:mod:`adjust.initial.motion`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -79,6 +80,21 @@ class PoseNetwork:
             pose = pose @ self.link_pose(link.slot, link.inverse)
         return pose
 
+    def products(self, chains: Sequence[Chain]) -> FloatArray:
+        """The products (n, 4, 4) of chains that are wholly known."""
+        forward = np.array([IDENTITY, *self.known.values()])
+        both = np.concatenate([forward, inverse(forward)])
+        place = {slot: i + 1 for i, slot in enumerate(self.known)}
+        longest = max((len(chain) for chain in chains), default=0)
+        rows = np.zeros((longest, len(chains)), dtype=np.int64)
+        for n, chain in enumerate(chains):
+            for i, link in enumerate(chain):
+                rows[i, n] = place[link.slot] + (len(forward) if link.inverse else 0)
+        out = np.tile(IDENTITY, (len(chains), 1, 1))
+        for row in rows:
+            out = out @ both[row]
+        return out
+
     def unknown_links(self, chain: Chain) -> list[int]:
         """Positions in the chain of the links that are unknown."""
         return [i for i, link in enumerate(chain) if link.slot not in self.known]
@@ -90,8 +106,21 @@ class PoseNetwork:
         value = inverse(before) @ observation.poses @ inverse(after)
         return inverse(value) if chain[position].inverse else value
 
+    def isolate_all(self, items: Sequence[tuple[ChainObservation, int]]) -> list[FloatArray]:
+        """:meth:`isolate` of many at once."""
+        before = inverse(self.products([o.chain[:i] for o, i in items]))
+        after = inverse(self.products([o.chain[i + 1 :] for o, i in items]))
+        counts = [len(o.poses) for o, _ in items]
+        poses = np.concatenate([o.poses for o, _ in items])
+        value = np.repeat(before, counts, axis=0) @ poses @ np.repeat(after, counts, axis=0)
+        turned = np.repeat([o.chain[i].inverse for o, i in items], counts)
+        value[turned] = inverse(value[turned])
+        return np.split(value, np.cumsum(counts)[:-1])
+
     def propagate(self, rotation_only: bool = False) -> bool:
         """Determine what is alone unknown in its chains, until nothing is; whether anything was found."""
+        if self.known.keys() >= self.names.keys():
+            return False
         missing: list[set[int]] = []
         using: dict[int, list[int]] = {}
         waiting: dict[int, list[int]] = {}
@@ -106,24 +135,40 @@ class PoseNetwork:
         while waiting:
             # what many observations determine goes first: it is the safer ground for the rest
             most = max(len(w) for w in waiting.values())
-            for slot in sorted(s for s, w in waiting.items() if 2 * len(w) >= most):
-                items = [self.observations[n] for n in waiting.pop(slot)]
-                places = [next(i for i, link in enumerate(o.chain) if link.slot == slot) for o in items]
-                self.known[slot] = self._mean(list(zip(items, places, strict=True)), rotation_only)
+            ready = sorted(s for s, w in waiting.items() if 2 * len(w) >= most)
+            offers = self._offers([(n, slot) for slot in ready for n in waiting[slot]])
+            for slot in ready:
+                numbers = waiting.pop(slot)
+                offers |= self._offers([(n, slot) for n in numbers if n not in offers])  # from slots just found
+                items = [(self.observations[n], offers[n]) for n in numbers]
+                self.known[slot] = self._mean(items, rotation_only)
                 for n in using[slot]:
                     missing[n].discard(slot)
                     self._queue(n, missing[n], waiting, rotation_only)
         return found
 
+    def _offers(self, wanted: Sequence[tuple[int, int]]) -> dict[int, FloatArray]:
+        """What observations, by number, say of a slot of their chain."""
+        if not wanted:
+            return {}
+        items = [
+            (o, next(i for i, link in enumerate(o.chain) if link.slot == slot))
+            for o, slot in ((self.observations[n], slot) for n, slot in wanted)
+        ]
+        return dict(zip((n for n, _ in wanted), self.isolate_all(items), strict=True))
+
     def _queue(self, n: int, missing: set[int], waiting: dict[int, list[int]], rotation_only: bool) -> None:
         if len(missing) == 1 and -1 not in missing and self.observations[n].rotation_only <= rotation_only:
             waiting.setdefault(next(iter(missing)), []).append(n)
 
-    def _mean(self, waiting: list[tuple[ChainObservation, int]], rotation_only: bool = False) -> FloatArray:
-        """Robust mean over all observations that isolate a slot; the likelier solution where just one does."""
+    def _mean(self, said: list[tuple[ChainObservation, FloatArray]], rotation_only: bool = False) -> FloatArray:
+        """Robust mean over all observations that isolate a slot; the likelier solution where just one does.
+
+        said: with each what it says of the slot (k, 4, 4).
+        """
         if rotation_only:  # full poses say more than rotations
-            waiting = [w for w in waiting if not w[0].rotation_only] or waiting
-        offers = [self.isolate(o, i) for o, i in waiting]
+            said = [s for s in said if not s[0].rotation_only] or said
+        offers = [offer for _, offer in said]
         if len(offers) == 1:
             return np.asarray(offers[0][0])
         if len(offers) == 2:  # the pair of solutions in which the two agree
@@ -145,7 +190,7 @@ class PoseNetwork:
                     by_slot.setdefault(slot, []).append((observation, i))
         for _ in range(rounds):
             for slot in sorted(by_slot):
-                self.known[slot] = self._mean(by_slot[slot])
+                self.known[slot] = self._mean([(o, self.isolate(o, i)) for o, i in by_slot[slot]])
 
 
 def given_pose(parameter: PoseParameter) -> FloatArray | None:

@@ -4,7 +4,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.closed_forms import align, rigid
-from adjust.closed_forms.view_kernels import median_offset
+from adjust.closed_forms.view_kernels import offsets_of_views
 from adjust.errors import SurveyError
 from adjust.geometry.building import frame_refs, position_refs
 from adjust.initial.gauge import fix_one_gauge, frames_of, world_is_free
@@ -29,8 +29,9 @@ from adjust.initial.views import (
     untrustworthy,
     used_rows,
 )
-from adjust.model import FloatArray, Survey
+from adjust.model import FloatArray, IntArray, Survey
 from adjust.observations import FrameRef, PositionRef
+from adjust.parallel import run_split, split_blocks
 from adjust.result import ParameterName
 from adjust.terrestrial.building import reading_refs
 from adjust.unknowns import Chain, FrameTree, Unknowns
@@ -65,6 +66,8 @@ class _Search:
     def __init__(self, survey: Survey) -> None:
         self.survey = survey
         self.targets = {t.target_id: t for t in survey.targets}
+        self.target_x: dict[str, FloatArray] = {}
+        self.seen_x: dict[tuple[str, bytes], FloatArray] = {}
         self.cameras = {c.camera_id: c for c in survey.cameras}
         unknowns = Unknowns()
         self.network = PoseNetwork(unknowns, FrameTree(survey, unknowns))
@@ -100,6 +103,15 @@ class _Search:
         for frame in [*frame_refs(self.survey), *(ref.frame for ref in refs if ref.frame is not None)]:
             self.network.frames.world_from(frame)
 
+    def _target_x(self, target_id: str, rows: IntArray) -> FloatArray:
+        """Points (n, 3) m of a target; one array for all images that show the same ones."""
+        key = (target_id, rows.tobytes())
+        if key not in self.seen_x:
+            if target_id not in self.target_x:
+                self.target_x[target_id] = target_points(self.targets[target_id])
+            self.seen_x[key] = self.target_x[target_id][rows]
+        return self.seen_x[key]
+
     def find_lenses(self) -> None:
         """Lens values of every camera, given or from its images of known points."""
         sightings: dict[str, list[Sighting]] = {c.camera_id: [] for c in self.survey.cameras}
@@ -109,7 +121,7 @@ class _Search:
                 continue  # the chain has already named it
             used = used_rows(block)
             if block.target_id is not None:
-                x = target_points(self.targets[block.target_id])[block.point_idx[used]]
+                x = self._target_x(block.target_id, block.point_idx[used])
                 sightings[block.camera_id].append(Sighting(i, x, block.uv[used]))
             else:
                 rows = used & known[block.point_idx]
@@ -125,7 +137,6 @@ class _Search:
         """Rays of all blocks and poses of all targets seen; blocks that cannot be trusted are set aside."""
         rays, failed = all_rays(self.survey, self.lenses)
         focal = {c.camera_id: focal_px(c, self.lenses[c.camera_id]) for c in self.survey.cameras}
-        target_x = {t.target_id: target_points(t) for t in self.survey.targets}
         sights: list[Sight] = []
         for i, block in enumerate(self.survey.image_blocks):
             used = used_rows(block)
@@ -134,7 +145,7 @@ class _Search:
             elif block.target_id is None:
                 self.points.add(self.survey, i, rays[i], focal[block.camera_id], self.chains[i])
             elif used.sum() >= 3:  # fewer give no pose, but may well serve in the adjustment
-                x = target_x[block.target_id][block.point_idx[used]]
+                x = self._target_x(block.target_id, block.point_idx[used])
                 sights.append(Sight(i, x, rays[i][used], focal[block.camera_id]))
         views, without = make_views(sights)
         for i, reason in without.items():
@@ -301,16 +312,18 @@ class _Search:
         """Robust misfit of every block at the present values: 1.2 times the median offset, px."""
         rms = np.full(len(self.survey.image_blocks), np.nan)
         sights = {s.block_idx: s for s in self.points.sights}
-        for i, chain in enumerate(self.chains):
-            if i in self.views:
-                x, rays, focal = self.views[i].x, self.views[i].rays, self.views[i].focal_px
-            elif i in sights:
-                x, rays, focal = self.points.x[sights[i].rows], sights[i].rays, sights[i].focal_px
-            else:
-                continue
-            offset = median_offset(self.network.product(chain), np.ascontiguousarray(x), np.ascontiguousarray(rays))
-            # the median of a circular normal's radius is 1.18 sigma, its rms 1.41 sigma
-            rms[i] = 1.2 * focal * offset if len(x) else np.nan
+        blocks = [i for i in range(len(self.chains)) if i in self.views or i in sights]
+        if not blocks:
+            return rms
+        seen = [self.views.get(i) or sights[i] for i in blocks]
+        x = [s.x if isinstance(s, View) else self.points.x[s.rows] for s in seen]
+        ptr = np.cumsum([0] + [len(part) for part in x])
+        offsets, medians = np.empty(int(ptr[-1])), np.empty(len(blocks))
+        poses = self.network.products([self.chains[i] for i in blocks])
+        rays = np.concatenate([s.rays for s in seen])
+        run_split(offsets_of_views, split_blocks(ptr), poses, np.concatenate(x), rays, ptr, offsets, medians)
+        # the median of a circular normal's radius is 1.18 sigma, its rms 1.41 sigma
+        rms[blocks] = 1.2 * np.array([s.focal_px for s in seen]) * medians
         return rms
 
     def result(self) -> Start:

@@ -6,12 +6,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from adjust.closed_forms import PLANAR, WIDEST, pose_solutions, refine_poses, view_errors
-from adjust.closed_forms.view_kernels import first_poses, offsets_of_views
+from adjust.closed_forms import PLANAR, WIDEST, pose_solutions, view_errors
+from adjust.closed_forms.view_kernels import first_poses, offsets_of_views, refine_candidates
 from adjust.errors import SurveyError
 from adjust.lens import camera_constants, focal_length_px, lens_model, unit_rays
 from adjust.model import BoolArray, Camera, FloatArray, IntArray, Survey, Target
 from adjust.observations import ImageBlock
+from adjust.parallel import run_split, split_blocks
 
 _RIVAL = 4.0  # a second pose whose error is within this factor of the best stays a candidate
 _NOISE_PX = 0.3  # ... or within this much of it
@@ -104,15 +105,13 @@ class Sight:
 
 def make_views(sights: Sequence[Sight]) -> tuple[list[View], dict[int, str]]:
     """Views with their unrefined candidate poses, and for every block that has none the reason."""
-    rows = [_sample(len(s.x)) for s in sights]
     n = len(sights)
-    ptr = np.cumsum([0] + [len(r) for r in rows])
     poses, error = np.empty((n, 2, 4, 4)), np.empty((n, 2))
     in_front, planar = np.empty((n, 2), dtype=np.bool_), np.empty(n, dtype=np.bool_)
     if n:
-        x = np.concatenate([s.x[r] for s, r in zip(sights, rows, strict=True)])
-        rays = np.concatenate([s.rays[r] for s, r in zip(sights, rows, strict=True)])
-        first_poses(x, rays, ptr, PLANAR, WIDEST, poses, error, in_front, planar)
+        rows, ptr = _samples(sights)
+        x, rays = np.concatenate([s.x for s in sights])[rows], np.concatenate([s.rays for s in sights])[rows]
+        run_split(first_poses, split_blocks(ptr), x, rays, ptr, PLANAR, WIDEST, poses, error, in_front, planar)
     views: list[View] = []
     failed: dict[int, str] = {}
     for i, s in enumerate(sights):
@@ -143,6 +142,15 @@ def _sample(n: int) -> IntArray:
     return np.arange(n) if n <= _ENOUGH else np.sort(np.random.default_rng(n).permutation(n)[:_ENOUGH])
 
 
+def _samples(views: "Sequence[View | Sight]") -> tuple[IntArray, IntArray]:
+    """Rows of all views' points, one after the other, that :func:`_sample` takes, and where each view's begin."""
+    sizes = [len(v.x) for v in views]
+    starts = np.cumsum([0, *sizes[:-1]])
+    few = [_sample(n) for n in sizes]
+    ptr = np.cumsum([0] + [len(r) for r in few])
+    return np.concatenate(few) + np.repeat(starts, np.diff(ptr)), ptr
+
+
 def refine_views(views: Sequence[View], iterations: int = 8) -> list[View]:
     """All candidates of all views refined in one go, robustly; implausible candidates dropped.
 
@@ -150,24 +158,21 @@ def refine_views(views: Sequence[View], iterations: int = 8) -> list[View]:
     """
     if not views:
         return []
-    if any(len(v.x) > _ENOUGH for v in views):
-        rough = _refined(views, [_sample(len(v.x)) for v in views], iterations)
-        return _refined(rough, [np.arange(len(v.x)) for v in views], 2)
-    return _refined(views, [np.arange(len(v.x)) for v in views], iterations)
-
-
-def _refined(views: Sequence[View], rows: Sequence[IntArray], iterations: int) -> list[View]:
-    counts = [len(v.poses) for v in views]
-    x = np.concatenate([np.tile(v.x[r], (k, 1)) for v, r, k in zip(views, rows, counts, strict=True)])
-    rays = np.concatenate([np.tile(v.rays[r], (k, 1)) for v, r, k in zip(views, rows, counts, strict=True)])
-    ptr = np.concatenate([[0], np.cumsum(np.repeat([len(r) for r in rows], counts))])
-    poses = refine_poses(np.concatenate([v.poses for v in views]), x, rays, ptr, iterations, robust=True)
-    error, in_front = view_errors(poses, x, rays, ptr)
-    first = np.concatenate([[0], np.cumsum(counts)])
-    return [
-        _ranked(v, poses[a:b], error[a:b] * v.focal_px, in_front[a:b])
-        for v, a, b in zip(views, first[:-1], first[1:], strict=True)
-    ]
+    ptr = np.cumsum([0] + [len(v.x) for v in views])
+    first = np.cumsum([0] + [len(v.poses) for v in views])
+    x, rays = np.concatenate([v.x for v in views]), np.concatenate([v.rays for v in views])
+    poses, focal = np.concatenate([v.poses for v in views]), np.array([v.focal_px for v in views])
+    error, in_front, kept = (np.empty(len(poses), dtype=t) for t in (np.float64, np.bool_, np.bool_))
+    run_split(
+        refine_candidates, split_blocks(ptr), x, rays, ptr, *_samples(views), first, iterations, _RIVAL,
+        _NOISE_PX / focal, poses, error, in_front, kept,
+    )  # fmt: skip
+    out = []
+    for i, (v, a, b) in enumerate(zip(views, first[:-1].tolist(), first[1:].tolist(), strict=True)):
+        mine = np.arange(a, b)[kept[a:b]]
+        order = mine[np.argsort(error[mine], kind="stable")] if len(mine) > 1 else mine
+        out.append(View(v.block_idx, v.x, v.rays, v.focal_px, poses[order], error[order] * focal[i]))
+    return out
 
 
 def _ranked(view: View | Sight, poses: FloatArray, error_px: FloatArray, in_front: BoolArray) -> View:
@@ -190,9 +195,9 @@ def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str]
         return reasons, notes
     ptr = np.cumsum([0] + [len(v.x) for v in views])
     offsets, medians = np.empty(int(ptr[-1])), np.empty(len(views))
-    offsets_of_views(
-        np.array([v.poses[0] for v in views]), np.concatenate([v.x for v in views]),
-        np.concatenate([v.rays for v in views]), ptr, offsets, medians,
+    run_split(
+        offsets_of_views, split_blocks(ptr), np.array([v.poses[0] for v in views]),
+        np.concatenate([v.x for v in views]), np.concatenate([v.rays for v in views]), ptr, offsets, medians,
     )  # fmt: skip
     focal = np.array([v.focal_px for v in views])
     by_camera: dict[str, list[int]] = {}
