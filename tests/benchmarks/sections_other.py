@@ -29,9 +29,11 @@ def targets(session: Session) -> None:
             per = 1e3 / len(case.images)
             ratio = tables.ratio(m, found[finding.OURS])
             rms = m.numbers.get("rms_px", np.nan)
-            rows.append([label, m.name, f"{per * m.median:.1f}", ratio, f"{m.numbers.get('found', 0):.0f} of "
-                         f"{len(case.images)}", "" if np.isnan(rms) else f"{rms:.4f}"])  # fmt: skip
-    session.say("", tables.table(("", "", "ms an image", "ratio to ours", "found", "rms px"), rows))
+            cpu = float(np.median(m.cpu)) if m.cpu else np.nan
+            all_found = f"{m.numbers.get('found', 0):.0f} of {len(case.images)}"
+            rows.append([label, m.name, f"{per * m.median:.1f}", f"{per * cpu:.1f}", ratio, all_found,
+                         "" if np.isnan(rms) else f"{rms:.4f}"])  # fmt: skip
+    session.say("", tables.table(("", "", "ms an image", "CPU ms", "ratio to ours", "found", "rms px"), rows))
 
 
 def stages(session: Session) -> None:
