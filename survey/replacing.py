@@ -142,6 +142,7 @@ def _replace(folder: Path, folders: list[str], files: list[str]) -> None:
     try:
         for entry in folders:
             complete_from(folder / entry, adding / entry)
+            sync_folder(adding / entry)
         with folder_held(folder, shared=False):
             _keep_old(folder, folders, files)
             for entry in folders:
