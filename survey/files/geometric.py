@@ -9,7 +9,7 @@ from survey.files.project import Sigmas
 from survey.files.quantity_columns import needed, one_of, quantity
 from survey.files.references import NameProblemError, Names, check_epochs, read_frame, read_position
 from survey.files.tables import FLAGS, Layout, Table, first_row, group_names
-from survey.files.text import natural_key, suggestion
+from survey.files.text import LARGEST_NUMBER, natural_key, suggestion
 from survey.files.units import to_si
 
 _TILTS = ("arcsec", "mgon", "deg", "mm_per_m")
@@ -50,8 +50,9 @@ def read_axis(table: Table, row: int, column: str, text: str) -> FloatArray:
         axis = np.array([float(part) for part in text.split()])
     except ValueError:
         axis = np.zeros(0)
-    length = float(np.linalg.norm(axis)) if axis.shape == (3,) else 0.0
-    if not length > 0 or not np.isfinite(length):
+    fits = axis.shape == (3,) and bool((np.abs(axis) <= LARGEST_NUMBER).all())
+    length = float(np.linalg.norm(axis)) if fits else 0.0
+    if not length > 0:
         raise table.error(row, f"{column}: found {text!r}; write x, y, z, -x, -y, -z or three numbers with blanks")
     return axis if abs(length - 1.0) < 1e-12 else axis / length
 
