@@ -10,6 +10,7 @@ import gtsam
 from adjust import adjustment
 from adjust.adjustment import AdjustOptions, assemble
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.image_reduction import PoseReduction
 from adjust.initial import find_start
 from adjust.pose_network import NetworkOptions, solve_network
 from adjust.pose_network import precision as pose_precision
@@ -28,6 +29,8 @@ Part = tuple[str, Any, str]
 PARTS: list[Part] = [
     ("load values", State, "load"),
     ("prepare (kernels)", AdjustmentGraph, "prepare"),
+    ("poses reduced", PoseReduction, "reduce"),
+    ("poses restored", PoseReduction, "complete"),
     ("linearise (GTSAM)", gtsam.NonlinearFactorGraph, "linearize"),
     ("eliminate (GTSAM)", _Loop, "step"),
     ("weighted square sum", AdjustmentGraph, "objective"),
@@ -139,6 +142,7 @@ def cameras(sizes: Sequence[tuple[int, int, tuple[int, int]]]) -> str:
 
         spent = best_of(run, PARTS)
         if n_cameras * epochs <= 2000:
+            find_start(survey(calibration(n_cameras, 10, shape)))  # compiles
             clock = Clock()
             clock.timed("start values, where none are given", find_start)(given)
             spent |= clock.spent
