@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from adjust.errors import SurveyError
 from adjust.model import Camera, Datum, FloatArray, Point, PointParameter, PoseParameter, Station, Survey
 from adjust.observations import FrameRef, ImageBlock
-from survey.files.text import id_problem
+from survey.files.text import atomic_write, id_problem
 from survey.interop.camera_values import CameraValues
 from survey.interop.colmap_model import ColmapCamera, ColmapModel, read_model
 from survey.interop.foreign import ForeignNetwork, Where, text_of
@@ -349,7 +349,8 @@ def write_colmap(values: CameraValues, folder: Path, text: bool = False) -> tupl
     """Write the model and the names of its points into a folder that is there; counts, and what is to be known."""
     model, names, notes = reconstruction(values)
     (model.write_text if text else model.write_binary)(str(folder))
-    (folder / NAMES_FILE).write_text(names_csv(names), encoding="utf-8")
+    # last: pycolmap says nothing where the disk is full, but then this file finds no room either
+    atomic_write(folder / NAMES_FILE, names_csv(names))
     counts = {"cameras": model.num_cameras(), "frames": model.num_frames(), "images": model.num_images(),
               "points": model.num_points3D(), "image_points": model.compute_num_observations()}  # fmt: skip
     return counts, notes

@@ -1,6 +1,7 @@
 """COLMAP's models: opened, projected and adjusted by pycolmap, and back."""
 
 import shutil
+import subprocess
 
 import numpy as np
 import pycolmap
@@ -41,6 +42,22 @@ def test_pycolmap_reads_the_model_and_projects_as_the_survey_does(lab, models, f
         np.testing.assert_allclose(predicted, ours[camera_id, epoch], rtol=0, atol=1e-9)
         blocks = [b.uv for b in values.blocks() if (b.camera_id, b.epoch_id) == (camera_id, epoch)]
         np.testing.assert_allclose([xy - 0.5 for xy, _ in seen], np.concatenate(blocks), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("format", ["colmap", "colmap-text"])
+def test_a_full_disk_leaves_no_half_model(lab, tmp_path, format, capsys):
+    """pycolmap alone would write what has room and say nothing."""
+    small = tmp_path / "small"
+    small.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(small)]
+    if subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip("no file system can be mounted here")
+    try:
+        assert main(["convert", str(lab[0]), str(small / "model"), "--format", format, "--quiet"]) == 1
+        assert "No space left on device" in capsys.readouterr().err
+        assert list(small.iterdir()) == []
+    finally:
+        subprocess.run(["umount", str(small)], check=True)
 
 
 @pytest.mark.parametrize("format", ["colmap", "colmap-text"])
