@@ -1,13 +1,15 @@
 """Pose of a camera from known points and the rays to them: all solutions, then refinement of many views at once."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.closed_forms.rigid import rigid, rotation_exp, rotation_to
-from adjust.closed_forms.view_kernels import errors_of_views, plane_poses, refine_views
+from adjust.closed_forms.view_kernels import errors_of_views, first_poses, plane_poses, refine_views
 from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.parallel import run_split, split_blocks
 
 PLANAR = 1e-4  # thickness against extent below which points count as a plane
 WIDEST = float(np.cos(np.deg2rad(80.0)))  # rays further off the mean direction are left to the refinement
@@ -33,6 +35,31 @@ def absolute_pose(x: FloatArray, rays: FloatArray, refinements: int = 5) -> Pose
     Raises SurveyError for too few points, points on a line, or where no pose has the points in front.
     """
     return _refined(pose_solutions(x, rays), x, rays, refinements)
+
+
+def best_poses(x: Sequence[FloatArray], rays: Sequence[FloatArray], refinements: int) -> tuple[FloatArray, FloatArray]:
+    """The best pose (B, 4, 4) of :func:`absolute_pose` in every view and its error (B,) rad, infinite where none is."""
+    n, ptr = len(x), np.cumsum([0] + [len(part) for part in x])
+    poses, error = np.tile(np.eye(4), (n, 2, 1, 1)), np.full((n, 2), np.inf)
+    in_front, planar = np.zeros((n, 2), dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+    if n:
+        all_x, all_rays = np.concatenate(x), np.concatenate(rays)
+        run_split(first_poses, split_blocks(ptr), all_x, all_rays, ptr, PLANAR, WIDEST, poses, error, in_front, planar)
+    for k in range(2 if planar.any() else 0):
+        mine = np.ascontiguousarray(poses[:, k])
+        refine_views(mine, all_x, all_rays, ptr, refinements, False)
+        rms, front = np.empty(n), np.empty(n, dtype=np.bool_)
+        errors_of_views(mine, all_x, all_rays, ptr, rms, front)
+        poses[:, k], error[:, k], in_front[:, k] = mine, rms, front
+    error[~in_front | ~planar[:, None]] = np.inf
+    for i in np.flatnonzero(~planar).tolist():
+        try:
+            found = absolute_pose(x[i], rays[i], refinements)
+        except SurveyError:
+            continue
+        poses[i, 0], error[i, 0] = found.camera_from_target[0], found.error[0]
+    best = np.argmin(error, axis=1)
+    return poses[np.arange(n), best], error[np.arange(n), best]
 
 
 def pose_solutions(x: FloatArray, rays: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.closed_forms import rigid, rotation_exp
-from adjust.closed_forms.rigid import skew
+from adjust.initial.refinement_kernels import lens_and_poses
 from adjust.lens import LensModel, lens_derivatives, lens_residuals
 from adjust.model import FloatArray, IntArray
 
@@ -102,20 +102,13 @@ def _normal_equations(
     weights: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Lens block (p, p), mixed (B, 6, p), pose blocks (B, 6, 6) and right sides (p,), (B, 6)."""
-    view = np.repeat(np.arange(len(poses)), np.diff(ptr))
-    p = _in_camera(poses, x, view)
+    p = _in_camera(poses, x, np.repeat(np.arange(len(poses)), np.diff(ptr)))
     r, by_values, by_point = lens_derivatives(model, values, constants, p, uv)
-    a = by_values @ directions
-    j = np.concatenate([-by_point @ skew(p), by_point], axis=2)
-    jw = np.swapaxes(j * weights[:, None, None], 1, 2)
-    aw = a * weights[:, None, None]
-    return (
-        np.asarray(np.tensordot(aw, a, axes=([0, 1], [0, 1]))),
-        np.add.reduceat(jw @ a, ptr[:-1]),
-        np.add.reduceat(jw @ j, ptr[:-1]),
-        np.asarray(np.tensordot(aw, r, axes=([0, 1], [0, 1]))),
-        np.add.reduceat((jw @ r[:, :, None])[..., 0], ptr[:-1]),
-    )
+    m, n = directions.shape[1], len(poses)
+    out = (np.zeros((m, m)), np.zeros((n, 6, m)), np.zeros((n, 6, 6)), np.zeros(m), np.zeros((n, 6)))
+    a, by_point = np.ascontiguousarray(by_values @ directions), np.ascontiguousarray(by_point)
+    lens_and_poses(np.asarray(ptr, dtype=np.int64), p, r, a, by_point, weights, *out)
+    return out
 
 
 def _step(

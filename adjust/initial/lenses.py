@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.closed_forms import absolute_pose, homography, pinhole_from_homographies
+from adjust.closed_forms import homography, pinhole_from_homographies
+from adjust.closed_forms.absolute_pose import best_poses
 from adjust.closed_forms.view_kernels import plane_misfits
 from adjust.errors import SurveyError
 from adjust.initial.lens_refinement import LensFit, fit_lens
@@ -180,13 +181,11 @@ class _LensSearch:
 
     def _error_px(self, values: FloatArray, images: Sequence[Sighting]) -> float:
         """Median over the images of the best pose's error, relative to the extent of the points, in px."""
-        focal, errors = focal_length_px(self.model, values, self.constants), []
-        for s, rays in zip(images, self._rays(values, images), strict=True):
-            try:
-                errors.append(np.inf if rays is None else focal * float(absolute_pose(s.x, rays, 2).error[0]))
-            except SurveyError:
-                errors.append(np.inf)
-        return float(np.median(errors))
+        rays = self._rays(values, images)
+        some = [(s.x, r) for s, r in zip(images, rays, strict=True) if r is not None]
+        errors = np.full(len(images), np.inf)
+        errors[: len(some)] = best_poses([x for x, _ in some], [r for _, r in some], 2)[1]
+        return float(np.median(errors)) * focal_length_px(self.model, values, self.constants)
 
     def _refine(self, start: FloatArray, how: str, chosen: Sequence[Sighting], excluded: dict[int, str]) -> LensStart:
         """The richest lens that the images determine, refined together with the poses."""
@@ -214,16 +213,11 @@ class _LensSearch:
         return LensStart(start, f"lens from {len(images)} images ({how}; too few to refine it)", excluded)
 
     def _poses(self, values: FloatArray, chosen: Sequence[Sighting]) -> tuple[list[Sighting], FloatArray]:
-        images, poses = [], []
-        for s, rays in zip(chosen, self._rays(values, chosen), strict=True):
-            if rays is None:
-                continue
-            try:
-                poses.append(absolute_pose(s.x, rays, refinements=3).camera_from_target[0])
-                images.append(s)
-            except SurveyError:  # left to the screening of all blocks, which reports it
-                continue
-        return images, np.array(poses).reshape(-1, 4, 4)
+        some = [(s, r) for s, r in zip(chosen, self._rays(values, chosen), strict=True) if r is not None]
+        poses, error = best_poses([s.x for s, _ in some], [r for _, r in some], 3)
+        # images without a pose are left to the screening of all blocks, which reports them
+        good = np.isfinite(error)
+        return [s for (s, _), g in zip(some, good, strict=True) if g], poses[good]
 
     def _rays(self, values: FloatArray, images: Sequence[Sighting]) -> list[FloatArray | None]:
         """Unit rays of every image, None for one with pixels that the lens cannot have imaged."""

@@ -200,12 +200,13 @@ def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str]
         np.concatenate([v.x for v in views]), np.concatenate([v.rays for v in views]), ptr, offsets, medians,
     )  # fmt: skip
     focal = np.array([v.focal_px for v in views])
+    worst = np.maximum.reduceat(offsets, ptr[:-1]) * focal
     by_camera: dict[str, list[int]] = {}
     for i, view in enumerate(views):
         by_camera.setdefault(survey.image_blocks[view.block_idx].camera_id, []).append(i)
     for mine in by_camera.values():
         limit = max(3.0, 10.0 * float(np.median(medians[mine] * focal[mine])))
-        for i in mine:
+        for i in (i for i in mine if worst[i] > limit):
             view, bad = views[i], offsets[ptr[i] : ptr[i + 1]] * focal[i] > limit
             text = block_text(survey.image_blocks[view.block_idx])
             if bad.mean() > _GROSS_SHARE:
@@ -213,6 +214,6 @@ def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str]
                     f"{text}: {int(bad.sum())} of {len(bad)} points are more than {limit:.1f} px off the best pose"
                     " (mis-detected, or points in the wrong order)"
                 )
-            elif bad.any():
+            else:
                 notes.append(f"{text}: {int(bad.sum())} of {len(bad)} points are gross errors (over {limit:.1f} px)")
     return reasons, notes
