@@ -52,8 +52,10 @@ def test_normal_equations_are_the_sums_over_their_rows():
         rows[2 * i : 2 * i + 2, m + 6 * view : m + 6 * view + 6] = j
     W = np.repeat(w, 2)
     N, g = rows.T @ (W[:, None] * rows), rows.T @ (W * r.ravel())
-    assert np.allclose(out[0], N[:m, :m]) and np.allclose(out[3], g[:m])
+    assert np.allclose(out[0], N[:m, :m])
+    assert np.allclose(out[3], g[:m])
     for view in range(3):
         k = slice(m + 6 * view, m + 6 * view + 6)
-        assert np.allclose(out[1][view], N[k, :m]) and np.allclose(out[2][view], N[k, k])
+        assert np.allclose(out[1][view], N[k, :m])
+        assert np.allclose(out[2][view], N[k, k])
         assert np.allclose(out[4][view], g[k])
