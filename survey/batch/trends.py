@@ -114,5 +114,5 @@ def _turns(records: Sequence[Record]) -> Iterator[tuple[str, str, int, float, fl
             now = Rotation.from_quat([x, y, z, w])
             vector = _ARCSEC * (first.setdefault(turn.name, now).inv() * now).as_rotvec()
             for axis, value, sigma in zip(("rx", "ry", "rz"), vector, turn.sigmas_arcsec, strict=True):
-                if sigma > 0.0:
+                if np.isfinite(sigma) and sigma > 0.0:
                     yield f"{turn.name}/{axis}", "arcsec", epoch, float(value), sigma
