@@ -111,11 +111,11 @@ def replace_parts(folder: Path, entries: Sequence[str] | None = None, gone: Sequ
     """
     adding = folder / ADDING
     wanted = sorted(path.name for path in adding.iterdir()) if entries is None else list(entries)
-    gone = [entry for entry in gone if (folder / entry).is_file()]
-    outside = next((entry for entry in (*wanted, *gone) if not _is_inside(folder, entry)), None)
+    files = [name for entry in wanted if entry != RESULTS for name in _files(adding, entry)]
+    files += [entry for entry in gone if (folder / entry).is_file()]
+    outside = next((entry for entry in files if not _is_inside(folder, entry)), None)
     if outside is not None:  # could not be undone
         raise SurveyError(f"{folder / outside}: lies behind a link; move that into the project, or use --out")
-    files = [*(name for entry in wanted if entry != RESULTS for name in _files(adding, entry)), *gone]
     if RESULTS in wanted and not (folder / RESULTS).exists():
         files.append(RESULTS)
     elif RESULTS in wanted:
@@ -160,8 +160,8 @@ def _replace(folder: Path, folders: list[str], files: list[str]) -> None:
         raise
     for entry in folders:
         carry_over(adding / entry, folder / entry)
-        shutil.rmtree(adding / entry)
-    shutil.rmtree(before)
+        shutil.rmtree(adding / entry, ignore_errors=True)
+    shutil.rmtree(before, ignore_errors=True)  # without its list it is a leftover
 
 
 def _keep_old(folder: Path, folders: list[str], files: list[str]) -> None:

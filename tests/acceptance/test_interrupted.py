@@ -457,9 +457,17 @@ def test_nothing_is_written_through_a_link(lab: Path, tmp_path: Path, capsys: py
         before = content(tmp_path)
         assert main(["remove", str(lab), "p0-2", "--quiet"]) == FAILED
         assert "link" in capsys.readouterr().err
+        with pytest.raises(SurveyError, match=r"is a link|lies behind a link"):
+            _changed(lab, f"{name}/deep/image_points.csv")
         assert content(tmp_path) == before
         (lab / name).unlink()
         (tmp_path / name).rename(lab / name)
+
+
+def _changed(lab: Path, name: str) -> None:
+    with changing(lab) as place:
+        atomic_write(place / name, "new")
+        replace_parts(lab)
 
 
 def test_a_table_behind_a_link_is_replaced_not_written_to(lab: Path, tmp_path: Path) -> None:
