@@ -25,7 +25,7 @@ LOCK, SESSION_LOCK = ".labsurvey.lock", "capture/lock"
 BEFORE, LIST = ".before", "entries.json"
 """In a project folder: what is being replaced; in there the list of it, while that is neither done nor undone."""
 _HELD = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
-_LOOK_S, _PATIENCE_S = 0.01, 60.0
+_LOOK_S, _PATIENCE_S, _TRIES = 0.01, 60.0, 5
 
 
 class BusyError(SurveyError):
@@ -50,8 +50,7 @@ class FileLock:
             try:
                 self._lock(handle)
                 if _is_at(handle, self.path):  # else the last holder has just removed the file: make a new one
-                    os.ftruncate(handle, 0)
-                    os.write(handle, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
+                    self._sign(handle)
                     self._handle, handle = handle, -1
             finally:
                 if handle >= 0:
@@ -69,13 +68,24 @@ class FileLock:
             raise SurveyError(f"{self.path}: is no lock of labsurvey; remove it")
         return handle
 
+    def _sign(self, handle: int) -> None:
+        try:
+            os.ftruncate(handle, 0)
+            os.write(handle, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
+        except OSError as error:  # a full disk
+            self.path.unlink(missing_ok=True)
+            raise OSError(error.errno, error.strerror, str(self._folder)) from error
+
     def _lock(self, handle: int) -> None:
         try:
-            if not _flocked(handle, shared=False):
-                said = _holder(handle)
-                raise BusyError(f"{self._folder}: another {self._user} works on this folder ({said}); wait for it or "
-                                "stop it")  # fmt: skip
+            for _ in range(_TRIES):  # somebody may just be asking who has it
+                if _flocked(handle, shared=False):
+                    return
+                time.sleep(_LOOK_S)
+            raise BusyError(f"{self._folder}: another {self._user} works on this folder ({_holder(handle)}); wait for "
+                            "it or stop it")  # fmt: skip
         except OSError as error:
+            self.path.unlink(missing_ok=True)
             raise SurveyError(
                 f"{self._folder}: its file system has no locks ({error.strerror}), so that two could write it at once; "
                 "work on a copy on a local disk"
