@@ -36,6 +36,8 @@ _SIGMAS = POSE_KEYS[4:-1]
 
 def rotation_from_quaternion(wxyz: FloatArray) -> Rot3 | None:
     """The rotation of a quaternion, or None where its length is not 1 within 1e-3."""
+    if not np.abs(wxyz).max() < 2.0:  # nor is there an end to what stands in files
+        return None
     length = float(np.linalg.norm(wxyz))
     if abs(length - 1.0) > 1e-3:
         return None

@@ -209,6 +209,8 @@ class _Reader:
         if not self.defaults.has(key):
             raise e.error(f"has no stdev and <points-observations> no {key}; add one")
         words = self.defaults.get(key).split()
+        if not words:
+            raise self.defaults.error(f"{key} is empty; give the deviation, for distances up to three numbers")
         a, *rest = (number(word, key, self.defaults.where) for word in words)
         if e.tag in _ANGULAR:
             sigma = a * CC
