@@ -216,5 +216,5 @@ def _holder(handle: int) -> str:
     try:
         who = json.loads(os.pread(handle, 1000, 0))
         return f"process {int(who['pid'])} on {who['host']!s}"
-    except (ValueError, KeyError, TypeError, RecursionError, OSError):
+    except (ValueError, OverflowError, KeyError, TypeError, RecursionError, OSError):
         return "it has not said who it is"
