@@ -27,8 +27,8 @@ def adjoint_of_inverse(R: FloatArray, t: FloatArray, out: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def compose_left(Ra: FloatArray, ta: FloatArray, inverse: bool | np.bool_, R: FloatArray, t: FloatArray) -> None:
-    """(R, t) <- A^+-1 (R, t), in place. A constant is given as np.bool_: numba would compile once more for it."""
+def compose_left(Ra: FloatArray, ta: FloatArray, inverse: bool, R: FloatArray, t: FloatArray) -> None:
+    """(R, t) <- A^+-1 (R, t), in place."""
     r = np.empty((3, 3))
     s = np.empty(3)
     if inverse:
@@ -58,14 +58,14 @@ def evaluate_chains(
         for k in range(link_ptr[b + 1] - 1, link_ptr[b] - 1, -1):
             a = link_slot[k]
             if link_inverse[k]:
-                compose_left(slot_R[a], slot_t[a], link_inverse[k], Rb, tb)
+                compose_left(slot_R[a], slot_t[a], True, Rb, tb)
                 adjoint_of_inverse(Rb, tb, C[k])
                 for i in range(6):
                     for j in range(6):
                         C[k, i, j] = -C[k, i, j]
             else:
                 adjoint_of_inverse(Rb, tb, C[k])
-                compose_left(slot_R[a], slot_t[a], link_inverse[k], Rb, tb)
+                compose_left(slot_R[a], slot_t[a], False, Rb, tb)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -99,15 +99,15 @@ def table_motion(
         axis3 = 3 - axis1 - axis2
         D[axis2, 1] = 1.0
         _turn(axis2, angle2, r)
-        compose_left(r, zero, np.bool_(False), R, t)
+        compose_left(r, zero, False, R, t)
         adjoint_of_inverse(R, t, ad)
         D[:, 2] = ad[:, axis3]
         _turn(axis3, tilt, r)
-        compose_left(r, zero, np.bool_(False), R, t)
+        compose_left(r, zero, False, R, t)
         adjoint_of_inverse(R, t, ad)
         D[:, 3] = ad[:, 3 + axis3]
         t[axis3] += offset
     adjoint_of_inverse(R, t, ad)
     D[:, 0] = ad[:, axis1]
     _turn(axis1, angle1, r)
-    compose_left(r, zero, np.bool_(False), R, t)
+    compose_left(r, zero, False, R, t)

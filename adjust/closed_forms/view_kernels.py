@@ -55,9 +55,7 @@ def refine_views(poses: FloatArray, x: FloatArray, rays: FloatArray, ptr: IntArr
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _refine(
-    pose: FloatArray, x: FloatArray, rays: FloatArray, iterations: int | np.int64, robust: bool | np.bool_
-) -> None:  # fmt: skip
+def _refine(pose: FloatArray, x: FloatArray, rays: FloatArray, iterations: int, robust: bool) -> None:
     n = len(x)
     across, p, r, depth = np.empty((n, 2, 3)), np.empty((n, 3)), np.empty((n, 2)), np.empty(n)
     new_p, new_r, new_depth = np.empty((n, 3)), np.empty((n, 2)), np.empty(n)
@@ -200,7 +198,7 @@ def _complete_map_rows(N: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def plane_to_image(xy: FloatArray, uv: FloatArray, refinements: int | np.int64, h: FloatArray) -> float:
+def plane_to_image(xy: FloatArray, uv: FloatArray, refinements: int, h: FloatArray) -> float:
     """Homography h (3, 3) of a plane and the rms of its residuals in the unit of uv; negative where it is singular.
 
     Hartley and Zisserman, Multiple View Geometry, algorithm 4.2, then Gauss-Newton steps on the distance in the image.
@@ -296,7 +294,7 @@ def plane_poses(x: FloatArray, rays: FloatArray, thickness: float, widest: float
     scale = np.sqrt(np.max(np.sum(centred**2, axis=1)))
     local = np.ascontiguousarray((centred @ axes.T)[:, :2]) / scale
     H = np.empty((3, 3))
-    if plane_to_image(local, xy, np.int64(0), H) < 0 or H[2, 2] == 0.0:
+    if plane_to_image(local, xy, 0, H) < 0 or H[2, 2] == 0.0:
         return -1
     H = H / H[2, 2]
     turns = np.empty((2, 3, 3))
@@ -403,7 +401,7 @@ def refine_candidates(run: IntArray, x: FloatArray, rays: FloatArray, ptr: IntAr
         whole[0], whole[1] = 0, len(rows)
         some_x, some_rays = x[rows], rays[rows]
         for k in range(c, d):
-            _refine(poses[k], some_x, some_rays, iterations, np.bool_(True))
+            _refine(poses[k], some_x, some_rays, iterations, True)
             errors_of_views(poses[k : k + 1], some_x, some_rays, whole, rms[k : k + 1], in_front[k : k + 1])
         kept[c:d] = True
         _plausible(rms[c:d], in_front[c:d], rival, noise[view], kept[c:d])
@@ -412,7 +410,7 @@ def refine_candidates(run: IntArray, x: FloatArray, rays: FloatArray, ptr: IntAr
         whole[1] = b - a
         for k in range(c, d):
             if kept[k]:
-                _refine(poses[k], x[a:b], rays[a:b], np.int64(2), np.bool_(True))
+                _refine(poses[k], x[a:b], rays[a:b], 2, True)
                 errors_of_views(poses[k : k + 1], x[a:b], rays[a:b], whole, rms[k : k + 1], in_front[k : k + 1])
         _plausible(rms[c:d], in_front[c:d], rival, noise[view], kept[c:d])
 
@@ -463,7 +461,7 @@ def plane_misfits(x: FloatArray, uv: FloatArray, ptr: IntArray, out: FloatArray)
         centred = x[a:b] - mean
         vectors = np.linalg.eigh(centred.T @ centred)[1]
         xy = np.ascontiguousarray((centred @ vectors)[:, :0:-1])
-        if plane_to_image(xy, uv[a:b], np.int64(0), h) < 0:
+        if plane_to_image(xy, uv[a:b], 0, h) < 0:
             continue
         miss = np.empty(b - a)
         for i in range(b - a):
