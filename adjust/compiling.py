@@ -35,6 +35,6 @@ def njit(*, cache: bool = True, **options: Any) -> Callable[[_F], _F]:
         dispatcher = numba.njit(cache=cache, **options)(function)
         if cache and _KNOWN and type(getattr(dispatcher, "_cache", None)) is FunctionCache:
             dispatcher._cache = _OpenedAsIs(function)  # type: ignore[no-untyped-call]  # numba has no types
-        return dispatcher  # type: ignore[no-any-return]
+        return dispatcher  # type: ignore[no-any-return]  # numba has no types; called as the function is
 
     return compiled

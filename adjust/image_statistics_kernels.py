@@ -30,8 +30,7 @@ def _add_four(
 def quadratic_forms(A: FloatArray, n: int, m: int, Q: FloatArray, T: FloatArray, M: FloatArray) -> None:
     """M (3, m): u' Q u, u' Q v and v' Q v for the columns A of m points, u first and v after it, and a symmetric Q.
 
-    Half of Q is enough: with T = (lower triangle, half its diagonal) a, a' Q a = 2 a' T. Q and A have four rows and
-    columns more than n; T (2 m,) is scratch.
+    Half of Q is enough: with T = (lower triangle, half its diagonal) a, a' Q a = 2 a' T. T (2 m,) is scratch.
     """
     M[:] = 0.0
     for i in range(n):

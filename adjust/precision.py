@@ -15,6 +15,7 @@ from adjust.bundle_hidden import BundleHidden
 from adjust.datum import stacking, survey_motions
 from adjust.distributions import chi2
 from adjust.graph import AdjustmentGraph
+from adjust.image_batch import square_root_information, whitened_squares
 from adjust.model import BoolArray, FloatArray
 from adjust.observation_factor import ObservationFactor
 from adjust.result import (
@@ -257,9 +258,7 @@ def _image_sums(
     number = {name: i for i, name in enumerate(names)}
     of_point = np.repeat([number[block.group] for block in blocks], np.diff(images.block_ptr))[images.used]
     cov = np.concatenate([block.cov for block in blocks])[images.used]
-    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
-    x, y = images.residuals[images.used].T
-    squares = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
+    squares = whitened_squares(images.residuals[images.used], square_root_information(cov))
 
     def total(of_points: FloatArray) -> FloatArray:
         return np.asarray(np.bincount(of_point, of_points, len(names)), dtype=np.float64)
