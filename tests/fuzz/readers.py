@@ -223,30 +223,30 @@ def _foreign(name: str) -> Callable[[Path], object]:
     return read
 
 
-def _aicon(folder: Path, file: str) -> Read:
-    read = _foreign("aicon")
-    for name, text in AICON.items():
-        (folder / name).write_text(text)
-    path = folder / file
+def _one_of(kind: str, files: dict[str, str], opened: str, file: str) -> Callable[[Path], Read]:
+    """One file of a network that consists of several, all others whole."""
 
-    def run(data: bytes) -> object:
-        path.write_bytes(data)
-        return read(folder / "net.phc")
+    def prepare(folder: Path) -> Read:
+        read = _foreign(kind)
+        for name, text in files.items():
+            (folder / name).write_text(text)
+        path = folder / file
 
-    return run
+        def run(data: bytes) -> object:
+            path.write_bytes(data)
+            return read(folder / opened)
+
+        return run
+
+    return prepare
 
 
-def _dbat(folder: Path, file: str) -> Read:
-    read = _foreign("dbat")
-    for name, text in {**DBAT_FILES, "net.xml": DBAT}.items():
-        (folder / name).write_text(text)
-    path = folder / file
+def _aicon(file: str) -> Callable[[Path], Read]:
+    return _one_of("aicon", AICON, "net.phc", file)
 
-    def run(data: bytes) -> object:
-        path.write_bytes(data)
-        return read(folder / "net.xml")
 
-    return run
+def _dbat(file: str) -> Callable[[Path], Read]:
+    return _one_of("dbat", {**DBAT_FILES, "net.xml": DBAT}, "net.xml", file)
 
 
 def _adjusted_krumm(path: Path) -> object:
@@ -301,10 +301,10 @@ READERS: dict[str, Reader] = {
     "krumm-adjusted": Reader(lambda: [b"A 1.0 2.0 3.0\nB 1 2 3 4 5 6 7\n"], in_file("net.adj", _adjusted_krumm)),
     "lgc": Reader(lambda: [LGC.encode()], in_file("net.lgc", _foreign("lgc"))),
     "csv": Reader(lambda: [CSV.encode()], in_file("net.csv", _foreign("csv"))),
-    "dbat": Reader(lambda: [DBAT.encode()], lambda folder: _dbat(folder, "net.xml")),
-    **{f"dbat-{n.split('.')[0]}": Reader(lambda t=t: [t.encode()], lambda folder, n=n: _dbat(folder, n))
+    "dbat": Reader(lambda: [DBAT.encode()], _dbat("net.xml")),
+    **{f"dbat-{n.split('.')[0]}": Reader(lambda t=t: [t.encode()], _dbat(n))
        for n, t in DBAT_FILES.items()},
-    **{f"aicon-{n.split('.')[1]}": Reader(lambda t=t: [t.encode()], lambda folder, n=n: _aicon(folder, n))
+    **{f"aicon-{n.split('.')[1]}": Reader(lambda t=t: [t.encode()], _aicon(n))
        for n, t in AICON.items()},
     **CAMERA_READERS,
     **JOB_READERS,
