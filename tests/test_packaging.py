@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from survey.cli import build_parser, main
-from survey.completion import SHELLS, commands_of, completion_script
+from survey.completion import SHELLS, commands_of
+from tests.completion_checks import bash_completes, names_every_command_and_parses
 from tests.lower_bounds import pins, requirements
 
 ROOT = Path(__file__).parents[1]
@@ -75,25 +76,14 @@ def test_lower_bounds_are_taken_as_they_stand() -> None:
     ],
 )
 def test_bash_completes(tmp_path: Path, words: list[str], expected: list[str]) -> None:
-    script = tmp_path / "completion"
-    script.write_text(completion_script(build_parser(), "bash"))
-    quoted = " ".join(f"'{w}'" for w in words)
-    code = f"source {script}; COMP_WORDS=({quoted}); COMP_CWORD={len(words) - 1}; _labsurvey; echo ${{COMPREPLY[@]}}"
-    done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=True)
-    assert done.stderr == ""
-    assert done.stdout.split() == expected
+    bash_completes(build_parser(), tmp_path, words, expected)
 
 
 @pytest.mark.parametrize("shell", SHELLS)
 def test_scripts_name_every_command_and_parse(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["completion", shell]) == 0
     script = capsys.readouterr().out
-    for command in commands_of(build_parser()):
-        assert re.search(rf"\b{command.name}\b", script)
-        assert all(flag.names[-1].lstrip("-") in script for flag in command.flags)
-    if shutil.which(shell):
-        (tmp_path / "s").write_text(script)
-        subprocess.run([shell, "-n", str(tmp_path / "s")], check=True)
+    names_every_command_and_parses(build_parser(), shell, script, tmp_path)
 
 
 def test_help_opens_with_a_command_and_names_the_next(capsys: pytest.CaptureFixture[str]) -> None:
