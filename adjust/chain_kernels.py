@@ -41,8 +41,19 @@ def compose_left(Ra: FloatArray, ta: FloatArray, inverse: bool, R: FloatArray, t
             s[i] = ta[i] + Ra[i, 0] * t[0] + Ra[i, 1] * t[1] + Ra[i, 2] * t[2]
             for j in range(3):
                 r[i, j] = Ra[i, 0] * R[0, j] + Ra[i, 1] * R[1, j] + Ra[i, 2] * R[2, j]
-    R[:] = r
-    t[:] = s
+    for i in range(3):
+        t[i] = s[i]
+        for j in range(3):
+            R[i, j] = r[i, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nothing(R: FloatArray, t: FloatArray) -> None:
+    """(R, t) becomes the motion that moves nothing."""
+    for i in range(3):
+        t[i] = 0.0
+        for j in range(3):
+            R[i, j] = 1.0 if i == j else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -53,8 +64,7 @@ def evaluate_chains(
     """Poses R (B, 3, 3), t (B, 3) of all chains, and C (links, 6, 6), the derivative of each pose by each link."""
     for b in range(link_ptr.size - 1):
         Rb, tb = R[b], t[b]
-        Rb[:] = np.eye(3)
-        tb[:] = 0.0
+        _nothing(Rb, tb)
         for k in range(link_ptr[b + 1] - 1, link_ptr[b] - 1, -1):
             a = link_slot[k]
             if link_inverse[k]:
@@ -72,12 +82,9 @@ def evaluate_chains(
 def _turn(axis: int, angle: float, R: FloatArray) -> None:
     c, s = np.cos(angle), np.sin(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
-    R[:] = 0.0
-    R[axis, axis] = 1.0
-    R[i, i] = c
-    R[j, j] = c
-    R[i, j] = -s
-    R[j, i] = s
+    R[axis, axis], R[axis, i], R[axis, j] = 1.0, 0.0, 0.0
+    R[i, axis], R[i, i], R[i, j] = 0.0, c, -s
+    R[j, axis], R[j, i], R[j, j] = 0.0, s, c
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -92,8 +99,7 @@ def table_motion(
     r = np.empty((3, 3))
     zero = np.zeros(3)
     ad = np.empty((6, 6))
-    R[:] = np.eye(3)
-    t[:] = 0.0
+    _nothing(R, t)
     D[:] = 0.0
     if axis2 >= 0:
         axis3 = 3 - axis1 - axis2
@@ -101,13 +107,16 @@ def table_motion(
         _turn(axis2, angle2, r)
         compose_left(r, zero, False, R, t)
         adjoint_of_inverse(R, t, ad)
-        D[:, 2] = ad[:, axis3]
+        for i in range(6):
+            D[i, 2] = ad[i, axis3]
         _turn(axis3, tilt, r)
         compose_left(r, zero, False, R, t)
         adjoint_of_inverse(R, t, ad)
-        D[:, 3] = ad[:, 3 + axis3]
+        for i in range(6):
+            D[i, 3] = ad[i, 3 + axis3]
         t[axis3] += offset
     adjoint_of_inverse(R, t, ad)
-    D[:, 0] = ad[:, axis1]
+    for i in range(6):
+        D[i, 0] = ad[i, axis1]
     _turn(axis1, angle1, r)
     compose_left(r, zero, False, R, t)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba
+from numba.core import types
 from numba.core.caching import FunctionCache
 from numba.core.runtime.nrt import rtsys
 
@@ -28,11 +29,22 @@ class _OpenedAsIs(FunctionCache):
 _KNOWN = all(hasattr(FunctionCache, n) for n in ("_load_overload", "_guard_against_spurious_io_errors"))
 
 
+def _one_for_all_values(get_call_template: Callable[..., Any]) -> Callable[..., Any]:
+    """A kernel that another one calls with a constant is not compiled once more for just this constant."""
+
+    def of_types(args: Any, kws: Any) -> Any:
+        plain: Callable[[Any], Any] = types.unliteral
+        return get_call_template(tuple(map(plain, args)), {name: plain(a) for name, a in kws.items()})
+
+    return of_types
+
+
 def njit(*, cache: bool = True, **options: Any) -> Callable[[_F], _F]:
     """``numba.njit(cache=cache, **options)``, with the cache opened as said above."""
 
     def compiled(function: _F) -> _F:
         dispatcher = numba.njit(cache=cache, **options)(function)
+        dispatcher.get_call_template = _one_for_all_values(dispatcher.get_call_template)
         if cache and _KNOWN and type(getattr(dispatcher, "_cache", None)) is FunctionCache:
             dispatcher._cache = _OpenedAsIs(function)  # type: ignore[no-untyped-call]  # numba has no types
         return dispatcher  # type: ignore[no-any-return]  # numba has no types; called as the function is

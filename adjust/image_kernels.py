@@ -343,7 +343,9 @@ def serve(
         b = which[i]
         nl = lenses.n_free[blocks.camera[b]]
         n = nl + 6 + blocks.n_warp[b] + 1
-        T[:n, :n] = H[b, :n, :n]
+        for j in range(n):
+            for c in range(n):
+                T[j, c] = H[b, j, c]
         half_cholesky(T, n)
         for j in range(n):
             r_out[b, j] = T[j, n - 1]
@@ -372,7 +374,9 @@ def pose_by_key(s: int, segments: SegmentArrays, C: FloatArray, D: FloatArray, E
     """Derivative E (6, n of segment s) of a block's pose by its unknown: a pose, or a part of a table."""
     Cs = C[segments.link[s]]
     if segments.kind[s] == SEGMENT_POSE:
-        E[:] = Cs
+        for i in range(6):
+            for j in range(6):
+                E[i, j] = Cs[i, j]
         return
     Ds, start = D[segments.table[s]], segments.start[s]
     for i in range(6):

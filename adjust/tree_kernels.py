@@ -43,8 +43,8 @@ def invert_cliques(front: IntArray, width: IntArray, at: IntArray, data: FloatAr
                 return c
         row = np.empty(n)
         for i in range(nf - 1, -1, -1):
-            row[i:nf] = 0.0
-            row[nf:] = A[i, nf:]
+            for j in range(i, n):
+                row[j] = A[i, j] if j >= nf else 0.0
             for k in range(i + 1, nf):
                 factor = A[i, k]
                 for j in range(k, n):
@@ -106,10 +106,14 @@ def covariance_rows(
         ns = n - nf
         A = data[at[c] : at[c] + nf * n].reshape(nf, n)
         C = cov[at[c] : at[c] + nf * n].reshape(nf, n)
-        P = np.ascontiguousarray(A[:, :nf])
+        P = np.empty((nf, nf))
         for i in range(nf):
-            P[i, :i] = 0.0
-        C[:, :nf] = P @ P.T
+            for j in range(nf):
+                P[i, j] = A[i, j] if j >= i else 0.0
+        X = P @ P.T
+        for i in range(nf):
+            for j in range(nf):
+                C[i, j] = X[i, j]
         if ns == 0:
             continue
         Q = np.empty((ns, ns))
@@ -126,7 +130,10 @@ def covariance_rows(
                         Q[s + m, r + k] = Q[r + k, s + m]
                 s += dj
             r += dims[keys[i]]
-        T = np.ascontiguousarray(A[:, nf:])
+        T = np.empty((nf, ns))
+        for i in range(nf):
+            for j in range(ns):
+                T[i, j] = A[i, nf + j]
         Y = T @ Q
         X = Y @ T.T
         for i in range(nf):

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.closed_forms.plane_kernels import first_poses, plane_poses
 from adjust.closed_forms.rigid import rigid, rotation_exp, rotation_to
-from adjust.closed_forms.view_kernels import errors_of_views, first_poses, plane_poses, refine_views
+from adjust.closed_forms.view_kernels import errors_of_views, refine_views
 from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.parallel import run_split, split_blocks
@@ -66,9 +67,9 @@ def pose_solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
     """The unrefined poses (k, 4, 4) of :func:`absolute_pose`, in no order and not checked for what lies in front."""
     if len(x) < 3:
         raise SurveyError(f"a camera pose needs 3 known points, got {len(x)}: observe more of them")
-    both = np.empty((2, 4, 4))
-    if len(x) > 3 and plane_poses(_flat(x), _flat(rays), PLANAR, WIDEST, both) == 2:
-        return both
+    both = np.empty((1, 2, 4, 4))
+    if len(x) > 3 and plane_poses(_flat(x), _flat(rays), 0, len(x), PLANAR, WIDEST, 0, both):
+        return np.asarray(both[0])
     mean = rays.mean(axis=0)
     front_from_camera = rotation_to(mean, np.array([0.0, 0.0, 1.0]))
     turned = rays @ front_from_camera.T

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adjust.closed_forms.view_kernels import plane_to_image
+from adjust.closed_forms.plane_kernels import plane_to_image
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from adjust.closed_forms import homography, pinhole_from_homographies
 from adjust.closed_forms.absolute_pose import best_poses
-from adjust.closed_forms.view_kernels import plane_misfits
+from adjust.closed_forms.plane_kernels import plane_misfits
 from adjust.errors import SurveyError
 from adjust.initial.lens_refinement import LensFit, fit_lens
 from adjust.lens import (

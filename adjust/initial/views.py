@@ -7,7 +7,8 @@ from functools import lru_cache
 import numpy as np
 
 from adjust.closed_forms import PLANAR, WIDEST, pose_solutions, view_errors
-from adjust.closed_forms.view_kernels import first_poses, offsets_of_views, refine_candidates
+from adjust.closed_forms.plane_kernels import first_poses
+from adjust.closed_forms.view_kernels import offsets_of_views, refine_candidates
 from adjust.errors import SurveyError
 from adjust.lens import camera_constants, focal_length_px, lens_model, unit_rays
 from adjust.model import BoolArray, Camera, FloatArray, IntArray, Survey, Target
@@ -17,6 +18,7 @@ from adjust.parallel import run_split, split_blocks
 _RIVAL = 4.0  # a second pose whose error is within this factor of the best stays a candidate
 _NOISE_PX = 0.3  # ... or within this much of it
 _ENOUGH = 36  # points of a view from which its pose is found before all of them refine it
+_ALL_STEPS = 2  # ... in so many steps
 _GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustworthy
 
 
@@ -164,8 +166,8 @@ def refine_views(views: Sequence[View], iterations: int = 8) -> list[View]:
     poses, focal = np.concatenate([v.poses for v in views]), np.array([v.focal_px for v in views])
     error, in_front, kept = (np.empty(len(poses), dtype=t) for t in (np.float64, np.bool_, np.bool_))
     run_split(
-        refine_candidates, split_blocks(ptr), x, rays, ptr, *_samples(views), first, iterations, _RIVAL,
-        _NOISE_PX / focal, poses, error, in_front, kept,
+        refine_candidates, split_blocks(ptr), x, rays, ptr, *_samples(views), first, iterations, _ALL_STEPS,
+        True, _RIVAL, _NOISE_PX / focal, poses, error, in_front, kept,
     )  # fmt: skip
     out = []
     for i, (v, a, b) in enumerate(zip(views, first[:-1].tolist(), first[1:].tolist(), strict=True)):

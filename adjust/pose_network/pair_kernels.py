@@ -3,14 +3,11 @@
 The same formulas as :mod:`adjust.relay.motions`, pair by pair without intermediate arrays.
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves every function below untyped
-
 from math import cos, sin, sqrt
 
 import numpy as np
-from numba import njit
 
+from adjust.compiling import njit
 from adjust.model import BoolArray, FloatArray, IntArray
 
 _SMALL = 0.3  # rad; below it the series are exact to the last digit, above it the closed forms lose none
@@ -131,7 +128,9 @@ def derivatives(
             w[i] = -(present[e, 0, i] * place[e, 0] + present[e, 1, i] * place[e, 1] + present[e, 2, i] * place[e, 2])
         _cross_matrix(w, K)
         _product(K, adjoint[e, :3, :3], first)
-        adjoint[e, 3:, :3] = first
+        for i in range(3):
+            for j in range(3):
+                adjoint[e, 3 + i, j] = first[i, j]
         _product(by_a[e], adjoint[e], by_b[e])
     by_b *= -1.0
 
@@ -153,7 +152,9 @@ def covariances(
     for i in range(d):
         J[i, d + i] = 1.0
     for e in range(len(by_b)):
-        B[:, :d], B[:, d:], J[:, :d] = by_b[e], by_a[e], -turn[e]
+        for i in range(d):
+            for j in range(d):
+                B[i, j], B[i, d + j], J[i, j] = by_b[e, i, j], by_a[e, i, j], -turn[e, i, j]
         _product(B, Q[e], BQ)
         _product(BQ, B.T, scatter[e])
         _product(J, Q[e], JQ)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from adjust.closed_forms import homography, refine_poses, rotation_exp, rotation_log
-from adjust.closed_forms.view_kernels import plane_poses
+from adjust.closed_forms.plane_kernels import plane_poses
 
 WIDEST = float(np.cos(np.radians(80.0)))
 
@@ -24,12 +24,18 @@ def board_views(n, seed=3, sigma=0.0):
             yield x, rays / np.linalg.norm(rays, axis=1)[:, None], p
 
 
+def planes_of(x, rays):
+    """Both poses (2, 4, 4) of a plane, found among other points; None where it is no plane."""
+    both = np.empty((3, 2, 4, 4))
+    around = [np.concatenate([part[:2], part, part[:1]]) for part in (x, rays)]
+    return both[1] if plane_poses(*around, 2, 2 + len(x), 1e-4, WIDEST, 1, both) else None
+
+
 def test_one_of_both_poses_of_a_plane_is_the_true_one():
     views = list(board_views(200))
     assert len(views) > 100
     for x, rays, p in views:
-        both = np.empty((2, 4, 4))
-        assert plane_poses(x, rays, 1e-4, WIDEST, both) == 2
+        both = planes_of(x, rays)
         assert min(np.abs(x @ m[:3, :3].T + m[:3, 3] - p).max() for m in both) < 1e-10
         np.testing.assert_allclose(np.linalg.det(both[:, :3, :3]), 1.0, atol=1e-9)
 
@@ -38,8 +44,7 @@ def test_both_poses_of_a_plane_as_opencv_has_them():
     """From noisy points both solutions, refined, are the two of OpenCV's IPPE, refined in the same way."""
     apart = []
     for x, rays, _ in board_views(40, seed=9, sigma=1e-3):
-        both = np.empty((2, 4, 4))
-        assert plane_poses(x, rays, 1e-4, WIDEST, both) == 2
+        both = planes_of(x, rays)
         centre = x.mean(axis=0)
         axes = np.linalg.svd(x - centre)[2]
         axes *= np.array([[1.0], [1.0], [np.linalg.det(axes)]])
@@ -62,11 +67,10 @@ def test_no_plane_no_answer():
     x = rng.normal(size=(10, 3))
     p = x + (0.0, 0.0, 8.0)
     rays = p / np.linalg.norm(p, axis=1)[:, None]
-    both = np.empty((2, 4, 4))
-    assert plane_poses(x, rays, 1e-4, WIDEST, both) == -1
+    assert planes_of(x, rays) is None
     line = np.outer(np.linspace(-1, 1, 10), (1.0, 2.0, 0.0))
     p = line + (0.0, 0.0, 8.0)
-    assert plane_poses(line, p / np.linalg.norm(p, axis=1)[:, None], 1e-4, WIDEST, both) == -1
+    assert planes_of(line, p / np.linalg.norm(p, axis=1)[:, None]) is None
 
 
 def test_homography_is_the_least_squares_one():
