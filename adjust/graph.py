@@ -127,6 +127,8 @@ class AdjustmentGraph:
         return known, unknown
 
     def _joined(self, known: _Rows, unknown: _Rows) -> _Rows:
+        if self.bundle is None:
+            return known
         out, at = [], [0, 0]
         for i, free in self.image_order:
             n = len(self.survey.image_blocks[i].uv)
@@ -139,6 +141,11 @@ class AdjustmentGraph:
         """Which image points (N,) take part, in the order of ``Survey.image_blocks``."""
         none: BoolArray = np.zeros(0, dtype=np.bool_)
         return self._joined(self.images.used, none if self.bundle is None else self.bundle.unsorted(self.bundle.used))
+
+    def square_roots(self) -> FloatArray:
+        """Square root information (N, 3) of the image points: w00, w01, w11, as ``Survey.image_blocks`` are ordered."""
+        none = np.zeros((0, 3))
+        return self._joined(self.images.W_all, none if self.bundle is None else self.bundle.unsorted(self.bundle.W_all))
 
     def set_weights(self, weights: FloatArray) -> None:
         """Weights (N,) of the image points, on top of their covariance; zero leaves a point out."""
@@ -155,9 +162,11 @@ class AdjustmentGraph:
 
     def behind_camera(self) -> list[ImageBlock]:
         """Blocks with a point behind their camera at the prepared values."""
-        found = [b for b, z in zip(self.images.blocks, self.images.depth, strict=True) if z <= 0.0]
+        found = [self.images.blocks[b] for b in np.flatnonzero(self.images.depth <= 0.0)]
         if self.bundle is not None:
             found += [b for b, z in zip(self.bundle.blocks, self.bundle.depth, strict=True) if z <= 0.0]
+        if not found:
+            return found
         fisheye = {c.camera_id for c in self.survey.cameras if c.lens.model == "fisheye"}
         return [b for b in found if b.camera_id not in fisheye]
 
@@ -180,7 +189,7 @@ class GraphBuilder:
         """The whole graph. Raises SurveyError naming what is missing or contradictory."""
         self._register_points()
         split = [self._block(i, block) for i, block in enumerate(self.survey.image_blocks)]
-        chains = {i: self._image_chain(block) for i, _, block in split}
+        chains = {i: self.frames.of_image(block) for i, _, block in split}
         positions, pair_chains = self._chains_of_others()
         geometry = GeometryFactors(self.survey, self.unknowns, self.frames)
         self.vector_starts |= geometry.starts
@@ -202,14 +211,15 @@ class GraphBuilder:
         for factor in self._holds():
             others.add(factor)
         known = [(i, b) for i, free, b in split if not free]
+        n_warp = {t: self._n_warp(t) for t in dict.fromkeys(b.target_id for _, b in known)}
+        x_in_world = self._world_points() if None in n_warp else np.zeros((0, 3))
         images = ImageBatch(
-            self.survey, self.unknowns, state, [b for _, b in known], [chains[i] for i, _ in known],
-            [self._known_points(b) for _, b in known], [self._n_warp(b) for _, b in known],
-        )  # fmt: skip
+            self.survey, state, [b for _, b in known], [chains[i] for i, _ in known], x_in_world, n_warp
+        )
         # unused observations too: they are predicted with the joint covariance of their unknowns
         outside = {k for item in self.others for k in list(item.factor.keys())} | set(self.unknowns.held)
         outside |= readings.keys if readings is not None else set()
-        of_images = {k for keys in images.keys for k in keys}
+        of_images = set(images.of_blocks.key.tolist())
         unknown = [(i, b) for i, free, b in split if free]
         bundle = None
         if unknown:
@@ -242,30 +252,25 @@ class GraphBuilder:
         )
         return i, free, block
 
-    def _image_chain(self, block: ImageBlock) -> Chain:
-        camera = FrameRef("camera", block.camera_id, block.epoch_id)
-        target = FrameRef("target", block.target_id, block.epoch_id) if block.target_id else FrameRef("world")
-        return self.frames.relative(target, camera)
-
     def block_keys(self, block: ImageBlock) -> set[int]:
         """Keys of the pose and table unknowns that an image block depends on."""
-        return {key for link in self._image_chain(block) for key in self.unknowns.link_keys(link.slot)}
+        return {key for link in self.frames.of_image(block) for key in self.unknowns.link_keys(link.slot)}
 
     def table_keys(self) -> set[int]:
         """Keys of the table angles, which are always read."""
         return {u.key for name, u in self.unknowns.by_name.items() if name[0] == "table_angles"}
 
-    def _known_points(self, block: ImageBlock) -> FloatArray:
-        if block.target_id is None:
-            return np.array([self.unknowns.held_points[self.point_ids[int(p)]] for p in block.point_idx])
-        return np.asarray(self.targets[block.target_id].x_in_target[block.point_idx])
+    def _world_points(self) -> FloatArray:
+        """Held world points (P, 3) m; NaN for those that are not held."""
+        held, unheld = self.unknowns.held_points, np.full(3, np.nan)
+        return np.array([held.get(p, unheld) for p in self.point_ids]).reshape(-1, 3)
 
-    def _n_warp(self, block: ImageBlock) -> int:
-        vector = self.unknowns.vectors.get(("warp", block.target_id or ""))
+    def _n_warp(self, target_id: str | None) -> int:
+        vector = self.unknowns.vectors.get(("warp", target_id or ""))
         if vector is None or vector.key is None:
             return 0
         if vector.free != vector.names:
-            raise SurveyError(f"target {block.target_id!r}: free both components of the warp or none")
+            raise SurveyError(f"target {target_id!r}: free both components of the warp or none")
         return 2
 
     def _position_chain(self, ref: PositionRef) -> Chain | None:

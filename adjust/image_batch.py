@@ -4,26 +4,23 @@ A block's rows are the upper triangular square root of its augmented normal matr
 warp | residual]: the same linear system and chi-square as its 2n rows, for any n (Lawson and Hanson 1974, chapter 27).
 """
 
-from collections.abc import Iterator, Sequence
-from itertools import accumulate
+from collections.abc import Mapping, Sequence, Set
+from functools import cached_property
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 
 from adjust.chain_kernels import evaluate_chains
 from adjust.image_kernels import (
-    SEGMENT_LENS,
-    SEGMENT_POSE,
-    SEGMENT_TABLE,
-    SEGMENT_WARP,
     BlockArrays,
     PointArrays,
-    SegmentArrays,
     errors,
     local_by_keys,
     normal_equations,
     serve,
 )
+from adjust.image_segments import block_keys
 from adjust.image_statistics_kernels import all_statistics
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.observations import ImageBlock
@@ -31,7 +28,7 @@ from adjust.parallel import run_split, split_blocks
 from adjust.state import State
 from adjust.tree_covariance import TreeCovariance
 from adjust.tree_kernels import TreeArrays
-from adjust.unknowns import Chain, Unknowns
+from adjust.unknowns import Chain
 
 
 def square_root_information(cov: FloatArray) -> FloatArray:
@@ -61,62 +58,14 @@ class Chains:
     def __init__(self, chains: Sequence[Chain]) -> None:
         links = [link for chain in chains for link in chain]
         self.ptr: IntArray = np.cumsum([0] + [len(chain) for chain in chains])
-        self._slots = [link.slot for link in links]
-        self.slot = np.array(self._slots, dtype=np.int64)
+        self.slot = np.array([link.slot for link in links], dtype=np.int64)
         self.inverse: BoolArray = np.array([link.inverse for link in links], dtype=np.bool_)
         n = len(chains)
         self.R, self.t, self.C = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((len(links), 6, 6))
 
-    def links(self, b: int) -> Iterator[tuple[int, int]]:
-        """Number and slot of every link of chain ``b``."""
-        first, end = self.ptr[b : b + 2].tolist()
-        return zip(range(first, end), self._slots[first:end], strict=True)
-
     def evaluate(self, state: State) -> None:
         """Fill R (B, 3, 3), t (B, 3) and C (links, 6, 6)."""
         evaluate_chains(state.slot_R, state.slot_t, self.ptr, self.slot, self.inverse, self.R, self.t, self.C)
-
-
-class Segments:
-    """Which columns of a block's rows belong to which key, and how they come from the local unknowns."""
-
-    def __init__(self) -> None:
-        self.keys: list[list[int]] = []
-        self.width: list[list[int]] = []
-        self.ptr = [0]
-        self.rows: list[tuple[int, int, int, int, int, int, int]] = []  # block, type, ref, d, start, n, key position
-
-    def block(self, unknowns: Unknowns, state: State, chains: Chains, b: int, camera: int, target: int | None) -> None:
-        """Append the segments of block ``b``."""
-        found: list[tuple[int | None, int, int, int, int, int]] = []  # key, type, ref, d, start, n
-        found.append((state.lens_maps[camera].key, SEGMENT_LENS, -1, -1, 0, int(state.lenses.n_free[camera])))
-        for link, slot in chains.links(b):
-            table = unknowns.table_slots.get(slot)
-            if table is None:
-                found.append((unknowns.slot_key[slot], SEGMENT_POSE, link, -1, 0, 6))
-            else:
-                d, k = int(state.table_index[slot]), len(table.axes)
-                found.append((table.angles_key, SEGMENT_TABLE, link, d, 0, k))
-                found.append((table.geometry.key, SEGMENT_TABLE, link, d, k, len(table.geometry.free)))
-        warp = state.warp_maps[target] if target is not None else None
-        if warp is not None:
-            found.append((warp.key, SEGMENT_WARP, -1, -1, 0, len(warp.free)))
-        position: dict[int, int] = {}
-        width: list[int] = []
-        for key, kind, ref, d, start, n in found:
-            if key is None or n == 0:
-                continue
-            if key not in position:
-                position[key] = len(width)
-                width.append(n)
-            self.rows.append((b, kind, ref, d, start, n, position[key]))
-        self.keys.append(list(position))
-        self.width.append(width)
-        self.ptr.append(len(self.rows))
-
-    def table(self) -> IntArray:
-        """The segments (S, 7): block, type, reference, table slot, start, width, position of the key."""
-        return np.array(self.rows, dtype=np.int64).reshape(-1, 7)
 
 
 class ImageBatch:
@@ -127,61 +76,31 @@ class ImageBatch:
     """
 
     def __init__(
-        self,
-        survey: Survey,
-        unknowns: Unknowns,
-        state: State,
-        blocks: Sequence[ImageBlock],
-        chains: Sequence[Chain],
-        points: Sequence[FloatArray],
-        n_warp: Sequence[int],
-    ) -> None:
+        self, survey: Survey, state: State, blocks: Sequence[ImageBlock], chains: Sequence[Chain],
+        x_in_world: FloatArray, n_warp: Mapping[str | None, int],
+    ) -> None:  # fmt: skip
+        """x_in_world: points (P, 3) m of the world, for blocks without a target. n_warp: free components by target."""
         self.blocks = tuple(blocks)
         self.state = state
         self.chains = Chains(chains)
-        n = len(blocks)
         self.ptr: IntArray = np.cumsum([0] + [len(b.uv) for b in blocks])
         self.camera = np.array([state.cameras[b.camera_id] for b in blocks], dtype=np.int64)
-        warped = {t: i for t, i in state.targets.items() if state.warp_maps[i] is not None}
-        self.warp_id = np.array(
-            [warped.get(b.target_id or "", -1) for b in blocks],
-            dtype=np.int64,
-        )
-        self.n_warp = np.array(n_warp, dtype=np.int64)
+        warped: dict[str | None, int] = {t: i for t, i in state.targets.items() if state.warp_maps[i] is not None}
+        self.warp_id = np.array([warped.get(b.target_id, -1) for b in blocks], dtype=np.int64)
+        self.n_warp = np.array([n_warp[b.target_id] for b in blocks], dtype=np.int64)
         self.n_points = int(self.ptr[-1])
-        X = _columns(points, 3)
-        shape, uv = np.zeros((2, self.n_points)), _columns([b.uv for b in blocks], 2)
-        self.W_all = square_root_information(np.concatenate([b.cov for b in blocks])) if n else np.zeros((0, 3))
-        self.used: BoolArray = np.concatenate(
-            [b.used if b.used is not None else np.ones(len(b.uv), dtype=np.bool_) for b in blocks]
-        ) if n else np.zeros(0, dtype=np.bool_)
+        self.W_all = square_root_information(np.concatenate([np.zeros((0, 2, 2)), *(b.cov for b in blocks)]))
+        self.used: BoolArray = used_points(blocks)
         self.W_all_columns = np.ascontiguousarray(self.W_all.T)
         self.W = self.W_all_columns * self.used
-        for i, block in enumerate(blocks):
-            if self.warp_id[i] >= 0:
-                target = survey.targets[self.warp_id[i]]
-                shape[:, self.ptr[i] : self.ptr[i + 1]] = warp_shape(target.x_in_target)[block.point_idx].T
         self.arrays = BlockArrays(self.ptr, self.camera, self.warp_id, self.n_warp)
-        self.points = PointArrays(X, shape, uv)
-        self._place_keys(unknowns)
+        self.points = _point_arrays(survey, blocks, x_in_world, warped.keys())
+        self._place_keys()
 
-    def _place_keys(self, unknowns: Unknowns) -> None:
-        segments = Segments()
-        for b, block in enumerate(self.blocks):
-            target = self.state.targets[block.target_id or ""] if self.n_warp[b] else None
-            segments.block(unknowns, self.state, self.chains, b, int(self.camera[b]), target)
+    def _place_keys(self) -> None:
+        warp = np.where(self.n_warp > 0, self.warp_id, -1)
+        self.of_blocks = block_keys(self.state, self.camera, self.chains.ptr, self.chains.slot, warp)
         self.n_rows: IntArray = self.state.lenses.n_free[self.camera] + 6 + self.n_warp + 1
-        self.keys = segments.keys
-        starts = [list(accumulate(width, initial=0)) for width in segments.width]
-        self.width = np.array([start[-1] for start in starts], dtype=np.int64)
-        self.key_ptr = np.cumsum([0] + [len(keys) for keys in self.keys]).astype(np.int64)
-        self._key_place = np.array([at for start in starts for at in start[:-1]], dtype=np.int64)
-        ptr = np.array(segments.ptr, dtype=np.int64)
-        block, kind, link, table, start, n, position = np.ascontiguousarray(segments.table().T)
-        self.seg_key_number = self.key_ptr[block] + position
-        place = self._key_place[self.seg_key_number]
-        self.segments = SegmentArrays(ptr, kind, link, table, start, n, place)
-        self._key_width = np.array([w for width in segments.width for w in width], dtype=np.int64)
         most = int(self.n_rows.max(initial=1))
         self.H = np.zeros((len(self.blocks), most, most))
         self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
@@ -190,6 +109,12 @@ class ImageBatch:
         self._prepared: gtsam.Values | None = None
         self._with_jacobians = False
         self._all = split_blocks(self.ptr)
+
+    @cached_property
+    def keys(self) -> list[list[int]]:
+        """The keys of every block."""
+        ptr, key = self.of_blocks.ptr.tolist(), self.of_blocks.key.tolist()
+        return [key[a:b] for a, b in pairwise(ptr)]
 
     def prepare(self, values: gtsam.Values, jacobians: bool) -> None:
         """Evaluate all blocks at ``values``; ``state`` must have been loaded from the same values.
@@ -222,22 +147,23 @@ class ImageBatch:
         if self._flat is None:
             self._make_room()
         runs = self._all if which is None else [which]
-        run_split(serve, runs, self.arrays, self.state.lenses, self.segments, self.chains.C, self.state.D, self.width,
-                  self._at, self.H, self._flat, self.r)  # fmt: skip
+        run_split(serve, runs, self.arrays, self.state.lenses, self.of_blocks.segments, self.chains.C,
+                  self.state.D, self.of_blocks.columns, self._at, self.H, self._flat, self.r)  # fmt: skip
         for run in runs:
             self._served[run] = True
 
     def _make_room(self) -> None:
         """Where the rows of all factors are written, and views of them for GTSAM."""
-        sizes = self.n_rows * self.width
+        k = self.of_blocks
+        sizes = self.n_rows * k.columns
         self._at = np.cumsum(np.append(0, sizes))[:-1].astype(np.int64)
         self._flat, self.r = np.zeros(int(sizes.sum())), np.zeros((len(self.blocks), int(self.n_rows.max(initial=1))))
         self._views: list[list[FloatArray]] = []
         for b in range(len(self.blocks)):
             rows, views = int(self.n_rows[b]), []
-            for i in range(self.key_ptr[b], self.key_ptr[b + 1]):
-                at, k = int(self._at[b] + rows * self._key_place[i]), int(self._key_width[i])
-                views.append(self._flat[at : at + rows * k].reshape(rows, k))
+            for i in range(k.ptr[b], k.ptr[b + 1]):
+                at, n = int(self._at[b] + rows * k.place[i]), int(k.width[i])
+                views.append(self._flat[at : at + rows * n].reshape(rows, n))
             self._views.append(views)
 
     def _evaluate_alone(self, b: int, values: gtsam.Values, jacobians: bool) -> None:
@@ -282,8 +208,8 @@ class ImageBatch:
     def local_from_keys(self, b: int) -> FloatArray:
         """Derivative (n_lens + 6 + n_warp, sum of key dims) of the block's local unknowns by its keys."""
         nl = int(self.state.lenses.n_free[self.camera[b]])
-        G = np.zeros((int(self.n_rows[b]) - 1, int(self.width[b])))
-        local_by_keys(b, nl, self.segments, self.chains.C, self.state.D, G)
+        G = np.zeros((int(self.n_rows[b]) - 1, int(self.of_blocks.columns[b])))
+        local_by_keys(b, nl, self.of_blocks.segments, self.chains.C, self.state.D, G)
         return G
 
     def statistics(self, tree: TreeCovariance | None) -> tuple[FloatArray, FloatArray]:
@@ -293,12 +219,12 @@ class ImageBatch:
         """
         residual, influence = np.zeros((self.n_points, 2)), np.zeros((self.n_points, 3))
         number = tree.number if tree is not None else {}
-        keys = np.array([number.get(k, -1) for mine in self.keys for k in mine], dtype=np.int64)
-        s, c = self.state, self.chains
+        s, c, k = self.state, self.chains, self.of_blocks
+        keys = np.array([number.get(key, -1) for key in k.key.tolist()], dtype=np.int64)
         lost = np.zeros(len(self.blocks), dtype=np.int64)
         run_split(
             all_statistics, self._all, self.arrays, self.points, self.W_all_columns, s.lenses, c.R, c.t, s.warp,
-            self.segments, c.C, s.D, self.width, self.key_ptr, keys, self._key_place,
+            k.segments, c.C, s.D, k.columns, k.ptr, keys, k.place,
             tree.arrays() if tree is not None else TreeArrays.nothing(), residual, influence, lost,
         )  # fmt: skip
         if lost.any() and tree is not None:
@@ -306,9 +232,36 @@ class ImageBatch:
         return residual, influence
 
 
-def _columns(rows: Sequence[FloatArray], n: int) -> FloatArray:
-    """Rows (N, n), given in parts, as columns (n, N)."""
-    return np.ascontiguousarray(np.concatenate([np.zeros((0, n)), *rows]).T)
+def used_points(blocks: Sequence[ImageBlock]) -> BoolArray:
+    """Which image points (N,) of these blocks take part."""
+    ptr = np.cumsum([0] + [len(b.uv) for b in blocks]).tolist()
+    used = np.ones(ptr[-1], dtype=np.bool_)
+    for i, block in enumerate(blocks):
+        if block.used is not None:
+            used[ptr[i] : ptr[i + 1]] = block.used
+    return used
+
+
+def _point_arrays(
+    survey: Survey, blocks: Sequence[ImageBlock], x_in_world: FloatArray, warped: Set[str | None]
+) -> PointArrays:
+    """All image points with what they show: taken from the points of all targets seen, one after the other."""
+    targets: dict[str | None, FloatArray] = {t.target_id: t.x_in_target for t in survey.targets}
+    targets[None] = x_in_world
+    seen = dict.fromkeys(b.target_id for b in blocks)
+    x = [np.zeros((0, 3)), *(targets[t] for t in seen)]
+    starts = np.cumsum([len(part) for part in x]).tolist()
+    start, sizes = dict(zip(seen, starts, strict=False)), [len(b.uv) for b in blocks]
+    index = np.concatenate([np.zeros(0, dtype=np.int64), *(b.point_idx for b in blocks)])
+    if np.any((index < 0) | (index >= np.repeat([len(targets[b.target_id]) for b in blocks], sizes))):
+        raise IndexError("an image block shows points that its target does not have")
+    rows = index + np.repeat(np.array([start[b.target_id] for b in blocks], dtype=np.int64), sizes)
+    uv = np.ascontiguousarray(np.concatenate([np.zeros((0, 2)), *(b.uv for b in blocks)]).T)
+    shape = np.zeros((2, len(rows)))
+    if not warped.isdisjoint(seen):
+        bent = [warp_shape(targets[t]) if t in warped else np.zeros((len(targets[t]), 2)) for t in seen]
+        shape = np.ascontiguousarray(np.concatenate(bent)[rows].T)
+    return PointArrays(np.ascontiguousarray(np.concatenate(x)[rows].T), shape, uv)
 
 
 def _callback(batch: ImageBatch, b: int):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped

@@ -8,12 +8,14 @@ covariances as if it had eliminated them first (Triggs et al. 2000, section 6).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import gtsam
 import numpy as np
-from scipy.linalg import lapack
+import scipy
 
 from adjust.image_batch import ImageBatch
+from adjust.image_segments import first_seen, ranges
 from adjust.model import FloatArray, IntArray
 from adjust.parallel import run_split, split_blocks
 from adjust.reduction_kernels import WEAKEST_PIVOT, ReductionArrays, leaf_rows, pose_steps, reduce_poses
@@ -40,68 +42,75 @@ def hidden_poses(batch: ImageBatch, unknowns: Unknowns, outside: set[int]) -> li
     at_epochs = {
         key for key, u in unknowns.by_key.items() if u.name[0] in _AT_EPOCHS and len(u.name) == 3 and key not in outside
     }
-    of_blocks = [[key for key in keys if key in at_epochs] for keys in batch.keys]
-    if any(len(keys) > 1 for keys in of_blocks):
+    mine = np.isin(batch.of_blocks.key, np.array(list(at_epochs), dtype=np.int64))
+    if np.bincount(batch.of_blocks.block[mine]).max(initial=0) > 1:
         return []
-    return list(dict.fromkeys(key for keys in of_blocks for key in keys))
+    return list(dict.fromkeys(batch.of_blocks.key[mine].tolist()))
+
+
+def _positions(keys: IntArray, among: IntArray) -> IntArray:
+    """Where each key stands among these different ones (at least one), -1 for one that does not."""
+    order = np.argsort(among)
+    at = order[np.minimum(np.searchsorted(among, keys, sorter=order), len(among) - 1)]
+    return np.where(among[at] == keys, at, -1)
 
 
 class PoseReduction:
     """The reduction of ``hidden`` poses of an image batch, and the one factor that is left of their blocks."""
 
     def __init__(self, batch: ImageBatch, unknowns: Unknowns, hidden: Sequence[int]) -> None:
-        self.batch, self.hidden = batch, list(hidden)
-        number = {key: j for j, key in enumerate(self.hidden)}
-        owner = np.array([next((number[k] for k in keys if k in number), -1) for keys in batch.keys], dtype=np.int64)
+        self.batch, self.hidden, k = batch, list(hidden), batch.of_blocks
+        pose_of_key = _positions(k.key, np.array(self.hidden, dtype=np.int64))
+        owner: IntArray = np.full(len(batch.blocks), -1, dtype=np.int64)
+        owner[k.block[pose_of_key >= 0]] = pose_of_key[pose_of_key >= 0]
         self.others: IntArray = np.flatnonzero(owner < 0)
         """Blocks without such a pose: they keep factors of their own."""
         order = np.argsort(owner, kind="stable")[len(self.others) :].astype(np.int64)
         block_ptr = np.searchsorted(owner[order], np.arange(len(self.hidden) + 1)).astype(np.int64)
-        shared = [dict.fromkeys(k for b in order[block_ptr[j] : block_ptr[j + 1]] for k in batch.keys[b] if k != key)
-                  for j, key in enumerate(self.hidden)]  # fmt: skip
-        keys = tuple(dict.fromkeys(k for mine in shared for k in mine))
-        starts = np.cumsum([0] + [unknowns.by_key[k].dim for k in keys])
-        self.interface = Interface(keys, {k: int(starts[i]) for i, k in enumerate(keys)}, int(starts[-1]))
-        self._shared = [sorted(mine, key=self.interface.at.__getitem__) for mine in shared]
-        self._place(unknowns, order, block_ptr)
-        self._runs = split_blocks(np.concatenate([[0], np.cumsum(np.diff(batch.ptr)[order])])[block_ptr])
+        # the keys that the poses' blocks share with others, pose after pose
+        of_pose = ranges(k.ptr[order], np.diff(k.ptr)[order])
+        of_pose = of_pose[pose_of_key[of_pose] < 0]
+        first, number = first_seen(k.key[of_pose])
+        keys = k.key[of_pose[first]].tolist()
+        widths = [unknowns.by_key[key].dim for key in keys]
+        starts = list(accumulate(widths, initial=0))
+        self.interface = Interface(tuple(keys), dict(zip(keys, starts, strict=False)), starts[-1])
+        self._place(of_pose, owner[k.block[of_pose]], number, np.array(widths, dtype=np.int64), order, block_ptr)
+        runs = split_blocks(np.concatenate([[0], np.cumsum(np.diff(batch.ptr)[order])])[block_ptr])
+        self._turns = [np.append(turn, run) for turn, run in enumerate(runs)]
         self.ready = False
 
-    def _place(self, unknowns: Unknowns, order: IntArray, block_ptr: IntArray) -> None:
-        at = self.interface.at
-        dims = {k: unknowns.by_key[k].dim for k in at}
-        of_key, place = np.zeros(int(self.batch.key_ptr[-1]), dtype=np.int64), self.batch.key_ptr.tolist()
-        columns, col_ptr = [], [0]
-        ptr, blocks = block_ptr.tolist(), order.tolist()
-        for j, (key, mine) in enumerate(zip(self.hidden, self._shared, strict=True)):
-            first, o = {key: 0}, 6
-            for k in mine:
-                first[k] = o
-                o += dims[k]
-                columns.append(np.arange(at[k], at[k] + dims[k]))
-            col_ptr.append(col_ptr[-1] + o - 6)
-            for b in blocks[ptr[j] : ptr[j + 1]]:
-                of_key[place[b] : place[b + 1]] = [first[k] for k in self.batch.keys[b]]
-        col = np.concatenate(columns) if columns else np.zeros(0)
+    def _place(
+        self, at: IntArray, pose: IntArray, number: IntArray, widths: IntArray, order: IntArray, block_ptr: IntArray
+    ) -> None:
+        """Columns of every pose's shared keys: ``number`` and ``pose`` of each, ``at`` its place among all keys."""
+        pairs, which = np.unique(pose * len(widths) + number, return_inverse=True)
+        self._shared_pose, self._shared = np.divmod(pairs, max(1, len(widths)))
+        shared_width = widths[self._shared]
+        end = np.concatenate([[0], np.cumsum(shared_width)])
+        col_ptr = end[np.searchsorted(self._shared_pose, np.arange(len(self.hidden) + 1))].astype(np.int64)
+        of_key = np.zeros(len(self.batch.of_blocks.key), dtype=np.int64)  # a pose's own columns come first
+        of_key[at] = (6 + end[:-1] - col_ptr[self._shared_pose])[which]
+        starts = np.cumsum(widths) - widths
         self.arrays = ReductionArrays(
-            block_ptr, order, np.array(col_ptr, dtype=np.int64), col.astype(np.int64),
-            of_key[self.batch.seg_key_number],
+            block_ptr, order, col_ptr, ranges(starts[self._shared], shared_width),
+            of_key[self.batch.of_blocks.of_segment],
         )  # fmt: skip
         self.L = np.zeros((len(self.hidden), 6, 6))
-        self.T = np.zeros(6 * (col_ptr[-1] + len(self.hidden)))
+        self.T = np.zeros(6 * (int(col_ptr[-1]) + len(self.hidden)))
         self._views: list[FloatArray] = []
         self._r = np.zeros(self.interface.n + 1)
 
     def reduce(self, damping: float) -> bool:
         """Reduce at the values the batch was last prepared at; False where something has no inverse to speak of."""
-        batch, n, count = self.batch, self.interface.n, len(self._runs)
+        batch, n, count = self.batch, self.interface.n, len(self._turns)
         rest, diagonal = np.zeros((count, n + 1, n + 1)), np.zeros((count, n))
         bad = np.full(count, -1, dtype=np.int64)
         self.ready = False
         run_split(
-            reduce_poses, [np.append(turn, run) for turn, run in enumerate(self._runs)], self.arrays, batch.arrays,
-            batch.state.lenses, batch.segments, batch.width, batch.chains.C, batch.state.D, damping, batch.H, self.L,
-            self.T, diagonal, rest, bad,
+            reduce_poses, self._turns, self.arrays, batch.arrays, batch.state.lenses, batch.of_blocks.segments,
+            batch.of_blocks.columns, batch.chains.C, batch.state.D, damping, batch.H, self.L, self.T, diagonal, rest,
+            bad,
         )  # fmt: skip
         return bool((bad < 0).all()) and self._serve(rest.sum(axis=0), diagonal.sum(axis=0))
 
@@ -111,10 +120,10 @@ class PoseReduction:
         if not (diagonal > 0.0).all():
             return False
         scale = np.sqrt(diagonal)
-        U, info = lapack.dpotrf(N[:n, :n] / scale[:, None] / scale, lower=0, clean=1)
+        U, info = scipy.linalg.lapack.dpotrf(N[:n, :n] / scale[:, None] / scale, lower=0, clean=1)
         if info != 0 or not np.diag(U).min() ** 2 > WEAKEST_PIVOT:
             return False
-        y = lapack.dtrtrs(U, N[:n, n] / scale, lower=0, trans=1)[0]
+        y = scipy.linalg.lapack.dtrtrs(U, N[:n, n] / scale, lower=0, trans=1)[0]
         self._r[:n], self._r[n] = y, np.sqrt(max(0.0, N[n, n] - float(y @ y)))
         R = np.zeros((n + 1, n))
         R[:n] = U * scale
@@ -152,7 +161,9 @@ class PoseReduction:
         width = 6 + np.diff(self.arrays.col_ptr)
         data = np.empty(6 * int(width.sum()))
         leaf_rows(self.arrays, self.L, self.T, data)
-        keys = [[key, *mine] for key, mine in zip(self.hidden, self._shared, strict=True)]
+        keys = [[key] for key in self.hidden]
+        for pose, number in zip(self._shared_pose.tolist(), self._shared.tolist(), strict=True):
+            keys[pose].append(self.interface.keys[number])
         return Leaves(keys, np.full(len(keys), 6, dtype=np.int64), width, data)
 
 

@@ -14,7 +14,7 @@ from gtsam import Pose3
 
 from adjust.errors import SurveyError
 from adjust.model import Camera, FloatArray, PoseParameter, Station, Survey, Table, Target, VectorParameter
-from adjust.observations import FrameRef
+from adjust.observations import FrameRef, ImageBlock
 from adjust.result import ParameterName
 
 T = TypeVar("T")
@@ -202,6 +202,14 @@ class FrameTree:
         self.tables = {t.table_id: t for t in survey.tables}
         self.targets = {t.target_id: t for t in survey.targets}
         self.on_table = {(r.table_id, r.epoch_id) for r in survey.table_readings}
+        still = {s.station_id for s in survey.stations if s.motion == "fixed"}
+        self._still_cameras = {c.camera_id for c in survey.cameras if c.station_id in still}
+        self._still_targets = {
+            t.target_id for t in survey.targets
+            if t.motion != "epoch" and (t.station_id is None or t.station_id in still)
+        }  # fmt: skip
+        self._to_camera: dict[tuple[str, str], Chain] = {}
+        self._from_target: dict[tuple[str, str], Chain] = {}
 
     def world_from(self, frame: FrameRef) -> list[Link]:
         """The chain from a frame to the world. Raises SurveyError for a frame that does not exist."""
@@ -221,6 +229,24 @@ class FrameTree:
     def relative(self, a: FrameRef, b: FrameRef) -> Chain:
         """The chain of ``b_from_a``."""
         return self.unknowns.tidy(inverse(tuple(self.world_from(b))) + self.world_from(a))
+
+    def of_image(self, block: ImageBlock) -> Chain:
+        """The chain of ``camera_from_target``, or ``camera_from_world``; its halves are shared by many images."""
+        place = block.camera_id, "" if block.camera_id in self._still_cameras else block.epoch_id
+        first = self._to_camera.get(place)
+        if first is None:
+            links = self.world_from(FrameRef("camera", block.camera_id, block.epoch_id))
+            first = self._to_camera[place] = self.unknowns.tidy(inverse(tuple(links)))
+        if block.target_id is None:
+            return first
+        place = block.target_id, "" if block.target_id in self._still_targets else block.epoch_id
+        second = self._from_target.get(place)
+        if second is None:
+            links = self.world_from(FrameRef("target", block.target_id, block.epoch_id))
+            second = self._from_target[place] = self.unknowns.tidy(links)
+        if first and second and first[-1].slot == second[0].slot:
+            return self.unknowns.tidy([*first, *second])
+        return first + second
 
     @staticmethod
     def _get(things: Mapping[str, T], kind: str, thing_id: str) -> T:

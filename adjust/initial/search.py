@@ -30,7 +30,7 @@ from adjust.initial.views import (
     used_rows,
 )
 from adjust.model import FloatArray, IntArray, Survey
-from adjust.observations import FrameRef, PositionRef
+from adjust.observations import PositionRef
 from adjust.parallel import run_split, split_blocks
 from adjust.result import ParameterName
 from adjust.terrestrial.building import reading_refs
@@ -71,7 +71,7 @@ class _Search:
         self.cameras = {c.camera_id: c for c in survey.cameras}
         unknowns = Unknowns()
         self.network = PoseNetwork(unknowns, FrameTree(survey, unknowns))
-        self.chains: list[Chain] = [self._block_chain(i) for i in range(len(survey.image_blocks))]
+        self.chains: list[Chain] = [self.network.frames.of_image(block) for block in survey.image_blocks]
         self.points: PointField = point_field(survey)
         self.lenses: dict[str, FloatArray] = {}
         self.reasons: dict[int, str] = {}
@@ -82,12 +82,6 @@ class _Search:
         self.scale_free = False
         self._register_pairs_and_positions()
         self.network.register(survey)
-
-    def _block_chain(self, i: int) -> Chain:
-        block = self.survey.image_blocks[i]
-        camera = FrameRef("camera", block.camera_id, block.epoch_id)
-        target = FrameRef("world") if block.target_id is None else FrameRef("target", block.target_id, block.epoch_id)
-        return self.network.frames.relative(target, camera)
 
     def _register_pairs_and_positions(self) -> None:
         for pair in self.survey.pairs:
