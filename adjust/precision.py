@@ -15,7 +15,7 @@ from adjust.bundle_hidden import BundleHidden
 from adjust.datum import stacking, survey_motions
 from adjust.distributions import chi2
 from adjust.graph import AdjustmentGraph
-from adjust.image_batch import square_root_information, whitened_squares
+from adjust.image_batch import whitened_squares
 from adjust.model import BoolArray, FloatArray
 from adjust.observation_factor import ObservationFactor
 from adjust.result import (
@@ -29,6 +29,9 @@ from adjust.result import (
 from adjust.s_transformation import STransformation, s_transformation
 from adjust.solve import Solved
 from adjust.tree_covariance import TreeCovariance
+
+_AT_A_TIME = 8192
+"""Image points tested together: what is computed on the way stays in the second cache."""
 
 
 class Precision:
@@ -97,10 +100,11 @@ class Precision:
 
     def cov(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
-        Q = self.hidden[key] if key in self.hidden else self.tree.marginal(key)
-        Q = np.array(self._in_datum([key], Q))
+        Q = self.hidden[key].copy() if key in self.hidden else self.tree.marginal(key)
+        Q = self._in_datum([key], Q)
         held = list(self.graph.unknowns.held.get(key, ()))
-        Q[held], Q[:, held] = 0.0, 0.0
+        if held:
+            Q[held], Q[:, held] = 0.0, 0.0
         return Q
 
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:
@@ -155,24 +159,39 @@ def image_residuals(precision: Precision) -> ImageResiduals:
 
 
 def _test(v: FloatArray, M: FloatArray, W: FloatArray, used: BoolArray) -> tuple[Any, ...]:
-    sign = np.where(used, -1.0, 1.0)
-    q00, q01, q11 = 1.0 + sign * M[:, 0], sign * M[:, 1], 1.0 + sign * M[:, 2]
-    redundancy = np.where(used[:, None], np.stack([q00, q11], axis=1), 0.0)
-    e0, e1 = W[:, 0] * v[:, 0] + W[:, 1] * v[:, 1], W[:, 2] * v[:, 1]
-    det = q00 * q11 - q01 * q01
+    n = len(v)
+    redundancy, standardized, test = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
     with np.errstate(divide="ignore", invalid="ignore"):
-        test = np.where(det > 1e-9, (q11 * e0 * e0 - 2 * q01 * e0 * e1 + q00 * e1 * e1) / det, np.nan)
-        # covariance of the residuals in pixels: W^-1 Q W^-T with W upper triangular
-        i00, i11 = 1.0 / W[:, 0], 1.0 / W[:, 2]
-        i01 = -W[:, 1] * i00 * i11
-        su = np.sqrt(np.maximum(0.0, i00 * i00 * q00 + 2 * i00 * i01 * q01 + i01 * i01 * q11))
-        sv = np.sqrt(np.maximum(0.0, i11 * i11 * q11))
-        standardized = np.stack([np.where(su > 1e-9 * i00, v[:, 0] / su, np.nan),
-                                 np.where(sv > 1e-9 * i11, v[:, 1] / sv, np.nan)], axis=1)  # fmt: skip
+        for start in range(0, n, _AT_A_TIME):
+            part = slice(start, start + _AT_A_TIME)
+            _fill_test(v[part], M[part], W[part], used[part], redundancy[part], standardized[part], test[part])
     return v, redundancy, standardized, test, used
 
 
+def _fill_test(
+    v: FloatArray, M: FloatArray, W: FloatArray, used: BoolArray, redundancy: FloatArray, standardized: FloatArray,
+    test: FloatArray,
+) -> None:  # fmt: skip
+    sign = np.where(used, -1.0, 1.0)
+    (v0, v1), (m00, m01, m11), (w00, w01, w11) = v.T, M.T, W.T
+    q00, q01, q11 = 1.0 + sign * m00, sign * m01, 1.0 + sign * m11
+    redundancy[:, 0], redundancy[:, 1] = q00, q11
+    redundancy[~used] = 0.0
+    e0, e1 = w00 * v0 + w01 * v1, w11 * v1
+    det = q00 * q11 - q01 * q01
+    test[:] = np.where(det > 1e-9, (q11 * e0 * e0 - 2 * q01 * e0 * e1 + q00 * e1 * e1) / det, np.nan)
+    # covariance of the residuals in pixels: W^-1 Q W^-T with W upper triangular
+    i00, i11 = 1.0 / w00, 1.0 / w11
+    i01 = -w01 * i00 * i11
+    su = np.sqrt(np.maximum(0.0, i00 * i00 * q00 + 2 * i00 * i01 * q01 + i01 * i01 * q11))
+    sv = np.sqrt(np.maximum(0.0, i11 * i11 * q11))
+    standardized[:, 0] = np.where(su > 1e-9 * i00, v0 / su, np.nan)
+    standardized[:, 1] = np.where(sv > 1e-9 * i11, v1 / sv, np.nan)
+
+
 def _merge(graph: AdjustmentGraph, parts: list[tuple[Any, ...]]) -> ImageResiduals:
+    if len(parts) == 1:
+        return ImageResiduals(graph.images.ptr, *(np.asarray(part) for part in parts[0]))
     ptr = np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks])
     n_points = int(ptr[-1])
     out: list[Any] = [np.zeros((n_points, 2)) for _ in range(3)]
@@ -256,14 +275,14 @@ def _image_sums(
     if not blocks:
         return np.zeros(0), np.zeros(0), np.zeros(0)
     number = {name: i for i, name in enumerate(names)}
-    of_point = np.repeat([number[block.group] for block in blocks], np.diff(images.block_ptr))[images.used]
-    cov = np.concatenate([block.cov for block in blocks])[images.used]
-    squares = whitened_squares(images.residuals[images.used], square_root_information(cov))
+    which = slice(None) if images.used.all() else images.used
+    of_point = np.repeat([number[block.group] for block in blocks], np.diff(images.block_ptr))[which]
 
     def total(of_points: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(of_point, of_points, len(names)), dtype=np.float64)
+        return np.asarray(np.bincount(of_point, of_points[which], len(names)), dtype=np.float64)
 
-    return total(np.full(len(of_point), 2.0)), total(images.redundancy[images.used].sum(axis=1)), total(squares)
+    squares = whitened_squares(images.residuals, graph.square_roots())
+    return total(np.full(len(squares), 2.0)), total(images.redundancy.sum(axis=1)), total(squares)
 
 
 def global_test(omega: float, redundancy: int, alpha: float) -> GlobalTest | None:
