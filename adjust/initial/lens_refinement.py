@@ -37,27 +37,30 @@ def fit_lens(
     Source: Levenberg-Marquardt with the poses eliminated (Schur complement; Triggs et al., Bundle adjustment, 2000).
     """
     view = np.repeat(np.arange(len(poses)), np.diff(ptr))
-    damping, residuals = 1e-4, _residuals(model, values, constants, poses, x, uv, view)
+    damping = 1e-4
+    points = _in_camera(poses, x, view)
+    residuals = _residuals(model, values, constants, points, uv)
     for _ in range(iterations):
         weights = _huber(residuals)
-        system = _normal_equations(model, values, constants, directions, poses, x, uv, ptr, weights)
+        system = _normal_equations(model, values, constants, directions, points, uv, ptr, weights)
         cost = float(weights @ np.sum(residuals**2, axis=1))
         gain = 0.0
         for _ in range(6):
             by_lens, by_pose = _step(*system, damping)
             new_values = values + directions @ by_lens
             new_poses = rigid(rotation_exp(by_pose[:, :3]), by_pose[:, 3:]) @ poses
-            new_residuals = _residuals(model, new_values, constants, new_poses, x, uv, view)
+            new_points = _in_camera(new_poses, x, view)
+            new_residuals = _residuals(model, new_values, constants, new_points, uv)
             new_cost = float(weights @ np.sum(new_residuals**2, axis=1))
             if new_cost < cost:
                 gain, damping = cost - new_cost, damping * 0.1
-                values, poses, residuals = new_values, new_poses, new_residuals
+                values, poses, points, residuals = new_values, new_poses, new_points, new_residuals
                 break
             damping = max(damping, 1e-8) * 10.0
         if gain < 1e-6 * cost:
             break
     cov = _lens_covariance(
-        *_normal_equations(model, values, constants, directions, poses, x, uv, ptr, _huber(residuals))
+        *_normal_equations(model, values, constants, directions, points, uv, ptr, _huber(residuals))
     )
     scale = float(np.median(np.sum(residuals**2, axis=1)) / np.log(4.0))  # median of a 2-D normal's square is s^2 ln 4
     return LensFit(values, poses, residuals, cov * scale)
@@ -68,15 +71,8 @@ def _in_camera(poses: FloatArray, x: FloatArray, view: IntArray) -> FloatArray:
 
 
 def _residuals(
-    model: LensModel,
-    values: FloatArray,
-    constants: FloatArray,
-    poses: FloatArray,
-    x: FloatArray,
-    uv: FloatArray,
-    view: IntArray,
+    model: LensModel, values: FloatArray, constants: FloatArray, p: FloatArray, uv: FloatArray
 ) -> FloatArray:
-    p = _in_camera(poses, x, view)
     r = lens_residuals(model, values, constants, p, uv)
     # a point behind the camera must never look like an improvement
     bad = ~np.all(np.isfinite(r), axis=1) | ((p[:, 2] <= 0) & (model.name != "fisheye"))
@@ -95,18 +91,17 @@ def _normal_equations(
     values: FloatArray,
     constants: FloatArray,
     directions: FloatArray,
-    poses: FloatArray,
-    x: FloatArray,
+    p: FloatArray,
     uv: FloatArray,
     ptr: IntArray,
     weights: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Lens block (p, p), mixed (B, 6, p), pose blocks (B, 6, 6) and right sides (p,), (B, 6)."""
-    p = _in_camera(poses, x, np.repeat(np.arange(len(poses)), np.diff(ptr)))
     r, by_values, by_point = lens_derivatives(model, values, constants, p, uv)
-    m, n = directions.shape[1], len(poses)
+    m, n = directions.shape[1], len(ptr) - 1
     out = (np.zeros((m, m)), np.zeros((n, 6, m)), np.zeros((n, 6, 6)), np.zeros(m), np.zeros((n, 6)))
-    a, by_point = np.ascontiguousarray(by_values @ directions), np.ascontiguousarray(by_point)
+    a = (by_values.reshape(-1, len(values)) @ directions).reshape(len(p), 2, m)
+    by_point = np.ascontiguousarray(by_point)
     lens_and_poses(np.asarray(ptr, dtype=np.int64), p, r, a, by_point, weights, *out)
     return out
 

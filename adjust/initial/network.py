@@ -125,7 +125,7 @@ class PoseNetwork:
         using: dict[int, list[int]] = {}
         waiting: dict[int, list[int]] = {}
         for n, observation in enumerate(self.observations):
-            slots = [observation.chain[i].slot for i in self.unknown_links(observation.chain)]
+            slots = [link.slot for link in observation.chain if link.slot not in self.known]
             # a slot that a chain passes twice cannot be isolated
             missing.append(set(slots) if len(set(slots)) == len(slots) else {-1})
             for slot in missing[n]:

@@ -29,8 +29,8 @@ from adjust.initial.views import (
     untrustworthy,
     used_rows,
 )
-from adjust.model import FloatArray, IntArray, Survey
-from adjust.observations import PositionRef
+from adjust.model import FloatArray, Survey
+from adjust.observations import ImageBlock, PositionRef
 from adjust.parallel import run_split, split_blocks
 from adjust.result import ParameterName
 from adjust.terrestrial.building import reading_refs
@@ -77,6 +77,7 @@ class _Search:
         self.reasons: dict[int, str] = {}
         self.notes: list[str] = []
         self.views: dict[int, View] = {}
+        self.rms: FloatArray = np.full(len(survey.image_blocks), np.nan)
         self.doubtful: list[ChainObservation] = []
         self.motion_solved = False
         self.scale_free = False
@@ -97,14 +98,17 @@ class _Search:
         for frame in [*frame_refs(self.survey), *(ref.frame for ref in refs if ref.frame is not None)]:
             self.network.frames.world_from(frame)
 
-    def _target_x(self, target_id: str, rows: IntArray) -> FloatArray:
-        """Points (n, 3) m of a target; one array for all images that show the same ones."""
-        key = (target_id, rows.tobytes())
+    def _seen_of_target(self, block: ImageBlock, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Points (n, 3) m of a block's target and their ``rows``, where used; one array for all that show the same."""
+        used = block.used
+        index = block.point_idx if used is None else block.point_idx[used_rows(block)]
+        target_id = str(block.target_id)
+        key = (target_id, index.tobytes())
         if key not in self.seen_x:
             if target_id not in self.target_x:
                 self.target_x[target_id] = target_points(self.targets[target_id])
-            self.seen_x[key] = self.target_x[target_id][rows]
-        return self.seen_x[key]
+            self.seen_x[key] = self.target_x[target_id][index]
+        return self.seen_x[key], rows if used is None else rows[used_rows(block)]
 
     def find_lenses(self) -> None:
         """Lens values of every camera, given or from its images of known points."""
@@ -113,12 +117,11 @@ class _Search:
         for i, block in enumerate(self.survey.image_blocks):
             if block.camera_id not in self.cameras or (block.target_id and block.target_id not in self.targets):
                 continue  # the chain has already named it
-            used = used_rows(block)
             if block.target_id is not None:
-                x = self._target_x(block.target_id, block.point_idx[used])
-                sightings[block.camera_id].append(Sighting(i, x, block.uv[used]))
+                x, uv = self._seen_of_target(block, block.uv)
+                sightings[block.camera_id].append(Sighting(i, x, uv))
             else:
-                rows = used & known[block.point_idx]
+                rows = used_rows(block) & known[block.point_idx]
                 sightings[block.camera_id].append(Sighting(i, self.points.x[block.point_idx[rows]], block.uv[rows]))
         for camera in self.survey.cameras:
             found = start_lens(camera, [s for s in sightings[camera.camera_id] if len(s.x)])
@@ -133,14 +136,14 @@ class _Search:
         focal = {c.camera_id: focal_px(c, self.lenses[c.camera_id]) for c in self.survey.cameras}
         sights: list[Sight] = []
         for i, block in enumerate(self.survey.image_blocks):
-            used = used_rows(block)
             if i in failed:
                 self.reasons.setdefault(i, f"{block_text(block)}: {failed[i]}")
             elif block.target_id is None:
                 self.points.add(self.survey, i, rays[i], focal[block.camera_id], self.chains[i])
-            elif used.sum() >= 3:  # fewer give no pose, but may well serve in the adjustment
-                x = self._target_x(block.target_id, block.point_idx[used])
-                sights.append(Sight(i, x, rays[i][used], focal[block.camera_id]))
+            elif len(block.uv):
+                x, mine = self._seen_of_target(block, rays[i])
+                if len(x) >= 3:  # fewer give no pose, but may well serve in the adjustment
+                    sights.append(Sight(i, x, mine, focal[block.camera_id]))
         views, without = make_views(sights)
         for i, reason in without.items():
             self.reasons.setdefault(i, f"{block_text(self.survey.image_blocks[i])}: {reason}")
@@ -228,16 +231,19 @@ class _Search:
         for _ in range(rounds if self.points.sights else 0):
             improve(network, self.points, movable)
         moved = set(network.known) - network.fixed - set(network.gauged)
-        if self.motion_solved or np.nanmax(self._block_rms(), initial=0.0) > _POLISH_PX:
+        self.rms = self._block_rms()
+        polished = self.motion_solved or np.nanmax(self.rms, initial=0.0) > _POLISH_PX
+        if polished:
             polish(network, moved, self.views)
-        self._settle_scale()
-        self._move_to_coordinates()
+        scaled, shifted = self._settle_scale(), self._move_to_coordinates()
+        if polished or scaled or shifted:
+            self.rms = self._block_rms()
         self._set_aside_contradictions()
 
-    def _settle_scale(self) -> None:
-        """The scale of a network of relative orientations, from observed distances or coordinates."""
+    def _settle_scale(self) -> bool:
+        """The scale of a network of relative orientations, from observed distances or coordinates; whether there is."""
         if not self.scale_free or self.views:
-            return
+            return False
         ratios = []
         for distance in self.survey.distances:
             a, b = self._place(distance.a), self._place(distance.b)
@@ -250,6 +256,7 @@ class _Search:
             slots = [s for s in self.network.known if s not in self.network.fixed]
             scale_lengths(self.network, self.points, float(np.median(ratios)), slots)
             self.notes.append(f"scale from {len(ratios)} observed length(s)")
+        return bool(ratios)
 
     def _observed_positions(self) -> tuple[FloatArray, FloatArray]:
         """Observed coordinates (m, 3) and where their positions are at present (m, 3)."""
@@ -262,19 +269,20 @@ class _Search:
                     rows.append((value, place))
         return np.array([r[0] for r in rows]).reshape(-1, 3), np.array([r[1] for r in rows]).reshape(-1, 3)
 
-    def _move_to_coordinates(self) -> None:
-        """Move the whole world onto observed coordinates where nothing given holds it."""
+    def _move_to_coordinates(self) -> bool:
+        """Move the whole world onto observed coordinates where nothing given holds it; whether it moved."""
         if not world_is_free(self.network, self.survey) or self.points.given.any():
-            return
+            return False
         observed, present = self._observed_positions()
         if not len(observed):
-            return
+            return False
         new_from_old = align(observed, present)
         for slot, name in self.network.names.items():
             if frames_of(self.network, name)[0] == ("world",):
                 self.network.known[slot] = new_from_old @ self.network.known[slot]
         self.points.x = self.points.x @ new_from_old[:3, :3].T + new_from_old[:3, 3]
         self.notes.append(f"world moved onto {len(observed)} observed positions")
+        return True
 
     def _place(self, ref: PositionRef) -> FloatArray | None:
         """Present world coordinates (3,) of a position."""
@@ -289,7 +297,7 @@ class _Search:
         return np.asarray(world_from_frame[:3, :3] @ local + world_from_frame[:3, 3])
 
     def _set_aside_contradictions(self) -> None:
-        rms = self._block_rms()
+        rms = self.rms
         trusted = [i for i in range(len(rms)) if i not in self.reasons and np.isfinite(rms[i])]
         if not trusted:
             return
@@ -334,7 +342,7 @@ class _Search:
         for target in survey.targets:
             if target.warp is not None:
                 vectors[("warp", target.target_id)] = np.array(target.warp.values, dtype=float)
-        rms = self._block_rms()
+        rms = self.rms
         good = [rms[i] for i in range(len(rms)) if i not in self.reasons and np.isfinite(rms[i])]
         if good:
             self.notes.append(

@@ -108,17 +108,19 @@ class Sight:
 def make_views(sights: Sequence[Sight]) -> tuple[list[View], dict[int, str]]:
     """Views with their unrefined candidate poses, and for every block that has none the reason."""
     n = len(sights)
-    poses, error = np.empty((n, 2, 4, 4)), np.empty((n, 2))
-    in_front, planar = np.empty((n, 2), dtype=np.bool_), np.empty(n, dtype=np.bool_)
+    poses, error = np.empty((n, 2, 4, 4)), np.zeros((n, 2))
+    in_front, planar = np.zeros((n, 2), dtype=np.bool_), np.empty(n, dtype=np.bool_)
     if n:
         rows, ptr = _samples(sights)
         x, rays = np.concatenate([s.x for s in sights])[rows], np.concatenate([s.rays for s in sights])[rows]
         run_split(first_poses, split_blocks(ptr), x, rays, ptr, PLANAR, WIDEST, poses, error, in_front, planar)
     views: list[View] = []
     failed: dict[int, str] = {}
-    for i, s in enumerate(sights):
-        if planar[i]:
-            views.append(_ranked(s, poses[i], error[i] * s.focal_px, in_front[i]))
+    error *= np.array([s.focal_px for s in sights]).reshape(-1, 1)
+    count = _rank_pairs(poses, error, in_front).tolist()
+    for i, (s, plane) in enumerate(zip(sights, planar.tolist(), strict=True)):
+        if plane:
+            views.append(View(s.block_idx, s.x, s.rays, s.focal_px, poses[i, : count[i]], error[i, : count[i]]))
             continue
         try:
             views.append(make_view(s.block_idx, s.x, s.rays, s.focal_px))
@@ -169,12 +171,26 @@ def refine_views(views: Sequence[View], iterations: int = 8) -> list[View]:
         refine_candidates, split_blocks(ptr), x, rays, ptr, *_samples(views), first, iterations, _ALL_STEPS,
         True, _RIVAL, _NOISE_PX / focal, poses, error, in_front, kept,
     )  # fmt: skip
-    out = []
-    for i, (v, a, b) in enumerate(zip(views, first[:-1].tolist(), first[1:].tolist(), strict=True)):
-        mine = np.arange(a, b)[kept[a:b]]
-        order = mine[np.argsort(error[mine], kind="stable")] if len(mine) > 1 else mine
-        out.append(View(v.block_idx, v.x, v.rays, v.focal_px, poses[order], error[order] * focal[i]))
-    return out
+    # by view, the best first, and of equal ones the first
+    owner = np.repeat(np.arange(len(views)), np.diff(first))[kept]
+    order = np.flatnonzero(kept)[np.lexsort((error[kept], owner))]
+    poses, error = poses[order], error[order] * focal[owner]
+    ends = np.cumsum(np.bincount(owner, minlength=len(views))).tolist()
+    return [
+        View(v.block_idx, v.x, v.rays, v.focal_px, poses[a:b], error[a:b])
+        for v, a, b in zip(views, [0, *ends], ends, strict=False)
+    ]
+
+
+def _rank_pairs(poses: FloatArray, error_px: FloatArray, in_front: BoolArray) -> IntArray:
+    """Of two candidates each (n, 2, ...) the likelier first, in place; how many (n,) stay: as :func:`_ranked`."""
+    (e0, e1), (front0, front1) = error_px.T, in_front.T
+    swapped = (front1 & ~front0) | ((front0 == front1) & (e1 < e0))
+    for array in (poses, error_px, in_front):
+        array[swapped] = array[swapped, ::-1]
+    best = error_px[:, 0]
+    rivals = in_front[:, 1] & (error_px[:, 1] <= np.maximum(_RIVAL * best, best + _NOISE_PX))
+    return np.asarray(1 + rivals)
 
 
 def _ranked(view: View | Sight, poses: FloatArray, error_px: FloatArray, in_front: BoolArray) -> View:
