@@ -10,8 +10,8 @@ from typing import TypeVar
 
 import gtsam
 import numpy as np
+import scipy
 from scipy import sparse
-from scipy.linalg import lapack
 
 from adjust.bundle_kernels import (
     add_direct,
@@ -363,11 +363,11 @@ class BundleBatch:
         A = 0.5 * (A + A.T)
         if nh:
             head[np.arange(nh), np.arange(nh)] += damping
-            self.C, info = lapack.dpotrf(head.T, lower=0, clean=0, overwrite_a=1)
+            self.C, info = scipy.linalg.lapack.dpotrf(head.T, lower=0, clean=0, overwrite_a=1)
             if info != 0:
                 raise self._undetermined_pose(info - 1)
             right = np.vstack([across[:, :nh], z[:nh]]).T
-            self.Y = lapack.dtrtrs(self.C, right, lower=0, trans=1, overwrite_b=1)[0]
+            self.Y = scipy.linalg.lapack.dtrtrs(self.C, right, lower=0, trans=1, overwrite_b=1)[0]
             A = A - self.Y[:, :-1].T @ self.Y[:, :-1]
             last = last - self.Y[:, :-1].T @ self.Y[:, -1]
             rest -= float(self.Y[:, -1] @ self.Y[:, -1])
@@ -406,12 +406,12 @@ class BundleBatch:
         A = A - blind @ (blind.T @ A)
         A = A - (A @ blind) @ blind.T
         z = z - blind @ (blind.T @ z)
-        U, pivots, rank, _ = lapack.dpstrf(np.asfortranarray(A), tol=ROUNDING_PIVOT, lower=0)
+        U, pivots, rank, _ = scipy.linalg.lapack.dpstrf(np.asfortranarray(A), tol=ROUNDING_PIVOT, lower=0)
         U = np.triu(U)
         U[rank:] = 0.0
         perm = pivots - 1
         y = np.zeros(n)
-        y[:rank] = lapack.dtrtrs(np.asfortranarray(U[:rank, :rank]), z[perm][:rank], lower=0, trans=1)[0]
+        y[:rank] = scipy.linalg.lapack.dtrtrs(np.asfortranarray(U[:rank, :rank]), z[perm][:rank], lower=0, trans=1)[0]
         self.r = np.zeros(n + 1)
         self.r[:n] = y
         self.r[n] = np.sqrt(max(0.0, rest - float(y @ y)))
@@ -473,7 +473,7 @@ class BundleBatch:
         nh = self.n_hidden
         if nh:
             right = self.Y[:, :-1] @ (d[nh:] * self.scale[nh:]) + self.Y[:, -1]
-            d[:nh] = -lapack.dtrtrs(self.C, right, lower=0)[0] / self.scale[:nh]
+            d[:nh] = -scipy.linalg.lapack.dtrtrs(self.C, right, lower=0)[0] / self.scale[:nh]
             for key in self.hidden_poses:
                 delta.insert(key, d[self.key_at[key] : self.key_at[key] + 6])
         dX = self.points_following((self.G @ d)[:, None], self.h)[:, :, 0]

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
+import scipy
 from scipy import sparse
-from scipy.linalg import block_diag, lapack
 
 from adjust.bundle_batch import BundleBatch
 from adjust.bundle_covariance import direct_influence, point_from_local, reduced_influence, with_lenses, with_poses
@@ -32,7 +32,7 @@ class BundleHidden:
         d = np.vstack([np.zeros((nh, k)), V])
         if nh:
             right = np.asfortranarray(b.Y[:, :-1] @ (V * b.scale[nh:, None]))
-            d[:nh] = -lapack.dtrtrs(b.C, right, lower=0)[0] / b.scale[:nh, None]
+            d[:nh] = -scipy.linalg.lapack.dtrtrs(b.C, right, lower=0)[0] / b.scale[:nh, None]
         local = np.asarray(b.G @ d)
         points = np.zeros((len(b.point_ids), 3, k))
         points[b.reduced] = b.points_following(local)
@@ -52,8 +52,8 @@ class BundleHidden:
         if self._given_interface is None:
             nh = b.n_hidden
             scale = b.scale[:nh]
-            T = -lapack.dtrtrs(b.C, b.Y[:, :-1], lower=0)[0]
-            P = lapack.dpotri(b.C, lower=0)[0].T  # in C's order the lower triangle
+            T = -scipy.linalg.lapack.dtrtrs(b.C, b.Y[:, :-1], lower=0)[0]
+            P = scipy.linalg.lapack.dpotri(b.C, lower=0)[0].T  # in C's order the lower triangle
             fill_upper(P)
             P /= scale
             P /= scale[:, None]
@@ -186,7 +186,7 @@ class BundleHidden:
                 rows.append(sparse.csr_matrix((np.ones(6), (np.arange(6), at + np.arange(6))), shape=(6, n)))
                 V.append(np.zeros((6, 6)))
         L = sparse.vstack(rows).tocsr()
-        scatter = np.asarray(L @ (L @ own).T) + block_diag(*V)
+        scatter = np.asarray(L @ (L @ own).T) + scipy.linalg.block_diag(*V)
         return np.asarray(L @ T), scatter
 
     def _point_from_local(self, j: int) -> sparse.csr_matrix:

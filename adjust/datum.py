@@ -13,7 +13,6 @@ import gtsam
 import numpy as np
 from gtsam import Pose3
 from scipy import sparse
-from scipy.linalg import qr
 
 from adjust.errors import SurveyError
 from adjust.geometry.motions import MOVED, vector_motions
@@ -218,13 +217,26 @@ def datum_rows(keys: Sequence[int], motions: Mapping[int, FloatArray]) -> dict[i
     return rows
 
 
+def independent_rows(B: FloatArray) -> IntArray:
+    """As many rows of B (n, k) as it has columns, each the one furthest from the span of those before it.
+
+    Source: QR factorisation with pivots, of the transpose (Golub and Van Loan, Matrix Computations, 5.4.2).
+    """
+    rest, chosen = B.copy(), []
+    for _ in range(B.shape[1]):
+        chosen.append(int(np.argmax(np.einsum("ij,ij->i", rest, rest))))
+        direction = rest[chosen[-1]] / max(float(np.linalg.norm(rest[chosen[-1]])), 1e-300)
+        rest -= np.outer(rest @ direction, direction)
+    return np.array(chosen, dtype=np.int64)
+
+
 def minimal_datum(
     graph: AdjustmentGraph, stack: Stacking, diagonal: FloatArray, motions: Mapping[int, FloatArray]
 ) -> dict[int, tuple[IntArray, FloatArray]]:
     """As many components of points and poses as there are defects, those that tell the motions apart best.
 
-    diagonal: of the normal matrix, stacked. The components come from a pivoted QR factorisation of the motions in units
-    of the components' own sigmas.
+    diagonal: of the normal matrix, stacked. The components are independent rows of the motions in units of the
+    components' own sigmas.
     """
     root = np.sqrt(diagonal)
     by_key = graph.unknowns.by_key
@@ -233,8 +245,7 @@ def minimal_datum(
         raise SurveyError("an inner datum needs free points or poses of the world; free some, or set no inner datum")
     index = stack.index(keys)
     B = np.concatenate([motions[k] for k in keys]) * root[index][:, None]
-    orthonormal = np.linalg.qr(B)[0]
-    chosen = qr(orthonormal.T, pivoting=True, mode="r")[1][: B.shape[1]]
+    chosen = independent_rows(np.linalg.qr(B)[0])
     out: dict[int, tuple[IntArray, FloatArray]] = {}
     owner = np.repeat(np.arange(len(keys)), [by_key[k].dim for k in keys])
     for number in dict.fromkeys(owner[chosen].tolist()):

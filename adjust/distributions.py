@@ -1,13 +1,14 @@
 """The distributions that tests and confidence regions need, by the names and signatures of ``scipy.stats``.
 
-``scipy.stats`` takes longer to import than a small survey takes to adjust; ``scipy.special`` computes the same. Each
-tail is computed where it is small, so that a probability of 1e-300 keeps its digits. Numbers or arrays, broadcast.
+``scipy.stats`` takes longer to import than a small survey takes to adjust; SciPy's special functions compute the same.
+Each tail is computed where it is small, so that a probability of 1e-300 keeps its digits. Numbers or arrays, broadcast.
 """
 
 from typing import Any
 
 import numpy as np
-from scipy import special
+
+from adjust.special_functions import ufuncs as special
 
 Numbers = Any
 

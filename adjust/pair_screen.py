@@ -7,6 +7,7 @@ first, one by one (Baarda's data snooping, 1968), each tested with the error pro
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from gtsam import Pose3
@@ -16,9 +17,11 @@ from adjust.distributions import chi2
 from adjust.errors import IndeterminateError
 from adjust.graph import StartValues
 from adjust.model import FloatArray, Survey
-from adjust.pose_network import NetworkOptions, NetworkSolution, solve_network
-from adjust.pose_network.from_survey import is_pose_network, network_adjustment, network_from_survey
 from adjust.result import Adjustment, ObservationResidual
+from adjust.survey_kind import is_pose_network
+
+if TYPE_CHECKING:
+    from adjust.pose_network import NetworkSolution
 
 Progress = Callable[[int, float], None]
 _FAMILY = 0.001
@@ -59,7 +62,7 @@ def is_pure(survey: Survey) -> bool:
 def network_solution(
     survey: Survey, options: PairOptions = PairOptions(), progress: Progress | None = None,
     start: tuple[FloatArray, FloatArray] | None = None,
-) -> NetworkSolution:  # fmt: skip
+) -> "NetworkSolution":  # fmt: skip
     """The pose network of a pure survey, solved. start: rotations (N, 3, 3) and translations (N, 3) of its stations.
 
     Raises IndeterminateError naming the stations that no pair in use reaches.
@@ -73,13 +76,18 @@ def network_solution(
             f"no measured pair ties {', '.join(lost[:8])}{more} to the datum; measure a pair to the rest, hold the "
             "station, or leave it out", tuple(lost),
         )  # fmt: skip
+    from adjust.pose_network import NetworkOptions, solve_network  # here: a survey without pairs starts without it
+    from adjust.pose_network.from_survey import network_from_survey
+
     network = network_from_survey(survey)
     how = NetworkOptions(robust="auto" if options.reject_pairs else "off", alpha=_FAMILY)
     return solve_network(network, start, how, progress)
 
 
-def adjusted_network(survey: Survey, solution: NetworkSolution, options: PairOptions) -> Adjustment:
+def adjusted_network(survey: Survey, solution: "NetworkSolution", options: PairOptions) -> Adjustment:
     """The solution of a pure survey as its adjustment, with warnings."""
+    from adjust.pose_network.from_survey import network_adjustment  # here: as above
+
     used = solution.network.used.tolist()
     pairs = tuple(replace(p, used=bool(u)) for p, u in zip(survey.pairs, used, strict=True))
     result = network_adjustment(replace(survey, pairs=pairs), solution, options.adjust.alpha)

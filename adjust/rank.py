@@ -2,10 +2,9 @@
 
 import gtsam
 import numpy as np
-from scipy.linalg import qr
 
 from adjust.bundle_hidden import BundleHidden
-from adjust.datum import BLIND, Stacking, gauge, stacking, times, visible_keys
+from adjust.datum import BLIND, Stacking, gauge, independent_rows, stacking, times, visible_keys
 from adjust.errors import IndeterminateError
 from adjust.graph import AdjustmentGraph
 from adjust.model import FloatArray, Station
@@ -247,7 +246,7 @@ def _rest(graph: AdjustmentGraph, stack: Stacking, null: FloatArray, lines: list
     if null.shape[1] == 0:
         return []
     size = np.abs(null).max(axis=1)
-    pivots = qr((null / np.where(size > 0, size, 1.0)[:, None] ** 0.5).T, pivoting=True, mode="r")[1][: null.shape[1]]
+    pivots = independent_rows(null / np.where(size > 0, size, 1.0)[:, None] ** 0.5)
     names: list[str] = []
     for vector in (null @ np.linalg.inv(null[pivots])).T:
         texts = _moving(graph, stack, vector)

@@ -12,6 +12,8 @@ import numpy as np
 from adjust.compiling import njit
 from adjust.model import FloatArray, IntArray
 
+_BY_HAND = 120_000  # products of a matrix product below which a loop over them takes about as long as BLAS
+
 
 class TreeArrays(NamedTuple):
     """What :func:`fill_block` needs beside the numbers of two keys, in its order."""
@@ -96,6 +98,26 @@ def fill_block(
 
 
 @njit(cache=True, nogil=True)
+def _times(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    """A B (n, m) into the first columns of out; small ones without BLAS, which is loaded by its first call."""
+    n, m, inner = A.shape[0], B.shape[1], A.shape[1]
+    if n * m * inner > _BY_HAND:
+        X = A @ B
+        for i in range(n):
+            for j in range(m):
+                out[i, j] = X[i, j]
+        return
+    for i in range(n):
+        for j in range(m):
+            out[i, j] = 0.0
+        for k in range(inner):
+            a = A[i, k]
+            if a != 0.0:
+                for j in range(m):
+                    out[i, j] += a * B[k, j]
+
+
+@njit(cache=True, nogil=True)
 def covariance_rows(
     n_front: IntArray, key_ptr: IntArray, keys: IntArray, dims: IntArray, home: IntArray, front: IntArray,
     width: IntArray, at: IntArray, data: FloatArray, cov: FloatArray,
@@ -106,14 +128,11 @@ def covariance_rows(
         ns = n - nf
         A = data[at[c] : at[c] + nf * n].reshape(nf, n)
         C = cov[at[c] : at[c] + nf * n].reshape(nf, n)
-        P = np.empty((nf, nf))
+        P, turned = np.zeros((nf, nf)), np.zeros((nf, nf))
         for i in range(nf):
-            for j in range(nf):
-                P[i, j] = A[i, j] if j >= i else 0.0
-        X = P @ P.T
-        for i in range(nf):
-            for j in range(nf):
-                C[i, j] = X[i, j]
+            for j in range(i, nf):
+                P[i, j] = turned[j, i] = A[i, j]
+        _times(P, turned, C)
         if ns == 0:
             continue
         Q = np.empty((ns, ns))
@@ -130,12 +149,12 @@ def covariance_rows(
                         Q[s + m, r + k] = Q[r + k, s + m]
                 s += dj
             r += dims[keys[i]]
-        T = np.empty((nf, ns))
+        T, T_turned, Y, X = np.empty((nf, ns)), np.empty((ns, nf)), np.empty((nf, ns)), np.empty((nf, nf))
         for i in range(nf):
             for j in range(ns):
-                T[i, j] = A[i, nf + j]
-        Y = T @ Q
-        X = Y @ T.T
+                T[i, j] = T_turned[j, i] = A[i, nf + j]
+        _times(T, Q, Y)
+        _times(Y, T_turned, X)
         for i in range(nf):
             for j in range(nf):
                 C[i, j] += X[i, j]

@@ -7,8 +7,8 @@ from gtsam import Pose3
 
 from adjust.distributions import chi2
 from adjust.model import FloatArray
+from adjust.named_precision import NamedPrecision
 from adjust.observations import FrameRef
-from adjust.pose_network.from_survey import NamedPrecision
 from adjust.precision import Precision
 from adjust.result import Adjustment, ObservationResidual
 from survey.adjusted_frames import AdjustedFrames

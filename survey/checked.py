@@ -6,7 +6,6 @@ from dataclasses import replace
 from adjust.errors import SurveyError
 from adjust.model import Survey
 from adjust.result import Adjustment
-from adjust.table_checks import probable_causes, sign_warnings
 from survey.epoch_names import separate_epochs
 
 
@@ -18,15 +17,27 @@ def checked(survey: Survey, run: Callable[[], Adjustment]) -> Adjustment:
     try:
         result = run()
     except SurveyError as error:
-        causes = separate_epochs(survey) + probable_causes(survey)
+        causes = separate_epochs(survey) + _probable_causes(survey)
         if not causes:
             raise
         lines = "\n  - ".join(["probable cause:", *causes])
         raise SurveyError(f"{lines}\nwithout that: {error}") from error
-    causes = sign_warnings(survey, result)
+    warnings: tuple[str, ...] = ()
+    if survey.tables:
+        from adjust.table_checks import sign_warnings  # here: a survey without a table starts without it
+
+        warnings = sign_warnings(survey, result)
     if _contradicted(survey, result):
-        causes += tuple(c for c in probable_causes(survey, result) if c not in causes)
-    return replace(result, warnings=tuple(f"probable cause: {c}" for c in causes) + result.warnings)
+        warnings += tuple(c for c in _probable_causes(survey, result) if c not in warnings)
+    return replace(result, warnings=tuple(f"probable cause: {c}" for c in warnings) + result.warnings)
+
+
+def _probable_causes(survey: Survey, result: Adjustment | None = None) -> tuple[str, ...]:
+    if not survey.tables:
+        return ()
+    from adjust.table_checks import probable_causes  # here: as above
+
+    return probable_causes(survey, result)
 
 
 def _contradicted(survey: Survey, result: Adjustment) -> bool:

@@ -2,8 +2,12 @@
 # (numba's decorator and its array arguments have no static types)
 """Compiled inner loops of the renderer: rays of the pixels' corners, and grey values of planes of cells."""
 
+from typing import Any
+
 import numpy as np
-from numba import njit
+
+from adjust.compiling import njit
+from adjust.model import FloatArray
 
 _BLOCK = 6  # pixels; lens distortion is linear across a block to far below the size of a sub-pixel
 
@@ -27,7 +31,9 @@ def _distort(x, y, d):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pixel_corner_rays(width, height, fx, fy, cx, cy, d):
+def pixel_corner_rays(
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, d: FloatArray
+) -> FloatArray:
     """Undistorted x/z, y/z of all pixel corners, (height + 1, width + 1, 2); NaN where the model cannot be inverted."""
     rays = np.empty((height + 1, width + 1, 2))
     for j in range(height + 1):
@@ -159,7 +165,9 @@ def _draw_pixel(corners, sub, n, facets, background, samples, candidates, ray, o
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def draw_facets(rays, n, facets, background, samples):
+def draw_facets(
+    rays: FloatArray, n: int, facets: tuple[Any, ...], background: float, samples: FloatArray
+) -> FloatArray:
     """Grey values (n * height, n * width) of sub-pixels, each integrated over its area.
 
     Blocks of pixels and pixels that see a single cell are filled at once. rays: of the pixel corners.

@@ -10,8 +10,6 @@ import numpy as np
 from adjust.distributions import norm
 from adjust.model import FloatArray, Survey
 from adjust.result import Adjustment, Estimate, GroupSummary
-from survey.adjusted_pairs import pairs_dict
-from survey.network_summary import loops_dict, network_dict, pair_loops, pair_network
 from survey.quantities import Scale, SigmaKind, point_entry, pose_entry, scale_of, vector_entry
 from survey.solution_instruments import instrument_entries
 from survey.statistics import Statistics
@@ -63,7 +61,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
             "points": _points(adjustment, scale),
             "tables": _tables(adjustment, scale),
             "targets": _targets(adjustment, scale),
-            "pairs": pairs_dict(adjustment, scale),
+            "pairs": _pairs(adjustment, scale),
             **instrument_entries(adjustment, scale),
             **_network(adjustment.survey),
             "groups": {g.group: _group(g) for g in adjustment.groups},
@@ -272,8 +270,21 @@ def _targets(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
     return out
 
 
+def _pairs(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+    if not adjustment.survey.pairs:
+        return {}
+    from survey.adjusted_pairs import pairs_dict  # here: as above
+
+    return pairs_dict(adjustment, scale)
+
+
 def _network(survey: Survey) -> dict[str, Any]:
     """What the pairs can tell, and how well their loops close; nothing where there are no pairs."""
+    if not survey.pairs:
+        return {}
+    # here: a survey without pairs is reported without it
+    from survey.network_summary import loops_dict, network_dict, pair_loops, pair_network
+
     loops = pair_loops(survey)
     if loops is None:
         return {}

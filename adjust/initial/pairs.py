@@ -4,10 +4,8 @@ from gtsam import Pose3, Rot3
 
 from adjust.initial.result import Start
 from adjust.model import Survey
-from adjust.pose_network.from_survey import is_pose_network, network_from_survey
-from adjust.pose_network.robust import clean
-from adjust.pose_network.solve import NetworkOptions
 from adjust.result import ParameterName
+from adjust.survey_kind import is_pose_network
 
 
 def network_start(survey: Survey) -> Start | None:
@@ -18,6 +16,11 @@ def network_start(survey: Survey) -> Start | None:
     """
     if not is_pose_network(survey) or not any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
         return None
+    # here: a survey without pairs starts without it
+    from adjust.pose_network.from_survey import network_from_survey
+    from adjust.pose_network.robust import clean
+    from adjust.pose_network.solve import NetworkOptions
+
     network = network_from_survey(survey, any_datum=True)
     found = clean(network, NetworkOptions())
     R, t = found.minimum.rotations, found.minimum.translations

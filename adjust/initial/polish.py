@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
 
 from adjust.closed_forms import inverse, pose_distance, rigid, rotation_exp, rotation_log
 from adjust.closed_forms.absolute_pose import tangent_axes
@@ -154,4 +153,6 @@ def _step(
     diagonal = normal.diagonal()
     damping = _DAMPING * diagonal + 1e-12 * float(diagonal.max())
     damped = csc_array(normal + csc_array((damping, (np.arange(size), np.arange(size))), shape=(size, size)))
+    from scipy.sparse.linalg import splu  # here: a survey without images starts without it
+
     return np.asarray(-splu(damped).solve(right.ravel()).reshape(-1, 6))

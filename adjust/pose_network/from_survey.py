@@ -5,6 +5,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.errors import IndeterminateError, SurveyError
 from adjust.model import FloatArray, PoseParameter, Survey
+from adjust.named_precision import NamedPrecision
 from adjust.observations import FrameRef
 from adjust.pose_network.network import PoseNetwork, pose_network
 from adjust.pose_network.precision import UNCONTROLLED
@@ -13,16 +14,6 @@ from adjust.precision import adjusted_motion, global_test
 from adjust.relay.motions import Motions, right_jacobian_inverse
 from adjust.result import Adjustment, Estimate, GroupSummary, ImageResiduals, ObservationResidual, ParameterName
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
-
-
-def is_pose_network(survey: Survey) -> bool:
-    """Whether a survey has nothing but pairs between stations that stay where they are."""
-    other = (survey.cameras, survey.image_blocks, survey.table_readings, survey.distances, survey.coordinates,
-             survey.readings, survey.coordinate_differences, survey.levels, survey.alignments, survey.laser_spots,
-             survey.on_surfaces)  # fmt: skip
-    fixed = {s.station_id for s in survey.stations if s.motion == "fixed"}
-    ends = [ref for p in survey.pairs for ref in (p.a, p.b)]
-    return bool(ends) and not any(other) and all(r.kind == "station" and r.frame_id in fixed for r in ends)
 
 
 def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:
@@ -105,18 +96,6 @@ def network_adjustment(survey: Survey, solution: NetworkSolution, alpha: float =
         defect, solution.redundancy, solution.omega, solution.sigma0, test, solution.iterations, solution.max_step,
         True, tuple(f"left out: {r}" for r in solution.rejected), NamedPrecision(solution),
     )  # fmt: skip
-
-
-class NamedPrecision:
-    """Joint covariances of stations by parameter name."""
-
-    def __init__(self, solution: NetworkSolution) -> None:
-        self.solution = solution
-
-    def joint(self, names: list[ParameterName]) -> FloatArray:
-        """Covariance (k dim, k dim) of ``("world_from_station", id)`` names, stacked in this order."""
-        index = self.solution.network.index_of
-        return self.solution.precision.joint([index[name[1]] for name in names])
 
 
 def _estimates(survey: Survey, solution: NetworkSolution) -> dict[ParameterName, Estimate]:

@@ -7,7 +7,6 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from adjust.closed_forms import nearest_rotation
 from adjust.errors import IndeterminateError, SurveyError
@@ -119,6 +118,8 @@ class PoseNetwork:
         if poses_only:
             rows = rows & self.is_pose
         ones = np.ones(int(rows.sum()))
+        from scipy.sparse.csgraph import connected_components  # here: a network without pairs starts without it
+
         graph = coo_array((ones, (self.a_idx[rows], self.b_idx[rows])), shape=(self.n_stations,) * 2)
         return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from scipy import sparse
-from scipy.linalg import lapack
 
 from adjust.model import FloatArray, IntArray
 from adjust.statistics.system import LinearSystem, Normal
@@ -128,10 +128,10 @@ def moments(sums: GroupSums, theta: FloatArray) -> Moments:
 
 def _inverse(N: FloatArray) -> FloatArray:
     scale = 1.0 / np.sqrt(np.diag(N))
-    half = lapack.dpotrf(np.asfortranarray(N * np.outer(scale, scale)))
+    half = scipy.linalg.lapack.dpotrf(np.asfortranarray(N * np.outer(scale, scale)))
     if half[1] != 0:
         raise np.linalg.LinAlgError("the normal matrix of the groups is not positive definite")
-    upper = lapack.dpotri(half[0])[0]
+    upper = scipy.linalg.lapack.dpotri(half[0])[0]
     full = np.triu(upper) + np.triu(upper, 1).T
     return np.asarray(full * np.outer(scale, scale))
 

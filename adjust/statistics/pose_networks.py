@@ -3,7 +3,7 @@
 import numpy as np
 
 from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.pose_network.from_survey import NamedPrecision
+from adjust.named_precision import NamedPrecision
 from adjust.result import Adjustment
 from adjust.unknowns import POSE_COMPONENTS
 

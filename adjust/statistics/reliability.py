@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.model import FloatArray, IntArray
-from adjust.pose_network.from_survey import NamedPrecision
+from adjust.named_precision import NamedPrecision
 from adjust.precision import Precision, noise_of
 from adjust.result import Adjustment
 from adjust.statistics.criteria import criteria

@@ -4,15 +4,14 @@ The solver condenses image points and hides unknowns; what compares observations
 influences, the search for outliers) needs them apart. Rows are linearised at the solution: ``e(x + dx) = e + A dx``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy
 from gtsam import Pose3, Rot3, Values
 from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse.linalg import splu
 
 from adjust.datum import gauge
 from adjust.errors import SurveyError
@@ -26,7 +25,9 @@ from adjust.solve import solve
 from adjust.statistics.row_kernels import block_rows
 
 DENSE = 3000
-"""Unknowns up to which the normal matrix is inverted as a full one."""
+"""Unknowns up to which the normal matrix is factored as a full one."""
+FEW = 200
+"""Unknowns up to which it is inverted at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +123,23 @@ class LinearSystem:
         return out
 
 
+def _solver(scaled: sparse.csc_matrix) -> Callable[[FloatArray], FloatArray]:
+    """The solution of a normal matrix with a unit diagonal."""
+    n = scaled.shape[0]
+    if n <= FEW:  # its inverse: SciPy's linear algebra takes longer to load
+        inverse = np.linalg.inv(scaled.toarray())
+        return lambda b: inverse @ b
+    if n <= DENSE:
+        factor = scipy.linalg.cho_factor(scaled.toarray())
+        return lambda b: np.asarray(scipy.linalg.cho_solve(factor, b))
+    from scipy.sparse.linalg import splu  # here: as above
+
+    solve: Callable[[FloatArray], FloatArray] = splu(
+        scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+    ).solve
+    return solve
+
+
 class Normal:
     """A normal matrix (n, n), factored: solutions, and its inverse in the datum of the survey."""
 
@@ -131,19 +149,12 @@ class Normal:
         S = sparse.diags(self.scale)
         scaled = (S @ N @ S).tocsc()
         self.n = scaled.shape[0]
-        self._dense = cho_factor(scaled.toarray()) if self.n <= DENSE else None
-        self._sparse = None if self.n <= DENSE else splu(scaled, permc_spec="MMD_AT_PLUS_A",
-                                                         options={"SymmetricMode": True})  # fmt: skip
+        self._of_scaled = _solver(scaled)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """The solution (n, k) or (n,) of N x = right, with the datum's rows fulfilled where ``right`` is seen."""
         scale = self.scale if right.ndim == 1 else self.scale[:, None]
-        b = scale * right
-        if self._dense is not None:
-            return np.asarray(scale * cho_solve(self._dense, b))
-        if self._sparse is None:
-            raise ValueError("a normal matrix without factors")
-        return np.asarray(scale * self._sparse.solve(b))
+        return np.asarray(scale * self._of_scaled(scale * right))
 
     @cached_property
     def inverse(self) -> FloatArray:

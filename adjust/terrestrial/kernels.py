@@ -72,10 +72,13 @@ def sight(
 
     curve: 1 / (2 radius), of refraction. body: whether F are the axes of a body instead of the plumb line's.
     """
-    offset = h_a * up_a + F.T @ c
-    d = x_b + h_b * up_b - x_a - offset
-    q = F @ d
-    g = np.empty(3)
+    offset, d, q, g, w = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    # no products of NumPy's: they load SciPy's linear algebra
+    for i in range(3):
+        offset[i] = h_a * up_a[i] + F[0, i] * c[0] + F[1, i] * c[1] + F[2, i] * c[2]
+        d[i] = x_b[i] + h_b * up_b[i] - x_a[i] - offset[i]
+    for i in range(3):
+        q[i] = F[i, 0] * d[0] + F[i, 1] * d[1] + F[i, 2] * d[2]
     value = shape(kind, sign, q, g)
     if kind == ZENITH:
         h = np.sqrt(q[0] * q[0] + q[1] * q[1])
@@ -84,8 +87,10 @@ def sight(
         if h > 0.0:
             g[0] -= refraction * curve * q[0] / h
             g[1] -= refraction * curve * q[1] / h
-    g *= factor
-    w = F.T @ g
+    for i in range(3):
+        g[i] *= factor
+    for i in range(3):
+        w[i] = F[0, i] * g[0] + F[1, i] * g[1] + F[2, i] * g[2]
     for i in range(3):
         A[AT + i] -= w[i]
         A[to_column + i] += w[i]

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import solve_triangular
+import scipy
 
 from adjust.errors import SurveyError
 from adjust.factors import ChainPose, Position
@@ -203,7 +203,7 @@ class LayoutBuilder:
         except np.linalg.LinAlgError:
             raise SurveyError(f"{name}: the matrix is not positive definite") from None
         self.arrays.sigma[rows] = scale
-        return rows, solve_triangular(L, np.diag(1.0 / scale), lower=True)
+        return rows, scipy.linalg.solve_triangular(L, np.diag(1.0 / scale), lower=True)
 
     def _chunk(self, number: int, rows: list[int], whitener: FloatArray | None) -> Chunk:
         keys: dict[int, int] = {}

@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import gc
 import importlib.util
 import io
 import json
@@ -16,6 +17,7 @@ from typing import Any, TextIO, cast
 from adjust.errors import SurveyError
 
 DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
+_OBJECTS = 100_000  # new ones before Python looks for cycles: loading modules makes many and no cycles
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # writing does not say which file
 
 
@@ -56,6 +58,7 @@ class _Shown:
 
 def run_command(program: str, build_parser: Callable[[], argparse.ArgumentParser], argv: Sequence[str] | None) -> int:
     """Parse and run a command line of ``program``; its exit code. What its owner can mend is one line on stderr."""
+    gc.set_threshold(_OBJECTS)
     if isinstance(sys.stdout, io.TextIOWrapper):  # a name that the terminal cannot show is no reason to stop
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -82,8 +85,8 @@ def run_command(program: str, build_parser: Callable[[], argparse.ArgumentParser
 def postpone(names: Sequence[str] = ("numpy.f2py", "numpy.testing")) -> None:
     """Modules that load when their contents are first looked at: SciPy imports all of NumPy and needs little of it."""
     for name in names:
-        spec = importlib.util.find_spec(name)
-        if name not in sys.modules and spec is not None and spec.loader is not None:
+        spec = None if name in sys.modules else importlib.util.find_spec(name)
+        if spec is not None and spec.loader is not None:
             spec.loader = importlib.util.LazyLoader(spec.loader)
             module = importlib.util.module_from_spec(spec)
             sys.modules[name] = module

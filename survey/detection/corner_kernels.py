@@ -8,10 +8,13 @@ at any angle, where the product of two error functions holds for perpendicular o
 """
 
 from math import asin, cos, erfc, exp, log, pi, sin, sqrt
+from typing import Any
 
 import numpy as np
-from numba import njit
+import numpy.typing as npt
 
+from adjust.compiling import njit
+from adjust.model import FloatArray, IntArray
 from survey.detection.solve_kernels import scaled_solve
 
 N_PARAMETERS = 9  # u, v, angle 1, angle 2, level, step, log(blur), slope u, slope v
@@ -231,7 +234,10 @@ def _fit(p, n_free, crossing, tolerance, offsets, values, n, row, frame, H, tria
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fit_corners(image, start, directions, blur, shapes, crossing, max_shift, tolerance):
+def fit_corners(
+    image: npt.NDArray[Any], start: FloatArray, directions: FloatArray, blur: FloatArray, shapes: FloatArray,
+    crossing: bool, max_shift: float, tolerance: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:  # fmt: skip
     """Fits every corner.
 
     image: (h, w) float. start: (n, 2) px. directions: (n, 2) angles of the two edges, the second clockwise (in the

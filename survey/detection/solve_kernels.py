@@ -5,7 +5,8 @@
 from math import sqrt
 
 import numpy as np
-from numba import njit
+
+from adjust.compiling import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

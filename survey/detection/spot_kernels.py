@@ -3,10 +3,13 @@
 """Compiled least-squares fit of luminous spots: a Gaussian integrated over the pixels, or a disc with a soft edge."""
 
 from math import erfc, exp, log, sqrt
+from typing import Any
 
 import numpy as np
-from numba import njit
+import numpy.typing as npt
 
+from adjust.compiling import njit
+from adjust.model import FloatArray, IntArray
 from survey.detection.solve_kernels import scaled_solve
 
 GAUSSIAN, DISC = 0, 1
@@ -108,7 +111,10 @@ def _minimise(p, profile, xy, values, n):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fit_spots(gray, labels, saturation, start, label, diameter, peak, background):
+def fit_spots(
+    gray: npt.NDArray[Any], labels: npt.NDArray[Any], saturation: float, start: FloatArray, label: IntArray,
+    diameter: FloatArray, peak: FloatArray, background: FloatArray,
+) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, IntArray]:  # fmt: skip
     """Fits each spot with both profiles and keeps the better one.
 
     gray: (h, w). labels: (h, w) component of each pixel, 0 none; pixels of other components are left out, and so are

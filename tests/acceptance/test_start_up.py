@@ -9,7 +9,8 @@ from survey.cli import main
 
 NEEDLESS = (
     "cv2", "matplotlib", "pycolmap", "pandas", "pyarrow", "distributed", "scipy.stats", "scipy.optimize",
-    "scipy.spatial", "scipy.fft", "numpy.f2py.crackfortran", "survey.detection", "survey.simulate",
+    "scipy.linalg", "scipy.special", "scipy.sparse.linalg", "scipy.spatial", "scipy.fft", "numpy.f2py.crackfortran",
+    "adjust.pose_network", "adjust.relay", "adjust.table_checks", "survey.detection", "survey.simulate",
 )  # fmt: skip
 COMPILER = ("numba.cpython.cmathimpl", "numba.misc.cffiimpl")
 """Loaded by numba when it registers what it can compile."""

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
+from scipy.linalg import qr
 
+from adjust.datum import independent_rows
 from adjust.errors import IndeterminateError, SurveyError
 from adjust.model import (
     Camera,
@@ -285,3 +287,10 @@ def test_an_inner_datum_without_defects_changes_nothing() -> None:
     _, inner = h.solved(replace(survey, datum=Datum("inner")), h.start_at(truth))
     assert inner.datum is None
     assert inner.omega == pytest.approx(given.omega, rel=1e-12)
+
+
+def test_independent_rows_are_the_pivots_of_lapack() -> None:
+    rng = np.random.default_rng(5)
+    for n, k in ((6, 1), (30, 4), (200, 7), (7, 7)):
+        B = rng.normal(size=(n, k)) * 10.0 ** rng.uniform(-3, 3, (n, 1))
+        assert independent_rows(B).tolist() == qr(B.T, pivoting=True, mode="r")[1][:k].tolist()

@@ -13,9 +13,9 @@ from scipy.stats import t as student
 from adjust.adjustment import AdjustOptions, adjust, assemble
 from adjust.graph import StartValues
 from adjust.model import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
+from adjust.named_precision import NamedPrecision
 from adjust.observations import FrameRef, Pair
 from adjust.pair_screen import adjust_with_pairs
-from adjust.pose_network.from_survey import NamedPrecision
 from adjust.result import Adjustment
 from adjust.statistics.criteria import criteria, noncentrality, sidak
 from adjust.statistics.influence import shifts
