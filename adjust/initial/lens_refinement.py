@@ -36,52 +36,59 @@ def fit_lens(
     directions: (n, p), what of the lens may move. x: (N, 3) m, uv: (N, 2) px, view after view by ``ptr`` (B + 1,).
     Source: Levenberg-Marquardt with the poses eliminated (Schur complement; Triggs et al., Bundle adjustment, 2000).
     """
-    view = np.repeat(np.arange(len(poses)), np.diff(ptr))
-    damping = 1e-4
-    points = _in_camera(poses, x, view)
-    residuals = _residuals(model, values, constants, points, uv)
+    damping, counts, x_columns = 1e-4, np.diff(ptr), np.ascontiguousarray(x.T)
+    points = _in_camera(poses, x_columns, counts)
+    residuals, squares = _residuals(model, values, constants, points, uv)
     for _ in range(iterations):
-        weights = _huber(residuals)
+        weights = _huber(squares)
         system = _normal_equations(model, values, constants, directions, points, uv, ptr, weights)
-        cost = float(weights @ np.sum(residuals**2, axis=1))
+        cost = float(weights @ squares)
         gain = 0.0
         for _ in range(6):
             by_lens, by_pose = _step(*system, damping)
             new_values = values + directions @ by_lens
             new_poses = rigid(rotation_exp(by_pose[:, :3]), by_pose[:, 3:]) @ poses
-            new_points = _in_camera(new_poses, x, view)
-            new_residuals = _residuals(model, new_values, constants, new_points, uv)
-            new_cost = float(weights @ np.sum(new_residuals**2, axis=1))
+            new_points = _in_camera(new_poses, x_columns, counts)
+            new_residuals, new_squares = _residuals(model, new_values, constants, new_points, uv)
+            new_cost = float(weights @ new_squares)
             if new_cost < cost:
                 gain, damping = cost - new_cost, damping * 0.1
-                values, poses, points, residuals = new_values, new_poses, new_points, new_residuals
+                values, poses, points = new_values, new_poses, new_points
+                residuals, squares = new_residuals, new_squares
                 break
             damping = max(damping, 1e-8) * 10.0
         if gain < 1e-6 * cost:
             break
     cov = _lens_covariance(
-        *_normal_equations(model, values, constants, directions, points, uv, ptr, _huber(residuals))
+        *_normal_equations(model, values, constants, directions, points, uv, ptr, _huber(squares))
     )
-    scale = float(np.median(np.sum(residuals**2, axis=1)) / np.log(4.0))  # median of a 2-D normal's square is s^2 ln 4
+    scale = float(np.median(squares) / np.log(4.0))  # median of a 2-D normal's square is s^2 ln 4
     return LensFit(values, poses, residuals, cov * scale)
 
 
-def _in_camera(poses: FloatArray, x: FloatArray, view: IntArray) -> FloatArray:
-    return np.asarray((poses[view, :3, :3] @ x[:, :, None])[..., 0] + poses[view, :3, 3])
+def _in_camera(poses: FloatArray, x: FloatArray, counts: IntArray) -> FloatArray:
+    """Points (N, 3) in their camera, of x (3, N) m in the target, ``counts`` of them under each pose."""
+    T = np.repeat(poses[:, :3].reshape(-1, 12).T, counts, axis=1)
+    out = np.empty((x.shape[1], 3))
+    for i in range(3):
+        out[:, i] = T[4 * i] * x[0] + T[4 * i + 1] * x[1] + T[4 * i + 2] * x[2] + T[4 * i + 3]
+    return out
 
 
 def _residuals(
     model: LensModel, values: FloatArray, constants: FloatArray, p: FloatArray, uv: FloatArray
-) -> FloatArray:
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (N, 2) px of points in the camera, and the squares (N,) of their lengths."""
     r = lens_residuals(model, values, constants, p, uv)
     # a point behind the camera must never look like an improvement
-    bad = ~np.all(np.isfinite(r), axis=1) | ((p[:, 2] <= 0) & (model.name != "fisheye"))
-    return np.where(bad[:, None], 1e6, r)
+    bad = ~(np.isfinite(r[:, 0]) & np.isfinite(r[:, 1])) | ((p[:, 2] <= 0) & (model.name != "fisheye"))
+    r[bad] = 1e6
+    return r, r[:, 0] ** 2 + r[:, 1] ** 2
 
 
-def _huber(residuals: FloatArray) -> FloatArray:
+def _huber(squares: FloatArray) -> FloatArray:
     """Weights (N,): convex, since points far out under an unfinished distortion must not be taken for gross errors."""
-    size = np.linalg.norm(residuals, axis=1)
+    size = np.sqrt(squares)
     limit = max(3.0 * float(np.median(size)), 1e-9)
     return np.asarray(limit / np.maximum(size, limit))
 

@@ -139,7 +139,9 @@ class _LensSearch:
     def _focal_length(self, flat: Sequence[Sighting], chosen: Sequence[Sighting]) -> tuple[FloatArray, str]:
         trials: list[tuple[FloatArray, str]] = []
         if flat and self.model.name != "fisheye":
-            h = np.array([homography(_unit(_plane_coordinates(s.x)), s.uv)[0] for s in flat])
+            plane = {id(s.x): s.x for s in flat}  # one for all images that show the same array of points
+            on_plane = {key: _unit(_plane_coordinates(x)) for key, x in plane.items()}
+            h = np.array([homography(on_plane[id(s.x)], s.uv)[0] for s in flat])
             for variants in (("full",), ("centred", "square")):
                 try:
                     found = pinhole_from_homographies(h, self.size, variants)
