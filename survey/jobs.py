@@ -106,7 +106,14 @@ class AdjustOutcome:
 
     def at(self, target: Path) -> "AdjustOutcome":
         """The same with its files where they are now."""
-        return replace(self, paths={name: target / RESULTS / name for name in self.paths})
+        return self.with_paths({name: target / RESULTS / name for name in self.paths})
+
+    def with_paths(self, paths: dict[str, Path]) -> "AdjustOutcome":
+        """The same, of these files."""
+        out = replace(self, paths=paths)
+        if "solution" in self.__dict__:
+            out.__dict__["solution"] = self.solution
+        return out
 
     @cached_property
     def solution(self) -> dict[str, Any]:
@@ -251,8 +258,9 @@ def made(
     with clock.step("statistics"):
         found = statistics_of(adjustment, project.options.tolerances, scale_of(adjustment, run.sigmas))
     with clock.step("report"):
-        paths = make_results(place, adjustment, run, found, report)
-    return AdjustOutcome(adjustment, run, paths, found)
+        outcome = AdjustOutcome(adjustment, run, {}, found)
+        paths = make_results(place, adjustment, run, outcome.solution, found, report)
+    return outcome.with_paths(paths)
 
 
 def adjust_project(project: Project, progress: bool) -> Adjustment:

@@ -106,7 +106,7 @@ def write_results(
     nothing has been written then.
     """
     with changing(folder) as place:
-        made = make_results(place, adjustment, run, statistics, options)
+        made = make_results(place, adjustment, run, solution_dict(adjustment, run, statistics), statistics, options)
         replace_parts(folder)
     return {name: folder / RESULTS / name for name in made}
 
@@ -115,12 +115,15 @@ def make_results(
     place: Path,
     adjustment: Adjustment,
     run: RunInfo,
+    solution: dict[str, Any],
     statistics: Statistics | None = None,
     options: ReportOptions = ENGLISH_PAGE,
 ) -> dict[str, Path]:
-    """Make everything in ``place/results``; the paths by file name. Raises as :func:`write_results`."""
+    """Make everything in ``place/results``; the paths by file name. Raises as :func:`write_results`.
+
+    solution: of :func:`survey.solution.solution_dict`, with the statistics.
+    """
     results = place / RESULTS
-    solution = solution_dict(adjustment, run, statistics)
     page = report_html(adjustment, run, solution, statistics, options.language)
     pdf = report_pdf(page) if options.pdf else b""
     results.mkdir(parents=True, exist_ok=True)

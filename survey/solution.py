@@ -1,6 +1,7 @@
 """The solution of a survey as one dictionary of plain values: what ``solution.json`` holds and reports print."""
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,6 +20,7 @@ from survey.verdict import suspects, verdict
 CORRELATION_LIMIT = 0.95
 # parameters for which "zero" is no sensible hypothesis
 _NEVER_ZERO = {"fx", "fy", "u0", "v0", "c", "xp", "yp"}
+_JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 CONVENTIONS = {
     "poses": "a_from_b takes coordinates in b to coordinates in a; camera x right, y down, z forward",
     "translation_mm": "origin of b in a; sigma_translation_mm along the axes of a",
@@ -82,6 +84,11 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
 
 def _plain(value: Any) -> Any:
     """Only what JSON knows: mappings and sequences kept, numbers as Python's, None for what is not finite."""
+    kind = type(value)
+    if kind is str or kind is int or kind is bool or value is None:
+        return value
+    if kind is float:
+        return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
@@ -92,7 +99,7 @@ def _plain(value: Any) -> Any:
         return float(value) if np.isfinite(value) else None
     if isinstance(value, int | np.integer):
         return int(value)
-    return value if value is None else str(value)
+    return str(value)
 
 
 def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, n_unmet: int) -> dict[str, Any]:
@@ -308,4 +315,4 @@ def _lines(value: Any, depth: int) -> str:
 
 
 def _one(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+    return _JSON.encode(value)
