@@ -5,13 +5,12 @@ messages to stderr. Heavy imports happen inside the commands.
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from adjust.errors import SurveyError
-from survey.commands.common import DONE, Version, is_set, print_json, run_command, say
+from survey.commands.common import DONE, Version, is_set, print_json, run_as_program, run_command, say
 from survey.commands.completing import declare_completion_of
 
 if TYPE_CHECKING:
@@ -35,6 +34,11 @@ Exit codes: 0 done, 1 error, 2 wrong usage, 130 interrupted.
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; the exit code."""
     return run_command("labcapture", build_parser, argv)
+
+
+def program() -> NoReturn:
+    """The installed command."""
+    run_as_program(main)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -247,4 +251,4 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

@@ -1,7 +1,5 @@
 """``python -m survey`` is the command ``labsurvey``."""
 
-import sys
+from survey.cli import program
 
-from survey.cli import main
-
-sys.exit(main())
+program()

@@ -6,13 +6,12 @@ Results go to stdout, progress and messages to stderr. Heavy imports happen insi
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 from survey.commands.adjusting import declare_adjust
 from survey.commands.aligning import declare_align
-from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, Version, run_command
+from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, Version, run_as_program, run_command
 from survey.commands.comparing import declare_compare
 from survey.commands.completing import declare_completion
 from survey.commands.converting import declare_convert
@@ -59,6 +58,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_command("labsurvey", build_parser, argv)
 
 
+def program() -> NoReturn:
+    """The installed command."""
+    run_as_program(main)
+
+
 def build_parser() -> argparse.ArgumentParser:
     """All commands and flags."""
     shared = argparse.ArgumentParser(add_help=False)
@@ -82,4 +86,4 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

@@ -12,7 +12,7 @@ import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any, TextIO, cast
+from typing import Any, NoReturn, TextIO, cast
 
 from adjust.errors import SurveyError
 
@@ -58,7 +58,6 @@ class _Shown:
 
 def run_command(program: str, build_parser: Callable[[], argparse.ArgumentParser], argv: Sequence[str] | None) -> int:
     """Parse and run a command line of ``program``; its exit code. What its owner can mend is one line on stderr."""
-    gc.set_threshold(_OBJECTS)
     if isinstance(sys.stdout, io.TextIOWrapper):  # a name that the terminal cannot show is no reason to stop
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -80,6 +79,14 @@ def run_command(program: str, build_parser: Callable[[], argparse.ArgumentParser
     except KeyboardInterrupt:
         print(f"\n{program}: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def run_as_program(main: Callable[[], int]) -> NoReturn:
+    """``main()`` as a program of its own, with little done for a memory that goes away with it."""
+    gc.set_threshold(_OBJECTS)
+    code = main()
+    gc.freeze()  # at its end Python looks for cycles once more, in all that was ever loaded
+    sys.exit(code)
 
 
 def postpone(names: Sequence[str] = ("numpy.f2py", "numpy.testing")) -> None:
