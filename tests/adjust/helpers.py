@@ -329,9 +329,13 @@ class Dense:
         A = self.A[self.used]
         return A.T @ A
 
-    def inverse(self, gauge: FloatArray | None = None) -> FloatArray:
+    def inverse(self, gauge: FloatArray | None = None, refined: bool = False) -> FloatArray:
         """Inverse of the normal matrix by a QR of the scaled Jacobian, so that it keeps more digits than a product of
-        matrices; ``gauge`` (k, n): rows of constraints of a free network, of no influence on the rest."""
+        matrices; ``gauge`` (k, n): rows of constraints of a free network, of no influence on the rest.
+
+        refined: one step of Newton's (Schulz) with extended numbers, which stay: exact in weak geometry, where double
+        ones lose the digits of redundancy numbers in the product with A.
+        """
         A = self.A[self.used]
         if gauge is not None:
             n, k = A.shape[1], len(gauge)
@@ -340,8 +344,12 @@ class Dense:
             return np.linalg.inv(bordered)[:n, :n]
         length = np.linalg.norm(A, axis=0)
         R = np.linalg.qr(A / length, mode="r")
-        half = np.linalg.solve(R, np.eye(len(R))) / length[:, None]
-        return half @ half.T
+        half = np.linalg.solve(R, np.eye(len(R)))
+        Q = half @ half.T
+        if refined:
+            scaled = A.astype(np.longdouble) / length
+            Q = Q + Q @ (np.eye(len(Q)) - (scaled.T @ scaled) @ Q)
+        return Q / np.outer(length, length)
 
 
 def dense(graph: AdjustmentGraph, lenses: dict[str, FloatArray], values: gtsam.Values) -> Dense:
@@ -542,13 +550,15 @@ def station_frame(station_id: str, epoch_id: str | None = None) -> FrameRef:
 # -- the whole precision against the dense one -------------------------------------------------------------------------
 
 
-def check_against_dense(survey: Survey, start: StartValues, tolerance: float = 1e-8) -> tuple[Precision, Dense]:
+def check_against_dense(
+    survey: Survey, start: StartValues, tolerance: float = 1e-8, refined: bool = False
+) -> tuple[Precision, Dense]:
     """Solve, and compare the minimum, all covariances and all statistics with one dense matrix."""
     graph, done = solved(survey, start)
     precision = Precision(graph, done)
     full = dense(graph, dict(start.lenses), done.values)
     gauge = inner_rows(graph, full, done)
-    Q = full.inverse(gauge)
+    Q = full.inverse(gauge, refined)
     check_minimum(full, done, Q)
     for name, place in full.place.items():
         mine, expected = covariance_of(precision, name), Q[place, place]
@@ -575,7 +585,7 @@ def check_statistics(precision: Precision, full: Dense, Q: FloatArray) -> None:
         rows = slice(at, at + len(full.W[k]))
         at = rows.stop
         A, e, used = full.A[rows], full.e[rows], bool(full.used[rows.start])
-        Qv = np.eye(len(A)) + (-1.0 if used else 1.0) * A @ Q @ A.T
+        Qv = np.asarray(np.eye(len(A)) + (-1.0 if used else 1.0) * A @ Q @ A.T, dtype=np.float64)
         inverse_root = np.linalg.inv(full.W[k])
         sigma_v = np.sqrt(np.maximum(0.0, np.diag(inverse_root @ Qv @ inverse_root.T)))
         v = full.v[rows]
