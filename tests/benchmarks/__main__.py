@@ -18,7 +18,8 @@ CASES: dict[str, Callable[[Session], None]] = {
     "bundle": sections_cameras.unknown_points, "scaling": sections_cameras.scaling,
     "graphs": sections_networks.published_graphs, "additions": sections_networks.additions,
     "large": sections_networks.large_networks, "readings": sections_networks.readings,
-    "trials": sections_networks.simulations, "targets": sections_other.targets, "stages": sections_other.stages,
+    "trials": sections_networks.simulations, "targets": sections_other.targets, "start": sections_other.start_up,
+    "stages": sections_other.stages,
 }  # fmt: skip
 PACKAGES = ("gtsam", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "pycolmap")
 
