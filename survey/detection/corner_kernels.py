@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from adjust.compiling import njit
 from adjust.model import FloatArray, IntArray
-from survey.detection.solve_kernels import scaled_solve
+from survey.detection.solve_kernels import put_state, scaled_solve
 
 N_PARAMETERS = 9  # u, v, angle 1, angle 2, level, step, log(blur), slope u, slope v
 _FAR = 4.5  # standard deviations beyond which an edge no longer bends the other one's profile (by 1e-5)
@@ -208,13 +208,12 @@ def _fit(p, n_free, crossing, tolerance, offsets, values, n, row, frame, H, tria
     """
     damping = 1e-3
     cost = _normals(p, crossing, offsets, values, n, row, frame, H, g)
-    trial = np.empty(9)
+    trial, step = np.empty(9), np.empty((9, 1))
     for _ in range(40):
-        step = g.copy()
+        put_state(p, H, g, trial, trial_H, step)
         if not scaled_solve(H, n_free, damping, step):
             damping = max(damping * 10.0, 1e-6)
             continue
-        trial[:] = p
         for a in range(n_free):
             trial[a] += step[a, 0]
         trial[6] = min(max(trial[6], log(0.2)), log(12.0))
@@ -222,7 +221,8 @@ def _fit(p, n_free, crossing, tolerance, offsets, values, n, row, frame, H, tria
         small = abs(trial[0] - p[0]) + abs(trial[1] - p[1]) < tolerance
         if trial_cost <= cost:
             gain = cost - trial_cost
-            p[:], H[:], g[:], cost = trial, trial_H, trial_g, trial_cost
+            put_state(trial, trial_H, trial_g, p, H, g)
+            cost = trial_cost
             damping *= 0.2
             if small and gain <= 0.05 * tolerance * cost + 1e-12:
                 return cost
@@ -280,7 +280,9 @@ def fit_corners(
         if not scaled_solve(H, n_free, 0.0, unit):
             status[c] = 3
             continue
-        cov[c] = variance * unit[:2, :2]
+        for a in range(2):
+            for b in range(2):
+                cov[c, a, b] = variance * unit[a, b]
         p[0] += cu
         p[1] += cv
         if abs(p[0] - start[c, 0]) + abs(p[1] - start[c, 1]) > max_shift:

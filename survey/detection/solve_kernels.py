@@ -54,3 +54,14 @@ def scaled_solve(H, n, damping, B):
         for c in range(B.shape[1]):
             B[i, c] *= d[i]
     return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def put_state(p, H, g, to_p, to_H, to_g):
+    """Parameters (m,), normal equations (n, n), right side (n, 1) into other arrays; assignments compile longer."""
+    for i in range(len(p)):
+        to_p[i] = p[i]
+    for i in range(len(H)):
+        to_g[i, 0] = g[i, 0]
+        for j in range(len(H)):
+            to_H[i, j] = H[i, j]

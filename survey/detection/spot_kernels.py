@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from adjust.compiling import njit
 from adjust.model import FloatArray, IntArray
-from survey.detection.solve_kernels import scaled_solve
+from survey.detection.solve_kernels import put_state, scaled_solve
 
 GAUSSIAN, DISC = 0, 1
 _ROOT_HALF = 0.7071067811865476
@@ -79,15 +79,14 @@ def _minimise(p, profile, xy, values, n):
     """Levenberg-Marquardt in place. Returns cost (-1 without convergence) and the covariance of u, v (2, 2)."""
     n_free = 6 if profile == GAUSSIAN else 7
     row, H, g = np.empty(7), np.empty((7, 7)), np.empty((7, 1))
-    trial, trial_H, trial_g = np.empty(7), np.empty((7, 7)), np.empty((7, 1))
+    trial, trial_H, trial_g, step = np.empty(7), np.empty((7, 7)), np.empty((7, 1)), np.empty((7, 1))
     cov = np.zeros((2, 2))
     cost, damping, done = _normals(p, profile, xy, values, n, row, H, g), 1e-3, False
     for _ in range(60):
-        step = g.copy()
+        put_state(p, H, g, trial, trial_H, step)
         if not scaled_solve(H, n_free, damping, step):
             damping *= 10.0
             continue
-        trial[:] = p
         for a in range(n_free):
             trial[a] += step[a, 0]
         for a in range(4, 7):
@@ -95,7 +94,8 @@ def _minimise(p, profile, xy, values, n):
         trial_cost = _normals(trial, profile, xy, values, n, row, trial_H, trial_g)
         small = abs(trial[0] - p[0]) + abs(trial[1] - p[1]) < 2e-5
         if trial_cost <= cost:
-            p[:], H[:], g[:], cost = trial, trial_H, trial_g, trial_cost
+            put_state(trial, trial_H, trial_g, p, H, g)
+            cost = trial_cost
             damping *= 0.2
         else:
             damping *= 6.0
@@ -106,7 +106,9 @@ def _minimise(p, profile, xy, values, n):
     unit[0, 0] = unit[1, 1] = 1.0
     if not done or not scaled_solve(H, n_free, 0.0, unit):
         return -1.0, cov
-    cov[:] = unit[:2] * (cost / (n - n_free))
+    for a in range(2):
+        for b in range(2):
+            cov[a, b] = unit[a, b] * (cost / (n - n_free))
     return cost, cov
 
 
