@@ -1,4 +1,4 @@
-"""Compiles the kernels once before several workers would each do it at the same time."""
+"""Work for several workers: what takes long comes first, kernels are compiled once and not by all at the same time."""
 
 import os
 import subprocess
@@ -26,6 +26,18 @@ adjust_cleaned(measured(*polar_network(4), 1))
 """
 _WARM_UP = ((_IMAGES.format(name="head_on_table"),), (_NAVIGATION, _READINGS, _IMAGES.format(name="beacons")))
 """For each of two processes: what hardly shares kernels with what the other one does at that time."""
+
+
+_LONG = ("test_docs", "test_end_to_end", "test_coverage", "test_planted_faults", "test_hardening_fuzz", "test_mfns",
+         "test_navigation", "test_pose_networks", "test_led_selfcal", "test_networks", "test_relay_paper",
+         "test_positioner", "test_batch", "test_detection", "test_camera_lab", "test_camera_gige")  # fmt: skip
+"""Files of 20 s and more: what is begun last is waited for by all workers."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The long files first, all others in their order."""
+    rank = {name: i for i, name in enumerate(_LONG)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(_LONG)))
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
