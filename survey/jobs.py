@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
@@ -83,10 +82,11 @@ class DetectOutcome:
 
 @dataclass(frozen=True, eq=False)
 class AdjustOutcome:
-    """An adjusted project and where its results are."""
+    """An adjusted project and where its results are. solution: all that ``solution.json`` holds."""
 
     adjustment: Adjustment
     run: RunInfo
+    solution: dict[str, Any]
     paths: dict[str, Path] = field(default_factory=dict)
     statistics: Statistics | None = None
 
@@ -106,19 +106,7 @@ class AdjustOutcome:
 
     def at(self, target: Path) -> "AdjustOutcome":
         """The same with its files where they are now."""
-        return self.with_paths({name: target / RESULTS / name for name in self.paths})
-
-    def with_paths(self, paths: dict[str, Path]) -> "AdjustOutcome":
-        """The same, of these files."""
-        out = replace(self, paths=paths)
-        if "solution" in self.__dict__:
-            out.__dict__["solution"] = self.solution
-        return out
-
-    @cached_property
-    def solution(self) -> dict[str, Any]:
-        """All that ``solution.json`` holds."""
-        return solution_dict(self.adjustment, self.run, self.statistics)
+        return replace(self, paths={name: target / RESULTS / name for name in self.paths})
 
 
 def detect_job(
@@ -258,9 +246,9 @@ def made(
     with clock.step("statistics"):
         found = statistics_of(adjustment, project.options.tolerances, scale_of(adjustment, run.sigmas))
     with clock.step("report"):
-        outcome = AdjustOutcome(adjustment, run, {}, found)
-        paths = make_results(place, adjustment, run, outcome.solution, found, report)
-    return outcome.with_paths(paths)
+        solution = solution_dict(adjustment, run, found)
+        paths = make_results(place, adjustment, run, solution, found, report)
+    return AdjustOutcome(adjustment, run, solution, paths, found)
 
 
 def adjust_project(project: Project, progress: bool) -> Adjustment:

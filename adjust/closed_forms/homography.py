@@ -24,7 +24,7 @@ def homography(xy: FloatArray, uv: FloatArray, refinements: int = 3) -> tuple[Fl
         raise SurveyError(f"a homography needs 4 points, got {len(xy)}: show more of the target")
     h = np.empty((3, 3))
     rms = plane_to_image(
-        np.ascontiguousarray(xy, dtype=np.float64), np.ascontiguousarray(uv, dtype=np.float64), refinements, h
+        np.ascontiguousarray(xy, dtype=np.float64), np.ascontiguousarray(uv, dtype=np.float64), 0, refinements, h
     )
     if rms < 0:
         raise SurveyError(

@@ -9,15 +9,17 @@ from adjust.model import BoolArray, FloatArray, IntArray
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def plane_to_image(xy: FloatArray, uv: FloatArray, refinements: int, h: FloatArray) -> float:
-    """Homography h (3, 3) of a plane and the rms of its residuals in the unit of uv; negative where it is singular.
+def plane_to_image(xy: FloatArray, uv: FloatArray, first: int, refinements: int, h: FloatArray) -> float:
+    """Homography h (3, 3) of points (n, 2) to uv first ... first + n, and the rms of its residuals in the unit of uv.
+
+    Negative where it is singular.
 
     Hartley and Zisserman, Multiple View Geometry, algorithm 4.2, then Gauss-Newton steps on the distance in the image.
     """
     n = len(xy)
     x, u, tx, tu = np.empty((n, 2)), np.empty((n, 2)), np.empty(3), np.empty(3)
-    _normalise(xy, n - n, x, tx)
-    _normalise(uv, n - n, u, tu)
+    _normalise(xy, 0, x, tx)
+    _normalise(uv, first, u, tu)
     N, g, trial, best_h = np.empty((9, 9)), np.empty(9), np.empty((3, 3)), np.empty((3, 3))
     if not _linear(x, u, N, best_h):
         return -1.0
@@ -63,8 +65,12 @@ def plane_poses(x: FloatArray, rays: FloatArray, first: int, last: int, thicknes
         for k in range(2):
             xy[i, k] = (F[k, 0] * r0 + F[k, 1] * r1 + F[k, 2] * r2) / z
     scale = _on_plane(x, first, thickness, centre, axes, local)
-    if not scale > 0.0 or not _linear_map(local, xy, n - n, H) or H[2, 2] == 0.0:
+    if not scale > 0.0 or plane_to_image(local, xy, 0, 0, H) < 0 or H[2, 2] == 0.0:
         return False
+    size = H[2, 2]
+    for i in range(3):
+        for j in range(3):
+            H[i, j] /= size
     turns, t, out = np.empty((2, 3, 3)), np.empty(3), np.empty((3, 3))
     if not _infinitesimal(H, turns):
         return False
@@ -114,7 +120,7 @@ def plane_misfits(x: FloatArray, uv: FloatArray, ptr: IntArray, out: FloatArray)
         a, n = ptr[view], ptr[view + 1] - ptr[view]
         out[view] = np.inf
         xy, miss = np.empty((n, 2)), np.empty(n)
-        if n < 4 or not _on_plane(x, a, np.inf, centre, axes, xy) > 0.0 or not _linear_map(xy, uv, a, h):
+        if n < 4 or not _on_plane(x, a, np.inf, centre, axes, xy) > 0.0 or plane_to_image(xy, uv, a, 0, h) < 0:
             continue
         low0, low1, high0, high1 = np.inf, np.inf, -np.inf, -np.inf
         for i in range(n):
@@ -181,25 +187,6 @@ def _cross_rows(A: FloatArray) -> None:
     A[2, 0] = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
     A[2, 1] = A[0, 2] * A[1, 0] - A[0, 0] * A[1, 2]
     A[2, 2] = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _linear_map(xy: FloatArray, uv: FloatArray, first: int, h: FloatArray) -> bool:
-    """Linear homography h (3, 3) of points (n, 2) to uv first ... first + n, h22 = 1; False where it is singular."""
-    n = len(xy)
-    x, u, tx, tu = np.empty((n, 2)), np.empty((n, 2)), np.empty(3), np.empty(3)
-    N, inner = np.empty((9, 9)), np.empty((3, 3))
-    _normalise(xy, n - n, x, tx)
-    _normalise(uv, first, u, tu)
-    if not _linear(x, u, N, inner):
-        return False
-    _undo_normalising(inner, tx, tu, h)
-    if h[2, 2] != 0.0:
-        size = h[2, 2]
-        for a in range(3):
-            for b in range(3):
-                h[a, b] /= size
-    return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -6,6 +6,7 @@ from adjust.closed_forms.small_kernels import median_in_place, select, solve_in_
 from adjust.compiling import njit
 from adjust.model import BoolArray, FloatArray, IntArray
 
+_ALL_STEPS = 2  # of refinement with all points of a view
 _ROBUST = 3.0  # times the median offset: where Cauchy's weight is a half
 
 
@@ -46,12 +47,12 @@ def refine_views(poses: FloatArray, x: FloatArray, rays: FloatArray, ptr: IntArr
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def refine_candidates(run: IntArray, x: FloatArray, rays: FloatArray, ptr: IntArray, few: IntArray, few_ptr: IntArray,
-                      first: IntArray, iterations: int, again: int, robust: bool, rival: float, noise: FloatArray,
-                      poses: FloatArray, rms: FloatArray, in_front: BoolArray, kept: BoolArray) -> None:  # fmt: skip
-    """Candidate poses first[v] ... first[v + 1] of the views of a run, refined in place.
+                      first: IntArray, iterations: int, rival: float, noise: FloatArray, poses: FloatArray,
+                      rms: FloatArray, in_front: BoolArray, kept: BoolArray) -> None:  # fmt: skip
+    """Candidate poses first[v] ... first[v + 1] of the views of a run, refined in place, robustly.
 
     A view's rows ``few`` of x and rays, where they are not all of its points, decide which candidates are refined on
-    all of them in ``again`` steps: those of :func:`_plausible`, marked in ``kept`` (K,). rms, in_front: (K,) of these.
+    all of them: those of :func:`_plausible`, marked in ``kept`` (K,). rms, in_front: (K,) of these.
     """
     for view in run:
         a, b = ptr[view], ptr[view + 1]
@@ -62,15 +63,15 @@ def refine_candidates(run: IntArray, x: FloatArray, rays: FloatArray, ptr: IntAr
                 some_x[i, c] = x[few[few_ptr[view] + i], c]
                 some_rays[i, c] = rays[few[few_ptr[view] + i], c]
         for k in range(first[view], first[view + 1]):
-            _refine(poses[k], some_x, some_rays, n - n, n, iterations, robust)
-            error_of_view(poses[k], some_x, some_rays, n - n, n, k, rms, in_front)
+            _refine(poses[k], some_x, some_rays, 0, n, iterations, True)
+            error_of_view(poses[k], some_x, some_rays, 0, n, k, rms, in_front)
             kept[k] = True
         _plausible(rms, in_front, first[view], first[view + 1], rival, noise[view], kept)
         if n == b - a:
             continue
         for k in range(first[view], first[view + 1]):
             if kept[k]:
-                _refine(poses[k], x, rays, a, b, again, robust)
+                _refine(poses[k], x, rays, a, b, _ALL_STEPS, True)
                 error_of_view(poses[k], x, rays, a, b, k, rms, in_front)
         _plausible(rms, in_front, first[view], first[view + 1], rival, noise[view], kept)
 

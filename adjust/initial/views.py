@@ -18,7 +18,6 @@ from adjust.parallel import run_split, split_blocks
 _RIVAL = 4.0  # a second pose whose error is within this factor of the best stays a candidate
 _NOISE_PX = 0.3  # ... or within this much of it
 _ENOUGH = 36  # points of a view from which its pose is found before all of them refine it
-_ALL_STEPS = 2  # ... in so many steps
 _GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustworthy
 
 
@@ -168,8 +167,8 @@ def refine_views(views: Sequence[View], iterations: int = 8) -> list[View]:
     poses, focal = np.concatenate([v.poses for v in views]), np.array([v.focal_px for v in views])
     error, in_front, kept = (np.empty(len(poses), dtype=t) for t in (np.float64, np.bool_, np.bool_))
     run_split(
-        refine_candidates, split_blocks(ptr), x, rays, ptr, *_samples(views), first, iterations, _ALL_STEPS,
-        True, _RIVAL, _NOISE_PX / focal, poses, error, in_front, kept,
+        refine_candidates, split_blocks(ptr), x, rays, ptr, *_samples(views), first, iterations, _RIVAL,
+        _NOISE_PX / focal, poses, error, in_front, kept,
     )  # fmt: skip
     # by view, the best first, and of equal ones the first
     owner = np.repeat(np.arange(len(views)), np.diff(first))[kept]
