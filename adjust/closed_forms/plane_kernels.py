@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adjust.closed_forms.small_kernels import eigen_in_place, median_in_place, solve_in_place, times3
+from adjust.closed_forms.small_kernels import eigen_in_place, median_in_place, product, solve_in_place
 from adjust.closed_forms.view_kernels import error_of_view
 from adjust.compiling import njit
 from adjust.model import BoolArray, FloatArray, IntArray
@@ -82,7 +82,7 @@ def plane_poses(x: FloatArray, rays: FloatArray, first: int, last: int, thicknes
         for i in range(3):
             for j in range(3):
                 out[i, j] = F[0, i] * turns[k, 0, j] + F[1, i] * turns[k, 1, j] + F[2, i] * turns[k, 2, j]
-        times3(out, axes, H)
+        product(out, axes, H)
         for i in range(3):
             along = scale * (F[0, i] * t[0] + F[1, i] * t[1] + F[2, i] * t[2])
             for j in range(3):

@@ -76,11 +76,14 @@ def eigen_in_place(A: FloatArray, V: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def times3(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
-    """The product (3, 3) of two matrices; out is neither of them."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+def product(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    """A B (n, m); out is neither of them."""
+    for i in range(A.shape[0]):
+        for j in range(B.shape[1]):
+            total = 0.0
+            for k in range(A.shape[1]):
+                total += A[i, k] * B[k, j]
+            out[i, j] = total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

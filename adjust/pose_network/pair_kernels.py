@@ -7,6 +7,7 @@ from math import cos, sin, sqrt
 
 import numpy as np
 
+from adjust.closed_forms.small_kernels import product
 from adjust.compiling import njit
 from adjust.model import BoolArray, FloatArray, IntArray
 
@@ -45,16 +46,6 @@ def _cross_matrix(v: FloatArray, out: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _product(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
-    for i in range(A.shape[0]):
-        for j in range(B.shape[1]):
-            total = 0.0
-            for k in range(A.shape[1]):
-                total += A[i, k] * B[k, j]
-            out[i, j] = total
-
-
-@njit(cache=True, nogil=True)
 def _coefficients(x2: float) -> tuple[float, float, float, float]:
     """Of the inverse Jacobian, and of its coupling block, by the squared angle."""
     if x2 < _SMALL * _SMALL:
@@ -89,7 +80,7 @@ def derivatives(
         o = omega[e]
         inverse, c1, c2, c3 = _coefficients(o[0] * o[0] + o[1] * o[1] + o[2] * o[2])
         _cross_matrix(o, K)
-        _product(K, K, K2)
+        product(K, K, K2)
         for i in range(3):
             for j in range(3):
                 one = 1.0 if i == j else 0.0
@@ -103,22 +94,22 @@ def derivatives(
             v[i], w[i] = -v[i], -o[i]
         _cross_matrix(w, P)
         _cross_matrix(v, U)
-        _product(P, U, PU)
-        _product(U, P, UP)
-        _product(PU, P, PUP)
-        _product(P, PU, first)
-        _product(UP, P, second)
+        product(P, U, PU)
+        product(U, P, UP)
+        product(PU, P, PUP)
+        product(P, PU, first)
+        product(UP, P, second)
         for i in range(3):
             for j in range(3):
                 K2[i, j] = 0.5 * U[i, j] + c1 * (PU[i, j] + UP[i, j] + PUP[i, j])
                 K2[i, j] += c2 * (first[i, j] + second[i, j] - 3.0 * PUP[i, j])
-        _product(PUP, P, first)
-        _product(P, PUP, second)
+        product(PUP, P, first)
+        product(P, PUP, second)
         for i in range(3):
             for j in range(3):
                 K2[i, j] += c3 * (first[i, j] + second[i, j])
-        _product(right, K2, first)
-        _product(first, right, second)
+        product(right, K2, first)
+        product(first, right, second)
         for i in range(3):
             for j in range(3):
                 by_a[e, i, j] = by_a[e, 3 + i, 3 + j] = right[i, j]
@@ -127,11 +118,11 @@ def derivatives(
         for i in range(3):  # the shift of the inverse motion
             w[i] = -(present[e, 0, i] * place[e, 0] + present[e, 1, i] * place[e, 1] + present[e, 2, i] * place[e, 2])
         _cross_matrix(w, K)
-        _product(K, adjoint[e, :3, :3], first)
+        product(K, adjoint[e, :3, :3], first)
         for i in range(3):
             for j in range(3):
                 adjoint[e, 3 + i, j] = first[i, j]
-        _product(by_a[e], adjoint[e], by_b[e])
+        product(by_a[e], adjoint[e], by_b[e])
     by_b *= -1.0
 
 
@@ -155,12 +146,12 @@ def covariances(
         for i in range(d):
             for j in range(d):
                 B[i, j], B[i, d + j], J[i, j] = by_b[e, i, j], by_a[e, i, j], -turn[e, i, j]
-        _product(B, Q[e], BQ)
-        _product(BQ, B.T, scatter[e])
-        _product(J, Q[e], JQ)
-        _product(JQ, J.T, own[e])
-        _product(whitening[e], scatter[e], W)
-        _product(W, whitening[e].T, Qvv[e])
+        product(B, Q[e], BQ)
+        product(BQ, B.T, scatter[e])
+        product(J, Q[e], JQ)
+        product(JQ, J.T, own[e])
+        product(whitening[e], scatter[e], W)
+        product(W, whitening[e].T, Qvv[e])
         sign = -1.0 if used[e] else 1.0
         for i in range(d):
             measured = 0.0

@@ -8,7 +8,7 @@ import textwrap
 
 import numpy as np
 
-from adjust.closed_forms.small_kernels import select, times3
+from adjust.closed_forms.small_kernels import product, select
 from adjust.compiling import made_of
 from adjust.tree_kernels import _times
 
@@ -88,7 +88,7 @@ def test_what_a_kernel_is_made_of():
     assert [name for name, _ in files] == ["adjust.closed_forms.plane_kernels", "adjust.closed_forms.small_kernels"]
     _, constants = made_of(_times.py_func)
     assert dict(constants) == {"adjust.tree_kernels._BY_HAND": "120000"}
-    assert made_of(times3.py_func)[1] == ()
+    assert made_of(product.py_func)[1] == ()
 
 
 def test_products_by_hand_and_by_blas_agree():

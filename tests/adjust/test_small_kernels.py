@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adjust.closed_forms.small_kernels import eigen_in_place, median_in_place, select, solve_in_place, times3
+from adjust.closed_forms.small_kernels import eigen_in_place, median_in_place, product, select, solve_in_place
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6, 9])
@@ -58,7 +58,7 @@ def test_not_finite_ends():
 def test_product():
     A, B = np.random.default_rng(1).normal(size=(2, 3, 3))
     out = np.empty((3, 3))
-    times3(A, B, out)
+    product(A, B, out)
     np.testing.assert_allclose(out, A @ B, rtol=1e-14)
 
 
