@@ -19,13 +19,13 @@ from adjust.model import FloatArray
 from survey.converting_g2o import project_to_g2o, survey_from_g2o
 from survey.files import AdjustmentOptions, Project, atomic_write, read, write_project
 from survey.files.project import DEFINITION_FILE
-from survey.files.text import suggestion
+from survey.files.text import read_bytes, suggestion
 from survey.interop import camera_formats
 from survey.interop.aicon import ENDINGS as AICON_ENDINGS
 from survey.interop.aicon import read_aicon
 from survey.interop.camera_values import camera_values
 from survey.interop.dbat import read_dbat
-from survey.interop.foreign import ForeignNetwork
+from survey.interop.foreign import ForeignNetwork, is_utf8
 from survey.interop.g2o import Information
 from survey.interop.gama import read_gama
 from survey.interop.gama_writer import gama_text
@@ -51,6 +51,7 @@ READERS: dict[str, Callable[[Path], ForeignNetwork]] = {
     "aicon": read_aicon,
     **camera_formats.READERS,
 }
+_TEXTS = ("gama", "krumm", "lgc", "csv", "dbat", "aicon")
 WRITERS = ("g2o", "gama", "csv", "json", "sinex", *camera_formats.WRITERS)
 _ENDINGS = {
     ".g2o": "g2o",
@@ -158,7 +159,8 @@ def _to_project(source: Path, target: Path, format: str, information: Informatio
     network = READERS[format](source)
     survey, renamed = with_safe_ids(network.survey)
     reject = network.reject
-    options = AdjustmentOptions(network.alpha or AdjustmentOptions.alpha, reject, reject, reject)
+    alpha = network.alpha or AdjustmentOptions.alpha
+    options = AdjustmentOptions(alpha, reject, reject, reject, sigmas=network.sigmas)
     title = network.title or source.stem
     with filling(target) as place:
         write_project(place, survey, title=title, options=options, target_kinds=network.target_kinds)
@@ -174,7 +176,14 @@ def _to_project(source: Path, target: Path, format: str, information: Informatio
         "stations": len(survey.stations),
     }
     shown = {what: n for what, n in counts.items() if n} or {"points": 0}
-    return ConvertOutcome(source, target, "project", shown, "as in the file", (*network.notes, *renamed))
+    notes = (*network.notes, *renamed, *_encoding(source, format))
+    return ConvertOutcome(source, target, "project", shown, "as in the file", notes)
+
+
+def _encoding(source: Path, format: str) -> tuple[str, ...]:
+    if format not in _TEXTS or not source.is_file() or is_utf8(read_bytes(source)[0]):
+        return ()
+    return ("the text is not UTF-8; unless the file names its encoding it was read as Latin-1",)
 
 
 def _to_file(
@@ -207,16 +216,19 @@ def _as_it_stands(project: Project) -> NetworkValues:
     """Adjusted points where the project has results, else its start values."""
     start = {p.point_id: p.x_in_world.value for p in project.survey.points if p.x_in_world.value is not None}
     if not (project.folder / RESULTS / "solution.json").is_file():
-        return NetworkValues(project.survey, project.title, start)
+        return NetworkValues(project.survey, project.title, start, sigmas=project.options.sigmas)
     previous = read_previous(project)
     covs = {name[1]: cov for name, cov in previous.covs.items() if name[0] == "point"}
-    return NetworkValues(project.survey, project.title, start | dict(previous.points), True, covs, previous.factor)
+    x = start | dict(previous.points)
+    return NetworkValues(
+        project.survey, project.title, x, True, covs, previous.factor, sigmas=project.options.sigmas
+    )
 
 
 def _adjusted(project: Project) -> NetworkValues:
     """The project adjusted anew, because its result files hold no covariances between points."""
     result = adjust_project(project, progress=False)
-    scale = scale_of(result, "a_posteriori")
+    scale = scale_of(result, project.options.sigmas)
     x: dict[str, FloatArray] = {}
     names: list[tuple[str, str]] = []
     points = []
@@ -232,5 +244,5 @@ def _adjusted(project: Project) -> NetworkValues:
     return NetworkValues(
         project.survey, project.title, x, True, {}, scale.factor, tuple(names),
         scale.factor**2 * joint[np.ix_(rows, rows)], result.n_observations, result.n_unknowns, result.redundancy,
-        result.omega,
+        result.omega, project.options.sigmas,
     )  # fmt: skip

@@ -28,7 +28,7 @@ from survey.cleaning import clean_options
 from survey.files import Definition, Project, SpotBlock, read, read_definition, write_image_points, write_spots
 from survey.files.project import RESULTS
 from survey.identify import Identification, identify_spots, without_points
-from survey.quantities import scale_of
+from survey.quantities import USUAL, scale_of
 from survey.replacing import changing, replace_parts
 from survey.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, solution_dict, summary_text
 from survey.statistics import Statistics, statistics_of
@@ -331,9 +331,10 @@ def run_info(project: Project, seconds: dict[str, float]) -> RunInfo:
         except PackageNotFoundError:
             continue
     chosen = replace(project.options, tolerances=(), identification=())
-    options = {k: v for k, v in asdict(chosen).items() if v != ()} | {"datum": project.survey.datum.kind}
+    options = {k: v for k, v in asdict(chosen).items() if v not in ((), None)} | {"datum": project.survey.datum.kind}
     date = datetime.now(UTC).isoformat(timespec="seconds")
     # the name alone: results of a copied folder stay the same; by its bytes: a terminal without UTF-8 garbles it
     name = os.fsencode(project.folder.resolve().name).decode("utf-8", "replace")
     said = project.options.identification
-    return RunInfo(name, project.title, project.inputs, options, versions, date, seconds, identification=said)
+    sigmas = project.options.sigmas or USUAL
+    return RunInfo(name, project.title, project.inputs, options, versions, date, seconds, sigmas, said)

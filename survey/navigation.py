@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from survey.navigation_task import (
     chosen_times,
     observed_epoch,
 )
-from survey.quantities import ARCSEC_PER_RAD
+from survey.quantities import ARCSEC_PER_RAD, SigmaKind
 from survey.replacing import changing, replace_parts
 from survey.results import RESULTS
 from survey.trajectory_files import write_trajectory
@@ -48,6 +48,7 @@ class NavigateOutcome:
     notes: tuple[str, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
     paths: dict[str, Path] = field(default_factory=dict)
+    sigmas: SigmaKind = "a_priori"
 
     def summary(self) -> dict[str, Any]:
         """Counts and median sigmas as plain values."""
@@ -60,6 +61,7 @@ class NavigateOutcome:
             "median_sigma_rotation_arcsec": rot,
             "median_sigma_translation_mm": trans,
             "calibration_sigma0": self.calibration.sigma0,
+            "sigmas": self.sigmas,
             "notes": list(self.notes),
             "written": {name: str(path) for name, path in self.paths.items()},
         }
@@ -72,7 +74,8 @@ class NavigateOutcome:
         if s["median_sigma_rotation_arcsec"] is not None:
             turn = "  ".join(f"{v:.0f}" for v in s["median_sigma_rotation_arcsec"])
             shift = "  ".join(f"{v:.3f}" for v in s["median_sigma_translation_mm"])
-            lines.append(f"  median sigmas along the head's axes: {turn} arcsec,  {shift} mm")
+            kind = self.sigmas.replace("_", " ")
+            lines.append(f"  median sigmas ({kind}) along the head's axes: {turn} arcsec,  {shift} mm")
         for epoch in self.trajectory.epochs:
             if epoch.status in ("ambiguous", "undetermined", "none"):
                 lines.append(f"  {epoch.epoch_id}: {epoch.status}: {_why(epoch)}")
@@ -134,10 +137,26 @@ def _navigated(folder: Path, request: NavigateRequest, there: Path, place: Path,
         trajectory = navigate(
             calibration.head, calibration.beacons, observed, options, lambda _done, _all: bar.update() and None
         )
+    sigmas: SigmaKind = "a_priori"
+    if project.options.sigmas == "a_posteriori" and calibration.sigma0 is not None:
+        sigmas, trajectory = "a_posteriori", _scaled(trajectory, calibration.sigma0)
     seconds = {"calibrate": calibrated - begin, "navigate": time.perf_counter() - calibrated}
-    outcome = NavigateOutcome(folder, station, calibration, trajectory, _notes(project, calibration), seconds)
+    outcome = NavigateOutcome(folder, station, calibration, trajectory, _notes(project, calibration), seconds, sigmas=sigmas)
     summary = {k: v for k, v in outcome.summary().items() if k not in ("written", "folder", "notes")}
     return replace(outcome, paths=write_trajectory(trajectory, observed, summary, place))
+
+
+def _scaled(trajectory: Trajectory, sigma0: float) -> Trajectory:
+    """All covariances times sigma0 of the calibration, squared; tests and choices were made a priori."""
+
+    def one(epoch: EpochPose) -> EpochPose:
+        others = tuple(replace(s, cov=sigma0**2 * s.cov) for s in epoch.alternatives)
+        shares = epoch.shares
+        if shares is not None:
+            shares = replace(shares, **{f.name: sigma0**2 * getattr(shares, f.name) for f in fields(shares)})
+        return replace(epoch, cov=sigma0**2 * epoch.cov, alternatives=others, shares=shares)
+
+    return Trajectory(tuple(one(e) for e in trajectory.epochs))
 
 
 def _notes(project: Project, calibration: Calibration) -> tuple[str, ...]:

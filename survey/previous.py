@@ -16,7 +16,7 @@ from survey.files import Project
 from survey.files.locking import settled
 from survey.files.poses import rotation_from_quaternion
 from survey.files.text import read_bytes
-from survey.quantities import ARCSEC_PER_RAD
+from survey.quantities import ARCSEC_PER_RAD, SigmaKind
 from survey.results import RESULTS, read_covariances
 
 # what damaged or foreign content makes the readers below raise
@@ -46,7 +46,7 @@ class Previous:
 
 @dataclass(frozen=True)
 class Move:
-    """How far a station or point went: mm, arcsec, and the largest component in its sigmas of before (a priori)."""
+    """How far a station or point went: mm, arcsec, and the largest component in its sigmas of before."""
 
     name: str
     mm: float
@@ -122,33 +122,37 @@ def _pose(entry: Mapping[str, Any]) -> Pose3:
     return Pose3(rotation, 1e-3 * _numbers(entry["translation_mm"], 3))
 
 
-def moves(previous: Previous, adjustment: Adjustment) -> tuple[Move, ...]:
+def moves(previous: Previous, adjustment: Adjustment, sigmas: SigmaKind | None = None) -> tuple[Move, ...]:
     """How far stations and points went since, most sigmas first; those that were held are left out.
 
+    sigmas: those of before, as the project asks for; None: a priori.
     In a free network the datum may have moved too: the new solution is first laid onto the old one.
     """
     old, new = previous.poses, adjustment.estimates
     names = [n for n in old if n[0] == "world_from_station" and n in new]
     onto = _fit(previous, adjustment, names) if adjustment.survey.datum.kind == "inner" else Pose3()
+    factor = 1.0 if sigmas == "a_posteriori" else previous.factor
     out = []
     for name in names:
         value = new[name].value
         if isinstance(value, Pose3):
             d = np.asarray(Pose3.Logmap(old[name].between(onto.compose(value))))
-            out.append(_move(previous, name, d, float(ARCSEC_PER_RAD * np.linalg.norm(d[:3])), d[3:]))
+            out.append(_move(previous, name, factor, d, float(ARCSEC_PER_RAD * np.linalg.norm(d[:3])), d[3:]))
     for point, x in previous.points.items():
         estimate = new.get(("point", point))
         if estimate is not None and not isinstance(estimate.value, Pose3):
             d = np.asarray(onto.transformFrom(np.asarray(estimate.value))) - x
-            out.append(_move(previous, ("point", point), d, 0.0, d))
+            out.append(_move(previous, ("point", point), factor, d, 0.0, d))
     return tuple(sorted((m for m in out if m is not None), key=lambda m: -m.sigmas))
 
 
-def _move(previous: Previous, name: ParameterName, d: FloatArray, arcsec: float, shift: FloatArray) -> Move | None:
+def _move(
+    previous: Previous, name: ParameterName, factor: float, d: FloatArray, arcsec: float, shift: FloatArray
+) -> Move | None:
     cov = previous.covs.get(name)
     if cov is None:
         return None
-    sigma = np.sqrt(np.clip(np.diag(cov), 0.0, None)) / previous.factor
+    sigma = np.sqrt(np.clip(np.diag(cov), 0.0, None)) / factor
     known = sigma > 0.0
     if not known.any():
         return None

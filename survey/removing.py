@@ -129,7 +129,7 @@ def remove_job(
         else:
             complete(folder, place)
     outcome = outcome.at(out or folder)
-    moved = () if before is None else moves(before, adjustment)
+    moved = () if before is None else moves(before, adjustment, project.options.sigmas)
     removed = {name: tables[name].named(rows) for name, rows in chosen.items()}
     return RemoveOutcome(outcome, removed, moved, before, why, time.perf_counter() - begin)
 

@@ -54,6 +54,7 @@ from survey.files.tables import Layout, Table, read_table
 from survey.files.terrestrial import KINDS, TERRESTRIAL, TERRESTRIAL_COVARIANCE, read_reading_covariances, read_readings
 from survey.files.text import id_problem, natural_key, suggestion
 from survey.files.tolerances import read_tolerances
+from survey.quantities import SIGMA_KINDS
 
 LAYOUTS = {
     layout.name: layout
@@ -240,14 +241,17 @@ def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest
 def _read_options(root: Node) -> AdjustmentOptions:
     """The tables [adjustment], [tolerances] and [identification]."""
     node, said = root.table("adjustment"), root.table("identification")
-    node.allow("alpha", "reject_blocks", "reject_points", "reject_pairs", "variance_components")
+    node.allow("alpha", "reject_blocks", "reject_points", "reject_pairs", "variance_components", "sigmas")
     alpha = node.number("alpha", 0.05, positive=True)
     if alpha >= 1:
         raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
     flags = {name: node.flag(name, True) for name in ("reject_blocks", "reject_points", "reject_pairs")}
     identification = tuple((key, said.text(key)) for key in said.values)
     flags["variance_components"] = node.flag("variance_components", False)
-    return AdjustmentOptions(alpha, **flags, tolerances=read_tolerances(root), identification=identification)
+    asked = node.choice("sigmas", SIGMA_KINDS) if node.has("sigmas") else ""
+    sigmas = next((kind for kind in SIGMA_KINDS if kind == asked), None)
+    tolerances = read_tolerances(root)
+    return AdjustmentOptions(alpha, **flags, sigmas=sigmas, tolerances=tolerances, identification=identification)
 
 
 def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:
