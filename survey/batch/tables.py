@@ -13,6 +13,7 @@ from survey.batch.control import Chart
 from survey.batch.record import DONE, FAILED, TEST_FAILED, Record
 from survey.batch.run import counts, exit_code
 from survey.batch.trends import LEVEL, Trends
+from survey.files.text import cell_text
 
 STATES = {DONE: "done", FAILED: "error", TEST_FAILED: "global test failed"}
 _MOST_TOLD = 8
@@ -148,8 +149,8 @@ def folders_csv(records: Sequence[Record]) -> str:
         numbers = (s.get("verdict", ""), *(_cell(s.get(k)) for k in (
             "sigma0", "redundancy", "n_observations", "n_unknowns")), _cell(s.get("suspects", {}).get("n_not_used")))
         message = r.error or s.get("reason", "")
-        writer.writerow((r.folder, r.state, r.exit_code, r.origin, *numbers, r.tries, f"{r.seconds:.3f}", r.cause,
-                         message))  # fmt: skip
+        writer.writerow((cell_text(r.folder), r.state, r.exit_code, r.origin, *numbers, r.tries, f"{r.seconds:.3f}",
+                         cell_text(r.cause), cell_text(message)))  # fmt: skip
     return out.getvalue()
 
 
@@ -166,7 +167,7 @@ def trends_csv(records: Sequence[Record], trends: Trends) -> str:
     for c in trends.charts:
         scatter = f"{c.by_scatter:.9g}" if np.isfinite(c.by_scatter) else ""
         for i, epoch in enumerate(c.series.epoch.tolist()):
-            writer.writerow((c.series.name, c.series.unit, records[epoch].folder, f"{c.series.value[i]:.12g}",
+            writer.writerow((cell_text(c.series.name), c.series.unit, cell_text(records[epoch].folder), f"{c.series.value[i]:.12g}",
                              f"{c.series.sigma[i]:.9g}", f"{c.mean:.12g}", f"{c.by_sigma[i]:.9g}", scatter,
                              int(c.outside[i]), int(c.outside_scatter[i])))  # fmt: skip
     return out.getvalue()

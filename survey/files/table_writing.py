@@ -9,7 +9,7 @@ import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
-from survey.files.text import atomic_write
+from survey.files.text import atomic_write, formula_problem
 
 Columns = Mapping[str, Sequence[str] | FloatArray]
 
@@ -17,8 +17,13 @@ Columns = Mapping[str, Sequence[str] | FloatArray]
 def write_table(folder: Path, name: str, columns: Columns, parquet: bool = False) -> Path:
     """Write ``folder/name.csv`` or ``.parquet`` and remove the other of the two; nan becomes blank.
 
-    Numbers keep all their digits: reading gives back the same doubles.
+    Numbers keep all their digits: reading gives back the same doubles. Raises SurveyError for a text that a spreadsheet
+    would take for a formula.
     """
+    for column, values in columns.items():
+        for text in () if isinstance(values, np.ndarray) else dict.fromkeys(values):
+            if problem := formula_problem(text):
+                raise SurveyError(f"{folder}/{name}: {column}: {text[:40]!r}: {problem}")
     path, other = folder / f"{name}.csv", folder / f"{name}.parquet"
     if parquet:
         path, other = other, path

@@ -32,18 +32,40 @@ def within_tolerance(survey: Survey, tolerance: float, unit_weight: float) -> tu
         for r in survey.readings
         if terms.get(r.reading_id, 0.0) * (min(1.0, unit_weight / r.sigma) if r.kind in _ANGULAR else 1.0) > tolerance
     }
+    left = _not_tested(survey, x, tolerance, len(survey.readings) - len(terms))
     if not gone:
-        return survey, ()
+        return survey, left
     named = [
         f"{name} ({r.kind.replace('_', ' ')} {r.at.point_id} - {r.to.point_id}) by {terms[name]:.3f} m"
         for name, r in gone.items()
     ]
-    more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
-    note = f"not used (used = no), beyond {tolerance / MM:g} mm from the file's coordinates: "
+    note = f"not used (used = false), beyond tol-abs = {tolerance / MM:g} mm from the file's coordinates: {_listed(named)}"
     kept = tuple(replace(r, used=False) if r.reading_id in gone else r for r in survey.readings)
     joint = tuple(c for whole in survey.reading_covariances if len((c := _without(whole, gone)).reading_ids) > 1)
-    changed = replace(survey, readings=kept, reading_covariances=joint)
-    return changed, (note + ", ".join(named[:_MOST_NAMED]) + more,)
+    return replace(survey, readings=kept, reading_covariances=joint), (note, *left)
+
+
+def _listed(named: Sequence[str]) -> str:
+    return ", ".join(named[:_MOST_NAMED]) + (f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else "")
+
+
+def _not_tested(survey: Survey, x: Mapping[str, FloatArray], tolerance: float, n: int) -> tuple[str, ...]:
+    """What tol-abs does not decide on here, in words: readings of points without coordinates, baselines, coordinates."""
+    nowhere = np.full(3, np.nan)
+    far: list[str] = []
+    for d in survey.coordinate_differences:
+        ends = [(a.point_id or "", t.point_id or "") for a, t in zip(d.at, d.to, strict=True)]
+        steps = np.array([x.get(t, nowhere) - x.get(a, nowhere) for a, t in ends])
+        far += [" - ".join(e) for e, off in zip(ends, np.abs(d.values - steps), strict=True) if (off > tolerance).any()]
+    for c in survey.coordinates:
+        seen = np.isfinite(np.diagonal(c.cov)).reshape(-1, 3)
+        for ref, value, known in zip(c.positions, c.values, seen, strict=True):
+            off = np.abs(value - x.get(ref.point_id or "", nowhere))[known]
+            far += [ref.point_id or ""] if (off > tolerance).any() else []
+    notes = (f"tol-abs was not applied to {n} readings of points that have no coordinates in the file",) if n else ()
+    if far:
+        notes += (f"tol-abs was not applied to baselines and coordinates; beyond it are {_listed(far)}",)
+    return notes
 
 
 def _without(whole: ReadingCovariance, gone: Mapping[str, object]) -> ReadingCovariance:

@@ -55,7 +55,7 @@ def test_krumm_dynamic_datum_is_observed_coordinates(tmp_path):
         ("300°00'30.5\"", "300.5", "line 20: found '300.5' where an angle like"),
         ("0.5 cm", "0.5 furlong", "line 12: the unit 'furlong' is not known"),
         ("100.001 0.002", "100.001", "line 14: has no deviation"),
-        ("68°15'20.7\"", "68°75'20.7\"", "line 22: angle: minutes and seconds are below 60"),
+        ("68°15'20.7\"", "68°75'20.7\"", "line 22: angle: minutes and seconds are at most 60"),
         ("B M A 30", "B Q A 30", "line 24: points without coordinates: Q"),
     ],
 )
