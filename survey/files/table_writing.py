@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import numpy as np
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from survey.files.text import atomic_write, formula_problem
+
+_NUMBERS = re.compile(r"[-+.\deE ]+")  # the components of an axis in one cell
 
 Columns = Mapping[str, Sequence[str] | FloatArray]
 
@@ -22,7 +25,7 @@ def write_table(folder: Path, name: str, columns: Columns, parquet: bool = False
     """
     for column, values in columns.items():
         for text in () if isinstance(values, np.ndarray) else dict.fromkeys(values):
-            if problem := formula_problem(text):
+            if (problem := formula_problem(text)) and not _NUMBERS.fullmatch(text):
                 raise SurveyError(f"{folder}/{name}: {column}: {text[:40]!r}: {problem}")
     path, other = folder / f"{name}.csv", folder / f"{name}.parquet"
     if parquet:
