@@ -25,8 +25,8 @@ ALPHA = 0.05
 class CompareOutcome:
     """Both folders with their adjustments, the deformation of neighbouring stations, and the congruence of all.
 
-    congruence: None where nothing common can be tested; ``why`` then says what is in the way. sigmas: what both projects
-    ask for; None: the pairs of stations are tested a priori, the congruence of all with the pooled sigma0.
+    congruence: None where nothing common can be tested; ``why`` then says what is in the way. sigmas: what both
+    projects ask for; None: the pairs of stations are tested a priori, the congruence of all with the pooled sigma0.
     """
 
     folders: tuple[Path, Path]

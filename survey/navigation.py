@@ -141,7 +141,8 @@ def _navigated(folder: Path, request: NavigateRequest, there: Path, place: Path,
     if project.options.sigmas == "a_posteriori" and calibration.sigma0 is not None:
         sigmas, trajectory = "a_posteriori", _scaled(trajectory, calibration.sigma0)
     seconds = {"calibrate": calibrated - begin, "navigate": time.perf_counter() - calibrated}
-    outcome = NavigateOutcome(folder, station, calibration, trajectory, _notes(project, calibration), seconds, sigmas=sigmas)
+    notes = _notes(project, calibration)
+    outcome = NavigateOutcome(folder, station, calibration, trajectory, notes, seconds, sigmas=sigmas)
     summary = {k: v for k, v in outcome.summary().items() if k not in ("written", "folder", "notes")}
     return replace(outcome, paths=write_trajectory(trajectory, observed, summary, place))
 

@@ -205,7 +205,8 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
             complete(folder, place)
     outcome = outcome.at(out or folder)
     added = {**merged.new_ids, **merged.rows}
-    return AddOutcome(outcome, added, moves(before, adjustment, grown.options.sigmas), before, start, time.perf_counter() - begin)
+    moved = moves(before, adjustment, grown.options.sigmas)
+    return AddOutcome(outcome, added, moved, before, start, time.perf_counter() - begin)
 
 
 def _read_merged(merged: Merged) -> Project:

@@ -167,7 +167,8 @@ def trends_csv(records: Sequence[Record], trends: Trends) -> str:
     for c in trends.charts:
         scatter = f"{c.by_scatter:.9g}" if np.isfinite(c.by_scatter) else ""
         for i, epoch in enumerate(c.series.epoch.tolist()):
-            writer.writerow((cell_text(c.series.name), c.series.unit, cell_text(records[epoch].folder), f"{c.series.value[i]:.12g}",
+            folder = cell_text(records[epoch].folder)
+            writer.writerow((cell_text(c.series.name), c.series.unit, folder, f"{c.series.value[i]:.12g}",
                              f"{c.series.sigma[i]:.9g}", f"{c.mean:.12g}", f"{c.by_sigma[i]:.9g}", scatter,
                              int(c.outside[i]), int(c.outside_scatter[i])))  # fmt: skip
     return out.getvalue()

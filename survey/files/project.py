@@ -51,8 +51,8 @@ class AdjustmentOptions:
     alpha: error probability of the tests. reject_blocks: leave mis-detected images out of the start, then test them.
     reject_points: leave gross errors among the image points out, and list them. reject_pairs: the same for measured
     pairs and single observations of all other kinds. variance_components: estimate the variance of every group.
-    sigmas: of all that is estimated, as the observations' own sigmas say (a_priori) or times sigma0 (a_posteriori); None
-    where the project does not say: every job then has its usual ones, ``adjust`` a posteriori.
+    sigmas: of all that is estimated, as the observations' own sigmas say (a_priori) or times sigma0 (a_posteriori);
+    None where the project does not say: every job then has its usual ones, ``adjust`` a posteriori.
     tolerances: what is demanded of the results. identification: who measured what, where and with
     what, printed in the report as it is.
     """

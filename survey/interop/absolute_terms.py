@@ -19,7 +19,7 @@ _PLANE: tuple[ReadingKind, ...] = ("direction", "angle", "azimuth", "horizontal_
 
 
 def within_tolerance(survey: Survey, tolerance: float, unit_weight: float) -> tuple[Survey, tuple[str, ...]]:
-    """The survey with the readings beyond ``tolerance`` (m) of its start values marked as not used, and which, in words.
+    """The survey with readings beyond ``tolerance`` (m) of its start values marked as not used, and which, in words.
 
     As GNU Gama does it, an angle (of whatever kind) goes only where its term is also beyond when multiplied with its
     weight, ``unit_weight`` (rad, of an angle with weight 1) over its sigma: Gama finds such terms before it scales its
@@ -39,18 +39,20 @@ def within_tolerance(survey: Survey, tolerance: float, unit_weight: float) -> tu
         f"{name} ({r.kind.replace('_', ' ')} {r.at.point_id} - {r.to.point_id}) by {terms[name]:.3f} m"
         for name, r in gone.items()
     ]
-    note = f"not used (used = false), beyond tol-abs = {tolerance / MM:g} mm from the file's coordinates: {_listed(named)}"
+    limit = f"tol-abs = {tolerance / MM:g} mm"
+    note = f"not used (used = false), beyond {limit} from the file's coordinates: {_listed(named)}"
     kept = tuple(replace(r, used=False) if r.reading_id in gone else r for r in survey.readings)
     joint = tuple(c for whole in survey.reading_covariances if len((c := _without(whole, gone)).reading_ids) > 1)
     return replace(survey, readings=kept, reading_covariances=joint), (note, *left)
 
 
 def _listed(named: Sequence[str]) -> str:
-    return ", ".join(named[:_MOST_NAMED]) + (f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else "")
+    more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
+    return ", ".join(named[:_MOST_NAMED]) + more
 
 
 def _not_tested(survey: Survey, x: Mapping[str, FloatArray], tolerance: float, n: int) -> tuple[str, ...]:
-    """What tol-abs does not decide on here, in words: readings of points without coordinates, baselines, coordinates."""
+    """What tol-abs does not decide on here, in words: readings of points without coordinates, baselines and so on."""
     nowhere = np.full(3, np.nan)
     far: list[str] = []
     for d in survey.coordinate_differences:

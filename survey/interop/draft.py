@@ -159,7 +159,8 @@ class NetworkDraft:
         touched = {(p, a) for r in readings for p in _ends(r) for a in _NEEDS[r.kind]}
         for v in (*self.differences, *self.coordinates):
             seen = np.isfinite(np.diagonal(v.cov)).reshape(-1, 3)
-            touched |= {(p, AXES[i]) for ids in (v.at, v.to) for k, p in enumerate(ids) for i in np.flatnonzero(seen[k])}
+            rows = [(p, seen[k]) for ids in (v.at, v.to) for k, p in enumerate(ids)]
+            touched |= {(p, AXES[i]) for p, row in rows for i in np.flatnonzero(row)}
         out, gone = {}, []
         for name, point in points.items():
             kept = {a: s for a, s in point.status.items() if s == "fixed" or (name, a) in touched}

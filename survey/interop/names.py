@@ -62,5 +62,6 @@ def with_safe_ids(survey: Survey) -> tuple[Survey, tuple[str, ...]]:
     }  # fmt: skip
     shown = [f"{old} -> {new}" for old, new in points.items()]
     more = f" and {len(shown) - 6} more" if len(shown) > 6 else ""
-    note = f"renamed, because ids have none of / \\ : @ , ; and no = + - in front: {', '.join(shown[:6])}{more}" if shown else ""
+    said = "renamed, because ids have none of / \\ : @ , ; and no = + - in front"
+    note = f"{said}: {', '.join(shown[:6])}{more}" if shown else ""
     return replace(survey, **changed), (note,) if note else ()

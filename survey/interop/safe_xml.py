@@ -16,7 +16,8 @@ from survey.interop.foreign import LATIN_1, Where, is_utf8, number
 
 _DEEPEST = 40
 _LITERAL = rb"(?:\"[^\"]*\"|'[^']*')"
-_DOCTYPE = re.compile(rb"<!DOCTYPE\s+[^\s<>\"'\[\]]+(?:\s+(?:SYSTEM|PUBLIC\s+" + _LITERAL + rb")\s*" + _LITERAL + rb")?\s*>")
+_GRAMMAR = rb"\s+(?:SYSTEM|PUBLIC\s+" + _LITERAL + rb")\s*" + _LITERAL
+_DOCTYPE = re.compile(rb"<!DOCTYPE\s+[^\s<>\"'\[\]]+(?:" + _GRAMMAR + rb")?\s*>")
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 

@@ -107,7 +107,8 @@ def row(run: GamaRun) -> str:
     sigma0 = "-" if run.sigma0_ratio is None else f"{run.sigma0_ratio:.7f}"
     low, high = run.sigma_ratio
     verdict = "ok" if run.agrees else f"OFF {run.worst}"
-    return f"{run.name:38} {run.state:9} {run.coordinate_m:9.2g} m  sigmas {low:.6f}..{high:.6f}  s0 {sigma0}{counts}  {verdict}"
+    numbers = f"{run.coordinate_m:9.2g} m  sigmas {low:.6f}..{high:.6f}  s0 {sigma0}{counts}"
+    return f"{run.name:38} {run.state:9} {numbers}  {verdict}"
 
 
 def _main() -> None:

@@ -30,6 +30,9 @@ GAMA = (
     "2019-zeman", "2020-barta-phase_0-1TK", "2020-barta-phase_1-1TK", "cube-1", "local_3d", "tst-tetrahedron-3-gon",
     "zoltan-test_2d_gon",
 )  # fmt: skip
+DEFAULTS = (
+    "krasovsky-1926", "zoltan-test_2d_dms", "stroner-levelling-a", "seq-dsuloha-d", "LotherStrehle_Direction7",
+)  # fmt: skip
 SYNTHETIC = ("net100", "free100")
 LARGE = ("net1000", "free1000")
 KRUMM = (
@@ -43,7 +46,7 @@ LGC = "MathisLGC_V1_20150709-141437"
 LGC_SIGMA0 = 17.927129
 
 
-# --- what a user gets: convert, adjust, and the files in results, in the order of the dense adjustment ------------------
+# --- what a user gets: convert, adjust, and the files in results ------------------------------------------------------
 
 _SI = {"mm": 1e-3, "arcsec": np.pi / 648000}
 

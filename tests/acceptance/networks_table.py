@@ -5,6 +5,7 @@ from collections.abc import Iterable
 
 from adjust.errors import SurveyError
 from tests.acceptance.networks import (
+    DEFAULTS,
     GAMA,
     KRUMM,
     LARGE,
@@ -45,6 +46,15 @@ exchange x and y.
 
 A project made from another program's file keeps every observation that its owner used (`reject_points` and `reject_pairs`
 are false in its `survey.toml`), so that `adjust` gives that program's result; what does not fit is listed in the report.
+Its `sigmas` under `[adjustment]` is that of the file: Gama's `sigma-act`; a posteriori for Krumm, LGC, DBAT and AICON.
+
+Of Gama's files: default deviations of angles are arc seconds where the value is in degrees, cc where it is in gon.
+Readings that are farther than `tol-abs` (1000 mm where the file does not say) from the coordinates in the file are marked
+`used = false` and named by `convert`; write `true` to take one back. An angle goes only where its term is also beyond with
+the weight that it has, as Gama does it. What the file asks for and does not get is listed: `latitude` and `ellipsoid`
+(nothing is reduced to an ellipsoid), the network's `epoch`, readings that `tol-abs` cannot be applied to because a
+point has no coordinates. `60` seconds are read as what rounding made of 59.99; a document type is passed over unless it
+declares something; text that is not UTF-8 is read as Latin-1; names that cannot be ids are changed and listed.
 
 SINEX-like means: FILE/COMMENT, SITE/ID, SOLUTION/STATISTICS, SOLUTION/ESTIMATE (STAX, STAY, STAZ in m) and
 SOLUTION/MATRIX_ESTIMATE L COVA in their fixed columns, epochs and approximate longitudes zero; the frame is the
@@ -58,11 +68,12 @@ Made by `python -m tests.acceptance.networks_table > docs/networks.md`; the test
 GAMA_TEXT = """
 ### GNU Gama
 
-Differences from Gama's XML: coordinates in mm, deviations relative, standardized residuals absolute (three decimals are
+Files and Gama's results through `labsurvey convert` and `labsurvey adjust`; `python -m tests.acceptance.gama_folder FOLDER`
+does the same with every `.gkf` below a folder. Differences from Gama's XML: coordinates in mm, deviations relative, standardized residuals absolute (three decimals are
 printed, half a unit is 0.0005). Gama stops after one linearisation. Columns *left* are what remains when exactly that
 step is repeated from Gama's own approximate coordinates by an independent dense adjustment: where they are small and
-the difference is not, Gama had not converged. For `tst-tetrahedron-3-gon` Gama's standardized residuals of correlated
-baselines come from decorrelated rows; its printed deviation of an adjusted dy contradicts its own covariance matrix.
+the difference is not, Gama had not converged. For `tst-tetrahedron-3-gon` and `seq-dsuloha-d` Gama's standardized residuals
+of correlated baselines and coordinates come from decorrelated rows; in the former its printed deviation of an adjusted dy contradicts its own covariance matrix.
 
 | network | points | observations | r | defect | sigma0 Gama | sigma0 | coordinates mm | left mm | deviations | left | w | left |
 |---|---|---|---|---|---|---|---|---|---|---|---|---|
@@ -164,9 +175,12 @@ def railway_row(found: Compared) -> str:
 
 def main() -> None:
     """Print the page."""
-    gama, synthetic, krumm, lgc = (data_folder("network", n) for n in ("gama", "synthetic", "krumm", "lgc"))
+    gama, defaults, synthetic, krumm, lgc = (
+        data_folder("network", n) for n in ("gama", "gama_defaults", "synthetic", "krumm", "lgc")
+    )
+    small = ((gama, GAMA), (defaults, DEFAULTS), (synthetic, SYNTHETIC))
     sections = [
-        (GAMA_TEXT, gama_row, [(compare_gama, f, n) for f, names in ((gama, GAMA), (synthetic, SYNTHETIC)) for n in names]),
+        (GAMA_TEXT, gama_row, [(compare_gama, f, n) for f, names in small for n in names]),
         (LARGE_TEXT, large_row, [(compare_large, synthetic, n) for n in LARGE]),
         (KRUMM_TEXT, krumm_row, [(compare_krumm, krumm, n) for n in KRUMM]),
         (LGC_TEXT, lgc_row, [(lambda folder, _: compare_lgc(folder), lgc, "")]),

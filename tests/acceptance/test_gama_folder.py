@@ -3,15 +3,11 @@
 import pytest
 
 from tests.acceptance.gama_folder import convert_and_adjust
+from tests.acceptance.networks import DEFAULTS
 from tests.data import data_folder
 
-DEFAULTS = (
-    "krasovsky-1926", "zoltan-test_2d_dms", "stroner-levelling-a", "seq-dsuloha-d", "LotherStrehle_Direction7",
-    "2019-08-20-knin_test", "tst-tetrahedron-1",
-)  # fmt: skip
 
-
-@pytest.mark.parametrize("name", DEFAULTS)
+@pytest.mark.parametrize("name", [*DEFAULTS, "2019-08-20-knin_test", "tst-tetrahedron-1"])
 def test_coordinates_sigmas_and_sigma0_are_gamas(tmp_path, name):
     """To 1e-6 m; sigmas and sigma0 to what Gama's last linearisation leaves (1e-4)."""
     run = convert_and_adjust(data_folder("network", "gama_defaults") / f"{name}.gkf", tmp_path / "net")

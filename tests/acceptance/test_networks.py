@@ -8,6 +8,7 @@ import pytest
 
 from survey.cli import main
 from tests.acceptance.networks import (
+    DEFAULTS,
     GAMA,
     KRUMM,
     LARGE,
@@ -181,6 +182,6 @@ def test_through_convert_and_adjust(tmp_path, source, sigma0, r):
 
 def test_the_page_lists_every_network():
     page = (Path(__file__).parents[2] / "docs" / "networks.md").read_text(encoding="utf-8")
-    for name in (*GAMA, *SYNTHETIC, *LARGE, *KRUMM, RAILWAY, "HIE-ISOLDE"):
+    for name in (*GAMA, *DEFAULTS, *SYNTHETIC, *LARGE, *KRUMM, RAILWAY, "HIE-ISOLDE"):
         assert f"| {name} |" in page, name
     assert "no start value" not in page

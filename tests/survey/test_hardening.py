@@ -157,7 +157,7 @@ def test_ids_that_are_no_names_of_files(name: str, said: str) -> None:
 
 @pytest.mark.parametrize("text", ["=1+1", "+A1", "-A1", "@SUM(A1)", "\t=1", "\r=1"])
 def test_no_cell_of_a_table_is_taken_for_a_formula(tmp_path: Path, text: str) -> None:
-    """Refused where a table is read again, shown with an apostrophe where it is not; also in a project made in Python."""
+    """Refused where a table is read again, shown with an apostrophe where it is not; in projects made in Python too."""
     assert cell_text(text) == f"'{text}"
     assert [cell_text(x) for x in ("", "A1", "a=b", "1-2")] == ["", "A1", "a=b", "1-2"]
     with pytest.raises(SurveyError, match=r"distances: group: .*takes? what begins with"):

@@ -134,7 +134,8 @@ GKF = """<gama-local><network><parameters sigma-apr="10" conf-pr="0.95" sigma-ac
 <points-observations distance-stdev="5">
 <point id="1" x="0" y="0" fix="xy"/><point id="2" x="90" y="0" fix="xy"/><point id="3" x="40" y="30" adj="xy"/>
 <point id="-4" x="10" y="30" adj="xy"/><point id="=5" x="10" y="60" adj="xy"/>
-<obs><distance from="1" to="3" val="50.02"/><distance from="2" to="3" val="58.31"/><distance from="1" to="-4" val="31.6"/>
+<obs><distance from="1" to="3" val="50.02"/><distance from="2" to="3" val="58.31"/>
+<distance from="1" to="-4" val="31.6"/>
 <distance from="2" to="-4" val="85.44"/><distance from="3" to="-4" val="30.03"/><distance from="1" to="=5" val="60.82"/>
 <distance from="2" to="=5" val="100"/><distance from="3" to="=5" val="42.42"/></obs>
 </points-observations></network></gama-local>"""
