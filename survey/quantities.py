@@ -11,6 +11,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.distributions import chi2, fisher
+from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from adjust.result import Adjustment, Estimate
 
@@ -37,9 +38,13 @@ class Scale:
 def scale_of(adjustment: Adjustment, sigmas: SigmaKind | None) -> Scale:
     """The scale asked for, ``USUAL`` where None; without redundancy there is no sigma0, and sigmas stay a priori.
 
+    Raises SurveyError for a word that is none of ``SIGMA_KINDS``.
+
     The ellipsoid follows the chi-square distribution with 3 degrees of freedom for a known, Fisher's F(3, r) for an
     estimated sigma0 (Koch 1999, Parameter Estimation and Hypothesis Testing in Linear Models, section 4.3).
     """
+    if sigmas not in (None, *SIGMA_KINDS):
+        raise SurveyError(f"there are no sigmas {sigmas!r}; write {' or '.join(SIGMA_KINDS)}")
     known = (sigmas or USUAL) == "a_priori" or adjustment.redundancy <= 0 or not np.isfinite(adjustment.sigma0)
     if known:
         return Scale("a_priori", 1.0, float(np.sqrt(chi2.ppf(PROBABILITY, 3))))

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import survey
+from adjust.errors import SurveyError
 from survey.aligning import align_job
 from survey.cli import main
 from survey.files import AdjustmentOptions, read, write_project
@@ -19,8 +21,8 @@ KINDS = (None, "a_priori", "a_posteriori")
 
 
 def _project(folder: Path, sigmas, seed=4, poses=None, held=0) -> Path:
-    survey = measured(chain() if poses is None else poses, np.random.default_rng(seed), held=held)
-    return write_project(folder, survey, options=AdjustmentOptions(sigmas=sigmas))
+    pairs = measured(chain() if poses is None else poses, np.random.default_rng(seed), held=held)
+    return write_project(folder, pairs, options=AdjustmentOptions(sigmas=sigmas))
 
 
 def _solution(folder: Path):
@@ -105,10 +107,10 @@ def test_how_far_things_moved_when_something_is_removed_obeys(tmp_path, capsys):
 
 
 def test_navigation_obeys(tmp_path):
-    survey, _ = beacons(seed=4, n_table_epochs=5, n_free_epochs=4, n_night_epochs=3)
+    lab, _ = beacons(seed=4, n_table_epochs=5, n_free_epochs=4, n_night_epochs=3)
     found = {}
     for sigmas in KINDS:
-        write_project(tmp_path / str(sigmas), survey, options=AdjustmentOptions(sigmas=sigmas))
+        write_project(tmp_path / str(sigmas), lab, options=AdjustmentOptions(sigmas=sigmas))
         found[sigmas] = navigate_job(tmp_path / str(sigmas), NavigateRequest(), progress=False)
     usual, prior, posterior = found.values()
     sigma0 = usual.calibration.sigma0
@@ -164,3 +166,9 @@ def test_points_named_like_formulas_are_renamed_on_the_way_in(tmp_path, capsys):
         cells = [cell for line in path.read_text(encoding="utf-8").splitlines() for cell in line.split(",")]
         texts = [cell for cell in cells if not cell.replace("-", "").replace(".", "").replace("e", "").isdigit()]
         assert not [cell for cell in texts if cell.startswith(("=", "+", "-", "@"))], path
+
+
+def test_a_wrong_word_in_python_is_no_kind(tmp_path):
+    _project(tmp_path / "lab", None)
+    with pytest.raises(SurveyError, match="there are no sigmas 'apriori'; write a_priori or a_posteriori"):
+        survey.adjust(survey.problem(tmp_path / "lab").with_options(sigmas="apriori")).scale  # noqa: B018
