@@ -64,7 +64,9 @@ def _not_tested(survey: Survey, x: Mapping[str, FloatArray], tolerance: float, n
         for ref, value, known in zip(c.positions, c.values, seen, strict=True):
             off = np.abs(value - x.get(ref.point_id or "", nowhere))[known]
             far += [ref.point_id or ""] if (off > tolerance).any() else []
-    notes = (f"tol-abs was not applied to {n} readings of points that have no coordinates in the file",) if n else ()
+    notes: tuple[str, ...] = ()
+    if n:
+        notes = (f"tol-abs was not applied to {n} readings of points that have no coordinates in the file",)
     if far:
         notes += (f"tol-abs was not applied to baselines and coordinates; beyond it are {_listed(far)}",)
     return notes
