@@ -216,13 +216,17 @@ def _as_it_stands(project: Project) -> NetworkValues:
     """Adjusted points where the project has results, else its start values."""
     start = {p.point_id: p.x_in_world.value for p in project.survey.points if p.x_in_world.value is not None}
     if not (project.folder / RESULTS / "solution.json").is_file():
-        return NetworkValues(project.survey, project.title, start, sigmas=project.options.sigmas)
+        return NetworkValues(project.survey, project.title, start, **_options(project))
     previous = read_previous(project)
     covs = {name[1]: cov for name, cov in previous.covs.items() if name[0] == "point"}
     x = start | dict(previous.points)
     return NetworkValues(
-        project.survey, project.title, x, True, covs, previous.factor, sigmas=project.options.sigmas
+        project.survey, project.title, x, True, covs, previous.factor, **_options(project)
     )
+
+
+def _options(project: Project) -> dict[str, Any]:
+    return {"sigmas": project.options.sigmas, "alpha": project.options.alpha}
 
 
 def _adjusted(project: Project) -> NetworkValues:
@@ -244,5 +248,5 @@ def _adjusted(project: Project) -> NetworkValues:
     return NetworkValues(
         project.survey, project.title, x, True, {}, scale.factor, tuple(names),
         scale.factor**2 * joint[np.ix_(rows, rows)], result.n_observations, result.n_unknowns, result.redundancy,
-        result.omega, project.options.sigmas,
+        result.omega, **_options(project),
     )  # fmt: skip

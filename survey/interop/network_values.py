@@ -16,7 +16,7 @@ class NetworkValues:
     """x: (3,) m by point, adjusted or start values; points without either are missing.
 
     covs: (3, 3) m^2 by point, empty where not adjusted; multiplied by factor^2. joint: of ``names`` (point, axis).
-    sigmas: what the project asks for.
+    sigmas, alpha: what the project asks for.
     """
 
     survey: Survey
@@ -32,6 +32,7 @@ class NetworkValues:
     redundancy: int = 0
     omega: float = 0.0
     sigmas: SigmaKind | None = None
+    alpha: float = 0.05
 
 
 def point_of(position: PositionRef) -> str | None:

@@ -18,6 +18,7 @@ _DEEPEST = 40
 _LITERAL = rb"(?:\"[^\"]*\"|'[^']*')"
 _GRAMMAR = rb"\s+(?:SYSTEM|PUBLIC\s+" + _LITERAL + rb")\s*" + _LITERAL
 _DOCTYPE = re.compile(rb"<!DOCTYPE\s+[^\s<>\"'\[\]]+(?:" + _GRAMMAR + rb")?\s*>")
+_BLANK = re.compile(rb"(?:\xef\xbb\xbf)?\s+|\xef\xbb\xbf")
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
@@ -96,7 +97,8 @@ def _without_doctype(data: bytes) -> bytes:
     """
     at, closing = 0, {b"<?": b"?>", b"<!--": b"-->"}
     while True:
-        at += len(data[at:]) - len(data[at:].lstrip(b"\xef\xbb\xbf \t\r\n"))
+        blank = _BLANK.match(data, at)
+        at = at if blank is None else blank.end()
         begin = next((b for b in closing if data.startswith(b, at)), None)
         if begin is None:
             break

@@ -132,7 +132,7 @@ def test_the_working_sheet_obeys(tmp_path):
     np.testing.assert_allclose(found[None], max(1.0, sigma0) ** 2 * found["a_priori"], rtol=1e-9)
 
 
-GKF = """<gama-local><network><parameters sigma-apr="10" conf-pr="0.95" sigma-act="{}"/>
+GKF = """<gama-local><network><parameters sigma-apr="10" conf-pr="0.99" sigma-act="{}"/>
 <points-observations distance-stdev="5">
 <point id="1" x="0" y="0" fix="xy"/><point id="2" x="90" y="0" fix="xy"/><point id="3" x="40" y="30" adj="xy"/>
 <point id="-4" x="10" y="30" adj="xy"/><point id="=5" x="10" y="60" adj="xy"/>
@@ -150,7 +150,8 @@ def test_a_network_of_another_program_brings_its_kind_and_takes_it_along(tmp_pat
     assert read(tmp_path / "net").options.sigmas == kind
     assert _solution(tmp_path / "net")["summary"]["sigmas"] == kind
     assert main(["convert", str(tmp_path / "net"), str(tmp_path / "back.gkf")]) == 0
-    assert f'sigma-act="{word}"' in (tmp_path / "back.gkf").read_text(encoding="utf-8")
+    back = (tmp_path / "back.gkf").read_text(encoding="utf-8")
+    assert f'conf-pr="0.99" tol-abs="1000000000" sigma-act="{word}"' in back
     assert main(["convert", str(tmp_path / "net"), str(tmp_path / "net.snx")]) == 0
     factor = _solution(tmp_path / "net")["summary"]["sigma_factor"]
     said = (tmp_path / "net.snx").read_text(encoding="utf-8").split("covariances are a priori times ")[1]
