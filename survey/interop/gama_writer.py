@@ -31,7 +31,8 @@ def gama_text(network: NetworkValues) -> str:
             '<gama-local xmlns="http://www.gnu.org/software/gama/gama-local">',
             f'<network axes-xy="{axes_xy(survey.bearings)}" angles="left-handed">',
             f"<description>{escape(network.title)}</description>",
-            f'<parameters sigma-apr="1" conf-pr="{1.0 - network.alpha:.12g}" tol-abs="{_NO_LIMIT_MM}" sigma-act="{actual}" />',
+            f'<parameters sigma-apr="1" conf-pr="{1.0 - network.alpha:.12g}" tol-abs="{_NO_LIMIT_MM}" '
+            f'sigma-act="{actual}" />',
             "<points-observations>",
             *body,
             "</points-observations>",
