@@ -18,7 +18,7 @@ import numpy as np
 
 _KINDS = {"f": np.float64, "i": np.int64, "s": np.float32, "u": np.uint8, "b": np.bool_}
 _FOLDER = Path(__file__).parent
-_FAMILIES = ("images",)
+_FAMILIES = ("images", "bundles")
 SETS = ("base", "avx2", "avx512")
 """Sets of vector instructions for which the library may have been built, the widest last."""
 
@@ -154,7 +154,9 @@ def _fits(shape: tuple[_Dimension, ...], given: tuple[int, ...], sizes: dict[str
 def _text(dimension: _Dimension) -> str:
     if dimension is None:
         return "any"
-    return str(dimension) if isinstance(dimension, int) else dimension[0] + (f" + {dimension[1]}" if dimension[1] else "")
+    if isinstance(dimension, int):
+        return str(dimension)
+    return f"{dimension[0]} + {dimension[1]}" if dimension[1] else dimension[0]
 
 
 def _told(value: Any) -> str:

@@ -8,8 +8,8 @@ import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.lens import MODELS, unit_rays
-from adjust.lens_kernels import FISHEYE, MAX_LENS
 from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.native.lenses import FISHEYE, MAX_LENS
 from adjust.navigation.model import Beacons, Head, NavigationEpoch, Spots
 from adjust.navigation.row_kernels import SystemArrays, in_view, spot_rows
 
