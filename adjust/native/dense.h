@@ -36,4 +36,77 @@ inline void product(const double *A, int64_t lda, const double *B, int64_t ldb, 
     for (; j < m; j += W) product_columns<1>(A, lda, B + j, ldb, C + j, ldc, n, inner);
 }
 
+// y += f x, of n numbers.
+inline void add_multiple(double f, const double *x, double *y, int64_t n) {
+    int64_t i = 0;
+    for (; i + W <= n; i += W) store(y + i, load(y + i) + f * load(x + i));
+    for (; i < n; ++i) y[i] += f * x[i];
+}
+inline double dot(const double *x, const double *y, int64_t n) {
+    V s = V{};
+    int64_t i = 0;
+    for (; i + W <= n; i += W) s += load(x + i) * load(y + i);
+    double total = sum(s);
+    for (; i < n; ++i) total += x[i] * y[i];
+    return total;
+}
+
+// Lower Cholesky factor of A (n, n), rows of ld numbers, in place; false where there is none.
+inline bool cholesky(double *A, int64_t n, int64_t ld) {
+    for (int64_t j = 0; j < n; ++j) {
+        const double s = A[j * ld + j] - dot(A + j * ld, A + j * ld, j);
+        if (!(s > 0.0)) return false;
+        const double pivot = root(s);
+        A[j * ld + j] = pivot;
+        for (int64_t i = j + 1; i < n; ++i) A[i * ld + j] = (A[i * ld + j] - dot(A + i * ld, A + j * ld, j)) / pivot;
+    }
+    return true;
+}
+// inv(L) X in place, X (n, m).
+inline void forward_solve(const double *L, int64_t n, int64_t ld, double *X, int64_t m) {
+    for (int64_t i = 0; i < n; ++i) {
+        for (int64_t k = 0; k < i; ++k) add_multiple(-L[i * ld + k], X + k * m, X + i * m, m);
+        for (int64_t j = 0; j < m; ++j) X[i * m + j] /= L[i * ld + i];
+    }
+}
+// inv(L') X in place, X (n, m).
+inline void backward_solve(const double *L, int64_t n, int64_t ld, double *X, int64_t m) {
+    for (int64_t i = n - 1; i >= 0; --i) {
+        for (int64_t k = i + 1; k < n; ++k) add_multiple(-L[k * ld + i], X + k * m, X + i * m, m);
+        for (int64_t j = 0; j < m; ++j) X[i * m + j] /= L[i * ld + i];
+    }
+}
+
+// Eigenvalues (any order) and vectors (columns of U) of a symmetric A, which is used up: Jacobi's rotations, cyclic
+// (Golub and Van Loan 2013, section 8.5).
+template <int N> inline void eigen(double (&A)[N][N], double (&values)[N], double (&U)[N][N]) {
+    for (int i = 0; i < N; ++i)
+        for (int j = 0; j < N; ++j) U[i][j] = i == j;
+    for (int sweep = 0; sweep < 60; ++sweep) {
+        double off = 0.0, all_of = 0.0;
+        for (int i = 0; i < N; ++i)
+            for (int j = 0; j < N; ++j) (i == j ? all_of : off) += A[i][j] * A[i][j];
+        if (!(off > 1e-32 * all_of)) break;
+        for (int p = 0; p < N; ++p)
+            for (int q = p + 1; q < N; ++q) {
+                if (A[p][q] == 0.0) continue;
+                const double tau = (A[q][q] - A[p][p]) / (2.0 * A[p][q]);
+                const double t = (tau >= 0.0 ? 1.0 : -1.0) / (magnitude(tau) + root(1.0 + tau * tau)), c = 1.0 / root(1.0 + t * t), s = t * c;
+                for (int k = 0; k < N; ++k) {
+                    const double x = A[k][p], y = A[k][q];
+                    A[k][p] = c * x - s * y, A[k][q] = s * x + c * y;
+                }
+                for (int k = 0; k < N; ++k) {
+                    const double x = A[p][k], y = A[q][k];
+                    A[p][k] = c * x - s * y, A[q][k] = s * x + c * y;
+                }
+                for (int k = 0; k < N; ++k) {
+                    const double x = U[k][p], y = U[k][q];
+                    U[k][p] = c * x - s * y, U[k][q] = s * x + c * y;
+                }
+            }
+    }
+    for (int i = 0; i < N; ++i) values[i] = A[i][i];
+}
+
 }  // namespace
