@@ -51,6 +51,27 @@ inline double dot(const double *x, const double *y, int64_t n) {
     return total;
 }
 
+// N += A A', upper triangle, of A's first n rows, m long: three columns by four in
+// registers. Rows n .. n + 2 of A are read too; they and what they make in N mean nothing.
+template <int LENGTH, int WIDTH> inline void add_gram(const double (*A)[LENGTH], int n, int m, V (*N)[WIDTH]) {
+    for (int j = 0; j < n; j += 3)
+        for (int k = j; k < n; k += 4) {
+            V c[3][4] = {};
+            for (int p = 0; p < m; p += W) {
+                const V a0 = load(&A[j][p]), a1 = load(&A[j + 1][p]), a2 = load(&A[j + 2][p]);
+#pragma GCC unroll 4
+                for (int i = 0; i < 4; ++i) {
+                    const V b = load(&A[k + i][p]);
+                    c[0][i] += a0 * b, c[1][i] += a1 * b, c[2][i] += a2 * b;
+                }
+            }
+#pragma GCC unroll 3
+            for (int r = 0; r < 3; ++r)
+#pragma GCC unroll 4
+                for (int i = 0; i < 4; ++i) N[j + r][k + i] += c[r][i];
+        }
+}
+
 // Lower Cholesky factor of A (n, n), rows of ld numbers, in place; false where there is none.
 inline bool cholesky(double *A, int64_t n, int64_t ld) {
     for (int64_t j = 0; j < n; ++j) {

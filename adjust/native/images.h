@@ -157,26 +157,6 @@ inline void clear_unused(const Batch &B, int64_t b, Room &room) {
     for (int j = 0; j < B.lenses.n_free[c]; ++j) std::memset(room.A[j], 0, sizeof room.A[j]);
 }
 
-// N += A A', upper triangle, of A's first n rows, m long: three columns by four in registers.
-inline void add_gram(const double (*A)[2 * CHUNK], int n, int m, V (*N)[COLUMNS]) {
-    for (int j = 0; j < n; j += 3)
-        for (int k = j; k < n; k += 4) {
-            V c[3][4] = {};
-            for (int p = 0; p < m; p += W) {
-                const V a0 = load(&A[j][p]), a1 = load(&A[j + 1][p]), a2 = load(&A[j + 2][p]);
-#pragma GCC unroll 4
-                for (int i = 0; i < 4; ++i) {
-                    const V b = load(&A[k + i][p]);
-                    c[0][i] += a0 * b, c[1][i] += a1 * b, c[2][i] += a2 * b;
-                }
-            }
-#pragma GCC unroll 3
-            for (int r = 0; r < 3; ++r)
-#pragma GCC unroll 4
-                for (int i = 0; i < 4; ++i) N[j + r][k + i] += c[r][i];
-        }
-}
-
 // For each listed block: normal matrix H[b] (symmetric) of its local unknowns and, last, the residual, whose diagonal
 // element is chi-square, also in chi; depth: the least one.
 inline void normal_equations(Ints which, const Batch &B, Out<double, 3> H, Out<double, 1> chi, Out<double, 1> depth) {

@@ -18,7 +18,7 @@ import numpy as np
 
 _KINDS = {"f": np.float64, "i": np.int64, "s": np.float32, "u": np.uint8, "b": np.bool_}
 _FOLDER = Path(__file__).parent
-_FAMILIES = ("images", "bundles", "navigation")
+_FAMILIES = ("images", "bundles", "navigation", "vision")
 SETS = ("base", "avx2", "avx512")
 """Sets of vector instructions for which the library may have been built, the widest last."""
 
