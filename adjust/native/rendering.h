@@ -104,6 +104,49 @@ struct Facets {
         }
         return any;
     }
+    // Sum of the grey values of rays inside a quadrangle that meets this facet alone, with one edge of cells across it at
+    // the most in each direction; false where it is not so.
+    bool sum_of_four(const Quad &q, int64_t f, In<double, 2> samples, double &total) const {
+        const double *m = &from_ray(f, 0, 0), *xs = &x_edges(f, 0), *ys = &y_edges(f, 0);
+        const int64_t nx = counts(f, 0), ny = counts(f, 1);
+        double low[2] = {__builtin_inf(), __builtin_inf()}, high[2] = {-__builtin_inf(), -__builtin_inf()};
+        for (const auto &c : q.p) {
+            const double w = m[6] * c[0] + m[7] * c[1] + m[8];
+            if (!(w > 0.0)) return false;
+            for (int a = 0; a < 2; ++a) {
+                const double at = (m[3 * a] * c[0] + m[3 * a + 1] * c[1] + m[3 * a + 2]) / w;
+                low[a] = smaller(low[a], at), high[a] = larger(high[a], at);
+            }
+        }
+        const int64_t i = cell(xs, nx, low[0]), j = cell(ys, ny, low[1]);
+        if (i < 0 || j < 0) return false;
+        const bool two_x = high[0] > xs[i + 1], two_y = high[1] > ys[j + 1];
+        if (high[0] > xs[smaller(i + 1 + two_x, nx)] || high[1] > ys[smaller(j + 1 + two_y, ny)]) return false;
+        const double x_edge = xs[i + 1], y_edge = ys[j + 1];
+        const double g[2][2] = {{cells(f, j, i), two_x ? cells(f, j, i + 1) : 0.0}, {two_y ? cells(f, j + 1, i) : 0.0, two_x && two_y ? cells(f, j + 1, i + 1) : 0.0}};
+        V sum_of = V{};
+        int64_t k = 0;
+        const int64_t n = samples.n[0];
+        for (; k + W <= n; k += W) {
+            V s, t;
+            for (int e = 0; e < W; ++e) s[e] = samples(k + e, 0), t[e] = samples(k + e, 1);
+            const V w[4] = {(1.0 - s) * (1.0 - t), s * (1.0 - t), (1.0 - s) * t, s * t};
+            const V x = w[0] * q.p[0][0] + w[1] * q.p[1][0] + w[2] * q.p[2][0] + w[3] * q.p[3][0];
+            const V y = w[0] * q.p[0][1] + w[1] * q.p[1][1] + w[2] * q.p[2][1] + w[3] * q.p[3][1];
+            const V depth = m[6] * x + m[7] * y + m[8];
+            const auto right = m[0] * x + m[1] * y + m[2] >= x_edge * depth, below = m[3] * x + m[4] * y + m[5] >= y_edge * depth;
+            const V above = right ? all<V>(g[0][1]) : all<V>(g[0][0]), under = right ? all<V>(g[1][1]) : all<V>(g[1][0]);
+            sum_of += below ? under : above;
+        }
+        total = sum(sum_of);
+        for (; k < n; ++k) {
+            double ray[2];
+            q.inner(samples(k, 0), samples(k, 1), ray);
+            const double depth = m[6] * ray[0] + m[7] * ray[1] + m[8];
+            total += g[m[3] * ray[0] + m[4] * ray[1] + m[5] >= y_edge * depth][m[0] * ray[0] + m[1] * ray[1] + m[2] >= x_edge * depth];
+        }
+        return true;
+    }
     // Grey value of one ray: the nearest facet that it meets.
     double sample(const double *ray, double background, const int64_t *candidates, int64_t n) const {
         double best = 0.0, gray = background;
@@ -164,7 +207,8 @@ inline void draw_facets(int64_t first, int64_t last, In<double, 3> rays, int64_t
                             for (int k = 0; k < 4; ++k) pixel.inner(double(a + k % 2) / double(n), double(b + k / 2) / double(n), sub.p[k]);
                             if (F.mixed(sub, background, candidates.data, found, gray)) {
                                 gray = 0.0;
-                                for (int64_t k = 0; k < samples.n[0]; ++k) {
+                                const bool simple = found == 1 && F.sum_of_four(sub, candidates[0], samples, gray);
+                                for (int64_t k = 0; !simple && k < samples.n[0]; ++k) {
                                     double ray[2];
                                     sub.inner(samples(k, 0), samples(k, 1), ray);
                                     gray += F.sample(ray, background, candidates.data, found);
