@@ -13,7 +13,13 @@ import numpy as np
 import scipy
 from scipy import sparse
 
-from adjust.bundle_kernels import (
+from adjust.errors import IndeterminateError
+from adjust.image_batch import Chains, square_root_information
+from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.motions import motions_of, points_motions, poses_at, poses_motions
+from adjust.native.bundles import (
+    BundleArrays,
+    ReducedArrays,
     add_direct,
     back_substitute,
     between_poses,
@@ -24,11 +30,7 @@ from adjust.bundle_kernels import (
     rows,
     symmetric_rows,
 )
-from adjust.errors import IndeterminateError
-from adjust.image_batch import Chains, square_root_information
-from adjust.lens_kernels import MAX_LENS
-from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.motions import motions_of, points_motions, poses_at, poses_motions
+from adjust.native.lenses import MAX_LENS
 from adjust.observations import ImageBlock
 from adjust.parallel import run_split, workers
 from adjust.state import State
@@ -168,6 +170,11 @@ class BundleBatch:
         self.world = np.array([self.unknowns.held_points.get(i, np.zeros(3)) for i in self.point_ids]).reshape(-1, 3)
         self.Vi, self.h = np.zeros((p, 3, 3)), np.zeros((p, 3))
         self.W3, self.WL = np.zeros((k, 3, 6)), np.zeros((len(self.pc_camera), 3, MAX_LENS))
+        self.of_reduced = ReducedArrays(self.Vi, self.W3, self.WL)
+        self.arrays = BundleArrays(
+            self.block, self.camera_of, self.pose_at, self.point_at, self.ptr, self.point_of, self.by_block,
+            self.by_ptr, self.pc_ptr, self.pc_camera, self.pc_of, n_lens, self.lens_at, self.first_pose,
+        )  # fmt: skip
         self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
         self._points_by_key = np.array(sorted(self.point_key, key=self.point_key.__getitem__), dtype=np.int64)
 
@@ -254,23 +261,12 @@ class BundleBatch:
         self._prepared, self._with_jacobians, self._damping = values, jacobians, damping
 
     def _condense(self, values: gtsam.Values, damping: float) -> None:
-        s = self.state
         S, g = np.zeros((self.n_local, self.n_local)), np.zeros(self.n_local)
-        bad = reduce_points(
-            self.ptr, self.pc_ptr, self.pc_camera, self.pc_of, self.A, self.camera_of, s.lenses.n_free, self.lens_at,
-            self.pose_at, damping, S, g, self.Vi, self.W3, self.WL, self.h,
-        )  # fmt: skip
+        bad = reduce_points(self.arrays, self.A, damping, S, g, self.of_reduced, self.h)
         if bad >= 0:
             raise self._undetermined_point(bad)
-        add_direct(
-            self.n_reduced, len(self.point), self.A, self.camera_of, s.lenses.n_free, self.lens_at, self.pose_at,
-            self.point_at, S, g,
-        )  # fmt: skip
-        run_split(
-            pose_rows, self.runs, self.by_block, self.by_ptr, self.ptr, self.pc_ptr, self.pc_camera, self.point_of,
-            self.block, self.camera_of, s.lenses.n_free, self.lens_at, self.first_pose, self.A, self.Vi, self.W3,
-            self.WL, S,
-        )  # fmt: skip
+        add_direct(self.n_reduced, len(self.point), self.arrays, self.A, S, g)
+        run_split(pose_rows, self.runs, self.arrays, self.A, self.of_reduced, S)
         self.G = self._local_from_keys()
         gradient = np.asarray(self.G.T @ g)
         rest = self.chi_square - float(np.einsum("ja,jab,jb->", self.h, self.Vi, self.h))
@@ -485,10 +481,7 @@ class BundleBatch:
         out = np.empty((len(self.reduced), 3, local.shape[1]))
         own, one = np.zeros_like(self.h) if h is None else h, np.empty((len(self.reduced), 3))
         for i in range(local.shape[1]):
-            back_substitute(
-                self.ptr, self.pc_ptr, self.pc_camera, self.camera_of, self.state.lenses.n_free, self.lens_at,
-                self.pose_at, self.Vi, self.W3, self.WL, own, np.ascontiguousarray(local[:, i]), one,
-            )  # fmt: skip
+            back_substitute(self.arrays, self.of_reduced, own, np.ascontiguousarray(local[:, i]), one)
             out[:, :, i] = one
         return out
 

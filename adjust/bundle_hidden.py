@@ -8,10 +8,18 @@ import scipy
 from scipy import sparse
 
 from adjust.bundle_batch import BundleBatch
-from adjust.bundle_covariance import direct_influence, point_from_local, reduced_influence, with_lenses, with_poses
-from adjust.bundle_kernels import between_poses, fill_upper, of_points
-from adjust.lens_kernels import MAX_LENS
 from adjust.model import FloatArray
+from adjust.native.bundles import (
+    between_poses,
+    direct_influence,
+    fill_upper,
+    of_points,
+    point_from_local,
+    reduced_influence,
+    with_lenses,
+    with_poses,
+)
+from adjust.native.lenses import MAX_LENS
 from adjust.parallel import run_split
 
 
@@ -96,26 +104,14 @@ class BundleHidden:
     def _of_points_and_rows(self, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Covariances (P, 3, 3) of the reduced points, A Q A' (K, 3) of all image points. Q: of the local unknowns."""
         b = self.batch
-        n_free, sees = b.state.lenses.n_free, (b.by_block, b.by_ptr)
         Y, YL = np.empty_like(b.W3), np.zeros_like(b.WL)
-        point_from_local(b.ptr, b.pc_ptr, b.Vi, b.W3, b.WL, Y, YL)
+        point_from_local(b.arrays, b.of_reduced, Y, YL)
         B, BL, C = np.empty_like(b.W3), np.zeros_like(b.WL), np.zeros((len(b.reduced), 3, 3))
-        run_split(
-            with_poses, b.runs, *sees, b.ptr, b.pc_ptr, b.pc_camera, b.point_of, b.block, n_free,
-            b.lens_at, b.first_pose, Q, Y, YL, B,
-        )  # fmt: skip
-        with_lenses(
-            b.ptr, b.pc_ptr, b.pc_camera, n_free, b.lens_at, b.pose_at, b.Vi, Q, Y, YL, B, BL, C
-        )
+        run_split(with_poses, b.runs, b.arrays, Q, Y, YL, B)
+        with_lenses(b.arrays, b.Vi, Q, Y, YL, B, BL, C)
         influence = np.zeros((len(b.point), 3))
-        run_split(
-            reduced_influence, b.runs, *sees, b.point_of, b.pc_of, b.camera_of, n_free, b.lens_at,
-            b.first_pose, b.A, Q, B, BL, C, influence,
-        )  # fmt: skip
-        direct_influence(
-            b.n_reduced, len(b.point), b.A, b.camera_of, n_free, b.lens_at, b.pose_at, b.point_at,
-            Q, influence,
-        )  # fmt: skip
+        run_split(reduced_influence, b.runs, b.arrays, b.A, Q, B, BL, C, influence)
+        direct_influence(b.n_reduced, len(b.point), b.arrays, b.A, Q, influence)
         return C, influence
 
     def transposed(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
@@ -153,10 +149,7 @@ class BundleHidden:
         b = self.batch
         g = b.Vi @ self._of_points(rows, k)
         local = np.zeros((b.n_local, k))
-        of_points(
-            b.ptr, b.pc_ptr, b.pc_camera, b.camera_of, b.state.lenses.n_free, b.lens_at, b.pose_at,
-            b.W3, b.WL, g, local,
-        )  # fmt: skip
+        of_points(b.arrays, b.of_reduced, g, local)
         out = np.asarray(b.G.T @ local)
         for key in b.hidden_poses:
             if key in rows:

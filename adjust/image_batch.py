@@ -12,22 +12,23 @@ import gtsam
 import numpy as np
 
 from adjust.chain_kernels import evaluate_chains
-from adjust.image_kernels import (
+from adjust.image_segments import block_keys
+from adjust.model import BoolArray, FloatArray, IntArray, Survey
+from adjust.native.images import (
     BlockArrays,
+    KeyArrays,
     PointArrays,
+    all_statistics,
     errors,
     local_by_keys,
     normal_equations,
     serve,
 )
-from adjust.image_segments import block_keys
-from adjust.image_statistics_kernels import all_statistics
-from adjust.model import BoolArray, FloatArray, IntArray, Survey
+from adjust.native.trees import TreeArrays
 from adjust.observations import ImageBlock
 from adjust.parallel import run_split, split_blocks
 from adjust.state import State
 from adjust.tree_covariance import TreeCovariance
-from adjust.tree_kernels import TreeArrays
 from adjust.unknowns import Chain
 
 
@@ -224,8 +225,8 @@ class ImageBatch:
         lost = np.zeros(len(self.blocks), dtype=np.int64)
         run_split(
             all_statistics, self._all, self.arrays, self.points, self.W_all_columns, s.lenses, c.R, c.t, s.warp,
-            k.segments, c.C, s.D, k.columns, k.ptr, keys, k.place,
-            tree.arrays() if tree is not None else TreeArrays.nothing(), residual, influence, lost,
+            k.segments, c.C, s.D, k.columns, KeyArrays(k.ptr, keys, k.place),
+            tree.arrays if tree is not None else TreeArrays.nothing(), residual, influence, lost,
         )  # fmt: skip
         if lost.any() and tree is not None:
             raise KeyError(f"unknowns of block {int(np.argmax(lost))} share no clique")

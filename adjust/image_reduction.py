@@ -17,8 +17,8 @@ import scipy
 from adjust.image_batch import ImageBatch
 from adjust.image_segments import first_seen, ranges
 from adjust.model import FloatArray, IntArray
+from adjust.native.reduction import WEAKEST_PIVOT, ReductionArrays, leaf_rows, pose_steps, reduce_poses
 from adjust.parallel import run_split, split_blocks
-from adjust.reduction_kernels import WEAKEST_PIVOT, ReductionArrays, leaf_rows, pose_steps, reduce_poses
 from adjust.tree_covariance import Leaves
 from adjust.unknowns import Unknowns
 
@@ -154,7 +154,7 @@ class PoseReduction:
         decrease = pose_steps(self.arrays, self.L, self.T, d, steps)
         for key, step in zip(self.hidden, steps, strict=True):
             delta.insert(key, step)
-        return float(decrease)
+        return decrease
 
     def leaves(self) -> Leaves:
         """The reduced poses as cliques below that of the interface: blocks [L' T]."""

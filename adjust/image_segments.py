@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.image_kernels import SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP, SegmentArrays
 from adjust.model import IntArray
+from adjust.native.images import SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP, SegmentArrays
 from adjust.state import State
 
 

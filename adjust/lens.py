@@ -10,12 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust import lens_kernels as kernels
 from adjust.errors import SurveyError
 from adjust.lens_radial import RadialProfile, invert_radius, radial_profile
 from adjust.model import BoolArray, Camera, FloatArray
-from adjust.parallel import run_split, split_blocks, workers
-from adjust.ray_kernels import tangents_of
+from adjust.native import lenses as kernels
 
 RAY_TOLERANCE = 1e-13
 """Newton's last step on a ray, in tangents of the angle to the axis."""
@@ -283,14 +281,12 @@ def _forward_rays(model: LensModel, values: FloatArray, constants: FloatArray, u
         s, centre_u, centre_v, _ = constants
         scale = values[0]
         distorted = np.column_stack([(uv[:, 0] - centre_u) * s - values[1], (uv[:, 1] - centre_v) * s + values[2]])
-    tangents = np.ascontiguousarray(_without_distortion(profile, distorted) / scale)
-    solved = np.zeros(len(uv), dtype=np.bool_)
-    parts = np.linspace(0, len(uv), workers() + 1).astype(np.int64)
-    lens, constants, _, uv = _arrays(values, constants, np.zeros((0, 3)), uv)
-    run_split(
-        tangents_of, split_blocks(parts), parts, model.kind, lens, constants, uv,
-        MAX_ITERATIONS, RAY_TOLERANCE, PIXEL_TOLERANCE, tangents, solved,
-    )  # fmt: skip
+    def equation(tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
+        ray = np.column_stack([tangents, np.ones(len(tangents))])
+        residuals, _, by_point = lens_derivatives(model, values, constants, ray, uv)
+        return residuals, by_point[:, :, :2]
+
+    tangents, solved = _newton(equation, _without_distortion(profile, distorted) / scale, 1.0)
     found = solved & (np.hypot(tangents[:, 0], tangents[:, 1]) * scale <= profile.limit * BEYOND_LIMIT)
     _require_invertible(model, values, constants, uv, found)
     return tangents

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust import lens_kernels as kernels
 from adjust.errors import SurveyError
 from adjust.lens import LensModel, lens_derivatives, project, unit_rays
 from adjust.model import FloatArray
+from adjust.native import lenses as kernels
 
 FIT_STEPS = (48, 36)
 CHECK_STEPS = (160, 120)

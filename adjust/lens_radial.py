@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import polynomial
 
-from adjust import lens_kernels as kernels
 from adjust.model import BoolArray, FloatArray
+from adjust.native import lenses as kernels
 
 SMALLEST_ROOT = 1e-12
 """Reciprocals of squared radii below this mean that the radius is out of any camera's sight."""

@@ -7,10 +7,10 @@ import numpy as np
 
 from adjust.chain_kernels import table_motion
 from adjust.errors import SurveyError
-from adjust.image_kernels import LensArrays
 from adjust.lens import MODELS, camera_constants
-from adjust.lens_kernels import MAX_LENS
 from adjust.model import FloatArray, IntArray, Survey, VectorParameter
+from adjust.native.images import LensArrays
+from adjust.native.lenses import MAX_LENS
 from adjust.unknowns import TableSlot, Unknowns, VectorMap, vector_map
 
 

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from adjust.model import FloatArray, IntArray
-from adjust.tree_kernels import TreeArrays, covariance_rows, fill_block, invert_cliques, joint_blocks, solve_cliques
+from adjust.native.trees import TreeArrays, covariance_rows, fill_block, invert_cliques, joint_blocks, solve_cliques
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,10 @@ class TreeCovariance:
             self._home[self._keys[start : start + self._n_front[c]]] = c
         if invert_cliques(self._front, self._width, self._at, self._data) >= 0:
             raise ZeroDivisionError("the Bayes tree is singular")
-        self._cov = np.empty_like(self._data)
-        covariance_rows(self._n_front, self._key_ptr, self._keys, self._dims, self._home, self._front, self._width,
-                        self._at, self._data, self._cov)  # fmt: skip
+        self.arrays = TreeArrays(self._home, self._key_ptr, self._keys, self._dims, self._front, self._width, self._at,
+                                 np.empty_like(self._data))  # fmt: skip
+        """What the compiled look-up of two keys' covariance needs."""
+        covariance_rows(self.arrays, self._n_front, self._data)
 
     def _frontal_keys(self, fronts: list[int]) -> IntArray:
         """Number of frontal keys of every clique, from the number of its frontal rows."""
@@ -80,15 +81,7 @@ class TreeCovariance:
 
     def _block(self, a: int, b: int) -> FloatArray | None:
         out = np.empty((self._dims[a], self._dims[b]))
-        found = fill_block(a, b, self._home, self._key_ptr, self._keys, self._dims, self._front, self._width, self._at,
-                           self._cov, out)  # fmt: skip
-        return out if found else None
-
-    def arrays(self) -> TreeArrays:
-        """What the compiled look-up of two keys' covariance needs."""
-        return TreeArrays(
-            self._home, self._key_ptr, self._keys, self._dims, self._front, self._width, self._at, self._cov
-        )
+        return out if fill_block(self.arrays, a, b, out) else None
 
     def marginal(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
@@ -136,8 +129,7 @@ class TreeCovariance:
         return np.array(sorted(found), dtype=np.int64)
 
     def _solve(self, cliques: IntArray, x: FloatArray) -> None:
-        solve_cliques(cliques, self._key_ptr, self._keys, self._dims, self._first, self._front, self._width, self._at,
-                      self._data, x)  # fmt: skip
+        solve_cliques(self.arrays, cliques, self._first, self._data, x)
 
     def rows(self, keys: Sequence[int]) -> IntArray:
         """Rows of these keys in a stacked vector of all unknowns, as :meth:`times` takes it."""
@@ -195,8 +187,7 @@ class TreeCovariance:
         table[np.array(list(self.number), dtype=np.int64)] = np.arange(len(self.number))
         a, b = table[first], table[second]
         out = np.empty((len(a), 2 * dim, 2 * dim))
-        lost = joint_blocks(a, b, dim, self._home, self._key_ptr, self._keys, self._dims, self._front, self._width,
-                            self._at, self._cov, out)  # fmt: skip
+        lost = joint_blocks(self.arrays, a, b, out)
         if lost >= 0:
             raise KeyError((int(first[lost]), int(second[lost])))
         return out

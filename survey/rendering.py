@@ -21,8 +21,8 @@ from scipy.special import erf
 
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
+from adjust.native.vision import Facets, draw_facets, pixel_corner_rays
 from survey.detection.dictionaries import charuco_board, marker_cells
-from survey.rendering_kernels import draw_facets, pixel_corner_rays
 from survey.targets import Charuco, Checkerboard, DetectableTarget, MarkerBlock, MarkerGrid
 
 GrayImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
@@ -167,8 +167,8 @@ def _illumination(image_size: tuple[int, int], gradient: tuple[float, float]) ->
 def _rays(camera: BrownCamera) -> FloatArray:
     """Rays of the pixel corners; kept, since many images share a camera."""
     width, height = camera.image_size
-    d = np.array(camera._coefficients())
-    return np.asarray(pixel_corner_rays(width, height, camera.fx, camera.fy, camera.cx, camera.cy, d))
+    lens = np.array([camera.fx, camera.fy, 0.0, camera.cx, camera.cy, *camera._coefficients()])
+    return pixel_corner_rays(width, height, lens)
 
 
 def _lattice(n: int) -> FloatArray:
@@ -196,9 +196,8 @@ def _planes(camera: BrownCamera, n: int, facets: list[_Facet], imaging: Imaging)
         x_edges[k, : columns + 1], y_edges[k, : rows + 1], cells[k, :rows, :columns] = f.x_edges, f.y_edges, f.cells
     inverse = np.stack([np.linalg.inv(f.camera_from_facet) for f in facets])
     bounds = np.stack([_bounds(f) for f in facets])
-    planes = (inverse, bounds, counts, x_edges, y_edges, cells)
-    image = draw_facets(_rays(camera), n, planes, float(imaging.background_gray), _lattice(imaging.samples))
-    return np.asarray(image, np.float32)
+    planes = Facets(inverse, bounds, counts, x_edges, y_edges, cells)
+    return draw_facets(_rays(camera), n, planes, float(imaging.background_gray), _lattice(imaging.samples))
 
 
 def _bounds(facet: _Facet) -> FloatArray:

@@ -11,8 +11,8 @@ from adjust.factors import ChainPose
 from adjust.graph import GraphBuilder, StartValues
 from adjust.image_batch import warp_shape
 from adjust.lens import MODELS, camera_constants, lens_residuals, project
-from adjust.lens_kernels import FISHEYE
 from adjust.model import BoolArray, Camera, FloatArray, Point, Survey, Target
+from adjust.native.lenses import FISHEYE
 from adjust.observations import FrameRef, ImageBlock, PositionRef, TableReading
 
 _STEPS = np.linspace(1.0 / 16.0, 1.0, 16)

@@ -11,8 +11,7 @@ import numpy as np
 
 from adjust.distributions import chi2
 from adjust.model import FloatArray, IntArray
-from adjust.navigation.fit_kernels import DONE, gauss_newton
-from adjust.navigation.pose_kernels import retracted, step_between, step_derivative
+from adjust.native.navigation import DONE, SpotArrays, gauss_newton, retracted, step_between, step_derivative
 from adjust.navigation.system import Sightings, System
 
 _NO_B: FloatArray = np.zeros((0, 0))
@@ -68,17 +67,17 @@ class PoseFit:
 
 def retract(pose: FloatArray, step: FloatArray) -> FloatArray:
     """``pose * Exp(step)``: rotation and translation are stepped apart, exact to first order at ``step = 0``."""
-    return np.asarray(retracted(pose, step))
+    return retracted(np.ascontiguousarray(pose), np.ascontiguousarray(step))
 
 
 def local(a: FloatArray, b: FloatArray) -> FloatArray:
     """The step (6,) with ``retract(a, step) = b``."""
-    return np.asarray(step_between(a, b))
+    return step_between(np.ascontiguousarray(a), np.ascontiguousarray(b))
 
 
 def local_derivative(step: FloatArray) -> FloatArray:
     """Derivative (6, 6) of ``local(a, retract(b, d))`` by d at zero, where ``step = local(a, b)``."""
-    return np.asarray(step_derivative(step))
+    return step_derivative(np.ascontiguousarray(step))
 
 
 def fit_pose(
@@ -103,7 +102,7 @@ def fit_pose(
     pose, C, gain = np.empty((4, 4)), np.empty((6, 6)), np.empty((6, n + k))
     residual, H, M = np.empty(n + k), np.empty((n + k, 6)), np.empty((n + k, r))
     state, in_front, chi_square, log_det, log_det_cov = gauss_newton(
-        system.arrays, np.ascontiguousarray(start), seen.camera[used], beacon, seen.uv[used], R,
+        system.arrays, np.ascontiguousarray(start), SpotArrays(seen.camera[used], beacon, seen.uv[used]), R,
         np.ascontiguousarray(prior_pose), prior_B, prior_rows, pose, residual, H, M, C, gain,
     )  # fmt: skip
     if state != DONE:

@@ -16,11 +16,10 @@ from adjust.closed_forms.rigid import rigid
 from adjust.distributions import chi2
 from adjust.lens import MODELS, focal_length_px
 from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.native.navigation import FoundArrays, SkyArrays, search
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers, local, log_evidence
 from adjust.navigation.model import NavigateOptions
-from adjust.navigation.row_kernels import gates
-from adjust.navigation.search_kernels import search
-from adjust.navigation.system import Sightings, System, station_rays, visible
+from adjust.navigation.system import Sightings, System, evaluate, station_rays, visible
 
 _KEPT = 400
 _ADJUSTED = 60
@@ -82,11 +81,13 @@ def _hypotheses(
     missed = np.where(seen.present, -np.log(1.0 - options.detection), 0.0)
     named = np.log(_sky(system) / np.radians(options.gate_deg) ** 2)[seen.camera]
     origin, ray = station_rays(system, seen)
-    kept, _ = search(
-        origin, ray, seen.camera, allowed, _triples(ray), x, system.camera_R, system.camera_t, system.field,
-        np.radians(options.gate_deg), named, missed, options.nearest_m, farthest, options.max_hypotheses,
-        R, t, score, match,
+    sky = SkyArrays(
+        origin, np.ascontiguousarray(ray), seen.camera, allowed, x, system.camera_R, system.camera_t, system.field,
+        float(np.radians(options.gate_deg)), named, missed,
     )  # fmt: skip
+    kept = search(
+        sky, _triples(ray), options.nearest_m, farthest, options.max_hypotheses, FoundArrays(R, t, score, match)
+    )
     order = np.argsort(-score[:kept], kind="stable")
     order = order[score[order] > score[order[:1]] - _COARSE]
     return rigid(R[order], t[order]), match[order]
@@ -188,15 +189,30 @@ def gate_distances(
     """
     margin = _MARGIN + 4.0 * float(np.sqrt(np.diag(prior.total)[:3].max()))
     ahead = visible(system, prior.pose, margin)
-    distance, log_det = np.empty((len(seen.uv), ahead.shape[1])), np.empty((len(seen.uv), ahead.shape[1]))
-    gates(
-        system.arrays, np.ascontiguousarray(prior.pose), np.ascontiguousarray(prior.cov),
-        np.ascontiguousarray(prior.B), seen.camera, np.ascontiguousarray(seen.uv), np.ascontiguousarray(seen.cov),
-        ahead, distance, log_det,
-    )  # fmt: skip
+    distance, log_det = _gates(system, seen, prior, ahead)
     vague = distance + log_det - 2.0 * np.log(options.detection / (1.0 - options.detection))
     by_chance = 2.0 * np.log(image_areas(system)[seen.camera] / options.false_spots)
     return distance, np.where((seen.label >= 0)[:, None], np.inf, by_chance[:, None] - vague)
+
+
+def _gates(system: System, seen: Sightings, prior: Prior, ahead: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Squared distance (n, m) in sigmas of spots from beacons at a pose of error ``e + B eta``; ln det(2 pi S).
+
+    ahead (c, m): the others are infinitely far.
+    """
+    m = ahead.shape[1]
+    distance, log_det = np.empty((len(seen.uv), m)), np.empty((len(seen.uv), m))
+    for c in np.unique(seen.camera).tolist():
+        predicted, H, M, _ = evaluate(system, prior.pose, np.full(m, c), np.arange(m), np.zeros((m, 2)))
+        H, common = H.reshape(m, 2, 6), (H @ prior.B + M).reshape(m, 2, -1)
+        base = H @ prior.cov @ H.transpose(0, 2, 1) + common @ common.transpose(0, 2, 1)
+        mine = np.flatnonzero(seen.camera == c)
+        S = base + seen.cov[mine][:, None]
+        det = S[:, :, 0, 0] * S[:, :, 1, 1] - S[:, :, 0, 1] ** 2
+        x, y = np.moveaxis(predicted.reshape(m, 2) - seen.uv[mine][:, None], 2, 0)
+        square = (S[:, :, 1, 1] * x * x - 2.0 * S[:, :, 0, 1] * x * y + S[:, :, 0, 0] * y * y) / det
+        distance[mine], log_det[mine] = np.where(ahead[c], square, np.inf), np.log(4.0 * np.pi**2 * det)
+    return distance, log_det
 
 
 def image_areas(system: System) -> FloatArray:

@@ -8,7 +8,7 @@ from gtsam import Pose3
 
 from adjust.lens import MODELS, project
 from adjust.model import FloatArray, IntArray
-from adjust.navigation import fit_kernels
+from adjust.native import navigation as native
 from adjust.navigation.fit import PoseFit, Prior, fit_pose
 from adjust.navigation.model import Beacons, Head, Shares
 from adjust.navigation.system import Sightings, System, evaluate, make_system, visible
@@ -119,7 +119,8 @@ def _named(direction: FloatArray, number: int, of: int) -> str:
 def some_pose(system: System, seen: Sightings, used: IntArray, beacon: IntArray, start: FloatArray) -> FloatArray:
     """One of the many poses (4, 4) that explain too few spots, nearest to a start in a way."""
     pose = np.empty((4, 4))
-    fit_kernels.some_pose(system.arrays, np.ascontiguousarray(start), seen.camera[used], beacon, seen.uv[used], pose)
+    spots = native.SpotArrays(seen.camera[used], beacon, seen.uv[used])
+    native.some_pose(system.arrays, np.ascontiguousarray(start), spots, pose)
     return pose
 
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.lens import MODELS, unit_rays
-from adjust.lens_kernels import FISHEYE, MAX_LENS
 from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.native.lenses import FISHEYE, MAX_LENS
+from adjust.native.navigation import SpotArrays, SystemArrays, spot_rows
 from adjust.navigation.model import Beacons, Head, NavigationEpoch, Spots
-from adjust.navigation.row_kernels import SystemArrays, in_view, spot_rows
 
 _BORDER_PX = 3.0
 
@@ -44,7 +44,7 @@ class System:
     def arrays(self) -> SystemArrays:
         """What compiled code takes."""
         x = np.ascontiguousarray(self.beacons.x_in_world, dtype=np.float64)
-        return (
+        return SystemArrays(
             self.kinds, self.lenses, self.constants, self.camera_R, self.camera_t, x, self.lens_at, self.n_lens,
             self.beacon_at, self.F,
         )  # fmt: skip
@@ -217,10 +217,9 @@ def evaluate(
     """Residual (2n,) px, H (2n, 6), M (2n, r), and whether all beacons are in front; pose (4, 4) world_from_station."""
     n = len(camera)
     residual, H, M = np.empty(2 * n), np.empty((2 * n, 6)), np.empty((2 * n, system.F.shape[1]))
-    in_front = spot_rows(
-        system.arrays, np.ascontiguousarray(pose), camera, beacon, np.ascontiguousarray(uv), residual, H, M
-    )
-    return residual, H, M, bool(in_front)
+    spots = SpotArrays(camera, beacon, np.ascontiguousarray(uv))
+    in_front = spot_rows(system.arrays, np.ascontiguousarray(pose), spots, residual, H, M)
+    return residual, H, M, in_front
 
 
 def visible(system: System, pose: FloatArray, margin: float = 0.0) -> BoolArray:
@@ -228,7 +227,11 @@ def visible(system: System, pose: FloatArray, margin: float = 0.0) -> BoolArray:
 
     margin: how far outside its border (tangent of the angle) counts as inside.
     """
-    arrays = system.arrays
-    out = np.empty((len(system.kinds), len(system.beacons.beacon_ids)), dtype=np.bool_)
-    in_view(arrays[3], arrays[4], arrays[5], system.field, np.ascontiguousarray(pose), margin, out)
-    return out
+    q = (system.arrays.x_in_world - pose[:3, 3]) @ pose[:3, :3]
+    p = np.einsum("cij,cbi->cbj", system.camera_R, q - system.camera_t[:, None])
+    low_x, high_x, low_y, high_y, cosine = (column[:, None] for column in system.field.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = p[:, :, 0] / p[:, :, 2], p[:, :, 1] / p[:, :, 2]
+    inside = (low_x - margin < x) & (x < high_x + margin) & (low_y - margin < y) & (y < high_y + margin)
+    in_cone = p[:, :, 2] > (cosine - margin) * np.linalg.norm(p, axis=2)
+    return np.asarray(np.where(cosine < 1.5, in_cone, (p[:, :, 2] > 0.0) & inside))

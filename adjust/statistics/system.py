@@ -16,13 +16,13 @@ from scipy import sparse
 from adjust.datum import gauge
 from adjust.errors import SurveyError
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
-from adjust.lens_kernels import MAX_LENS
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
+from adjust.native.images import block_rows
+from adjust.native.lenses import MAX_LENS
 from adjust.pair_screen import values_of
 from adjust.precision import Precision, noise_of
 from adjust.result import Adjustment, ParameterName
 from adjust.solve import solve
-from adjust.statistics.row_kernels import block_rows
 
 DENSE = 3000
 """Unknowns up to which the normal matrix is factored as a full one."""

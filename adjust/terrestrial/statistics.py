@@ -83,7 +83,7 @@ def influences(batch: TerrestrialBatch, tree: TreeCovariance) -> FloatArray:
     row_ptr = np.cumsum([0] + [len(chunk.rows) for chunk in chunks]).astype(np.int64)
     start = np.array([chunk.start for chunk in chunks], dtype=np.int64)
     found, lost = np.zeros(int(row_ptr[-1])), np.zeros(len(chunks), dtype=np.int64)
-    chunk_influences(key_ptr_of, key_of, start, row_ptr, batch.J, *tree.arrays(), found, lost)
+    chunk_influences(key_ptr_of, key_of, start, row_ptr, batch.J, *tree.arrays, found, lost)
     for c in np.flatnonzero(lost):
         A = batch.jacobian(int(c))
         found[row_ptr[c] : row_ptr[c + 1]] = np.einsum("ip,pq,iq->i", A, tree.joint(chunks[c].keys), A)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from adjust.model import BoolArray, FloatArray
-from survey.detection.corner_kernels import fit_corners
+from adjust.native.vision import fit_corners
 
 # What the fit cannot know: the pixel's square is taken for a Gaussian of equal variance, and edges for straight lines.
 # Edges bent by distortion act alike on both sides of a crossing, but not at a marker's corner, where they end. Measured

@@ -7,9 +7,9 @@ import numpy as np
 import numpy.typing as npt
 
 from adjust.model import FloatArray
+from adjust.native.vision import GAUSSIAN, fit_spots
 from survey.detection.gray import AnyImage, Gray32, gray_values, saturation_level
 from survey.detection.results import Detection, SpotOptions, Spots
-from survey.detection.spot_kernels import GAUSSIAN, fit_spots
 
 # Neither profile is quite that of a small disc under a point spread, least of all on the rim that saturation leaves;
 # measured on renderings (tests/survey/test_detection_spots.py).

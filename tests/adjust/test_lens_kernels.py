@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from adjust.lens import MODELS, lens_constants, lens_derivatives, lens_residuals, project
-from adjust.lens_kernels import FISHEYE, MAX_LENS, N_COLUMNS, N_LENS, lens_row
+from adjust.native.lenses import FISHEYE, MAX_LENS, N_COLUMNS, N_LENS, lens_rows
 from tests.adjust.lenses import IMAGE_SIZE, NAMES, PIXEL_SIZE_MM, R0_MM, lens, points_in_camera
 
 
@@ -52,23 +52,26 @@ def test_residual_with_and_without_derivatives_is_the_same(name):
     np.testing.assert_allclose(residuals, lens_residuals(model, values, constants, q, uv), atol=1e-11)
 
 
+def one_row(name, q):
+    model, values, constants = lens(name)
+    residuals, rows = lens_rows(model.kind, values, constants, np.array([q]), np.array([[300.0, 200.0]]))
+    return model, residuals[0], rows[0]
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_row_fills_its_columns_and_no_other(name):
-    model, values, constants = lens(name)
-    row = np.full((2, N_COLUMNS + 1), 7.5)
-    lens_row(model.kind, values, constants, 0.1, 0.2, 1.0, 300.0, 200.0, row)
-    assert np.all(row[:, model.n : MAX_LENS] == 7.5)
-    assert np.all(row[:, N_COLUMNS] == 7.5)
-    assert not np.any(row[:, : model.n] == 7.5)
-    assert model.n == N_LENS[model.kind] == len(values)
+    model, _, row = one_row(name, (0.1, 0.2, 1.0))
+    assert row.shape == (2, N_COLUMNS)
+    assert not np.any(row[:, model.n : MAX_LENS])
+    assert np.all(np.any(row[:, : model.n] != 0.0, axis=0))
+    assert model.n == N_LENS[model.kind] == len(lens(name)[1])
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("q", [(0.1, 0.2, -1.0), (0.1, 0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)])
 def test_points_beside_and_behind_the_camera_give_finite_numbers(name, q):
-    model, values, constants = lens(name)
-    row = np.zeros((2, N_COLUMNS))
-    assert np.all(np.isfinite(lens_row(model.kind, values, constants, *q, 300.0, 200.0, row)))
+    _, residual, row = one_row(name, q)
+    assert np.all(np.isfinite(residual))
     assert np.all(np.isfinite(row))
 
 
@@ -116,7 +119,8 @@ def test_fisheye_near_the_axis_keeps_its_digits(tangent):
     _, values, constants = lens("fisheye")
     row = np.zeros((2, N_COLUMNS))
     values[2:5] = 0.0
-    ru, _ = lens_row(FISHEYE, values, constants, tangent, 0.0, 1.0, 0.0, 0.0, row)
+    residuals, rows = lens_rows(FISHEYE, values, constants, np.array([[tangent, 0.0, 1.0]]), np.zeros((1, 2)))
+    ru, row = residuals[0, 0], rows[0]
     theta = np.arctan(tangent)
     k = values[5:]
     theta_d = theta * (1 + k[0] * theta**2 + k[1] * theta**4 + k[2] * theta**6 + k[3] * theta**8)

@@ -5,8 +5,8 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.errors import SurveyError
+from adjust.native.vision import corner_rows
 from survey.detection import detect_image
-from survey.detection.corner_kernels import corner_row
 from survey.detection.corners import CROSSING_FLOOR_PX, MARKER_FLOOR_PX
 from survey.detection.gray import gray_values, reduced, saturation_level
 from survey.rendering import BrownCamera, Imaging, PlacedTarget, render
@@ -80,13 +80,12 @@ def test_without_noise_the_stated_floor_holds(target, floor):
 @pytest.mark.parametrize("crossing", [True, False])
 def test_the_fits_derivatives_are_those_of_its_grey_value(crossing):
     p = np.array([0.2, -0.3, 0.3, 1.6, 100.0, -60.0, 0.1, 0.5, -0.4])
-    row, unused = np.empty(9), np.empty(9)
-    for x, y in ((0.0, 1.0), (-1.5, 0.4), (2.2, -2.0), (0.2, -0.3)):
-        corner_row(x, y, p, crossing, row)
-        for k in range(9):
-            h = 1e-5 * np.eye(9)[k]
-            up, down = (corner_row(x, y, p + s * h, crossing, unused) for s in (1, -1))
-            assert row[k] == pytest.approx((up - down) / 2e-5, abs=1e-5)
+    xy = np.array([[0.0, 1.0], [-1.5, 0.4], [2.2, -2.0], [0.2, -0.3]])
+    _, rows = corner_rows(xy, p, crossing)
+    for k in range(9):
+        h = 1e-5 * np.eye(9)[k]
+        up, down = (corner_rows(xy, p + s * h, crossing)[0] for s in (1, -1))
+        np.testing.assert_allclose(rows[:, k], (up - down) / 2e-5, atol=1e-5)
 
 
 def test_the_fits_grey_value_is_a_blurred_wedge_at_any_angle():
@@ -96,9 +95,9 @@ def test_the_fits_grey_value_is_a_blurred_wedge_at_any_angle():
         z = np.array([x, y]) + 1.3 * rng.standard_normal((400_000, 2))
         angle = np.arctan2(z[:, 1], z[:, 0])
         inside = ((angle > 0.2) & (angle < 1.2)).mean()
-        assert corner_row(x, y, p, False, np.empty(9)) == pytest.approx(inside, abs=3e-3)
+        assert corner_rows(np.array([[x, y]]), p, False)[0][0] == pytest.approx(inside, abs=3e-3)
         opposite = ((angle + np.pi > 0.2) & (angle + np.pi < 1.2)).mean()
-        assert corner_row(x, y, p, True, np.empty(9)) == pytest.approx(2 * (inside + opposite) - 1, abs=6e-3)
+        assert corner_rows(np.array([[x, y]]), p, True)[0][0] == pytest.approx(2 * (inside + opposite) - 1, abs=6e-3)
 
 
 @pytest.mark.parametrize("roll", np.deg2rad([0, 120, 179, 300]))

@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
+from adjust.native.vision import DISC, GAUSSIAN, spot_rows
 from survey.detection import SpotOptions, detect_spots
-from survey.detection.spot_kernels import DISC, GAUSSIAN, spot_row
 from survey.rendering import Beacons, BrownCamera, Imaging, render
 
 CAMERA = BrownCamera((800, 600), 1600.0, 1600.0, 399.5, 299.5, (-0.2, 0.05, 1e-3, -5e-4))
@@ -57,13 +57,12 @@ def test_centres_and_their_covariance(diameter_m, gray, profile, limit):
 @pytest.mark.parametrize("profile", [GAUSSIAN, DISC])
 def test_the_fits_derivatives_are_those_of_its_grey_value(profile):
     p = np.array([0.2, -0.3, 10.0, 80.0, 0.4, 0.6, -0.1])
-    row, unused = np.empty(7), np.empty(7)
-    for x, y in ((0.0, 1.0), (-1.5, 0.4), (2.2, -2.0)):
-        spot_row(x, y, p, profile, row)
-        for k in range(7):
-            h = 1e-5 * np.eye(7)[k]
-            up, down = (spot_row(x, y, p + s * h, profile, unused) for s in (1, -1))
-            assert row[k] == pytest.approx((up - down) / 2e-5, abs=1e-5)
+    xy = np.array([[0.0, 1.0], [-1.5, 0.4], [2.2, -2.0]])
+    _, rows = spot_rows(xy, p, profile)
+    for k in range(7):
+        h = 1e-5 * np.eye(7)[k]
+        up, down = (spot_rows(xy, p + s * h, profile)[0] for s in (1, -1))
+        np.testing.assert_allclose(rows[:, k], (up - down) / 2e-5, atol=1e-5)
 
 
 def test_what_is_no_spot_of_the_wanted_size_is_left_out_and_counted():

@@ -1,0 +1,141 @@
+// What Python gives: views of NumPy's arrays with their shapes, read one after the other from a list of arguments.
+#pragma once
+#include <array>
+#include <bit>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <tuple>
+#include <type_traits>
+#include <utility>
+
+namespace {  // one copy for every instruction set: nothing here may be shared between translation units
+
+#ifdef CHECKED  // set by the debug build alone: an index outside its array stops the program
+constexpr bool checked = true;
+#else
+constexpr bool checked = false;
+#endif
+
+struct Argument {
+    void *data;  // of an array; the bits of a scalar
+    int64_t shape[4];
+};
+
+// Reads arguments in order; one with a text writes down of which kind they have to be instead.
+struct Reader {
+    const Argument *next;
+    char *described;
+
+    [[gnu::noinline]] void describe(char kind, int dimensions) {
+        *described++ = kind;
+        *described++ = char('0' + dimensions);
+        *described = 0;
+    }
+};
+
+template <class T> constexpr char kind_of() {
+    using U = std::remove_const_t<T>;
+    constexpr char kind = std::is_same_v<U, double> ? 'f' : std::is_same_v<U, int64_t> ? 'i' : std::is_same_v<U, float> ? 's'
+                          : std::is_same_v<U, uint8_t> ? 'u' : std::is_same_v<U, bool> ? 'b' : '?';
+    static_assert(kind != '?');
+    return std::is_const_v<T> ? kind : char(kind - 'a' + 'A');  // capital letters are written to
+}
+
+// An array of N dimensions, row by row.
+template <class T, int N> struct Array {
+    T *data = nullptr;
+    int64_t n[N] = {};
+
+    Array() = default;
+    Array(T *at, const std::array<int64_t, N> &shape) : data(at) {
+        for (int i = 0; i < N; ++i) n[i] = shape[i];
+    }
+    explicit Array(Reader &reader) {
+        if (reader.described) {
+            reader.describe(kind_of<T>(), N);
+            return;
+        }
+        data = static_cast<T *>(reader.next->data);
+        for (int i = 0; i < N; ++i) n[i] = reader.next->shape[i];
+        ++reader.next;
+    }
+    operator Array<const T, N>() const {
+        Array<const T, N> o;
+        o.data = data;
+        for (int i = 0; i < N; ++i) o.n[i] = n[i];
+        return o;
+    }
+    template <class... I> T &operator()(I... index) const {
+        static_assert(sizeof...(I) == N);
+        const int64_t at[] = {int64_t(index)...};
+        int64_t offset = 0;
+        for (int i = 0; i < N; ++i) {
+            if (checked && (at[i] < 0 || at[i] >= n[i])) __builtin_trap();
+            offset = offset * n[i] + at[i];
+        }
+        return data[offset];
+    }
+    // Part i along the first dimension.
+    auto operator[](int64_t i) const {
+        if (checked && (i < 0 || i >= n[0])) __builtin_trap();
+        if constexpr (N == 1) {
+            return data[i];
+        } else {
+            Array<T, N - 1> o;
+            int64_t size = 1;
+            for (int k = 1; k < N; ++k) o.n[k - 1] = n[k], size *= n[k];
+            o.data = data + i * size;
+            return o;
+        }
+    }
+};
+template <class T, int N> using In = Array<const T, N>;
+template <class T, int N> using Out = Array<T, N>;
+using Ints = In<int64_t, 1>;
+using Vector = In<double, 1>;
+
+template <class T> T taken(Reader &reader) {
+    if constexpr (std::is_same_v<T, int64_t> || std::is_same_v<T, double>) {
+        if (reader.described) {
+            reader.describe(std::is_same_v<T, double> ? 'd' : 'n', 0);
+            return {};
+        }
+        T value;
+        std::memcpy(&value, &(reader.next++)->data, sizeof value);
+        return value;
+    } else {
+        return T(reader);  // an array, or several in a structure
+    }
+}
+
+struct Entry {
+    const char *name;
+    int64_t (*run)(const Argument *);
+    void (*describe)(char *);
+};
+
+// The function F as Python calls it: with a list of arguments; its own parameters say of which kind each must be.
+template <auto F> struct Bound;
+template <class R, class... P, R (*F)(P...)> struct Bound<F> {
+    static std::tuple<std::remove_cvref_t<P>...> take(Reader &reader) { return {taken<std::remove_cvref_t<P>>(reader)...}; }
+    static int64_t run(const Argument *arguments) {
+        Reader reader{arguments, nullptr};
+        auto given = take(reader);
+        if constexpr (std::is_void_v<R>) return std::apply(F, given), 0;
+        else return int64_t(std::apply(F, given));
+    }
+    static void describe(char *out) {
+        Reader reader{nullptr, out};
+        *out = 0;
+        take(reader);
+    }
+};
+template <auto F> constexpr Entry entry(const char *name) { return {name, Bound<F>::run, Bound<F>::describe}; }
+
+inline int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
+inline int64_t larger(int64_t a, int64_t b) { return a > b ? a : b; }
+inline double smaller(double a, double b) { return a < b ? a : b; }
+inline double larger(double a, double b) { return a > b ? a : b; }
+
+}  // namespace

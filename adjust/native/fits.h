@@ -1,0 +1,119 @@
+// Least-squares fits of a few parameters to the pixels of a window, by Levenberg and Marquardt (Marquardt 1963).
+#pragma once
+#include "dense.h"
+
+namespace {
+
+constexpr int WINDOW = 64;  // pixels evaluated together
+
+template <int N> struct Normals {  // of N parameters: matrix, right side, sum of squared residuals
+    double H[N][N], g[N], cost;
+};
+
+// (H + damping diag(H)) X = B solved in place for the leading n rows, B (n, K), scaled to a unit diagonal; false where the
+// matrix is not positive definite.
+template <int N, int K> inline bool scaled_solve(const double (&H)[N][N], int n, double damping, double (&B)[N][K]) {
+    double d[N], A[N][N];
+    for (int i = 0; i < n; ++i) d[i] = H[i][i] > 0.0 ? 1.0 / root(H[i][i]) : 0.0;
+    for (int i = 0; i < n; ++i) {
+        for (int j = 0; j <= i; ++j) A[i][j] = H[i][j] * d[i] * d[j];
+        A[i][i] += damping + 1e-12;
+        for (double &b : B[i]) b *= d[i];
+    }
+    for (int i = 0; i < n; ++i)
+        for (int j = 0; j <= i; ++j) {
+            double total = A[i][j];
+            for (int k = 0; k < j; ++k) total -= A[i][k] * A[j][k];
+            if (i == j && !(total > 1e-14)) return false;
+            A[i][j] = i == j ? root(total) : total / A[j][j];
+        }
+    for (int c = 0; c < K; ++c) {
+        for (int i = 0; i < n; ++i) {
+            for (int k = 0; k < i; ++k) B[i][c] -= A[i][k] * B[k][c];
+            B[i][c] /= A[i][i];
+        }
+        for (int i = n - 1; i >= 0; --i) {
+            for (int k = i + 1; k < n; ++k) B[i][c] -= A[k][i] * B[k][c];
+            B[i][c] = B[i][c] / A[i][i];
+        }
+    }
+    for (int i = 0; i < n; ++i)
+        for (double &b : B[i]) b *= d[i];
+    return true;
+}
+
+// Pixels of a window: places x, y from its centre, and grey values.
+struct Pixels {
+    const double *x, *y, *value;
+    int n;
+};
+
+// Normal equations of the window: row(x, y, derivatives) gives the predicted grey value.
+template <int N, class Row> inline void add_pixels(const Pixels &w, const Row &row, Normals<N> &out) {
+    constexpr int ROOM = N + 4;
+    alignas(64) double A[ROOM][WINDOW];
+    alignas(64) V sums[ROOM][ROOM];
+    for (auto &line : sums)
+        for (V &v : line) v = V{};
+    for (int j = N + 1; j < ROOM; ++j) std::memset(A[j], 0, sizeof A[j]);
+    for (int lo = 0; lo < w.n; lo += WINDOW) {
+        const int m = w.n - lo < WINDOW ? w.n - lo : WINDOW, full = (m + W - 1) / W * W;
+        for (int i = 0; i < m; ++i) {
+            double d[N];
+            A[N][i] = w.value[lo + i] - row(w.x[lo + i], w.y[lo + i], d);
+            for (int j = 0; j < N; ++j) A[j][i] = d[j];
+        }
+        for (int i = m; i < full; ++i)
+            for (int j = 0; j <= N; ++j) A[j][i] = 0.0;
+        add_gram(A, N + 1, full, sums);
+    }
+    for (int a = 0; a < N; ++a) {
+        for (int b = a; b < N; ++b) out.H[a][b] = out.H[b][a] = sum(sums[a][b]);
+        out.g[a] = sum(sums[a][N]);
+    }
+    out.cost = sum(sums[N][N]);
+}
+
+// The first n_free of N parameters p, in place, with the normal equations there; false without convergence. The first two
+// are the place (px), which may be off by tolerance; steps shrink at least as the damping does. evaluate(p, out) makes
+// the normal equations, clamp(p) keeps parameters where they mean something.
+template <int N, class Evaluate, class Clamp>
+inline bool levenberg_marquardt(double (&p)[N], int n_free, double tolerance, const Evaluate &evaluate, const Clamp &clamp, Normals<N> &at) {
+    double damping = 1e-3, trial[N], step[N][1];
+    Normals<N> there;
+    evaluate(p, at);
+    for (int iteration = 0; iteration < 40; ++iteration) {
+        for (int i = 0; i < N; ++i) trial[i] = p[i], step[i][0] = at.g[i];
+        if (!scaled_solve(at.H, n_free, damping, step)) {
+            damping = larger(damping * 10.0, 1e-6);
+            continue;
+        }
+        for (int i = 0; i < n_free; ++i) trial[i] += step[i][0];
+        clamp(trial);
+        evaluate(trial, there);
+        const bool small = magnitude(trial[0] - p[0]) + magnitude(trial[1] - p[1]) < tolerance;
+        if (there.cost <= at.cost) {
+            const double gain = at.cost - there.cost;
+            std::memcpy(p, trial, sizeof p);
+            at = there;
+            damping *= 0.2;
+            if (small && gain <= 0.05 * tolerance * at.cost + 1e-12) return true;
+        } else {
+            if (small) return true;
+            damping *= 6.0;
+        }
+    }
+    return false;
+}
+
+// Covariance (2, 2) of the place, with the residuals' variance; false where there is none.
+template <int N> inline bool place_covariance(const Normals<N> &at, int n_free, double variance, double *cov) {
+    double unit[N][2] = {};
+    unit[0][0] = unit[1][1] = 1.0;
+    if (!scaled_solve(at.H, n_free, 0.0, unit)) return false;
+    for (int a = 0; a < 2; ++a)
+        for (int b = 0; b < 2; ++b) cov[2 * a + b] = variance * unit[a][b];
+    return true;
+}
+
+}  // namespace

@@ -1,0 +1,153 @@
+"""Image points of known targets in the core: residuals, condensed normal equations and redundancy, block after block.
+
+A block is what one camera saw of one target at one epoch. Its local unknowns are the free lens parameters of the
+camera, the six of ``camera_from_target`` (tangent on the right) and, where the target has them, two of its warp. All
+functions take the blocks that they shall do, so that threads share them. The formulas are in ``images.h``.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from adjust.model import FloatArray, IntArray
+from adjust.native.library import Function
+from adjust.native.trees import TREE, TreeArrays
+
+SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP = 0, 1, 2, 3
+MAX_LOCAL = 23
+"""Local unknowns and residual of a block, at most."""
+
+BLOCKS = "ptr[B+1] camera[B] warp_id[B] n_warp[B]"
+LENSES = "kind[c] values[c,14] constants[c,4] n_free[c] n_map[c] source[c,14] column[c,14] factor[c,14]"
+SEGMENTS = "segment_ptr[B+1] segment_kind[S] link[S] table[S] start[S] n[S] place[S]"
+_BATCH = f"{BLOCKS} X[3,N] shape[2,N] uv[2,N] W[3,N] {LENSES} R[B,3,3] t[B,3] warp[*,2]"
+CHAINED = "C[*,6,6] D[*,6,*]"
+_normal_equations = Function("normal_equations", f"which[*] {_BATCH} H[B,m,m] chi[B] depth[B]")
+_errors = Function("errors", f"which[*] {_BATCH} chi[B] depth[B]")
+_block_rows = Function("block_rows", f"b {_BATCH} out[*,*]")
+_serve = Function(
+    "serve", f"which[*] {BLOCKS} {LENSES} {SEGMENTS} {CHAINED} width[B] at[B] H[B,m,m] flat[*] r[B,m]"
+)
+_local_by_keys = Function("local_by_keys", f"b n_lens {SEGMENTS} {CHAINED} G[*,*]")
+_all_statistics = Function(
+    "all_statistics",
+    f"which[*] {_BATCH} {SEGMENTS} {CHAINED} columns[B] keys_ptr[B+1] key[k] key_place[k] {TREE} "
+    "residual[N,2] influence[N,3] lost[B] work[*]",
+)
+
+
+class LensArrays(NamedTuple):
+    """Lenses of all cameras: values (C, MAX_LENS), constants (C, 4), and how they follow from the free parameters.
+
+    Parameter ``source[c, i]`` of camera c is ``factor[c, i]`` times its free one ``column[c, i]``, i < n_map[c].
+    """
+
+    kind: IntArray
+    values: FloatArray
+    constants: FloatArray
+    n_free: IntArray
+    n_map: IntArray
+    source: IntArray
+    column: IntArray
+    factor: FloatArray
+
+
+class BlockArrays(NamedTuple):
+    """Blocks: rows ptr[b]..ptr[b + 1] of the points, camera, which warp applies (-1: none), free warp components."""
+
+    ptr: IntArray
+    camera: IntArray
+    warp_id: IntArray
+    n_warp: IntArray
+
+
+class PointArrays(NamedTuple):
+    """Image points by columns: X (3, N) m in the target, warp functions shape (2, N), observed uv (2, N) px."""
+
+    X: FloatArray
+    shape: FloatArray
+    uv: FloatArray
+
+
+class SegmentArrays(NamedTuple):
+    """How a block's condensed columns reach its keys: kind, link of the chain, table slot, start, width.
+
+    place: first column among those of all the block's keys. ptr: segments of every block.
+    """
+
+    ptr: IntArray
+    kind: IntArray
+    link: IntArray
+    table: IntArray
+    start: IntArray
+    n: IntArray
+    place: IntArray
+
+
+class KeyArrays(NamedTuple):
+    """Block b has the keys ``key[ptr[b]:ptr[b + 1]]``, numbered as a tree does, at columns ``place``; -1 is known."""
+
+    ptr: IntArray
+    key: IntArray
+    place: IntArray
+
+
+def normal_equations(
+    which: IntArray, blocks: BlockArrays, points: PointArrays, W: FloatArray, lenses: LensArrays, R: FloatArray,
+    t: FloatArray, warp: FloatArray, H: FloatArray, chi: FloatArray, depth: FloatArray,
+) -> None:  # fmt: skip
+    """For each listed block: normal matrix H[b] (symmetric) of its local unknowns and, last, the residual.
+
+    Its last diagonal element is chi-square, also in ``chi``; depth: the least one (m), infinite without points. W:
+    square root information (3, N): w00 w01 w11; a point of weight zero gives rows of zeros and no depth.
+    """
+    _normal_equations(which, *blocks, *points, W, *lenses, R, t, warp, H, chi, depth)
+
+
+def errors(
+    which: IntArray, blocks: BlockArrays, points: PointArrays, W: FloatArray, lenses: LensArrays, R: FloatArray,
+    t: FloatArray, warp: FloatArray, chi: FloatArray, depth: FloatArray,
+) -> None:  # fmt: skip
+    """Chi-square (whitened) and least depth of each listed block."""
+    _errors(which, *blocks, *points, W, *lenses, R, t, warp, chi, depth)
+
+
+def block_rows(
+    b: int, blocks: BlockArrays, points: PointArrays, W: FloatArray, lenses: LensArrays, R: FloatArray, t: FloatArray,
+    warp: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Whitened rows (2 n, n_lens + 6 + n_warp + 1) of block b over its local unknowns, residual last."""
+    _block_rows(b, *blocks, *points, W, *lenses, R, t, warp, out)
+
+
+def serve(
+    which: IntArray, blocks: BlockArrays, lenses: LensArrays, segments: SegmentArrays, C: FloatArray, D: FloatArray,
+    width: IntArray, at: IntArray, H: FloatArray, flat: FloatArray, r_out: FloatArray,
+) -> None:  # fmt: skip
+    """For each listed block: its condensed rows, chained to its keys, into ``flat`` from ``at[b]``, and r_out (B, n).
+
+    Keys one after the other, each (n, its width); ``segments.place`` counts columns, width (B,) all of a block.
+    """
+    _serve(which, *blocks, *lenses, *segments, C, D, width, at, H, flat, r_out)
+
+
+def local_by_keys(b: int, n_lens: int, segments: SegmentArrays, C: FloatArray, D: FloatArray, G: FloatArray) -> None:
+    """Derivative G (n_lens + 6 + n_warp, sum of key dims) of a block's local unknowns by its keys."""
+    _local_by_keys(b, n_lens, *segments, C, D, G)
+
+
+def all_statistics(
+    which: IntArray, blocks: BlockArrays, points: PointArrays, W: FloatArray, lenses: LensArrays, R: FloatArray,
+    t: FloatArray, warp: FloatArray, segments: SegmentArrays, C: FloatArray, D: FloatArray, width: IntArray,
+    keys: KeyArrays, tree: TreeArrays, residual: FloatArray, influence: FloatArray, lost: IntArray,
+) -> None:  # fmt: skip
+    """Residuals (N, 2) px of the listed blocks and the whitened covariance A Q A' (N, 3: 00, 01, 11) of their points.
+
+    W: that of all points, used or not. lost[b] becomes 1 where two keys of a block share no clique of the tree.
+    """
+    widest = int(width.max(initial=0))
+    work = np.empty(widest * (widest + 2 * MAX_LOCAL))
+    _all_statistics(
+        which, *blocks, *points, W, *lenses, R, t, warp, *segments, C, D, width, *keys, *tree, residual, influence,
+        lost, work,
+    )  # fmt: skip

@@ -1,0 +1,45 @@
+"""Lens models in the core: their numbers, and points of one camera at once.
+
+Every model has a number (its kind), a parameter vector in a fixed order and a vector of constants ``[pixel_size_mm,
+centre_u, centre_v, r0_mm]`` of which it uses what it needs; ``adjust.lens`` names them all. The formulas, each written
+once for values and derivatives, are in ``lenses.h``. A point on or behind the camera's plane gives finite numbers
+without meaning; the caller tests the depth. The fisheye alone sees behind that plane, and means it.
+"""
+
+import numpy as np
+
+from adjust.model import FloatArray
+from adjust.native.library import Function
+
+BROWN = 0
+FISHEYE = 1
+BROWN_BACKWARD = 2
+BROWN_BACKWARD_DBAT = 3
+AICON = 4
+
+N_LENS = (13, 9, 10, 9, 10)
+MAX_LENS = 14
+N_COLUMNS = MAX_LENS + 3
+
+_lens_rows = Function("lens_rows", "kind lens[*] constants[4] q[n,3] uv[n,2] residuals[n,2] rows[*,2,17]")
+_NO_ROWS = np.zeros((0, 2, N_COLUMNS))
+
+
+def lens_rows(
+    kind: int, lens: FloatArray, constants: FloatArray, q: FloatArray, uv: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (n, 2) px, predicted minus observed, of points q (n, 3) m in the camera seen at uv (n, 2) px.
+
+    And their derivatives (n, 2, 17): columns 0 .. N_LENS[kind] - 1 by the parameters, 14 .. 16 by q (px/m), else zero.
+    """
+    residuals, rows = np.empty((len(q), 2)), np.empty((len(q), 2, N_COLUMNS))
+    if len(q):
+        _lens_rows(kind, lens, constants, q, uv, residuals, rows)
+    return residuals, rows
+
+
+def lens_residuals(kind: int, lens: FloatArray, constants: FloatArray, q: FloatArray, uv: FloatArray) -> FloatArray:
+    """The residuals (n, 2) px of :func:`lens_rows` alone."""
+    residuals = np.empty((len(q), 2))
+    _lens_rows(kind, lens, constants, q, uv, residuals, _NO_ROWS)
+    return residuals

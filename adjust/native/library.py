@@ -1,0 +1,163 @@
+"""The shared library of this machine, and functions of it that check what they are given.
+
+The library is built once for every set of vector instructions (``build_tools``); which one runs is chosen by what the
+processor says. A C++ function tells itself of which kind its arguments are, see ``arrays.h``; what belongs together in
+shape is said here, beside its Python face. A function runs without Python's lock, so threads run it side by side.
+"""
+
+import ctypes
+import os
+import platform
+from array import array
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+_KINDS = {"f": np.float64, "i": np.int64, "s": np.float32, "u": np.uint8, "b": np.bool_}
+_FOLDER = Path(__file__).parent
+_FAMILIES = ("images", "bundles", "navigation", "vision")
+SETS = ("base", "avx2", "avx512")
+"""Sets of vector instructions for which the library may have been built, the widest last."""
+
+
+class _Entry(ctypes.Structure):
+    _fields_ = (("name", ctypes.c_char_p), ("run", ctypes.c_void_p), ("describe", ctypes.c_void_p))
+
+
+class Compiled(Protocol):
+    """A function of the library: arrays and numbers in, one integer out."""
+
+    def __call__(self, *arguments: Any) -> int:
+        """Run it."""
+
+
+@cache
+def opened(name: str) -> dict[str, tuple[Callable[[int], int], str]]:
+    """Functions and kinds of arguments of the library for a set of instructions, which the processor must have."""
+    path = _FOLDER / f"kernels_{name}.so"
+    if not path.exists():
+        raise ImportError(f"{path} is missing: build it by 'pip install .' or 'python setup.py build_ext --inplace'")
+    library = ctypes.CDLL(str(path))
+    found = {}
+    for family in _FAMILIES:
+        table = library[family]
+        table.restype = ctypes.POINTER(_Entry)
+        entries = table()
+        i = 0
+        while entries[i].name is not None:
+            text = ctypes.create_string_buffer(256)
+            ctypes.CFUNCTYPE(None, ctypes.c_char_p)(entries[i].describe)(text)  # type: ignore[arg-type]  # an address
+            run = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)(entries[i].run)
+            found[entries[i].name.decode()] = (run, text.value.decode())
+            i += 1
+    return found
+
+
+@cache
+def instruction_set() -> str:
+    """The set of vector instructions in use: the widest that processor and build have, or ``LABSURVEY_VECTORS``."""
+    built = [name for name in SETS if (_FOLDER / f"kernels_{name}.so").exists()]
+    wanted = os.environ.get("LABSURVEY_VECTORS")
+    if wanted:
+        if wanted not in built:
+            raise ImportError(f"LABSURVEY_VECTORS is {wanted!r}; built are: {', '.join(built)}")
+        return wanted
+    if platform.machine() not in ("x86_64", "AMD64") or len(built) < 2:
+        return "base"
+    widest = ctypes.CDLL(str(_FOLDER / "kernels_base.so")).widest_instructions
+    return [name for name in built if SETS.index(name) <= widest()][-1]
+
+
+class Function:
+    """A function of the library with named arguments, checked against each other at every call.
+
+    arguments: a name for each, arrays with the names of their dimensions: ``"which[k] ptr[B+1] W[3,N] damping"``. A
+    dimension is a number, a name (equal wherever it stands), ``name+1``, or ``*`` for any length.
+    """
+
+    def __init__(self, name: str, arguments: str, instructions: str | None = None) -> None:
+        self.name = name
+        self._declared = [_declared(part) for part in arguments.split()]
+        self._instructions = instructions
+        self._run: Callable[[int], int] | None = None
+        self._kinds = ""
+
+    def _open(self) -> Callable[[int], int]:
+        run, described = opened(self._instructions or instruction_set())[self.name]
+        self._kinds = described[::2]
+        dims = [int(d) for d in described[1::2]]
+        expected = [len(shape) for _, shape in self._declared]
+        if dims != expected:
+            raise TypeError(f"{self.name}: the library takes arrays of {dims} dimensions, declared are {expected}")
+        self._run = run
+        return run
+
+    def __call__(self, *arguments: Any) -> int:
+        """Run it; raises TypeError or ValueError naming the argument that does not fit."""
+        run = self._run or self._open()
+        if len(arguments) != len(self._declared):
+            raise TypeError(f"{self.name} takes {len(self._declared)} arguments, {len(arguments)} were given")
+        sizes: dict[str, int] = {}
+        packed = array("q")
+        for kind, (name, shape), value in zip(self._kinds, self._declared, arguments, strict=True):
+            if kind == "n":
+                packed.extend((int(value), 0, 0, 0, 0))
+            elif kind == "d":
+                packed.extend((*array("q", array("d", [value]).tobytes()), 0, 0, 0, 0))
+            else:
+                if not isinstance(value, np.ndarray) or value.dtype != _KINDS[kind.lower()]:
+                    raise TypeError(f"{self.name}: {name} must be an array of {_KINDS[kind.lower()].__name__}, "
+                                    f"not {_told(value)}")  # fmt: skip
+                if value.ndim != len(shape) or not _fits(shape, value.shape, sizes):
+                    raise ValueError(f"{self.name}: {name} must be ({', '.join(map(_text, shape))}), not {value.shape}"
+                                     f" with {sizes}")  # fmt: skip
+                flags = value.flags
+                if not flags.c_contiguous or not flags.aligned or (kind.isupper() and not flags.writeable):
+                    raise ValueError(f"{self.name}: {name} must be contiguous{' and writable' * kind.isupper()}")
+                packed.extend((value.ctypes.data, *value.shape, *(0,) * (4 - value.ndim)))
+        return run(packed.buffer_info()[0])
+
+
+_Dimension = int | tuple[str, int] | None
+"""A length; a name and what is added to it; any length."""
+
+
+def _declared(part: str) -> tuple[str, tuple[_Dimension, ...]]:
+    name, _, inside = part.rstrip("]").partition("[")
+    return name, tuple(_dimension(text) for text in inside.split(",")) if inside else ()
+
+
+def _dimension(text: str) -> _Dimension:
+    if text == "*":
+        return None
+    if text.isdigit():
+        return int(text)
+    name, _, more = text.partition("+")
+    return name, int(more or 0)
+
+
+def _fits(shape: tuple[_Dimension, ...], given: tuple[int, ...], sizes: dict[str, int]) -> bool:
+    for wanted, n in zip(shape, given, strict=True):
+        if wanted is None:
+            continue
+        if isinstance(wanted, int):
+            if n != wanted:
+                return False
+        elif sizes.setdefault(wanted[0], n - wanted[1]) != n - wanted[1]:
+            return False
+    return True
+
+
+def _text(dimension: _Dimension) -> str:
+    if dimension is None:
+        return "any"
+    if isinstance(dimension, int):
+        return str(dimension)
+    return f"{dimension[0]} + {dimension[1]}" if dimension[1] else dimension[0]
+
+
+def _told(value: Any) -> str:
+    return f"an array of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__

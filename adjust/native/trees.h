@@ -1,0 +1,173 @@
+// Recursions over the cliques of a Bayes tree, flattened; see adjust.tree_covariance.
+//
+// Clique c has the keys keys[key_ptr[c]] .. keys[key_ptr[c + 1] - 1], the first n_front[c] of them frontal, parents
+// before children. Blocks of front x width numbers, row by row, begin at at[c]: in data first [R S], later
+// [R^-1, -R^-1 S]; in cov the rows of the covariance that belong to the frontal keys.
+#pragma once
+#include "dense.h"
+
+namespace {
+
+struct Tree {
+    explicit Tree(Reader &r) : home(r), key_ptr(r), keys(r), dims(r), front(r), width(r), at(r), cov(r) {}
+    Ints home, key_ptr, keys, dims, front, width, at;
+    Out<double, 1> cov;
+
+    // Column at which a key begins in a clique, -1 where it is not in it.
+    int64_t offset_in(int64_t clique, int64_t key) const {
+        int64_t o = 0;
+        for (int64_t i = key_ptr[clique]; i < key_ptr[clique + 1]; o += dims[keys[i++]])
+            if (keys[i] == key) return o;
+        return -1;
+    }
+    // Covariance of keys a and b, which share a clique, into out (row length ld); whether they do. The key whose home
+    // lies deeper was eliminated first, so that its clique holds the other one.
+    bool block(int64_t a, int64_t b, double *out, int64_t ld) const {
+        const bool flip = home[b] > home[a];
+        const int64_t deep = flip ? b : a, high = flip ? a : b, c = home[deep];
+        const int64_t row = offset_in(c, deep), column = offset_in(c, high), n = width[c];
+        if (column < 0) return false;
+        const double *from = cov.data + at[c] + row * n + column;
+        for (int64_t i = 0; i < dims[deep]; ++i)
+            for (int64_t j = 0; j < dims[high]; ++j) out[flip ? j * ld + i : i * ld + j] = from[i * n + j];
+        return true;
+    }
+};
+
+inline int64_t tree_block(const Tree &tree, int64_t a, int64_t b, Out<double, 2> out) { return tree.block(a, b, out.data, out.n[1]); }
+
+// [R S] to [R^-1, -R^-1 S] in place; the first singular clique or -1. row: scratch as wide as the widest clique.
+inline int64_t invert_cliques(Ints front, Ints width, Ints at, Out<double, 1> data, Out<double, 1> row) {
+    for (int64_t c = 0; c < front.n[0]; ++c) {
+        const int64_t nf = front[c], n = width[c];
+        double *A = data.data + at[c], *x = row.data;
+        for (int64_t i = 0; i < nf; ++i)
+            if (!(magnitude(A[i * n + i]) > 0.0)) return c;
+        for (int64_t i = nf - 1; i >= 0; --i) {
+            for (int64_t j = i; j < n; ++j) x[j] = j >= nf ? A[i * n + j] : 0.0;
+            for (int64_t k = i + 1; k < nf; ++k) {
+                const double f = A[i * n + k];
+                const double *from = A + k * n;
+                for (int64_t j = k; j < n; ++j) x[j] += f * from[j];
+            }
+            const double d = 1.0 / A[i * n + i];
+            A[i * n + i] = d;
+            for (int64_t j = i + 1; j < n; ++j) A[i * n + j] = -d * x[j];
+        }
+    }
+    return -1;
+}
+
+inline int64_t room_for_rows(int64_t nf, int64_t ns) {
+    const int64_t pf = padded(nf), ps = padded(ns);
+    return 3 * nf * pf + ns * (ps + pf) + nf * ps;
+}
+
+// Numbers of scratch that covariance_rows takes.
+inline int64_t covariance_room(Ints front, Ints width) {
+    int64_t most = 0;
+    for (int64_t c = 0; c < front.n[0]; ++c) most = larger(most, room_for_rows(front[c], width[c] - front[c]));
+    return most;
+}
+
+// Q_fs = T Q_ss and Q_ff = R^-1 R^-T + T Q_sf, with T = -R^-1 S, parents first (Takahashi, Fagan and Chen 1973).
+inline void covariance_rows(const Tree &t, Ints n_front, Vector data, Out<double, 1> work) {
+    for (int64_t c = 0; c < t.front.n[0]; ++c) {
+        const int64_t nf = t.front[c], n = t.width[c], ns = n - nf, pf = padded(nf), ps = padded(ns);
+        const double *A = data.data + t.at[c];
+        double *C = t.cov.data + t.at[c];
+        std::memset(work.data, 0, sizeof(double) * room_for_rows(nf, ns));
+        double *P = work.data, *X = P + nf * pf, *Z = X + nf * pf, *Q = Z + nf * pf, *turned = Q + ns * ps, *Y = turned + ns * pf;
+        for (int64_t i = 0; i < nf; ++i)
+            for (int64_t j = i; j < nf; ++j) P[j * pf + i] = A[i * n + j];
+        for (int64_t i = 0; i < nf; ++i)  // row i of R^-1 begins at its diagonal
+            product(A + i * n + i, n, P + i * pf, pf, X + i * pf, pf, 1, nf, nf - i);
+        int64_t r = 0;
+        for (int64_t i = t.key_ptr[c] + n_front[c]; i < t.key_ptr[c + 1]; r += t.dims[t.keys[i++]]) {
+            int64_t s = 0;
+            for (int64_t j = t.key_ptr[c] + n_front[c]; j <= i; s += t.dims[t.keys[j++]]) {
+                double *to = Q + r * ps + s;
+                t.block(t.keys[i], t.keys[j], to, ps);
+                for (int64_t a = 0; a < t.dims[t.keys[i]]; ++a)
+                    for (int64_t b = 0; b < t.dims[t.keys[j]]; ++b) Q[(s + b) * ps + r + a] = to[a * ps + b];
+            }
+        }
+        if (ns) {
+            for (int64_t i = 0; i < nf; ++i)
+                for (int64_t j = 0; j < ns; ++j) turned[j * pf + i] = A[i * n + nf + j];
+            product(A + nf, n, Q, ps, Y, ps, nf, ns, ns);
+            product(Y, ps, turned, pf, Z, pf, nf, nf, ns);
+        }
+        for (int64_t i = 0; i < nf; ++i) {
+            for (int64_t j = 0; j < nf; ++j) C[i * n + j] = X[i * pf + j] + Z[i * pf + j];
+            std::memcpy(C + i * n + nf, Y + i * ps, sizeof(double) * ns);
+        }
+    }
+}
+
+// Joint covariances (p, 2 d, 2 d) of pairs of keys of dimension d that share a clique; a key -1 is a constant. The first
+// pair that shares none, or -1.
+inline int64_t joint_blocks(const Tree &t, Ints first, Ints second, Out<double, 3> out) {
+    const int64_t d = out.n[1] / 2, ld = out.n[2];
+    for (int64_t p = 0; p < first.n[0]; ++p) {
+        double *o = &out(p, 0, 0);
+        std::memset(o, 0, sizeof(double) * ld * ld);
+        const int64_t a = first[p], b = second[p];
+        if (a >= 0) t.block(a, a, o, ld);
+        if (b >= 0) t.block(b, b, o + d * ld + d, ld);
+        if (a < 0 || b < 0) continue;
+        if (!t.block(a, b, o + d, ld)) return p;
+        for (int64_t i = 0; i < d; ++i)
+            for (int64_t j = 0; j < d; ++j) o[(d + j) * ld + i] = o[i * ld + d + j];
+    }
+    return -1;
+}
+
+// Q x in place (D, m) over cliques (parents first) that hold every ancestor of each of them. first: row of x at which a
+// key begins. With R'u = x, R y = u: leaves to roots, then back. rows: scratch as wide as the widest clique.
+inline void solve_cliques(Ints cliques, Ints key_ptr, Ints keys, Ints dims, Ints first, Ints front, Ints width, Ints at, Vector data,
+                          Out<double, 2> x, Out<int64_t, 1> rows) {
+    const int64_t m = x.n[1], count = cliques.n[0];
+    const auto place = [&](int64_t c) {
+        int64_t o = 0;
+        for (int64_t i = key_ptr[c]; i < key_ptr[c + 1]; ++i)
+            for (int64_t j = 0; j < dims[keys[i]]; ++j) rows.data[o++] = first[keys[i]] + j;
+    };
+    const auto row = [&](int64_t j) { return x.data + rows[j] * m; };
+    for (int64_t index = count - 1; index >= 0; --index) {
+        const int64_t c = cliques[index], nf = front[c], n = width[c];
+        const double *A = data.data + at[c];
+        place(c);
+        for (int64_t j = nf; j < n; ++j)
+            for (int64_t i = 0; i < nf; ++i) {
+                const double a = A[i * n + j];
+                if (a == 0.0) continue;
+                double *to = row(j);
+                const double *from = row(i);
+                for (int64_t k = 0; k < m; ++k) to[k] += a * from[k];
+            }
+        for (int64_t j = nf - 1; j >= 0; --j) {
+            double *to = row(j);
+            for (int64_t k = 0; k < m; ++k) to[k] *= A[j * n + j];
+            for (int64_t i = 0; i < j; ++i) {
+                const double *from = row(i);
+                for (int64_t k = 0; k < m; ++k) to[k] += A[i * n + j] * from[k];
+            }
+        }
+    }
+    for (int64_t index = 0; index < count; ++index) {
+        const int64_t c = cliques[index], nf = front[c], n = width[c];
+        const double *A = data.data + at[c];
+        place(c);
+        for (int64_t i = 0; i < nf; ++i) {
+            double *to = row(i);
+            for (int64_t k = 0; k < m; ++k) to[k] *= A[i * n + i];
+            for (int64_t j = i + 1; j < n; ++j) {
+                const double *from = row(j);
+                for (int64_t k = 0; k < m; ++k) to[k] += A[i * n + j] * from[k];
+            }
+        }
+    }
+}
+
+}  // namespace

@@ -1,0 +1,74 @@
+"""Recursions over the cliques of a Bayes tree, flattened; see :mod:`adjust.tree_covariance` and ``trees.h``.
+
+Clique c has the keys ``keys[key_ptr[c]:key_ptr[c + 1]]``, the first ``n_front[c]`` of them frontal, parents before
+children. Row-major blocks of front x width numbers begin at ``at[c]``: in ``data`` first [R S], later [R^-1, -R^-1 S];
+in ``cov`` the rows of the covariance that belong to the frontal keys.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from adjust.model import FloatArray, IntArray
+from adjust.native.library import Function
+
+TREE = "home[K] key_ptr[C+1] keys[*] dims[K] front[C] width[C] at[C] cov[*]"
+_tree_block = Function("tree_block", f"{TREE} a b out[*,*]")
+_invert_cliques = Function("invert_cliques", "front[C] width[C] at[C] data[*] row[*]")
+_covariance_room = Function("covariance_room", "front[C] width[C]")
+_covariance_rows = Function("covariance_rows", f"{TREE} n_front[C] data[*] work[*]")
+_joint_blocks = Function("joint_blocks", f"{TREE} first[p] second[p] out[p,e,e]")
+_solve_cliques = Function(
+    "solve_cliques", "cliques[*] key_ptr[C+1] keys[*] dims[K] first[*] front[C] width[C] at[C] data[*] x[*,*] rows[*]"
+)
+
+
+class TreeArrays(NamedTuple):
+    """A tree and its covariances."""
+
+    home: IntArray
+    key_ptr: IntArray
+    keys: IntArray
+    dims: IntArray
+    front: IntArray
+    width: IntArray
+    at: IntArray
+    cov: FloatArray
+
+    @staticmethod
+    def nothing() -> "TreeArrays":
+        """A tree without unknowns."""
+        none = np.zeros(0, dtype=np.int64)
+        return TreeArrays(none, np.zeros(1, dtype=np.int64), none, none, none, none, none, np.zeros(0))
+
+
+def invert_cliques(front: IntArray, width: IntArray, at: IntArray, data: FloatArray) -> int:
+    """[R S] to [R^-1, -R^-1 S] in place; returns the first singular clique or -1."""
+    return _invert_cliques(front, width, at, data, np.empty(int(width.max(initial=0))))
+
+
+def fill_block(tree: TreeArrays, a: int, b: int, out: FloatArray) -> bool:
+    """Covariance of two keys that share a clique into ``out``; whether they do."""
+    return bool(_tree_block(*tree, a, b, out))
+
+
+def covariance_rows(tree: TreeArrays, n_front: IntArray, data: FloatArray) -> None:
+    """Fill ``tree.cov``: Q_fs = T Q_ss and Q_ff = R^-1 R^-T + T Q_sf, parents first."""
+    _covariance_rows(*tree, n_front, data, np.empty(_covariance_room(tree.front, tree.width)))
+
+
+def joint_blocks(tree: TreeArrays, first: IntArray, second: IntArray, out: FloatArray) -> int:
+    """Joint covariances ``out`` (p, 2 d, 2 d) of pairs of keys of dimension d that share a clique; -1: a constant.
+
+    Returns the first pair that shares none, or -1.
+    """
+    return _joint_blocks(*tree, first, second, out)
+
+
+def solve_cliques(tree: TreeArrays, cliques: IntArray, first: IntArray, data: FloatArray, x: FloatArray) -> None:
+    """Q x in place (D, m) over ``cliques`` (parents first), which hold every ancestor of each of them.
+
+    first: row of x at which a key begins. With R'u = x, R y = u: leaves to roots, then back.
+    """
+    rows = np.empty(int(tree.width.max(initial=0)), dtype=np.int64)
+    _solve_cliques(cliques, tree.key_ptr, tree.keys, tree.dims, first, tree.front, tree.width, tree.at, data, x, rows)

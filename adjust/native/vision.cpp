@@ -1,0 +1,12 @@
+// What Python calls of the fits of corners and spots, and of the renderer.
+#include "corners.h"
+#include "rendering.h"
+#include "spots.h"
+
+extern "C" __attribute__((visibility("default"))) const Entry *vision() {
+    static constexpr Entry table[] = {
+        entry<fit_corners>("fit_corners"), entry<corner_rows>("corner_rows"), entry<fit_spots>("fit_spots"),
+        entry<spot_profile>("spot_rows_of_profile"), entry<pixel_corner_rays>("pixel_corner_rays"),
+        entry<draw_facets>("draw_facets"), {nullptr, nullptr, nullptr}};
+    return table;
+}

@@ -1,0 +1,136 @@
+"""Fits of corners and spots to the pixels of an image, and the renderer's inner loops, in the core.
+
+The formulas are in ``corners.h``, ``spots.h``, ``fits.h`` and ``rendering.h``. Places are px, the centre of the first
+pixel is (0, 0).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtr
+
+from adjust.model import FloatArray, IntArray
+from adjust.native.library import Function
+
+Gray = npt.NDArray[np.float32]
+
+CORNER_PARAMETERS = 9
+"""u, v, angle 1, angle 2, level, step, log(blur), slope u, slope v."""
+ENOUGH_FOR_SLOPES = 45
+"""Pixels of a corner from which the last two are free: fewer cannot tell them from the corner's own form."""
+GAUSSIAN, DISC = 0, 1
+
+_NODES = np.arange(-384, 385) / 64.0  # of the normal distribution, as corners.h expects them
+_TABLE = ndtr(_NODES), np.exp(-0.5 * _NODES**2) / np.sqrt(2.0 * np.pi)
+_fit_corners = Function(
+    "fit_corners",
+    "image[*,*] start[n,2] angles[n,2] blur[n] shapes[n,4] crossing max_shift tolerance enough phi[769] density[769] "
+    "p[n,9] cov[n,2,2] pixels[n] rms[n] status[n]",
+)
+_corner_rows = Function("corner_rows", "xy[n,2] p[9] crossing phi[769] density[769] value[n] rows[n,9]")
+_fit_spots = Function(
+    "fit_spots",
+    "gray[h,w] labels[h,w] saturation start[n,2] label[n] diameter[n] peak[n] background[n] p[n,7] best[n] cov[n,2,2] "
+    "rms[n] saturated[n] work[*]",
+)
+_spot_rows = Function("spot_rows_of_profile", "xy[n,2] p[7] profile value[n] rows[n,7]")
+_pixel_corner_rays = Function("pixel_corner_rays", "first last lens[14] rays[*,*,2]")
+_draw_facets = Function(
+    "draw_facets",
+    "first last rays[*,*,2] n from_ray[f,3,3] bounds[f,4] counts[f,2] x_edges[f,*] y_edges[f,*] cells[f,*,*] "
+    "background samples[*,2] image[*,*] candidates[f]",
+)
+
+
+class Facets(NamedTuple):
+    """Planes of grey cells: ``from_ray`` (F, 3, 3) takes x/z, y/z, 1 to the facet's x, y, 1 over its depth.
+
+    bounds: (F, 4) boxes x from, x to, y from, y to in x/z, y/z. counts: (F, 2) cells in x and y, whose edges and grey
+    values follow.
+    """
+
+    from_ray: FloatArray
+    bounds: FloatArray
+    counts: IntArray
+    x_edges: FloatArray
+    y_edges: FloatArray
+    cells: FloatArray
+
+
+def fit_corners(
+    image: Gray, start: FloatArray, angles: FloatArray, blur: FloatArray, shapes: FloatArray, crossing: bool,
+    max_shift: float, tolerance: float,
+) -> tuple[FloatArray, FloatArray, IntArray, FloatArray, IntArray]:  # fmt: skip
+    """Fit two blurred edges to every corner.
+
+    start: (n, 2) px. angles: (n, 2) of the two edges, the second clockwise (in the image) of the first. blur: (n,) px.
+    shapes: (n, 4) px, radius of the disc around the corner, half width of the strips along its edges, their lengths.
+    crossing: the edges go on behind the corner (four quadrants); otherwise they end there. tolerance: px, where the fit
+    may stop. Returns p (n, 9) with absolute u, v; covariance (n, 2, 2) of u, v; number of pixels; residual rms; status
+    (n,): 0 good, 1 at the border, 2 too few pixels, 3 no convergence, 4 more than ``max_shift`` px from the start.
+    """
+    n = len(start)
+    p, cov, rms = np.zeros((n, CORNER_PARAMETERS)), np.zeros((n, 2, 2)), np.zeros(n)
+    pixels, status = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    given = (np.ascontiguousarray(a, dtype=np.float64) for a in (start, angles, blur, shapes))
+    _fit_corners(np.ascontiguousarray(image), *given, crossing, max_shift, tolerance, ENOUGH_FOR_SLOPES, *_TABLE, p,
+                 cov, pixels, rms, status)  # fmt: skip
+    return p, cov, pixels, rms, status
+
+
+def corner_rows(xy: FloatArray, p: FloatArray, crossing: bool) -> tuple[FloatArray, FloatArray]:
+    """Grey values (n,) at places xy (n, 2) px from a window's centre, and derivatives (n, 9) by the parameters p."""
+    value, rows = np.empty(len(xy)), np.empty((len(xy), CORNER_PARAMETERS))
+    _corner_rows(xy, p, crossing, *_TABLE, value, rows)
+    return value, rows
+
+
+def fit_spots(
+    gray: Gray, labels: IntArray, saturation: float, start: FloatArray, label: IntArray, diameter: FloatArray,
+    peak: FloatArray, background: FloatArray,
+) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, IntArray]:  # fmt: skip
+    """Fit each spot with both profiles and keep the better one.
+
+    gray: (h, w). labels: (h, w) component of each pixel, 0 none; pixels of other components are left out, and so are
+    those at or above ``saturation``. start: (n, 2) px. label, diameter (px), peak, background: (n,) of each spot.
+    Returns p (n, 7) with absolute u, v; profile (n,), -1 where none converged; covariance (n, 2, 2); residual rms (n,);
+    number of saturated pixels (n,).
+    """
+    n = len(start)
+    p, cov, rms = np.zeros((n, 7)), np.zeros((n, 2, 2)), np.zeros(n)
+    best, saturated = np.full(n, -1, np.int64), np.zeros(n, np.int64)
+    reach = int(np.ceil(float(diameter.max(initial=0.0)) + 3.0))
+    given = (np.ascontiguousarray(a, dtype=np.float64) for a in (diameter, peak, background))
+    _fit_spots(np.ascontiguousarray(gray), np.ascontiguousarray(labels, dtype=np.int64), saturation,
+               np.ascontiguousarray(start, dtype=np.float64), label, *given, p, best, cov, rms, saturated,
+               np.empty(3 * (2 * reach + 1) ** 2))  # fmt: skip
+    return p, best, cov, rms, saturated
+
+
+def spot_rows(xy: FloatArray, p: FloatArray, profile: int) -> tuple[FloatArray, FloatArray]:
+    """Grey values (n,) at xy (n, 2) and derivatives (n, 7) by u, v, background, amplitude, log widths, log softness."""
+    value, rows = np.empty(len(xy)), np.empty((len(xy), 7))
+    _spot_rows(xy, p, profile, value, rows)
+    return value, rows
+
+
+def pixel_corner_rays(width: int, height: int, lens: FloatArray) -> FloatArray:
+    """Undistorted x/z, y/z of all pixel corners, (height + 1, width + 1, 2); NaN where the lens cannot be inverted.
+
+    lens: Brown's parameters (13,), as :mod:`adjust.lens` orders them.
+    """
+    rays = np.empty((height + 1, width + 1, 2))
+    _pixel_corner_rays(0, height + 1, np.append(lens, 0.0), rays)
+    return rays
+
+
+def draw_facets(rays: FloatArray, n: int, facets: Facets, background: float, samples: FloatArray) -> Gray:
+    """Grey values (n * height, n * width) of sub-pixels, each integrated over its area; rays: of the pixel corners.
+
+    samples: (S, 2) offsets in the unit square of a sub-pixel that sees an edge.
+    """
+    height, width = rays.shape[0] - 1, rays.shape[1] - 1
+    image = np.empty((n * height, n * width), np.float32)
+    _draw_facets(0, height, rays, n, *facets, background, samples, image, np.empty(len(facets.from_ray), np.int64))
+    return image

@@ -1,0 +1,46 @@
+"""setuptools' build backend; where no C++ compiler is found, it asks for one that the package index has."""
+
+import os
+import shlex
+import shutil
+import sysconfig
+from typing import Any
+
+from setuptools import build_meta
+from setuptools.build_meta import (  # the hooks that stay setuptools' own
+    build_editable,
+    build_sdist,
+    build_wheel,
+    get_requires_for_build_sdist,
+    prepare_metadata_for_build_editable,
+    prepare_metadata_for_build_wheel,
+)
+
+__all__ = [
+    "build_editable", "build_sdist", "build_wheel", "compiler", "get_requires_for_build_editable",
+    "get_requires_for_build_sdist", "get_requires_for_build_wheel", "prepare_metadata_for_build_editable",
+    "prepare_metadata_for_build_wheel",
+]  # fmt: skip
+
+
+def compiler() -> list[str] | None:
+    """The C++ compiler of this machine as the beginning of a command, None where there is none."""
+    named = shlex.split(os.environ.get("CXX") or "")
+    if named:
+        return named
+    configured = shlex.split(sysconfig.get_config_var("CXX") or "")[:1]
+    return next(([name] for name in [*configured, "c++", "g++", "clang++"] if shutil.which(name)), None)
+
+
+def _more() -> list[str]:
+    return [] if compiler() else ["ziglang>=0.13"]
+
+
+def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
+    """What setuptools needs, and a compiler."""
+    return [*build_meta.get_requires_for_build_wheel(config_settings), *_more()]
+
+
+def get_requires_for_build_editable(config_settings: Any = None) -> list[str]:
+    """What setuptools needs, and a compiler."""
+    return [*build_meta.get_requires_for_build_editable(config_settings), *_more()]
