@@ -5,9 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.closed_forms import homography, pinhole_from_homographies
-from adjust.closed_forms.absolute_pose import best_poses
-from adjust.closed_forms.plane_kernels import plane_misfits
+from adjust.closed_forms import best_poses, homography, pinhole_from_homographies, plane_misfits
 from adjust.errors import SurveyError
 from adjust.initial.lens_refinement import LensFit, fit_lens
 from adjust.lens import (
@@ -124,9 +122,8 @@ class _LensSearch:
 
     def _screen(self, flat: Sequence[Sighting]) -> tuple[list[Sighting], dict[int, str]]:
         """Images whose points lie as on a plane; a wrong point order misses by a good part of the image."""
-        misfit = np.empty(len(flat))
         ptr = np.cumsum([0] + [len(s.x) for s in flat])
-        plane_misfits(np.concatenate([s.x for s in flat]), np.concatenate([s.uv for s in flat]), ptr, misfit)
+        misfit = plane_misfits(np.concatenate([s.x for s in flat]), np.concatenate([s.uv for s in flat]), ptr)
         limit = max(0.02, 6.0 * float(np.median(misfit)))
         good = [s for s, m in zip(flat, misfit, strict=True) if m <= limit]
         excluded = {

@@ -8,9 +8,9 @@ import textwrap
 
 import numpy as np
 
-from adjust.closed_forms.small_kernels import product, select
 from adjust.compiling import made_of
-from adjust.tree_kernels import _times
+from adjust.navigation.search_kernels import search
+from adjust.tree_kernels import _times, offset_in
 
 
 def run(code, folder, **environment):
@@ -26,7 +26,7 @@ def test_modules_of_kernels_load_without_numba(tmp_path):
 
 
 def test_a_kernel_is_pickled_by_its_name():
-    assert pickle.loads(pickle.dumps(select)) is select
+    assert pickle.loads(pickle.dumps(search)) is search
 
 
 def test_constants_share_one_machine_code(tmp_path):
@@ -82,13 +82,11 @@ def test_another_file_or_constant_makes_new_machine_code(tmp_path):
 
 
 def test_what_a_kernel_is_made_of():
-    from adjust.closed_forms import plane_kernels
-
-    files, _ = made_of(plane_kernels.plane_poses.py_func)
-    assert [name for name, _ in files] == ["adjust.closed_forms.plane_kernels", "adjust.closed_forms.small_kernels"]
+    files, _ = made_of(search.py_func)
+    assert [name for name, _ in files] == ["adjust.navigation.minimal_kernels", "adjust.navigation.search_kernels"]
     _, constants = made_of(_times.py_func)
     assert dict(constants) == {"adjust.tree_kernels._BY_HAND": "120000"}
-    assert made_of(product.py_func)[1] == ()
+    assert made_of(offset_in.py_func)[1] == ()
 
 
 def test_products_by_hand_and_by_blas_agree():

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from adjust.closed_forms import absolute_pose, rigid, rotation_exp
-from adjust.closed_forms.absolute_pose import best_poses
+from adjust.closed_forms import absolute_pose, best_poses, rigid, rotation_exp
 from adjust.closed_forms.rigid import skew
 from adjust.errors import SurveyError
 from adjust.initial.refinement_kernels import lens_and_poses
