@@ -3,7 +3,7 @@
 from adjust.closed_forms.absolute_pose import PoseCandidates, absolute_pose, best_poses, pose_solutions
 from adjust.closed_forms.averaging import mean_pose, mean_rotation, pose_distance
 from adjust.closed_forms.hand_eye import degenerate_direction, relative_motions, solve_ax_xb, solve_ax_zb
-from adjust.closed_forms.planes import apply_homography, homography, plane_misfits, plane_poses
+from adjust.closed_forms.planes import homographies, plane_misfits, plane_poses
 from adjust.closed_forms.rigid import align, inverse, nearest_rotation, rigid, rotation_exp, rotation_log, transform
 from adjust.closed_forms.triangulation import Intersection, intersect
 from adjust.closed_forms.views import refine_poses, tangent_axes, view_errors, view_offsets
@@ -15,10 +15,9 @@ __all__ = [
     "PoseCandidates",
     "absolute_pose",
     "align",
-    "apply_homography",
     "best_poses",
     "degenerate_direction",
-    "homography",
+    "homographies",
     "intersect",
     "inverse",
     "mean_pose",

@@ -3,10 +3,11 @@
 Stacks of views are those of :mod:`adjust.closed_forms.views`.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from adjust.closed_forms.views import gathered, median, stacks
-from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
 
 PLANAR = 1e-4  # thickness against extent below which points count as a plane
@@ -14,29 +15,22 @@ WIDEST = float(np.cos(np.deg2rad(80.0)))  # rays further off the mean direction 
 _SINGULAR = 1e-13  # smallest against largest eigenvalue
 
 
-def apply_homography(h: FloatArray, xy: FloatArray) -> FloatArray:
-    """Points (n, 2) mapped by h (3, 3)."""
-    p = xy @ h[:, :2].T + h[:, 2]
-    return np.asarray(p[:, :2] / p[:, 2:])
+def homographies(
+    xy: FloatArray, uv: FloatArray, ptr: IntArray, refinements: int = 3
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Of every view ``h`` (B, 3, 3) with uv ~ h (x, y, 1) and the rms (B,) of its residuals in the unit of uv.
 
-
-def homography(xy: FloatArray, uv: FloatArray, refinements: int = 3) -> tuple[FloatArray, float]:
-    """``h`` (3, 3) with uv ~ h (x, y, 1) and the rms of its residuals in the unit of uv.
+    xy, uv: (N, 2), view after view by ptr (B + 1,). Also which (B,) are determined: not those of less than four points
+    or of points on one line.
 
     Source: direct linear transformation on normalised points (Hartley and Zisserman, Multiple View Geometry, alg. 4.2),
-    then Gauss-Newton steps on the distance in the image. Raises SurveyError for fewer than four points or for points on
-    one line.
+    then Gauss-Newton steps on the distance in the image.
     """
-    if len(xy) < 4:
-        raise SurveyError(f"a homography needs 4 points, got {len(xy)}: show more of the target")
-    h, rms, good = _homographies(
-        np.asarray(xy, dtype=float).T[None], np.asarray(uv, dtype=float).T[None], np.ones((1, len(xy))), refinements
-    )
-    if not good[0]:
-        raise SurveyError(
-            "the points of a planar target lie on one line: no homography is determined; show more points"
-        )
-    return h[0], float(rms[0])
+    n = len(ptr) - 1
+    h, rms, good = np.tile(np.eye(3), (n, 1, 1)), np.full(n, np.inf), np.zeros(n, dtype=np.bool_)
+    for at, rows, real in _stacks_of_planes(ptr):
+        h[at], rms[at], good[at] = _homographies(gathered(xy, rows), gathered(uv, rows), real, refinements)
+    return h, rms, good
 
 
 def plane_poses(x: FloatArray, rays: FloatArray, ptr: IntArray) -> tuple[FloatArray, BoolArray]:
@@ -50,9 +44,7 @@ def plane_poses(x: FloatArray, rays: FloatArray, ptr: IntArray) -> tuple[FloatAr
     """
     n = len(ptr) - 1
     poses, found = np.tile(np.eye(4), (n, 2, 1, 1)), np.zeros(n, dtype=np.bool_)
-    enough = np.flatnonzero(np.diff(ptr) > 3)
-    for which, rows, real in stacks(ptr[enough], np.diff(ptr)[enough]):
-        at = enough[which]
+    for at, rows, real in _stacks_of_planes(ptr):
         poses[at], found[at] = _poses(gathered(x, rows), gathered(rays, rows), real)
     poses[~found] = np.eye(4)
     return poses, found
@@ -64,15 +56,21 @@ def plane_misfits(x: FloatArray, uv: FloatArray, ptr: IntArray) -> FloatArray:
     Infinite where the points lie on one line or are fewer than four.
     """
     out = np.full(len(ptr) - 1, np.inf)
-    enough = np.flatnonzero(np.diff(ptr) > 3)
-    for which, rows, real in stacks(ptr[enough], np.diff(ptr)[enough]):
+    for at, rows, real in _stacks_of_planes(ptr):
         seen = gathered(uv, rows)
         _, _, _, local, good = _on_plane(gathered(x, rows), real, np.inf)
         h, _, determined = _homographies(local, seen, real, 0)
         miss = median(np.linalg.norm(_mapped(h, local) - seen, axis=1), real)
         extent = np.linalg.norm(seen.max(axis=2) - seen.min(axis=2), axis=1)
-        out[enough[which]] = np.where(good & determined, miss / np.maximum(extent, 1e-9), np.inf)
+        out[at] = np.where(good & determined, miss / np.maximum(extent, 1e-9), np.inf)
     return out
+
+
+def _stacks_of_planes(ptr: IntArray) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:
+    """:func:`adjust.closed_forms.views.stacks` of the views that have more than three points."""
+    enough = np.flatnonzero(np.diff(ptr) > 3)
+    for which, rows, real in stacks(ptr[enough], np.diff(ptr)[enough]):
+        yield enough[which], rows, real
 
 
 def _poses(x: FloatArray, rays: FloatArray, real: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -122,7 +120,7 @@ def _homographies(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Homographies (b, 3, 3) of points (b, 2, n) to uv (b, 2, n), rms (b,), and whether (b,) they are determined.
 
-    Source as :func:`homography`; the first two rows of h follow linearly from the last, the vector of length one with
+    Source as :func:`homographies`; the first two rows of h follow linearly from the last, the vector of length one with
     the least algebraic error (Harker and O'Leary, Computation of homographies, BMVC 2005).
     """
     x, (sx, mx) = _normalised(xy, real)

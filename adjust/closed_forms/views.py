@@ -13,6 +13,7 @@ from adjust.model import BoolArray, FloatArray, IntArray
 
 _STACK = 8192  # points at a time: what they need stays in the processor's cache
 _ROBUST = 3.0  # times the median offset: where Cauchy's weight is a half
+_ENOUGH = 1e-7  # share of the square sum: what a further step could take off is far less
 _BEHIND = 1e3  # offset of a point behind the camera, more than any in front can be
 
 
@@ -109,7 +110,7 @@ def _ranges(ptr: IntArray, of: IntArray | None) -> tuple[IntArray, IntArray]:
 def _tangents(poses: FloatArray, x: FloatArray, rays: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Tangents (b, n) of the angles between rays and points, and which points (b, n) lie behind."""
     p = poses[:, :3, :3] @ x + poses[:, :3, 3:]
-    depth = (p * rays).sum(axis=1)
+    depth = np.einsum("bcn,bcn->bn", p, rays)
     across = np.linalg.norm(np.cross(p, rays, axis=1), axis=1)
     return across / np.maximum(np.abs(depth), 1e-12), ~(depth > 0)
 
@@ -126,14 +127,14 @@ def _refined(
         N, g, old = _normal_equations(p, depth, r, rays, across, w)
         trial = _moved(poses, _damped(N, g, damping))
         q, trial_depth, e = _offsets(trial, x, rays, across)
-        new = (w * (e**2).sum(axis=1)).sum(axis=1)
+        new = np.einsum("bn,bkn,bkn->b", w, e, e)
         better = new < old
         damping *= np.where(better, 0.1, 30.0)
         for state, found in ((poses, trial), (p, q), (depth, trial_depth), (r, e)):
             np.copyto(state, found, where=better.reshape(-1, *[1] * (state.ndim - 1)))
         out[at] = poses
         # the last digits are reached, or a step that small lowers nothing any more
-        go = np.where(better, old - new > 1e-12 * old, damping <= 1e3)
+        go = np.where(better, old - new > _ENOUGH * old, damping <= 1e3)
         if not go.any():
             break
         if not go.all():
@@ -147,15 +148,15 @@ def _offsets(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Points (b, 3, n) in the camera, depths (b, n) along their rays, and offsets (b, 2, n) rad across them."""
     p = poses[:, :3, :3] @ x + poses[:, :3, 3:]
-    depth = (p * rays).sum(axis=1)
-    r = (across * p[:, :, None]).sum(axis=1) / np.maximum(depth, 1e-12)[:, None]
+    depth = np.einsum("bcn,bcn->bn", p, rays)
+    r = np.einsum("bckn,bcn->bkn", across, p) / np.maximum(depth, 1e-12)[:, None]
     np.copyto(r, _BEHIND, where=~(depth > 0)[:, None])
     return p, depth, r
 
 
 def _cauchy(r: FloatArray, real: FloatArray) -> FloatArray:
     """Weights (b, n) at ``_ROBUST`` times the median offset."""
-    squares = (r**2).sum(axis=1)
+    squares = np.einsum("bkn,bkn->bn", r, r)
     limit = np.maximum(_ROBUST**2 * median(squares, real), 1e-24)
     return np.asarray(1.0 / (1.0 + squares / limit[:, None]))
 
@@ -166,11 +167,13 @@ def _normal_equations(
     """N (b, 6, 6) and g (b, 6) of N step = g, a turn, then a shift, in the camera's frame; the square sums (b,)."""
     b, n = depth.shape
     J = np.empty((b, 7, 2, n))
-    np.subtract(across, r[:, None] * rays[:, :, None], out=J[:, 3:6])
-    J[:, 3:6] /= depth[:, None, None]
+    np.multiply(r[:, None], rays[:, :, None], out=J[:, 3:6])
+    np.subtract(across, J[:, 3:6], out=J[:, 3:6])
+    J[:, 3:6] *= (1.0 / depth)[:, None, None]
     for i in range(3):  # the derivative by a turn is -j [p]x = p x j
         k, m = (i + 1) % 3, (i + 2) % 3
-        J[:, i] = p[:, k, None] * J[:, 3 + m] - p[:, m, None] * J[:, 3 + k]
+        np.multiply(p[:, k, None], J[:, 3 + m], out=J[:, i])
+        J[:, i] -= p[:, m, None] * J[:, 3 + k]
     J[:, 6] = r
     rows = J.reshape(b, 7, 2 * n)
     N = (J * w[:, None, None]).reshape(b, 7, 2 * n) @ np.swapaxes(rows, 1, 2)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from adjust.closed_forms import (
-    homography,
+    homographies,
     plane_misfits,
     plane_poses,
     refine_poses,
@@ -86,7 +86,7 @@ def test_homography_is_the_least_squares_one():
     h = np.array([[800.0, 30.0, 640.0], [-20.0, 780.0, 500.0], [0.1, -0.05, 1.0]])
     p = np.column_stack([xy, np.ones(30)]) @ h.T
     uv = p[:, :2] / p[:, 2:] + rng.normal(0.0, 0.5, (30, 2))
-    found, rms = homography(xy, uv)
+    (found,), (rms,), _ = homographies(xy, uv, np.array([0, 30]))
     theirs = cv2.findHomography(xy, uv, 0)[0]
     np.testing.assert_allclose(found / found[2, 2], theirs, rtol=1e-4, atol=1e-4)
     q = np.column_stack([xy, np.ones(30)]) @ theirs.T
