@@ -61,9 +61,11 @@ def predict(r: Readings, u: Geometry, sign: float, curve: float) -> tuple[FloatA
     value[level] = _heights(r, u, level, A)
     rows = np.flatnonzero(r.kind != HEIGHT)
     factor = np.where(r.kind[rows] == ANGLE, -1.0, 1.0)
-    value[rows] = _sights(r, u, rows, r.to, 1, TO, factor, sign, curve, A)
+    value[rows], A[rows] = _sights(r, u, rows, r.to, 1, TO, factor, sign, curve)
     rows = np.flatnonzero(r.kind == ANGLE)
-    value[rows] += _sights(r, u, rows, r.second, 2, SECOND, np.ones(len(rows)), sign, curve, A)
+    if len(rows):
+        more, by = _sights(r, u, rows, r.second, 2, SECOND, np.ones(len(rows)), sign, curve)
+        value[rows], A[rows] = value[rows] + more, A[rows] + by
     rows = np.flatnonzero(r.kind == DIRECTION)
     value[rows] -= u.orientation[r.orientation[rows]]
     A[rows, ORIENTATION] = -1.0
@@ -106,9 +108,9 @@ def _heights(r: Readings, u: Geometry, rows: IntArray, A: FloatArray) -> FloatAr
 
 def _sights(
     r: Readings, u: Geometry, rows: IntArray, to: IntArray, target: int, to_column: int, factor: FloatArray,
-    sign: float, curve: float, A: FloatArray,
-) -> FloatArray:  # fmt: skip
-    """``factor`` times the values of the sights of ``rows`` to the positions ``to``, and their derivatives into A.
+    sign: float, curve: float,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """``factor`` times the values (m,) of the sights of ``rows`` to the positions ``to``, and their derivatives (m, 22).
 
     target: column of the target's height.
     """
@@ -119,24 +121,23 @@ def _sights(
     d = u.X[b] + h_b * up_b - u.X[a] - offset
     q = _times(F, d)
     value, g = _shape(kind, sign, q)
+    A = np.zeros((len(rows), N_COLUMNS))
     zenith = np.flatnonzero(kind == ZENITH)
     h = np.hypot(q[zenith, 0], q[zenith, 1])
     bend = u.instrument[r.instrument[rows[zenith]], 2] * curve
     value[zenith] -= bend * h
-    A[rows[zenith], INSTRUMENT + 2] -= factor[zenith] * curve * h
+    A[zenith, INSTRUMENT + 2] -= factor[zenith] * curve * h
     g[zenith, :2] -= (bend / np.where(h > 0.0, h, np.inf))[:, None] * q[zenith, :2]
     g *= factor[:, None]
     w = _times(back, g)
-    A[rows, AT : AT + 3] -= w
-    A[rows, to_column : to_column + 3] += w
-    A[rows, CENTRING : CENTRING + 3] -= g
+    A[:, AT : AT + 3], A[:, to_column : to_column + 3], A[:, CENTRING : CENTRING + 3] = -w, w, -g
     turn = np.cross(w, d + offset)
     on_body, levelled = np.flatnonzero(body >= 0), np.flatnonzero(body < 0)
-    A[rows[on_body], BODY : BODY + 3] += _times(F[on_body], turn[on_body])
-    _add_turn(horizon, a[levelled], turn[levelled], rows[levelled], AT, A)
+    A[on_body, BODY : BODY + 3] = _times(F[on_body], turn[on_body])
+    _add_turn(horizon, a[levelled], turn[levelled], levelled, AT, A)
     raised = np.flatnonzero(h_b[:, 0])
-    _add_turn(horizon, b[raised], np.cross(h_b * up_b, w)[raised], rows[raised], to_column, A)
-    return np.asarray(factor * value)
+    _add_turn(horizon, b[raised], np.cross(h_b * up_b, w)[raised], raised, to_column, A)
+    return factor * value, A
 
 
 def _add_turn(h: Horizon, at: IntArray, turn: FloatArray, rows: IntArray, column: int, A: FloatArray) -> None:
@@ -165,4 +166,4 @@ def _shape(kind: IntArray, sign: float, q: FloatArray) -> tuple[FloatArray, Floa
 
 def _times(A: FloatArray, x: FloatArray) -> FloatArray:
     """A x of matrices (n, i, j) and vectors (n, j)."""
-    return np.asarray((A @ x[:, :, None])[:, :, 0])
+    return np.einsum("nij,nj->ni", A, x)

@@ -23,7 +23,7 @@ _ANGLES = ("direction", "angle", "zenith", "azimuth")
 def influences(batch: TerrestrialBatch, tree: TreeCovariance) -> FloatArray:
     """Whitened a Q a' (N,) of all readings; the batch serves its rows unweighted. Order of ``Survey.readings``."""
     chunks = batch.layout.chunks
-    rows, keys = (np.array(n, dtype=np.int64) for n in zip(*((len(c.rows), len(c.keys)) for c in chunks), strict=True))
+    rows, keys = np.array([(len(c.rows), len(c.keys)) for c in chunks], dtype=np.int64).reshape(-1, 2).T
     of = np.repeat(np.arange(len(chunks)), keys)
     key = np.array([tree.number[k] for chunk in chunks for k in chunk.keys], dtype=np.int64)
     dim = np.array([d for chunk in chunks for d in chunk.dims], dtype=np.int64)
@@ -35,8 +35,10 @@ def influences(batch: TerrestrialBatch, tree: TreeCovariance) -> FloatArray:
     i = np.repeat(np.arange(len(key)), number)
     j = first[of[i]] + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
     found, lost, blocks = np.zeros(int(rows.sum())), np.zeros(len(chunks), dtype=np.bool_), _Blocks(tree.arrays())
-    for m, da, db in np.unique(np.stack([rows[of[i]], dim[i], dim[j]]), axis=1).T.tolist():
-        e = np.flatnonzero((rows[of[i]] == m) & (dim[i] == da) & (dim[j] == db))
+    most = int(dim.max(initial=0)) + 1
+    kinds, kind = np.unique((rows[of[i]] * most + dim[i]) * most + dim[j], return_inverse=True)
+    for n, shape in enumerate(kinds.tolist()):
+        e, (m, da), db = np.flatnonzero(kind == n), divmod(shape // most, most), shape % most
         Q, there = blocks(key[i[e]], key[j[e]], da, db)
         lost[of[i[e[~there]]]] = True
         A, B = (batch.J[at[k[e], None] + np.arange(m * d)].reshape(-1, m, d) for k, d in ((i, da), (j, db)))
