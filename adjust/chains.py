@@ -7,16 +7,16 @@ forward link i reaches T through ``Ad((A_{i+1} ... A_n)^-1)``; of an inverted li
 
 import numpy as np
 
-from adjust.closed_forms.rigid import skew
 from adjust.model import BoolArray, FloatArray, IntArray
 
 
 def adjoint_of_inverse(R: FloatArray, t: FloatArray) -> FloatArray:
     """Ad(T^-1) (n, 6, 6) of motions T = (R, t), R (n, 3, 3) and t (n, 3)."""
     out = np.zeros((len(R), 6, 6))
-    back = np.swapaxes(R, 1, 2)
-    out[:, :3, :3] = out[:, 3:, 3:] = back
-    np.matmul(-back, skew(t), out=out[:, 3:, :3])
+    out[:, :3, :3] = out[:, 3:, 3:] = np.swapaxes(R, 1, 2)
+    for i in range(3):  # -R' [t]x has the rows t x (column of R)
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[:, 3:, i] = t[:, j, None] * R[:, k] - t[:, k, None] * R[:, j]
     return out
 
 
@@ -41,9 +41,10 @@ def evaluate_chains(
         before_R, before_t = R[some], t[some]
         R[some] = now_R = Ra @ before_R
         t[some] = now_t = (Ra @ before_t[:, :, None])[:, :, 0] + both_t[pose_of[link]]
-        by = adjoint_of_inverse(np.where(inverse[:, None, None], now_R, before_R),
-                                np.where(inverse[:, None], now_t, before_t))  # fmt: skip
-        C[link] = np.where(inverse, -1.0, 1.0)[:, None, None] * by
+        before_R[inverse], before_t[inverse] = now_R[inverse], now_t[inverse]
+        by = adjoint_of_inverse(before_R, before_t)
+        by[inverse] *= -1.0
+        C[link] = by
     return R, t, C
 
 
