@@ -201,7 +201,8 @@ def _to_front(directions: FloatArray) -> FloatArray:
     """The smallest rotations (b, 3, 3) that turn directions (b, 3), not nearly backwards, to +z."""
     x, y, z = directions.T / np.linalg.norm(directions, axis=1)
     k = 1.0 / (1.0 + z)
-    return np.array([[1.0 - x * x * k, -x * y * k, -x], [-x * y * k, 1.0 - y * y * k, -y], [x, y, z]]).transpose(2, 0, 1)
+    rows = [1.0 - x * x * k, -x * y * k, -x], [-x * y * k, 1.0 - y * y * k, -y], [x, y, z]
+    return np.array(rows).transpose(2, 0, 1)
 
 
 def _infinitesimal(H: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from adjust.closed_forms import intersect, inverse
-from adjust.initial.network import ChainObservation, PoseNetwork
 from adjust.initial import views as single
+from adjust.initial.network import ChainObservation, PoseNetwork
 from adjust.initial.views import View, block_text, make_views, refine_views, used_rows
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.unknowns import Chain

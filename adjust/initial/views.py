@@ -146,7 +146,8 @@ def refine_views(views: Sequence[View], iterations: int = 8) -> list[View]:
     if not views:
         return []
     ptr = np.cumsum([0] + [len(v.x) for v in views])
-    of, poses = np.repeat(np.arange(len(views)), [len(v.poses) for v in views]), np.concatenate([v.poses for v in views])
+    of = np.repeat(np.arange(len(views)), [len(v.poses) for v in views])
+    poses = np.concatenate([v.poses for v in views])
     x, rays = np.concatenate([v.x for v in views]), np.concatenate([v.rays for v in views])
     rows, few_ptr = _samples(views)
     poses = refine_poses(poses, x[rows], rays[rows], few_ptr, iterations, True, of)
@@ -175,8 +176,10 @@ def _with_poses(
 
 
 def _likeliest(seen: Sequence[View | Sight], error: FloatArray, in_front: BoolArray, of: IntArray) -> IntArray:
-    """Of candidates (K,) of the views ``of`` (K,) those in front that come near the best, or else the best: the best
-    first, view by view. error: (K,) rad."""
+    """Of candidates (K,) of the views ``of`` (K,) the best, and those in front that come near it, if it is.
+
+    View by view, the best first. error: (K,) rad.
+    """
     order = np.lexsort((error, ~in_front, of))
     of, error, in_front = of[order], error[order], in_front[order]
     first = np.diff(of, prepend=-1) > 0

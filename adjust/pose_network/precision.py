@@ -140,7 +140,7 @@ class NetworkPrecision:
         scatter, own = B @ Q @ np.swapaxes(B, 1, 2), J @ Q @ np.swapaxes(J, 1, 2)
         sign = np.where(network.used, -1.0, 1.0)[:, None, None]
         # a row of the whitening that is zero was not measured
-        Qvv = sign * (W @ scatter @ np.swapaxes(W, 1, 2)) + W.any(axis=2)[:, :, None] * np.eye(d)
+        Qvv = sign * (W @ scatter @ np.swapaxes(W, 1, 2)) + np.any(W, axis=2)[..., None] * np.eye(d)
         white = np.einsum("nij,nj->ni", W, residual)
         test, freedom = _quadratic(Qvv, white)
         with np.errstate(invalid="ignore"):

@@ -54,7 +54,8 @@ def meeting_stations(ways: _Ways) -> list[int]:
     heap = [(-d, v) for v, d in enumerate(degree)]
     heapq.heapify(heap)
     gone = [d < 2 for d in degree]
-    stack, out = [v for v, dead in enumerate(gone) if dead], []
+    stack = [v for v, dead in enumerate(gone) if dead]
+    out: list[int] = []
     while True:
         while stack:
             for w, _ in ways[stack.pop()]:

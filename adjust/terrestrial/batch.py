@@ -13,7 +13,7 @@ from adjust.terrestrial import equations as k
 from adjust.terrestrial.layout import Chunk, Layout, ReadingArrays
 from adjust.terrestrial.parameters import TerrestrialParameters
 from adjust.unknowns import VectorMap
-from adjust.vertical import Horizon, Plumb
+from adjust.vertical import Horizon
 
 
 class TerrestrialBatch:

@@ -40,8 +40,11 @@ class Readings:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Values by number: positions X (P, 3) and the horizon at each, axes of bodies (., 3, 3), orientations (.,),
-    centring errors (., 3) and instruments (., 4)."""
+    """Present values by number.
+
+    X (P, 3): positions, and the horizon at each. body_axes (., 3, 3), orientation (.,), centring (., 3), instrument
+    (., 4): distance offset and scale, refraction, vertical index.
+    """
 
     X: FloatArray
     horizon: Horizon
@@ -110,7 +113,7 @@ def _sights(
     r: Readings, u: Geometry, rows: IntArray, to: IntArray, target: int, to_column: int, factor: FloatArray,
     sign: float, curve: float,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """``factor`` times the values (m,) of the sights of ``rows`` to the positions ``to``, and their derivatives (m, 22).
+    """``factor`` times the values (m,) of the sights of ``rows`` to the positions ``to``, and derivatives A (m, 22).
 
     target: column of the target's height.
     """
@@ -166,4 +169,4 @@ def _shape(kind: IntArray, sign: float, q: FloatArray) -> tuple[FloatArray, Floa
 
 def _times(A: FloatArray, x: FloatArray) -> FloatArray:
     """A x of matrices (n, i, j) and vectors (n, j)."""
-    return np.einsum("nij,nj->ni", A, x)
+    return np.asarray(np.einsum("nij,nj->ni", A, x))
