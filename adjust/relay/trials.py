@@ -8,7 +8,7 @@ import numpy as np
 
 from adjust.model import BoolArray, FloatArray, IntArray
 
-_RUN = 1024  # trials at a time: what they need stays in the processor's cache
+_RUN = 512  # trials at a time: what they need stays in the processor's cache
 
 
 def adjust_trials(
