@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from adjust.closed_forms import intersect, inverse
-from adjust.errors import SurveyError
+from adjust.initial import views as single
 from adjust.initial.network import ChainObservation, PoseNetwork
-from adjust.initial.views import View, block_text, make_view, refine_views, used_rows
+from adjust.initial.views import View, block_text, make_views, refine_views, used_rows
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.unknowns import Chain
 
@@ -76,16 +76,13 @@ def point_field(survey: Survey) -> PointField:
 def resect(network: PoseNetwork, points: PointField) -> bool:
     """Give a pose to the blocks that see enough known points and have none yet; whether there were any."""
     have = {o.block_idx for o in network.observations}
-    views, sights = [], {}
     known = points.known
-    for sight in points.sights:
-        if sight.block_idx in have or not network.unknown_links(sight.chain) or known[sight.rows].sum() < 3:
-            continue
-        try:
-            views.append(_view(sight, points, known))
-            sights[sight.block_idx] = sight
-        except SurveyError:  # on a line, or none in front: other blocks may do
-            continue
+    views = _views(
+        [s for s in points.sights
+         if s.block_idx not in have and network.unknown_links(s.chain) and known[s.rows].sum() >= 3],
+        points,
+    )  # fmt: skip
+    sights = {s.block_idx: s for s in points.sights}
     # three points fit up to four poses exactly: they count only where nothing better is left
     strong = [v for v in views if len(v.x) >= 4]
     if not strong and _resect_together(network, points):
@@ -96,9 +93,13 @@ def resect(network: PoseNetwork, points: PointField) -> bool:
     return bool(views)
 
 
-def _view(sight: Sight, points: PointField, known: BoolArray) -> View:
-    rows = known[sight.rows]
-    return make_view(sight.block_idx, points.x[sight.rows][rows], sight.rays[rows], sight.focal_px)
+def _views(sights: Sequence[Sight], points: PointField) -> list[View]:
+    """Views of the known points; not those on a line, or none in front: other blocks may do."""
+    seen = []
+    for s in sights:
+        rows = points.known[s.rows]
+        seen.append(single.Sight(s.block_idx, points.x[s.rows][rows], s.rays[rows], s.focal_px))
+    return make_views(seen)[0]
 
 
 def _resect_together(network: PoseNetwork, points: PointField) -> bool:
@@ -176,23 +177,17 @@ def intersect_points(network: PoseNetwork, points: PointField, parallax: float, 
 
 def improve(network: PoseNetwork, points: PointField, movable: set[int]) -> None:
     """One round: every block's pose from all points now known, the movable poses from these, and the points again."""
-    views, sights = [], {}
     known = points.known
-    for sight in points.sights:
-        if network.unknown_links(sight.chain) or known[sight.rows].sum() < 4:
-            continue
-        try:
-            view = _view(sight, points, known)
-        except SurveyError:
-            continue
-        present = network.product(sight.chain)[None]
-        views.append(replace(view, poses=np.concatenate([present, view.poses])))
-        sights[sight.block_idx] = sight
+    placed = [s for s in points.sights if not network.unknown_links(s.chain) and known[s.rows].sum() >= 4]
+    sights = {s.block_idx: s for s in placed}
+    found = _views(placed, points)
+    present = network.products([sights[v.block_idx].chain for v in found])
+    views = [replace(v, poses=np.concatenate([at[None], v.poses])) for v, at in zip(found, present, strict=True)]
     renewed = {
         v.block_idx: ChainObservation(sights[v.block_idx].chain, v.poses, sights[v.block_idx].text, v.block_idx)
         for v in refine_views(views)
     }
     network.observations = [renewed.pop(o.block_idx, o) for o in network.observations] + list(renewed.values())
-    touched = {link.slot for sight in sights.values() for link in sight.chain}
+    touched = {link.slot for view in views for link in sights[view.block_idx].chain}
     network.relax(movable & touched)
     intersect_points(network, points, PARALLAX[1], renew=True)

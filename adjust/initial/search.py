@@ -3,8 +3,7 @@
 import numpy as np
 from gtsam import Pose3
 
-from adjust.closed_forms import align, rigid
-from adjust.closed_forms.view_kernels import offsets_of_views
+from adjust.closed_forms import align, rigid, view_offsets
 from adjust.errors import SurveyError
 from adjust.geometry.building import frame_refs, position_refs
 from adjust.initial.gauge import fix_one_gauge, frames_of, world_is_free
@@ -31,7 +30,6 @@ from adjust.initial.views import (
 )
 from adjust.model import FloatArray, Survey
 from adjust.observations import ImageBlock, PositionRef
-from adjust.parallel import run_split, split_blocks
 from adjust.result import ParameterName
 from adjust.terrestrial.building import reading_refs
 from adjust.unknowns import Chain, FrameTree, Unknowns
@@ -320,10 +318,8 @@ class _Search:
         seen = [self.views.get(i) or sights[i] for i in blocks]
         x = [s.x if isinstance(s, View) else self.points.x[s.rows] for s in seen]
         ptr = np.cumsum([0] + [len(part) for part in x])
-        offsets, medians = np.empty(int(ptr[-1])), np.empty(len(blocks))
         poses = self.network.products([self.chains[i] for i in blocks])
-        rays = np.concatenate([s.rays for s in seen])
-        run_split(offsets_of_views, split_blocks(ptr), poses, np.concatenate(x), rays, ptr, offsets, medians)
+        medians = view_offsets(poses, np.concatenate(x), np.concatenate([s.rays for s in seen]), ptr)[1]
         # the median of a circular normal's radius is 1.18 sigma, its rms 1.41 sigma
         rms[blocks] = 1.2 * np.array([s.focal_px for s in seen]) * medians
         return rms

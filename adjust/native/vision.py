@@ -4,7 +4,7 @@ The formulas are in ``corners.h``, ``spots.h``, ``fits.h`` and ``rendering.h``. 
 pixel is (0, 0).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -89,7 +89,7 @@ def corner_rows(xy: FloatArray, p: FloatArray, crossing: bool) -> tuple[FloatArr
 
 
 def fit_spots(
-    gray: Gray, labels: IntArray, saturation: float, start: FloatArray, label: IntArray, diameter: FloatArray,
+    gray: Gray, labels: npt.NDArray[np.integer[Any]], saturation: float, start: FloatArray, label: IntArray, diameter: FloatArray,
     peak: FloatArray, background: FloatArray,
 ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, IntArray]:  # fmt: skip
     """Fit each spot with both profiles and keep the better one.

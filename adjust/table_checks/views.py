@@ -12,10 +12,11 @@ from adjust.closed_forms.rigid import skew
 from adjust.errors import SurveyError
 from adjust.initial.lenses import Sighting, start_lens
 from adjust.initial.views import (
+    Sight,
     View,
     all_rays,
     focal_px,
-    make_view,
+    make_views,
     refine_views,
     target_points,
     untrustworthy,
@@ -175,17 +176,15 @@ def poses_of_views(survey: Survey) -> dict[int, View]:
         seen = [Sighting(i, targets[str(b.target_id)][b.point_idx[used_rows(b)]], b.uv[used_rows(b)]) for i, b in mine]
         lenses[camera_id] = start_lens(cameras[camera_id], [s for s in seen if len(s.x)]).values
     rays, _ = all_rays(survey, lenses)
-    views = []
+    sights = []
     for i, block in enumerate(survey.image_blocks):
         used = used_rows(block)
         if i in rays and used.sum() >= 3:
             x = targets[str(block.target_id)][block.point_idx[used]]
-            try:
-                focal = focal_px(cameras[block.camera_id], lenses[block.camera_id])
-                views.append(make_view(i, x, rays[i][used], focal))
-            except SurveyError:  # no pose: the search for start values names the block
-                continue
-    refined = refine_views(views)
+            focal = focal_px(cameras[block.camera_id], lenses[block.camera_id])
+            sights.append(Sight(i, x, rays[i][used], focal))
+    # those without a pose are named by the search for start values
+    refined = refine_views(make_views(sights)[0])
     reasons, _ = untrustworthy(refined, survey)
     return {v.block_idx: v for v in refined if v.block_idx not in reasons}
 

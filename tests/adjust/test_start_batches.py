@@ -1,13 +1,12 @@
-"""The kernels of the start against what they replace: one pose at a time, and plain sums over rows."""
+"""What the start does for all views at once, against one pose at a time, and plain sums over rows."""
 
 import numpy as np
 import pytest
 
-from adjust.closed_forms import absolute_pose, rigid, rotation_exp
-from adjust.closed_forms.absolute_pose import best_poses
+from adjust.closed_forms import absolute_pose, best_poses, rigid, rotation_exp
 from adjust.closed_forms.rigid import skew
 from adjust.errors import SurveyError
-from adjust.initial.refinement_kernels import lens_and_poses
+from adjust.initial.lens_refinement import lens_and_poses
 
 
 def seen(x, pose, rng):
@@ -42,8 +41,7 @@ def test_normal_equations_are_the_sums_over_their_rows():
     ptr, m = np.array([0, 4, 4, 9]), 3
     p, r, w = rng.normal(size=(9, 3)), rng.normal(size=(9, 2)), rng.uniform(0.1, 1.0, 9)
     a, by_point = rng.normal(size=(9, 2, m)), rng.normal(size=(9, 2, 3))
-    out = (np.zeros((m, m)), np.zeros((3, 6, m)), np.zeros((3, 6, 6)), np.zeros(m), np.zeros((3, 6)))
-    lens_and_poses(ptr, p, r, a, by_point, w, *out)
+    out = lens_and_poses(ptr, p, r, a, by_point, w)
     rows = np.zeros((18, m + 18))
     for i, view in enumerate(np.repeat([0, 1, 2], np.diff(ptr))):
         # camera_from_target moves by turn, then shift, in the camera: dp = turn x p + shift
