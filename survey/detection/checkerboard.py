@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from adjust.model import BoolArray, FloatArray
+from survey.detection.bent_edges import unbent
 from survey.detection.corners import CornerFit, refine_corners
 from survey.detection.gray import Gray8, Gray32, reduced
 from survey.detection.results import Detection, nothing_found
@@ -45,6 +46,8 @@ def _measured(gray: Gray32, gray8: Gray8, rough: FloatArray) -> Detection:
     keep = fit.good & _on_grid(fit, grid.shape[:2]) if fit.good.sum() >= needed else fit.good
     if keep.sum() < needed:
         return nothing_found(f"board found, but only {int(keep.sum())} of {keep.size} corners could be measured")
+    row, column = np.divmod(np.arange(keep.size), grid.shape[1])
+    fit = unbent(fit, np.stack([column, row], axis=1).astype(float), keep)
     notes: tuple[str, ...] = ()
     if not keep.all():
         notes += (f"{int((~keep).sum())} of {keep.size} corners were not sharp or not free",)

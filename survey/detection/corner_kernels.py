@@ -18,6 +18,7 @@ from adjust.model import FloatArray, IntArray
 from survey.detection.solve_kernels import put_state, scaled_solve
 
 N_PARAMETERS = 9  # u, v, angle 1, angle 2, level, step, log(blur), slope u, slope v
+ENOUGH_FOR_SLOPES = 45  # pixels from which the last two are free
 _FAR = 4.5  # standard deviations beyond which an edge no longer bends the other one's profile (by 1e-5)
 _OUT = 6.0  # standard deviations beyond which an edge is not seen at all (1e-9)
 _FRAME = 28  # length of what does not change from pixel to pixel, see _frame
@@ -264,7 +265,7 @@ def fit_corners(
         n = _window(image, cu, cv, p, shapes[c], crossing, offsets, values)
         pixels[c] = n
         # slopes of the illumination need a window that is large enough to tell them from the corner's own form
-        n_free = 9 if n >= 45 else 7
+        n_free = 9 if n >= ENOUGH_FOR_SLOPES else 7
         if n < 20:
             status[c] = 1 if n < 0 else 2
             continue
