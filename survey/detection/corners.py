@@ -11,9 +11,10 @@ from adjust.model import BoolArray, FloatArray, IntArray
 from survey.detection.corner_kernels import ENOUGH_FOR_SLOPES, N_PARAMETERS, fit_corners
 
 # Edges are taken for straight lines. What bending by the lens does where it cannot be told from the other corners
-# (see ``survey.detection.bent_edges``): measured on noiseless renderings with k1 = -0.2 (tests/survey/test_detection.py).
-CROSSING_FLOOR_PX = 0.002
-MARKER_FLOOR_PX = 0.003
+# (see ``survey.detection.bent_edges``), and what remains of images without noise where it can: both measured on
+# renderings with k1 = -0.2 (tests/survey/test_detection.py, test_detection_sigmas.py).
+CROSSING_BENT_PX, MARKER_BENT_PX = 0.002, 0.003
+CROSSING_FLOOR_PX, MARKER_FLOOR_PX = 0.0002, 0.0005
 _PIXEL_VARIANCE = 1.0 / 12.0
 _ROUGH_PX, _FINE_PX = 1e-2, 2e-5  # where the first and the second fit may stop
 
@@ -67,14 +68,13 @@ def refine_corners(
     total_blur = np.exp(p[:, 6])
     lens_blur = np.sqrt(np.maximum(total_blur**2 - _PIXEL_VARIANCE, 0.0))
     length = np.maximum(shapes[:, :1], shapes[:, 2:])
-    seen = 2.0 * length if crossing else length
-    cov = _student(cov, pixels) + _sampling_cov(lens_blur, p[:, 2:4], seen)
+    floor, bent = (CROSSING_FLOOR_PX, CROSSING_BENT_PX) if crossing else (MARKER_FLOOR_PX, MARKER_BENT_PX)
+    cov = _student(cov, pixels) + _sampling_cov(lens_blur, p[:, 2:4], length, crossing) + floor**2 * np.eye(2)
     good = (status == 0) & again & (rms < 0.2 * contrast) & (np.trace(cov, axis1=1, axis2=2) < 1.0)
     good &= total_blur < np.maximum(0.5 * shapes[:, [0, 2, 3]].max(1), 1.0)
     # means of the parabola x^2 / 2: over both sides of the corner, and where it begins if there is but one side
     bend = length**2 / 6.0 if crossing else -(length**2) / 12.0
-    floor = CROSSING_FLOOR_PX if crossing else MARKER_FLOOR_PX
-    return CornerFit(p[:, :2], cov, lens_blur, contrast, good, p[:, 2:4], bend, floor)
+    return CornerFit(p[:, :2], cov, lens_blur, contrast, good, p[:, 2:4], bend, bent)
 
 
 def _student(cov: FloatArray, pixels: IntArray) -> FloatArray:
@@ -83,20 +83,30 @@ def _student(cov: FloatArray, pixels: IntArray) -> FloatArray:
     return cov * (redundancy / np.maximum(redundancy - 2.0, 1.0))[:, None, None]
 
 
-def _sampling_cov(blur: FloatArray, angles: FloatArray, seen: FloatArray) -> FloatArray:
+def _sampling_cov(blur: FloatArray, angles: FloatArray, length: FloatArray, crossing: bool) -> FloatArray:
     """What pixels do to sharp edges along their rows and columns, (n, 2, 2) px^2.
 
     A pixel's square is taken for a Gaussian of equal variance. The difference has a harmonic at one period a pixel,
     which displaces the edge by as much, periodically with its place; an oblique edge averages it over the pixels that
-    it passes. blur: (n,) px of the lens; angles: (n, 2) rad; seen: (n, 2) px of each edge in the window.
+    it passes. blur: (n,) px of the lens; angles: (n, 2) rad; length: (n, 1 or 2) px of the edges in the window, on
+    each side of a crossing.
     """
     slope = np.minimum(np.abs(np.sin(angles)), np.abs(np.cos(angles)))
+    periods = length * slope
     nodes, amplitude = _sampling_table()
-    displaced = np.interp(blur, nodes, amplitude)[:, None] * np.sinc(seen * slope) / np.sqrt(2.0)
+    averaged = np.sinc(2.0 * periods) if crossing else _at_the_end(periods)
+    displaced = np.interp(blur, nodes, amplitude)[:, None] * averaged / np.sqrt(2.0)
     normals = np.stack([-np.sin(angles), np.cos(angles)], axis=2)
     parallel = np.abs(np.linalg.det(normals)) < 1e-3
     back = np.linalg.inv(np.where(parallel[:, None, None], np.eye(2), normals)) * displaced[:, None, :]
     return np.asarray(back @ back.transpose(0, 2, 1))
+
+
+def _at_the_end(periods: FloatArray) -> FloatArray:
+    """Amplitude at 0 of the straight line fitted over (0, 1) to a unit sine of that many periods."""
+    w = 2j * np.pi * np.maximum(periods, 1e-4)
+    end = np.exp(w)
+    return np.asarray(np.abs(4.0 * (end - 1.0) / w - 6.0 * (end / w - (end - 1.0) / w**2)))
 
 
 @lru_cache(maxsize=1)
