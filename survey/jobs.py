@@ -33,6 +33,7 @@ from survey.quantities import scale_of
 from survey.replacing import changing, replace_parts
 from survey.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, solution_dict, summary_text
 from survey.statistics import Statistics, statistics_of
+from survey.symmetric_boards import consistent_turns
 from survey.targets import DetectableTarget, PointList
 
 if TYPE_CHECKING:  # brings in OpenCV, which a folder that is detected already does without
@@ -275,16 +276,18 @@ def adjust_project(project: Project, progress: bool) -> Adjustment:
             "into observations/"
         )
     options = AdjustOptions(project.options.alpha, project.options.reject_blocks, project.options.reject_points)
+    survey, turned = consistent_turns(survey, project.target_kinds)
+    project = replace(project, survey=survey)
     with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
 
         def step(_iteration: int, omega: float) -> None:
             bar.set_postfix_str(f"v'Pv = {omega:.6g}")
             bar.update()
 
-        notes: tuple[str, ...] = ()
+        notes = turned
         if project.spots:
             found = _identify(project, options, step)
-            notes = found.notes
+            notes += found.notes
             if found.unidentified:
                 notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
             survey = replace(survey, image_blocks=survey.image_blocks + found.blocks)
