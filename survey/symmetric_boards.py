@@ -136,9 +136,7 @@ def _undecided(survey: Survey, symmetric: _Symmetric) -> tuple[str, ...]:
         cameras = list(dict.fromkeys(survey.image_blocks[i].camera_id for i in mine))
         for camera in cameras[1:]:
             base = base or find_start(survey)
-            turned = _renamed(
-                survey, symmetric, {i: 1 for i in mine if survey.image_blocks[i].camera_id == camera}
-            )
+            turned = _renamed(survey, symmetric, {i: 1 for i in mine if survey.image_blocks[i].camera_id == camera})
             other = _start(turned)
             if other is not None and not _better(base, other):
                 notes.append(

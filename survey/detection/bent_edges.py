@@ -40,9 +40,7 @@ def unbent(fit: CornerFit, xy: FloatArray, keep: BoolArray) -> CornerFit:
     return replace(fit, uv=fit.uv - shift, cov=fit.cov + cov)
 
 
-def _bending(
-    uv: FloatArray, xy: FloatArray
-) -> tuple[FloatArray, float, FloatArray, FloatArray, float] | None:
+def _bending(uv: FloatArray, xy: FloatArray) -> tuple[FloatArray, float, FloatArray, FloatArray, float] | None:
     """Centre, scale, coefficients (k, 2) px of a polynomial of the place, their cofactors (k, k) and variance px^2."""
     if len(uv) < 4:
         return None
@@ -59,7 +57,7 @@ def _bending(
         unit_cov = np.linalg.inv(A.T @ A)
         coefficients = unit_cov @ A.T @ left
         variance = float(((left - A @ coefficients) ** 2).sum() / (2 * (len(uv) - n_terms)))
-        return centre, scale, coefficients, unit_cov, variance
+        return np.asarray(centre), scale, np.asarray(coefficients), np.asarray(unit_cov, float), variance
     return None
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model import BoolArray, FloatArray
 from survey.detection.corner_kernels import ENOUGH_FOR_SLOPES, N_PARAMETERS, fit_corners
 
 # Edges are taken for straight lines. What bending by the lens does where it cannot be told from the other corners
@@ -77,10 +77,10 @@ def refine_corners(
     return CornerFit(p[:, :2], cov, lens_blur, contrast, good, p[:, 2:4], bend, bent)
 
 
-def _student(cov: FloatArray, pixels: IntArray) -> FloatArray:
+def _student(cov: FloatArray, pixels: FloatArray) -> FloatArray:
     """Covariances (n, 2, 2) whose noise comes from few residuals: those of Student's distribution, not its scale's."""
     redundancy = pixels - np.where(pixels >= ENOUGH_FOR_SLOPES, N_PARAMETERS, N_PARAMETERS - 2)
-    return cov * (redundancy / np.maximum(redundancy - 2.0, 1.0))[:, None, None]
+    return np.asarray(cov * (redundancy / np.maximum(redundancy - 2.0, 1.0))[:, None, None])
 
 
 def _sampling_cov(blur: FloatArray, angles: FloatArray, length: FloatArray, crossing: bool) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Whether a grid of corners is a whole board: of neighbouring squares, and not going on beyond the edge it was given."""
+"""Whether a grid of corners is a whole board: of neighbouring squares, and ending where it was said to end."""
 
 import cv2
 import numpy as np

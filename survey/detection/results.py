@@ -33,9 +33,7 @@ class Detection:
         return len(self.point_idx)
 
 
-def nothing_found(
-    reason: str, notes: tuple[str, ...] = (), other_size: tuple[int, int] | None = None
-) -> Detection:
+def nothing_found(reason: str, notes: tuple[str, ...] = (), other_size: tuple[int, int] | None = None) -> Detection:
     """An empty detection."""
     none = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2))
     return Detection(*none, notes=notes, reason=reason, other_size=other_size)
