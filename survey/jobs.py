@@ -23,6 +23,7 @@ from adjust.model import IntArray, Survey
 from adjust.observations import ImageBlock
 from adjust.result import Adjustment
 from adjust.statistics.cleaned import adjust_cleaned
+from survey.board_sizes import wrong_sizes
 from survey.checked import checked
 from survey.cleaning import clean_options
 from survey.files import Definition, Project, SpotBlock, read, read_definition, write_image_points, write_spots
@@ -32,6 +33,7 @@ from survey.quantities import USUAL, scale_of
 from survey.replacing import changing, replace_parts
 from survey.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, solution_dict, summary_text
 from survey.statistics import Statistics, statistics_of
+from survey.symmetric_boards import consistent_turns
 from survey.targets import DetectableTarget, PointList
 
 if TYPE_CHECKING:  # brings in OpenCV, which a folder that is detected already does without
@@ -43,11 +45,12 @@ _PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-head
 
 @dataclass(frozen=True)
 class DetectOutcome:
-    """What detection did: one report per image, and the files written."""
+    """What detection did: one report per image, and the files written. wrong_sizes: by target id, said once each."""
 
     folder: Path
     reports: "tuple[ImageReport, ...]"
     paths: tuple[Path, ...]
+    wrong_sizes: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def messages(self) -> tuple[str, ...]:
@@ -56,8 +59,13 @@ class DetectOutcome:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """The lines of the images in which nothing was found, or that could not be read."""
-        return tuple(m for m, r in zip(self.messages, self.reports, strict=True) if r.status != "found")
+        """Boards of a wrong size; then the images in which nothing was found for another reason, or not readable."""
+        lines = (m for m, r in zip(self.messages, self.reports, strict=True) if r.status != "found" and self._news(r))
+        return (*self.wrong_sizes.values(), *lines)
+
+    def _news(self, report: "ImageReport") -> bool:
+        missed = {t for t, d in report.detections.items() if not len(d)}
+        return report.status == "failed" or not missed or not missed <= self.wrong_sizes.keys()
 
     def summary(self) -> dict[str, Any]:
         """Counts as plain values."""
@@ -69,6 +77,7 @@ class DetectOutcome:
             "failed": sum(r.status == "failed" for r in self.reports),
             "image_points": sum(len(d) for r in self.reports for d in r.detections.values()),
             "spots": sum(len(r.spots) for r in self.reports if r.spots is not None),
+            "warnings": list(self.wrong_sizes.values()),
             "written": [str(p) for p in self.paths],
         }
 
@@ -134,7 +143,10 @@ def _detect(folder: Path, place: Path, jobs: int | None, pictures: bool, progres
         )
     reports = detect_images(tasks, jobs=jobs, progress=progress, pictures=place / PICTURES if pictures else None)
     blocks, spots = _blocks(definition, reports)
+    wrong = wrong_sizes(folder, definition, reports)
     if not blocks and not spots:
+        if wrong:
+            raise SurveyError("\n".join(wrong.values()))
         lines = "\n".join(f"  {r.path}: {r.message}" for r in reports[:10])
         raise SurveyError(f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}")
     # an empty table is written too: one of an earlier run must not stay behind
@@ -142,7 +154,7 @@ def _detect(folder: Path, place: Path, jobs: int | None, pictures: bool, progres
     files += [write_spots(place, spots)] if definition.spots_request is not None else []
     names = [path.relative_to(place) for path in files]
     replace_parts(folder, gone=[name.with_suffix(".parquet").as_posix() for name in names])
-    return DetectOutcome(folder, tuple(reports), tuple(folder / name for name in names))
+    return DetectOutcome(folder, tuple(reports), tuple(folder / name for name in names), wrong)
 
 
 def _tasks(definition: Definition) -> "Iterator[DetectionTask]":
@@ -264,16 +276,18 @@ def adjust_project(project: Project, progress: bool) -> Adjustment:
             "into observations/"
         )
     options = AdjustOptions(project.options.alpha, project.options.reject_blocks, project.options.reject_points)
+    survey, turned = consistent_turns(survey, project.target_kinds)
+    project = replace(project, survey=survey)
     with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
 
         def step(_iteration: int, omega: float) -> None:
             bar.set_postfix_str(f"v'Pv = {omega:.6g}")
             bar.update()
 
-        notes: tuple[str, ...] = ()
+        notes = turned
         if project.spots:
             found = _identify(project, options, step)
-            notes = found.notes
+            notes += found.notes
             if found.unidentified:
                 notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
             survey = replace(survey, image_blocks=survey.image_blocks + found.blocks)

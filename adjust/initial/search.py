@@ -1,9 +1,12 @@
 """From a survey to start values: lenses, the pose of every view, then the network of frames and points."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import numpy as np
 from gtsam import Pose3
 
-from adjust.closed_forms import align, rigid, view_offsets
+from adjust.closed_forms import align, pose_distance, rigid, view_offsets
 from adjust.errors import SurveyError
 from adjust.geometry.building import frame_refs, position_refs
 from adjust.initial.gauge import fix_one_gauge, frames_of, world_is_free
@@ -58,11 +61,34 @@ def find_start(survey: Survey) -> Start:
     return search.result()
 
 
-class _Search:
-    """The state of one search."""
+def turns_of_views(survey: Survey, turned: Mapping[str, FloatArray]) -> dict[int, int]:
+    """How the target of each block must be turned to agree with the other blocks, by position in ``image_blocks``.
 
-    def __init__(self, survey: Survey) -> None:
+    turned: by target id the motions (m, 4, 4) target_from_turned after which the target looks the same. 0 for a block
+    that is named as the others are, else 1 + the position of the motion; no entry where nothing tells.
+    Raises SurveyError as :func:`find_start`.
+    """
+    search = _Search(survey, turned)
+    search.find_lenses()
+    search.find_views()
+    search.solve()
+    out = {}
+    for i, view in search.views.items():
+        motions = turned.get(str(survey.image_blocks[i].target_id))
+        if motions is None or search.network.unknown_links(search.chains[i]):
+            continue
+        camera_from_target = search.network.product(search.chains[i])
+        away = pose_distance(search.alternatives(i, view.poses), camera_from_target, search.network.lever)
+        out[i] = int(np.argmin(away)) // len(view.poses)
+    return out
+
+
+class _Search:
+    """The state of one search. turned: see :func:`turns_of_views`."""
+
+    def __init__(self, survey: Survey, turned: Mapping[str, FloatArray] = MappingProxyType({})) -> None:
         self.survey = survey
+        self.turned = turned
         self.targets = {t.target_id: t for t in survey.targets}
         self.target_x: dict[str, FloatArray] = {}
         self.seen_x: dict[tuple[str, bytes], FloatArray] = {}
@@ -152,10 +178,15 @@ class _Search:
         self.views = {v.block_idx: v for v in refined}
         for i, view in self.views.items():
             text = block_text(self.survey.image_blocks[i])
-            observation = ChainObservation(self.chains[i], view.poses, text, i)
+            observation = ChainObservation(self.chains[i], self.alternatives(i, view.poses), text, i)
             (self.doubtful if i in self.reasons else self.network.observations).append(observation)
         distances = [float(np.linalg.norm(v.poses[0][:3, 3])) for v in refined]
         self.network.lever = float(np.median(distances)) if distances else 1.0
+
+    def alternatives(self, i: int, poses: FloatArray) -> FloatArray:
+        """Poses (k, 4, 4) of a block as named, then after every motion that its target cannot be told from."""
+        motions = self.turned.get(str(self.survey.image_blocks[i].target_id), ())
+        return np.concatenate([poses, *(poses @ motion for motion in motions)])
 
     def solve(self) -> None:
         """Determine all poses and points, the safest first; what floats is set freely one by one."""
