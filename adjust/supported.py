@@ -154,7 +154,7 @@ def _without(survey: Survey, needs: _Needs, lost: Needs) -> Survey:
     def left(items: Iterable[Any], of_each: Iterable[Needs]) -> tuple[Any, ...]:
         return tuple(item for item, mine in zip(items, of_each, strict=True) if not mine & lost)
 
-    others = {name: left(getattr(survey, name), of_each) for name, of_each in needs.others().items()}
+    others: dict[str, Any] = {name: left(getattr(survey, name), of_each) for name, of_each in needs.others().items()}
     kept = replace(survey, image_blocks=left(survey.image_blocks, needs.of_blocks), **others)
     points = {name[1] for name in lost if name[0] == "point"}
     kept = without_named_points(kept, points) if points else kept

@@ -139,12 +139,17 @@ def _in_force(project: Project, names: Sequence[str]) -> list[Name]:
     if not names:
         raise SurveyError(f"{path}: no name of an exclusion is given; name what is to be taken back")
     for text in dict.fromkeys(names):
-        same = [n for n in there if text in (str(n), n.id, f"{n.what}:{n.id}") or n.id.endswith((f"/{text}", f":{text}"))]
+        same = [n for n in there if text in (str(n), n.id, f"{n.what}:{n.id}") or _ends_in(n.id, text)]
         exact = [n for n in same if text in (str(n), f"{n.what}:{n.id}")] or [n for n in same if text == n.id] or same
         if len(exact) > 1:
             raise SurveyError(f"{path}: {text!r} stands for {' and '.join(map(str, exact[:6]))}; name one of them so")
         found.append(exact[0] if exact else _as_found(path, observed, there, text))
     return list(dict.fromkeys(found))
+
+
+def _ends_in(name: str, text: str) -> bool:
+    """Whether a text is the last part of an id."""
+    return name.endswith((f"/{text}", f":{text}"))
 
 
 def _as_found(path: Path, observed: Observed, there: dict[Name, Exclusion], text: str) -> Name:

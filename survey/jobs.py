@@ -5,7 +5,7 @@ import platform
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.errors import IndeterminateError, SurveyError
+from adjust.graph import StartValues
 from adjust.lost_points import without_lost_points
 from adjust.model import IntArray, Survey
 from adjust.observations import ImageBlock
@@ -156,8 +157,11 @@ def made(
     return AdjustOutcome(adjustment, run, solution, paths, found)
 
 
-def adjust_project(project: Project, progress: bool) -> Adjustment:
-    """Adjust what was read. Raises SurveyError."""
+Begin = Callable[[Survey], StartValues | None]
+
+
+def adjust_project(project: Project, progress: bool, begin: Begin = lambda _: None) -> Adjustment:
+    """Adjust what was read. begin: start values of a survey, found where it gives None. Raises SurveyError."""
     survey = project.survey
     observed = (
         survey.image_blocks, project.spots, survey.pairs, survey.distances, survey.coordinates, survey.readings,
@@ -177,7 +181,7 @@ def adjust_project(project: Project, progress: bool) -> Adjustment:
 
         notes: tuple[str, ...] = ()
         if project.spots:
-            found = _identify(project, options, step)
+            found = _identify(project, options, step, begin)
             notes = found.notes
             if found.unidentified:
                 notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
@@ -185,12 +189,14 @@ def adjust_project(project: Project, progress: bool) -> Adjustment:
             survey = _seen_points(survey)
         how = clean_options(project.options)
         survey, lost = supported(survey)
-        result = checked(survey, lambda: without_lost_points(survey, lambda part: adjust_cleaned(part, how, step)))
+        result = checked(
+            survey, lambda: without_lost_points(survey, lambda part: adjust_cleaned(part, how, step, begin(part)))
+        )
     return told(project, survey, replace(result, warnings=result.warnings + notes + lost_notes(lost)))
 
 
 def told(project: Project, given: Survey, adjustment: Adjustment) -> Adjustment:
-    """An adjustment that also says what was noticed when its project was read, and how much of ``given`` it left out."""
+    """An adjustment that says what was noticed when its project was read, and how much of ``given`` it left out."""
     warnings = adjustment.warnings + project.notes + image_warnings(project.detected)
     images = sum(len(b.uv) if b.used is None else int(b.used.sum()) for b in given.image_blocks)
     images -= int(adjustment.image_residuals.used.sum())
@@ -199,10 +205,13 @@ def told(project: Project, given: Survey, adjustment: Adjustment) -> Adjustment:
     return replace(adjustment, warnings=warnings, n_screened=images + others)
 
 
-def _identify(project: Project, options: AdjustOptions, step: Callable[[int, float], None]) -> Identification:
+def _identify(
+    project: Project, options: AdjustOptions, step: Callable[[int, float], None], begin: Begin
+) -> Identification:
     gate = project.spots_request.gate_px if project.spots_request is not None else 15.0
     try:
-        first = adjust(supported(without_points(project.survey))[0], options=options, progress=step)
+        part = supported(without_points(project.survey))[0]
+        first = adjust(part, begin(part), options, step)
     except IndeterminateError as error:
         raise SurveyError(
             f"{project.folder}/observations: the spots cannot be identified, because cameras and stations are not "

@@ -39,8 +39,8 @@ class RunInfo:
 
     date: time stamp, ISO 8601. seconds: duration per step; printed, but in no file, so that equal input gives equal
     files. sigmas: how sigmas of unknowns are given. identification: what the project says of itself (who, where, with
-    what), in its order. command: with its options, as it can be given again. images: by camera/epoch, with their hashes.
-    left_out, n_left_out, n_unused_in_files: as of :class:`survey.files.Project`.
+    what), in its order. command: as it can be given again. images: by camera/epoch, with their hashes. left_out,
+    n_left_out, n_unused_in_files: as of :class:`survey.files.Project`.
     """
 
     folder: str

@@ -14,7 +14,8 @@ def declare_detect(commands: Any, shaped: dict[str, Any]) -> None:
         help="find the targets and beacons in the images of a project folder",
         usage="labsurvey detect lab   (labsurvey detect FOLDER [--all] [--jobs N] [--pictures])",
         description="Looks into images that are new or have changed, replaces their rows in "
-        "FOLDER/observations/image_points.csv,\nand in spots.csv where beacons are asked for. Rows of other images stay.",
+        "FOLDER/observations/image_points.csv,\nand in spots.csv where beacons are asked for. The rows of other "
+        "images stay.",
         epilog="Next: labsurvey adjust FOLDER",
         **shaped,
     )

@@ -20,8 +20,8 @@ def declare_exclude(commands: Any, shaped: dict[str, Any]) -> None:
         help="leave observations out from now on, with the reason",
         usage='labsurvey exclude lab X/h05 --reason "motion blur"   (labsurvey exclude FOLDER NAME [NAME ...] '
         "--reason TEXT)",
-        description="Adds rows to FOLDER/observations/exclusions.csv, which every command obeys; nothing is adjusted.\n\n"
-        + NAMES,
+        description="Adds rows to FOLDER/observations/exclusions.csv, which every command obeys; nothing is "
+        "adjusted.\n\n" + NAMES,
         epilog="Next: labsurvey adjust FOLDER",
         **shaped,
     )

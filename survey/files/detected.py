@@ -45,7 +45,7 @@ class DetectedImage:
 
 
 def read_detected(folder: Path) -> dict[ImageKey, DetectedImage]:
-    """What detection wrote into ``folder``; empty where that is not there. Raises SurveyError for what it never wrote."""
+    """What detection wrote into ``folder``; empty where there is nothing. Raises SurveyError for another's file."""
     path = folder / DETECTED_FILE
     if not path.is_file():
         return {}
@@ -99,8 +99,8 @@ class ImageNews:
     """Images whose points are not those of the file that is there now, in natural order.
 
     new: never looked at and without points. changed: another file. sought: it is to be searched for other targets.
-    by_hand: changed too, but nothing is looked for in it. gone: no file any more, but points. unseen: points of other images were given, but none of these. same: the others,
-    as they are known.
+    by_hand: changed too, but nothing is looked for in it. gone: no file any more, but points. unseen: points of other
+    images were given, but none of these. same: the others, as they are known.
     """
 
     new: tuple[ImageKey, ...] = ()

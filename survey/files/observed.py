@@ -325,7 +325,8 @@ def _frame(ref: Any) -> FrameRef:
 
 def name_of_residual(residual: Any) -> str:
     """The name of an observation of ``Adjustment.other_residuals``: ``table:id``."""
-    return f"{_KINDS.get(residual.kind, residual.kind)}:{'/'.join(residual.ids)}"
+    whole = residual.kind in ("table", "coordinates", "surface")  # the others carry their id in front of what they join
+    return f"{_KINDS.get(residual.kind, residual.kind)}:{'/'.join(residual.ids) if whole else residual.ids[0]}"
 
 
 def _rows(item: Any) -> list[list[Any]]:

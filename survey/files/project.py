@@ -176,10 +176,10 @@ class Project(Definition):
     """A definition whose ``survey`` holds the observations too; ``spots`` are image points without identity.
 
     The covariances of the observations contain ``sigmas.scale`` already. left_out: what people excluded; it is not used
-    in ``survey``, nor among the ``spots``. n_left_out: how many observations, each once. n_unused_in_files: those
-    that only a table marks ``used = false``.
-    detected: what is known of every image and its points. to_detect: images whose points are to be found anew. notes: what its owner should know, such as exclusions that
-    name nothing and images that have changed since.
+    in ``survey``, nor among the ``spots``. n_left_out: how many observations that are, each once. n_unused_in_files:
+    those that only a table marks ``used = false``. detected: what is known of every image and its points. to_detect:
+    images whose points are to be found anew. notes: what its owner should know, such as exclusions that name nothing
+    and images that have changed since.
     """
 
     spots: tuple[SpotBlock, ...] = ()

@@ -357,7 +357,8 @@ def _read_tables(folder: Path) -> dict[str, Table]:
             continue
         layout: Layout | None = LAYOUTS.get(path.stem)
         if layout is None:
-            raise SurveyError(f"{path}: unknown table {path.stem!r}; {suggestion(path.stem, (*LAYOUTS, EXCLUSIONS.name))}")
+            near = suggestion(path.stem, (*LAYOUTS, EXCLUSIONS.name))
+            raise SurveyError(f"{path}: unknown table {path.stem!r}; {near}")
         if path.stem in tables:
             raise SurveyError(f"{path}: {tables[path.stem].path.name} is there too; keep one of the two")
         tables[path.stem] = read_table(path, layout)
