@@ -128,10 +128,10 @@ def read_exclusions(folder: Path) -> tuple[tuple[Row, ...], str]:
 
 
 def _row(path: Path, line: int, header: Sequence[str], cells: Sequence[str]) -> Row:
-    if len(cells) != len(header):
-        hint = "; put a reason that holds a comma into quotes" if len(cells) > len(header) else ""
+    if len(cells) > len(header):
+        hint = "; put a reason that holds a comma into quotes"
         raise SurveyError(f"{path}:{line}: found {len(cells)} cells, the header has {len(header)}{hint}")
-    row = dict(zip(header, (c.strip() for c in cells), strict=True))
+    row = {name: "" for name in header} | dict(zip(header, (c.strip() for c in cells), strict=False))
     what, name, state = row["what"], row["id"], row.get("state") or EXCLUDED
     problem = name_problem(what, name)
     if problem is None and state not in (EXCLUDED, INCLUDED):
@@ -167,29 +167,38 @@ def in_force(rows: Sequence[Row]) -> dict[Name, Exclusion]:
 
 
 def appended(path: Path, rows: Sequence[Row]) -> str:
-    """The file's text with rows added behind what is there, to the letter; its columns in their own order."""
+    """The file's text with rows added behind what is there, which stays to the letter, in the order of its columns.
+
+    A column that the new rows need and the file has not is added to its header; the cells of old rows are then blank.
+    """
     text = decode(path, read_bytes(path)[0]) if path.is_file() else ""
+    cells = [_cells(row) for row in rows]
     if not text.strip():
         header, text = list(EXCLUSIONS.columns), text + ",".join(EXCLUSIONS.columns) + "\n"
     else:
-        lines = csv.reader(io.StringIO(text, newline=""), strict=True)
-        header = next(cells for cells in lines if any(cells) and not cells[0].lstrip().startswith("#"))
+        header, line = _header_of(text)
+        needed = [name for name in EXCLUSIONS.columns if name not in header and any(c[name] not in ("", EXCLUDED) for c in cells)]
+        lines = text.splitlines(keepends=True)
+        end = lines[line - 1][len(lines[line - 1].rstrip("\r\n")) :]
+        lines[line - 1] = ",".join([lines[line - 1].rstrip("\r\n"), *needed]) + end
+        header, text = [*header, *needed], "".join(lines)
     text += "" if text.endswith("\n") else "\n"
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
-    lost = [name for name in ("reason", "state") if name not in header and _needed(rows, name)]
-    if lost:
-        raise SurveyError(f"{path}:1: the column {lost[0]!r} is missing, but is to be filled in; add it")
-    for row in rows:
-        one = row.exclusion
-        u, v = ("", "") if one.at is None else (repr(one.at[0]), repr(one.at[1]))
-        cells = {"what": one.name.what, "id": one.name.id, "state": EXCLUDED if row.excluded else INCLUDED,
-                 "reason": one.reason, "author": one.author, "time": one.time, "u_px": u, "v_px": v}  # fmt: skip
-        writer.writerow([cells[name] for name in header])
+    writer.writerows([one[name] for name in header] for one in cells)
     return text + out.getvalue()
 
 
-def _needed(rows: Sequence[Row], column: str) -> bool:
-    return any(not row.excluded if column == "state" else bool(row.exclusion.reason) for row in rows)
+def _header_of(text: str) -> tuple[list[str], int]:
+    """The names of the columns, and the line on which they stand."""
+    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
+    header = next(cells for cells in lines if any(cells) and not cells[0].lstrip().startswith("#"))
+    return header, lines.line_num
 
 
+def _cells(row: Row) -> dict[str, str]:
+    """The cells of a row by their columns."""
+    one = row.exclusion
+    u, v = ("", "") if one.at is None else (repr(one.at[0]), repr(one.at[1]))
+    return {"what": one.name.what, "id": one.name.id, "state": EXCLUDED if row.excluded else INCLUDED, "reason": one.reason,
+            "author": one.author, "time": one.time, "u_px": u, "v_px": v}  # fmt: skip
