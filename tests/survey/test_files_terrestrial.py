@@ -210,7 +210,7 @@ def test_round_trip(tmp_path: Path, parquet: bool) -> None:
         mine = again.coordinates[order.index(tuple(str(p) for p in c.positions))]
         assert not loose((c.values, c.cov), (mine.values, mine.cov), 1e-12)
     assert [d.set_id for d in again.coordinate_differences] == ["set1", "d3"]  # what had no name got one
-    named = tuple(dataclasses.replace(d, set_id="") for d in again.coordinate_differences)
+    named = tuple(replace(d, set_id="") for d in again.coordinate_differences)
     assert not loose(survey.coordinate_differences, named, 1e-12)
     assert not loose(sigmas.instruments, first.sigmas.instruments)
     files.write_project(tmp_path / "two", again, sigmas=first.sigmas, parquet=parquet)
