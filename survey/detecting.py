@@ -157,17 +157,18 @@ def detect_in(
         for key in wanted for one in [state.sought[key]]
     ]  # fmt: skip
     files = {key: file_of(state.definition.images[key], _file_name(key, state)) for key in wanted}
+    dropped = _without_image(state, files, everything)
     reports = detect_images(tasks, jobs=jobs, progress=progress, pictures=place / PICTURES if pictures else None)
     blocks, spots = _blocks(state.definition, reports)
-    kept = {*state.points.images, *state.spots.images} - set(wanted)
+    kept = {*state.points.images, *state.spots.images} - set(wanted) - dropped
     if not blocks and not spots and not kept:
         lines = "\n".join(f"  {r.path}: {r.message}" for r in reports[:10])
         raise SurveyError(f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}")
-    names = _write(folder, place, state, wanted, blocks, spots)
-    known = _known_now(place, state, files, reports)
+    names = _write(folder, place, state, wanted, dropped, blocks, spots)
+    known = {key: entry for key, entry in _known_now(state, files, reports).items() if key not in dropped}
     atomic_write(place / OBSERVATIONS_FOLDER / DETECTED_FILE, detected_text(known))
     replace_parts(folder, gone=[name.with_suffix(".parquet").as_posix() for name in names])
-    gone = state.news.gone
+    gone = [key for key in state.news.gone if key not in dropped]
     if gone:
         state.notes.append(f"gone, their points are used as before: {named(gone)}")
     same = len([key for key in state.definition.images if key not in files])
@@ -212,19 +213,39 @@ def _wanted(state: _State, everything: bool) -> list[ImageKey]:
     return wanted
 
 
+def _without_image(state: _State, files: Mapping[ImageKey, DetectedImage], everything: bool) -> set[ImageKey]:
+    """Images that are gone and whose rows go too: they have another name now, or all is to be found anew.
+
+    Rows that were given, or that people have changed, stay in any case.
+    """
+    names = {entry.sha256: key for key, entry in files.items()}
+    dropped: set[ImageKey] = set()
+    for key in state.news.gone:
+        entry = state.known[key]
+        if entry.status == "given" or state.edited(key):
+            continue
+        if entry.sha256 in names:
+            state.notes.append(f"{'/'.join(key)} is {'/'.join(names[entry.sha256])} now: the same image")
+            dropped.add(key)
+        elif everything:
+            state.notes.append(f"{'/'.join(key)} is gone, and its points with it")
+            dropped.add(key)
+    return dropped
+
+
 def _write(
-    folder: Path, place: Path, state: _State, wanted: Sequence[ImageKey], blocks: list[ImageBlock],
-    spots: list[SpotBlock],
+    folder: Path, place: Path, state: _State, wanted: Sequence[ImageKey], dropped: set[ImageKey],
+    blocks: list[ImageBlock], spots: list[SpotBlock],
 ) -> list[Path]:  # fmt: skip
-    """Write the tables with the rows of ``wanted`` replaced; their paths in the project."""
+    """Write the tables with the rows of ``wanted`` replaced and without those of ``dropped``; their paths."""
     targets = {key: set(state.sought[key].targets) for key in wanted}
-    gone = state.points.taken(lambda key, target: target in targets.get(key, ()))
+    gone = state.points.taken(lambda key, target: key in dropped or target in targets.get(key, ()))
     _keep_decisions(folder, place, state, gone)
     found = row_table(None, IMAGE_POINTS, image_point_columns(blocks, state.definition.survey))
     state.points = state.points.without(gone).with_rows(found.with_cells_of(gone, "group"))
     files = {Path(OBSERVATIONS_FOLDER, "image_points.csv"): state.points.text()}
     if state.definition.spots_request is not None:
-        keys = set(wanted)
+        keys = {*wanted, *dropped}
         old = state.spots.taken(lambda key, _: key in keys)
         state.spots = state.spots.without(old).with_rows(row_table(None, SPOTS, spot_columns(spots)))
         files[Path(OBSERVATIONS_FOLDER, "spots.csv")] = state.spots.text()
@@ -264,7 +285,7 @@ def author_name(said: Iterable[tuple[str, str]] = ()) -> str:
 
 
 def _known_now(
-    place: Path, state: _State, files: Mapping[ImageKey, DetectedImage], reports: "Sequence[ImageReport]"
+    state: _State, files: Mapping[ImageKey, DetectedImage], reports: "Sequence[ImageReport]"
 ) -> dict[ImageKey, DetectedImage]:
     """What is known of all images from now on; of images that are gone while their points are used, too."""
     known = {key: entry for key, entry in state.known.items() if key in state.news.gone}

@@ -86,7 +86,8 @@ def fingerprint(folder: Path) -> str:
         for path in (*own, *(folder / name for name in sorted(_tables(folder)))):
             digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
         for path in sorted((folder / "images").glob("*/*")):
-            digest.update(f"{path.relative_to(folder).as_posix()} {path.stat().st_size}\n".encode())
+            status = path.stat()
+            digest.update(f"{path.relative_to(folder).as_posix()} {status.st_size} {status.st_mtime_ns}\n".encode())
     except OSError:
         return ""
     return digest.hexdigest()

@@ -129,6 +129,15 @@ def test_what_is_gone_is_said_and_its_points_stay(lab):
     assert any("gone" in note for note in detect_job(lab, progress=False).notes)
 
 
+def test_a_renamed_image_is_not_counted_twice(lab):
+    (lab / "images/C/e3.png").rename(lab / "images/C/e7.png")
+    outcome = adjust_job(lab, progress=False)
+    assert {b.epoch_id for b in outcome.adjustment.survey.image_blocks} == {"e1", "e2", "e7"}
+    (lab / "images/C/e7.png").unlink()
+    assert any("C/e7 is gone, and its points" in note for note in detect_job(lab, progress=False, everything=True).notes)
+    assert rows_of(lab, "e7") == []
+
+
 def test_edits_of_people_stay_unless_the_image_changes(lab):
     text = points(lab).read_text()
     kept = [line for line in text.splitlines() if not line.startswith("e2,") or "r0c0" not in line]
