@@ -132,7 +132,13 @@ def command_line(command: str, folder: Path, *words: str, **flags: Any) -> str:
 
 
 def _shown(value: Any) -> str:
-    return shlex.quote(value.resolve().name if isinstance(value, Path) else str(value))
+    return shlex.quote(_plain_name(value) if isinstance(value, Path) else
+                       str(value).encode("utf-8", "surrogateescape").decode("utf-8", "replace"))  # fmt: skip
+
+
+def _plain_name(folder: Path) -> str:
+    """The name alone: results of a copied folder stay the same; by its bytes: a terminal without UTF-8 garbles it."""
+    return os.fsencode(folder.resolve().name).decode("utf-8", "replace")
 
 
 def image_warnings(images: Mapping[tuple[str, str], DetectedImage]) -> tuple[str, ...]:
@@ -258,8 +264,7 @@ def run_info(project: Project, seconds: dict[str, float], command: str = "") -> 
     chosen = replace(project.options, tolerances=(), identification=())
     options = {k: v for k, v in asdict(chosen).items() if v != ()} | {"datum": project.survey.datum.kind}
     date = datetime.now(UTC).isoformat(timespec="seconds")
-    # the name alone: results of a copied folder stay the same; by its bytes: a terminal without UTF-8 garbles it
-    name = os.fsencode(project.folder.resolve().name).decode("utf-8", "replace")
+    name = _plain_name(project.folder)
     said = project.options.identification
     images = {"/".join(key): entry for key, entry in project.detected.items() if key in project.images}
     return RunInfo(

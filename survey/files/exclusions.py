@@ -131,7 +131,7 @@ def _row(path: Path, line: int, header: Sequence[str], cells: Sequence[str]) -> 
     if len(cells) > len(header):
         hint = "; put a reason that holds a comma into quotes"
         raise SurveyError(f"{path}:{line}: found {len(cells)} cells, the header has {len(header)}{hint}")
-    row = {name: "" for name in header} | dict(zip(header, (c.strip() for c in cells), strict=False))
+    row = dict.fromkeys(header, "") | dict(zip(header, (c.strip() for c in cells), strict=False))
     what, name, state = row["what"], row["id"], row.get("state") or EXCLUDED
     problem = name_problem(what, name)
     if problem is None and state not in (EXCLUDED, INCLUDED):
@@ -177,7 +177,8 @@ def appended(path: Path, rows: Sequence[Row]) -> str:
         header, text = list(EXCLUSIONS.columns), text + ",".join(EXCLUSIONS.columns) + "\n"
     else:
         header, line = _header_of(text)
-        needed = [name for name in EXCLUSIONS.columns if name not in header and any(c[name] not in ("", EXCLUDED) for c in cells)]
+        needed = [name for name in EXCLUSIONS.columns
+                  if name not in header and any(c[name] not in ("", EXCLUDED) for c in cells)]  # fmt: skip
         lines = text.splitlines(keepends=True)
         end = lines[line - 1][len(lines[line - 1].rstrip("\r\n")) :]
         lines[line - 1] = ",".join([lines[line - 1].rstrip("\r\n"), *needed]) + end
@@ -200,5 +201,5 @@ def _cells(row: Row) -> dict[str, str]:
     """The cells of a row by their columns."""
     one = row.exclusion
     u, v = ("", "") if one.at is None else (repr(one.at[0]), repr(one.at[1]))
-    return {"what": one.name.what, "id": one.name.id, "state": EXCLUDED if row.excluded else INCLUDED, "reason": one.reason,
-            "author": one.author, "time": one.time, "u_px": u, "v_px": v}  # fmt: skip
+    state = EXCLUDED if row.excluded else INCLUDED
+    return {"what": one.name.what, "id": one.name.id, "state": state, "reason": one.reason, "author": one.author, "time": one.time, "u_px": u, "v_px": v}  # fmt: skip

@@ -365,7 +365,7 @@ def without(
         replace(b, used=~masks[i] if b.used is None else b.used & ~masks[i]) if i in masks else b
         for i, b in enumerate(survey.image_blocks)
     )
-    changed = {
+    changed: dict[str, Any] = {
         name: tuple(
             part
             for i, o in enumerate(getattr(survey, name))

@@ -44,8 +44,9 @@ def test_an_epoch_without_reading_and_image_goes(table):
     kept, lost = supported(less)
     assert lost == (("table_angles", table.tables[0].table_id, block.epoch_id),)
     assert len(kept.image_blocks) == len(table.image_blocks) - len(mine)
-    without = replace(table, image_blocks=tuple(b for i, b in enumerate(table.image_blocks) if i not in mine),
-                      table_readings=tuple(r for r in table.table_readings if r.epoch_id != block.epoch_id))  # fmt: skip
+    blocks = tuple(b for i, b in enumerate(table.image_blocks) if i not in mine)
+    others = tuple(r for r in table.table_readings if r.epoch_id != block.epoch_id)
+    without = replace(table, image_blocks=blocks, table_readings=others)
     assert adjust(kept).omega == pytest.approx(adjust(without).omega, rel=1e-9)
 
 
@@ -73,7 +74,8 @@ def test_points_and_what_would_reach_them():
     cov = 1e-6 * np.eye(3)
     survey = Survey(points=points, coordinates=(Coordinates((b,), np.ones((1, 3)), cov),
                                                 Coordinates((c,), 2 * np.ones((1, 3)), cov, used=False)),
-                    distances=(Distance("bc", b, c, 1.7, 1e-3, used=False), Distance("ab", a, b, 1.7, 1e-3)))  # fmt: skip
+                    distances=(Distance("bc", b, c, 1.7, 1e-3, used=False),
+                               Distance("ab", a, b, 1.7, 1e-3)))  # fmt: skip
     kept, lost = supported(survey)
     assert lost == (("point", "C"),)
     assert [p.point_id for p in kept.points] == ["A", "B"]
