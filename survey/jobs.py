@@ -125,7 +125,7 @@ def adjust_job(
     return outcome.at(target)
 
 
-def command_line(command: str, folder: Path, *words: str, **flags: Any) -> str:
+def command_line(command: str, folder: Path, *words: str | Path, **flags: Any) -> str:
     """A command as it can be given again, with its options; folders by their names, as results may be moved."""
     said = [f"--{name}" if value is True else f"--{name} {_shown(value)}" for name, value in flags.items() if value]
     return " ".join(["labsurvey", command, _shown(folder), *map(_shown, words), *said])
@@ -203,7 +203,7 @@ def adjust_project(project: Project, progress: bool, begin: Begin = lambda _: No
 
 def told(project: Project, given: Survey, adjustment: Adjustment) -> Adjustment:
     """An adjustment that says what was noticed when its project was read, and how much of ``given`` it left out."""
-    warnings = adjustment.warnings + project.notes + image_warnings(project.detected)
+    warnings = adjustment.warnings + project.notes + project.image_notes + image_warnings(project.detected)
     images = sum(len(b.uv) if b.used is None else int(b.used.sum()) for b in given.image_blocks)
     images -= int(adjustment.image_residuals.used.sum())
     others = sum(o.used for kind in _OTHERS for o in getattr(given, kind))

@@ -141,7 +141,7 @@ def _navigated(folder: Path, request: NavigateRequest, there: Path, place: Path,
 
 
 def _notes(project: Project, calibration: Calibration) -> tuple[str, ...]:
-    notes = list(project.notes)
+    notes = [*project.notes, *project.image_notes]
     missing = sorted({p.point_id for p in project.survey.points} - set(calibration.beacons.beacon_ids), key=natural_key)
     if missing:
         notes.append(f"beacons without coordinates, left out: {', '.join(missing)}")

@@ -10,7 +10,7 @@ on as long as the rest determines what they hang on.
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from survey.files.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.files.reading import read_all
 from survey.files.text import atomic_write
 from survey.jobs import AdjustOutcome, Clock, adjust_project, command_line, made
-from survey.merging import point_files
+from survey.merging import point_files, read_copy
 from survey.previous import Move, Previous, moves, read_previous
 from survey.replacing import complete, copy_folder, place_for, replace_parts
 from survey.results import RESULTS
@@ -112,8 +112,7 @@ def remove_job(
         rows = new_rows(read_all(folder), names, reason, author)
         _copy(folder, place)
         atomic_write(place / FILE, appended(folder / FILE, rows))
-        reduced = replace(read(place), folder=out or folder, title=project.title, images=project.images,
-                          detected=project.detected, notes=_own_notes(project, place))  # fmt: skip
+        reduced = read_copy(place, project, out or folder)
         adjustment, start = _adjusted(folder, project, reduced, [row.exclusion.name for row in rows], before, progress)
         said = command_line("remove", folder, *names, out=out, reason=reason)
         outcome = made(reduced, adjustment, place, Clock({"adjust": time.perf_counter() - begin}), command=said)
@@ -125,11 +124,6 @@ def remove_job(
     moved = () if before is None else moves(before, adjustment)
     removed = tuple(str(row.exclusion.name) for row in rows)
     return RemoveOutcome(outcome, removed, moved, before, why, start, time.perf_counter() - begin)
-
-
-def _own_notes(project: Project, place: Path) -> tuple[str, ...]:
-    """Notes by the project's own path, not by that of its copy."""
-    return tuple(note.replace(str(place), str(project.folder)) for note in project.notes)
 
 
 def _adjusted(

@@ -202,4 +202,5 @@ def _cells(row: Row) -> dict[str, str]:
     one = row.exclusion
     u, v = ("", "") if one.at is None else (repr(one.at[0]), repr(one.at[1]))
     state = EXCLUDED if row.excluded else INCLUDED
-    return {"what": one.name.what, "id": one.name.id, "state": state, "reason": one.reason, "author": one.author, "time": one.time, "u_px": u, "v_px": v}  # fmt: skip
+    said = {"state": state, "reason": one.reason, "author": one.author, "time": one.time}
+    return {"what": one.name.what, "id": one.name.id, **said, "u_px": u, "v_px": v}

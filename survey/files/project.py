@@ -178,8 +178,8 @@ class Project(Definition):
     The covariances of the observations contain ``sigmas.scale`` already. left_out: what people excluded; it is not used
     in ``survey``, nor among the ``spots``. n_left_out: how many observations that are, each once. n_unused_in_files:
     those that only a table marks ``used = false``. detected: what is known of every image and its points. to_detect:
-    images whose points are to be found anew. notes: what its owner should know, such as exclusions that name nothing
-    and images that have changed since.
+    images whose points are to be found anew. notes: exclusions that name nothing. image_notes: images that are new,
+    have changed or are gone.
     """
 
     spots: tuple[SpotBlock, ...] = ()
@@ -190,6 +190,7 @@ class Project(Definition):
     detected: Mapping[tuple[str, str], DetectedImage] = field(default_factory=dict)
     to_detect: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
+    image_notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """What is in the folder, in a few lines: a notebook prints it."""

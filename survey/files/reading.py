@@ -114,8 +114,8 @@ def read_definition(folder: Path) -> Definition:
 def read(folder: Path) -> Project:
     """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError.
 
-    What ``exclusions.csv`` leaves out is not used. ``notes`` say which of its rows name nothing, and which images are
-    not those any more that the points come from.
+    What ``exclusions.csv`` leaves out is not used. ``notes`` say which of its rows name nothing, ``image_notes``
+    which images are not those any more that the points come from.
     """
     project = read_all(folder)
     return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
@@ -136,7 +136,7 @@ def read_all(folder: Path) -> Project:
         project = dataclasses.replace(project, inputs=hashes)
     notes = images.notes(definition.folder)
     detected = {**known, **(images.same or {})}
-    return dataclasses.replace(project, detected=detected, to_detect=images.to_detect, notes=notes)
+    return dataclasses.replace(project, detected=detected, to_detect=images.to_detect, image_notes=notes)
 
 
 def leaving_out(project: Project, exclusions: Iterable[Exclusion]) -> Project:

@@ -14,6 +14,7 @@ from survey.detecting import detect_job
 from survey.files import read
 from survey.files.detected import read_detected
 from survey.jobs import adjust_job
+from survey.network import add_job
 
 TOML = """format = 1
 [cameras.C]
@@ -94,8 +95,8 @@ def test_new_and_changed_images_are_looked_at_and_others_are_not(lab):
     before = {epoch: rows_of(lab, epoch) for epoch in ("e1", "e2", "e3")}
     shutil.copy(lab / "images/C/e1.png", lab / "images/C/e9.png")
     draw(lab / "images/C/e2.png", -0.45)
-    assert any("C/e9 were never looked at" in note for note in read(lab).notes)
-    assert any("C/e2 have changed" in note for note in read(lab).notes)
+    assert any("C/e9 were never looked at" in note for note in read(lab).image_notes)
+    assert any("C/e2 have changed" in note for note in read(lab).image_notes)
     outcome = adjust_job(lab, progress=False)
     assert [rows_of(lab, e) == before[e] for e in ("e1", "e2", "e3")] == [True, False, True]
     assert len(rows_of(lab, "e9")) == 30
@@ -137,6 +138,24 @@ def test_a_renamed_image_is_not_counted_twice(lab):
     again = detect_job(lab, progress=False, everything=True)
     assert any("C/e7 is gone, and its points" in note for note in again.notes)
     assert rows_of(lab, "e7") == []
+
+
+def test_what_is_added_brings_its_images_and_exclusions(lab, tmp_path):
+    new = tmp_path / "new"
+    shutil.copytree(lab / "images", new / "images")
+    (new / "observations").mkdir()
+    for i in (1, 2, 3):
+        (new / f"images/C/e{i}.png").rename(new / f"images/C/f{i}.png")
+    header, *rows = points(lab).read_text().splitlines()
+    points(new).write_text("\n".join([header, *("f" + row[1:] for row in rows)]) + "\n")
+    (new / "observations/exclusions.csv").write_text("what,id,reason\nimage,C/f2,blurred\n")
+    outcome = add_job(lab, new, progress=False)
+    assert not any("images:" in w for w in outcome.outcome.adjustment.warnings)
+    assert set(solution(lab)["inputs"]["images"]) == {f"C/{x}{i}" for x in "ef" for i in (1, 2, 3)}
+    assert [e["name"] for e in solution(lab)["exclusions"]] == ["image:C/f2"]
+    assert solution(lab)["inputs"]["command"] == "labsurvey add lab new"
+    adjust_job(lab, progress=False)
+    assert unchanged_solution(lab) is not None
 
 
 def test_edits_of_people_stay_unless_the_image_changes(lab):
