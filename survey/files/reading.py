@@ -141,6 +141,9 @@ def read_all(folder: Path) -> Project:
 
 def leaving_out(project: Project, exclusions: Iterable[Exclusion]) -> Project:
     """A project without what is excluded; what names nothing is said in its notes."""
+    exclusions = tuple(exclusions)
+    if not exclusions:
+        return dataclasses.replace(project, n_unused_in_files=_n_unused(project.survey))
     observed = Observed(project.survey, project.spots)
     path = project.folder / OBSERVATIONS_FOLDER / EXCLUSIONS_FILE
     found, hits, notes = [], [], []
@@ -152,8 +155,6 @@ def leaving_out(project: Project, exclusions: Iterable[Exclusion]) -> Project:
             notes.append(f"{path}:{one.line}: {one.name} is left out, but nothing has that name; "
                          f"{observed.near(one.name)}")  # fmt: skip
         found.append(LeftOut(one, len(hit.images), hit.n_image_points, hit.n_spots, hit.n_readings))
-    if not found:
-        return dataclasses.replace(project, n_unused_in_files=_n_unused(project.survey))
     survey, spots = without(project.survey, project.spots, hits)
     every = union(hits)
     in_files = _n_unused(survey) - (every.n - every.n_spots)
