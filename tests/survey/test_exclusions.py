@@ -20,6 +20,7 @@ from survey.files.exclusions import Exclusion, Name
 from survey.files.observed import Observed
 from survey.files.reading import leaving_out, read_all
 from survey.jobs import adjust_job, adjust_project
+from survey.navigation_task import NavigateRequest, observed_epoch
 from survey.previous import read_previous
 from survey.removing import remove_job
 from survey.warm_start import WARM, survey_start, warm_adjustment
@@ -283,3 +284,16 @@ def test_survey_start_takes_lenses_and_poses_of_before(mine):
     start = survey_start(project.survey, read_previous(project))
     fx = solution(mine)["cameras"]["left"]["lens"]["fx_px"]
     assert start.lenses["left"][0] == pytest.approx(fx, abs=1e-9)
+
+
+def test_navigation_does_not_see_what_is_left_out(mine):
+    project = read_all(mine)
+    block = next(b for b in project.survey.image_blocks if b.target_id is None)
+    names = [project.survey.points[int(i)].point_id for i in block.point_idx]
+    out = Exclusion(Name("image_point", f"{block.camera_id}/{block.epoch_id}/{names[0]}"))
+    station = project.survey.stations[0].station_id
+    seen = [
+        sum(len(s.uv) for s in observed_epoch(p, station, block.epoch_id, None, NavigateRequest(), set(names)).spots)
+        for p in (project, leaving_out(project, [out]))
+    ]
+    assert seen[1] == seen[0] - 1
