@@ -10,6 +10,7 @@ from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.initial import Start, find_start
 from adjust.lens import MODELS, camera_constants, monotone_radius_px, principal_point_px
 from adjust.model import BoolArray, FloatArray, Survey
+from adjust.observations import ImageBlock
 from adjust.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
 from adjust.result import Adjustment, Estimate, ParameterName
 from adjust.robust import limit, screen
@@ -44,6 +45,7 @@ def adjust(
     progress: called with (iteration, v'Pv). Raises SurveyError, IndeterminateError, NotConvergedError.
     """
     notes: tuple[str, ...] = ()
+    given = survey
     if start is None:
         survey, start, notes = _trusted(survey, options)
     graph = GraphBuilder(survey, start.lenses).build(start)
@@ -51,9 +53,9 @@ def adjust(
     if options.reject_points:
         screened = screen(graph, solved, options.solve)
         survey = with_used(survey, screened.used)
-        notes = rejections(survey) + notes
-        return replace(assemble(graph, screened.solved, options, notes, screened.precision), survey=survey)
-    return assemble(graph, solved, options, notes)
+        notes = rejections(survey, given) + notes
+        return replace(assemble(graph, screened.solved, options, notes, screened.precision, given), survey=survey)
+    return assemble(graph, solved, options, notes, given=given)
 
 
 def with_used(survey: Survey, used: BoolArray) -> Survey:
@@ -63,21 +65,38 @@ def with_used(survey: Survey, used: BoolArray) -> Survey:
     return replace(survey, image_blocks=blocks)
 
 
-def rejections(survey: Survey) -> tuple[str, ...]:
-    """Image points that are not used, by block."""
+def rejections(survey: Survey, given: Survey) -> tuple[str, ...]:
+    """Image points that are not used, though they were in the survey as it was given, by block."""
     out, targets = [], {t.target_id: t.point_ids for t in survey.targets}
+    before = _unused_before(given)
     points = tuple(p.point_id for p in survey.points)
     for block in survey.image_blocks:
         if block.used is None or block.used.all() or not block.used.any():
             continue
         ids = targets[block.target_id] if block.target_id else points
-        names = [ids[int(i)] for i in block.point_idx[~block.used]]
+        old = before.get(_place(block), frozenset())
+        names = [ids[int(i)] for i in block.point_idx[~block.used] if int(i) not in old]
+        if not names:
+            continue
         more = f" and {len(names) - 8} more" if len(names) > 8 else ""
         out.append(
             f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}: left out as "
             f"gross errors: {', '.join(names[:8])}{more}"
         )
     return tuple(out)
+
+
+def _place(block: ImageBlock) -> tuple[str, str, str | None, str]:
+    return block.camera_id, block.epoch_id, block.target_id, block.group
+
+
+def _unused_before(given: Survey) -> dict[tuple[str, str, str | None, str], frozenset[int]]:
+    """Positions of the points of each block that its owner does not use."""
+    return {
+        _place(b): frozenset(b.point_idx[~b.used].tolist())
+        for b in given.image_blocks
+        if b.used is not None and not b.used.all()
+    }
 
 
 def _trusted(survey: Survey, options: AdjustOptions) -> tuple[Survey, StartValues, tuple[str, ...]]:
@@ -121,8 +140,12 @@ def assemble(
     options: AdjustOptions,
     notes: tuple[str, ...] = (),
     precision: Precision | None = None,
+    given: Survey | None = None,
 ) -> Adjustment:
-    """Everything a report needs, from the solution; ``precision`` where it is known already."""
+    """Everything a report needs, from the solution; ``precision`` where it is known already.
+
+    given: the survey of its owner; what that does not use needs no warning.
+    """
     precision = precision or Precision(graph, solved)
     images = image_residuals(precision)
     others = other_residuals(precision)
@@ -142,7 +165,7 @@ def assemble(
         omega, float(np.sqrt(omega / redundancy)) if redundancy > 0 else float("nan"), test, solved.iterations,
         solved.max_step, True, (), precision, readings,
     )  # fmt: skip
-    return replace(result, warnings=warnings(graph, result) + notes)
+    return replace(result, warnings=warnings(graph, result, given) + notes)
 
 
 def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
@@ -178,7 +201,7 @@ def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
     return out
 
 
-def warnings(graph: AdjustmentGraph, result: Adjustment) -> tuple[str, ...]:
+def warnings(graph: AdjustmentGraph, result: Adjustment, given: Survey | None = None) -> tuple[str, ...]:
     """What its owner should know first."""
     out = []
     total = float(sum(g.redundancy for g in result.groups))
@@ -194,13 +217,14 @@ def warnings(graph: AdjustmentGraph, result: Adjustment) -> tuple[str, ...]:
             f"global test failed: sigma0 = {result.sigma0:.3f}, the residuals are {side} than the a priori sigmas say "
             f"(v'Pv = {test.omega:.1f}, expected {test.lower:.1f} to {test.upper:.1f})"
         )
-    out += _image_warnings(graph, result) + _lens_warnings(graph, result)
+    out += _image_warnings(graph, result, given) + _lens_warnings(graph, result)
     return tuple(out)
 
 
-def _image_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
+def _image_warnings(graph: AdjustmentGraph, result: Adjustment, given: Survey | None) -> list[str]:
     out, images, blocks = [], result.image_residuals, graph.survey.image_blocks
     bound = limit(len(images.test)) * max(1.0, result.sigma0**2)
+    before = {} if given is None else _unused_before(given)
     of_point = np.repeat(np.arange(len(blocks)), np.diff(images.block_ptr))
     used = np.bincount(of_point[images.used], minlength=len(blocks))
     with np.errstate(invalid="ignore"):
@@ -208,6 +232,8 @@ def _image_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
     for i in np.flatnonzero((used == 0) | (bad > 0)).tolist():
         block = blocks[i]
         what = f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}"
+        if used[i] == 0 and len(before.get(_place(block), ())) == len(block.uv):
+            continue  # as its owner wants it
         if used[i] == 0 and len(block.uv):
             out.append(f"{what}: not used")
         elif bad[i]:

@@ -135,7 +135,8 @@ class Adjustment:
     other_residuals: of all that are not image points, the readings last, also as arrays in ``reading_residuals``.
     precision: gives joint covariances, ``precision.joint([name, ...])``.
     variance_components: ``adjust.statistics.result.VarianceComponents``, where they were estimated. decisions: the log
-    of the search for gross errors, ``adjust.statistics.result.Decision``.
+    of the search for gross errors, ``adjust.statistics.result.Decision``. n_screened: image points and other
+    observations that were in use and that this adjustment left out, where that was counted.
     """
 
     survey: Survey
@@ -158,6 +159,7 @@ class Adjustment:
     reading_residuals: ReadingResiduals | None = None
     variance_components: Any = None
     decisions: tuple[Any, ...] = ()
+    n_screened: int = 0
 
     def __repr__(self) -> str:
         """The key figures in one line."""

@@ -17,6 +17,7 @@ from survey.commands.completing import declare_completion
 from survey.commands.converting import declare_convert
 from survey.commands.detecting import declare_detect
 from survey.commands.examples import declare_example
+from survey.commands.excluding import declare_exclude, declare_include
 from survey.commands.navigating import declare_navigate
 from survey.commands.networks import declare_add, declare_remove, declare_trackers
 from survey.commands.planning import declare_plan
@@ -43,6 +44,8 @@ _COMMANDS = (
     declare_plan,
     declare_add,
     declare_remove,
+    declare_exclude,
+    declare_include,
     declare_convert,
     declare_trackers,
     declare_navigate,

@@ -161,7 +161,7 @@ def _scaled(trajectory: Trajectory, sigma0: float) -> Trajectory:
 
 
 def _notes(project: Project, calibration: Calibration) -> tuple[str, ...]:
-    notes = []
+    notes = [*project.notes, *project.image_notes]
     missing = sorted({p.point_id for p in project.survey.points} - set(calibration.beacons.beacon_ids), key=natural_key)
     if missing:
         notes.append(f"beacons without coordinates, left out: {', '.join(missing)}")

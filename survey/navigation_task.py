@@ -10,9 +10,10 @@ import numpy as np
 from adjust.errors import SurveyError
 from adjust.model import Survey
 from adjust.navigation import NavigationEpoch, Spots
+from adjust.supported import supported
 from survey.files import Project
 from survey.files.text import natural_key
-from survey.parts import only_between, points_read
+from survey.parts import in_use, only_between, points_read
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def chosen_epochs(project: Project, station: str, request: NavigateRequest) -> l
     own = {c.camera_id for c in project.survey.cameras if c.station_id == station}
     if not own:
         raise SurveyError(f"{project.folder}/survey.toml: no camera is on station {station!r}")
-    blocks = [b for b in project.survey.image_blocks if b.camera_id in own]
+    blocks = [b for b in in_use(project.survey).image_blocks if b.camera_id in own]
     lit = {s.epoch_id for s in project.spots if s.camera_id in own}
     lit |= {b.epoch_id for b in blocks if b.target_id is None}
     if request.epochs is not None:
@@ -108,7 +109,7 @@ def calibrating(project: Project, station: str, epochs: Sequence[str]) -> Survey
     blocks = tuple(b for b in survey.image_blocks if not (b.camera_id in own and b.epoch_id in out))
     carried = next(s for s in survey.stations if s.station_id == station).table_id
     readings = tuple(r for r in survey.table_readings if not (r.table_id == carried and r.epoch_id in out))
-    return _with_known_points(replace(survey, image_blocks=blocks, table_readings=readings))
+    return supported(_with_known_points(replace(survey, image_blocks=blocks, table_readings=readings)))[0]
 
 
 def _with_known_points(survey: Survey) -> Survey:
@@ -116,7 +117,7 @@ def _with_known_points(survey: Survey) -> Survey:
     seen: dict[int, set[tuple[str, str]]] = {}
     for b in survey.image_blocks:
         if b.target_id is None:
-            for i in b.point_idx.tolist():
+            for i in (b.point_idx if b.used is None else b.point_idx[b.used]).tolist():
                 seen.setdefault(i, set()).add((b.camera_id, b.epoch_id))
     given = {r.point_id for c in survey.coordinates if c.used for r in c.positions if r.frame is None}
     given |= points_read(survey)
@@ -143,8 +144,8 @@ def _with_known_points(survey: Survey) -> Survey:
 def observed_epoch(
     project: Project, station: str, epoch_id: str, time_s: float | None, request: NavigateRequest, named: set[str]
 ) -> NavigationEpoch:
-    """One epoch's spots, named or not, and its table reading."""
-    survey = project.survey
+    """One epoch's spots, named or not, and its table reading; what is not used is not navigated from."""
+    survey = in_use(project.survey)
     own = [c.camera_id for c in survey.cameras if c.station_id == station]
     spots = [Spots(s.camera_id, s.uv, s.cov) for s in project.spots if s.camera_id in own and s.epoch_id == epoch_id]
     for b in survey.image_blocks:

@@ -16,8 +16,8 @@ from survey.files.pairs import COVARIANCE_COLUMNS, EULER, PAIRS, QUATERNION, SIG
 from survey.files.project import OBSERVATIONS_FOLDER
 from survey.files.references import NameProblemError, Names, check_epochs, read_frame
 from survey.files.tables import Table, read_table
-from survey.jobs import AdjustOutcome, Clock, adjust_project, made
-from survey.merging import Merged, merge
+from survey.jobs import AdjustOutcome, Clock, adjust_project, command_line, made
+from survey.merging import Merged, merge, read_copy
 from survey.network_summary import network_dict, pair_network
 from survey.previous import Move, Previous, moves, read_previous
 from survey.replacing import complete, place_for, replace_parts
@@ -195,10 +195,10 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
         project = read(folder)
         before = read_previous(project)
         merged = merge(folder, new, place)
-        grown = _read_merged(merged)
-        grown = replace(grown, folder=out or folder, title=project.title)
+        grown = _read_merged(merged, project, out or folder)
         adjustment, start = warm_adjustment(grown, before, lambda p: adjust_project(p, progress), progress)
-        outcome = made(grown, adjustment, place, Clock({"adjust": time.perf_counter() - begin}))
+        said = command_line("add", folder, new, out=out)
+        outcome = made(grown, adjustment, place, Clock({"adjust": time.perf_counter() - begin}), command=said)
         if out is None:
             replace_parts(folder, [*merged.entries, RESULTS])
         else:
@@ -209,9 +209,9 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
     return AddOutcome(outcome, added, moved, before, start, time.perf_counter() - begin)
 
 
-def _read_merged(merged: Merged) -> Project:
+def _read_merged(merged: Merged, project: Project, folder: Path) -> Project:
     try:
-        return read(merged.place)
+        return read_copy(merged.place, project, folder)
     except SurveyError as error:
         raise merged.translated(error) from error
 

@@ -1,8 +1,8 @@
 """What an earlier adjustment of a project left in its results: values to start from, and sigmas to compare with."""
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from survey.files import Project
 from survey.files.locking import settled
 from survey.files.poses import rotation_from_quaternion
 from survey.files.text import read_bytes
-from survey.quantities import ARCSEC_PER_RAD, SigmaKind
+from survey.quantities import ARCSEC_PER_RAD, SigmaKind, key_of, unit_for_people
 from survey.results import RESULTS, read_covariances
 
 # what damaged or foreign content makes the readers below raise
@@ -33,7 +33,8 @@ _POSES = {
 class Previous:
     """A solution that was written: poses and points by parameter name; covs as written, by the same names.
 
-    factor: by which sigmas were multiplied. clean: whether every observation was used.
+    factor: by which sigmas were multiplied. clean: whether the run left nothing out by itself. vectors: components as
+    ``solution.json`` has them, of lenses (with ``model``), table angles and geometry and warps, by parameter name.
     """
 
     poses: Mapping[ParameterName, Pose3]
@@ -42,6 +43,18 @@ class Previous:
     factor: float
     summary: Mapping[str, Any]
     clean: bool
+    vectors: Mapping[ParameterName, Mapping[str, Any]] = field(default_factory=dict)
+
+    def vector(self, name: ParameterName, names: Sequence[str], units: Sequence[str]) -> FloatArray | None:
+        """The components (n,) of a lens, a table, angles or a warp, in units inside; None where they are not there."""
+        entry, out = self.vectors.get(name, {}), []
+        for component, unit in zip(names, units, strict=True):
+            unit_shown, factor = unit_for_people(component, unit)
+            value = entry.get(key_of(component, unit_shown))
+            if not isinstance(value, int | float) or not np.isfinite(value):
+                return None
+            out.append(value / factor)
+        return np.array(out)
 
 
 @dataclass(frozen=True)
@@ -89,9 +102,23 @@ def _previous(found: Mapping[str, Any], covs: Mapping[str, FloatArray]) -> Previ
         raise ValueError("a covariance has not the size of its parameter")
     int(summary["redundancy"]), float(summary["sigma0"] or 0.0)
     factor = float(_numbers([summary["sigma_factor"]], 1)[0])
-    return Previous(
-        dict(_poses(found)), points, by_name, factor, summary, summary["suspects"]["n_not_used"] == 0
-    )  # fmt: skip
+    clean = found["left_out"]["in_this_run"] == 0
+    return Previous(dict(_poses(found)), points, by_name, factor, summary, clean, dict(_vectors(found)))
+
+
+def _vectors(found: Mapping[str, Any]) -> Iterator[tuple[ParameterName, Mapping[str, Any]]]:
+    for camera, entry in found["cameras"].items():
+        if isinstance(entry.get("lens"), dict):
+            yield ("lens", camera), entry["lens"]
+    for table, entry in found["tables"].items():
+        if isinstance(entry.get("geometry"), dict):
+            yield ("table_geometry", table), entry["geometry"]
+        for epoch, angles in entry.get("epochs", {}).items():
+            if isinstance(angles, dict):
+                yield ("table_angles", table, epoch), angles
+    for target, entry in found["targets"].items():
+        if isinstance(entry.get("warp"), dict):
+            yield ("warp", target), entry["warp"]
 
 
 def _numbers(values: Any, n: int) -> FloatArray:

@@ -11,6 +11,9 @@ import numpy as np
 from adjust.distributions import norm
 from adjust.model import FloatArray, Survey
 from adjust.result import Adjustment, Estimate, GroupSummary
+from survey.files.detected import DetectedImage
+from survey.files.project import LeftOut
+from survey.left_out import left_out_dict
 from survey.quantities import Scale, SigmaKind, point_entry, pose_entry, scale_of, vector_entry
 from survey.solution_instruments import instrument_entries
 from survey.statistics import Statistics
@@ -36,7 +39,8 @@ class RunInfo:
 
     date: time stamp, ISO 8601. seconds: duration per step; printed, but in no file, so that equal input gives equal
     files. sigmas: how sigmas of unknowns are given. identification: what the project says of itself (who, where, with
-    what), in its order.
+    what), in its order. command: as it can be given again. images: by camera/epoch, with their hashes. left_out,
+    n_left_out, n_unused_in_files: as of :class:`survey.files.Project`.
     """
 
     folder: str
@@ -48,6 +52,11 @@ class RunInfo:
     seconds: Mapping[str, float] = field(default_factory=dict)
     sigmas: SigmaKind = "a_posteriori"
     identification: tuple[tuple[str, str], ...] = ()
+    command: str = ""
+    images: Mapping[str, DetectedImage] = field(default_factory=dict)
+    left_out: tuple[LeftOut, ...] = ()
+    n_left_out: int = 0
+    n_unused_in_files: int = 0
 
 
 def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None = None) -> dict[str, Any]:
@@ -67,12 +76,19 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
             **instrument_entries(adjustment, scale),
             **_network(adjustment.survey),
             "groups": {g.group: _group(g) for g in adjustment.groups},
+            **left_out_dict(adjustment, run.left_out, run.n_left_out, run.n_unused_in_files),
             "warnings": list(adjustment.warnings),
             **(statistics_dict(adjustment, found, scale) if found is not None else {}),
             "inputs": {
                 "folder": run.folder,
                 "identification": dict(run.identification),
+                "command": run.command,
                 "hashes": dict(run.input_hashes),
+                "images": {
+                    name: {"file": i.file, "sha256": i.sha256, "points": i.status, "n_image_points": i.n_image_points,
+                           "n_spots": i.n_spots}
+                    for name, i in run.images.items()
+                },
                 "options": dict(run.options),
                 "versions": dict(run.versions),
                 "date": run.date,

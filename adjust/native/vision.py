@@ -89,8 +89,8 @@ def corner_rows(xy: FloatArray, p: FloatArray, crossing: bool) -> tuple[FloatArr
 
 
 def fit_spots(
-    gray: Gray, labels: npt.NDArray[np.integer[Any]], saturation: float, start: FloatArray, label: IntArray, diameter: FloatArray,
-    peak: FloatArray, background: FloatArray,
+    gray: Gray, labels: npt.NDArray[np.integer[Any]], saturation: float, start: FloatArray, label: IntArray,
+    diameter: FloatArray, peak: FloatArray, background: FloatArray,
 ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, IntArray]:  # fmt: skip
     """Fit each spot with both profiles and keep the better one.
 

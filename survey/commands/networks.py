@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from survey.commands.common import DONE, is_set, print_json, require_project, say, tested
+from survey.commands.excluding import NAMES
 
 
 def declare_add(commands: Any, shaped: dict[str, Any]) -> None:
@@ -29,14 +30,16 @@ def declare_remove(commands: Any, shaped: dict[str, Any]) -> None:
     parser = commands.add_parser(
         "remove",
         help="adjust a project again without some observations",
-        usage="labsurvey remove lab p3   (labsurvey remove FOLDER ID [ID ...] [--out DIR])",
-        description="Writes used = false beside pairs, distances and coordinates, adjusts again and says what moved.\n"
-        "Refuses what the rest cannot do without; on any error FOLDER stays as it was.",
-        epilog="Next: open FOLDER/results/report.html",
+        usage="labsurvey remove lab p3   (labsurvey remove FOLDER NAME [NAME ...] [--reason TEXT] [--out DIR])",
+        description="Excludes observations as 'labsurvey exclude' does, adjusts again and says what moved.\nRefuses "
+        "what the rest cannot do without; on any error FOLDER stays as it was.\n\n" + NAMES,
+        epilog="Next: open FOLDER/results/report.html; labsurvey include FOLDER NAME takes back",
         **shaped,
     )
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="project folder, adjusted or not")
-    parser.add_argument("ids", nargs="+", metavar="ID", help="pair, distance, point or set; pairs:ID where it is twice")
+    parser.add_argument("names", nargs="+", metavar="NAME", help="what is to be left out")
+    parser.add_argument("--reason", default="", metavar="TEXT", help="why; stands in the report")
+    parser.add_argument("--author", default="", metavar="TEXT", help="who; default: $LABSURVEY_AUTHOR, or the user")
     parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the new project to DIR")
     parser.set_defaults(run=_remove, parser=parser)
 
@@ -74,7 +77,10 @@ def _remove(arguments: argparse.Namespace) -> int:
     from survey.removing import remove_job
 
     progress = not is_set(arguments, "quiet")
-    outcome = remove_job(arguments.folder, arguments.ids, out=arguments.out, progress=progress)
+    outcome = remove_job(
+        arguments.folder, arguments.names, out=arguments.out, progress=progress, reason=arguments.reason,
+        author=arguments.author,
+    )  # fmt: skip
     if is_set(arguments, "json"):
         print_json(outcome.summary())
     else:

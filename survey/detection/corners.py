@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from adjust.model import BoolArray, FloatArray
+from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.native.vision import CORNER_PARAMETERS, ENOUGH_FOR_SLOPES, fit_corners
 
 # Edges are taken for straight lines. What bending by the lens does where it cannot be told from the other corners
@@ -77,7 +77,7 @@ def refine_corners(
     return CornerFit(p[:, :2], cov, lens_blur, contrast, good, p[:, 2:4], bend, bent)
 
 
-def _student(cov: FloatArray, pixels: FloatArray) -> FloatArray:
+def _student(cov: FloatArray, pixels: IntArray) -> FloatArray:
     """Covariances (n, 2, 2) whose noise comes from few residuals: those of Student's distribution, not its scale's."""
     redundancy = pixels - np.where(pixels >= ENOUGH_FOR_SLOPES, CORNER_PARAMETERS, CORNER_PARAMETERS - 2)
     return np.asarray(cov * (redundancy / np.maximum(redundancy - 2.0, 1.0))[:, None, None])

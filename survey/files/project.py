@@ -8,6 +8,8 @@ from gtsam import Rot3
 
 from adjust.model import FloatArray, IntArray, Survey
 from adjust.observations import FrameRef
+from survey.files.detected import DetectedImage
+from survey.files.exclusions import Exclusion
 from survey.quantities import SigmaKind
 from survey.targets import TargetKind
 from survey.tolerances import Tolerance
@@ -140,6 +142,17 @@ class ImagePointsWhere:
         return f"{self.file}:{self.lines[block][point]}"
 
 
+@dataclass(frozen=True)
+class LeftOut:
+    """An exclusion in force, and how many images, image points, spots without a name and readings it meets."""
+
+    exclusion: Exclusion
+    n_images: int = 0
+    n_image_points: int = 0
+    n_spots: int = 0
+    n_readings: int = 0
+
+
 @dataclass(frozen=True, eq=False)
 class Definition:
     """What survey.toml says, and the images that are there; ``survey`` has no observations.
@@ -166,11 +179,22 @@ class Definition:
 class Project(Definition):
     """A definition whose ``survey`` holds the observations too; ``spots`` are image points without identity.
 
-    The covariances of the observations contain ``sigmas.scale`` already.
+    The covariances of the observations contain ``sigmas.scale`` already. left_out: what people excluded; it is not used
+    in ``survey``, nor among the ``spots``. n_left_out: how many observations that are, each once. n_unused_in_files:
+    those that only a table marks ``used = false``. detected: what is known of every image and its points. to_detect:
+    images whose points are to be found anew. notes: exclusions that name nothing. image_notes: images that are new,
+    have changed or are gone.
     """
 
     spots: tuple[SpotBlock, ...] = ()
     image_points_where: ImagePointsWhere = ImagePointsWhere()
+    left_out: tuple[LeftOut, ...] = ()
+    n_left_out: int = 0
+    n_unused_in_files: int = 0
+    detected: Mapping[tuple[str, str], DetectedImage] = field(default_factory=dict)
+    to_detect: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+    image_notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """What is in the folder, in a few lines: a notebook prints it."""

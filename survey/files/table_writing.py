@@ -39,11 +39,12 @@ def _csv(columns: Columns) -> str:
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows(zip(*(_cells(column) for column in columns.values()), strict=True))
+    writer.writerows(zip(*(cells_of(column) for column in columns.values()), strict=True))
     return stream.getvalue()
 
 
-def _cells(column: Sequence[str] | FloatArray) -> Sequence[object]:
+def cells_of(column: Sequence[str] | FloatArray) -> Sequence[object]:
+    """The cells of a column as the csv module writes them; nan is blank."""
     if not isinstance(column, np.ndarray):
         return column
     values: list[object] = column.tolist()

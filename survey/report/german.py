@@ -30,6 +30,30 @@ GERMAN = {
     "Pairs": "Paare",
     "Observations": "Beobachtungen",
     "Image points": "Bildpunkte",
+    "Excluded by people": "Von Personen ausgeschlossen",
+    "What": "Was",
+    "Reason": "Grund",
+    "Who": "Wer",
+    "When": "Wann",
+    "Readings": "Ablesungen",
+    "Largest |w| now": "Größtes |w| jetzt",
+    "no reason given": "ohne Angabe eines Grundes",
+    "names nothing": "bezeichnet nichts",
+    "fits now": "passt jetzt",
+    "does not fit": "passt nicht",
+    "Nothing is excluded by people.": "Von Personen ist nichts ausgeschlossen.",
+    "{people} observations are left out by people (observations/exclusions.csv), {files} only by used = false in "
+    "their table, {run} by this adjustment. What is left out is predicted and tested as long as the others "
+    "determine it: a small residual says that it would fit now.": "{people} Beobachtungen sind von Personen "
+    "ausgeschlossen (observations/exclusions.csv), {files} nur durch used = false in ihrer Tabelle, {run} durch diese "
+    "Ausgleichung. Ausgeschlossenes wird vorhergesagt und getestet, solange die übrigen es bestimmen: Eine kleine "
+    "Verbesserung sagt, dass es jetzt passen würde.",
+    "{n} observations were left out by this adjustment.": "{n} Beobachtungen hat diese Ausgleichung weggelassen.",
+    '<a href="#excluded">{n} observations</a> are left out by people or their tables.':
+    '<a href="#excluded">{n} Beobachtungen</a> sind von Personen oder in ihren Tabellen ausgeschlossen.',
+    "Command": "Befehl",
+    "{n} images, each with the hash of the file that its points come from":
+    "{n} Bilder, jedes mit der Prüfsumme der Datei, aus der seine Punkte stammen",
     "Inputs": "Eingangsdaten",
     "Options": "Einstellungen",
     "Versions": "Programmstände",
@@ -45,7 +69,8 @@ GERMAN = {
     '<a href="#observations">{n} other observations</a> are suspect.': (
         '<a href="#observations">{n} andere Beobachtungen</a> sind verdächtig.'
     ),
-    "{n} observations were not used.": "{n} Beobachtungen wurden nicht verwendet.",
+    "Image": "Bild",
+    "Images": "Bilder",
     "No warnings, nothing suspect, nothing left out.": "Keine Warnungen, nichts verdächtig, nichts ausgelassen.",
     "sigma0 (a priori 1)": "sigma0 (a priori 1)",
     "observations": "Beobachtungen",
@@ -430,6 +455,30 @@ GERMAN_MESSAGES = (
         r"\(v'Pv = ([\d.]+), expected ([\d.]+) to ([\d.]+)\)",
         "Globaltest nicht bestanden: sigma0 = {}, die Verbesserungen sind kleiner, als die Sigmas a priori sagen "
         "(v'Pv = {}, erwartet {} bis {})",
+    ),
+    (
+        r"left out, because every observation of it is left out: (.*)",
+        "ausgelassen, weil jede Beobachtung davon ausgelassen ist: {}",
+    ),
+    (
+        r"(.*): (\S+) is left out, but nothing has that name; (.*)",
+        "{}: {} ist ausgeschlossen, bezeichnet aber nichts; {}",
+    ),
+    (r"detection: (.*): nothing: (.*)", "Erkennung: {}: nichts gefunden: {}"),
+    (r"detection: (.*): failed: (.*)", "Erkennung: {}: nicht lesbar: {}"),
+    (r"images: (.*) are gone, their points are used: .*", "Bilder: {} fehlen, ihre Punkte werden verwendet"),
+    (
+        r"images: (.*) have no points, while those of other images were given; .*",
+        "Bilder: {} haben keine Punkte, während die anderer Bilder gegeben sind",
+    ),
+    (
+        r"images: (.*) have changed since their points were (?:found|given).*",
+        "Bilder: {} sind andere als die, von denen ihre Punkte stammen",
+    ),
+    (r"images: (.*) were never looked at: .*", "Bilder: {} wurden nie ausgewertet, ihre Zieltafeln fehlen"),
+    (
+        r"images: (.*) were searched for other targets than survey.toml names now; .*",
+        "Bilder: {} wurden nach anderen Zieltafeln durchsucht, als survey.toml jetzt nennt",
     ),
     (_WHERE + ": not used", "Kamera {}, Epoche {}, Zieltafel {}: nicht verwendet"),
     (

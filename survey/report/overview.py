@@ -34,8 +34,12 @@ def header(c: Context) -> str:
     if found["n_other"]:
         n = count(found["n_other"])
         problems.append(t('<a href="#observations">{n} other observations</a> are suspect.', n=n))
-    if found["n_not_used"]:
-        problems.append(t("{n} observations were not used.", n=count(found["n_not_used"])))
+    out = c.solution["left_out"]
+    if out["in_this_run"]:
+        problems.append(t("{n} observations were left out by this adjustment.", n=count(out["in_this_run"])))
+    if out["by_people"] + out["in_files"]:
+        n = count(out["by_people"] + out["in_files"])
+        problems.append(t('<a href="#excluded">{n} observations</a> are left out by people or their tables.', n=n))
     unmet = [v for v in c.statistics.verdicts if not v.met] if c.statistics is not None else []
     if unmet:
         most = count(len(c.statistics.verdicts) if c.statistics is not None else 0)
@@ -188,7 +192,14 @@ def inputs(c: Context) -> str:
     """What went in: files with their hashes, options, versions."""
     i = c.solution["inputs"]
     files = table(("<File", "<Hash"), [(esc(k), f"<code>{esc(v)}</code>") for k, v in i["hashes"].items()])
-    parts = [files] if i["hashes"] else []
+    parts = [definition([(t("Command"), f"<code>{esc(i['command'])}</code>")])] if i["command"] else []
+    parts += [files] if i["hashes"] else []
+    if i["images"]:
+        rows = [(esc(e["file"]), f"<code>{esc(e['sha256'])}</code>", count(e["n_image_points"] + e["n_spots"]))
+                for e in i["images"].values()]  # fmt: skip
+        listed = table(("<Image", "<Hash", "Points"), rows)
+        said = t("{n} images, each with the hash of the file that its points come from", n=count(len(rows)))
+        parts.append(f"<details><summary>{said}</summary>{listed}</details>")
     for title, entries in (("Options", i["options"]), ("Versions", i["versions"])):
         if entries:
             parts.append(f"<h3>{t(title)}</h3>" + definition((k, esc(v)) for k, v in entries.items()))

@@ -5,7 +5,7 @@ from typing import Any
 
 from adjust.result import Adjustment
 from survey.quantities import scale_of
-from survey.report import every, instruments, loops, observations, overview, statistics, unknowns
+from survey.report import every, instruments, left_out, loops, observations, overview, statistics, unknowns
 from survey.report.context import Context
 from survey.report.embedding import json_script
 from survey.report.language import language, localised, speaking, t
@@ -30,6 +30,7 @@ _SECTIONS = (
     ("Network", "network", loops.network),
     ("Loops", "loops", loops.loops),
     ("Pairs", "pairs", loops.pairs),
+    ("Excluded by people", "excluded", left_out.excluded),
     ("Observations", "observations", observations.others),
     ("Image points", "image-points", observations.image_points),
     ("All observations", "all-observations", every.every_observation),
