@@ -30,7 +30,7 @@ class CondensedSystem:
 
     block: (m,) index into ``Survey.image_blocks``. lens: (m, MAX_LENS) by the free lens parameters of its camera. camera,
     target: (m, 6) by a motion of the camera in its own axes, of the target in its own axes (rotation, translation).
-    shape: (m, 4) by the shape of the target: flat ones grow along x and y, and bend (unit sags) along x and y; others
+    key_columns: of the system. shape: (m, 4) by the shape of the target: flat ones grow along x and y, and bend (unit sags) along x and y; others
     grow along x, y and z, the last column is zero. e: (m,).
     """
 
@@ -41,15 +41,35 @@ class CondensedSystem:
     target: FloatArray
     shape: FloatArray
     e: FloatArray
+    key_columns: KeyColumns
+
+    def point_rows(self, row: int) -> tuple[IntArray, FloatArray]:
+        """Columns (k,) and the whitened rows (2, k) over them of an image point that is in use."""
+        graph = self.system.precision.graph
+        ptr = np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks])
+        i = int(np.searchsorted(ptr, row, side="right")) - 1
+        point, known = row - int(ptr[i]), [k for k, free in graph.image_order if not free]
+        if i not in known:  # its rows are among those of the system
+            first = int(np.flatnonzero(self.block == i)[0])
+            A = self.system.A[first + 2 * point : first + 2 * point + 2]
+            columns = np.unique(A.indices)
+            return columns, A[:, columns].toarray()
+        b = known.index(i)
+        local = _block_rows(graph, b)[2 * point : 2 * point + 2, :-1]
+        columns = np.concatenate([self.key_columns[key] for key in graph.images.keys[b]])
+        kept = columns >= 0
+        return columns[kept], (local @ graph.images.local_from_keys(b))[:, kept]
 
 
 def condensed_system(precision: Precision) -> CondensedSystem:
     """The system of a solved survey, of any size."""
     kept: dict[str, list[FloatArray]] = {k: [] for k in ("lens", "camera", "target", "shape")}
     blocks: list[IntArray] = []
+    columns: KeyColumns = {}
 
     def image_rows(precision: Precision, n: int, key_columns: KeyColumns) -> ImageRows:
         graph = precision.graph
+        columns.update(key_columns)
         parts = [_known(graph, n, key_columns, kept, blocks)]
         if graph.bundle is not None:
             parts.append(_unknown(precision, graph.bundle, n, key_columns, kept, blocks))
@@ -63,7 +83,7 @@ def condensed_system(precision: Precision) -> CondensedSystem:
         np.concatenate([np.zeros((0, w)), *kept[k]])
         for k, w in (("lens", MAX_LENS), ("camera", 6), ("target", 6), ("shape", N_SHAPE))
     )
-    return CondensedSystem(system, block, lens, camera, target, shape, system.e[: len(block)])
+    return CondensedSystem(system, block, lens, camera, target, shape, system.e[: len(block)], columns)
 
 
 def _known(
@@ -77,8 +97,7 @@ def _known(
     at, lengths, e = 0, np.zeros(len(images.blocks), dtype=np.int64), [np.zeros(0)]
     for b, keys in enumerate(images.keys):
         points = slice(int(images.ptr[b]), int(images.ptr[b + 1]))
-        local = np.zeros((2 * (points.stop - points.start), int(images.n_rows[b])))
-        block_rows(b, images.arrays, images.points, images.W_all_columns, s.lenses, c.R, c.t, s.warp, local)
+        local = _block_rows(graph, b)
         nl = int(s.lenses.n_free[images.camera[b]])
         given = whole.get(images.blocks[b].target_id or "")
         shape = _shape_columns(given, images.blocks[b].point_idx, local[:, nl + 3 : nl + 6])
@@ -100,6 +119,15 @@ def _known(
         at += k
     A = entries.matrix((at, n))
     return ImageRows(A, np.concatenate(e), lengths, np.ones(len(lengths), dtype=np.bool_), [b.group for b in images.blocks])
+
+
+def _block_rows(graph: AdjustmentGraph, b: int) -> FloatArray:
+    """Whitened rows (2 n, local unknowns and 1) of all points of the b-th block of known targets, residual last."""
+    images = graph.images
+    s, c = images.state, images.chains
+    local = np.zeros((2 * int(images.ptr[b + 1] - images.ptr[b]), int(images.n_rows[b])))
+    block_rows(b, images.arrays, images.points, images.W_all_columns, s.lenses, c.R, c.t, s.warp, local)
+    return local
 
 
 def _of_camera(R: FloatArray, t: FloatArray) -> FloatArray:

@@ -29,6 +29,8 @@ DENSE = 3000
 """Unknowns up to which the normal matrix is factored as a full one."""
 FEW = 200
 """Unknowns up to which it is inverted at once."""
+_SMALL_SET = 100
+"""Unknowns of one epoch, or one point, up to which they are eliminated by themselves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,12 +135,67 @@ def _solver(scaled: sparse.csc_matrix) -> Callable[[FloatArray], FloatArray]:
     if n <= DENSE:
         factor = scipy.linalg.cho_factor(scaled.toarray())
         return lambda b: np.asarray(scipy.linalg.cho_solve(factor, b))
+    arrow = _arrow(scaled)
+    if arrow is not None:
+        return arrow
     from scipy.sparse.linalg import splu  # here: as above
 
     solve: Callable[[FloatArray], FloatArray] = splu(
         scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
     ).solve
     return solve
+
+
+def _arrow(scaled: sparse.csc_matrix) -> Callable[[FloatArray], FloatArray] | None:
+    """The solution by a few unknowns that most others touch and many small sets that touch nothing but these.
+
+    That is a survey of many epochs, or of many points seen from a few places; None for others.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    degree = np.diff(scaled.indptr)
+    core = np.flatnonzero(degree > 2 * np.median(degree))
+    rest = np.flatnonzero(degree <= 2 * np.median(degree))
+    if not 0 < len(core) <= DENSE:
+        return None
+    N = scaled.tocsr()
+    own, across, head = N[rest][:, rest], N[rest][:, core], N[core][:, core].toarray()
+    _, label = connected_components(own, directed=False)
+    sizes = np.bincount(label)
+    if sizes.max() > _SMALL_SET:
+        return None
+    sets = [np.argsort(label, kind="stable")[np.repeat(sizes, sizes) == k].reshape(-1, k) for k in np.unique(sizes)]
+    inverses = [np.linalg.inv(_blocks(own, x)) for x in sets]
+
+    def inner(b: FloatArray) -> FloatArray:
+        out = np.empty_like(b)
+        for index, inverse in zip(sets, inverses, strict=True):
+            out[index] = inverse @ b[index]
+        return out
+
+    T = inner(across.toarray())
+    factor = scipy.linalg.cho_factor(head - across.T @ T)
+
+    def solve(b: FloatArray) -> FloatArray:
+        columns = b.reshape(len(b), -1)
+        x = np.empty_like(columns)
+        x[core] = scipy.linalg.cho_solve(factor, columns[core] - T.T @ columns[rest])
+        x[rest] = inner(columns[rest]) - T @ x[core]
+        return x.reshape(b.shape)
+
+    return solve
+
+
+def _blocks(N: sparse.csr_matrix, sets: IntArray) -> FloatArray:
+    """The blocks (p, k, k) of a matrix that has no others; sets (p, k)."""
+    p, k = sets.shape
+    place, number = np.full(N.shape[0], -1), np.full(N.shape[0], -1)
+    place[sets], number[sets] = np.arange(k), np.arange(p)[:, None]
+    entries = N.tocoo()
+    kept = number[entries.row] >= 0
+    out = np.zeros((p, k, k))
+    out[number[entries.row[kept]], place[entries.row[kept]], place[entries.col[kept]]] = entries.data[kept]
+    return out
 
 
 class Normal:
