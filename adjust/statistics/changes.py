@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from adjust.distributions import chi2, fisher, norm
 from adjust.model import FloatArray, IntArray
@@ -19,14 +20,14 @@ from adjust.precision import noise_of
 from adjust.result import Adjustment
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Change, ChangeShift
-from adjust.statistics.system import DENSE, LinearSystem
+from adjust.statistics.system import LinearSystem
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
 
 _SEEN = 1e-4
 """Share of a column that no unknown takes over, below which it is not told from rounding."""
-_MOST_RUNS = 64
-_MANY, _FEW = 6000, 400
-"""Columns of possible changes in surveys whose normal matrix is a full one, and in larger ones."""
+_MOST_RUNS = 256
+_WORK, _ROOM = 1e10, 2e7
+"""Multiplications that possible changes may cost, and numbers that they may need."""
 _MOST = 6
 _SHAPES = {True: (("width", "1"), ("height", "1"), ("sag along x", "m"), ("sag along y", "m")),
            False: (("width", "1"), ("height", "1"), ("depth", "1"), ("", "1"))}  # fmt: skip
@@ -53,26 +54,34 @@ class Unit:
 class _Candidates:
     """A unit's possible changes (J, ...), scaled so that B'B has a unit diagonal: M (J, q, q), g (J, q), scale (J, q).
 
-    X, Y: (J, n, q) A'B and Q A'B.
+    Y: (J, n, q) Q A'B.
     """
 
     unit: Unit
     M: FloatArray
     g: FloatArray
     scale: FloatArray
-    X: FloatArray
     Y: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class _Chosen:
-    """What was found: B (m, q) over all image rows, M (q, q), g (q,), X and Y (n, q)."""
+    """What was found: B (m, q) over all rows, g (q,), X = A'B and Y = Q A'B (n, q)."""
 
     B: FloatArray
-    M: FloatArray
     g: FloatArray
     X: FloatArray
     Y: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """All that was found: B (m, q) over all rows, X (n, q), the inverse (q, q) of their M, and that times their g."""
+
+    B: FloatArray
+    X: FloatArray
+    inverse: FloatArray
+    amounts: FloatArray
 
 
 def natural(name: str) -> tuple[tuple[int, str], ...]:
@@ -91,10 +100,11 @@ class ChangeSearch:
         rows = s.used[s.row_of]
         step = s.normal.solve(np.asarray(s.A[rows].T @ s.e[rows]))
         self.A, self.e = s.A, s.e - s.A @ step
-        dense = len(s.columns) <= DENSE
+        n = len(s.columns)
         units = list(self._units(_MOST_RUNS))
         columns = sum(u.B.shape[1] for u in units)
-        self.runs = int(np.clip((_MANY if dense else _FEW) // max(columns, 1), 2, _MOST_RUNS))
+        most = min(_WORK / s.normal.cost, _ROOM / max(n, 1))
+        self.runs = int(np.clip(most / max(columns, 1), 2, _MOST_RUNS))
         self.candidates = [self._candidates(u) for u in self._units(self.runs)]
         self.n_tests = sum(len(c.g) for c in self.candidates)
 
@@ -113,8 +123,9 @@ class ChangeSearch:
         omega, left = self.adjustment.omega, self.adjustment.redundancy
         while len(out) < _MOST:
             best: tuple[float, _Candidates, int, FloatArray, FloatArray] | None = None
+            known = _joint(chosen)
             for c in self.candidates:
-                M, g = self._given(c, chosen)
+                M, g = _given(c, known)
                 T, q = _statistics(M, g)
                 z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)
                 j = int(z.argmax()) if len(z) else -1
@@ -189,7 +200,8 @@ class ChangeSearch:
             run, first = _runs(epochs, most_runs)
             axes = tuple(others[mine[0]].components)
             if len(first) > 1:
-                yield Unit("table", table.table_id, "zero", rows, np.vstack(W), run, first, tuple((x, "rad") for x in axes))
+                zeros = tuple((x, "rad") for x in axes)
+                yield Unit("table", table.table_id, "zero", rows, np.vstack(W), run, first, zeros)
             for axis, name in enumerate(axes):
                 angle = np.array([others[i].observed[axis] for i in mine])
                 waves = np.stack([f(k * angle) for k in (1, 2) for f in (np.sin, np.cos)], axis=1)
@@ -203,39 +215,20 @@ class ChangeSearch:
         """Of the runs from j on, j = 1, 2, ..., or of the only one."""
         J, q = len(u.epochs), u.B.shape[1]
         A, e = self.A[u.rows], self.e[u.rows]
-        wide = np.zeros((len(u.rows), J * q))
-        wide[np.arange(len(u.rows))[:, None], u.run[:, None] * q + np.arange(q)] = u.B
-        X = np.asarray(A.T @ wide)
+        columns = (u.run[:, None] * q + np.arange(q)).ravel()
+        wide = sparse.csr_matrix((u.B.ravel(), columns, np.arange(len(u.rows) + 1) * q), (len(u.rows), J * q))
+        X = (A.T @ wide).toarray()
         Y = self.system.normal.solve(X)
-        P = np.array([u.B[u.run == j].T @ u.B[u.run == j] for j in range(J)])
-        g = np.array([u.B[u.run == j].T @ e[u.run == j] for j in range(J)])
+        P = _by_run(u, u.B)
+        g = _by_run(u, e[:, None])[:, :, 0]
         X, Y = (x.reshape(-1, J, q).transpose(1, 0, 2) for x in (X, Y))
         X, Y, P, g = (np.cumsum(x[::-1], axis=0)[::-1] for x in (X, Y, P, g))
         kept = slice(1, None) if J > 1 else slice(None)
         X, Y, P, g = X[kept], Y[kept], P[kept], g[kept]
         size = np.sqrt(np.einsum("jqq->jq", P))
         scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
-        M = (P - np.einsum("jnq,jnr->jqr", X, Y)) * scale[:, :, None] * scale[:, None, :]
-        return _Candidates(u, 0.5 * (M + M.transpose(0, 2, 1)), g * scale, scale, X, Y)
-
-    def _given(self, c: _Candidates, chosen: Sequence[_Chosen]) -> tuple[FloatArray, FloatArray]:
-        """M and g of candidates where the chosen changes are part of the model."""
-        if not chosen:
-            return c.M, c.g
-        u, J = c.unit, len(c.unit.epochs)
-        B = np.hstack([x.B for x in chosen])[u.rows]
-        direct = np.array([u.B[u.run == j].T @ B[u.run == j] for j in range(J)])
-        direct = np.cumsum(direct[::-1], axis=0)[::-1][1 if J > 1 else 0 :]
-        X = np.hstack([x.X for x in chosen])
-        K = (direct - np.einsum("jnq,nr->jqr", c.Y, X)) * c.scale[:, :, None]
-        own, gradient = self._joint(chosen)
-        inverse = np.linalg.pinv(own, rcond=1e-12, hermitian=True)
-        M = c.M - np.einsum("jqr,rs,jps->jqp", K, inverse, K)
-        return 0.5 * (M + M.transpose(0, 2, 1)), c.g - np.einsum("jqr,rs,s->jq", K, inverse, gradient)
-
-    def _joint(self, chosen: Sequence[_Chosen]) -> tuple[FloatArray, FloatArray]:
-        B, X, Y = (np.hstack([getattr(x, name) for x in chosen]) for name in ("B", "X", "Y"))
-        return B.T @ B - X.T @ Y, np.concatenate([x.g for x in chosen])
+        M = (P - X.transpose(0, 2, 1) @ Y) * scale[:, :, None] * scale[:, None, :]
+        return _Candidates(u, 0.5 * (M + M.transpose(0, 2, 1)), g * scale, scale, Y)
 
     def _chosen(self, c: _Candidates, j: int) -> _Chosen:
         """Its directions that show, with columns of unit length."""
@@ -244,7 +237,7 @@ class ChangeSearch:
         B[u.rows[mine]] = u.B[mine] * c.scale[j]
         values, vectors = np.linalg.eigh(c.M[j])
         V = vectors[:, values > _SEEN]
-        return _Chosen(B @ V, V.T @ c.M[j] @ V, V.T @ c.g[j], c.X[j] * c.scale[j] @ V, c.Y[j] * c.scale[j] @ V)
+        return _Chosen(B @ V, V.T @ c.g[j], np.asarray(self.A.T @ (B @ V)), c.Y[j] * c.scale[j] @ V)
 
 
 def _runs(epochs: Sequence[str], most: int) -> tuple[IntArray, tuple[str, ...]]:
@@ -256,6 +249,33 @@ def _runs(epochs: Sequence[str], most: int) -> tuple[IntArray, tuple[str, ...]]:
     for e in names:
         first.setdefault(number[e], e)
     return np.array([number[e] for e in epochs], dtype=np.int64), tuple(first.values())
+
+
+def _by_run(u: Unit, other: FloatArray) -> FloatArray:
+    """B' times other columns (k, r), of every run apart: (J, q, r)."""
+    order = np.argsort(u.run, kind="stable")
+    first = np.searchsorted(u.run[order], np.arange(len(u.epochs)))
+    return np.asarray(np.add.reduceat(u.B[order][:, :, None] * other[order][:, None, :], first, axis=0))
+
+
+def _joint(chosen: Sequence[_Chosen]) -> _Known | None:
+    """All that was found, together."""
+    if not chosen:
+        return None
+    B, X, Y = (np.hstack([getattr(x, name) for x in chosen]) for name in ("B", "X", "Y"))
+    inverse = np.linalg.pinv(B.T @ B - X.T @ Y, rcond=1e-12, hermitian=True)
+    return _Known(B, X, inverse, inverse @ np.concatenate([x.g for x in chosen]))
+
+
+def _given(c: _Candidates, known: _Known | None) -> tuple[FloatArray, FloatArray]:
+    """M and g of candidates where the chosen changes are part of the model."""
+    if known is None:
+        return c.M, c.g
+    u, J = c.unit, len(c.unit.epochs)
+    direct = np.cumsum(_by_run(u, known.B[u.rows])[::-1], axis=0)[::-1][1 if J > 1 else 0 :]
+    K = (direct - c.Y.transpose(0, 2, 1) @ known.X) * c.scale[:, :, None]
+    M = c.M - K @ known.inverse @ K.transpose(0, 2, 1)
+    return 0.5 * (M + M.transpose(0, 2, 1)), c.g - K @ known.amounts
 
 
 def _statistics(M: FloatArray, g: FloatArray) -> tuple[FloatArray, IntArray]:
@@ -281,9 +301,8 @@ def _change(
     inverse = np.linalg.pinv(M[np.ix_(index, index)], rcond=1e-9, hermitian=True)
     amount, sigma = -inverse @ g[index] * c.scale[j, index], np.sqrt(spread * np.diag(inverse)) * c.scale[j, index]
     order = np.argsort(-np.abs(amount) / np.maximum(sigma, 1e-300), kind="stable")
-    shifts = tuple(
-        ChangeShift(*u.components[index[i]], float(amount[i]), float(sigma[i])) for i in order
-    )
+    said = [u.components[i] for i in index]
+    shifts = tuple(ChangeShift(said[i][0], said[i][1], float(amount[i]), float(sigma[i])) for i in order)
     return Change(u.kind, u.name, u.what, epoch, T, q, p, shifts)
 
 

@@ -26,12 +26,12 @@ _FLAT = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class CondensedSystem:
-    """The system, whose first observations are the image blocks, and its m image rows by what each block has of its own.
+    """The system, whose first observations are the image blocks, and its m image rows by what a block has of its own.
 
-    block: (m,) index into ``Survey.image_blocks``. lens: (m, MAX_LENS) by the free lens parameters of its camera. camera,
-    target: (m, 6) by a motion of the camera in its own axes, of the target in its own axes (rotation, translation).
-    key_columns: of the system. shape: (m, 4) by the shape of the target: flat ones grow along x and y, and bend (unit sags) along x and y; others
-    grow along x, y and z, the last column is zero. e: (m,).
+    block: (m,) index into ``Survey.image_blocks``. lens: (m, MAX_LENS) by the free lens parameters of its camera.
+    camera, target: (m, 6) by a motion of the camera in its own axes, of the target in its own axes (rotation,
+    translation). shape: (m, 4) by the shape of the target: flat ones grow along x and y, and bend (unit sags) along x
+    and y; others grow along x, y and z, the last column is zero. e: (m,). key_columns: of the system.
     """
 
     system: LinearSystem
@@ -103,7 +103,7 @@ def _known(
         shape = _shape_columns(given, images.blocks[b].point_idx, local[:, nl + 3 : nl + 6])
         rows = np.hstack([local[:, :-1], shape, local[:, -1:]]) * np.repeat(images.used[points], 2)[:, None]
         if len(rows) > rows.shape[1]:
-            rows = np.linalg.qr(rows, mode="r")
+            rows = np.asarray(np.linalg.qr(rows, mode="r"))
         k, width = len(rows), local.shape[1] - 1
         if keys:
             columns = np.concatenate([key_columns[key] for key in keys])
@@ -118,7 +118,8 @@ def _known(
         lengths[b] = k
         at += k
     A = entries.matrix((at, n))
-    return ImageRows(A, np.concatenate(e), lengths, np.ones(len(lengths), dtype=np.bool_), [b.group for b in images.blocks])
+    groups = [b.group for b in images.blocks]
+    return ImageRows(A, np.concatenate(e), lengths, np.ones(len(groups), dtype=np.bool_), groups)
 
 
 def _block_rows(graph: AdjustmentGraph, b: int) -> FloatArray:
@@ -140,7 +141,7 @@ def _of_camera(R: FloatArray, t: FloatArray) -> FloatArray:
 
 
 def _shape_columns(whole: FloatArray | None, point_idx: IntArray, by_point: FloatArray) -> FloatArray:
-    """Derivatives (2 n, 4) by the shape of a target with the points ``whole`` (P, 3); by_point (2 n, 3): by coordinates."""
+    """Derivatives (2 n, 4) by the shape of a target with points ``whole`` (P, 3); by_point (2 n, 3): by coordinates."""
     out = np.zeros((len(by_point), N_SHAPE))
     if whole is None:
         return out

@@ -37,7 +37,7 @@ def upper_tail(x: float, weights: FloatArray) -> float:
 
 
 def _saddlepoint(x: float, weights: FloatArray) -> float:
-    """t with K'(t) = sum of lambda / (1 - 2 t lambda) = x, which grows with t up to 1 / (2 max lambda)."""
+    """T with K'(t) = sum of lambda / (1 - 2 t lambda) = x, which grows with t up to 1 / (2 max lambda)."""
     high = 0.5 / float(weights.max())
     # K' is at least its largest term, and at most k of them
     low = min(0.0, 0.5 * (1.0 / float(weights.max()) - len(weights) / x)) - 1.0

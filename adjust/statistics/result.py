@@ -385,15 +385,16 @@ class ChangeShift:
     sigma: float
 
 
-_IN_UNITS = {"rad": ("arcsec", 180.0 * 3600.0 / np.pi), "m": ("mm", 1e3)}
+_IN_UNITS = {"rad": (" arcsec", 180.0 * 3600.0 / np.pi), "m": (" mm", 1e3), "1": ("", 1.0)}
 
 
 @dataclass(frozen=True)
 class Change:
-    """What the residuals say that one camera, target or table has of its own: a score test of parameters that were not there.
+    """What the residuals say that a camera, target or table has of its own: a score test of what was no unknown.
 
     kind: "camera", "target" or "table"; name: which. what: "lens", "position", "shape", "zero", "reading of" an axis.
-    epoch: from which on, "" where it is the same at all epochs. statistic, freedom, p: of the test. shifts: the components that explain it, largest first.
+    epoch: from which on, "" where it is the same at all epochs. statistic, freedom, p: of the test. shifts: the
+    components that explain it, largest first.
     """
 
     kind: str
@@ -412,8 +413,8 @@ class Change:
             said = f"{self.kind} {self.name}: its {self.what} is not as given"
         parts = []
         for x in self.shifts:
-            unit, factor = _IN_UNITS.get(x.unit, (x.unit, 1.0))
-            parts.append(f"{x.component} {x.amount * factor:+.3g} +- {x.sigma * factor:.2g} {unit}".rstrip(" 1"))
+            unit, factor = _IN_UNITS.get(x.unit, (f" {x.unit}", 1.0))
+            parts.append(f"{x.component} {x.amount * factor:+.3g} +- {x.sigma * factor:.2g}{unit}")
         return f"{said}: {', '.join(parts)} (p {self.p:.2g})"
 
 
@@ -421,9 +422,9 @@ class Change:
 class Consistency:
     """Whether every part of a survey fits, and whether cameras and targets stayed the same.
 
-    alpha: error probability of all n_tests together; level: of each. parts: all, smallest p first. changes: those found,
-    the clearest first, each given the ones before it. relative: tested against the rest, because the survey as a whole
-    does not fit its sigmas. n_changes: how many were asked for. left_out: what was not tested, and why.
+    alpha: error probability of all n_tests together; level: of each. parts: all, smallest p first. changes: those
+    found, the clearest first, each given the ones before it. relative: tested against the rest, because the survey as a
+    whole does not fit its sigmas. n_changes: how many were asked for. left_out: what was not tested, and why.
     """
 
     alpha: float

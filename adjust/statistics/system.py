@@ -29,6 +29,8 @@ DENSE = 3000
 """Unknowns up to which the normal matrix is factored as a full one."""
 FEW = 200
 """Unknowns up to which it is inverted at once."""
+_PLAIN = 600
+"""Unknowns up to which nothing is gained by their structure."""
 _SMALL_SET = 100
 """Unknowns of one epoch, or one point, up to which they are eliminated by themselves."""
 
@@ -126,27 +128,28 @@ class LinearSystem:
         return out
 
 
-def _solver(scaled: sparse.csc_matrix) -> Callable[[FloatArray], FloatArray]:
-    """The solution of a normal matrix with a unit diagonal."""
+Solver = tuple[Callable[[FloatArray], FloatArray], float]
+"""The solution of a normal matrix with a unit diagonal, and the multiplications that one right-hand side takes."""
+
+
+def _solver(scaled: sparse.csc_matrix) -> Solver:
     n = scaled.shape[0]
     if n <= FEW:  # its inverse: SciPy's linear algebra takes longer to load
         inverse = np.linalg.inv(scaled.toarray())
-        return lambda b: inverse @ b
-    if n <= DENSE:
-        factor = scipy.linalg.cho_factor(scaled.toarray())
-        return lambda b: np.asarray(scipy.linalg.cho_solve(factor, b))
-    arrow = _arrow(scaled)
+        return lambda b: inverse @ b, float(n**2)
+    arrow = _arrow(scaled) if n > _PLAIN else None
     if arrow is not None:
         return arrow
+    if n <= DENSE:
+        factor = scipy.linalg.cho_factor(scaled.toarray())
+        return lambda b: np.asarray(scipy.linalg.cho_solve(factor, b)), float(n**2)
     from scipy.sparse.linalg import splu  # here: as above
 
-    solve: Callable[[FloatArray], FloatArray] = splu(
-        scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
-    ).solve
-    return solve
+    lu = splu(scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    return lu.solve, 2.0 * lu.L.nnz
 
 
-def _arrow(scaled: sparse.csc_matrix) -> Callable[[FloatArray], FloatArray] | None:
+def _arrow(scaled: sparse.csc_matrix) -> Solver | None:
     """The solution by a few unknowns that most others touch and many small sets that touch nothing but these.
 
     That is a survey of many epochs, or of many points seen from a few places; None for others.
@@ -183,7 +186,7 @@ def _arrow(scaled: sparse.csc_matrix) -> Callable[[FloatArray], FloatArray] | No
         x[rest] = inner(columns[rest]) - T @ x[core]
         return x.reshape(b.shape)
 
-    return solve
+    return solve, 2.0 * len(rest) * len(core) + len(core) ** 2
 
 
 def _blocks(N: sparse.csr_matrix, sets: IntArray) -> FloatArray:
@@ -199,7 +202,10 @@ def _blocks(N: sparse.csr_matrix, sets: IntArray) -> FloatArray:
 
 
 class Normal:
-    """A normal matrix (n, n), factored: solutions, and its inverse in the datum of the survey."""
+    """A normal matrix (n, n), factored: solutions, and its inverse in the datum of the survey.
+
+    cost: multiplications of a solution.
+    """
 
     def __init__(self, N: sparse.csc_matrix, motions: FloatArray) -> None:
         self.N, self.motions = N, motions
@@ -207,7 +213,7 @@ class Normal:
         S = sparse.diags(self.scale)
         scaled = (S @ N @ S).tocsc()
         self.n = scaled.shape[0]
-        self._of_scaled = _solver(scaled)
+        self._of_scaled, self.cost = _solver(scaled)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """The solution (n, k) or (n,) of N x = right, with the datum's rows fulfilled where ``right`` is seen."""
@@ -365,6 +371,7 @@ class Entries:
         self.parts: list[tuple[IntArray, IntArray, FloatArray]] = []
 
     def add(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
+        """Values (r, c) at these rows and columns."""
         kept = columns >= 0
         c = columns[kept]
         v = values[:, kept]
@@ -378,6 +385,7 @@ class Entries:
         self.parts.append((rows[kept], across[kept], values[kept]))
 
     def matrix(self, shape: tuple[int, int]) -> sparse.csr_matrix:
+        """All together."""
         if not self.parts:
             return sparse.csr_matrix(shape)
         r, c, v = (np.concatenate(x) for x in zip(*self.parts, strict=True))
@@ -421,6 +429,7 @@ def _known_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows
 
 
 def bundle_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns, values: Values) -> Rows:
+    """Whitened rows of the image points of unknown points, used or not, in the order of the bundle's blocks."""
     bundle = graph.bundle
     if bundle is None:
         raise ValueError("a survey without unknown points has no such rows")

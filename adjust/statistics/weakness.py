@@ -87,14 +87,15 @@ def _variances(system: LinearSystem, index: IntArray) -> FloatArray:
 
 def _within(system: LinearSystem, number: IntArray, limit: float) -> list[tuple[int, int, float]]:
     """Pairs of components of one unknown that is not compared with others."""
-    by_name, out = system.precision.graph.unknowns.by_name, []
+    by_name, out = system.precision.graph.unknowns.by_name, list[tuple[int, int, float]]()
     for name, at in system.columns.at.items():
         if len(at) > 1 and (number[at] < 0).all():
             free = system.columns.free[name]
             Q = system.precision.cov(by_name[name].key)[np.ix_(free, free)]
             d = np.sqrt(np.maximum(np.diag(Q), 1e-300))
             C = np.triu(Q / np.outer(d, d), 1)
-            out += [(int(at[i]), int(at[j]), float(C[i, j])) for i, j in zip(*np.nonzero(np.abs(C) >= limit), strict=True)]
+            a, b = np.nonzero(np.abs(C) >= limit)
+            out += zip(at[a].tolist(), at[b].tolist(), C[a, b].tolist(), strict=True)
     return out
 
 

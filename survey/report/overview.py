@@ -111,9 +111,8 @@ def _global_test(test: dict[str, Any] | None) -> str:
     else:
         words = t("{low} to {high}", low=general(marks["lower"]), high=general(marks["upper"]))
         parts.append(d.text(0.5 * (x["lower"] + x["upper"]), 50, words, "middle"))
-    words = {"passed": ("good", "passed"), "cautious": ("warn", "cautious sigmas"), "failed": ("bad", "failed")}
-    kind, said = words[test["status"]]
-    word = pill(kind, t(said))
+    said = {"passed": "passed", "cautious": "cautious sigmas", "failed": "failed"}[test["status"]]
+    word = pill({"passed": "good", "cautious": "warn", "failed": "bad"}[test["status"]], t(said))
     sentence = t(
         "Global test {word} omega = {omega}, redundancy {r}, accepted between {lower} and {upper} at {level} %",
         word=word, omega=general(test["omega"], 6), r=count(r), lower=general(test["lower"], 6),
@@ -150,8 +149,8 @@ def parts(c: Context) -> str:
     tested, out = s.consistency, ""
     if tested is not None and tested.parts:
         rows = [
-            (esc(f"{t(_KINDS[x.kind])} {x.name}"), count(x.n), fixed(x.redundancy, 1), fixed(x.factor, 3), general(x.p, 2),
-             pill("bad", t("does not fit")) if x.fails else pill("good", t("fits")))
+            (esc(f"{t(_KINDS[x.kind])} {x.name}"), count(x.n), fixed(x.redundancy, 1), fixed(x.factor, 3),
+             general(x.p, 2), pill("bad", t("does not fit")) if x.fails else pill("good", t("fits")))
             for x in tested.parts[:_MOST_PARTS]
         ]  # fmt: skip
         classes = ["suspect" if x.fails else "" for x in tested.parts[:_MOST_PARTS]]
