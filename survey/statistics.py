@@ -107,8 +107,8 @@ def _left_out(adjustment: Adjustment, system: LinearSystem, n_budgets: int) -> t
     compared = len(compared_columns(system))
     if compared < n:
         out.append(
-            f"correlations: {compared} of {n} components were compared with all others, points and then those of single "
-            "epochs last; the rest only within their own unknown"
+            f"correlations: {compared} of {n} components were compared with all others, points and then those of "
+            "single epochs last; the rest only within their own unknown"
         )
     if n_budgets > MOST_BUDGETS:
         out.append(f"uncertainty budgets: of {MOST_BUDGETS} of {n_budgets} parameters, points last")

@@ -24,7 +24,7 @@ def consistency(
     test = adjustment.global_test
     if test is None:
         return Consistency(alpha, alpha, 0, (), (), False, 0)
-    relative = test.omega > test.upper
+    relative = test.status == "failed"
     system = None if condensed is None else condensed.system
     if condensed is None or isinstance(adjustment.precision, NamedPrecision):
         parts = parts_of_network(adjustment) if len(adjustment.groups) > 1 else ()

@@ -36,7 +36,7 @@ class Contributions:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part: the observations (k,) of the condensed system that belong to it, or none where only its sums are known."""
+    """A part: the observations (k,) of the condensed system that belong to it; none where only its sums are known."""
 
     kind: str
     name: str
@@ -53,7 +53,7 @@ def parts_of_network(adjustment: Adjustment) -> tuple[Part, ...]:
 
 
 def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> tuple[Part, ...]:
-    """All parts that are neither the whole survey nor without redundancy. blocks: the image block of each observation."""
+    """All parts that are neither the whole nor without redundancy. blocks: the image block of each observation."""
     found = contributions(adjustment, system, blocks)
     members: dict[tuple[str, str], list[int]] = {}
     for i, labels in enumerate(_labels(adjustment, system, blocks)):

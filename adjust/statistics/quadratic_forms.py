@@ -1,7 +1,7 @@
 """The distribution of a sum of weighted squares of residuals that belong together: ``sum of lambda_i chi-square_1``.
 
-v'Pv of a group has the eigenvalues lambda of its part R_gg of the redundancy matrix: they lie between 0 and 1, add up to
-its redundancy r, and their squares to half its variance.
+v'Pv of a group has the eigenvalues lambda of its part R_gg of the redundancy matrix: they lie between 0 and 1, add up
+to its redundancy r, and their squares to half its variance.
 """
 
 import numpy as np
@@ -16,8 +16,8 @@ _NEAR = 1e-4
 def upper_tail(x: float, weights: FloatArray) -> float:
     """P(sum of weights_i chi-square_1 > x), weights (k,) positive: the saddlepoint formula of Lugannani and Rice.
 
-    Kuonen (1999), Biometrika 86, 929-935; its relative error stays small far out, where that of an adjusted chi-square
-    grows without bound. Near the mean chi-square with the same two moments (Satterthwaite 1946).
+    Kuonen (1999), Biometrika 86, 929-935; its relative error stays small far out, where that of chi-square with the
+    same two moments (Satterthwaite 1946) grows without bound. At the mean its limit.
     """
     weights = weights[weights > 0.0]
     mean, squares = float(weights.sum()), float((weights**2).sum())
@@ -32,8 +32,8 @@ def upper_tail(x: float, weights: FloatArray) -> float:
         v = t * np.sqrt(2.0 * float(((weights / rest) ** 2).sum()))
         if abs(w) > _NEAR and v != 0.0:
             return float(np.clip(norm.sf(w + np.log(v / w) / w), 0.0, 1.0))
-    scale = squares / mean
-    return float(chi2.sf(x / scale, mean / scale))
+    skewness = 8.0 * float((weights**3).sum()) / (2.0 * squares) ** 1.5
+    return float(0.5 - skewness / (6.0 * np.sqrt(2.0 * np.pi)))
 
 
 def _saddlepoint(x: float, weights: FloatArray) -> float:
