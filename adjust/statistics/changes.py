@@ -9,7 +9,8 @@ can be paid for; each that is found is added to the model before the next is loo
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
@@ -101,11 +102,12 @@ class ChangeSearch:
         step = s.normal.solve(np.asarray(s.A[rows].T @ s.e[rows]))
         self.A, self.e = s.A, s.e - s.A @ step
         n = len(s.columns)
-        units = list(self._units(_MOST_RUNS))
-        columns = sum(u.B.shape[1] for u in units)
+        units, self.runs = list(self._units(_MOST_RUNS)), _MOST_RUNS
         most = min(_WORK / s.normal.cost, _ROOM / max(n, 1))
-        self.runs = int(np.clip(most / max(columns, 1), 2, _MOST_RUNS))
-        self.candidates = [self._candidates(u) for u in self._units(self.runs)]
+        if sum(u.B.shape[1] * len(u.epochs) for u in units) > most:
+            self.runs = int(np.clip(most / sum(u.B.shape[1] for u in units), 2, _MOST_RUNS))
+            units = list(self._units(self.runs))
+        self.candidates = [self._candidates(_by_runs(u)) for u in units]
         self.n_tests = sum(len(c.g) for c in self.candidates)
 
     def left_out(self) -> tuple[str, ...]:
@@ -240,6 +242,12 @@ class ChangeSearch:
         return _Chosen(B @ V, V.T @ c.g[j], np.asarray(self.A.T @ (B @ V)), c.Y[j] * c.scale[j] @ V)
 
 
+def _by_runs(u: Unit) -> Unit:
+    """With its rows in the order of the runs."""
+    order = np.argsort(u.run, kind="stable")
+    return replace(u, rows=u.rows[order], B=u.B[order], run=u.run[order])
+
+
 def _runs(epochs: Sequence[str], most: int) -> tuple[IntArray, tuple[str, ...]]:
     """Number (k,) of the run of epochs that each belongs to, at most so many, and the first epoch of every run."""
     names = sorted(set(epochs), key=natural)
@@ -253,9 +261,8 @@ def _runs(epochs: Sequence[str], most: int) -> tuple[IntArray, tuple[str, ...]]:
 
 def _by_run(u: Unit, other: FloatArray) -> FloatArray:
     """B' times other columns (k, r), of every run apart: (J, q, r)."""
-    order = np.argsort(u.run, kind="stable")
-    first = np.searchsorted(u.run[order], np.arange(len(u.epochs)))
-    return np.asarray(np.add.reduceat(u.B[order][:, :, None] * other[order][:, None, :], first, axis=0))
+    first = np.searchsorted(u.run, np.arange(len(u.epochs) + 1))
+    return np.array([u.B[i:j].T @ other[i:j] for i, j in pairwise(first.tolist())])
 
 
 def _joint(chosen: Sequence[_Chosen]) -> _Known | None:

@@ -6,6 +6,7 @@ what a block could have besides: a motion of its camera, of its target, other le
 epochs, another shape of its target. What the residuals say of these is asked in :mod:`adjust.statistics.changes`.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +32,8 @@ class CondensedSystem:
     block: (m,) index into ``Survey.image_blocks``. lens: (m, MAX_LENS) by the free lens parameters of its camera.
     camera, target: (m, 6) by a motion of the camera in its own axes, of the target in its own axes (rotation,
     translation). shape: (m, 4) by the shape of the target: flat ones grow along x and y, and bend (unit sags) along x
-    and y; others grow along x, y and z, the last column is zero. e: (m,). key_columns: of the system.
+    and y; others grow along x, y and z, the last column is zero. e: (m,). numbers: the image block
+    of each of the first observations. key_columns: of the system.
     """
 
     system: LinearSystem
@@ -41,6 +43,7 @@ class CondensedSystem:
     target: FloatArray
     shape: FloatArray
     e: FloatArray
+    numbers: IntArray
     key_columns: KeyColumns
 
     def point_rows(self, row: int) -> tuple[IntArray, FloatArray]:
@@ -65,14 +68,15 @@ def condensed_system(precision: Precision) -> CondensedSystem:
     """The system of a solved survey, of any size."""
     kept: dict[str, list[FloatArray]] = {k: [] for k in ("lens", "camera", "target", "shape")}
     blocks: list[IntArray] = []
+    numbers: list[IntArray] = []
     columns: KeyColumns = {}
 
     def image_rows(precision: Precision, n: int, key_columns: KeyColumns) -> ImageRows:
         graph = precision.graph
         columns.update(key_columns)
-        parts = [_known(graph, n, key_columns, kept, blocks)]
+        parts = [_known(graph, n, key_columns, kept, blocks, numbers)]
         if graph.bundle is not None:
-            parts.append(_unknown(precision, graph.bundle, n, key_columns, kept, blocks))
+            parts.append(_unknown(precision, graph.bundle, n, key_columns, kept, blocks, numbers))
         A = sparse.vstack([p.A for p in parts]).tocsr()
         e, lengths, used = (np.concatenate([getattr(p, x) for p in parts]) for x in ("e", "lengths", "used"))
         return ImageRows(A, e, lengths, used, [g for p in parts for g in p.groups])
@@ -83,43 +87,79 @@ def condensed_system(precision: Precision) -> CondensedSystem:
         np.concatenate([np.zeros((0, w)), *kept[k]])
         for k, w in (("lens", MAX_LENS), ("camera", 6), ("target", 6), ("shape", N_SHAPE))
     )
-    return CondensedSystem(system, block, lens, camera, target, shape, system.e[: len(block)], columns)
+    return CondensedSystem(system, block, lens, camera, target, shape, system.e[: len(block)],
+                           np.concatenate([np.zeros(0, dtype=np.int64), *numbers]), columns)  # fmt: skip
 
 
 def _known(
-    graph: AdjustmentGraph, n: int, key_columns: KeyColumns, kept: dict[str, list[FloatArray]], blocks: list[IntArray]
-) -> ImageRows:
-    """Blocks of known targets."""
+    graph: AdjustmentGraph, n: int, key_columns: KeyColumns, kept: dict[str, list[FloatArray]], blocks: list[IntArray],
+    numbers: list[IntArray],
+) -> ImageRows:  # fmt: skip
+    """Blocks of known targets, those of the same size together."""
     images, entries = graph.images, Entries()
-    s, c = images.state, images.chains
-    number = [i for i, free in graph.image_order if not free]
-    whole = {t.target_id: t.x_in_target for t in graph.survey.targets}
-    at, lengths, e = 0, np.zeros(len(images.blocks), dtype=np.int64), [np.zeros(0)]
-    for b, keys in enumerate(images.keys):
-        points = slice(int(images.ptr[b]), int(images.ptr[b + 1]))
-        local = _block_rows(graph, b)
-        nl = int(s.lenses.n_free[images.camera[b]])
-        given = whole.get(images.blocks[b].target_id or "")
-        shape = _shape_columns(given, images.blocks[b].point_idx, local[:, nl + 3 : nl + 6])
-        rows = np.hstack([local[:, :-1], shape, local[:, -1:]]) * np.repeat(images.used[points], 2)[:, None]
-        if len(rows) > rows.shape[1]:
-            rows = np.asarray(np.linalg.qr(rows, mode="r"))
-        k, width = len(rows), local.shape[1] - 1
-        if keys:
-            columns = np.concatenate([key_columns[key] for key in keys])
-            entries.add(np.arange(at, at + k), columns, rows[:, :width] @ images.local_from_keys(b))
-        pose = rows[:, nl : nl + 6]
-        kept["lens"].append(np.pad(rows[:, :nl], ((0, 0), (0, MAX_LENS - nl))))
-        kept["target"].append(pose)
-        kept["camera"].append(pose @ _of_camera(c.R[b], c.t[b]))
-        kept["shape"].append(rows[:, width:-1])
-        blocks.append(np.full(k, number[b]))
-        e.append(rows[:, -1])
-        lengths[b] = k
-        at += k
-    A = entries.matrix((at, n))
-    groups = [b.group for b in images.blocks]
-    return ImageRows(A, np.concatenate(e), lengths, np.ones(len(groups), dtype=np.bool_), groups)
+    number = np.array([i for i, free in graph.image_order if not free], dtype=np.int64)
+    shapes = {t.target_id: _shape_factors(t.x_in_target) for t in graph.survey.targets}
+    sizes = np.stack([np.diff(images.ptr), images.n_rows, images.of_blocks.columns], axis=1)
+    kinds, kind = np.unique(sizes, axis=0, return_inverse=True)
+    at, order, lengths, e = 0, np.zeros(0, dtype=np.int64), [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+    for j in range(len(kinds)):
+        mine = np.flatnonzero(kind.ravel() == j)
+        rows = _condensed_rows(graph, mine, shapes)
+        g, k, width = len(mine), rows.shape[1], int(kinds[j, 1]) - 1
+        if kinds[j, 2]:
+            columns = np.array([np.concatenate([key_columns[key] for key in images.keys[b]]) for b in mine])
+            by_key = rows[:, :, :width] @ np.array([images.local_from_keys(int(b)) for b in mine])
+            entries.add_blocks(at + np.arange(g * k).reshape(g, k), columns, by_key)
+        _keep(graph, mine, rows, width, kept)
+        blocks.append(np.repeat(number[mine], k))
+        e.append(rows[:, :, -1].ravel())
+        lengths.append(np.full(g, k))
+        order, at = np.concatenate([order, mine]), at + g * k
+    numbers.append(number[order])
+    groups = [images.blocks[b].group for b in order]
+    used = np.ones(len(groups), dtype=np.bool_)
+    return ImageRows(entries.matrix((at, n)), np.concatenate(e), np.concatenate(lengths), used, groups)
+
+
+def _condensed_rows(
+    graph: AdjustmentGraph, mine: IntArray, shapes: Mapping[str | None, FloatArray]
+) -> FloatArray:
+    """Rows (g, k, lens + pose + warp + shape + 1) of g blocks with equally many points and columns."""
+    images = graph.images
+    local = np.array([_block_rows(graph, int(b)) for b in mine])
+    n = local.shape[1] // 2
+    none = np.zeros((0, N_SHAPE))
+    factors = np.zeros((len(mine), n, N_SHAPE))
+    for i, b in enumerate(mine):
+        given = shapes.get(images.blocks[b].target_id, none)
+        if len(given):
+            factors[i] = given[images.blocks[b].point_idx]
+    nl = images.state.lenses.n_free[images.camera[mine]]
+    pose = nl[:, None] + 3 + np.array([0, 1, 2, 2])
+    by_point = np.take_along_axis(local, np.broadcast_to(pose[:, None], (len(mine), 2 * n, N_SHAPE)), axis=2)
+    rows = np.concatenate([local[:, :, :-1], by_point * np.repeat(factors, 2, axis=1), local[:, :, -1:]], axis=2)
+    used = images.used[images.ptr[mine][:, None] + np.arange(n)]
+    rows *= np.repeat(used, 2, axis=1)[:, :, None]
+    return np.asarray(np.linalg.qr(rows, mode="r")) if rows.shape[1] > rows.shape[2] else rows
+
+
+def _keep(
+    graph: AdjustmentGraph, mine: IntArray, rows: FloatArray, width: int, kept: dict[str, list[FloatArray]]
+) -> None:
+    """The columns of what a block may have of its own."""
+    images = graph.images
+    nl = images.state.lenses.n_free[images.camera[mine]]
+    lens = np.zeros((*rows.shape[:2], MAX_LENS))
+    pose = np.empty((*rows.shape[:2], 6))
+    for count in np.unique(nl):  # warps make up for lens parameters in the number of columns
+        those = nl == count
+        lens[those, :, :count] = rows[those][:, :, :count]
+        pose[those] = rows[those][:, :, count : count + 6]
+    by_camera = _of_cameras(images.chains.R[mine], images.chains.t[mine])
+    kept["lens"].append(lens.reshape(-1, MAX_LENS))
+    kept["target"].append(pose.reshape(-1, 6))
+    kept["camera"].append((pose @ by_camera).reshape(-1, 6))
+    kept["shape"].append(rows[:, :, width:-1].reshape(-1, N_SHAPE))
 
 
 def _block_rows(graph: AdjustmentGraph, b: int) -> FloatArray:
@@ -131,29 +171,30 @@ def _block_rows(graph: AdjustmentGraph, b: int) -> FloatArray:
     return local
 
 
-def _of_camera(R: FloatArray, t: FloatArray) -> FloatArray:
-    """Motion (6, 6) in the target of a motion d of the camera: Exp(d) T = T Exp(Ad(inv T) d), T = (R, t)."""
-    out = np.zeros((6, 6))
-    cross = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]])
-    out[:3, :3] = out[3:, 3:] = R.T
-    out[3:, :3] = -R.T @ cross
+def _of_cameras(R: FloatArray, t: FloatArray) -> FloatArray:
+    """Motions (B, 6, 6) in the target of a motion d of the camera: Exp(d) T = T Exp(Ad(inv T) d), T = (R, t)."""
+    out = np.zeros((len(R), 6, 6))
+    turned = R.transpose(0, 2, 1)
+    out[:, :3, :3] = out[:, 3:, 3:] = turned
+    cross = np.zeros((len(R), 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        cross[:, i, j], cross[:, j, i] = -t[:, k], t[:, k]
+    out[:, 3:, :3] = -turned @ cross
     return out
 
 
-def _shape_columns(whole: FloatArray | None, point_idx: IntArray, by_point: FloatArray) -> FloatArray:
-    """Derivatives (2 n, 4) by the shape of a target with points ``whole`` (P, 3); by_point (2 n, 3): by coordinates."""
-    out = np.zeros((len(by_point), N_SHAPE))
-    if whole is None:
-        return out
-    out[:, :3] = by_point * np.repeat(whole[point_idx], 2, axis=0)
-    if np.ptp(whole[:, 2]) < _FLAT:
-        out[:, 2:] = by_point[:, 2:] * np.repeat(warp_shape(whole)[point_idx], 2, axis=0)
+def _shape_factors(x: FloatArray) -> FloatArray:
+    """By what the derivatives by x, y, z and z again of the points (P, 3) of a target are to be multiplied: (P, 4)."""
+    out = np.zeros((len(x), N_SHAPE))
+    out[:, :3] = x
+    if np.ptp(x[:, 2]) < _FLAT:
+        out[:, 2:] = warp_shape(x)
     return out
 
 
 def _unknown(
     precision: Precision, bundle: BundleBatch, n: int, key_columns: KeyColumns, kept: dict[str, list[FloatArray]],
-    blocks: list[IntArray],
+    blocks: list[IntArray], numbers: list[IntArray],
 ) -> ImageRows:  # fmt: skip
     """Blocks of unknown points, whose rows differ in the columns of their points: as they are, two per point."""
     A, e = bundle_rows(precision.graph, n, key_columns, precision.solved.values)
@@ -165,12 +206,13 @@ def _unknown(
     of_row = np.repeat(np.arange(len(lengths)), lengths)
     pose = local[:, MAX_LENS : MAX_LENS + 6]
     c = bundle.chains
-    by_camera = np.array([_of_camera(R, t) for R, t in zip(c.R, c.t, strict=True)])
+    by_camera = _of_cameras(c.R, c.t)
     kept["lens"].append(local[:, :MAX_LENS])
     kept["target"].append(np.zeros_like(pose))
     kept["camera"].append(np.einsum("ni,nij->nj", pose, by_camera[of_row]))
     kept["shape"].append(np.zeros((len(local), N_SHAPE)))
     blocks.append(number[of_row])
+    numbers.append(number)
     groups = [b.group for b in bundle.blocks]
     A = sparse.diags(used) @ A
     return ImageRows(A.tocsr(), e * used, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)

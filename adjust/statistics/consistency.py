@@ -5,7 +5,7 @@ from adjust.result import Adjustment
 from adjust.statistics.changes import ChangeSearch
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.criteria import sidak
-from adjust.statistics.parts import block_numbers, parts_of, parts_of_network, tested_parts
+from adjust.statistics.parts import parts_of, parts_of_network, tested_parts
 from adjust.statistics.result import Consistency
 
 _ESTIMATED = ("estimated", "unseparable")
@@ -29,7 +29,7 @@ def consistency(
     if condensed is None or isinstance(adjustment.precision, NamedPrecision):
         parts = parts_of_network(adjustment) if len(adjustment.groups) > 1 else ()
     else:
-        parts = parts_of(adjustment, condensed.system, block_numbers(condensed.system.precision))
+        parts = parts_of(adjustment, condensed.system, condensed.numbers)
     known = adjustment.variance_components
     fitted = {c.group for c in known.components if c.status in _ESTIMATED} if known is not None else set()
     parts = tuple(p for p in parts if not (p.kind == "group" and p.name in fitted))

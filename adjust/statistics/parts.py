@@ -13,7 +13,6 @@ import numpy as np
 from adjust.distributions import chi2, fisher
 from adjust.image_batch import whitened_squares
 from adjust.model import FloatArray, IntArray
-from adjust.precision import Precision
 from adjust.result import Adjustment
 from adjust.statistics.quadratic_forms import upper_tail, upper_tail_bound
 from adjust.statistics.result import PartTest
@@ -152,10 +151,3 @@ def eigenvalues(system: LinearSystem, rows: IntArray, n: int) -> FloatArray:
     influence = A @ system.normal.solve(A.T.toarray())
     taken = np.sort(np.linalg.eigvalsh(0.5 * (influence + influence.T)))[::-1][:n]
     return np.concatenate([np.clip(1.0 - taken, 0.0, 1.0), np.ones(n - len(taken))])
-
-
-def block_numbers(precision: Precision) -> IntArray:
-    """The image block of every block of a condensed system: those of known targets first."""
-    order = precision.graph.image_order
-    return np.array([i for i, free in order if not free] + [i for i, free in order if free], dtype=np.int64)
-

@@ -377,12 +377,16 @@ class Entries:
         v = values[:, kept]
         self.parts.append((np.repeat(rows, len(c)), np.tile(c, len(rows)), v.ravel()))
 
-    def add_many(self, points: IntArray, columns: IntArray, values: FloatArray) -> None:
-        """Two rows each of many points: columns (k, c), values (k, 2, c)."""
-        rows = np.broadcast_to((2 * points[:, None] + np.arange(2))[:, :, None], values.shape)
+    def add_blocks(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
+        """Values (b, r, c) at rows (b, r) and columns (b, c)."""
+        down = np.broadcast_to(rows[:, :, None], values.shape)
         across = np.broadcast_to(columns[:, None, :], values.shape)
         kept = across >= 0
-        self.parts.append((rows[kept], across[kept], values[kept]))
+        self.parts.append((down[kept], across[kept], values[kept]))
+
+    def add_many(self, points: IntArray, columns: IntArray, values: FloatArray) -> None:
+        """Two rows each of many points: columns (k, c), values (k, 2, c)."""
+        self.add_blocks(2 * points[:, None] + np.arange(2), columns, values)
 
     def matrix(self, shape: tuple[int, int]) -> sparse.csr_matrix:
         """All together."""

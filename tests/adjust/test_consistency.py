@@ -13,7 +13,7 @@ from adjust.statistics.changes import ChangeSearch, natural
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.consistency import consistency
 from adjust.statistics.criteria import sidak
-from adjust.statistics.parts import block_numbers, eigenvalues, parts_of
+from adjust.statistics.parts import eigenvalues, parts_of
 from adjust.statistics.quadratic_forms import upper_tail, upper_tail_bound
 from adjust.statistics.result import Change, Consistency
 from adjust.statistics.system import linear_system, precision_of
@@ -58,7 +58,7 @@ def test_mean_and_variance_of_a_part_are_those_of_its_quadratic_form() -> None:
     full = linear_system(adjustment)
     A = full.A.toarray()
     R = np.eye(len(A)) - A @ np.linalg.inv(A.T @ A) @ A.T
-    for part in parts_of(adjustment, system, block_numbers(system.precision)):
+    for part in parts_of(adjustment, system, condensed.numbers):
         rows = np.flatnonzero(np.isin(full.row_of, part.members))
         own = R[np.ix_(rows, rows)]
         found = eigenvalues(system, rows, len(rows))
