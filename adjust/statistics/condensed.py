@@ -98,7 +98,8 @@ def _known(
     """Blocks of known targets, those of the same size together."""
     images, entries = graph.images, Entries()
     number = np.array([i for i, free in graph.image_order if not free], dtype=np.int64)
-    shapes = {t.target_id: _shape_factors(t.x_in_target) for t in graph.survey.targets}
+    shapes: dict[str | None, FloatArray] = {}
+    shapes.update({t.target_id: _shape_factors(t.x_in_target) for t in graph.survey.targets})
     sizes = np.stack([np.diff(images.ptr), images.n_rows, images.of_blocks.columns], axis=1)
     kinds, kind = np.unique(sizes, axis=0, return_inverse=True)
     at, order, lengths, e = 0, np.zeros(0, dtype=np.int64), [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
