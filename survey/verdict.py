@@ -72,9 +72,9 @@ def findings(tested: Consistency | None) -> tuple[str, ...]:
     """For people: changes, and the parts that do not fit, the clearest first."""
     if tested is None:
         return ()
-    parts = tested.failing
-    more = (f"and {len(parts) - _MOST_PARTS} more parts do not fit",) if len(parts) > _MOST_PARTS else ()
-    return (*(c.text() for c in tested.changes), *(p.text() for p in parts[:_MOST_PARTS]), *more)
+    out = [c.text() for c in tested.changes[:_MOST_PARTS]] + [p.text() for p in tested.failing[:_MOST_PARTS]]
+    more = len(tested.changes) + len(tested.failing) - len(out)
+    return (*out, f"and {more} more parts do not fit") if more else tuple(out)
 
 
 def verdict(

@@ -8,6 +8,7 @@ can be paid for; each that is found is added to the model before the next is loo
 """
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -29,7 +30,8 @@ _SEEN = 1e-4
 _MOST_RUNS = 256
 _WORK, _ROOM = 1e10, 2e7
 """Multiplications that possible changes may cost, and numbers that they may need."""
-_MOST = 6
+_MOST, _MOST_OF_ONE = 20, 2
+"""Changes that are named: in all, and of the same kind of one camera, target or table, which may drift without end."""
 _SHAPES = {True: (("width", "1"), ("height", "1"), ("sag along x", "m"), ("sag along y", "m")),
            False: (("width", "1"), ("height", "1"), ("depth", "1"), ("", "1"))}  # fmt: skip
 
@@ -125,8 +127,10 @@ class ChangeSearch:
         omega, left = self.adjustment.omega, self.adjustment.redundancy
         while len(out) < _MOST:
             best: tuple[float, _Candidates, int, FloatArray, FloatArray] | None = None
-            known = _joint(chosen)
+            known, named = _joint(chosen), Counter((x.kind, x.name, x.what) for x in out)
             for c in self.candidates:
+                if named[c.unit.kind, c.unit.name, c.unit.what] >= _MOST_OF_ONE:
+                    continue
                 M, g = _given(c, known)
                 T, q = _statistics(M, g)
                 z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)

@@ -64,3 +64,13 @@ def test_bent_boards_are_named_with_their_sag(tmp_path):
     for x in changes.values():
         assert x["what"] == "shape"
         assert x["shifts"][0]["amount"] == pytest.approx(2e-3, abs=4 * x["shifts"][0]["sigma"])
+
+
+def test_boards_that_are_wider_than_given_are_named_and_not_the_table(tmp_path):
+    """All are 0.3 % wider in x; the held one, which the rest follows, the other way round: too low."""
+    found = adjusted("nonsquare", tmp_path, 3)
+    changes = found["consistency"]["changes"]
+    assert {x["what"] for x in changes} == {"shape"}
+    assert len({x["name"] for x in changes}) > 10
+    size = [next(s["amount"] for s in x["shifts"] if s["component"] in ("width", "height")) for x in changes]
+    assert all(abs(abs(s) - 0.003) < 0.0015 for s in size)
