@@ -135,7 +135,7 @@ class ChangeSearch:
                 T, q = _statistics(M, g)
                 z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)
                 j = int(z.argmax()) if len(z) else -1
-                if j >= 0 and (best is None or z[j] > best[0]):
+                if j >= 0 and z[j] > (best[0] if best is not None else -np.inf):
                     best = float(z[j]), c, j, M[j], g[j]
             if best is None:
                 break
