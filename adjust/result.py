@@ -136,6 +136,11 @@ class GlobalTest:
             return "failed"
         return "cautious" if self.omega < self.lower else "passed"
 
+    @property
+    def said(self) -> str:
+        """The status in words."""
+        return "passed with cautious sigmas" if self.status == "cautious" else self.status
+
     def warning(self, sigma0: float) -> str:
         """For people: what is not as the sigmas say; "" where all is."""
         if self.passed:
@@ -183,7 +188,7 @@ class Adjustment:
 
     def __repr__(self) -> str:
         """The key figures in one line."""
-        said = "" if self.global_test is None else f", global test {self.global_test.status}"
+        said = "" if self.global_test is None else f", global test {self.global_test.said}"
         return (
             f"Adjustment(sigma0 {self.sigma0:.4f}, {self.n_observations} observations, {self.n_unknowns} unknowns, "
             f"redundancy {self.redundancy}{said})"
