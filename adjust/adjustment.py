@@ -212,11 +212,7 @@ def warnings(graph: AdjustmentGraph, result: Adjustment, given: Survey | None = 
         )
     test = result.global_test
     if test is not None and not test.passed:
-        side = "larger" if test.omega > test.upper else "smaller"
-        out.append(
-            f"global test failed: sigma0 = {result.sigma0:.3f}, the residuals are {side} than the a priori sigmas say "
-            f"(v'Pv = {test.omega:.1f}, expected {test.lower:.1f} to {test.upper:.1f})"
-        )
+        out.append(test.warning(result.sigma0))
     out += _image_warnings(graph, result, given) + _lens_warnings(graph, result)
     return tuple(out)
 

@@ -96,13 +96,7 @@ def adjusted_network(survey: Survey, solution: "NetworkSolution", options: PairO
 
 def _test_warning(result: Adjustment) -> tuple[str, ...]:
     test = result.global_test
-    if test is None or test.passed:
-        return ()
-    side = "larger" if test.omega > test.upper else "smaller"
-    return (
-        f"global test failed: sigma0 = {result.sigma0:.3f}, the residuals are {side} than the a priori sigmas say "
-        f"(v'Pv = {test.omega:.1f}, expected {test.lower:.1f} to {test.upper:.1f})",
-    )
+    return () if test is None or test.passed else (test.warning(result.sigma0),)
 
 
 def _uncontrolled_warning(result: Adjustment) -> tuple[str, ...]:

@@ -35,7 +35,7 @@ Adjusts a whole laboratory at once: cameras, turntable, beacons, relay stations 
 _EPILOG = """\
 Next: labsurvey example full-lab lab
 Help for one command: labsurvey adjust --help
-Exit codes: 0 done, 1 error in the project, 2 wrong usage, 3 solved but residuals are larger than the sigmas say.
+Exit codes: 0 done, 1 error in the project, 2 wrong usage, 3 solved, but something does not fit.
 """
 _COMMANDS = (
     declare_adjust,

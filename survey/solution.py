@@ -18,7 +18,7 @@ from survey.quantities import Scale, SigmaKind, point_entry, pose_entry, scale_o
 from survey.solution_instruments import instrument_entries
 from survey.statistics import Statistics
 from survey.statistics_dict import statistics_dict
-from survey.verdict import suspects, verdict
+from survey.verdict import findings, fit_of, suspects, verdict
 
 CORRELATION_LIMIT = 0.95
 # parameters for which "zero" is no sensible hypothesis
@@ -65,7 +65,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
     solution: dict[str, Any] = _plain(
         {
             "format": 1,
-            "summary": _summary(adjustment, run, scale, sum(not v.met for v in found.verdicts) if found else 0),
+            "summary": _summary(adjustment, run, scale, found),
             "conventions": CONVENTIONS,
             "cameras": _cameras(adjustment, scale),
             "stations": _stations(adjustment, scale),
@@ -77,7 +77,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
             **_network(adjustment.survey),
             "groups": {g.group: _group(g) for g in adjustment.groups},
             **left_out_dict(adjustment, run.left_out, run.n_left_out, run.n_unused_in_files),
-            "warnings": list(adjustment.warnings),
+            "warnings": [*findings(found.consistency if found else None), *adjustment.warnings],
             **(statistics_dict(adjustment, found, scale) if found is not None else {}),
             "inputs": {
                 "folder": run.folder,
@@ -118,13 +118,16 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, n_unmet: int) -> dict[str, Any]:
+def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, statistics: Statistics | None) -> dict[str, Any]:
     found, test = suspects(adjustment), adjustment.global_test
-    level, reason = verdict(adjustment, found, n_unmet)
+    n_unmet = sum(not v.met for v in statistics.verdicts) if statistics is not None else 0
+    tested = statistics.consistency if statistics is not None else None
+    level, reason = verdict(adjustment, found, n_unmet, tested)
     return {
         "title": run.title,
         "verdict": level,
         "reason": reason,
+        "fit": fit_of(adjustment, tested),
         "sigma0": adjustment.sigma0 if adjustment.redundancy > 0 else None,
         "redundancy": adjustment.redundancy,
         "n_observations": adjustment.n_observations,
@@ -146,6 +149,7 @@ def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, n_unmet: int) -
             "lower": test.lower,
             "upper": test.upper,
             "passed": test.passed,
+            "status": test.status,
         },
         "suspects": {
             "alpha": found.alpha,

@@ -76,7 +76,7 @@ def _header(records: Sequence[Record], trends: Trends, date: str) -> str:
     seconds = sum(r.seconds for r in records if r.origin == "adjusted")
     cards = (
         (count(n["folders"]), t("surveys")), (count(n["done"]), t("passed")),
-        (count(n["test_failed"]), t("global test failed")), (count(n["failed"]), t("not adjusted")),
+        (count(n["test_failed"]), t("does not fit")), (count(n["failed"]), t("not adjusted")),
         (count(n["not_adjusted_again"]), t("unchanged, not adjusted again")),
         (t("{n} s", n=fixed(seconds, 1)), t("time of all adjustments")),
     )  # fmt: skip

@@ -7,6 +7,7 @@ from typing import Any
 
 from survey.batch.causes import CAUSES
 from survey.shapes import NUMBER, POSITIVE, REAL, WHOLE, Each, Either, misfit
+from survey.verdict import misfits
 
 DONE, TEST_FAILED, FAILED = "done", "test_failed", "failed"
 ORIGINS, VERDICTS = ("adjusted", "unchanged", "resumed"), ("passed", "check", "failed")
@@ -114,10 +115,8 @@ def solved_record(
     folder: str, solution: Mapping[str, Any], written: Mapping[str, str], seconds: float = 0.0, origin: str = "adjusted"
 ) -> Record:
     """The record of a folder that was adjusted, from what ``solution.json`` holds."""
-    test = solution["summary"]["global_test"]
-    too_large = test is not None and test["omega"] > test["upper"]
     return Record(
-        folder, TEST_FAILED if too_large else DONE, origin, summary=solution["summary"],
+        folder, TEST_FAILED if misfits(solution["summary"]) else DONE, origin, summary=solution["summary"],
         warnings=tuple(solution["warnings"]), groups=solution["groups"], numbers=tuple(_numbers(solution)),
         turns=tuple(_turns(solution)), written=dict(written), seconds=seconds,
     )  # fmt: skip

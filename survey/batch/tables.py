@@ -15,7 +15,7 @@ from survey.batch.run import counts, exit_code
 from survey.batch.trends import LEVEL, Trends
 from survey.files.text import cell_text
 
-STATES = {DONE: "done", FAILED: "error", TEST_FAILED: "global test failed"}
+STATES = {DONE: "done", FAILED: "error", TEST_FAILED: "does not fit"}
 _MOST_TOLD = 8
 
 
@@ -49,7 +49,7 @@ def count_line(records: Sequence[Record]) -> str:
     """How many ended how, in one line."""
     n = counts(records)
     parts = [f"{n['done']} done"]
-    parts += [f"{n['test_failed']} global test failed"] if n["test_failed"] else []
+    parts += [f"{n['test_failed']} do not fit"] if n["test_failed"] else []
     parts += [f"{n['failed']} failed"] if n["failed"] else []
     again = n["not_adjusted_again"]
     more = f"; {again} not adjusted again, their inputs are unchanged" if again else ""

@@ -71,7 +71,7 @@ def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
         say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
     if is_set(arguments, "verbose"):
         say(arguments, *(f"{step}: {seconds:.2f} s" for step, seconds in outcome.run.seconds.items()))
-    return tested(outcome.adjustment.global_test)
+    return tested(outcome.solution["summary"])
 
 
 def _adjust_batch(arguments: argparse.Namespace) -> int:

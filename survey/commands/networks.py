@@ -69,7 +69,7 @@ def _add(arguments: argparse.Namespace) -> int:
     else:
         print(outcome.text())
         say(arguments, *(f"written: {path}" for path in outcome.outcome.paths.values()))
-    return tested(outcome.outcome.adjustment.global_test)
+    return tested(outcome.outcome.solution["summary"])
 
 
 def _remove(arguments: argparse.Namespace) -> int:
@@ -86,7 +86,7 @@ def _remove(arguments: argparse.Namespace) -> int:
     else:
         print(outcome.text())
         say(arguments, *(f"written: {path}" for path in outcome.outcome.paths.values()))
-    return tested(outcome.outcome.adjustment.global_test)
+    return tested(outcome.outcome.solution["summary"])
 
 
 def _trackers(arguments: argparse.Namespace) -> int:

@@ -44,5 +44,5 @@ def _report(arguments: argparse.Namespace) -> int:
             times = f"{v.found / v.allowed:.2f} times what is allowed"
             print(f"  tolerance {v.tolerance} not met: {' '.join(v.result)} {v.quantity}, {times}")
         say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
-    code = tested(outcome.adjustment.global_test)
+    code = tested(outcome.solution["summary"])
     return TEST_FAILED if code == DONE and arguments.check and unmet else code

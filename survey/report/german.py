@@ -94,6 +94,22 @@ GERMAN = {
         "Verbesserungen sind ausgeglichen minus beobachtet."
     ),
     "Global test": "Globaltest",
+    "cautious sigmas": "vorsichtige Sigmas",
+    "Not computed": "Nicht berechnet",
+    "Parts of the survey": "Teile der Vermessung",
+    "Part": "Teil",
+    "Parts": "Teile",
+    "Table": "Drehtisch",
+    "Set-up": "Aufstellung",
+    "Factor": "Faktor",
+    "fits": "passt",
+    "does not fit": "passt nicht",
+    "Every group, camera, epoch, target, table, set-up and instrument tested for itself, and {n} changes and shapes of "
+    "cameras, targets and tables: {all} tests at {level} % together. The {most} with the smallest p are listed.": (
+        "Jede Gruppe, Kamera, Epoche, Zieltafel, jeder Tisch, Aufbau und jedes Instrument für sich geprüft, dazu {n} "
+        "Änderungen und Formen von Kameras, Zieltafeln und Tischen: {all} Prüfungen, zusammen mit {level} %. Gezeigt "
+        "sind die {most} mit dem kleinsten p."
+    ),
     "No global test: there is no redundancy.": "Kein Globaltest: es gibt keine Redundanz.",
     "Global test {word} omega = {omega}, redundancy {r}, accepted between {lower} and {upper} at {level} %": (
         "Globaltest {word} Omega = {omega}, Redundanz {r}, angenommen zwischen {lower} und {upper} bei {level} %"
@@ -451,9 +467,9 @@ GERMAN_MESSAGES = (
         "(v'Pv = {}, erwartet {} bis {})",
     ),
     (
-        r"global test failed: sigma0 = ([\d.]+), the residuals are smaller than the a priori sigmas say "
+        r"cautious sigmas: sigma0 = ([\d.]+), the residuals are smaller than the a priori sigmas say "
         r"\(v'Pv = ([\d.]+), expected ([\d.]+) to ([\d.]+)\)",
-        "Globaltest nicht bestanden: sigma0 = {}, die Verbesserungen sind kleiner, als die Sigmas a priori sagen "
+        "Vorsichtige Sigmas: sigma0 = {}, die Verbesserungen sind kleiner, als die Sigmas a priori sagen "
         "(v'Pv = {}, erwartet {} bis {})",
     ),
     (
@@ -495,10 +511,27 @@ GERMAN_MESSAGES = (
         "erlauben. Nach groben Fehlern, falschen Sigmas oder einem lückenhaften Modell suchen, zuerst bei den Gruppen.",
     ),
     (
-        r"Global test failed on the low side: residuals are only ([\d.]+) times the sigmas of the observations\. .*",
-        "Globaltest nach unten nicht bestanden: die Verbesserungen sind nur das {}-fache der Sigmas der Beobachtungen. "
-        "Die angegebenen Sigmas sind zu groß.",
+        r"Observations and model agree, with cautious sigmas: residuals are ([\d.]+) times what the sigmas of the "
+        r"observations claim\.",
+        "Beobachtungen und Modell stimmen überein, die Sigmas sind vorsichtig: die Verbesserungen sind {}-mal so groß, "
+        "wie die Sigmas der Beobachtungen angeben.",
     ),
+    (
+        r"The survey as a whole fits its sigmas, but not every part of it; .*",
+        "Das Ganze passt zu seinen Sigmas, aber nicht jeder Teil; was nicht passt, steht zuerst bei den Warnungen.",
+    ),
+    (
+        r"(\S+) (.*) does not fit: its residuals are ([\d.]+) times what the sigmas allow \(variance factor (\S+), "
+        r"redundancy ([\d.]+), p (\S+)\)",
+        "{} {} passt nicht: die Verbesserungen sind {}-mal so groß, wie die Sigmas erlauben (Varianzfaktor {}, "
+        "Redundanz {}, p {})",
+    ),
+    (r"and (\d+) more parts do not fit", "und {} weitere Teile passen nicht"),
+    (
+        r"(camera|target|table) (.*): its (.*) is not the one of the other epochs from (.*) on: (.*)",
+        "{} {}: {} ist ab {} nicht wie in den anderen Epochen: {}",
+    ),
+    (r"(camera|target|table) (.*): its (.*) is not as given: (.*)", "{} {}: {} ist nicht wie angegeben: {}"),
     (
         r"The adjustment did not converge: the numbers below are no solution\.",
         "Die Ausgleichung ist nicht konvergiert: die Zahlen unten sind keine Lösung.",

@@ -15,6 +15,9 @@ from survey.tolerances import Verdict, coverage
 _WORDS = {"passed": "Passed", "check": "Needs a look", "failed": "Failed"}
 _MOST_WARNINGS = 25
 _MOST_VERDICTS = 200
+_MOST_PARTS = 20
+_KINDS = {"group": "Group", "camera": "Camera", "epoch": "Epoch", "target": "Target", "table": "Table",
+          "set-up": "Set-up", "instrument": "Instrument"}  # fmt: skip
 _CLEAR = 3.0  # deviations of a group beyond this many sigmas are marked
 
 
@@ -99,7 +102,7 @@ def _global_test(test: dict[str, Any] | None) -> str:
     x = {
         k: left + (v - low + 0.1 * span) / (1.2 * span) * (width - 2 * left) for k, v in (marks | {"one": 1.0}).items()
     }
-    colour = d.GREEN if test["passed"] else d.RED
+    colour = {"passed": d.GREEN, "cautious": d.ORANGE, "failed": d.RED}[test["status"]]
     parts = [
         d.line(left, 28, width - left, 28, d.FAINT, 2),
         d.rect(x["lower"], 22, x["upper"] - x["lower"], 12, d.GREEN, ' fill-opacity="0.22" rx="2"'),
@@ -112,7 +115,8 @@ def _global_test(test: dict[str, Any] | None) -> str:
     else:
         words = t("{low} to {high}", low=general(marks["lower"]), high=general(marks["upper"]))
         parts.append(d.text(0.5 * (x["lower"] + x["upper"]), 50, words, "middle"))
-    word = pill("good", t("passed")) if test["passed"] else pill("bad", t("failed"))
+    said = {"passed": "passed", "cautious": "cautious sigmas", "failed": "failed"}[test["status"]]
+    word = pill({"passed": "good", "cautious": "warn", "failed": "bad"}[test["status"]], t(said))
     sentence = t(
         "Global test {word} omega = {omega}, redundancy {r}, accepted between {lower} and {upper} at {level} %",
         word=word, omega=general(test["omega"], 6), r=count(r), lower=general(test["lower"], 6),
@@ -139,6 +143,34 @@ def groups(c: Context) -> str:
     )
     columns = ("<Group", "Observations", "Redundancy", "Omega", "Variance factor", "Scale of sigmas", "Deviation [σ]")
     return section("groups", "Groups of observations", table(columns, rows) if rows else "", note)
+
+
+def parts(c: Context) -> str:
+    """Every part of the survey tested for itself, the least likely first; what the statistics leave out."""
+    s = c.statistics
+    if s is None:
+        return ""
+    tested, out = s.consistency, ""
+    if tested is not None and tested.parts:
+        rows = [
+            (esc(f"{t(_KINDS[x.kind])} {x.name}"), count(x.n), fixed(x.redundancy, 1), fixed(x.factor, 3),
+             general(x.p, 2), pill("bad", t("does not fit")) if x.fails else pill("good", t("fits")))
+            for x in tested.parts[:_MOST_PARTS]
+        ]  # fmt: skip
+        classes = ["suspect" if x.fails else "" for x in tested.parts[:_MOST_PARTS]]
+        columns = ("<Part", "Observations", "Redundancy", "Factor", "p", "<")
+        note = t(
+            "Every group, camera, epoch, target, table, set-up and instrument tested for itself, and {n} changes and "
+            "shapes of cameras, targets and tables: {all} tests at {level} % together. The {most} with the smallest p "
+            "are listed.",
+            n=count(tested.n_changes), all=count(tested.n_tests), level=general(100 * tested.alpha),
+            most=count(len(rows)),
+        )  # fmt: skip
+        out = section("parts", "Parts of the survey", table(columns, rows, "", classes), note)
+    if s.left_out:
+        listed = "".join(f"<li>{esc(message(x))}</li>" for x in s.left_out)
+        out += section("not-computed", "Not computed", f"<ul>{listed}</ul>")
+    return out
 
 
 def identification(c: Context) -> str:

@@ -20,6 +20,7 @@ _SECTIONS = (
     ("Tolerances", "tolerances", overview.tolerances),
     ("Variance components", "components", statistics.components),
     ("Groups", "groups", overview.groups),
+    ("Parts", "parts", overview.parts),
     ("Picture", "picture", overview.picture),
     ("Cameras", "cameras", unknowns.cameras),
     ("Poses", "poses", unknowns.stations),

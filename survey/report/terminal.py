@@ -61,10 +61,18 @@ def _figures(solution: dict[str, Any]) -> Iterator[str]:
         f"redundancy {s['redundancy']}   iterations {s['iterations']}"
     )
     if test:
+        said = {"passed": "passed", "cautious": "passed with cautious sigmas", "failed": "FAILED"}[test["status"]]
         yield (
-            f"  global test {'passed' if test['passed'] else 'FAILED'}: omega {test['omega']:.1f}, accepted "
+            f"  global test {said}: omega {test['omega']:.1f}, accepted "
             f"{test['lower']:.1f} to {test['upper']:.1f} at {100 * (1 - test['alpha']):g} %"
         )
+    parts = solution.get("consistency")
+    if parts and parts["n_tests"]:
+        failed = [f"{kind} {name}" for kind, x in parts["parts"].items() for name, p in x.items() if not p["fits"]]
+        changed = [f"{x['kind']} {x['name']}" for x in parts["changes"]]
+        listed = ", ".join(dict.fromkeys(changed + failed)) or "all fit"
+        yield f"  parts and changes: {parts['n_tests']} tests: {_cut(listed, _WIDTH - 30)}"
+    yield from (f"  not computed: {line}" for line in solution.get("not_computed", ()))
     yield (
         f"  suspect: {found['n_image_points']} image points, {found['n_other']} other observations; "
         f"not used: {found['n_not_used']}   (sigmas below {s['sigmas'].replace('_', ' ')})"

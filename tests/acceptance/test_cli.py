@@ -13,7 +13,6 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from adjust.errors import SurveyError
-from adjust.result import GlobalTest
 from capture.cli import main as capture_main
 from survey.cli import build_parser, main
 
@@ -29,12 +28,12 @@ def _run(*arguments, **more):
 @dataclass
 class _Outcome:
     folder: Path
-    omega: float = 100.0
+    fit: str = "fits"
     paths: dict = field(default_factory=dict)
 
     @property
-    def adjustment(self):
-        return SimpleNamespace(global_test=GlobalTest(self.omega, 100, 0.05, 74.0, 130.0))
+    def solution(self):
+        return {"summary": {"fit": self.fit, "global_test": None}}
 
     def summary(self):
         return {"summary": {"sigma0": 1.25, "redundancy": 77}}
@@ -58,7 +57,7 @@ def jobs(monkeypatch):
             raise KeyboardInterrupt
         if folder.name == "gone":
             raise PermissionError(13, "Permission denied", str(folder / "results"))
-        return _Outcome(folder, {"poor": 200.0, "cautious": 50.0}.get(folder.name, 100.0))
+        return _Outcome(folder, {"poor": "does_not_fit", "cautious": "cautious"}.get(folder.name, "fits"))
 
     module = ModuleType("survey.jobs")
     module.adjust_job = adjust_job
@@ -138,7 +137,7 @@ def test_adjust_prints_the_result_and_is_0(jobs, project, capsys):
     assert jobs[0].out is None
 
 
-def test_a_failed_global_test_is_3(jobs, project):
+def test_what_does_not_fit_is_3(jobs, project):
     assert main(["adjust", project("poor")]) == 3
 
 
