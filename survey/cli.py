@@ -19,6 +19,7 @@ from survey.commands.detecting import declare_detect
 from survey.commands.examples import declare_example
 from survey.commands.navigating import declare_navigate
 from survey.commands.networks import declare_add, declare_remove, declare_trackers
+from survey.commands.parser import Parser, name_commands
 from survey.commands.planning import declare_plan
 from survey.commands.reporting import declare_report
 
@@ -75,13 +76,14 @@ def build_parser() -> argparse.ArgumentParser:
         "--quiet", action="store_true", default=argparse.SUPPRESS, help="no progress bars and no messages on stderr"
     )
     shaped: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "parents": [shared]}
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         "labsurvey", usage=f"{_OPENING}   (labsurvey COMMAND ...)", description=_DESCRIPTION, epilog=_EPILOG, **shaped
     )
     parser.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for declare in _COMMANDS:
         declare(commands, shaped)
+    name_commands(commands)
     return parser
 
 
