@@ -22,6 +22,7 @@ from survey.commands.networks import declare_add, declare_remove, declare_tracke
 from survey.commands.parser import Parser, name_commands
 from survey.commands.planning import declare_plan
 from survey.commands.reporting import declare_report
+from survey.commands.schema import declare_schema
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "TEST_FAILED", "USAGE", "build_parser", "main"]
 
@@ -50,6 +51,7 @@ _COMMANDS = (
     declare_align,
     declare_compare,
     declare_example,
+    declare_schema,
     declare_completion,
 )
 
