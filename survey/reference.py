@@ -18,8 +18,8 @@ All of `survey.toml` and of the tables in `observations/`, as the program checks
 What they are for: [observations](observations.md), [planning](planning.md) for `plan.toml`, [capture](capture.md) for
 capture plans.
 
-**In an editor**: `labsurvey schema > survey.schema.json` writes a JSON schema. With `#:schema ./survey.schema.json` as the
-first line of `survey.toml`, editors that know it (Taplo, Even Better TOML) complete keys, show what they mean, and
+**In an editor**: `labsurvey schema > survey.schema.json` writes a JSON schema. With `#:schema ./survey.schema.json` as
+the first line of `survey.toml`, editors that know it (Taplo, Even Better TOML) complete keys, show what they mean, and
 underline what is wrong.
 
 `ID` is a name of your own: letters, digits, `_`, `-` and `.`. Units are the endings of names.
@@ -35,8 +35,8 @@ def reference_page() -> str:
     parts += [_table(d) for d in DECLARATIONS]
     parts.append("## Parameters of the lens models\n")
     parts.append(_rows(("model", "parameters"), [(f"`{m.name}`", _listed(m.names)) for m in MODELS.values()]))
-    parts.append("## Tables in `observations/`\n\nCSV with a head line, or Parquet with the same columns. Rows may be in "
-                 "any order; columns that may be missing may also be blank.\n")  # fmt: skip
+    parts.append("## Tables in `observations/`\n\nCSV with a head line, or Parquet with the same columns. Rows may be "
+                 "in any order; columns that may be missing may also be blank.\n")  # fmt: skip
     parts += [_layout(layout) for layout in LAYOUTS.values()]
     return "\n".join(parts)
 
@@ -98,7 +98,7 @@ def _meaning(key: Key) -> str:
 
 
 def _layout(layout: Layout) -> str:
-    rows = []
+    rows: list[tuple[str, ...]] = []
     needed = set(layout.required)
     said = [(c, column_text(layout.name, c), c in needed) for c in (*layout.required, *_optional(layout))]
     for (text, required), columns in groupby(said, key=lambda row: row[1:]):

@@ -113,6 +113,6 @@ def test_changes_citation_and_metadata_speak_of_the_same_version() -> None:
 def test_every_entry_page_says_how_to_install() -> None:
     pages = [ROOT / "README.md", ROOT / "docs" / "index.md", *(ROOT / "docs" / "tutorials").glob("*.md")]
     pages += [ROOT / "docs" / f"{name}.md" for name in (
-        "report", "batch", "capture", "planning", "navigation", "networks", "relay", "formats", "python", "observations",
-        "hand-eye")]  # fmt: skip
+        "report", "batch", "capture", "planning", "navigation", "networks", "relay", "formats", "python",
+        "observations", "hand-eye")]  # fmt: skip
     assert [p.name for p in pages if "pip install ." not in p.read_text(encoding="utf-8")] == []

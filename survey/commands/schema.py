@@ -14,8 +14,8 @@ def declare_schema(commands: Any, shaped: dict[str, Any]) -> None:
         "schema",
         help="print a JSON schema of survey.toml for editors, or its reference",
         usage="labsurvey schema --out lab/survey.schema.json   (labsurvey schema [--markdown] [--out FILE])",
-        description="Prints a JSON schema of survey.toml, made from the declarations that check it. With the first line\n"
-        "#:schema ./survey.schema.json in survey.toml, editors complete and check its keys.\n"
+        description="Prints a JSON schema of survey.toml, made from the declarations that check it. With the first\n"
+        "line #:schema ./survey.schema.json in survey.toml, editors complete and check its keys.\n"
         "With --markdown: the reference of all keys and of all columns of the tables.",
         epilog="Next: write #:schema ./survey.schema.json above the first line of survey.toml",
         **shaped,

@@ -29,13 +29,16 @@ COLUMN_TEXTS: dict[str, tuple[str, dict[str, str]]] = {
     "spots": ("Bright spots without a name; written by labsurvey detect.", {"spot_id": "number of the spot"}),
     "table_angles": ("Readings of turntables.", {
         "table_id": "turntable", "axis1_deg": "outer axis", "axis2_deg": "inner axis",
-        "sigma_arcsec": "of both axes; default: that of the table in survey.toml", "sigma_axis1_arcsec": "or of each: outer",
+        "sigma_arcsec": "of both axes; default: that of the table in survey.toml",
+        "sigma_axis1_arcsec": "or of each: outer",
         "sigma_axis2_arcsec": "inner", "rho_12": "correlation of the two"}),
     "pairs": ("Measured relative rotations and poses b_from_a.", {
         "pair_id": "name of the pair", "a_id": "frame a, such as camera:X@e01", "b_id": "frame b",
         "qw": "unit quaternion of b_from_a", "qx": "x", "qy": "y", "qz": "z", 
-        "euler_x_deg": "or R = Rz(z) Ry(y) Rx(x): x", "euler_y_deg": "y", "euler_z_deg": "z", "tx_mm": "translation; blank: a rotation alone", "ty_mm": "y", "tz_mm": "z"}),
-    "distances": ("Distances between two positions: tape, caliper, scale bar.", {"distance_id": "name of the distance"}),
+        "euler_x_deg": "or R = Rz(z) Ry(y) Rx(x): x", "euler_y_deg": "y", "euler_z_deg": "z",
+        "tx_mm": "translation; blank: a rotation alone", "ty_mm": "y", "tz_mm": "z"}),
+    "distances": ("Distances between two positions: tape, caliper, scale bar.", {
+        "distance_id": "name of the distance"}),
     "coordinates": ("Measured coordinates of positions in the world; blank: not measured.", {"point_id": _POSITION}),
     "coordinates_covariance": ("Covariances within sets of coordinates; rows that are not there are 0.", {
         "set_id": "set of coordinates.csv", "a_id": "position", "b_id": "position"}),
@@ -44,7 +47,8 @@ COLUMN_TEXTS: dict[str, tuple[str, dict[str, str]]] = {
         "reading_id": "name of the reading; default: r and its row", "setup_id": "set-up of survey.toml",
         "second_id": "right target of an angle", "value_dms": "an angle as 12 34 56.7, or",
         "value_m": "a length", "value_mm": "a length", "length_m": "of the levelling line",
-        "sigma_mm": "of a length; default: the instrument's", "sigma_target_centring_mm": "in place of the instrument's"}),
+        "sigma_mm": "of a length; default: the instrument's",
+        "sigma_target_centring_mm": "in place of the instrument's"}),
     "terrestrial_covariance": ("Correlations between readings.", {
         "a_id": "reading", "b_id": "reading", "rho": "their correlation"}),
     "coordinate_differences": ("Coordinates of one position less those of another: vectors, GNSS baselines.", {
@@ -53,22 +57,26 @@ COLUMN_TEXTS: dict[str, tuple[str, dict[str, str]]] = {
         "a_id": "difference", "b_id": "difference"}),
     "levels": ("Readings of levels put on boards and tables.", {
         "level_id": "name of the reading", "frame_id": "frame on which the level stands",
-        "axis": "the level's axis in that frame: x, -y, or three numbers", "value_g": "of an accelerometer: share of gravity",
+        "axis": "the level's axis in that frame: x, -y, or three numbers",
+        "value_g": "of an accelerometer: share of gravity",
         "sigma_g": "standard deviation of it"}),
     "alignments": ("Measured angles between an axis of one frame and one of another: laser traces, autocollimation.", {
         "alignment_id": "name", "a_id": "frame a", "b_id": "frame b", "axis_a": "axis in a: x, -y, or three numbers",
         "axis_b": "axis in b", "rho_12": "correlation of the two values"}),
     "laser_spots": ("Places where a beam met a target.", {
-        "spot_id": "name", "beam_id": "beam of survey.toml", "target_id": "target that it met", "x_mm": "x in the target",
+        "spot_id": "name", "beam_id": "beam of survey.toml", "target_id": "target that it met",
+        "x_mm": "x in the target",
         "y_mm": "y in the target", "epoch_id": "epoch; blank where nothing moves"}),
     "on_surfaces": ("Positions that lie on a surface.", {
-        "surface_id": "surface of survey.toml", "point_id": _POSITION, "offset_mm": "distance above it: radius of a reflector"}),
+        "surface_id": "surface of survey.toml", "point_id": _POSITION,
+        "offset_mm": "distance above it: radius of a reflector"}),
 }  # fmt: skip
 _PATTERNS = (
     ("sigma_", "standard deviation"), ("cov_", "covariance of the components named, rotation rad and translation m"),
     ("value_1_", "first angle"), ("value_2_", "second angle"), ("value_", "the value, in one of the units"),
     ("instrument_height_", "of the instrument above its point"), ("target_height_", "of the target above its point"),
-    ("second_height_", "of the right target of an angle"), ("rho_", "correlation"), ("d", "component of the difference"),
+    ("second_height_", "of the right target of an angle"), ("rho_", "correlation"),
+    ("d", "component of the difference"),
 )  # fmt: skip
 
 

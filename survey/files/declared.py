@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 ValueKind = Literal[
-    "text", "choice", "flag", "whole", "number", "numbers", "matrix", "names", "sigma", "table", "any"
+    "text", "choice", "flag", "whole", "number", "numbers", "matrix", "names", "sigma", "table"
 ]  # fmt: skip
 REQUIRED = object()
 """The default of a key that must be there."""

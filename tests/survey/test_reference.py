@@ -1,4 +1,4 @@
-"""The declarations of ``survey.toml``: readers check exactly what they name, the page and the schema follow from them."""
+"""The declarations of ``survey.toml``: readers check what they name, page and schema follow from them."""
 
 import copy
 import json
