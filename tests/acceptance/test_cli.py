@@ -262,7 +262,7 @@ def test_every_command_line_of_the_readme_is_understood(line, capsys):
 def test_every_flag_of_the_readme_exists(capsys):
     flags = set(re.findall(r"`(--?[a-z]+)", (ROOT / "README.md").read_text())) - {"--strict"}
     known = ""
-    for command in ("adjust", "report", "plan", "add", "convert", "navigate", "align", "detect"):
+    for command in ("adjust", "report", "plan", "add", "convert", "navigate", "align", "detect", "schema"):
         with pytest.raises(SystemExit):
             main([command, "--help"])
         known += capsys.readouterr().out

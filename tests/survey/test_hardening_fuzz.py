@@ -23,7 +23,6 @@ NO_READERS = {
     "survey/files/locking.py:FileLock._opened": "a handle for the lock alone",
     "survey/files/locking.py:remove_unheld": "a handle for the lock alone",
     "survey/interop/colmap.py:reconstruction": "an empty model of pycolmap, to be filled and written",
-    "survey/report/document.py:page_style": "the program's own style sheet",
     "survey/report/page.py:_page": "the program's own script",
     "survey/report/pdf.py:_by_browser": "a PDF that was just printed",
     "survey/replacing.py:_move": "copies bytes that were just written",
