@@ -12,7 +12,7 @@ from adjust.model import Survey
 from adjust.navigation import NavigationEpoch, Spots
 from adjust.supported import supported
 from survey.files import Project
-from survey.files.text import natural_key
+from survey.files.text import decode, natural_key, read_bytes
 from survey.parts import in_use, only_between, points_read
 
 
@@ -77,10 +77,7 @@ def chosen_times(epochs: Sequence[str], request: NavigateRequest) -> list[float]
         return None if step is None else [i * step for i in range(len(epochs))]
     if request.interval_s is not None:
         raise SurveyError("give either the interval between epochs or a table of their times, not both")
-    try:
-        rows = list(csv.DictReader(request.times.read_text("utf-8-sig").splitlines()))
-    except (OSError, UnicodeDecodeError) as error:
-        raise SurveyError(f"{request.times}: cannot be read as a table of epoch_id and time_s ({error})") from error
+    rows = list(csv.DictReader(decode(request.times, read_bytes(request.times)[0]).splitlines()))
     if not rows or not {"epoch_id", "time_s"} <= set(rows[0]):
         raise SurveyError(f"{request.times}:1: the columns epoch_id and time_s are needed")
     found: dict[str, float] = {}

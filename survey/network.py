@@ -72,7 +72,8 @@ def plan_job(folder: Path) -> PlanOutcome:
     if path is None:
         raise SurveyError(
             f"{definition.folder / OBSERVATIONS_FOLDER}/pairs.csv: there is no such file; list the pairs to be "
-            "measured in it: pair_id,a_id,b_id (values may follow later)"
+            "measured in it: pair_id,a_id,b_id (values may follow later). What images will tell is planned by "
+            f"{definition.folder / 'plan.toml'}, which is not there either"
         )
     survey = replace(definition.survey, pairs=_planned(read_table(path, PAIRS), Names.of(definition.survey)))
     network = network_dict(pair_network(survey))

@@ -26,6 +26,7 @@ from adjust.result import Adjustment
 from survey.files import read
 from survey.files.observation_columns import pair_columns
 from survey.files.table_writing import write_table
+from survey.files.text import decode, read_bytes
 from survey.parts import in_use
 
 _INTERVALS_S = (1.0, 1.5, 2.0, 3.0, 4.0)
@@ -130,11 +131,7 @@ def read_trajectories(paths: Mapping[str, Path]) -> tuple[Trajectory, ...]:
     """Trajectory files by the ids of their eyes. Raises SurveyError naming file and line."""
     out = []
     for eye_id, path in paths.items():
-        try:
-            text = Path(path).read_text(encoding="utf-8-sig")
-        except (OSError, UnicodeDecodeError) as error:
-            raise SurveyError(f"{path}: cannot be read: {error}") from error
-        out.append(read_trajectory(text, eye_id, str(path)))
+        out.append(read_trajectory(decode(Path(path), read_bytes(Path(path))[0]), eye_id, str(path)))
     return tuple(out)
 
 

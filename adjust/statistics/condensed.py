@@ -15,10 +15,10 @@ from scipy import sparse
 from adjust.bundle_batch import BundleBatch
 from adjust.graph import AdjustmentGraph
 from adjust.image_batch import warp_shape
-from adjust.lens_kernels import MAX_LENS
 from adjust.model import FloatArray, IntArray
+from adjust.native.images import block_rows
+from adjust.native.lenses import MAX_LENS
 from adjust.precision import Precision
-from adjust.statistics.row_kernels import block_rows
 from adjust.statistics.system import Entries, ImageRows, KeyColumns, LinearSystem, assembled, bundle_order, bundle_rows
 
 N_SHAPE = 4

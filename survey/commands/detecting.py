@@ -1,10 +1,10 @@
 """The command ``detect``."""
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from survey.commands.common import DONE, is_set, positive, print_json, require_project, say
+from survey.commands.parser import project_folder
 
 
 def declare_detect(commands: Any, shaped: dict[str, Any]) -> None:
@@ -19,11 +19,11 @@ def declare_detect(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: labsurvey adjust FOLDER",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder with a survey.toml and images/")
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml and images/")
     parser.add_argument("--all", action="store_true", help="also in images that are as they were")
     parser.add_argument("--jobs", type=positive, metavar="N", help="images at a time; default: one per processor")
     parser.add_argument("--pictures", action="store_true", help="also write every image with what was found in it")
-    parser.set_defaults(run=_detect, parser=parser)
+    parser.set_defaults(run=_detect)
 
 
 def _detect(arguments: argparse.Namespace) -> int:

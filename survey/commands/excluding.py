@@ -1,10 +1,10 @@
 """The commands ``exclude`` and ``include``."""
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from survey.commands.common import DONE, is_set, print_json, require_project
+from survey.commands.parser import project_folder
 
 NAMES = """\
 Names: image:X/h05  epoch:h05  camera:X  target:board  target:X/h05/board  point:board/r7c2  point:B07
@@ -25,11 +25,11 @@ def declare_exclude(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: labsurvey adjust FOLDER",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="project folder")
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
     parser.add_argument("names", nargs="+", metavar="NAME", help="what is to be left out")
     parser.add_argument("--reason", required=True, metavar="TEXT", help="why; stands in the report")
     parser.add_argument("--author", default="", metavar="TEXT", help="who; default: $LABSURVEY_AUTHOR, or the user")
-    parser.set_defaults(run=_exclude, parser=parser)
+    parser.set_defaults(run=_exclude)
 
 
 def declare_include(commands: Any, shaped: dict[str, Any]) -> None:
@@ -43,11 +43,11 @@ def declare_include(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: labsurvey adjust FOLDER",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="project folder")
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
     parser.add_argument("names", nargs="+", metavar="NAME", help="what was left out, by its name in the file")
     parser.add_argument("--reason", default="", metavar="TEXT", help="why")
     parser.add_argument("--author", default="", metavar="TEXT", help="who; default: $LABSURVEY_AUTHOR, or the user")
-    parser.set_defaults(run=_include, parser=parser)
+    parser.set_defaults(run=_include)
 
 
 def _exclude(arguments: argparse.Namespace) -> int:

@@ -6,6 +6,7 @@ from typing import Any
 
 from survey.commands.common import DONE, is_set, print_json, require_project, say, tested
 from survey.commands.excluding import NAMES
+from survey.commands.parser import project_folder
 
 
 def declare_add(commands: Any, shaped: dict[str, Any]) -> None:
@@ -19,10 +20,10 @@ def declare_add(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: open FOLDER/results/report.html",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="adjusted project folder")
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="adjusted project folder")
     parser.add_argument("new", type=Path, metavar="NEW", help="folder with what is new")
     parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the grown project to DIR")
-    parser.set_defaults(run=_add, parser=parser)
+    parser.set_defaults(run=_add)
 
 
 def declare_remove(commands: Any, shaped: dict[str, Any]) -> None:
@@ -36,12 +37,12 @@ def declare_remove(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: open FOLDER/results/report.html; labsurvey include FOLDER NAME takes back",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="project folder, adjusted or not")
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder, adjusted or not")
     parser.add_argument("names", nargs="+", metavar="NAME", help="what is to be left out")
     parser.add_argument("--reason", default="", metavar="TEXT", help="why; stands in the report")
     parser.add_argument("--author", default="", metavar="TEXT", help="who; default: $LABSURVEY_AUTHOR, or the user")
     parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the new project to DIR")
-    parser.set_defaults(run=_remove, parser=parser)
+    parser.set_defaults(run=_remove)
 
 
 def declare_trackers(commands: Any, shaped: dict[str, Any]) -> None:
@@ -56,7 +57,7 @@ def declare_trackers(commands: Any, shaped: dict[str, Any]) -> None:
     )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="trajectories, three or more")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write the pairs to DIR/pairs.csv")
-    parser.set_defaults(run=_trackers, parser=parser)
+    parser.set_defaults(run=_trackers)
 
 
 def _add(arguments: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ from adjust.errors import SurveyError
 from adjust.model import Datum, FloatArray, Point, PointParameter, Survey
 from survey.files.alignment_tasks import read_alignment_tasks
 from survey.files.bodies import read_beams, read_surfaces
+from survey.files.declarations import keys_of
 from survey.files.detected import DetectedImage, ImageKey, ImageNews, image_news, read_detected
 from survey.files.differences import DIFFERENCES, DIFFERENCES_COVARIANCE, read_differences
 from survey.files.exclusions import EXCLUSIONS, EXCLUSIONS_FILE, Exclusion, in_force, read_exclusions
@@ -80,30 +81,6 @@ _EXTRA = {  # tables that only make sense beside another
     "terrestrial_covariance": "terrestrial",
     "coordinate_differences_covariance": "coordinate_differences",
 }
-_TOP_LEVEL = (
-    "format",
-    "title",
-    "tie_points",
-    "cameras",
-    "stations",
-    "tables",
-    "targets",
-    "points",
-    "align",
-    "dimensions",
-    "vertical",
-    "bearings",
-    "instruments",
-    "setups",
-    "beams",
-    "surfaces",
-    "spots",
-    "sigmas",
-    "datum",
-    "adjustment",
-    "tolerances",
-    "identification",
-)
 
 
 def read_definition(folder: Path) -> Definition:
@@ -243,7 +220,7 @@ def _read_definition(folder: Path) -> tuple[Definition, Node]:
         raise SurveyError(f"{path}: there is no such file; a project folder holds a {DEFINITION_FILE}")
     root, digest = read_toml(path)
     _check_format(root)
-    root.allow(*_TOP_LEVEL)
+    root.allow(*keys_of("root"))
     inputs = {DEFINITION_FILE: digest}
     tables, table_sigmas = read_tables(root)
     stations = read_stations(root, tuple(table.table_id for table in tables))
@@ -292,7 +269,7 @@ def _check_format(root: Node) -> None:
 
 
 def _read_datum(node: Node, station_ids: tuple[str, ...]) -> Datum:
-    node.allow("kind", "points", "stations")
+    node.allow(*keys_of("datum"))
     kind = node.choice("kind", ("given", "inner"), "given")
     for key in ("points", "stations"):
         if kind == "given" and node.has(key):
@@ -307,7 +284,7 @@ def _check_datum_points(root: Node, survey: Survey) -> None:
 
 
 def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest:
-    node.allow("cameras", "epochs", "diameter_px", "gate_px")
+    node.allow(*keys_of("spots"))
     cameras = node.references("cameras", camera_ids, "camera")
     epochs = node.names("epochs") if node.has("epochs") else None
     for i, epoch_id in enumerate(epochs or ()):
@@ -323,7 +300,7 @@ def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest
 def _read_options(root: Node) -> AdjustmentOptions:
     """The tables [adjustment], [tolerances] and [identification]."""
     node, said = root.table("adjustment"), root.table("identification")
-    node.allow("alpha", "reject_blocks", "reject_points", "reject_pairs", "variance_components", "sigmas")
+    node.allow(*keys_of("adjustment"))
     alpha = node.number("alpha", 0.05, positive=True)
     if alpha >= 1:
         raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
@@ -337,7 +314,7 @@ def _read_options(root: Node) -> AdjustmentOptions:
 
 
 def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:
-    node.allow("image_px", "scale")
+    node.allow(*keys_of("sigmas"))
     scale = node.table("scale")
     image_px = node.number("image_px", positive=True) if node.has("image_px") else None
     return Sigmas(image_px, {group: scale.number(group, positive=True) for group in scale.values}, tables)

@@ -155,6 +155,13 @@ def cell_text(text: str) -> str:
     return f"'{text}" if formula_problem(text) else text
 
 
+def choice_hint(name: str, options: Iterable[str]) -> str:
+    """What to do where one of few words is wanted: the nearest one, and all of them, once."""
+    options = tuple(options)
+    near, listed = suggestion(name, options), f"one of: {', '.join(options)}"
+    return f"{near} ({listed})" if near.startswith("did you mean") else listed
+
+
 def suggestion(name: str, known: Iterable[str]) -> str:
     """What to do about an unknown name: the nearest known one, else the known ones."""
     names, name = list(dict.fromkeys(known)), name[:80]  # the time to compare grows with the square of the length

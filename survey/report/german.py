@@ -103,7 +103,6 @@ GERMAN = {
     "Set-up": "Aufstellung",
     "Factor": "Faktor",
     "fits": "passt",
-    "does not fit": "passt nicht",
     "Every group, camera, epoch, target, table, set-up and instrument tested for itself, and {n} changes and shapes of "
     "cameras, targets and tables: {all} tests at {level} % together. The {most} with the smallest p are listed.": (
         "Jede Gruppe, Kamera, Epoche, Zieltafel, jeder Tisch, Aufbau und jedes Instrument für sich geprüft, dazu {n} "
@@ -156,9 +155,9 @@ GERMAN = {
     "|value| / σ": "|Wert| / σ",
     "Held at zero: {names}.": "Auf null gehalten: {names}.",
     "Residual vectors point from the observed to the adjusted position. Red: suspect, orange: not used. "
-    "A pattern in the mean per cell is what the lens model leaves over; white cells hold no points.": (
+    "A pattern in the mean per cell is what the lens model leaves over; empty cells hold no points.": (
         "Die Vektoren zeigen von der beobachteten zur ausgeglichenen Lage. Rot: verdächtig, orange: nicht verwendet. "
-        "Ein Muster in den Zellmitteln ist, was das Objektivmodell übrig lässt; weiße Zellen haben keine Punkte."
+        "Ein Muster in den Zellmitteln ist, was das Objektivmodell übrig lässt; leere Zellen haben keine Punkte."
     ),
     "{width} × {height} px on station {station} · {images} images, {points} points": (
         "{width} × {height} px auf Standpunkt {station} · {images} Bilder, {points} Punkte"
@@ -307,6 +306,9 @@ GERMAN = {
     "Gross error": "Grober Fehler",
     "MDB": "Grenzwert",
     "image point": "Bildpunkt",
+    "image": "Bild",
+    "reading": "Ablesung",
+    "closure": "Schleifenschluss",
     "The worst {shown} of {n}; all in residuals.csv and residuals_other.csv.": (
         "Die {shown} schlechtesten von {n}; alle in residuals.csv und residuals_other.csv."
     ),
@@ -330,9 +332,12 @@ GERMAN = {
     "last page": "letzte Seite",
     "page {{page}} of {{pages}}, {{n}} rows": "Seite {{page}} von {{pages}}, {{n}} Zeilen",
     "The survey in space": "Die Vermessung im Raum",
-    "Drag to turn, wheel to zoom, arrow keys turn too. Ellipsoids enlarged": (
-        "Ziehen dreht, das Rad vergrößert, auch Pfeiltasten drehen. Ellipsoide vergrößert"
+    "Drag to turn, Ctrl and wheel to zoom; arrow keys, + and − do the same.": (
+        "Ziehen dreht, Strg und Rad vergrößern; Pfeiltasten, + und − ebenso."
     ),
+    "Ellipsoids enlarged": "Ellipsoide vergrößert",
+    "nearer": "näher",
+    "further away": "weiter weg",
     "times": "mal",
     # what is demanded
     "Identification": "Angaben zur Messung",
@@ -445,8 +450,8 @@ GERMAN = {
     "Correlations": "Korrelationen",
     "Correlated above 95 %": "Über 95 % korreliert",
     "Weak directions": "Schwache Richtungen",
-    "Blue: positive, red: negative; white: none. Lines separate the parameters.": (
-        "Blau: positiv, rot: negativ, weiß: keine. Linien trennen die Parameter."
+    "Blue: positive, red: negative; empty: none. Lines separate the parameters.": (
+        "Blau: positiv, rot: negativ, leer: keine. Linien trennen die Parameter."
     ),
     "Distribution": "Verteilung",
     "Distribution of residuals": "Verteilung der Verbesserungen",

@@ -5,7 +5,7 @@ from typing import Any
 from survey.quantities import sigma_unit_for_people
 from survey.report import drawing as d
 from survey.report.context import Context
-from survey.report.language import known, message, t
+from survey.report.language import group_name, known, message, t
 from survey.report.markup import count, definition, esc, fixed, general, pill, section, table
 from survey.report.picture import pictures
 from survey.report.scene import scene_of
@@ -122,7 +122,7 @@ def _global_test(test: dict[str, Any] | None) -> str:
         word=word, omega=general(test["omega"], 6), r=count(r), lower=general(test["lower"], 6),
         upper=general(test["upper"], 6), level=general(100 * (1 - test["alpha"])),
     )  # fmt: skip
-    return f'<p class="lead">{sentence}</p>{d.svg(width, height, parts, t("Global test"))}'
+    return f'<p class="lead">{sentence}</p><div class="wide">{d.svg(width, height, parts, t("Global test"))}</div>'
 
 
 def groups(c: Context) -> str:
@@ -133,9 +133,8 @@ def groups(c: Context) -> str:
         if g["deviation"] is not None and abs(g["deviation"]) > _CLEAR:
             deviation = pill("warn", deviation)
         numbers = (fixed(g["variance_factor"], 3), fixed(g["sigma_scale"], 3), deviation)
-        rows.append(
-            (esc(name), count(g["n_observations"]), fixed(g["redundancy"], 1), general(g["omega"], 6), *numbers)
-        )
+        sums = (count(g["n_observations"]), fixed(g["redundancy"], 1), general(g["omega"], 6))
+        rows.append((esc(group_name(name)), *sums, *numbers))
     note = t(
         "The variance factor is the weighted square sum omega over the redundancy of the group; its root is the number "
         "by which the sigmas given for the group would have to be multiplied to agree with its residuals. Deviation: "

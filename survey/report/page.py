@@ -7,8 +7,10 @@ from adjust.result import Adjustment
 from survey.quantities import scale_of
 from survey.report import every, instruments, left_out, loops, observations, overview, statistics, unknowns
 from survey.report.context import Context
+from survey.report.document import document
+from survey.report.drawing import DARK
 from survey.report.embedding import json_script
-from survey.report.language import language, localised, speaking, t
+from survey.report.language import localised, speaking, t
 from survey.report.markup import esc
 from survey.residual_tables import image_rows
 from survey.solution import RunInfo, solution_dict
@@ -69,24 +71,17 @@ def report_html(
 def _page(c: Context) -> str:
     made = [(name, anchor, make(c)) for name, anchor, make in _SECTIONS]
     nav = "".join(f'<a href="#{anchor}">{esc(t(name))}</a>' for name, anchor, body in made if body)
-    here = Path(__file__)
-    style = here.with_name("style.css").read_text(encoding="utf-8")
-    script = here.with_name("script.js").read_text(encoding="utf-8")
-    title = esc(c.solution["summary"]["title"] or c.run.folder)
-    return (
-        f'<!doctype html>\n<html lang="{language()}"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title} – {t('Adjustment report')}</title><style>{style}</style></head>\n<body><main>"
-        f"{overview.header(c)}<nav>{nav}</nav>"
-        + "\n".join(body for _, _, body in made)
-        + f"</main>{json_script('words', _words())}<script>{script}</script></body></html>\n"
-    )
+    script = Path(__file__).with_name("script.js").read_text(encoding="utf-8")
+    title = f"{c.solution['summary']['title'] or c.run.folder} – {t('Adjustment report')}"
+    shown = f"{overview.header(c)}<nav>{nav}</nav>" + "\n".join(body for _, _, body in made)
+    return document(title, shown, f"{json_script('words', _words())}<script>{script}</script>")
 
 
 def _words() -> dict[str, Any]:
     """What the script says."""
     return {
         "decimal": localised("."),
+        "dark": DARK,
         "filter": t("filter"),
         "flags": ["", t("suspect"), t("not used")],
         "where": t("page {{page}} of {{pages}}, {{n}} rows").replace("{{", "{").replace("}}", "}"),
