@@ -110,8 +110,9 @@ def convert_job(
     """Write ``source`` in another format at ``target``: the one a project folder, the other a file.
 
     format: of the file; by default by its ending. information: what the rotation part of g2o's information matrices
-    refers to. block_diagonal: only their blocks of translation and rotation are read. station: whose cameras or poses are written, for the formats that hold those of one. Raises SurveyError
-    for what the other format cannot hold, and where there is something at ``target``.
+    refers to. block_diagonal: only their blocks of translation and rotation are read. station: whose cameras or poses
+    are written, for the formats that hold those of one. Raises SurveyError for what the other format cannot hold, and
+    where there is something at ``target``.
     """
     source, target = Path(source), Path(target)
     if source.is_dir() and not (format in camera_formats.FOLDERS and not (source / DEFINITION_FILE).exists()):

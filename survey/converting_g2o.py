@@ -18,7 +18,6 @@ from survey.previous import read_previous
 from survey.results import RESULTS
 from survey.warm_start import network_start
 
-
 AS_IN_THE_FILE = AdjustmentOptions(reject_pairs=False)
 """A file's own minimum is that of all its pairs; its owner may let the program look for wrong ones."""
 

@@ -191,7 +191,7 @@ def test_pairs_sorted_out_by_mistake_are_taken_back(monkeypatch: pytest.MonkeyPa
     sim = simulate(6, 5, seed=1, wrong=2, extra=25)
     first = graduated_weights(sim.network)
     first[[n for n in range(5, 15) if sim.network.pair_ids[n] not in sim.wrong]] = 0.0
-    monkeypatch.setattr("adjust.pose_network.robust.graduated_weights", lambda network: first)
+    monkeypatch.setattr("adjust.pose_network.robust.graduated_weights", lambda *_: first)
     solution = solve_network(sim.network, options=NetworkOptions(robust="on"))
     assert {r.pair_id for r in solution.rejected} == set(sim.wrong)
     assert solution.network.used.sum() == sim.network.n_pairs - 2
@@ -200,7 +200,7 @@ def test_pairs_sorted_out_by_mistake_are_taken_back(monkeypatch: pytest.MonkeyPa
 def test_wrong_pairs_that_passed_the_first_sorting_are_found_by_their_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     sim = simulate(6, 5, seed=1, wrong=2, extra=25)
     ones = np.ones(sim.network.n_pairs)
-    monkeypatch.setattr("adjust.pose_network.robust.graduated_weights", lambda network: ones)
+    monkeypatch.setattr("adjust.pose_network.robust.graduated_weights", lambda *_: ones)
     assert {r.pair_id for r in solve_network(sim.network).rejected} == set(sim.wrong)
 
 
