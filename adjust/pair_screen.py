@@ -18,10 +18,18 @@ from adjust.adjustment import AdjustOptions, adjust
 from adjust.distributions import chi2
 from adjust.errors import IndeterminateError, NotConvergedError
 from adjust.graph import StartValues
-from adjust.model import FloatArray, Survey
+from adjust.model import FloatArray, IntArray, Survey
 from adjust.result import Adjustment, ObservationResidual
 from adjust.robust import limit as image_limit
-from adjust.statistics.criteria import MANY, cautious, explanation_cost, sidak, typical_factor, widening
+from adjust.statistics.criteria import (
+    MANY,
+    cautious,
+    cost_of_leaving_out,
+    explanation_cost,
+    sidak,
+    typical_factor,
+    widening,
+)
 from adjust.survey_kind import is_pose_network
 
 if TYPE_CHECKING:
@@ -151,7 +159,7 @@ class _PairSearch:
     def result(self) -> Adjustment:
         """The adjustment without the pairs that are wrong, with what was left out among its warnings."""
         pairs = _tested(self.first.result, self.candidates)
-        if cautious(np.array([o.test for o in pairs]), np.array([len(o.components) for o in pairs], dtype=np.int64)):
+        if cautious(*_tests(pairs)):
             return self.first.result
         last = self._settled(self.first)
         best = min(self.states, key=lambda state: state.cost)
@@ -203,11 +211,11 @@ class _PairSearch:
         level = sidak(_FAMILY, len(pairs))
         limit = {o.ids[0]: float(chi2.isf(level, len(o.components))) for o in pairs}
         used = [o for o in pairs if o.used]
-        tests = np.array([o.test for o in used]), np.array([len(o.components) for o in used], dtype=np.int64)
+        tests = _tests(used)
         widened = max(factor, typical_factor(*tests)) if len(used) >= MANY else factor
         over = {o.ids[0]: float(o.test / (limit[o.ids[0]] * widened)) for o in pairs}
-        limits = sum(limit.get(p, 0.0) for p in out) + _image_limits(self.survey, result)
-        cost = explanation_cost([(g.omega, g.redundancy) for g in result.groups], limits)
+        left_out = _cost_of([o for o in pairs if not o.used], limit) + _cost_of_points(self.survey, result)
+        cost = explanation_cost([(g.omega, g.redundancy) for g in result.groups], left_out)
         mine = {o.group for o in used}
         omega, redundancy = (sum(getattr(g, of) for g in result.groups if g.group in mine) for of in _SUMS)
         supposed = widening(omega, redundancy, *tests)
@@ -222,10 +230,22 @@ def _tested(result: Adjustment, candidates: set[str]) -> list[ObservationResidua
     return [o for o in pairs if not o.used or float(o.redundancy.max()) > 1e-6]
 
 
-def _image_limits(survey: Survey, result: Adjustment) -> float:
-    """Limits of the tests of image points that are out here and not in the survey."""
+def _tests(pairs: list[ObservationResidual]) -> tuple[FloatArray, IntArray]:
+    return np.array([o.test for o in pairs]), np.array([len(o.components) for o in pairs], dtype=np.int64)
+
+
+def _cost_of(out: list[ObservationResidual], limit: dict[str, float]) -> float:
+    return cost_of_leaving_out(*_tests(out), np.array([limit[o.ids[0]] for o in out]))
+
+
+def _cost_of_points(survey: Survey, result: Adjustment) -> float:
+    """Of the image points that are out here and not in the survey."""
     given = sum(int(len(b.uv) if b.used is None else b.used.sum()) for b in survey.image_blocks)
-    return (given - int(result.image_residuals.used.sum())) * image_limit(given)
+    images = result.image_residuals
+    n, bound = given - int(images.used.sum()), image_limit(given)
+    T = np.sort(np.nan_to_num(images.test[~images.used]))[::-1][:n]  # of images that the start refused none is known
+    T = np.concatenate([T, np.zeros(n - len(T))])
+    return cost_of_leaving_out(T, np.full(n, 2), np.full(n, bound))
 
 
 def _said(o: ObservationResidual) -> str:

@@ -27,7 +27,15 @@ from adjust.pose_network.start import (
     translation_misfits,
     translation_sigmas,
 )
-from adjust.statistics.criteria import MANY, cautious, explanation_cost, sidak, typical_factor, widening
+from adjust.statistics.criteria import (
+    MANY,
+    cautious,
+    cost_of_leaving_out,
+    explanation_cost,
+    sidak,
+    typical_factor,
+    widening,
+)
 
 _TRUNCATION = float(chi2.isf(1e-4, 3))
 _SLACK = 4.0  # positions inherit what is left in the rotations of the first stage
@@ -155,9 +163,11 @@ def clean(
     weights = graduated_weights(network, 1.0 if first is None else first.factor)
     try:
         last = search.settled(_connected(network, weights))
-        best = min(search.states, key=lambda state: state.cost)
-        if int(network.used.sum()) < MANY and best.cost < last.cost and best.supposed > 1.0:
-            last = search.settled(best.network.used, best.supposed)
+        if first is not None and int(network.used.sum()) < MANY:
+            search.descend(first)
+            best = min(search.states, key=lambda state: state.cost)
+            if best.cost < last.cost:
+                last = search.settled(best.network.used, best.supposed)
     except (IndeterminateError, NotConvergedError):
         if first is None:
             raise
@@ -195,7 +205,9 @@ class _Search:
         factor = max(least_factor, variance_factor(pairs, used))
         over = np.where(tested, np.nan_to_num(pairs.test) / (factor * limit), 0.0)
         omega, redundancy = minimum.omega, float(pairs.redundancy[used].sum())
-        cost = explanation_cost([(omega, redundancy)], float(limit[tested & ~used].sum()))
+        gone = tested & ~used
+        left_out = cost_of_leaving_out(pairs.test[gone], pairs.freedom[gone], limit[gone])
+        cost = explanation_cost([(omega, redundancy)], left_out)
         supposed = widening(omega, redundancy, pairs.test[used], pairs.freedom[used])
         found = _State(network, minimum, precision, limit, factor, over, cost, supposed)
         self.states.append(found)
@@ -215,6 +227,17 @@ class _Search:
             taken_back |= back
             used = (used | back) & ~out
         raise NotConvergedError(f"no set of pairs that agree was found in {_ROUNDS} rounds; the pairs contradict")
+
+    def descend(self, state: _State) -> None:
+        """One pair after the other, the worst first, down to half of them: every state is an explanation."""
+        while (state.over[state.network.used] > 1.0).any():
+            used = state.network.used.copy()
+            over = np.where(used, state.over, 0.0)
+            over[over < over.max()] = 0.0
+            used &= ~_worst_around(state.network, over)
+            if used.sum() == state.network.used.sum() or 2 * used.sum() < self.candidates.sum():
+                return
+            state = self.state(used, (state.minimum.rotations, state.minimum.translations))
 
     def cleaned(self, state: _State) -> Cleaned:
         """As the result."""

@@ -50,19 +50,32 @@ def widening(omega: float, redundancy: float, statistics: FloatArray, freedom: I
     """What the limits of a group's tests (n,) grow by where its sigmas are taken as too small throughout; else 1.
 
     Only where its typical test says so too, and then by as much: what errors of other groups add to a test is in it.
+    Nothing is said of a group with the redundancy of a single observation or two: there one error shows in all tests.
     """
+    if redundancy < 2.0 * float(freedom.max(initial=0)) + 0.5:
+        return 1.0
     typical = typical_factor(statistics, freedom)
     factor = variance_of(omega, redundancy)
     return max(factor, typical) if typical > 1.0 and factor > 1.0 else 1.0
 
 
-def explanation_cost(groups: Iterable[tuple[float, float]], limits: float) -> float:
-    """-2 ln likelihood of what is left, (omega, redundancy) of every group, and the limits of the tests of what is out.
+def cost_of_leaving_out(statistics: FloatArray, freedom: IntArray, limits: FloatArray) -> float:
+    """Of observations (n,) that are out, with their tests against what is left: each has a variance of its own.
+
+    At least the limit of its test, so that with sigmas that are right an observation goes if and only if it fails.
+    """
+    T, q = np.nan_to_num(statistics), np.maximum(freedom, 1)
+    own = q * (1.0 + np.log(np.maximum(T / q, 1.0))) + float(chi2.isf(_OF_A_FACTOR, 1))
+    return float(np.sum(np.maximum(limits, own)))
+
+
+def explanation_cost(groups: Iterable[tuple[float, float]], left_out: float) -> float:
+    """-2 ln likelihood of what is left, (omega, redundancy) of every group, and the cost of what was left out.
 
     As ``J`` of :mod:`adjust.statistics.exchange`, where the sigmas of a group may also be too small throughout: the
     least cost tells wrong observations from wrong sigmas, also among few.
     """
-    total = limits
+    total = left_out
     for omega, redundancy in groups:
         f = variance_of(omega, redundancy)
         total += omega if f == 1.0 else redundancy * (1.0 + float(np.log(f))) + float(chi2.isf(_OF_A_FACTOR, 1))

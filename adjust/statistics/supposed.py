@@ -12,7 +12,7 @@ import numpy as np
 
 from adjust.distributions import chi2
 from adjust.model import BoolArray, FloatArray
-from adjust.statistics.criteria import MANY, cautious, explanation_cost, widening
+from adjust.statistics.criteria import MANY, cautious, cost_of_leaving_out, explanation_cost, widening
 from adjust.statistics.snooping import Snooping
 
 _LONGEST = 60
@@ -109,8 +109,10 @@ def _state(snooping: Snooping, few: BoolArray) -> _State:
         own[snooping.sizes == k] = np.einsum("nii->n", R)
     redundancy = np.bincount(s.group[used], weights=own[used], minlength=G)
     out = np.array(snooping.out, dtype=np.int64)
-    limits = chi2.isf(snooping.level, snooping.sizes[out]) * snooping.factors[s.group[out]] if len(out) else np.zeros(0)
-    cost = explanation_cost(zip(omega.tolist(), redundancy.tolist(), strict=True), float(np.sum(limits)))
+    limits = np.asarray(chi2.isf(snooping.level, snooping.sizes[out])) * snooping.factors[s.group[out]]
+    statistics = np.array([snooping.verdict(o).statistic for o in snooping.out])
+    left_out = cost_of_leaving_out(statistics, snooping.sizes[out], limits)
+    cost = explanation_cost(zip(omega.tolist(), redundancy.tolist(), strict=True), left_out)
     supposed = np.ones(G)
     for g in np.flatnonzero(few).tolist():
         mine = used & (s.group == g)

@@ -102,7 +102,7 @@ def test_blocks_alone_are_read_where_that_is_asked_for(tmp_path: Path, capsys: p
     assert "2 of 3 edges was dropped" in capsys.readouterr().out
     # blocks that are indefinite themselves cannot be helped
     path.write_text(path.read_text().replace("9 0 0 9 0 9", "9 0 0 9 0 -9"))
-    with pytest.raises(SurveyError, match="line 6: .* not positive definite.*; correct the file"):
+    with pytest.raises(SurveyError, match=r"line 6: .* not positive definite.*; correct the file"):
         read_g2o(path, block_diagonal=True)
 
 
