@@ -9,6 +9,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.model import FloatArray, IntArray
 from adjust.motions import point_motions, skew
+from adjust.named_precision import rotations_only
 from adjust.precision import Precision
 from adjust.result import Adjustment, ParameterName
 
@@ -74,11 +75,13 @@ def origin(value: Pose3 | FloatArray) -> FloatArray:
 
 
 def epoch_state(adjustment: Adjustment) -> EpochState:
-    """All points and fixed stations of an adjustment, a priori, in its datum."""
+    """All points and fixed stations of an adjustment, a priori, in its datum; of rotation networks positions are nan."""
     names = [n for n in adjustment.estimates if n[0] == "point" or (n[0] == "world_from_station" and len(n) == 2)]
     values = tuple(
         e.value if isinstance(e.value, Pose3) else np.asarray(e.value) for e in (adjustment.estimates[n] for n in names)
     )
+    if rotations_only(adjustment):
+        values = tuple(Pose3(v.rotation(), np.full(3, np.nan)) for v in values if isinstance(v, Pose3))
     state = EpochState(tuple(names), values, np.zeros((0, 0)), open_directions(adjustment))
     starts = np.concatenate([[0], np.cumsum(state.sizes)]).astype(np.int64)
     cov = np.zeros((int(starts[-1]),) * 2)
@@ -86,10 +89,8 @@ def epoch_state(adjustment: Adjustment) -> EpochState:
     free = [i for i, s in enumerate(status) if any(x != "held" for x in s)]
     if free:
         joint = np.asarray(adjustment.precision.joint([names[i] for i in free]))
-        short = len(joint) < sum(int(state.sizes[i]) for i in free)  # a network of rotations
-        width = [3 if short else int(state.sizes[i]) for i in free]
-        rows = np.concatenate([np.arange(starts[i], starts[i] + w) for i, w in zip(free, width, strict=True)])
-        held = np.concatenate([np.array(status[i][:w]) == "held" for i, w in zip(free, width, strict=True)])
+        rows = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in free])
+        held = np.concatenate([np.array(status[i]) == "held" for i in free])
         joint = joint * np.outer(~held, ~held)
         cov[np.ix_(rows, rows)] = joint
     return replace(state, cov=cov)
