@@ -85,7 +85,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
 
 
 def _free_datum(adjustment: Adjustment) -> dict[str, Any]:
-    """Motions of the whole (t, rotation vector, ln scale) that the observations leave open, and who carries the datum."""
+    """Motions of the whole (t, rotation vector, ln scale) that the observations leave open, and what carries them."""
     directions = open_directions(adjustment)
     if not directions.shape[1]:
         return {}

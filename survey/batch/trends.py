@@ -101,8 +101,10 @@ def comparable(records: Sequence[Record]) -> tuple[tuple[Record, ...], tuple[str
     for i, datum, moved in zip(free, data, in_common_datum(data) if data else [], strict=True):
         out[i] = _moved(records[i], moved, scale_is_open(datum))
     if any(map(scale_is_open, data)):
-        notes.append("the observations do not determine the scale: lengths are in that of all epochs together, and those "
-                     "that a camera, a station or a table has in itself are not compared")  # fmt: skip
+        notes.append(
+            "the observations do not determine the scale: lengths are in that of all epochs together, and those that "
+            "a camera, a station or a table has in itself are not compared"
+        )
     return tuple(out), tuple(notes)
 
 
