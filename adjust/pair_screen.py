@@ -178,14 +178,15 @@ class _PairSearch:
         """From this state on, with limits wider by ``factor``; the last that could be solved."""
         returned: set[str] = set()
         for _ in range(_ROUNDS):
-            bad = [p for p in state.over if p not in state.out and p not in self.kept and state.over[p] > 1.0]
+            bad = [p for p in state.over if p not in state.out and state.over[p] > 1.0]
             back = [p for p in state.out if state.over.get(p, np.inf) <= 1.0 and p not in returned]
             if bad and 2 * (len(state.out) + 1) <= len(self.candidates):
                 worst = max(bad, key=lambda p: state.over[p])
                 now = self._tried((*state.out, worst), factor)
-                if now is None:
+                if now is None:  # the others fail beside it, and none of them is to blame before it is cleared up
                     self.kept.add(worst)
-                state = now or state
+                    break
+                state = now
                 continue
             if not back:
                 break

@@ -109,7 +109,7 @@ def incomparable(data: Sequence[FreeDatum | None]) -> dict[int, str]:
     if len(kinds) < 2:
         return {}
     most = max(kinds, key=lambda kind: (len(kinds[kind]), -kinds[kind][0]))
-    out = {}
+    out: dict[int, str] = {}
     for kind, epochs in kinds.items():
         if kind != most:
             out |= dict.fromkeys(epochs, _why(kind, most))
@@ -241,7 +241,7 @@ class _Epoch:
         x, sigmas = tuple((1e3 * origin(value)).tolist()), tuple((1e3 * own).tolist())
         if not isinstance(value, Pose3):
             return Moved(x, sigmas, None, None)
-        q = value.rotation().toQuaternion()
+        q: Any = value.rotation().toQuaternion()  # a class that the stubs leave out
         turned = ARCSEC_PER_RAD * (np.sqrt(np.clip(np.diag(cov)[:3], 0.0, None)) + gained[:3])
         return Moved(x, sigmas, (q.w(), q.x(), q.y(), q.z()), tuple(turned.tolist()))
 
