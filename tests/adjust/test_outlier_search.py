@@ -7,11 +7,12 @@ import pytest
 from gtsam import Pose3
 from scipy.stats import binom
 
-from adjust.adjustment import adjust
+from adjust.adjustment import AdjustOptions, adjust
 from adjust.errors import NotConvergedError
 from adjust.graph import StartValues
 from adjust.model import FloatArray, Point, PointParameter, Survey
 from adjust.observations import Distance, FrameRef, Pair, PositionRef, Reading, ReadingCovariance
+from adjust.robust import limit
 from adjust.statistics.candidates import candidates, without
 from adjust.statistics.outlier_search import SearchOptions, search_outliers
 from adjust.statistics.reliability import reliability
@@ -302,3 +303,18 @@ def test_a_small_group_with_sigmas_too_small_loses_only_what_is_wrong(seed: int)
     found = search_outliers(replace(survey, distances=tuple(tapes)), start)
     assert [d.ids[0] for d in found.rejected if d.group == "tape"] == [tapes[3].distance_id]
     assert "tape" in dict(found.widened)
+
+
+def test_image_points_stay_where_residuals_are_far_below_their_sigmas() -> None:
+    survey, truth = h.network(7, n_epochs=3, n_points=40, coordinates=2)
+    blocks = [replace(b, cov=100.0 * b.cov) for b in survey.image_blocks]
+    uv = blocks[0].uv.copy()
+    uv[3] += 7.0 * np.sqrt(blocks[0].cov[3, 0, 0]) * np.array([1.0, 0.0])
+    blocks[0] = replace(blocks[0], uv=uv)
+    options = AdjustOptions(reject_points=True)
+    timid = adjust(replace(survey, image_blocks=tuple(blocks)), h.start_at(truth), options)
+    assert timid.image_residuals.used.all()
+    assert timid.image_residuals.test[3] > limit(len(timid.image_residuals.test))
+    right = tuple(replace(b, cov=b.cov / 100.0) for b in blocks)
+    bold = adjust(replace(survey, image_blocks=right), h.start_at(truth), options)
+    assert np.flatnonzero(~bold.image_residuals.used).tolist() == [3]
