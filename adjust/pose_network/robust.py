@@ -16,7 +16,7 @@ import numpy as np
 
 from adjust.distributions import chi2
 from adjust.errors import IndeterminateError, NotConvergedError
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model import BoolArray, FloatArray
 from adjust.pose_network.network import PoseNetwork, loop_marks
 from adjust.pose_network.precision import NetworkPrecision, PairStatistics
 from adjust.pose_network.solve import Minimum, NetworkOptions, Progress, minimize
@@ -28,6 +28,7 @@ from adjust.pose_network.start import (
     translation_sigmas,
 )
 from adjust.statistics.criteria import (
+    CAUTIOUS,
     MANY,
     cautious,
     cost_of_leaving_out,
@@ -158,7 +159,7 @@ def clean(
     if options.robust == "auto":
         with contextlib.suppress(NotConvergedError):  # by wrong pairs; without them the next attempt says more
             first = search.state(network.used, start)
-        if first is not None and (not (first.over > 1.0).any() or cautious(_tests(first), _freedom(first))):
+        if first is not None and (not (first.over > 1.0).any() or _far_below(first)):
             return search.cleaned(first)
     weights = graduated_weights(network, 1.0 if first is None else first.factor)
     try:
@@ -175,12 +176,11 @@ def clean(
     return search.cleaned(last)
 
 
-def _tests(state: _State) -> FloatArray:
-    return state.precision.pairs.test[state.network.used]
-
-
-def _freedom(state: _State) -> IntArray:
-    return state.precision.pairs.freedom[state.network.used]
+def _far_below(state: _State) -> bool:
+    """Whether residuals are together far smaller than their sigmas say, by v'Pv or by the tests of the pairs."""
+    pairs, used = state.precision.pairs, state.network.used
+    redundancy = float(pairs.redundancy[used].sum())
+    return state.minimum.omega < CAUTIOUS**2 * redundancy or cautious(pairs.test[used], pairs.freedom[used])
 
 
 class _Search:
