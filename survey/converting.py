@@ -16,7 +16,7 @@ import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
-from survey.converting_g2o import project_to_g2o, survey_from_g2o
+from survey.converting_g2o import AS_IN_THE_FILE, project_to_g2o, survey_from_g2o
 from survey.files import AdjustmentOptions, Project, atomic_write, read, write_project
 from survey.files.project import DEFINITION_FILE
 from survey.files.text import read_bytes, suggestion
@@ -105,13 +105,15 @@ def convert_job(
     *,
     format: str | None = None,
     information: Information = "tangent",
+    block_diagonal: bool = False,
     station: str | None = None,
 ) -> ConvertOutcome:
     """Write ``source`` in another format at ``target``: the one a project folder, the other a file.
 
     format: of the file; by default by its ending. information: what the rotation part of g2o's information matrices
-    refers to. station: whose cameras or poses are written, for the formats that hold those of one. Raises SurveyError
-    for what the other format cannot hold, and where there is something at ``target``.
+    refers to. block_diagonal: only their blocks of translation and rotation are read. station: whose cameras or poses
+    are written, for the formats that hold those of one. Raises SurveyError for what the other format cannot hold, and
+    where there is something at ``target``.
     """
     source, target = Path(source), Path(target)
     if source.is_dir() and not (format in camera_formats.FOLDERS and not (source / DEFINITION_FILE).exists()):
@@ -125,7 +127,7 @@ def convert_job(
     if format in ("json", "sinex"):
         raise SurveyError(f"{source}: the format {format} is only written; give a project folder")
     chosen = None if format == "project" else format
-    return _to_project(source, target, _file_format(source, chosen, (*READERS, "g2o")), information)
+    return _to_project(source, target, _file_format(source, chosen, (*READERS, "g2o")), information, block_diagonal)
 
 
 def _file_format(path: Path, given: str | None, known: tuple[str, ...]) -> str:
@@ -145,17 +147,19 @@ def _file_format(path: Path, given: str | None, known: tuple[str, ...]) -> str:
     return found
 
 
-def _to_project(source: Path, target: Path, format: str, information: Information) -> ConvertOutcome:
+def _to_project(
+    source: Path, target: Path, format: str, information: Information, block_diagonal: bool
+) -> ConvertOutcome:
     if target.exists() and not target.is_dir():
         raise SurveyError(f"{target}: is a file; give the name of a new folder")
     if (target / DEFINITION_FILE).exists():
         raise SurveyError(f"{target}: there is a project already; choose another folder")
     if format == "g2o":
-        survey = survey_from_g2o(source, information)
+        survey, notes = survey_from_g2o(source, information, block_diagonal)
         with filling(target) as place:
-            write_project(place, survey, title=source.stem)
+            write_project(place, survey, title=source.stem, options=AS_IN_THE_FILE)
         counts = {"stations": len(survey.stations), "pairs": len(survey.pairs)}
-        return ConvertOutcome(source, target, "project", counts, "as in the file")
+        return ConvertOutcome(source, target, "project", counts, "as in the file", notes)
     network = READERS[format](source)
     survey, renamed = with_safe_ids(network.survey)
     reject = network.reject

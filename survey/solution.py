@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from adjust.distributions import norm
+from adjust.epoch_states import datum_carriers, open_directions
 from adjust.model import FloatArray, Survey
 from adjust.result import Adjustment, Estimate, GroupSummary
 from survey.files.detected import DetectedImage
@@ -75,6 +76,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
             "pairs": _pairs(adjustment, scale),
             **instrument_entries(adjustment, scale),
             **_network(adjustment.survey),
+            **_free_datum(adjustment),
             "groups": {g.group: _group(g) for g in adjustment.groups},
             **left_out_dict(adjustment, run.left_out, run.n_left_out, run.n_unused_in_files),
             "warnings": [*findings(found.consistency if found else None), *adjustment.warnings],
@@ -96,6 +98,15 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
         }
     )
     return solution
+
+
+def _free_datum(adjustment: Adjustment) -> dict[str, Any]:
+    """Motions of the whole (t, rotation vector, ln scale) that the observations leave open, and what carries them."""
+    directions = open_directions(adjustment)
+    if not directions.shape[1]:
+        return {}
+    carriers = ["/".join(name) for name in datum_carriers(adjustment)]
+    return {"free_datum": {"open_motions": directions.T.tolist(), "carried_by": carriers}}
 
 
 def _plain(value: Any) -> Any:

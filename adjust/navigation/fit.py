@@ -15,6 +15,7 @@ from adjust.model import FloatArray, IntArray
 from adjust.native.navigation import DONE, SpotArrays, gauss_newton
 from adjust.navigation.system import Sightings, System
 from adjust.relay.motions import right_jacobian_inverse
+from adjust.statistics.criteria import cautious
 
 _NO_B: FloatArray = np.zeros((0, 0))
 _NO_ROWS: IntArray = np.zeros(0, dtype=np.int64)
@@ -146,12 +147,15 @@ def fit_without_outliers(
     system: System, seen: Sightings, used: IntArray, beacon: IntArray, start: FloatArray, prior: Prior | None,
     alpha: float,
 ) -> tuple[PoseFit | None, tuple[int, ...]]:  # fmt: skip
-    """The fit after spots that fail the test (family-wise level alpha) were taken out, worst first; and which."""
+    """The fit after spots that fail the test (family-wise level alpha) were taken out, worst first; and which.
+
+    None is taken out where the residuals of all are together far smaller than their sigmas say.
+    """
     rejected: list[int] = []
     fit = fit_pose(system, seen, used, beacon, start, prior)
     while fit is not None and fit.redundancy > 0:
         values = spot_tests(fit)
-        if np.isnan(values).all():
+        if np.isnan(values).all() or (not rejected and cautious(values, np.full(len(values), 2))):
             break
         worst = int(np.nanargmax(values))
         if values[worst] < chi2.isf(alpha / len(values), 2):

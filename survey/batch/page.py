@@ -156,7 +156,8 @@ def _control(records: Sequence[Record], trends: Trends) -> str:
     if calm:
         rest = t("{n} more charts", n=count(len(calm[:_MOST_MORE])))
         body += f"<details><summary>{rest}</summary>{_figures(calm[:_MOST_MORE], records)}</details>"
-    return section("control", "Control charts", body, note)
+    said = "".join(f"<p>{esc(message(n))}</p>" for n in trends.notes)
+    return section("control", "Control charts", said + body, note)
 
 
 def _figures(charts: Sequence[Chart], records: Sequence[Record]) -> str:

@@ -63,7 +63,7 @@ def trend_lines(trends: Trends, records: Sequence[Record]) -> list[str]:
     more = len(alarming) - len(lines)
     lines += [f"  and {more} more in the overview"] if more > 0 else []
     head = f"{len(alarming)} of {len(trends.charts)} numbers are not in control over the epochs"
-    return [head + (":" if lines else ""), *lines]
+    return [head + (":" if lines else ""), *lines, *(f"  ! {note}" for note in trends.notes)]
 
 
 def short_names(records: Sequence[Record]) -> list[str]:
@@ -106,7 +106,8 @@ def overview_json(records: Sequence[Record], trends: Trends) -> str:
     value = {
         "counts": counts(records), "exit_code": exit_code(records), "folders": [row_of(r) for r in records],
         "trends": {"alpha_of_all_tests": LEVEL, "level_of_a_test": trends.level, "n_points": trends.n_points,
-                   "points_outside_expected_by_chance": trends.expected, "charts": charts},
+                   "points_outside_expected_by_chance": trends.expected, "notes": list(trends.notes),
+                   "charts": charts},
     }  # fmt: skip
     return json.dumps(_finite(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 

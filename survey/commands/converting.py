@@ -39,6 +39,10 @@ def declare_convert(commands: Any, shaped: dict[str, Any]) -> None:
         "--information", choices=("tangent", "quaternion"), default="tangent",
         help="rotation part of g2o's information: of the rotation vector, or of the quaternion as g2o itself means it",
     )  # fmt: skip
+    parser.add_argument(
+        "--block-diagonal", action="store_true",
+        help="of g2o's information matrices read only the blocks of translation and of rotation",
+    )  # fmt: skip
     parser.set_defaults(run=_convert)
 
 
@@ -49,7 +53,7 @@ def _convert(arguments: argparse.Namespace) -> int:
 
     outcome = convert_job(
         arguments.source, arguments.target, format=arguments.format, information=arguments.information,
-        station=arguments.station,
+        block_diagonal=arguments.block_diagonal, station=arguments.station,
     )  # fmt: skip
     if is_set(arguments, "json"):
         print_json(outcome.summary())
