@@ -10,7 +10,13 @@ from adjust.closed_forms.absolute_pose import (
     view_errors,
 )
 from adjust.closed_forms.averaging import mean_pose, mean_rotation, pose_distance
-from adjust.closed_forms.hand_eye import degenerate_direction, relative_motions, solve_ax_xb, solve_ax_zb
+from adjust.closed_forms.hand_eye import (
+    degenerate_direction,
+    relative_motions,
+    solve_ax_xb,
+    solve_ax_zb,
+    solve_views,
+)
 from adjust.closed_forms.homography import apply_homography, homography
 from adjust.closed_forms.rigid import align, inverse, nearest_rotation, rigid, rotation_exp, rotation_log, transform
 from adjust.closed_forms.triangulation import Intersection, intersect
@@ -43,6 +49,7 @@ __all__ = [
     "rotation_log",
     "solve_ax_xb",
     "solve_ax_zb",
+    "solve_views",
     "transform",
     "view_errors",
 ]
