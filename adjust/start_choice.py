@@ -1,0 +1,105 @@
+"""Which start values an adjustment begins with: those given, and where they lead nowhere those found without them."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adjust.errors import SurveyError
+from adjust.graph import StartValues
+from adjust.initial.given import GivenStarts, given_starts, without_starts
+from adjust.model import Survey
+from adjust.result import Adjustment
+
+_LOST_PX = 20.0
+"""Median misfit of the images from which a start is tried only after others; good ones are near 1 px."""
+_NO_FIT = 10.0
+"""sigma0 above which a solution is compared with those from other starts."""
+_SHOWN = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Begun:
+    """A survey without what its search for start values does not trust, the values, and notes on what was left out.
+
+    misfit_px: median over the images, zero where there are none.
+    """
+
+    survey: Survey
+    start: StartValues
+    notes: tuple[str, ...] = ()
+    misfit_px: float = 0.0
+
+
+def adjusted_from_own_start(
+    survey: Survey, find: Callable[[Survey, GivenStarts], Begun], run: Callable[[Begun], Adjustment]
+) -> Adjustment:
+    """``run(find(survey))``; where that fails or fits badly, from starts found without the values given for them.
+
+    find: start values of a survey; the given ones tell where a free datum belongs. Of several solutions that do not fit
+    the best is taken; a start other than the given one is told in the warnings. Raises what the first one raised.
+    """
+    given = given_starts(survey)
+    first: SurveyError | None = None
+    best: tuple[float, Adjustment] | None = None
+    for number, what, begun in _starts(survey, given, find):
+        if isinstance(begun, SurveyError):
+            first = begun if number == 0 else first
+            continue
+        try:
+            result = run(begun)
+        except SurveyError as error:
+            first = error if number == 0 or first is None else first
+            continue
+        if number > 0:
+            note = _said(given, what, first if best is None else None)
+            result = replace(result, warnings=(*result.warnings, note))
+        fit = result.sigma0 if np.isfinite(result.sigma0) else 0.0
+        if best is None or fit < 0.5 * best[0]:
+            best = fit, result
+        if fit < _NO_FIT:
+            break
+    if best is not None:
+        return best[1]
+    raise first if first is not None else SurveyError("no start values were found")
+
+
+def _starts(
+    survey: Survey, given: GivenStarts, find: Callable[[Survey, GivenStarts], Begun]
+) -> Iterator[tuple[int, str, Begun | SurveyError]]:
+    """Number (0: as given), what was found anew, and the start or why there is none; lost ones come last."""
+    lost: list[tuple[float, int, str, Begun]] = []
+    for number, (what, trial) in enumerate(_trials(survey, given)):
+        try:
+            begun = find(trial, given)
+        except SurveyError as error:
+            yield number, what, error
+            continue
+        if begun.misfit_px > _LOST_PX and given:
+            lost.append((begun.misfit_px, number, what, begun))
+        else:
+            yield number, what, begun
+    for _, number, what, begun in sorted(lost, key=lambda item: item[:2]):
+        yield number, what, begun
+
+
+def _trials(survey: Survey, given: GivenStarts) -> Iterator[tuple[str, Survey]]:
+    """The survey as it is, then without given start values: those of points, of poses, all."""
+    yield "", survey
+    if given.points:
+        yield "points", without_starts(survey, points=True, poses=False)
+    if given.poses:
+        yield "poses", without_starts(survey, points=False, poses=True)
+    if given.points and given.poses:
+        yield "points and poses", without_starts(survey, points=True, poses=True)
+
+
+def _said(given: GivenStarts, what: str, error: SurveyError | None) -> str:
+    names = [n for n in given.points] if "points" in what else []
+    names += [" ".join(n) for n in given.poses] if "poses" in what else []
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    why = f": {str(error).splitlines()[0]}" if error is not None else ""
+    return (
+        f"start values: those given for {what} ({', '.join(names[:_SHOWN])}{more}) lead to no solution that fits{why}; "
+        "they were found anew from the observations: check what was given"
+    )
