@@ -45,13 +45,13 @@ class _Group:
         return _Group((b, not b_inverse), (a, not a_inverse), inverse(self.motions), inverse(self.products))
 
 
-def solve_motion(network: PoseNetwork) -> str | None:
+def solve_motion(network: PoseNetwork, degenerate: bool = True) -> str | None:
     """Find what two unknowns and the motion between them determine; a note on what was done, or None.
 
     Robot-world closed form where a group of observations turns about two axes; else hand-eye from the motions of all
     groups that share an unknown; else all views together, where what a chain lacks on either side may be several poses
-    in a row; with all turns about one axis the smallest of the consistent solutions is taken, since a start need only
-    be consistent.
+    in a row; with all turns about one axis (where ``degenerate`` ones will do) the smallest of the consistent solutions
+    is taken, since a start need only be consistent.
     """
     groups = _groups(network)
     for group in sorted(groups, key=lambda g: -g.spread()):
@@ -62,7 +62,7 @@ def solve_motion(network: PoseNetwork) -> str | None:
         _set(network, group.second, second)
         _set(network, group.first, inverse(first))
         return f"{_text(network, group.first)} and {_text(network, group.second)} from {len(group.motions)} motions"
-    return _shared(network, groups, False) or _together(network) or _shared(network, groups, True)
+    return _shared(network, groups, False) or _together(network) or (_shared(network, groups, True) if degenerate else None)
 
 
 def _shared(network: PoseNetwork, groups: list[_Group], minimum_norm: bool) -> str | None:

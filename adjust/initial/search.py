@@ -124,7 +124,11 @@ class _Search:
                 rows = used_rows(block) & known[block.point_idx]
                 sightings[block.camera_id].append(Sighting(i, self.points.x[block.point_idx[rows]], block.uv[rows]))
         for camera in self.survey.cameras:
-            found = start_lens(camera, [s for s in sightings[camera.camera_id] if len(s.x)])
+            mine = [s for s in sightings[camera.camera_id] if len(s.x)]
+            if not mine and camera.lens.values is None and self.points.release():
+                self.find_lenses()  # no target shows it: the points as they are given have to do
+                return
+            found = start_lens(camera, mine)
             self.lenses[camera.camera_id] = found.values
             self.notes.append(f"camera {camera.camera_id!r}: {found.note}")
             for i, reason in found.excluded.items():
@@ -199,10 +203,12 @@ class _Search:
         if slot is not None:
             self.notes.append(f"{' '.join(network.names[slot])}: set freely, no observation tells it")
             return True
-        note = solve_motion(network)
+        note = solve_motion(network, degenerate=points.released)
         if note is not None:
             self.notes.append(note)
             self.motion_solved = True
+            return True
+        if points.release():
             return True
         if network.propagate(rotation_only=True):
             return True
@@ -215,7 +221,7 @@ class _Search:
     def _unseen_chains(self) -> list[ChainObservation]:
         """Chains of blocks of world points that have no pose yet; they bind the world as soon as any point is known."""
         have = {o.block_idx for o in self.network.observations}
-        bound = bool(self.points.known.any())
+        bound = bool(self.points.known.any() or self.points.rough.any())
         return [
             ChainObservation(s.chain, np.zeros((0, 4, 4)), s.text, s.block_idx, ends=(True, bound))
             for s in self.points.sights
