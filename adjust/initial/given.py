@@ -8,6 +8,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.closed_forms import align
+from adjust.initial.network import as_pose3, given_pose
 from adjust.initial.result import Start
 from adjust.model import FloatArray, PointParameter, PoseParameter, Survey
 from adjust.result import ParameterName
@@ -57,6 +58,12 @@ def _pose_parameters(survey: Survey) -> dict[ParameterName, PoseParameter]:
         out["carrier_from_target", target.target_id] = target.carrier_from_target
         out |= {("carrier_from_target", target.target_id, epoch): p for epoch, p in target.epochs.items()}
     return out
+
+
+def given_poses(survey: Survey) -> dict[ParameterName, Pose3]:
+    """All poses that have a value, held ones too (at identity where they have none), but open priors."""
+    out = {name: given_pose(parameter) for name, parameter in _pose_parameters(survey).items()}
+    return {name: as_pose3(matrix) for name, matrix in out.items() if matrix is not None}
 
 
 def without_starts(survey: Survey, points: bool, poses: bool) -> Survey:
