@@ -69,7 +69,7 @@ def repeated_orientations(survey: Survey) -> dict[str, ParameterName]:
     """Set-ups that are not levelled whose orientation nothing tells from the turn of their station, with that pose.
 
     The first set-up with directions on each station whose frame nothing else uses: no camera or target stands on it, no
-    pair, level or beam refers to it, and no component of its rotation is held or known.
+    pair, level or beam refers to it, and its turn about z is not held or known, or it alone holds the world.
     """
     tilted = {s.setup_id for s in survey.setups if not s.levelled}
     if not tilted:
@@ -94,16 +94,28 @@ def repeated_orientations(survey: Survey) -> dict[str, ParameterName]:
         pose = station.world_from_station
         if station.motion != "fixed":
             name, pose = (*name, frame.epoch_id or ""), station.epochs.get(frame.epoch_id or "", pose)
-        if station.motion != "table" and _turns_freely(pose) and name not in out.values():
+        free = _turns_freely(pose) or (pose.treatment == "held" and _alone_holds_the_world(survey, frame.frame_id))
+        if station.motion != "table" and free and name not in out.values():
             out[setup_id] = name
     return out
 
 
 def _turns_freely(pose: PoseParameter) -> bool:
-    """Whether nothing is known of the rotation."""
-    if pose.treatment == "prior" and pose.prior_cov is not None:
-        return not np.isfinite(np.diag(pose.prior_cov)[:3]).any() and not {"rx", "ry", "rz"} & set(pose.held)
-    return pose.treatment == "free" and not {"rx", "ry", "rz"} & set(pose.held)
+    """Whether nothing is known of the turn about the station's own z axis."""
+    known = pose.treatment == "prior" and pose.prior_cov is not None and np.isfinite(pose.prior_cov[2, 2])
+    return pose.treatment != "held" and not known and "rz" not in pose.held
+
+
+def _alone_holds_the_world(survey: Survey, station_id: str) -> bool:
+    """Whether a held station is all that tells the directions of the world's axes: its frame is the world's then."""
+    points = any(p.x_in_world.treatment != "free" or p.x_in_world.held for p in survey.points)
+    poses = [s.world_from_station for s in survey.stations if s.station_id != station_id]
+    poses += [p for s in survey.stations for p in s.epochs.values()]
+    poses += [t.carrier_from_target for t in survey.targets if t.station_id is None]
+    poses += [t.world_from_table for t in survey.tables]
+    held = any(p.treatment != "free" or p.held for p in poses)
+    observed = survey.coordinates or survey.coordinate_differences or survey.cameras or survey.on_surfaces
+    return not (points or held or observed or any(r.kind == "azimuth" for r in survey.readings))
 
 
 def _by_id(kind: str, items: Iterable[tuple[str, T]]) -> dict[str, T]:
