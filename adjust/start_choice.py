@@ -1,6 +1,6 @@
 """Which start values an adjustment begins with: those given, and where they lead nowhere those found without them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,13 +8,16 @@ import numpy as np
 from adjust.errors import SurveyError
 from adjust.graph import StartValues
 from adjust.initial.given import GivenStarts, given_starts, without_starts
-from adjust.model import Survey
+from adjust.initial.reflection import Apart, apart, mirrored
+from adjust.model import FloatArray, Survey
 from adjust.result import Adjustment
 
 _LOST_PX = 20.0
 """Median misfit of the images from which a start is tried only after others; good ones are near 1 px."""
 _NO_FIT = 10.0
 """sigma0 above which a solution is compared with those from other starts."""
+_AS_WELL = 9.0
+"""By how much v'Pv of a mirror image may be larger, and the image fit as well: three sigmas."""
 _SHOWN = 8
 
 
@@ -32,6 +35,16 @@ class Begun:
 
 
 def adjusted_from_own_start(
+    survey: Survey, find: Callable[[Survey, GivenStarts], Begun], run: Callable[[Begun], Adjustment]
+) -> Adjustment:
+    """An adjustment from start values that are found where they are not given, near those given where that fits as well.
+
+    As :func:`_that_leads` and :func:`_near_given` say.
+    """
+    return _near_given(survey, _that_leads(survey, find, run), run)
+
+
+def _that_leads(
     survey: Survey, find: Callable[[Survey, GivenStarts], Begun], run: Callable[[Begun], Adjustment]
 ) -> Adjustment:
     """``run(find(survey))``; where that fails or fits badly, from starts found without the values given for them.
@@ -103,3 +116,52 @@ def _said(given: GivenStarts, what: str, error: SurveyError | None) -> str:
         f"start values: those given for {what} ({', '.join(names[:_SHOWN])}{more}) lead to no solution that fits{why}; "
         "they were found anew from the observations: check what was given"
     )
+
+
+def _near_given(survey: Survey, result: Adjustment, run: Callable[[Begun], Adjustment]) -> Adjustment:
+    """The result, or its mirror image where that fits as well and lies nearer to the start values; what is far is told.
+
+    Only what no image sees can be mirrored: a ray tells in front from behind.
+    """
+    found = apart(survey, result)
+    if not found.far.any():
+        return result
+    for places in mirrored(survey, result, found) if not survey.image_blocks else ():
+        try:
+            other = run(Begun(result.survey, _from_places(result, places)))
+        except SurveyError:
+            continue
+        now = apart(survey, other)
+        if other.omega <= result.omega + _AS_WELL * max(1.0, result.sigma0**2) and now.rms < 0.5 * found.rms:
+            said = (
+                f"start values: the observations fit two mirror images equally well (v'Pv {result.omega:.4g} and "
+                f"{other.omega:.4g}); the one near the start values is kept: {_some(found)}"
+            )
+            kept = tuple(w for w in result.warnings if w.startswith("start values"))
+            return _with_far(replace(other, warnings=(*other.warnings, *kept, said)), now)
+    return _with_far(result, found)
+
+
+def _from_places(result: Adjustment, places: Mapping[str, FloatArray]) -> StartValues:
+    """The adjusted values with other places of points; what is turned there is found anew."""
+    from adjust.pair_screen import values_of  # here: it stands above this module
+
+    start = values_of(result)
+    vectors = {n: v for n, v in start.vectors.items() if n[0] not in ("orientation", "centring")}
+    return replace(start, points={**start.points, **places}, vectors=vectors)
+
+
+def _with_far(result: Adjustment, found: Apart) -> Adjustment:
+    if not found.far.any():
+        return result
+    note = (
+        f"start values: {int(found.far.sum())} of {len(found.ids)} points lie far from the start values given for them: "
+        f"{_some(found)}; check names and coordinates, and whether the network came out mirrored"
+    )
+    return replace(result, warnings=(*result.warnings, note))
+
+
+def _some(found: Apart) -> str:
+    order = [int(i) for i in np.argsort(-found.distances) if found.far[i]]
+    more = f" and {len(order) - _SHOWN} more" if len(order) > _SHOWN else ""
+    return ", ".join(f"{found.ids[i]} ({found.distances[i]:.4g} m)" for i in order[:_SHOWN]) + more
