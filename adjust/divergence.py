@@ -12,6 +12,8 @@ from adjust.rank import readable
 from adjust.unknowns import Unknown
 
 _GROUPS, _OWNERS, _MOVED = 4, 3, 4
+_BY_FAR = 9.0
+"""Mean square over that of the next, from which an owner stands out."""
 _MISFIT = 16.0
 """Mean squares over their variance from which a group or one of its owners is named: four sigmas."""
 
@@ -34,8 +36,10 @@ def describe_divergence(graph: AdjustmentGraph, values: gtsam.Values) -> list[st
     start = graph.start
     before, after = misfits(graph, start), misfits(graph, values)
     n = max(1, len(after))
+    first = _stands_out(before)
     rms = [float(np.sqrt(np.mean([m.square for m in side]))) if side else 0.0 for side in (before, after)]
-    lines = [
+    lines = [] if first is None else [first]
+    lines += [
         f"the observations miss by {rms[0]:.3g} of their sigmas (root mean square of {n}) at the start values, "
         f"by {rms[1]:.3g} where it stopped"
     ]
@@ -45,6 +49,18 @@ def describe_divergence(graph: AdjustmentGraph, values: gtsam.Values) -> list[st
     lines += [f"at the start values: {line}" for line in worst_by_group(before)]
     lines += [f"where it stopped: {line}" for line in worst_by_group(after)]
     return lines
+
+
+def _stands_out(found: list[Misfit]) -> str | None:
+    """The one owner whose observations fit far worse at the start than those of any other; None where none does."""
+    owners = [o for o in _owners(found) if np.isfinite(o[1])]
+    if len(owners) < 2 or owners[0][1] < _MISFIT or owners[0][1] < _BY_FAR * owners[1][1]:
+        return None
+    (owner, square), (_, after) = owners[:2]
+    return (
+        f"look first at {owner}: at the start values its observations miss by {np.sqrt(square):.3g} sigmas, those of any "
+        f"other by {np.sqrt(after):.3g} at most"
+    )
 
 
 def worst_by_group(found: list[Misfit]) -> list[str]:

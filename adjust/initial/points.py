@@ -87,9 +87,10 @@ def point_field(survey: Survey) -> PointField:
                 x[index[ref.point_id]] = value
     firm = np.isfinite(x[:, 0])
     for i, point in enumerate(survey.points):
-        if point.x_in_world.value is not None:
+        known = point.x_in_world.treatment != "free" or bool(point.x_in_world.held)
+        if point.x_in_world.value is not None and (known or not firm[i]):  # what was observed tells more than a start
             x[i] = point.x_in_world.value
-            firm[i] |= point.x_in_world.treatment != "free" or bool(point.x_in_world.held)
+            firm[i] |= known
     given = np.asarray(np.isfinite(x[:, 0]))
     boards = any(b.target_id is not None for b in survey.image_blocks)
     return PointField(x, given, given & ~firm, released=not boards)

@@ -308,8 +308,10 @@ class _Search:
         if not trusted:
             return
         limit = max(15.0, _OFF * float(np.median([rms[i] for i in trusted])))
+        # points where a start value puts them say nothing against an image
+        rough = {s.block_idx for s in self.points.sights if self.points.rough[s.rows].any()}
         for i in range(len(rms)):
-            if i not in self.reasons and rms[i] > limit:
+            if i not in self.reasons and rms[i] > limit and (i not in rough or np.isinf(rms[i])):
                 what = "has points behind the camera" if np.isinf(rms[i]) else f"is {rms[i]:.1f} px off"
                 text = block_text(self.survey.image_blocks[i])
                 self.reasons[i] = (
