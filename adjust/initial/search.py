@@ -307,15 +307,17 @@ class _Search:
         trusted = [i for i in range(len(rms)) if i not in self.reasons and np.isfinite(rms[i])]
         if not trusted:
             return
-        limit = max(15.0, _OFF * float(np.median([rms[i] for i in trusted])))
-        # points where a start value puts them say nothing against an image
+        # blocks of points that are where a start value puts them are measured by their own kind
         rough = {s.block_idx for s in self.points.sights if self.points.rough[s.rows].any()}
+        kinds = [[i for i in trusted if (i in rough) == kind and np.isfinite(rms[i])] for kind in (False, True)]
+        typical = [float(np.median(rms[kind])) if kind else 0.0 for kind in kinds]
         for i in range(len(rms)):
-            if i not in self.reasons and rms[i] > limit and (i not in rough or np.isinf(rms[i])):
+            limit = max(15.0, _OFF * typical[i in rough])
+            if i not in self.reasons and rms[i] > limit:
                 what = "has points behind the camera" if np.isinf(rms[i]) else f"is {rms[i]:.1f} px off"
                 text = block_text(self.survey.image_blocks[i])
                 self.reasons[i] = (
-                    f"{text}: {what} where the other blocks put it (typical: {np.median(rms[trusted]):.1f} px)"
+                    f"{text}: {what} where the other blocks put it (typical: {typical[i in rough]:.1f} px)"
                 )
 
     def _block_rms(self) -> FloatArray:
