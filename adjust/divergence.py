@@ -58,8 +58,8 @@ def _stands_out(found: list[Misfit]) -> str | None:
         return None
     (owner, square), (_, after) = owners[:2]
     return (
-        f"look first at {owner}: at the start values its observations miss by {np.sqrt(square):.3g} sigmas, those of any "
-        f"other by {np.sqrt(after):.3g} at most"
+        f"look first at {owner}: at the start values its observations miss by {np.sqrt(square):.3g} sigmas, those of "
+        f"any other by {np.sqrt(after):.3g} at most"
     )
 
 

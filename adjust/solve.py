@@ -122,7 +122,7 @@ class _Loop:
         return self._ordering[1]
 
     def step(self) -> gtsam.VectorValues:
-        """The (damped) step of ``linear``; raises IndeterminateError where there is none: by name where it is judged."""
+        """The (damped) step. Raises IndeterminateError where there is none, by name where that is judged."""
         system = self.linear if self.damping == 0.0 else damped(self.graph, self.linear, self.damping)
         try:
             how = (self.ordering, gtsam.EliminateQR) if self.use_qr else (self.ordering,)

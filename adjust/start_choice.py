@@ -37,7 +37,7 @@ class Begun:
 def adjusted_from_own_start(
     survey: Survey, find: Callable[[Survey, GivenStarts], Begun], run: Callable[[Begun], Adjustment]
 ) -> Adjustment:
-    """An adjustment from start values that are found where they are not given, near those given where that fits as well.
+    """An adjustment from start values that are found where they are not given, near those given if that fits as well.
 
     As :func:`_that_leads` and :func:`_near_given` say.
     """
@@ -108,7 +108,7 @@ def _trials(survey: Survey, given: GivenStarts) -> Iterator[tuple[str, Survey]]:
 
 
 def _said(given: GivenStarts, what: str, error: SurveyError | None) -> str:
-    names = [n for n in given.points] if "points" in what else []
+    names = list(given.points) if "points" in what else []
     names += [" ".join(n) for n in given.poses] if "poses" in what else []
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     why = f": {str(error).splitlines()[0]}" if error is not None else ""
@@ -155,8 +155,8 @@ def _with_far(result: Adjustment, found: Apart) -> Adjustment:
     if not found.far.any():
         return result
     note = (
-        f"start values: {int(found.far.sum())} of {len(found.ids)} points lie far from the start values given for them: "
-        f"{_some(found)}; check names and coordinates, and whether the network came out mirrored"
+        f"start values: {int(found.far.sum())} of {len(found.ids)} points lie far from the start values given for "
+        f"them: {_some(found)}; check names and coordinates, and whether the network came out mirrored"
     )
     return replace(result, warnings=(*result.warnings, note))
 

@@ -144,7 +144,7 @@ def _all_rotations(
     N = (N / seen[:, None, None, None] / seen[None, :, None, None]).swapaxes(1, 2).reshape(9 * (m + k), -1)
     w, v = np.linalg.eigh(N)
     if not w[1] > max(_ONE_NULL_VECTOR * max(float(w[0]), 0.0), _SMALLEST_GAP):
-        raise SurveyError("the views leave rotations undetermined: more views, or turns about a second axis, are needed")
+        raise SurveyError("the views leave rotations undetermined: more, or turns about a second axis, are needed")
     found = (v[:, 0].reshape(m + k, 9) / seen[:, None]).reshape(m + k, 3, 3).swapaxes(1, 2)
     if np.linalg.det(found / np.linalg.norm(found, axis=(1, 2), keepdims=True)).sum() < 0.0:
         found = -found

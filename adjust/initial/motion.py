@@ -62,7 +62,8 @@ def solve_motion(network: PoseNetwork, degenerate: bool = True) -> str | None:
         _set(network, group.second, second)
         _set(network, group.first, inverse(first))
         return f"{_text(network, group.first)} and {_text(network, group.second)} from {len(group.motions)} motions"
-    return _shared(network, groups, False) or _together(network) or (_shared(network, groups, True) if degenerate else None)
+    note = _shared(network, groups, False) or _together(network)
+    return note or (_shared(network, groups, True) if degenerate else None)
 
 
 def _shared(network: PoseNetwork, groups: list[_Group], minimum_norm: bool) -> str | None:
@@ -105,7 +106,8 @@ def _together(network: PoseNetwork) -> str | None:
     for found in _connected(_rows_of_poses(network)):
         first, inside = np.unique(found.first, return_inverse=True)
         second, outside = np.unique(found.second, return_inverse=True)
-        alone = [(i, 0) for i in first if len(found.rows[i]) == 1] + [(i, 1) for i in second if len(found.rows[i]) == 1]
+        alone = [(i, 0) for i in first if len(found.rows[i]) == 1]
+        alone += [(i, 1) for i in second if len(found.rows[i]) == 1]
         solved = _solved_views(found, inside, outside, network.lever) if alone else None
         if solved is None:
             continue

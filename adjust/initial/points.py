@@ -77,7 +77,7 @@ class PointField:
 
 
 def point_field(survey: Survey) -> PointField:
-    """The points of a survey with their given or observed coordinates. A start value is rough where targets are seen."""
+    """The points of a survey, given or observed; those with a start value are rough where targets are seen."""
     x = np.full((len(survey.points), 3), np.nan)
     index = {p.point_id: i for i, p in enumerate(survey.points)}
     for observed in survey.coordinates:

@@ -102,7 +102,7 @@ def _neighbours(survey: Survey) -> dict[str, set[str]]:
 
 
 def _image(x: FloatArray, base: FloatArray, flat: bool) -> FloatArray | None:
-    """x (3,) mirrored in the plane of ``base`` (n, 3); in a plane network in their line. None where there is neither."""
+    """Image (3,) of x in the plane of ``base`` (n, 3), in a plane network in their line; None where there is none."""
     dims = 2 if flat else 3
     if len(base) < dims:
         return None

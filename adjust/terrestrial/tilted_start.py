@@ -1,4 +1,4 @@
-"""Start values from set-ups that are not levelled: poses of their stations, points that they see, targets tied to these.
+"""Start values from set-ups that are not levelled: poses of their stations, points they see, targets tied to these.
 
 Direction and zenith angle are a ray in the station's frame, with a distance a point in it. A station follows from the
 points that it sees and that are known, by resection or by fitting; points follow from stations, targets from points.

@@ -20,7 +20,8 @@ def adjusted(folder: Path) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("name", "sigma0", "redundancy"), [("start18", 1.0079, 5612), ("rough0.02", 0.9988, 18616), ("navN4", 1.0107, 10672)]
+    ("name", "sigma0", "redundancy"),
+    [("start18", 1.0079, 5612), ("rough0.02", 0.9988, 18616), ("navN4", 1.0107, 10672)],
 )
 def test_nothing_is_wrong_and_it_passes(name: str, sigma0: float, redundancy: int) -> None:
     """The first: what the program gave when it was started at the truth; the others: sigma0 as without rough values."""

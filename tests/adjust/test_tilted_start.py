@@ -1,4 +1,4 @@
-"""Start values of stations that are not levelled: scanners and trackers on any slope, and theodolites without distances."""
+"""Start values of stations that are not levelled: scanners and trackers, and theodolites without distances."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -74,7 +74,8 @@ def around(n: int, seed: int = 2) -> dict[str, FloatArray]:
 def points(x: dict[str, FloatArray], held: int) -> tuple[Point, ...]:
     """The first ones held, the others without any value."""
     return tuple(
-        Point(n, PointParameter(place, "held") if i < held else PointParameter()) for i, (n, place) in enumerate(x.items())
+        Point(n, PointParameter(place, "held") if i < held else PointParameter())
+        for i, (n, place) in enumerate(x.items())
     )
 
 
