@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from gtsam import Pose3, Rot3
 
 from adjust.errors import SurveyError
 from adjust.graph import StartValues
@@ -18,6 +19,7 @@ _NO_FIT = 10.0
 """sigma0 above which a solution is compared with those from other starts."""
 _AS_WELL = 9.0
 """By how much v'Pv of a mirror image may be larger, and the image fit as well: three sigmas."""
+_TURNED = np.deg2rad(20.0)
 _SHOWN = 8
 
 
@@ -64,7 +66,8 @@ def _that_leads(
         except SurveyError as error:
             first = error if number == 0 or first is None else first
             continue
-        if number > 0:
+        # a start that was put off, since the images did not fit it well, is mentioned where it was wrong indeed
+        if number > 0 and (first is not None or best is not None or _turned_away(given, result)):
             note = _said(given, what, first if best is None else None)
             result = replace(result, warnings=(*result.warnings, note))
         fit = result.sigma0 if np.isfinite(result.sigma0) else 0.0
@@ -105,6 +108,13 @@ def _trials(survey: Survey, given: GivenStarts) -> Iterator[tuple[str, Survey]]:
         yield "poses", without_starts(survey, points=False, poses=True)
     if given.points and given.poses:
         yield "points and poses", without_starts(survey, points=True, poses=True)
+
+
+def _turned_away(given: GivenStarts, result: Adjustment) -> bool:
+    """Whether a pose was adjusted to something else than the start value given for it."""
+    found = {n: e.value for n, e in result.estimates.items() if n in given.poses}
+    turns = (given.poses[n].rotation().between(p.rotation()) for n, p in found.items() if isinstance(p, Pose3))
+    return any(float(np.linalg.norm(Rot3.Logmap(turn))) > _TURNED for turn in turns)
 
 
 def _said(given: GivenStarts, what: str, error: SurveyError | None) -> str:
