@@ -8,6 +8,7 @@ from gtsam import Pose3
 
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.initial import Start, find_start
+from adjust.initial.given import GivenStarts, given_starts, moved_onto
 from adjust.lens import MODELS, camera_constants, monotone_radius_px, principal_point_px
 from adjust.model import BoolArray, FloatArray, Survey
 from adjust.observations import ImageBlock
@@ -15,6 +16,7 @@ from adjust.precision import Precision, global_test, group_summaries, image_resi
 from adjust.result import Adjustment, Estimate, ParameterName
 from adjust.robust import limit, screen
 from adjust.solve import Solved, SolveOptions, solve
+from adjust.start_choice import Begun, adjusted_from_own_start
 from adjust.terrestrial.joint_start import find_all, needs_points
 from adjust.terrestrial.statistics import JoinedResiduals, reading_residuals
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
@@ -44,11 +46,20 @@ def adjust(
 
     progress: called with (iteration, v'Pv). Raises SurveyError, IndeterminateError, NotConvergedError.
     """
-    notes: tuple[str, ...] = ()
-    given = survey
-    if start is None:
-        survey, start, notes = _trusted(survey, options)
-    graph = GraphBuilder(survey, start.lenses).build(start)
+    if start is not None:
+        return _adjusted(Begun(survey, start), survey, options, progress)
+    return adjusted_from_own_start(
+        survey,
+        lambda trial, starts: _trusted(trial, starts, options),
+        lambda begun: _adjusted(begun, survey, options, progress),
+    )
+
+
+def _adjusted(
+    begun: Begun, given: Survey, options: AdjustOptions, progress: Callable[[int, float], None] | None
+) -> Adjustment:
+    survey, notes = begun.survey, begun.notes
+    graph = GraphBuilder(survey, begun.start.lenses).build(begun.start)
     solved = solve(graph, options.solve, progress)
     if options.reject_points:
         screened = screen(graph, solved, options.solve)
@@ -99,18 +110,32 @@ def _unused_before(given: Survey) -> dict[tuple[str, str, str | None, str], froz
     }
 
 
-def _trusted(survey: Survey, options: AdjustOptions) -> tuple[Survey, StartValues, tuple[str, ...]]:
+def _trusted(survey: Survey, given: GivenStarts, options: AdjustOptions) -> Begun:
     """Start values; what the search refused gets a second chance with the lenses that the rest determines."""
-    found = find_all(survey) if needs_points(survey) else find_start(survey)
+    found = _found(survey, given)
     if not found.excluded_blocks or not options.reject_blocks:
-        return survey, start_values(found), ()
+        return Begun(survey, start_values(found), (), _misfit_px(found))
     kept = _without(survey, found.excluded_blocks)
     graph = GraphBuilder(kept, found.lenses).build(start_values(found))
     values = solve(graph, options.solve).values
     lenses = {c.camera_id: graph.unknowns.vectors[("lens", c.camera_id)].full(values) for c in survey.cameras}
     cameras = tuple(replace(c, lens=replace(c.lens, values=lenses[c.camera_id])) for c in survey.cameras)
-    again = find_start(replace(survey, cameras=cameras))
-    return _without(survey, again.excluded_blocks), start_values(again), again.reasons
+    again = _found(replace(survey, cameras=cameras), given)
+    return Begun(_without(survey, again.excluded_blocks), start_values(again), again.reasons, _misfit_px(again))
+
+
+def _found(survey: Survey, given: GivenStarts) -> Start:
+    """Start values; of a free network where the given ones were, though they may have been left aside."""
+    found = find_all(survey) if needs_points(survey) else find_start(survey)
+    moved = survey.datum.kind == "inner" and not given_starts(survey) and given
+    return moved_onto(found, given, survey) if moved else found
+
+
+def _misfit_px(found: Start) -> float:
+    """Median misfit of the images that take part, px; zero where there are none."""
+    out = set(found.excluded_blocks)
+    rms = [v for i, v in enumerate(found.block_rms_px) if i not in out and not np.isnan(v)]
+    return float(np.median(rms)) if rms else 0.0
 
 
 def start_values(found: Start) -> StartValues:

@@ -1,5 +1,6 @@
 """The job behind ``labsurvey navigate``: calibrate from everything else, then a pose for every navigation epoch."""
 
+import contextlib
 import sys
 import time
 from collections.abc import Sequence
@@ -24,6 +25,7 @@ from survey.navigation_task import (
     chosen_station,
     chosen_times,
     observed_epoch,
+    others_to_navigate,
 )
 from survey.quantities import ARCSEC_PER_RAD, SigmaKind
 from survey.replacing import changing, replace_parts
@@ -106,8 +108,9 @@ def navigate_job(
 ) -> NavigateOutcome:
     """Navigate a project and write ``results/trajectory.csv`` and ``.json``. Raises SurveyError.
 
-    The calibration is adjusted from the epochs that are not navigated, so that no spot is used twice, and its joint
-    covariance of cameras, table and beacons goes into every pose. It is kept in ``results`` and used again while
+    The calibration is adjusted without the epochs that are navigated, or could be (those that show beacons and no
+    target), so that no spot is used twice and every choice of epochs has the same; its joint covariance of cameras,
+    table and beacons goes into every pose. It is kept in ``results`` and used again while
     that survey, options and versions are the same. (The solution of ``adjust`` has the navigated spots in it.)
     """
     target = Path(out or folder)
@@ -165,28 +168,50 @@ def _notes(project: Project, calibration: Calibration) -> tuple[str, ...]:
     missing = sorted({p.point_id for p in project.survey.points} - set(calibration.beacons.beacon_ids), key=natural_key)
     if missing:
         notes.append(f"beacons without coordinates, left out: {', '.join(missing)}")
+    if calibration.helped_by:
+        notes.append(
+            f"calibration: with epochs that were not asked for ({_some(calibration.helped_by)}), because the others do "
+            "not determine the head"
+        )
     if calibration.reused:
         notes.append(f"calibration: that of {RESULTS}/{CALIBRATION}; what it came from has not changed")
     return tuple(notes)
 
 
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
 def _calibrate(project: Project, station: str, epochs: Sequence[str], there: Path, new: Path) -> Calibration:
-    """Head and beacons, from the file ``there`` where it was made from the same survey, options and versions."""
-    survey = calibrating(project, station, epochs)
+    """Head and beacons, from the file ``there`` where it was made from the same survey, options and versions.
+
+    Epochs that could be navigated too, but were not asked for, calibrate only where nothing else does.
+    """
+    others = others_to_navigate(project, station, epochs)
+    try:
+        return _calibrated(project, station, [*epochs, *others], there, new)
+    except SurveyError as error:
+        if others:
+            with contextlib.suppress(SurveyError):
+                return replace(_calibrated(project, station, epochs, there, new), helped_by=tuple(others))
+        if not isinstance(error, IndeterminateError):
+            raise
+        raise SurveyError(
+            f"{project.folder}: the head is not calibrated without the epochs to navigate ({_some(epochs)}); navigate "
+            f"fewer with --epochs, or calibrate with a target\n({error})"
+        ) from error
+
+
+def _calibrated(project: Project, station: str, without: Sequence[str], there: Path, new: Path) -> Calibration:
+    """From everything but these epochs of the station."""
+    survey = calibrating(project, station, without)
     run = run_info(project, {})
     options = AdjustOptions(project.options.alpha, project.options.reject_blocks, project.options.reject_points)
     key = digest(survey, options, run.versions, station)
     found = kept(there, key)
     if found is not None:
         return found
-    try:
-        adjustment = adjust(survey, options=options)
-    except IndeterminateError as error:
-        raise SurveyError(
-            f"{project.folder}: the head is not calibrated without the epochs to navigate ({', '.join(epochs[:5])}"
-            f"{', ...' if len(epochs) > 5 else ''}); navigate fewer with --epochs, or calibrate with a target"
-            f"\n({error})"
-        ) from error
+    adjustment = adjust(survey, options=options)
     head, beacons = head_and_beacons(adjustment, station)
     calibration = Calibration(head, beacons, adjustment.sigma0 if adjustment.redundancy > 0 else None)
     keep(new, key, calibration)

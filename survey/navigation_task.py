@@ -53,21 +53,37 @@ def chosen_epochs(project: Project, station: str, request: NavigateRequest) -> l
     own = {c.camera_id for c in project.survey.cameras if c.station_id == station}
     if not own:
         raise SurveyError(f"{project.folder}/survey.toml: no camera is on station {station!r}")
-    blocks = [b for b in in_use(project.survey).image_blocks if b.camera_id in own]
-    lit = {s.epoch_id for s in project.spots if s.camera_id in own}
-    lit |= {b.epoch_id for b in blocks if b.target_id is None}
+    lit, shown = _lit_and_shown(project, own)
     if request.epochs is not None:
         unknown = [e for e in request.epochs if e not in lit]
         if unknown:
             raise SurveyError(f"{project.folder}: no beacon was observed at epoch {', '.join(unknown)} from {station}")
         return list(request.epochs)
-    found = sorted(lit - {b.epoch_id for b in blocks if b.target_id is not None}, key=natural_key)
+    found = sorted(lit - shown, key=natural_key)
     if not found:
         raise SurveyError(
             f"{project.folder}/observations: no epoch to navigate: none shows beacons to station {station} without a "
             "target; name epochs with --epochs, or detect spots first"
         )
     return found
+
+
+def _lit_and_shown(project: Project, own: set[str]) -> tuple[set[str], set[str]]:
+    """Epochs at which these cameras show beacons, and those at which they show a target."""
+    blocks = [b for b in in_use(project.survey).image_blocks if b.camera_id in own]
+    lit = {s.epoch_id for s in project.spots if s.camera_id in own}
+    lit |= {b.epoch_id for b in blocks if b.target_id is None}
+    return lit, {b.epoch_id for b in blocks if b.target_id is not None}
+
+
+def others_to_navigate(project: Project, station: str, epochs: Sequence[str]) -> list[str]:
+    """Epochs that could be navigated as well and were not asked for, in natural order.
+
+    They take no part in the calibration either, so that it is the same whichever epochs are asked for; none where no
+    epoch of the station shows a target, so that nothing else could calibrate it.
+    """
+    lit, shown = _lit_and_shown(project, {c.camera_id for c in project.survey.cameras if c.station_id == station})
+    return sorted(lit - shown - set(epochs), key=natural_key) if shown else []
 
 
 def chosen_times(epochs: Sequence[str], request: NavigateRequest) -> list[float] | None:

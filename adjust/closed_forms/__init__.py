@@ -2,7 +2,13 @@
 
 from adjust.closed_forms.absolute_pose import PoseCandidates, absolute_pose, best_poses, pose_solutions
 from adjust.closed_forms.averaging import mean_pose, mean_rotation, pose_distance
-from adjust.closed_forms.hand_eye import degenerate_direction, relative_motions, solve_ax_xb, solve_ax_zb
+from adjust.closed_forms.hand_eye import (
+    degenerate_direction,
+    relative_motions,
+    solve_ax_xb,
+    solve_ax_zb,
+    solve_views,
+)
 from adjust.closed_forms.planes import homographies, plane_misfits, plane_poses
 from adjust.closed_forms.rigid import align, inverse, nearest_rotation, rigid, rotation_exp, rotation_log, transform
 from adjust.closed_forms.triangulation import Intersection, intersect
@@ -36,6 +42,7 @@ __all__ = [
     "rotation_log",
     "solve_ax_xb",
     "solve_ax_zb",
+    "solve_views",
     "tangent_axes",
     "transform",
     "view_errors",

@@ -32,16 +32,34 @@ class Sight:
 
 @dataclass(eq=False)
 class PointField:
-    """The world's points, (n, 3) m: nan until known. ``given`` (n,): coordinates that came with the survey."""
+    """The world's points, (n, 3) m: nan until known. ``given`` (n,): coordinates that came with the survey.
+
+    rough (n,): given ones that nothing but a start value tells. They stay unknown, and may be intersected, while there
+    is firmer ground to go on from (targets), until they are ``released``.
+    """
 
     x: FloatArray
     given: BoolArray
+    rough: BoolArray
     sights: list[Sight] = field(default_factory=list)
+    released: bool = False
 
     @property
     def known(self) -> BoolArray:
-        """Which points (n,) have coordinates by now."""
-        return np.asarray(np.isfinite(self.x[:, 0]))
+        """Which points (n,) have coordinates by now that may be used."""
+        known = np.isfinite(self.x[:, 0])
+        return np.asarray(known if self.released else known & ~self.rough)
+
+    def release(self) -> bool:
+        """Use the rough ones from now on; whether that is news."""
+        news = not self.released and bool(self.rough.any())
+        self.released = True
+        return news
+
+    def place(self, rows: BoolArray, x: FloatArray) -> None:
+        """Set coordinates that were found; they are no given ones any more."""
+        self.x[rows] = x[rows]
+        self.given[rows] = self.rough[rows] = False
 
     def add(self, survey: Survey, block_idx: int, rays: FloatArray, focal_px: float, chain: Chain) -> None:
         """Take in a block of world points."""
@@ -59,7 +77,7 @@ class PointField:
 
 
 def point_field(survey: Survey) -> PointField:
-    """The points of a survey with their given or observed coordinates."""
+    """The points of a survey, given or observed; those with a start value are rough where targets are seen."""
     x = np.full((len(survey.points), 3), np.nan)
     index = {p.point_id: i for i, p in enumerate(survey.points)}
     for observed in survey.coordinates:
@@ -67,10 +85,15 @@ def point_field(survey: Survey) -> PointField:
         for ref, value, whole in zip(observed.positions, observed.values, finite, strict=True):
             if ref.frame is None and ref.point_id in index and observed.used and whole:
                 x[index[ref.point_id]] = value
+    firm = np.isfinite(x[:, 0])
     for i, point in enumerate(survey.points):
-        if point.x_in_world.value is not None:
+        known = point.x_in_world.treatment != "free" or bool(point.x_in_world.held)
+        if point.x_in_world.value is not None and (known or not firm[i]):  # what was observed tells more than a start
             x[i] = point.x_in_world.value
-    return PointField(x, np.asarray(np.isfinite(x[:, 0])))
+            firm[i] |= known
+    given = np.asarray(np.isfinite(x[:, 0]))
+    boards = any(b.target_id is not None for b in survey.image_blocks)
+    return PointField(x, given, given & ~firm, released=not boards)
 
 
 def resect(network: PoseNetwork, points: PointField) -> bool:
@@ -169,9 +192,10 @@ def intersect_points(network: PoseNetwork, points: PointField, parallax: float, 
     ahead = np.ones(len(points.x), dtype=bool)
     behind = np.bincount(row, weights=found.residual > np.pi / 2, minlength=len(points.x))
     ahead &= 2 * behind < np.bincount(row, minlength=len(points.x))
-    good = (found.parallax > parallax) & np.isfinite(found.x[:, 0]) & ahead & ~points.given
+    wanted = np.where(points.rough, PARALLAX[0], parallax)  # a rough value is better than rays almost in line
+    good = (found.parallax > wanted) & np.isfinite(found.x[:, 0]) & ahead & ~(points.given & points.known)
     new = good & ~points.known
-    points.x[good if renew else new] = found.x[good if renew else new]
+    points.place(good if renew else new, found.x)
     return int(new.sum())
 
 

@@ -148,7 +148,11 @@ class _Search:
                 rows = used_rows(block) & known[block.point_idx]
                 sightings[block.camera_id].append(Sighting(i, self.points.x[block.point_idx[rows]], block.uv[rows]))
         for camera in self.survey.cameras:
-            found = start_lens(camera, [s for s in sightings[camera.camera_id] if len(s.x)])
+            mine = [s for s in sightings[camera.camera_id] if len(s.x)]
+            if not mine and camera.lens.values is None and self.points.release():
+                self.find_lenses()  # no target shows it: the points as they are given have to do
+                return
+            found = start_lens(camera, mine)
             self.lenses[camera.camera_id] = found.values
             self.notes.append(f"camera {camera.camera_id!r}: {found.note}")
             for i, reason in found.excluded.items():
@@ -228,10 +232,12 @@ class _Search:
         if slot is not None:
             self.notes.append(f"{' '.join(network.names[slot])}: set freely, no observation tells it")
             return True
-        note = solve_motion(network)
+        note = solve_motion(network, degenerate=points.released)
         if note is not None:
             self.notes.append(note)
             self.motion_solved = True
+            return True
+        if points.release():
             return True
         if network.propagate(rotation_only=True):
             return True
@@ -244,7 +250,7 @@ class _Search:
     def _unseen_chains(self) -> list[ChainObservation]:
         """Chains of blocks of world points that have no pose yet; they bind the world as soon as any point is known."""
         have = {o.block_idx for o in self.network.observations}
-        bound = bool(self.points.known.any())
+        bound = bool(self.points.known.any() or self.points.rough.any())
         return [
             ChainObservation(s.chain, np.zeros((0, 4, 4)), s.text, s.block_idx, ends=(True, bound))
             for s in self.points.sights
@@ -330,13 +336,17 @@ class _Search:
         trusted = [i for i in range(len(rms)) if i not in self.reasons and np.isfinite(rms[i])]
         if not trusted:
             return
-        limit = max(15.0, _OFF * float(np.median([rms[i] for i in trusted])))
+        # blocks of points that are where a start value puts them are measured by their own kind
+        rough = {s.block_idx for s in self.points.sights if self.points.rough[s.rows].any()}
+        kinds = [[i for i in trusted if (i in rough) == kind and np.isfinite(rms[i])] for kind in (False, True)]
+        typical = [float(np.median(rms[kind])) if kind else 0.0 for kind in kinds]
         for i in range(len(rms)):
+            limit = max(15.0, _OFF * typical[i in rough])
             if i not in self.reasons and rms[i] > limit:
                 what = "has points behind the camera" if np.isinf(rms[i]) else f"is {rms[i]:.1f} px off"
                 text = block_text(self.survey.image_blocks[i])
                 self.reasons[i] = (
-                    f"{text}: {what} where the other blocks put it (typical: {np.median(rms[trusted]):.1f} px)"
+                    f"{text}: {what} where the other blocks put it (typical: {typical[i in rough]:.1f} px)"
                 )
 
     def _block_rms(self) -> FloatArray:

@@ -22,7 +22,7 @@ from adjust.initial.views import (
     untrustworthy,
     used_rows,
 )
-from adjust.model import FloatArray, IntArray, PoseParameter, Station, Survey, Table, Target
+from adjust.model import BoolArray, FloatArray, IntArray, PoseParameter, Station, Survey, Table, Target
 from adjust.observations import ImageBlock
 
 
@@ -80,6 +80,22 @@ class TableViews:
         return replace(
             self, inner=self.inner[rows], outer=self.outer[rows], epoch=self.epoch[rows], poses=self.poses[rows],
             cov=self.cov[rows],
+        )  # fmt: skip
+
+    def shows(self, kind: str, thing_id: str) -> BoolArray:
+        """Which views (n,) are those of one thing, a camera or a target."""
+        inner = np.array([name == (kind, thing_id) for name in self.inner_ids])
+        outer = np.array([name == (kind, thing_id) for name in self.outer_ids])
+        return np.asarray(inner[self.inner] | outer[self.outer])
+
+    def without(self, kind: str, thing_id: str) -> "TableViews":
+        """The same without the views of one thing, and without what only these show."""
+        rest = self.only(np.flatnonzero(~self.shows(kind, thing_id)))
+        left, place = np.unique(rest.inner, return_inverse=True)
+        right, other = np.unique(rest.outer, return_inverse=True)
+        return replace(
+            rest, inner=place, outer=other, inner_ids=tuple(self.inner_ids[i] for i in left),
+            outer_ids=tuple(self.outer_ids[i] for i in right),
         )  # fmt: skip
 
 

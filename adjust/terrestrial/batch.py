@@ -1,6 +1,6 @@
 """All readings of a survey: evaluated together, served to GTSAM chunk by chunk."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gtsam
@@ -231,7 +231,8 @@ class TerrestrialBatch:
         chunk = layout.chunks[c]
         rows = chunk.rows
         for i in np.unique(a.orientation[rows][a.kind[rows] == k.DIRECTION]):
-            self.orientation[i] = values.atVector(self._orientation_maps[i].key)[0]
+            key = self._orientation_maps[i].key
+            self.orientation[i] = 0.0 if key is None else values.atVector(key)[0]
         for i in np.unique(a.centring[rows]):
             if i >= 0:
                 self.centring[i] = self._centring_maps[i].full(values)
@@ -252,16 +253,23 @@ class TerrestrialBatch:
             self.e[rows] = root[rows] * (chunk.whitener @ out)
             self._decorrelate(c, root)
 
-    def orient(self, values: gtsam.Values, known: set[str]) -> None:
-        """Set the orientations not ``known`` (setups) to what their directions say at the other ``values``."""
+    def orient(self, values: gtsam.Values, known: set[str], poses: Mapping[str, int]) -> None:
+        """Set the orientations not ``known`` (setups) to what their directions say at the other ``values``.
+
+        poses: keys of stations that are turned instead, by setup whose orientation is held for their sake.
+        """
         self.evaluate(values)
         self._prepared = None
         a = self.layout.arrays
         for i, (setup_id, vector) in enumerate(self.parameters.orientations.items()):
             rows = np.flatnonzero((a.orientation == i) & (a.kind == k.DIRECTION))
+            turn = self.residual[rows]
             if setup_id not in known and vector.key is not None:
-                turn = self.residual[rows]
                 values.update(vector.key, self.orientation[i : i + 1] + _circular_median(turn[np.isfinite(turn)]))
+            elif setup_id not in known and setup_id in poses:
+                turn_about_z = self.sign * _circular_median(turn[np.isfinite(turn)])
+                station = values.atPose3(poses[setup_id])
+                values.update(poses[setup_id], station * gtsam.Pose3(gtsam.Rot3.Rz(turn_about_z), np.zeros(3)))
 
 
 def sigmas(a: ReadingArrays, axes: FloatArray, A: FloatArray) -> FloatArray:
