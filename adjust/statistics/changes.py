@@ -324,7 +324,8 @@ def _explaining(M: FloatArray, g: FloatArray, T: float, spread: float) -> list[i
     limit = spread * float(norm.isf(0.005)) ** 2
     while possible:
         taken = [_part(M, g, [*index, i]) for i in possible]
-        best = int(np.argmax(taken))
+        # of those that say the same, such as width and height of a board, the first
+        best = next(i for i, x in enumerate(taken) if x >= max(taken) - 1e-6 * abs(T))
         if index and taken[best] - _part(M, g, index) < limit:
             break
         index.append(possible.pop(best))
