@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from adjust import parallel
+from adjust.native import vision
 from adjust.native.lenses import BROWN, N_LENS, lens_residuals, lens_rows
 from adjust.native.library import Function, instruction_set, instruction_sets, opened
 from adjust.precision import Precision, image_residuals
@@ -183,6 +184,16 @@ def test_a_lens_of_no_model_or_with_too_few_parameters_is_refused(kind: int, n: 
     for function in (lens_rows, lens_residuals):
         with pytest.raises(ValueError, match="lens"):
             function(*given)
+
+
+@pytest.mark.parametrize("start", [(np.nan, 20.0), (np.inf, 20.0), (1e300, 20.0), (-50.0, 20.0), (20.0, 61.0)])
+def test_a_fit_that_begins_nowhere_finds_nothing(start: tuple[float, float]) -> None:
+    image, places, one = np.full((60, 80), 30.0, np.float32), np.array([start]), np.ones(1)
+    shapes = np.array([[6.0, 2.0, 8.0, 8.0]])
+    status = vision.fit_corners(image, places, np.array([[0.0, 1.5]]), one, shapes, True, 2.0, 1e-4)[-1]
+    assert status.tolist() == [1]  # at the border
+    none = np.zeros((60, 80), np.int64), 255.0, places, np.ones(1, np.int64)
+    assert vision.fit_spots(image, *none, 5.0 * one, 100.0 * one, one)[1].tolist() == [-1]
 
 
 def _told(**environment: str) -> tuple[int, str]:
