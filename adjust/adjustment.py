@@ -8,12 +8,15 @@ from gtsam import Pose3
 
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.initial import Start, find_start
+from adjust.initial.given import GivenStarts, given_starts, moved_onto
 from adjust.lens import MODELS, camera_constants, monotone_radius_px, principal_point_px
 from adjust.model import BoolArray, FloatArray, Survey
+from adjust.observations import ImageBlock
 from adjust.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
 from adjust.result import Adjustment, Estimate, ParameterName
 from adjust.robust import limit, screen
 from adjust.solve import Solved, SolveOptions, solve
+from adjust.start_choice import Begun, adjusted_from_own_start
 from adjust.terrestrial.joint_start import find_all, needs_points
 from adjust.terrestrial.statistics import JoinedResiduals, reading_residuals
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
@@ -43,17 +46,27 @@ def adjust(
 
     progress: called with (iteration, v'Pv). Raises SurveyError, IndeterminateError, NotConvergedError.
     """
-    notes: tuple[str, ...] = ()
-    if start is None:
-        survey, start, notes = _trusted(survey, options)
-    graph = GraphBuilder(survey, start.lenses).build(start)
+    if start is not None:
+        return _adjusted(Begun(survey, start), survey, options, progress)
+    return adjusted_from_own_start(
+        survey,
+        lambda trial, starts: _trusted(trial, starts, options),
+        lambda begun: _adjusted(begun, survey, options, progress),
+    )
+
+
+def _adjusted(
+    begun: Begun, given: Survey, options: AdjustOptions, progress: Callable[[int, float], None] | None
+) -> Adjustment:
+    survey, notes = begun.survey, begun.notes
+    graph = GraphBuilder(survey, begun.start.lenses).build(begun.start)
     solved = solve(graph, options.solve, progress)
     if options.reject_points:
         screened = screen(graph, solved, options.solve)
         survey = with_used(survey, screened.used)
-        notes = rejections(survey) + notes
-        return replace(assemble(graph, screened.solved, options, notes, screened.precision), survey=survey)
-    return assemble(graph, solved, options, notes)
+        notes = rejections(survey, given) + notes
+        return replace(assemble(graph, screened.solved, options, notes, screened.precision, given), survey=survey)
+    return assemble(graph, solved, options, notes, given=given)
 
 
 def with_used(survey: Survey, used: BoolArray) -> Survey:
@@ -63,15 +76,19 @@ def with_used(survey: Survey, used: BoolArray) -> Survey:
     return replace(survey, image_blocks=blocks)
 
 
-def rejections(survey: Survey) -> tuple[str, ...]:
-    """Image points that are not used, by block."""
+def rejections(survey: Survey, given: Survey) -> tuple[str, ...]:
+    """Image points that are not used, though they were in the survey as it was given, by block."""
     out, targets = [], {t.target_id: t.point_ids for t in survey.targets}
+    before = _unused_before(given)
     points = tuple(p.point_id for p in survey.points)
     for block in survey.image_blocks:
         if block.used is None or block.used.all() or not block.used.any():
             continue
         ids = targets[block.target_id] if block.target_id else points
-        names = [ids[int(i)] for i in block.point_idx[~block.used]]
+        old = before.get(_place(block), frozenset())
+        names = [ids[int(i)] for i in block.point_idx[~block.used] if int(i) not in old]
+        if not names:
+            continue
         more = f" and {len(names) - 8} more" if len(names) > 8 else ""
         out.append(
             f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}: left out as "
@@ -80,18 +97,45 @@ def rejections(survey: Survey) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _trusted(survey: Survey, options: AdjustOptions) -> tuple[Survey, StartValues, tuple[str, ...]]:
+def _place(block: ImageBlock) -> tuple[str, str, str | None, str]:
+    return block.camera_id, block.epoch_id, block.target_id, block.group
+
+
+def _unused_before(given: Survey) -> dict[tuple[str, str, str | None, str], frozenset[int]]:
+    """Positions of the points of each block that its owner does not use."""
+    return {
+        _place(b): frozenset(b.point_idx[~b.used].tolist())
+        for b in given.image_blocks
+        if b.used is not None and not b.used.all()
+    }
+
+
+def _trusted(survey: Survey, given: GivenStarts, options: AdjustOptions) -> Begun:
     """Start values; what the search refused gets a second chance with the lenses that the rest determines."""
-    found = find_all(survey) if needs_points(survey) else find_start(survey)
+    found = _found(survey, given)
     if not found.excluded_blocks or not options.reject_blocks:
-        return survey, start_values(found), ()
+        return Begun(survey, start_values(found), (), _misfit_px(found))
     kept = _without(survey, found.excluded_blocks)
     graph = GraphBuilder(kept, found.lenses).build(start_values(found))
     values = solve(graph, options.solve).values
     lenses = {c.camera_id: graph.unknowns.vectors[("lens", c.camera_id)].full(values) for c in survey.cameras}
     cameras = tuple(replace(c, lens=replace(c.lens, values=lenses[c.camera_id])) for c in survey.cameras)
-    again = find_start(replace(survey, cameras=cameras))
-    return _without(survey, again.excluded_blocks), start_values(again), again.reasons
+    again = _found(replace(survey, cameras=cameras), given)
+    return Begun(_without(survey, again.excluded_blocks), start_values(again), again.reasons, _misfit_px(again))
+
+
+def _found(survey: Survey, given: GivenStarts) -> Start:
+    """Start values; of a free network where the given ones were, though they may have been left aside."""
+    found = find_all(survey) if needs_points(survey) else find_start(survey)
+    moved = survey.datum.kind == "inner" and not given_starts(survey) and given
+    return moved_onto(found, given, survey) if moved else found
+
+
+def _misfit_px(found: Start) -> float:
+    """Median misfit of the images that take part, px; zero where there are none."""
+    out = set(found.excluded_blocks)
+    rms = [v for i, v in enumerate(found.block_rms_px) if i not in out and not np.isnan(v)]
+    return float(np.median(rms)) if rms else 0.0
 
 
 def start_values(found: Start) -> StartValues:
@@ -121,8 +165,12 @@ def assemble(
     options: AdjustOptions,
     notes: tuple[str, ...] = (),
     precision: Precision | None = None,
+    given: Survey | None = None,
 ) -> Adjustment:
-    """Everything a report needs, from the solution; ``precision`` where it is known already."""
+    """Everything a report needs, from the solution; ``precision`` where it is known already.
+
+    given: the survey of its owner; what that does not use needs no warning.
+    """
     precision = precision or Precision(graph, solved)
     images = image_residuals(precision)
     others = other_residuals(precision)
@@ -142,7 +190,7 @@ def assemble(
         omega, float(np.sqrt(omega / redundancy)) if redundancy > 0 else float("nan"), test, solved.iterations,
         solved.max_step, True, (), precision, readings,
     )  # fmt: skip
-    return replace(result, warnings=warnings(graph, result) + notes)
+    return replace(result, warnings=warnings(graph, result, given) + notes)
 
 
 def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
@@ -178,7 +226,7 @@ def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
     return out
 
 
-def warnings(graph: AdjustmentGraph, result: Adjustment) -> tuple[str, ...]:
+def warnings(graph: AdjustmentGraph, result: Adjustment, given: Survey | None = None) -> tuple[str, ...]:
     """What its owner should know first."""
     out = []
     total = float(sum(g.redundancy for g in result.groups))
@@ -189,18 +237,15 @@ def warnings(graph: AdjustmentGraph, result: Adjustment) -> tuple[str, ...]:
         )
     test = result.global_test
     if test is not None and not test.passed:
-        side = "larger" if test.omega > test.upper else "smaller"
-        out.append(
-            f"global test failed: sigma0 = {result.sigma0:.3f}, the residuals are {side} than the a priori sigmas say "
-            f"(v'Pv = {test.omega:.1f}, expected {test.lower:.1f} to {test.upper:.1f})"
-        )
-    out += _image_warnings(graph, result) + _lens_warnings(graph, result)
+        out.append(test.warning(result.sigma0))
+    out += _image_warnings(graph, result, given) + _lens_warnings(graph, result)
     return tuple(out)
 
 
-def _image_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
+def _image_warnings(graph: AdjustmentGraph, result: Adjustment, given: Survey | None) -> list[str]:
     out, images, blocks = [], result.image_residuals, graph.survey.image_blocks
     bound = limit(len(images.test)) * max(1.0, result.sigma0**2)
+    before = {} if given is None else _unused_before(given)
     of_point = np.repeat(np.arange(len(blocks)), np.diff(images.block_ptr))
     used = np.bincount(of_point[images.used], minlength=len(blocks))
     with np.errstate(invalid="ignore"):
@@ -208,6 +253,8 @@ def _image_warnings(graph: AdjustmentGraph, result: Adjustment) -> list[str]:
     for i in np.flatnonzero((used == 0) | (bad > 0)).tolist():
         block = blocks[i]
         what = f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}"
+        if used[i] == 0 and len(before.get(_place(block), ())) == len(block.uv):
+            continue  # as its owner wants it
         if used[i] == 0 and len(block.uv):
             out.append(f"{what}: not used")
         elif bad[i]:

@@ -20,7 +20,7 @@ from adjust.model import FloatArray, IntArray
 from adjust.result import Adjustment, ParameterName
 from adjust.statistics.criteria import noncentrality, sidak
 from adjust.statistics.relative_precision import ellipsoid
-from adjust.statistics.result import LevelOptions
+from adjust.statistics.result import Ellipsoid, LevelOptions
 
 _DETERMINED = 1e-9
 
@@ -49,7 +49,8 @@ DEFAULT_CONGRUENCE = CongruenceOptions()
 class _Change:
     """Differences d (n,), their covariance Q (n, n), the motions G (n, k) that do not count, and whose rows are whose.
 
-    owner: (n,) number of the name. component: (n,) of rx ry rz x y z, 0 to 5. weight: (n,) in the datum.
+    owner: (n,) number of the name. component: (n,) of rx ry rz x y z, 0 to 5. weight: (n,) in the datum. nowhere:
+    names of which an epoch knows the rotation alone.
     """
 
     names: tuple[ParameterName, ...]
@@ -59,6 +60,7 @@ class _Change:
     owner: IntArray
     component: IntArray
     weight: FloatArray
+    nowhere: frozenset[ParameterName] = frozenset()
 
     def rows(self, stable: Sequence[int]) -> IntArray:
         """Components of these names."""
@@ -170,8 +172,9 @@ def _change(
     known = np.isfinite(d) & (np.diag(before.cov) + np.diag(after.cov) > 0.0)
     owner = np.repeat(np.arange(len(names)), before.sizes)
     component = np.concatenate([before.components(n) for n in names])
+    nowhere = frozenset(names[int(i)] for i in owner[~np.isfinite(d)])
     change = _Change(names, d[known], Q[np.ix_(known, known)], G[known], owner[known], component[known],
-                     np.ones(int(known.sum())))  # fmt: skip
+                     np.ones(int(known.sum())), nowhere)  # fmt: skip
     return replace(change, weight=_weights(change))
 
 
@@ -306,6 +309,11 @@ def _motion(
         turning = np.flatnonzero(place < 3)
         statistic, rank, _ = _quadratic(d[turning], Q[np.ix_(turning, turning)])
         turn, rotation_test = full[:3], _test(statistic, rank, pooled, level)
+    if name in here.nowhere:
+        nan = np.full((3, 3), np.nan)
+        region = Ellipsoid(np.zeros(0), np.zeros((3, 0)), 1.0 - options.alpha, np.isfinite(pooled[1]))
+        return Motion(name, nan[0], nan, region, test, turn, cov[:3, :3], rotation_test, stable, bool(test.p < level),
+                      float("nan"))  # fmt: skip
     q = max(1, test.freedom)
     size = noncentrality(level, options.levels.power, q) * float(np.linalg.eigvalsh(cov_shift)[-1])
     scale = (pooled[0], int(pooled[1])) if np.isfinite(pooled[1]) else (None, 0)

@@ -40,7 +40,8 @@ class Motion:
     displacement: (3,) m, world; cov (3, 3); ellipsoid at the level of one test. test: of the displacement (and rotation
     together for a station). rotation: (3,) rad, in the tangent of the station at the first epoch, with rotation_cov and
     rotation_test; None for points. stable: belongs to the reference. significant: at the family-wise level. smallest:
-    m, displacement in the worst direction that would be found with the power of the test options.
+    m, displacement in the worst direction that would be found with the power of the test options. Where an epoch knows
+    rotations alone displacement, cov and smallest are nan, and the ellipsoid has no axes.
     """
 
     name: ParameterName

@@ -17,6 +17,7 @@ from gtsam import Pose3, Rot3
 from adjust.distributions import chi2
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
+from adjust.named_precision import rotations_only
 from adjust.relay.motions import right_jacobian_inverse
 from adjust.result import Adjustment, Estimate, ParameterName
 from adjust.rotation_forms import euler_cov_from_tangent, euler_from_matrix
@@ -78,8 +79,9 @@ def relative_pose(adjustment: Adjustment, a: str, b: str) -> tuple[Pose3, FloatA
     free = [e.name for e in (of_a, of_b) if any(s != "held" for s in e.status)]
     if not free:
         return b_from_a, np.zeros((6, 6))
-    joint = np.asarray(adjustment.precision.joint(free))
-    dim = len(joint) // len(free)
+    dim = 3 if rotations_only(adjustment) else 6
+    rows = (6 * np.arange(len(free))[:, None] + np.arange(dim)).ravel()
+    joint = np.asarray(adjustment.precision.joint(free))[np.ix_(rows, rows)]
     by_a, by_b = np.eye(dim), -b_from_a.inverse().AdjointMap()[:dim, :dim]
     J = np.hstack([by_a if name == of_a.name else by_b for name in free])
     cov = np.full((6, 6), np.nan)

@@ -7,8 +7,7 @@ Each tail is computed where it is small, so that a probability of 1e-300 keeps i
 from typing import Any
 
 import numpy as np
-
-from adjust.special_functions import ufuncs as special
+from scipy import special
 
 Numbers = Any
 

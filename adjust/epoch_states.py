@@ -9,6 +9,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.model import FloatArray, IntArray
 from adjust.motions import point_motions, skew
+from adjust.named_precision import NamedPrecision, rotations_only
 from adjust.precision import Precision
 from adjust.result import Adjustment, ParameterName
 
@@ -74,11 +75,13 @@ def origin(value: Pose3 | FloatArray) -> FloatArray:
 
 
 def epoch_state(adjustment: Adjustment) -> EpochState:
-    """All points and fixed stations of an adjustment, a priori, in its datum."""
+    """Points and fixed stations of an adjustment, a priori, in its datum; in rotation networks positions are nan."""
     names = [n for n in adjustment.estimates if n[0] == "point" or (n[0] == "world_from_station" and len(n) == 2)]
     values = tuple(
         e.value if isinstance(e.value, Pose3) else np.asarray(e.value) for e in (adjustment.estimates[n] for n in names)
     )
+    if rotations_only(adjustment):
+        values = tuple(Pose3(v.rotation(), np.full(3, np.nan)) for v in values if isinstance(v, Pose3))
     state = EpochState(tuple(names), values, np.zeros((0, 0)), open_directions(adjustment))
     starts = np.concatenate([[0], np.cumsum(state.sizes)]).astype(np.int64)
     cov = np.zeros((int(starts[-1]),) * 2)
@@ -86,13 +89,23 @@ def epoch_state(adjustment: Adjustment) -> EpochState:
     free = [i for i, s in enumerate(status) if any(x != "held" for x in s)]
     if free:
         joint = np.asarray(adjustment.precision.joint([names[i] for i in free]))
-        short = len(joint) < sum(int(state.sizes[i]) for i in free)  # a network of rotations
-        width = [3 if short else int(state.sizes[i]) for i in free]
-        rows = np.concatenate([np.arange(starts[i], starts[i] + w) for i, w in zip(free, width, strict=True)])
-        held = np.concatenate([np.array(status[i][:w]) == "held" for i, w in zip(free, width, strict=True)])
+        rows = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in free])
+        held = np.concatenate([np.array(status[i]) == "held" for i in free])
         joint = joint * np.outer(~held, ~held)
         cov[np.ix_(rows, rows)] = joint
     return replace(state, cov=cov)
+
+
+def datum_carriers(adjustment: Adjustment) -> tuple[ParameterName, ...]:
+    """The points and stations over which the inner constraints of an adjustment hold; none where its datum is given."""
+    precision = adjustment.precision
+    if isinstance(precision, Precision):
+        datum, by_key = precision.solved.datum, precision.graph.unknowns.by_key
+        return () if datum is None else tuple(by_key[k].name for k in datum.keys)
+    if isinstance(precision, NamedPrecision) and adjustment.datum_defect:
+        network = precision.solution.network
+        return tuple(("world_from_station", network.station_ids[int(i)]) for i in network.inner)
+    return ()
 
 
 def open_directions(adjustment: Adjustment) -> FloatArray:
@@ -108,10 +121,11 @@ def open_directions(adjustment: Adjustment) -> FloatArray:
 
 def gauge_rows(state: EpochState) -> FloatArray:
     """How all components (n, 7) move with the whole."""
-    return np.concatenate([_motions(v) for v in state.values])
+    return np.concatenate([value_motions(v) for v in state.values])
 
 
-def _motions(value: Pose3 | FloatArray) -> FloatArray:
+def value_motions(value: Pose3 | FloatArray) -> FloatArray:
+    """How the components (3 or 6, 7) of a point or pose move with the whole."""
     if not isinstance(value, Pose3):
         return point_motions(value)
     R, t = value.rotation().matrix(), np.asarray(value.translation())
@@ -124,39 +138,38 @@ def _motions(value: Pose3 | FloatArray) -> FloatArray:
 
 def differences(before: EpochState, after: EpochState) -> FloatArray:
     """After minus before (n,), of poses in the tangent of the first; nan where only rotations are known."""
-    out = []
-    for a, b in zip(before.values, after.values, strict=True):
-        if isinstance(a, Pose3) and isinstance(b, Pose3):
-            if not (np.isfinite(a.translation()).all() and np.isfinite(b.translation()).all()):
-                turn = Rot3.Logmap(a.rotation().inverse() * b.rotation())
-                out.append(np.concatenate([turn, np.full(3, np.nan)]))
-            else:
-                out.append(np.asarray(Pose3.Logmap(a.inverse() * b)))
-        else:
-            out.append(origin(b) - origin(a))
-    return np.concatenate(out)
+    return np.concatenate([differences_of(a, b) for a, b in zip(before.values, after.values, strict=True)])
+
+
+def differences_of(a: Pose3 | FloatArray, b: Pose3 | FloatArray) -> FloatArray:
+    """Of one point (3,) or pose (6,): b minus a."""
+    if not (isinstance(a, Pose3) and isinstance(b, Pose3)):
+        return origin(b) - origin(a)
+    if np.isfinite(a.translation()).all() and np.isfinite(b.translation()).all():
+        return np.asarray(Pose3.Logmap(a.inverse() * b))
+    turn = Rot3.Logmap(a.rotation().inverse() * b.rotation())
+    return np.concatenate([turn, np.full(3, np.nan)])
+
+
+def moved_value(value: Pose3 | FloatArray, motion: FloatArray) -> Pose3 | FloatArray:
+    """A point or pose moved by ``motion`` (7,) about the origin: translation, rotation vector, ln(scale)."""
+    R, s = Rot3.Expmap(motion[3:6]).matrix(), float(np.exp(motion[6]))
+    x = s * R @ origin(value) + motion[:3]
+    return Pose3(Rot3(R @ value.rotation().matrix()), x) if isinstance(value, Pose3) else x
 
 
 def moved(state: EpochState, motion: FloatArray) -> EpochState:
-    """The whole turned, shifted and scaled by ``motion`` (7,): t, rotation vector, ln(scale), about the origin."""
+    """The whole moved by ``motion`` (7,), with its covariance."""
     R, s = Rot3.Expmap(motion[3:6]).matrix(), float(np.exp(motion[6]))
-    values: list[Pose3 | FloatArray] = []
-    blocks = []
-    for v in state.values:
-        x = s * R @ origin(v) + motion[:3]
-        if isinstance(v, Pose3):
-            values.append(Pose3(Rot3(R @ v.rotation().matrix()), x))
-            blocks.append(np.diag([1.0] * 3 + [s] * 3))  # the tangent on the right turns along
-        else:
-            values.append(x)
-            blocks.append(s * R)
+    # the tangent of a pose, on the right, turns along
+    blocks = [np.diag([1.0] * 3 + [s] * 3) if isinstance(v, Pose3) else s * R for v in state.values]
     J = np.zeros_like(state.cov)
     at = 0
     for block in blocks:
         k = slice(at, at + len(block))
         J[k, k] = block
         at = k.stop
-    return replace(state, values=tuple(values), cov=J @ state.cov @ J.T)
+    return replace(state, values=tuple(moved_value(v, motion) for v in state.values), cov=J @ state.cov @ J.T)
 
 
 def aligned(before: EpochState, after: EpochState, directions: FloatArray, reference: Sequence[int]) -> EpochState:

@@ -198,7 +198,8 @@ class GraphBuilder:
         values = self._values(start)
         readings = build_batch(self.survey, self.unknowns, self.terrestrial, self.frames, state, at)
         if readings is not None:
-            readings.orient(values, {name[1] for name in start.vectors if name[0] == "orientation"})
+            turned = {s: u.key for s, n in self.terrestrial.repeated.items() if (u := self.unknowns.by_name.get(n))}
+            readings.orient(values, {name[1] for name in start.vectors if name[0] == "orientation"}, turned)
             readings.update_sigmas(values)
         survey = geometry.find_starts(state, at, values, start.vectors)
         self._other_factors(state, at, pair_chains)

@@ -11,7 +11,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
-from adjust.chain_kernels import evaluate_chains
+from adjust.chains import evaluate_chains
 from adjust.image_segments import block_keys
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.images import (
@@ -66,7 +66,7 @@ class Chains:
 
     def evaluate(self, state: State) -> None:
         """Fill R (B, 3, 3), t (B, 3) and C (links, 6, 6)."""
-        evaluate_chains(state.slot_R, state.slot_t, self.ptr, self.slot, self.inverse, self.R, self.t, self.C)
+        self.R, self.t, self.C = evaluate_chains(state.slot_R, state.slot_t, self.ptr, self.slot, self.inverse)
 
 
 class ImageBatch:

@@ -2,7 +2,7 @@
 
 All models use the camera frame x right, y down, z forward and pixels with the first pixel's centre at (0, 0). The
 models in millimetres measure the image with y up from the image's centre (``brown_backward``, ``aicon``) or from the
-pixel origin (``brown_backward_dbat``). The formulas are in ``adjust.lens_kernels``.
+pixel origin (``brown_backward_dbat``). The formulas are in ``adjust/native/lenses.h``.
 """
 
 from collections.abc import Callable, Mapping

@@ -2,8 +2,10 @@
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from adjust.model import FloatArray
-from adjust.result import ParameterName
+from adjust.result import Adjustment, ParameterName
 
 if TYPE_CHECKING:
     from adjust.pose_network.solution import NetworkSolution
@@ -16,6 +18,21 @@ class NamedPrecision:
         self.solution = solution
 
     def joint(self, names: list[ParameterName]) -> FloatArray:
-        """Covariance (k dim, k dim) of ``("world_from_station", id)`` names, stacked in this order."""
-        index = self.solution.network.index_of
-        return self.solution.precision.joint([index[name[1]] for name in names])
+        """Covariance (6 k, 6 k) of ``("world_from_station", id)`` names, stacked in this order.
+
+        In networks of rotations the translations, of which nothing is known, have zeros: they are held.
+        """
+        network = self.solution.network
+        Q = self.solution.precision.joint([network.index_of[name[1]] for name in names])
+        if network.dim == 6:
+            return Q
+        out = np.zeros((6 * len(names),) * 2)
+        rows = (6 * np.arange(len(names))[:, None] + np.arange(3)).ravel()
+        out[np.ix_(rows, rows)] = Q
+        return out
+
+
+def rotations_only(adjustment: Adjustment) -> bool:
+    """Whether nothing but rotations was measured, so that nothing is where it seems to be."""
+    found = adjustment.precision
+    return isinstance(found, NamedPrecision) and found.solution.network.rotation_only

@@ -91,6 +91,7 @@ class Coordinates:
     """World coordinates (n, 3) m of n positions, with their joint covariance (3n, 3n).
 
     ``np.inf`` on the diagonal of cov: that coordinate was not observed (its row and column are then ignored).
+    set_id: the name of the set in its table, "" for the coordinates of one position, which has its name.
     """
 
     positions: tuple[PositionRef, ...]
@@ -98,6 +99,7 @@ class Coordinates:
     cov: FloatArray
     group: str = "coordinates"
     used: bool = True
+    set_id: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +139,10 @@ class ReadingCovariance:
 
 @dataclass(frozen=True, eq=False)
 class CoordinateDifferences:
-    """World coordinates of ``to`` minus those of ``at``, (n, 3) m of n baselines, with joint covariance (3n, 3n)."""
+    """World coordinates of ``to`` minus those of ``at``, (n, 3) m of n baselines, with joint covariance (3n, 3n).
+
+    set_id: the name of the set in its table, or of the difference that is a set by itself.
+    """
 
     at: tuple[PositionRef, ...]
     to: tuple[PositionRef, ...]
@@ -145,6 +150,7 @@ class CoordinateDifferences:
     cov: FloatArray
     group: str = "coordinate_difference"
     used: bool = True
+    set_id: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from gtsam import Pose3
 
@@ -110,6 +110,10 @@ class GroupSummary:
         return self.omega / self.redundancy if self.redundancy > 1e-9 else float("nan")
 
 
+CAUTIOUS_SIGMAS = "cautious sigmas"
+"""How the warning begins that residuals are smaller than their sigmas: nobody is misled by these."""
+
+
 @dataclass(frozen=True)
 class GlobalTest:
     """Chi-square test of sigma0 (two-sided): passed when ``lower <= omega <= upper``."""
@@ -125,6 +129,29 @@ class GlobalTest:
         """Whether the weighted square sum agrees with the a priori sigmas."""
         return self.lower <= self.omega <= self.upper
 
+    @property
+    def status(self) -> Literal["passed", "cautious", "failed"]:
+        """``cautious``: residuals are smaller than the sigmas say; ``failed``: larger, something does not fit."""
+        if self.omega > self.upper:
+            return "failed"
+        return "cautious" if self.omega < self.lower else "passed"
+
+    @property
+    def said(self) -> str:
+        """The status in words."""
+        return "passed with cautious sigmas" if self.status == "cautious" else self.status
+
+    def warning(self, sigma0: float) -> str:
+        """For people: what is not as the sigmas say; "" where all is."""
+        if self.passed:
+            return ""
+        larger = self.status == "failed"
+        what, side = ("global test failed", "larger") if larger else (CAUTIOUS_SIGMAS, "smaller")
+        return (
+            f"{what}: sigma0 = {sigma0:.3f}, the residuals are {side} than the a priori sigmas say "
+            f"(v'Pv = {self.omega:.1f}, expected {self.lower:.1f} to {self.upper:.1f})"
+        )
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Adjustment:
@@ -135,7 +162,8 @@ class Adjustment:
     other_residuals: of all that are not image points, the readings last, also as arrays in ``reading_residuals``.
     precision: gives joint covariances, ``precision.joint([name, ...])``.
     variance_components: ``adjust.statistics.result.VarianceComponents``, where they were estimated. decisions: the log
-    of the search for gross errors, ``adjust.statistics.result.Decision``.
+    of the search for gross errors, ``adjust.statistics.result.Decision``. n_screened: image points and other
+    observations that were in use and that this adjustment left out, where that was counted.
     """
 
     survey: Survey
@@ -158,10 +186,11 @@ class Adjustment:
     reading_residuals: ReadingResiduals | None = None
     variance_components: Any = None
     decisions: tuple[Any, ...] = ()
+    n_screened: int = 0
 
     def __repr__(self) -> str:
         """The key figures in one line."""
-        said = "" if self.global_test is None else f", global test {'passed' if self.global_test.passed else 'failed'}"
+        said = "" if self.global_test is None else f", global test {self.global_test.said}"
         return (
             f"Adjustment(sigma0 {self.sigma0:.4f}, {self.n_observations} observations, {self.n_unknowns} unknowns, "
             f"redundancy {self.redundancy}{said})"

@@ -1,7 +1,8 @@
 """Gross errors among the image points: found by reweighting, confirmed by test, left out of a clean least squares.
 
 Cauchy weights with a scale from the median (Huber 1981, section 7.8; Zhang 1997 for the constant) bring the solution to
-what most points agree on; there every point is tested with the error probability of the whole family (Sidak).
+what most points agree on; there every point is tested with the error probability of the whole family (Sidak). Where
+the residuals are together far smaller than the sigmas say, nothing contradicts these and nothing is looked for.
 """
 
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from adjust.graph import AdjustmentGraph
 from adjust.model import BoolArray, FloatArray
 from adjust.precision import Precision, image_residuals
 from adjust.solve import Solved, SolveOptions, solve
+from adjust.statistics.criteria import cautious
 
 _CAUCHY = 2.385**2
 _MEDIAN = 2.0 * np.log(2.0)  # of chi-square with two degrees of freedom
@@ -45,7 +47,8 @@ def screen(graph: AdjustmentGraph, solved: Solved, options: SolveOptions) -> Scr
     given = graph.used()
     used = given.copy()
     precision = Precision(graph, solved)
-    if _suspects(image_residuals(precision).test, used).any():
+    test = image_residuals(precision).test
+    if not cautious(test[used], np.full(int(used.sum()), 2)) and _suspects(test, used).any():
         graph.start = _reweighted(graph, solved, used, options)
         for _ in range(_ROUNDS):
             solved = solve(graph, options)

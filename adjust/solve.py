@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 
 from adjust.datum import InnerDatum, inner_datum, normal_diagonal, stacking, visible_keys
+from adjust.divergence import describe_divergence
 from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.graph import AdjustmentGraph
 from adjust.rank import describe_null_space, unobserved_unknowns
@@ -24,6 +25,12 @@ _LATE = frozenset((
     "vertical", "beam", "surface",
 ))  # fmt: skip
 """What many observations share is eliminated last."""
+
+_HALVINGS = 3
+_LEAST_GAIN = 0.1
+"""Share of the promised decrease of chi-square that a step must bring."""
+_STATIONARY = 1e-2
+"""Sigmas that a step moves at most where the rank of the system is judged."""
 
 Progress = Callable[[int, float], None]
 
@@ -54,12 +61,21 @@ class Solved:
 
 
 class _Loop:
+    """Steps of Gauss-Newton, shortened where the whole one does not gain what it promises, else damped.
+
+    What observations leave undetermined is judged at the start and at stationary points. In between a system without a
+    solution is only damped: a state on the way out says nothing about the survey.
+    """
+
     def __init__(self, graph: AdjustmentGraph, options: SolveOptions, progress: Progress | None) -> None:
         self.graph, self.options, self.progress = graph, options, progress
         self.values = graph.start
         self._set_datum()
-        self.damping = 0.0
+        self.damping, self.length = 0.0, 1.0
         self.use_qr = False
+        self.moved = self.before = np.inf
+        self.judging = True
+        self.behind: frozenset[tuple[str, str, str | None]] = frozenset()
         self._ordering: tuple[gtsam.NonlinearFactorGraph, gtsam.Ordering] | None = None
 
     def _set_datum(self) -> None:
@@ -106,14 +122,16 @@ class _Loop:
         return self._ordering[1]
 
     def step(self) -> gtsam.VectorValues:
-        """The (damped) step of ``linear``; raises IndeterminateError by name where there is none."""
+        """The (damped) step. Raises IndeterminateError where there is none, by name where that is judged."""
         system = self.linear if self.damping == 0.0 else damped(self.graph, self.linear, self.damping)
         try:
             how = (self.ordering, gtsam.EliminateQR) if self.use_qr else (self.ordering,)
             delta = system.optimize(*how)
         except RuntimeError as error:
-            if "ndetermin" not in str(error) or self.use_qr:
+            if "ndetermin" not in str(error):
                 raise
+            if self.use_qr or not self.judging:
+                raise IndeterminateError("the normal equations have no solution here") from None
             if self.graph.reduction is not None:  # what is weak is judged, and named, with all unknowns in sight
                 self.graph.reduction = None
                 self.graph.prepare(self.values, True, self.damping)
@@ -136,49 +154,122 @@ class _Loop:
 
     def run(self) -> Solved:
         omega = self.evaluate(self.values)
+        self.behind = self._images_behind()
         self.linearize()
-        moved = before = np.inf
         for iteration in range(1, self.options.max_iterations + 1):
-            delta = self.step()
-            decrease = -float(delta.dot(self.linear.gradientAtZero()))
-            delta, hidden = self.completed(delta)
-            decrease += hidden
-            before, moved = moved, np.sqrt(max(0.0, decrease))
-            trial = self.values.retract(delta)
-            used, new = self.damping, self.evaluate(trial)
-            behind = self.graph.behind_camera()
-            if self._accept(new, omega, moved, bool(behind)):
-                self.values, omega = trial, new
-                if self.progress:
-                    self.progress(iteration, omega)
-                # steps shrink at least linearly near the minimum: what is left is below the next step
-                left = moved * min(1.0, moved / before if np.isfinite(before) else 1.0)
-                if self.damping == 0.0 and left < self.options.max_step:
-                    return self._finish(omega, iteration, moved)
-                self.damping = self.damping / 10.0 if self.damping > 1e-8 else 0.0
-            else:
-                self.damping = max(self.damping * 10.0, self.options.first_damping)
-                if self.damping > 1e8:
-                    raise self._stuck(iteration, moved)
-            if self.damping != used or self.values is not trial:
-                self.graph.prepare(self.values, True, self.damping)
+            try:
+                delta, promised = self._proposed()
+            except IndeterminateError:
+                if self.judging:
+                    raise
+                self._damp(iteration)
+                continue
+            self.before, self.moved = self.moved, np.sqrt(max(0.0, promised))
+            found = self._along(delta, omega, promised)
+            if found is None:
+                self._damp(iteration)
+                continue
+            self.values, omega, gain = found
+            if self.progress:
+                self.progress(iteration, omega)
+            if self._arrived():
+                return self._finish(omega, iteration)
+            self._relax(gain)
+        raise self._stuck(self.options.max_iterations)
+
+    def _proposed(self) -> tuple[gtsam.VectorValues, float]:
+        """The step of all unknowns from here, and by how much it lowers chi-square to first order, at least."""
+        delta = self.step()
+        decrease = -float(delta.dot(self.linear.gradientAtZero()))
+        delta, hidden = self.completed(delta)
+        return delta, decrease + hidden
+
+    def _along(
+        self, delta: gtsam.VectorValues, omega: float, promised: float
+    ) -> tuple[gtsam.Values, float, float] | None:
+        """Where the step leads: values, their chi-square and the share of the promised decrease; None if nowhere.
+
+        An undamped step is halved up to ``_HALVINGS`` times, until it keeps a part of its promise: the quadratic model
+        falls by a (2 - a) of the whole at the length a. Source: Dennis and Schnabel 1996, section 6.3.
+        """
+        length = self.length
+        for _ in range(_HALVINGS + 1 if self.damping == 0.0 else 1):
+            trial = self.values.retract(delta if length == 1.0 else delta.scale(length))
+            new = self.evaluate(trial)
+            behind = self._images_behind()
+            if np.isfinite(new) and behind <= self.behind:
+                gain = (omega - new) / max(length * (2.0 - length) * promised, 1e-300)
+                if gain > _LEAST_GAIN or self._at_the_bottom(new, omega):
+                    self.length, self.behind = length, behind
+                    return trial, new, gain
+            length *= 0.5
+        return None
+
+    def _at_the_bottom(self, new: float, old: float) -> bool:
+        """Where rounding decides whether chi-square falls."""
+        return self.moved < 1e-4 or (self.moved**2 < 1e-11 * old and new <= old * (1.0 + 1e-11))
+
+    def _images_behind(self) -> frozenset[tuple[str, str, str | None]]:
+        """Images with a point behind their camera at the values that were prepared last."""
+        return frozenset((b.camera_id, b.epoch_id, b.target_id) for b in self.graph.behind_camera())
+
+    def _arrived(self) -> bool:
+        """Whether what is left to go is small: steps shrink at least linearly near the minimum."""
+        if self.damping > 0.0:
+            return False
+        ratio = min(1.0, self.moved / self.before) if np.isfinite(self.before) else 1.0
+        return self.moved * max(ratio, 1.0 - self.length) < self.options.max_step
+
+    def _relax(self, gain: float) -> None:
+        """The next step's length and damping, from what the last one gained; ready to be linearised."""
+        self.judging = self.moved < _STATIONARY
+        used = self.damping
+        if used == 0.0:
+            self.length = min(1.0, 2.0 * self.length) if gain > 0.75 else self.length
+        elif gain > 0.5:
+            self.damping = used / 10.0 if used > 1e-7 else 0.0
+        elif gain < 0.1:
+            self.damping = 4.0 * used
+        if self.damping == used:
             self.linearize()
-        raise self._stuck(self.options.max_iterations, moved)
+        elif not self._prepared_here():
+            self.damping = used
+            self._prepared_here()
 
-    @staticmethod
-    def _accept(new: float, old: float, moved: float, behind: bool) -> bool:
-        """Downhill, or at the bottom where rounding decides; never behind a camera."""
-        return np.isfinite(new) and not behind and (new <= old * (1.0 + 1e-12) or moved < 1e-4)
+    def _prepared_here(self) -> bool:
+        """Linearise at the present values with the damping of now; False where that has no solution, which is none."""
+        try:
+            self.graph.prepare(self.values, True, self.damping)
+        except IndeterminateError:
+            if self.judging and self.damping == 0.0:
+                raise
+            return False
+        self.linearize()
+        return True
 
-    def _stuck(self, iteration: int, moved: float) -> NotConvergedError:
-        blocks = sorted({f"{b.camera_id} at {b.epoch_id}" for b in self.graph.behind_camera()})
+    def _damp(self, iteration: int) -> None:
+        """From the present values once more, with shorter steps."""
+        self.length = 1.0
+        while True:
+            self.damping = max(self.damping * 10.0, self.options.first_damping)
+            if self.damping > 1e8:
+                raise self._stuck(iteration)
+            if self._prepared_here():
+                return
+
+    def _stuck(self, iteration: int) -> NotConvergedError:
+        blocks = sorted({f"{camera} at {epoch}" for camera, epoch, _ in self.behind})
         what = f"; points behind the camera in {', '.join(blocks[:5])}" if blocks else ""
-        return NotConvergedError(
-            f"the adjustment did not converge in {iteration} steps: the last step moved an unknown by {moved:.2g} sigma"
-            f"{what}; look for gross errors in the observations or a wrong start value"
+        head = (
+            f"the adjustment did not converge in {iteration} steps: the last step moved an unknown by "
+            f"{self.moved:.2g} sigma{what}; look for gross errors in the observations or a wrong start value"
         )
+        return NotConvergedError("\n  - ".join([head, *describe_divergence(self.graph, self.values)]))
 
-    def _finish(self, omega: float, iteration: int, moved: float) -> Solved:
+    def _finish(self, omega: float, iteration: int) -> Solved:
+        if self.behind:
+            raise self._stuck(iteration)
+        self.judging = True
         if self.datum is not None:
             self._set_datum()  # about the solution, where the covariances belong; the solution stays
             self.graph.prepare(self.values, True)
@@ -188,7 +279,7 @@ class _Loop:
         self.values = self.values.retract(delta)
         leaves = None if self.graph.reduction is None else self.graph.reduction.leaves()
         return Solved(
-            self.values, self.linear, self.ordering, self.use_qr, omega, iteration, moved, self.datum, leaves
+            self.values, self.linear, self.ordering, self.use_qr, omega, iteration, self.moved, self.datum, leaves
         )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import gtsam
 import numpy as np
 
-from adjust.chain_kernels import table_motion
+from adjust.chains import table_motion
 from adjust.errors import SurveyError
 from adjust.lens import MODELS, camera_constants
 from adjust.model import FloatArray, IntArray, Survey, VectorParameter
@@ -73,13 +73,12 @@ class State:
         """Read everything, or only these slots (and the lenses and warps unless told otherwise), from ``values``."""
         if slots is None:
             self._load_poses(values)
-            for table_slot in self.unknowns.table_slots.values():
-                self._move_table(values, table_slot)
+            self._move_tables(values, self.unknowns.table_slots.values())
         else:
-            for slot in slots:
-                if slot in self.unknowns.table_slots:
-                    self._move_table(values, self.unknowns.table_slots[slot])
-                elif (found := self.unknowns.slot_key[slot]) is not None:
+            asked = list(slots)
+            self._move_tables(values, [t for s, t in self.unknowns.table_slots.items() if s in asked])
+            for slot in asked:
+                if slot not in self.unknowns.table_slots and (found := self.unknowns.slot_key[slot]) is not None:
                     self._set(slot, values.atPose3(found))
         if lenses:
             self._load_lenses(values)
@@ -113,28 +112,31 @@ class State:
             out.append((table.geometry.key, by_slot @ D[:, k : k + len(table.geometry.free)]))
         return out
 
-    def _move_table(self, values: gtsam.Values, table: TableSlot) -> None:
-        angles = values.atVector(table.angles_key)
-        geometry = dict(zip(table.geometry.names, table.geometry.full(values), strict=True))
-        two = len(table.axes) == 2
-        derivative = np.zeros((6, 4))
-        table_motion(
-            table.axes[0],
-            table.axes[1] if two else -1,
-            angles[0] + geometry.get("zero_1", 0.0),
-            angles[1] + geometry.get("zero_2", 0.0) if two else 0.0,
-            geometry.get("non_orthogonality", 0.0),
-            geometry.get("axis_offset", 0.0),
-            self.slot_R[table.slot],
-            self.slot_t[table.slot],
-            derivative,
+    def _move_tables(self, values: gtsam.Values, slots: Iterable[TableSlot]) -> None:
+        by_table: dict[str, list[TableSlot]] = {}
+        for slot in slots:
+            by_table.setdefault(slot.table_id, []).append(slot)
+        for tables in by_table.values():
+            self._move_table(values, tables)
+
+    def _move_table(self, values: gtsam.Values, slots: list[TableSlot]) -> None:
+        """Poses of one table's slots, and their derivatives into D."""
+        axes, geometry = slots[0].axes, slots[0].geometry
+        k, at = len(axes), [s.slot for s in slots]
+        angles = np.zeros((len(slots), 2))
+        angles[:, :k] = [values.atVector(s.angles_key) for s in slots]
+        given = dict.fromkeys(("zero_1", "zero_2", "non_orthogonality", "axis_offset"), 0.0)
+        given |= dict(zip(geometry.names, geometry.full(values).tolist(), strict=True))
+        zero_1, zero_2, tilt, offset = given.values()
+        one = np.ones(len(slots))
+        self.slot_R[at], self.slot_t[at], derivative = table_motion(
+            axes[0], axes[1] if k == 2 else -1, angles[:, 0] + zero_1, angles[:, 1] + zero_2, tilt * one, offset * one
         )
-        column = {"zero_1": 0, "zero_2": 1, "non_orthogonality": 2, "axis_offset": 3}
-        k = len(table.axes)
-        D = self.D[self.table_index[table.slot]]
-        D[:, :k] = derivative[:, :k]
-        by_geometry = derivative[:, [column[name] for name in table.geometry.names]] @ table.geometry.matrix
-        D[:, k : k + by_geometry.shape[1]] = by_geometry
+        columns = [list(given).index(name) for name in geometry.names]
+        by_geometry = derivative[:, :, columns] @ geometry.matrix
+        rows = self.table_index[at]
+        self.D[rows, :, :k] = derivative[:, :, :k]
+        self.D[rows, :, k : k + by_geometry.shape[2]] = by_geometry
 
 
 def collect_vectors(survey: Survey, unknowns: Unknowns, lenses: dict[str, FloatArray]) -> None:

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 from gtsam import Rot3
 
-from adjust.compiling import njit
+from adjust.closed_forms.rigid import skew
 from adjust.errors import SurveyError
 from adjust.model import FloatArray, Survey, Vertical, tilt_axes
 from adjust.unknowns import Unknowns, VectorMap, vector_map
@@ -20,61 +20,20 @@ from adjust.unknowns import Unknowns, VectorMap, vector_map
 VERTICAL = ("vertical",)
 
 
-@njit(cache=True, nogil=True)
-def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The vector a x b."""
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+@dataclass(frozen=True, eq=False)
+class Horizon:
+    """The horizons at n positions.
 
-
-@njit(cache=True, nogil=True)
-def horizon_at(
-    x: FloatArray, up: FloatArray, zero: FloatArray, turns: FloatArray, radius: float, axes: FloatArray,
-    by_x: FloatArray, by_tilt: FloatArray,
-) -> float:  # fmt: skip
-    """Axes (3, 3) at ``x``: rows zero, 90 degrees counter-clockwise, up; returns the height above the level of 0.
-
-    up, zero: unit vectors at the world's origin (zero horizontal there). turns (3, 2): by how much these turn, about
-    the world's axes, with the two tilts. radius: 0 for planes. by_x (3, 3), by_tilt (3, 2): the rotation vector, about
-    the world's axes, that the axes turn by with the position and with the tilts.
+    axes: (n, 3, 3), rows zero, 90 degrees counter-clockwise, up. by_x (n, 3, 3), by_tilt (n, 3, 2): the rotation
+    vector, about the world's axes, that they turn by with the position and with the tilts. height (n,): above the level
+    of the world's origin; height_by_tilt (n, 2).
     """
-    by_x[:] = 0.0
-    height = 0.0
-    if radius == 0.0:
-        v = up.copy()
-        length = 1.0
-        for i in range(3):
-            height += x[i] * up[i]
-    else:
-        p = x + radius * up
-        length = np.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
-        v = p / length
-        for i in range(3):
-            height += x[i] * (x[i] + 2.0 * radius * up[i])
-        height /= length + radius
-    dot = zero[0] * v[0] + zero[1] * v[1] + zero[2] * v[2]
-    h0 = zero - dot * v
-    n = np.sqrt(h0[0] * h0[0] + h0[1] * h0[1] + h0[2] * h0[2])
-    h0 /= n
-    h1 = cross(v, h0)
-    axes[0], axes[1], axes[2] = h0, h1, v
-    # a change dv of the plumb line and dz of the zero axis turn the axes by v x dv + v (h1.dz - (zero.v) h1.dv) / n
-    if radius > 0.0:
-        for j in range(3):
-            dv = -v[j] * v / length
-            dv[j] += 1.0 / length
-            twist = -dot * (h1[0] * dv[0] + h1[1] * dv[1] + h1[2] * dv[2]) / n
-            by_x[:, j] = cross(v, dv) + twist * v
-    for j in range(2):
-        w = turns[:, j]
-        dz, dv = cross(w, zero), cross(w, up)
-        if radius > 0.0:
-            dv *= radius / length
-            dv -= (v[0] * dv[0] + v[1] * dv[1] + v[2] * dv[2]) * v
-        twist = (
-            h1[0] * dz[0] + h1[1] * dz[1] + h1[2] * dz[2] - dot * (h1[0] * dv[0] + h1[1] * dv[1] + h1[2] * dv[2])
-        ) / n
-        by_tilt[:, j] = cross(v, dv) + twist * v
-    return height
+
+    axes: FloatArray
+    by_x: FloatArray
+    by_tilt: FloatArray
+    height: FloatArray
+    height_by_tilt: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +48,30 @@ class Plumb:
     turns: FloatArray
     radius: float
 
-    def horizon(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """Axes (3, 3) (rows zero, counter-clockwise, up), their turns by x (3, 3) and tilt (3, 2), and the height."""
-        axes, by_x, by_tilt = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 2))
-        x = np.ascontiguousarray(x, dtype=float)
-        height = horizon_at(x, self.up, self.zero, self.turns, self.radius, axes, by_x, by_tilt)
-        return axes, by_x, by_tilt, height
+    def horizon(self, x: FloatArray) -> Horizon:
+        """The horizons at positions x (n, 3).
+
+        A change dv of the plumb line and dz of the zero axis turn the axes by v x dv + v (h1.dz - (zero.v) h1.dv) / n.
+        """
+        up, radius, dv, dz = self.up, self.radius, np.cross(self.turns.T, self.up), np.cross(self.turns.T, self.zero)
+        if radius > 0.0:
+            p = x + radius * up
+            length = np.linalg.norm(p, axis=1)[:, None]
+            v, share = p / length, radius / length
+            height = (x * (x + 2.0 * radius * up)).sum(axis=1) / (length[:, 0] + radius)
+        else:
+            v, share, height = np.tile(up, (len(x), 1)), np.ones((len(x), 1)), x @ up
+        dot = (v @ self.zero)[:, None]
+        across = self.zero - dot * v
+        n = np.linalg.norm(across, axis=1)[:, None]
+        h1 = np.cross(v, across / n)
+        by_x = np.zeros((len(x), 3, 3))
+        if radius > 0.0:
+            by_x += (skew(v) - v[:, :, None] * (dot / n * h1)[:, None]) / length[:, :, None]
+        turned = share[:, :, None] * (dv - (v @ dv.T)[:, :, None] * v[:, None])
+        twist = (h1 @ dz.T - dot * (turned @ h1[:, :, None])[:, :, 0]) / n
+        by_tilt = np.swapaxes(np.cross(v[:, None], turned) + twist[:, :, None] * v[:, None], 1, 2)
+        return Horizon(np.stack([across / n, h1, v], axis=1), by_x, by_tilt, height, share * (x @ dv.T))
 
 
 def plumb(vertical: Vertical, zero: Literal["x", "y"], tilt: FloatArray) -> Plumb:
@@ -150,7 +127,7 @@ def collect_vertical(survey: Survey, unknowns: Unknowns) -> VerticalMap:
 
 def up_at(plumb_line: Plumb, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The unit vector upwards at a position x (3,) m, with its derivatives by x (3, 3) and by the tilts (3, 2)."""
-    axes, by_x, by_tilt, _ = plumb_line.horizon(x)
-    up = axes[2]
-    cross = np.array([[0, up[2], -up[1]], [-up[2], 0, up[0]], [up[1], -up[0], 0]])  # w -> w x up
-    return up, cross @ by_x, cross @ by_tilt
+    horizon = plumb_line.horizon(np.asarray(x, dtype=float)[None])
+    up = horizon.axes[0, 2]
+    cross = -skew(up)  # w -> w x up
+    return up, cross @ horizon.by_x[0], cross @ horizon.by_tilt[0]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from adjust.errors import SurveyError
 from survey.commands.common import DONE, Version, is_set, print_json, run_as_program, run_command, say
 from survey.commands.completing import declare_completion_of
+from survey.commands.parser import Parser, name_commands, port, project_folder
 
 if TYPE_CHECKING:
     from capture.camera import CameraInfo
@@ -52,7 +53,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--quiet", action="store_true", default=argparse.SUPPRESS, help="no progress and no messages on stderr"
     )
     shaped: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "parents": [shared]}
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         "labcapture", usage=f"{_OPENING}   (labcapture COMMAND ...)", description=_DESCRIPTION, epilog=_EPILOG, **shaped
     )
     parser.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
@@ -63,6 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_view(commands, shaped)
     _add_export(commands, shaped)
     declare_completion_of("labcapture", build_parser, commands, shaped)
+    name_commands(commands)
     return parser
 
 
@@ -79,7 +81,7 @@ def _add_run(commands: Any, shaped: dict[str, Any]) -> None:
     )
     parser.add_argument("plan", type=Path, metavar="PLAN", help="capture plan, a TOML file")
     parser.add_argument("--dry-run", action="store_true", help="print poses and time, check limits; move nothing")
-    parser.set_defaults(run=_run, parser=parser)
+    parser.set_defaults(run=_run)
 
 
 def _add_cameras(commands: Any, shaped: dict[str, Any]) -> None:
@@ -92,7 +94,7 @@ def _add_cameras(commands: Any, shaped: dict[str, Any]) -> None:
         **shaped,
     )
     parser.add_argument("driver", nargs="?", default="all", metavar="DRIVER", help="ask this driver only")
-    parser.set_defaults(run=_cameras, parser=parser)
+    parser.set_defaults(run=_cameras)
 
 
 def _add_table(commands: Any, shaped: dict[str, Any]) -> None:
@@ -111,7 +113,7 @@ def _add_table(commands: Any, shaped: dict[str, Any]) -> None:
     )
     parser.add_argument("--home", action="store_true", help="look for the references")
     parser.add_argument("--stop", action="store_true", help="stop all axes")
-    parser.set_defaults(run=_table, parser=parser)
+    parser.set_defaults(run=_table)
 
 
 def _add_view(commands: Any, shaped: dict[str, Any]) -> None:
@@ -125,13 +127,13 @@ def _add_view(commands: Any, shaped: dict[str, Any]) -> None:
         **shaped,
     )
     parser.add_argument("plan", type=Path, metavar="PLAN", help="capture plan")
-    parser.add_argument("--port", type=int, default=8780, metavar="N", help="on loopback; 0 takes a free one")
+    parser.add_argument("--port", type=port, default=8780, metavar="N", help="on loopback; 0 takes a free one")
     parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="a loopback address; others are refused")
     parser.add_argument("--live", action="store_true", help="open the cameras and show what they see")
     parser.add_argument(
         "--allow-move", action="store_true", help="let the page turn and stop the table, with the token that is printed"
     )
-    parser.set_defaults(run=_view, parser=parser)
+    parser.set_defaults(run=_view)
 
 
 def _add_export(commands: Any, shaped: dict[str, Any]) -> None:
@@ -143,9 +145,9 @@ def _add_export(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: labsurvey adjust FOLDER",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="project folder that was captured")
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder that was captured")
     parser.add_argument("file", type=Path, metavar="FILE.nxs", help="new file")
-    parser.set_defaults(run=_export, parser=parser)
+    parser.set_defaults(run=_export)
 
 
 def _run(arguments: argparse.Namespace) -> int:

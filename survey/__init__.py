@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from survey.notebook.covariance import Covariance
     from survey.notebook.plots import Plot
     from survey.notebook.solution import Solution
-    from survey.notebook.steps import Problem, adjust, detect, problem, read, solve
+    from survey.notebook.steps import Problem, adjust, detect, exclude, include, problem, read, solve
 
 _PLACES = {
     "Batch": "survey.batch.python",
@@ -36,6 +36,8 @@ _PLACES = {
     "adjust": "survey.notebook.steps",
     "adjust_many": "survey.batch.python",
     "detect": "survey.notebook.steps",
+    "exclude": "survey.notebook.steps",
+    "include": "survey.notebook.steps",
     "problem": "survey.notebook.steps",
     "read": "survey.notebook.steps",
     "solve": "survey.notebook.steps",
@@ -54,6 +56,8 @@ __all__ = [
     "adjust",
     "adjust_many",
     "detect",
+    "exclude",
+    "include",
     "problem",
     "read",
     "solve",

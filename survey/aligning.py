@@ -75,7 +75,7 @@ def _made(folder: Path, target: Path, place: Path, progress: bool) -> tuple[Adju
             '[align.board]\nbody = "target:board"\nonto = "table:turntable"\ntolerance_arcsec = 60'
         )
     adjustment = adjust_project(project, progress)
-    sheets = working_sheets(adjustment, project.alignment_tasks, project.options.alpha)
+    sheets = working_sheets(adjustment, project.alignment_tasks, project.options.alpha, project.options.sigmas)
     date = datetime.now(UTC).isoformat(timespec="seconds")
     rounds = _with_round(_rounds(target / RESULTS / ROUNDS), sheets, date)
     stream = io.StringIO(newline="")

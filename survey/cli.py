@@ -17,10 +17,13 @@ from survey.commands.completing import declare_completion
 from survey.commands.converting import declare_convert
 from survey.commands.detecting import declare_detect
 from survey.commands.examples import declare_example
+from survey.commands.excluding import declare_exclude, declare_include
 from survey.commands.navigating import declare_navigate
 from survey.commands.networks import declare_add, declare_remove, declare_trackers
+from survey.commands.parser import Parser, name_commands
 from survey.commands.planning import declare_plan
 from survey.commands.reporting import declare_report
+from survey.commands.schema import declare_schema
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "TEST_FAILED", "USAGE", "build_parser", "main"]
 
@@ -34,7 +37,7 @@ Adjusts a whole laboratory at once: cameras, turntable, beacons, relay stations 
 _EPILOG = """\
 Next: labsurvey example full-lab lab
 Help for one command: labsurvey adjust --help
-Exit codes: 0 done, 1 error in the project, 2 wrong usage, 3 solved but residuals are larger than the sigmas say.
+Exit codes: 0 done, 1 error in the project, 2 wrong usage, 3 solved, but something does not fit.
 """
 _COMMANDS = (
     declare_adjust,
@@ -43,12 +46,15 @@ _COMMANDS = (
     declare_plan,
     declare_add,
     declare_remove,
+    declare_exclude,
+    declare_include,
     declare_convert,
     declare_trackers,
     declare_navigate,
     declare_align,
     declare_compare,
     declare_example,
+    declare_schema,
     declare_completion,
 )
 
@@ -75,13 +81,14 @@ def build_parser() -> argparse.ArgumentParser:
         "--quiet", action="store_true", default=argparse.SUPPRESS, help="no progress bars and no messages on stderr"
     )
     shaped: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "parents": [shared]}
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         "labsurvey", usage=f"{_OPENING}   (labsurvey COMMAND ...)", description=_DESCRIPTION, epilog=_EPILOG, **shaped
     )
     parser.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for declare in _COMMANDS:
         declare(commands, shaped)
+    name_commands(commands)
     return parser
 
 

@@ -13,9 +13,9 @@ from adjust.deformation import Deformation, DeformationTest, station_deformation
 from adjust.errors import SurveyError
 from adjust.result import Adjustment
 from survey.congruence_text import congruence_dict, congruence_text
-from survey.files import read
+from survey.files import Project, read
 from survey.jobs import adjust_project
-from survey.quantities import ARCSEC_PER_RAD
+from survey.quantities import ARCSEC_PER_RAD, SigmaKind
 
 ALPHA = 0.05
 """Error probability of the tests of all pairs of stations together."""
@@ -25,7 +25,8 @@ ALPHA = 0.05
 class CompareOutcome:
     """Both folders with their adjustments, the deformation of neighbouring stations, and the congruence of all.
 
-    congruence: None where nothing common can be tested; ``why`` then says what is in the way.
+    congruence: None where nothing common can be tested; ``why`` then says what is in the way. sigmas: what both
+    projects ask for; None: the pairs of stations are tested a priori, the congruence of all with the pooled sigma0.
     """
 
     folders: tuple[Path, Path]
@@ -33,6 +34,7 @@ class CompareOutcome:
     deformations: tuple[Deformation, ...]
     congruence: Congruence | None = None
     why: str = ""
+    sigmas: SigmaKind | None = None
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -46,7 +48,7 @@ class CompareOutcome:
             "folders": [str(f) for f in self.folders],
             "sigma0": [_number(a.sigma0) for a in self.adjustments],
             "redundancy": [a.redundancy for a in self.adjustments],
-            "sigmas": "a_priori",
+            "sigmas": self.sigmas or "a_priori",
             "alpha": ALPHA,
             "deformations": [_entry(d) for d in self.deformations],
             "congruence": None if self.congruence is None else congruence_dict(self.congruence),
@@ -65,7 +67,7 @@ class CompareOutcome:
         axes = "".join(f"{axis:>7}{'sigma':>7}" for axis in "xyz")
         return "\n".join([
             f"{self.folders[0]} -> {self.folders[1]}: {moved} of {len(self.deformations)} relations moved "
-            f"(error probability {ALPHA:g} for all together, a priori sigmas)",
+            f"(error probability {ALPHA:g} for all together, {(self.sigmas or 'a_priori').replace('_', ' ')} sigmas)",
             *(f"  ! {p}" for p in self.problems),
             "", head.rstrip(), f"  {'a - b':<{width}}  {axes}  {axes}{'p':>9}",
             *(_row(d, width) for d in self.deformations),
@@ -76,20 +78,33 @@ class CompareOutcome:
 def compare_job(folder_a: Path, folder_b: Path, *, progress: bool = True) -> CompareOutcome:
     """Adjust two project folders and compare their stations; writes nothing. Raises SurveyError."""
     folders = Path(folder_a), Path(folder_b)
-    first, second = (_adjusted(folder, progress) for folder in folders)
-    options = CongruenceOptions(ALPHA, names=(folders[0].name, folders[1].name))
+    projects = read(folders[0]), read(folders[1])
+    sigmas = _sigmas(projects)
+    first, second = (_adjusted(project, progress) for project in projects)
+    options = CongruenceOptions(ALPHA, sigmas != "a_priori", names=(folders[0].name, folders[1].name))
     try:
         found, why = congruence(first, second, options), ""
     except SurveyError as error:
         found, why = None, f"no congruence test: {error}"
     stations = [{s.station_id for s in a.survey.stations if s.motion == "fixed"} for a in (first, second)]
     if found is not None and len(stations[0] & stations[1]) < 2:
-        return CompareOutcome(folders, (first, second), (), found)
-    return CompareOutcome(folders, (first, second), station_deformations(first, second, alpha=ALPHA), found, why)
+        return CompareOutcome(folders, (first, second), (), found, sigmas=sigmas)
+    scaled = (sigmas == "a_posteriori",) * 2
+    moved = station_deformations(first, second, alpha=ALPHA, scale=(scaled[0], scaled[1]))
+    return CompareOutcome(folders, (first, second), moved, found, why, sigmas)
 
 
-def _adjusted(folder: Path, progress: bool) -> Adjustment:
-    project = read(folder)
+def _sigmas(projects: tuple[Project, Project]) -> SigmaKind | None:
+    """What both ask for; what only one says holds for the other too."""
+    asked = {p.options.sigmas: p.folder for p in projects if p.options.sigmas is not None}
+    if len(asked) > 1:
+        said = ", ".join(f"{folder} {kind}" for kind, folder in asked.items())
+        raise SurveyError(f"[adjustment] sigmas differ ({said}), and a test has but one kind; make them the same")
+    return next(iter(asked), None)
+
+
+def _adjusted(project: Project, progress: bool) -> Adjustment:
+    folder = project.folder
     if project.images and not (project.survey.image_blocks or project.spots):
         raise SurveyError(
             f"{folder}: nothing was detected in its images yet, and a comparison writes nothing; run 'labsurvey detect "

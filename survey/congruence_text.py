@@ -38,17 +38,40 @@ def congruence_text(found: Congruence) -> str:
         f"congruence of all {n}: {verdict} (F {found.before.statistic:.2f}, p {found.before.p:.2g}); of the {stable} "
         f"stable ones: p {found.after.p:.2g}; sigma0 {found.sigma0:.3f}; motions left open: {open_}",
         *(f"  ! {w}" for w in found.warnings),
-        f"    {'':<14}{'dx':>9}{'dy':>9}{'dz':>9}{'sigmas':>21}{'p':>10}{'found from':>12}   mm",
+        *_table(found),
     ]
-    for m in found.motions[:_MOST]:
-        d, s = 1e3 * m.displacement, 1e3 * np.sqrt(np.maximum(np.diag(m.cov), 0.0))
-        cells = "".join(_cell(x, 9, 3) for x in d) + "".join(_cell(x, 7, 3) for x in s)
-        mark = " *" if m.significant else "" if m.stable else " (not in the datum)"
-        tests = _cell(m.test.p, 10, 4) + _cell(1e3 * m.smallest, 12, 2)
-        lines.append(f"    {' '.join(m.name[1:]):<14}{cells}{tests}{mark}")
     if n > _MOST:
         lines.append(f"    and {n - _MOST} more")
     return "\n".join(lines)
+
+
+def _table(found: Congruence) -> list[str]:
+    """A line per point and station: displacements, or rotations where nothing else is known."""
+    turned = [m for m in found.motions if not np.isfinite(m.displacement).any()]
+    if turned and len(turned) == len(found.motions):
+        head = f"    {'':<14}{'rx':>9}{'ry':>9}{'rz':>9}{'sigmas':>21}{'p':>10}   arcsec"
+        return ["  rotations alone were measured: they are compared, displacements are not known", head,
+                *(_turn_row(m) for m in turned[:_MOST])]  # fmt: skip
+    head = f"    {'':<14}{'dx':>9}{'dy':>9}{'dz':>9}{'sigmas':>21}{'p':>10}{'found from':>12}   mm"
+    return [head, *(_shift_row(m) for m in found.motions[:_MOST])]
+
+
+def _shift_row(m: Motion) -> str:
+    d, s = 1e3 * m.displacement, 1e3 * np.sqrt(np.maximum(np.diag(m.cov), 0.0))
+    cells = "".join(_cell(x, 9, 3) for x in d) + "".join(_cell(x, 7, 3) for x in s)
+    return f"    {' '.join(m.name[1:]):<14}{cells}{_cell(m.test.p, 10, 4)}{_cell(1e3 * m.smallest, 12, 2)}{_mark(m)}"
+
+
+def _turn_row(m: Motion) -> str:
+    turn = np.full(3, np.nan) if m.rotation is None else m.rotation
+    spread = np.full(3, np.nan) if m.rotation_cov is None else np.sqrt(np.maximum(np.diag(m.rotation_cov), 0.0))
+    cells = "".join(_cell(ARCSEC_PER_RAD * x, 9, 1) for x in turn)
+    cells += "".join(_cell(ARCSEC_PER_RAD * x, 7, 1) for x in spread)
+    return f"    {' '.join(m.name[1:]):<14}{cells}{_cell(m.test.p, 10, 4)}{_mark(m)}"
+
+
+def _mark(m: Motion) -> str:
+    return " *" if m.significant else "" if m.stable else " (not in the datum)"
 
 
 def _name(name: tuple[str, ...]) -> str:

@@ -16,16 +16,16 @@ import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
-from survey.converting_g2o import project_to_g2o, survey_from_g2o
+from survey.converting_g2o import AS_IN_THE_FILE, project_to_g2o, survey_from_g2o
 from survey.files import AdjustmentOptions, Project, atomic_write, read, write_project
 from survey.files.project import DEFINITION_FILE
-from survey.files.text import suggestion
+from survey.files.text import read_bytes, suggestion
 from survey.interop import camera_formats
 from survey.interop.aicon import ENDINGS as AICON_ENDINGS
 from survey.interop.aicon import read_aicon
 from survey.interop.camera_values import camera_values
 from survey.interop.dbat import read_dbat
-from survey.interop.foreign import ForeignNetwork
+from survey.interop.foreign import ForeignNetwork, is_utf8
 from survey.interop.g2o import Information
 from survey.interop.gama import read_gama
 from survey.interop.gama_writer import gama_text
@@ -51,6 +51,7 @@ READERS: dict[str, Callable[[Path], ForeignNetwork]] = {
     "aicon": read_aicon,
     **camera_formats.READERS,
 }
+_TEXTS = ("gama", "krumm", "lgc", "csv", "dbat", "aicon")
 WRITERS = ("g2o", "gama", "csv", "json", "sinex", *camera_formats.WRITERS)
 _ENDINGS = {
     ".g2o": "g2o",
@@ -104,13 +105,15 @@ def convert_job(
     *,
     format: str | None = None,
     information: Information = "tangent",
+    block_diagonal: bool = False,
     station: str | None = None,
 ) -> ConvertOutcome:
     """Write ``source`` in another format at ``target``: the one a project folder, the other a file.
 
     format: of the file; by default by its ending. information: what the rotation part of g2o's information matrices
-    refers to. station: whose cameras or poses are written, for the formats that hold those of one. Raises SurveyError
-    for what the other format cannot hold, and where there is something at ``target``.
+    refers to. block_diagonal: only their blocks of translation and rotation are read. station: whose cameras or poses
+    are written, for the formats that hold those of one. Raises SurveyError for what the other format cannot hold, and
+    where there is something at ``target``.
     """
     source, target = Path(source), Path(target)
     if source.is_dir() and not (format in camera_formats.FOLDERS and not (source / DEFINITION_FILE).exists()):
@@ -124,7 +127,7 @@ def convert_job(
     if format in ("json", "sinex"):
         raise SurveyError(f"{source}: the format {format} is only written; give a project folder")
     chosen = None if format == "project" else format
-    return _to_project(source, target, _file_format(source, chosen, (*READERS, "g2o")), information)
+    return _to_project(source, target, _file_format(source, chosen, (*READERS, "g2o")), information, block_diagonal)
 
 
 def _file_format(path: Path, given: str | None, known: tuple[str, ...]) -> str:
@@ -144,21 +147,24 @@ def _file_format(path: Path, given: str | None, known: tuple[str, ...]) -> str:
     return found
 
 
-def _to_project(source: Path, target: Path, format: str, information: Information) -> ConvertOutcome:
+def _to_project(
+    source: Path, target: Path, format: str, information: Information, block_diagonal: bool
+) -> ConvertOutcome:
     if target.exists() and not target.is_dir():
         raise SurveyError(f"{target}: is a file; give the name of a new folder")
     if (target / DEFINITION_FILE).exists():
         raise SurveyError(f"{target}: there is a project already; choose another folder")
     if format == "g2o":
-        survey = survey_from_g2o(source, information)
+        survey, notes = survey_from_g2o(source, information, block_diagonal)
         with filling(target) as place:
-            write_project(place, survey, title=source.stem)
+            write_project(place, survey, title=source.stem, options=AS_IN_THE_FILE)
         counts = {"stations": len(survey.stations), "pairs": len(survey.pairs)}
-        return ConvertOutcome(source, target, "project", counts, "as in the file")
+        return ConvertOutcome(source, target, "project", counts, "as in the file", notes)
     network = READERS[format](source)
     survey, renamed = with_safe_ids(network.survey)
     reject = network.reject
-    options = AdjustmentOptions(network.alpha or AdjustmentOptions.alpha, reject, reject, reject)
+    alpha = network.alpha or AdjustmentOptions.alpha
+    options = AdjustmentOptions(alpha, reject, reject, reject, sigmas=network.sigmas)
     title = network.title or source.stem
     with filling(target) as place:
         write_project(place, survey, title=title, options=options, target_kinds=network.target_kinds)
@@ -174,7 +180,14 @@ def _to_project(source: Path, target: Path, format: str, information: Informatio
         "stations": len(survey.stations),
     }
     shown = {what: n for what, n in counts.items() if n} or {"points": 0}
-    return ConvertOutcome(source, target, "project", shown, "as in the file", (*network.notes, *renamed))
+    notes = (*network.notes, *renamed, *_encoding(source, format))
+    return ConvertOutcome(source, target, "project", shown, "as in the file", notes)
+
+
+def _encoding(source: Path, format: str) -> tuple[str, ...]:
+    if format not in _TEXTS or not source.is_file() or is_utf8(read_bytes(source)[0]):
+        return ()
+    return ("the text is not UTF-8; unless the file names its encoding it was read as Latin-1",)
 
 
 def _to_file(
@@ -207,16 +220,23 @@ def _as_it_stands(project: Project) -> NetworkValues:
     """Adjusted points where the project has results, else its start values."""
     start = {p.point_id: p.x_in_world.value for p in project.survey.points if p.x_in_world.value is not None}
     if not (project.folder / RESULTS / "solution.json").is_file():
-        return NetworkValues(project.survey, project.title, start)
+        return NetworkValues(project.survey, project.title, start, **_options(project))
     previous = read_previous(project)
     covs = {name[1]: cov for name, cov in previous.covs.items() if name[0] == "point"}
-    return NetworkValues(project.survey, project.title, start | dict(previous.points), True, covs, previous.factor)
+    x = start | dict(previous.points)
+    return NetworkValues(
+        project.survey, project.title, x, True, covs, previous.factor, **_options(project)
+    )
+
+
+def _options(project: Project) -> dict[str, Any]:
+    return {"sigmas": project.options.sigmas, "alpha": project.options.alpha}
 
 
 def _adjusted(project: Project) -> NetworkValues:
     """The project adjusted anew, because its result files hold no covariances between points."""
     result = adjust_project(project, progress=False)
-    scale = scale_of(result, "a_posteriori")
+    scale = scale_of(result, project.options.sigmas)
     x: dict[str, FloatArray] = {}
     names: list[tuple[str, str]] = []
     points = []
@@ -232,5 +252,5 @@ def _adjusted(project: Project) -> NetworkValues:
     return NetworkValues(
         project.survey, project.title, x, True, {}, scale.factor, tuple(names),
         scale.factor**2 * joint[np.ix_(rows, rows)], result.n_observations, result.n_unknowns, result.redundancy,
-        result.omega,
+        result.omega, **_options(project),
     )  # fmt: skip

@@ -11,17 +11,26 @@ from adjust.model import PoseParameter, Station, Survey
 from adjust.observations import FrameRef, Pair
 from adjust.pair_screen import is_pure
 from adjust.pose_network.from_survey import network_from_survey
-from survey.files import read
+from survey.files import AdjustmentOptions, read
 from survey.files.text import id_problem
-from survey.interop.g2o import Information, read_g2o, write_g2o
+from survey.interop.g2o import Information, read_g2o_file, write_g2o
 from survey.previous import read_previous
 from survey.results import RESULTS
 from survey.warm_start import network_start
 
+AS_IN_THE_FILE = AdjustmentOptions(reject_pairs=False)
+"""A file's own minimum is that of all its pairs; its owner may let the program look for wrong ones."""
 
-def survey_from_g2o(source: Path, information: Information) -> Survey:
-    """The stations and pairs of a g2o file. Raises SurveyError for what cannot be read, or named in a project."""
-    network = read_g2o(source, information, use_vertices=True)
+
+def survey_from_g2o(
+    source: Path, information: Information, block_diagonal: bool = False
+) -> tuple[Survey, tuple[str, ...]]:
+    """The stations and pairs of a g2o file, and what of it was not taken as it stands, for people.
+
+    Raises SurveyError for what cannot be read, or named in a project.
+    """
+    found = read_g2o_file(source, information, use_vertices=True, block_diagonal=block_diagonal)
+    network = found.network
     for station in network.station_ids:
         if (problem := id_problem(station)) is not None:
             raise SurveyError(f"{source}: vertex {station}: {problem}")
@@ -38,7 +47,7 @@ def survey_from_g2o(source: Path, information: Information) -> Survey:
              _pose(network.rotations[e], network.translations[e]), network.cov[e])
         for e in range(network.n_pairs)
     )  # fmt: skip
-    return Survey(stations=tuple(stations), pairs=pairs)
+    return Survey(stations=tuple(stations), pairs=pairs), found.notes
 
 
 def _pose(rotation: Any, translation: Any) -> Pose3:

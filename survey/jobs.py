@@ -2,82 +2,48 @@
 
 import os
 import platform
+import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.errors import IndeterminateError, SurveyError
+from adjust.graph import StartValues
 from adjust.lost_points import without_lost_points
 from adjust.model import IntArray, Survey
 from adjust.observations import ImageBlock
 from adjust.result import Adjustment
 from adjust.statistics.cleaned import adjust_cleaned
+from adjust.supported import lost_notes, supported
 from survey.checked import checked
 from survey.cleaning import clean_options
-from survey.files import Definition, Project, SpotBlock, read, read_definition, write_image_points, write_spots
+from survey.detecting import detect_in, detect_job, remember_images
+from survey.files import Project, read
+from survey.files.detected import DetectedImage
 from survey.files.project import RESULTS
 from survey.identify import Identification, identify_spots, without_points
-from survey.quantities import scale_of
+from survey.quantities import USUAL, scale_of
 from survey.replacing import changing, replace_parts
 from survey.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, solution_dict, summary_text
 from survey.statistics import Statistics, statistics_of
-from survey.targets import DetectableTarget, PointList
+from survey.symmetric_boards import consistent_turns
 
-if TYPE_CHECKING:  # brings in OpenCV, which a folder that is detected already does without
-    from survey.detection import DetectionTask, ImageReport
-
-PICTURES = "detected"
 _PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-headless", "numba")
 
 
-@dataclass(frozen=True)
-class DetectOutcome:
-    """What detection did: one report per image, and the files written."""
-
-    folder: Path
-    reports: "tuple[ImageReport, ...]"
-    paths: tuple[Path, ...]
-
-    @property
-    def messages(self) -> tuple[str, ...]:
-        """One line per image."""
-        return tuple(f"{r.path}: {r.status}{': ' + r.message if r.message else ''}" for r in self.reports)
-
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """The lines of the images in which nothing was found, or that could not be read."""
-        return tuple(m for m, r in zip(self.messages, self.reports, strict=True) if r.status != "found")
-
-    def summary(self) -> dict[str, Any]:
-        """Counts as plain values."""
-        return {
-            "folder": str(self.folder),
-            "images": len(self.reports),
-            "found": sum(r.status == "found" for r in self.reports),
-            "nothing": sum(r.status == "nothing" for r in self.reports),
-            "failed": sum(r.status == "failed" for r in self.reports),
-            "image_points": sum(len(d) for r in self.reports for d in r.detections.values()),
-            "spots": sum(len(r.spots) for r in self.reports if r.spots is not None),
-            "written": [str(p) for p in self.paths],
-        }
-
-    def text(self) -> str:
-        """The counts, and every image that gave nothing, for people."""
-        s = self.summary()
-        head = f"{self.folder}: {s['found']} of {s['images']} images show {s['image_points']} target points"
-        head += f" and {s['spots']} spots" if s["spots"] else ""
-        return "\n".join([head, *(f"  {line}" for line in self.problems)])
+_OTHERS = ("table_readings", "pairs", "distances", "coordinates", "readings", "coordinate_differences", "levels",
+           "alignments", "laser_spots", "on_surfaces")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,84 +75,6 @@ class AdjustOutcome:
         return replace(self, paths={name: target / RESULTS / name for name in self.paths})
 
 
-def detect_job(
-    folder: Path, *, jobs: int | None = None, pictures: bool = False, progress: bool = True
-) -> DetectOutcome:
-    """Find targets and spots in all images of a project, and write their tables.
-
-    Raises SurveyError where there is nothing to look at or to look for.
-    """
-    with changing(folder) as place:
-        return _detect(Path(folder), place, jobs, pictures, progress)
-
-
-def _detect(folder: Path, place: Path, jobs: int | None, pictures: bool, progress: bool) -> DetectOutcome:
-    from survey.detection import detect_images
-
-    definition = read_definition(folder)
-    tasks = list(_tasks(definition))
-    if not definition.images:
-        raise SurveyError(f"{folder}/images: no images; put them at images/<camera_id>/<epoch_id>.png")
-    if not tasks:
-        raise SurveyError(
-            f"{folder}/survey.toml: nothing to look for; name a target that can be detected (checkerboard, charuco, "
-            "marker_grid, marker_block) or a table [spots]"
-        )
-    reports = detect_images(tasks, jobs=jobs, progress=progress, pictures=place / PICTURES if pictures else None)
-    blocks, spots = _blocks(definition, reports)
-    if not blocks and not spots:
-        lines = "\n".join(f"  {r.path}: {r.message}" for r in reports[:10])
-        raise SurveyError(f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}")
-    # an empty table is written too: one of an earlier run must not stay behind
-    files = [write_image_points(place, blocks, definition.survey)]
-    files += [write_spots(place, spots)] if definition.spots_request is not None else []
-    names = [path.relative_to(place) for path in files]
-    replace_parts(folder, gone=[name.with_suffix(".parquet").as_posix() for name in names])
-    return DetectOutcome(folder, tuple(reports), tuple(folder / name for name in names))
-
-
-def _tasks(definition: Definition) -> "Iterator[DetectionTask]":
-    """Every image with what may be in it: all targets, except on images that are reserved for spots."""
-    from survey.detection import DetectionTask, SpotOptions
-
-    request = definition.spots_request
-    targets: dict[str, DetectableTarget] = {
-        target_id: kind for target_id, kind in definition.target_kinds.items() if not isinstance(kind, PointList)
-    }
-    for (camera_id, epoch_id), path in definition.images.items():
-        wanted = request is not None and camera_id in request.cameras
-        reserved = wanted and request is not None and request.epochs is not None and epoch_id in request.epochs
-        spots = None
-        if wanted and request is not None and (reserved or (request.epochs is None and not targets)):
-            spots = SpotOptions(diameter_px=request.diameter_px)
-        only = definition.target_cameras
-        here = {} if reserved else {t: k for t, k in targets.items() if camera_id in only.get(t, (camera_id,))}
-        if here or spots:
-            yield DetectionTask(path, camera_id, epoch_id, here, spots)
-
-
-def _blocks(definition: Definition, reports: "Sequence[ImageReport]") -> tuple[list[ImageBlock], list[SpotBlock]]:
-    sizes = {c.camera_id: c.image_size for c in definition.survey.cameras}
-    blocks, spots = [], []
-    for report in reports:
-        size = report.image_size
-        if size is not None and size != sizes[report.camera_id]:
-            raise SurveyError(
-                f"{report.path}: the image is {size[0]} x {size[1]} px, but survey.toml says camera "
-                f"{report.camera_id!r} has {sizes[report.camera_id][0]} x {sizes[report.camera_id][1]}; correct "
-                "image_size_px or take the right image"
-            )
-        for target_id, found in report.detections.items():
-            if len(found):
-                blocks.append(
-                    ImageBlock(report.camera_id, report.epoch_id, target_id, found.point_idx, found.uv, found.cov)
-                )
-        if report.spots is not None and len(report.spots):
-            names = tuple(f"s{i + 1}" for i in range(len(report.spots)))
-            spots.append(SpotBlock(report.camera_id, report.epoch_id, names, report.spots.uv, report.spots.cov))
-    return blocks, spots
-
-
 class Clock:
     """How long each step took."""
 
@@ -212,37 +100,62 @@ def adjust_job(
     """The main job: detect where that has not been done, adjust everything, write the results. Raises SurveyError."""
     clock, folder = Clock(), Path(folder)
     target = folder if out is None else Path(out)
-    messages: tuple[str, ...] = ()
+    said = command_line("adjust", folder, redetect=redetect, out=out)
     with changing(target) as place:
 
-        def detected() -> tuple[str, ...]:
+        def detected() -> None:
             with clock.step("detect"):
                 if out is None:
-                    return _detect(folder, place, None, False, progress).problems
-                return detect_job(folder, progress=progress).problems
+                    detect_in(folder, place, jobs=None, pictures=False, progress=progress, everything=redetect)
+                else:
+                    detect_job(folder, progress=progress, everything=redetect)
 
-        if redetect:
-            messages = detected()
         with clock.step("read"):
             project = read(folder)
-        if project.images and not redetect and not (project.survey.image_blocks or project.spots):
-            messages = detected()
+        nothing_yet = bool(project.images) and not (project.survey.image_blocks or project.spots)
+        if redetect or project.to_detect or (nothing_yet and not project.detected):
+            detected()
             with clock.step("read"):
                 project = read(folder)
+        elif project.images and out is None:
+            project = replace(project, detected=remember_images(folder, place))
         with clock.step("adjust"):
             adjustment = adjust_project(project, progress)
-        notes = tuple(f"detection: {m}" for m in messages)
-        adjustment = replace(adjustment, warnings=adjustment.warnings + notes)
-        outcome = made(project, adjustment, place, clock, report)
+        outcome = made(project, adjustment, place, clock, report, said)
         replace_parts(target)
     return outcome.at(target)
 
 
+def command_line(command: str, folder: Path, *words: str | Path, **flags: Any) -> str:
+    """A command as it can be given again, with its options; folders by their names, as results may be moved."""
+    said = [f"--{name}" if value is True else f"--{name} {_shown(value)}" for name, value in flags.items() if value]
+    return " ".join(["labsurvey", command, _shown(folder), *map(_shown, words), *said])
+
+
+def _shown(value: Any) -> str:
+    return shlex.quote(_plain_name(value) if isinstance(value, Path) else
+                       str(value).encode("utf-8", "surrogateescape").decode("utf-8", "replace"))  # fmt: skip
+
+
+def _plain_name(folder: Path) -> str:
+    """The name alone: results of a copied folder stay the same; by its bytes: a terminal without UTF-8 garbles it."""
+    return os.fsencode(folder.resolve().name).decode("utf-8", "replace")
+
+
+def image_warnings(images: Mapping[tuple[str, str], DetectedImage]) -> tuple[str, ...]:
+    """Images in which nothing was found, or that could not be read; at every adjustment, not only at the first."""
+    return tuple(
+        f"detection: {entry.file}: {entry.status}{': ' + entry.message if entry.message else ''}"
+        for entry in images.values() if entry.status in ("nothing", "failed")
+    )  # fmt: skip
+
+
 def made(
-    project: Project, adjustment: Adjustment, place: Path, clock: Clock, report: ReportOptions = ENGLISH_PAGE
-) -> AdjustOutcome:
-    """The statistics of an adjusted project, and its result files made in ``place``."""
-    run = run_info(project, clock.seconds)
+    project: Project, adjustment: Adjustment, place: Path, clock: Clock, report: ReportOptions = ENGLISH_PAGE,
+    command: str = "",
+) -> AdjustOutcome:  # fmt: skip
+    """The statistics of an adjusted project, and its result files made in ``place``. command: what asked for it."""
+    run = run_info(project, clock.seconds, command)
     with clock.step("statistics"):
         found = statistics_of(adjustment, project.options.tolerances, scale_of(adjustment, run.sigmas))
     with clock.step("report"):
@@ -251,8 +164,11 @@ def made(
     return AdjustOutcome(adjustment, run, solution, paths, found)
 
 
-def adjust_project(project: Project, progress: bool) -> Adjustment:
-    """Adjust what was read. Raises SurveyError."""
+Begin = Callable[[Survey], StartValues | None]
+
+
+def adjust_project(project: Project, progress: bool, begin: Begin = lambda _: None) -> Adjustment:
+    """Adjust what was read. begin: start values of a survey, found where it gives None. Raises SurveyError."""
     survey = project.survey
     observed = (
         survey.image_blocks, project.spots, survey.pairs, survey.distances, survey.coordinates, survey.readings,
@@ -264,29 +180,47 @@ def adjust_project(project: Project, progress: bool) -> Adjustment:
             "into observations/"
         )
     options = AdjustOptions(project.options.alpha, project.options.reject_blocks, project.options.reject_points)
+    survey, turned = consistent_turns(survey, project.target_kinds)
+    project = replace(project, survey=survey)
     with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
 
         def step(_iteration: int, omega: float) -> None:
             bar.set_postfix_str(f"v'Pv = {omega:.6g}")
             bar.update()
 
-        notes: tuple[str, ...] = ()
+        notes = turned
         if project.spots:
-            found = _identify(project, options, step)
-            notes = found.notes
+            found = _identify(project, options, step, begin)
+            notes += found.notes
             if found.unidentified:
                 notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
             survey = replace(survey, image_blocks=survey.image_blocks + found.blocks)
             survey = _seen_points(survey)
         how = clean_options(project.options)
-        result = checked(survey, lambda: without_lost_points(survey, lambda part: adjust_cleaned(part, how, step)))
-    return replace(result, warnings=result.warnings + notes)
+        survey, lost = supported(survey)
+        result = checked(
+            survey, lambda: without_lost_points(survey, lambda part: adjust_cleaned(part, how, step, begin(part)))
+        )
+    return told(project, survey, replace(result, warnings=result.warnings + notes + lost_notes(lost)))
 
 
-def _identify(project: Project, options: AdjustOptions, step: Callable[[int, float], None]) -> Identification:
+def told(project: Project, given: Survey, adjustment: Adjustment) -> Adjustment:
+    """An adjustment that says what was noticed when its project was read, and how much of ``given`` it left out."""
+    warnings = adjustment.warnings + project.notes + project.image_notes + image_warnings(project.detected)
+    images = sum(len(b.uv) if b.used is None else int(b.used.sum()) for b in given.image_blocks)
+    images -= int(adjustment.image_residuals.used.sum())
+    others = sum(o.used for kind in _OTHERS for o in getattr(given, kind))
+    others -= sum(o.used for kind in _OTHERS for o in getattr(adjustment.survey, kind))
+    return replace(adjustment, warnings=warnings, n_screened=images + others)
+
+
+def _identify(
+    project: Project, options: AdjustOptions, step: Callable[[int, float], None], begin: Begin
+) -> Identification:
     gate = project.spots_request.gate_px if project.spots_request is not None else 15.0
     try:
-        first = adjust(without_points(project.survey), options=options, progress=step)
+        part = supported(without_points(project.survey))[0]
+        first = adjust(part, begin(part), options, step)
     except IndeterminateError as error:
         raise SurveyError(
             f"{project.folder}/observations: the spots cannot be identified, because cameras and stations are not "
@@ -322,8 +256,8 @@ def _reindexed(survey: Survey, block: ImageBlock, ids: dict[str, int]) -> IntArr
     return np.array([ids[survey.points[int(i)].point_id] for i in block.point_idx], dtype=np.int64)
 
 
-def run_info(project: Project, seconds: dict[str, float]) -> RunInfo:
-    """What was run, for result files."""
+def run_info(project: Project, seconds: dict[str, float], command: str = "") -> RunInfo:
+    """What was run, for result files. command: as it was given."""
     versions = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
@@ -331,9 +265,14 @@ def run_info(project: Project, seconds: dict[str, float]) -> RunInfo:
         except PackageNotFoundError:
             continue
     chosen = replace(project.options, tolerances=(), identification=())
-    options = {k: v for k, v in asdict(chosen).items() if v != ()} | {"datum": project.survey.datum.kind}
+    options = {k: v for k, v in asdict(chosen).items() if v not in ((), None)} | {"datum": project.survey.datum.kind}
     date = datetime.now(UTC).isoformat(timespec="seconds")
-    # the name alone: results of a copied folder stay the same; by its bytes: a terminal without UTF-8 garbles it
-    name = os.fsencode(project.folder.resolve().name).decode("utf-8", "replace")
+    name = _plain_name(project.folder)
     said = project.options.identification
-    return RunInfo(name, project.title, project.inputs, options, versions, date, seconds, identification=said)
+    sigmas = project.options.sigmas or USUAL
+    images = {"/".join(key): entry for key, entry in project.detected.items() if key in project.images}
+    return RunInfo(
+        name, project.title, project.inputs, options, versions, date, seconds, sigmas, said, command=command,
+        images=images, left_out=project.left_out, n_left_out=project.n_left_out,
+        n_unused_in_files=project.n_unused_in_files,
+    )  # fmt: skip

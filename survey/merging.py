@@ -5,15 +5,18 @@ import io
 import re
 import shutil
 import tomllib
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from adjust.errors import SurveyError
+from survey.files.detected import ImageKey, file_of
+from survey.files.exclusions import EXCLUSIONS_FILE, appended, read_exclusions
 from survey.files.node import read_toml
-from survey.files.project import DEFINITION_FILE, FORMAT, IMAGES_FOLDER, OBSERVATIONS_FOLDER
-from survey.files.reading import LAYOUTS
+from survey.files.project import DEFINITION_FILE, FORMAT, IMAGES_FOLDER, OBSERVATIONS_FOLDER, Project
+from survey.files.reading import LAYOUTS, read
 from survey.files.tables import read_table
 from survey.files.text import atomic_write, decode, read_bytes, suggestion
 from survey.files.toml_lines import KeyPath, key_lines
@@ -149,6 +152,10 @@ def _merge_tables(merged: Merged) -> None:
     for path in sorted(source.iterdir()) if source.is_dir() else []:
         if path.suffix not in (".csv", ".parquet") or path.name.startswith("."):
             continue
+        if path.name == EXCLUSIONS_FILE:
+            atomic_write(target / path.name, appended(old / path.name, read_exclusions(source)[0]))
+            merged.entries.append(f"{OBSERVATIONS_FOLDER}/{path.name}")
+            continue
         if path.stem not in LAYOUTS:
             raise SurveyError(f"{path}: unknown table {path.stem!r}; {suggestion(path.stem, LAYOUTS)}")
         read_table(path, LAYOUTS[path.stem])  # its own faults, with its own lines
@@ -156,6 +163,24 @@ def _merge_tables(merged: Merged) -> None:
             raise SurveyError(f"{path}: Parquet tables cannot be added to; write both tables as CSV")
         _merge_table(merged, old / path.name, path, target / path.name)
         merged.entries.append(f"{OBSERVATIONS_FOLDER}/{path.name}")
+
+
+def read_copy(place: Path, project: Project, folder: Path) -> Project:
+    """Read what was made of ``project`` in ``place``, as it will be at ``folder``; images that are not copied count."""
+    copy = read(place)
+    points = Counter[ImageKey]()
+    for block in copy.survey.image_blocks:
+        points[block.camera_id, block.epoch_id] += len(block.uv)
+    new = {
+        key: replace(file_of(path, path.relative_to(place).as_posix()), status="given", n_image_points=points[key])
+        for key, path in copy.images.items()
+        if key not in project.images
+    }
+    return replace(
+        copy, folder=folder, title=project.title, images={**copy.images, **project.images},
+        detected={**project.detected, **new}, image_notes=project.image_notes,
+        notes=tuple(note.replace(str(place), str(folder)) for note in copy.notes),
+    )  # fmt: skip
 
 
 def point_files(folder: Path) -> list[str]:

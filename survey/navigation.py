@@ -1,9 +1,10 @@
 """The job behind ``labsurvey navigate``: calibrate from everything else, then a pose for every navigation epoch."""
 
+import contextlib
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,9 @@ from survey.navigation_task import (
     chosen_station,
     chosen_times,
     observed_epoch,
+    others_to_navigate,
 )
-from survey.quantities import ARCSEC_PER_RAD
+from survey.quantities import ARCSEC_PER_RAD, SigmaKind
 from survey.replacing import changing, replace_parts
 from survey.results import RESULTS
 from survey.trajectory_files import write_trajectory
@@ -48,6 +50,7 @@ class NavigateOutcome:
     notes: tuple[str, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
     paths: dict[str, Path] = field(default_factory=dict)
+    sigmas: SigmaKind = "a_priori"
 
     def summary(self) -> dict[str, Any]:
         """Counts and median sigmas as plain values."""
@@ -60,6 +63,7 @@ class NavigateOutcome:
             "median_sigma_rotation_arcsec": rot,
             "median_sigma_translation_mm": trans,
             "calibration_sigma0": self.calibration.sigma0,
+            "sigmas": self.sigmas,
             "notes": list(self.notes),
             "written": {name: str(path) for name, path in self.paths.items()},
         }
@@ -72,7 +76,8 @@ class NavigateOutcome:
         if s["median_sigma_rotation_arcsec"] is not None:
             turn = "  ".join(f"{v:.0f}" for v in s["median_sigma_rotation_arcsec"])
             shift = "  ".join(f"{v:.3f}" for v in s["median_sigma_translation_mm"])
-            lines.append(f"  median sigmas along the head's axes: {turn} arcsec,  {shift} mm")
+            kind = self.sigmas.replace("_", " ")
+            lines.append(f"  median sigmas ({kind}) along the head's axes: {turn} arcsec,  {shift} mm")
         for epoch in self.trajectory.epochs:
             if epoch.status in ("ambiguous", "undetermined", "none"):
                 lines.append(f"  {epoch.epoch_id}: {epoch.status}: {_why(epoch)}")
@@ -103,8 +108,9 @@ def navigate_job(
 ) -> NavigateOutcome:
     """Navigate a project and write ``results/trajectory.csv`` and ``.json``. Raises SurveyError.
 
-    The calibration is adjusted from the epochs that are not navigated, so that no spot is used twice, and its joint
-    covariance of cameras, table and beacons goes into every pose. It is kept in ``results`` and used again while
+    The calibration is adjusted without the epochs that are navigated, or could be (those that show beacons and no
+    target), so that no spot is used twice and every choice of epochs has the same; its joint covariance of cameras,
+    table and beacons goes into every pose. It is kept in ``results`` and used again while
     that survey, options and versions are the same. (The solution of ``adjust`` has the navigated spots in it.)
     """
     target = Path(out or folder)
@@ -134,39 +140,78 @@ def _navigated(folder: Path, request: NavigateRequest, there: Path, place: Path,
         trajectory = navigate(
             calibration.head, calibration.beacons, observed, options, lambda _done, _all: bar.update() and None
         )
+    sigmas: SigmaKind = "a_priori"
+    if project.options.sigmas == "a_posteriori" and calibration.sigma0 is not None:
+        sigmas, trajectory = "a_posteriori", _scaled(trajectory, calibration.sigma0)
     seconds = {"calibrate": calibrated - begin, "navigate": time.perf_counter() - calibrated}
-    outcome = NavigateOutcome(folder, station, calibration, trajectory, _notes(project, calibration), seconds)
+    notes = _notes(project, calibration)
+    outcome = NavigateOutcome(folder, station, calibration, trajectory, notes, seconds, sigmas=sigmas)
     summary = {k: v for k, v in outcome.summary().items() if k not in ("written", "folder", "notes")}
     return replace(outcome, paths=write_trajectory(trajectory, observed, summary, place))
 
 
+def _scaled(trajectory: Trajectory, sigma0: float) -> Trajectory:
+    """All covariances times sigma0 of the calibration, squared; tests and choices were made a priori."""
+
+    def one(epoch: EpochPose) -> EpochPose:
+        others = tuple(replace(s, cov=sigma0**2 * s.cov) for s in epoch.alternatives)
+        shares = epoch.shares
+        if shares is not None:
+            shares = replace(shares, **{f.name: sigma0**2 * getattr(shares, f.name) for f in fields(shares)})
+        return replace(epoch, cov=sigma0**2 * epoch.cov, alternatives=others, shares=shares)
+
+    return Trajectory(tuple(one(e) for e in trajectory.epochs))
+
+
 def _notes(project: Project, calibration: Calibration) -> tuple[str, ...]:
-    notes = []
+    notes = [*project.notes, *project.image_notes]
     missing = sorted({p.point_id for p in project.survey.points} - set(calibration.beacons.beacon_ids), key=natural_key)
     if missing:
         notes.append(f"beacons without coordinates, left out: {', '.join(missing)}")
+    if calibration.helped_by:
+        notes.append(
+            f"calibration: with epochs that were not asked for ({_some(calibration.helped_by)}), because the others do "
+            "not determine the head"
+        )
     if calibration.reused:
         notes.append(f"calibration: that of {RESULTS}/{CALIBRATION}; what it came from has not changed")
     return tuple(notes)
 
 
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
 def _calibrate(project: Project, station: str, epochs: Sequence[str], there: Path, new: Path) -> Calibration:
-    """Head and beacons, from the file ``there`` where it was made from the same survey, options and versions."""
-    survey = calibrating(project, station, epochs)
+    """Head and beacons, from the file ``there`` where it was made from the same survey, options and versions.
+
+    Epochs that could be navigated too, but were not asked for, calibrate only where nothing else does.
+    """
+    others = others_to_navigate(project, station, epochs)
+    try:
+        return _calibrated(project, station, [*epochs, *others], there, new)
+    except SurveyError as error:
+        if others:
+            with contextlib.suppress(SurveyError):
+                return replace(_calibrated(project, station, epochs, there, new), helped_by=tuple(others))
+        if not isinstance(error, IndeterminateError):
+            raise
+        raise SurveyError(
+            f"{project.folder}: the head is not calibrated without the epochs to navigate ({_some(epochs)}); navigate "
+            f"fewer with --epochs, or calibrate with a target\n({error})"
+        ) from error
+
+
+def _calibrated(project: Project, station: str, without: Sequence[str], there: Path, new: Path) -> Calibration:
+    """From everything but these epochs of the station."""
+    survey = calibrating(project, station, without)
     run = run_info(project, {})
     options = AdjustOptions(project.options.alpha, project.options.reject_blocks, project.options.reject_points)
     key = digest(survey, options, run.versions, station)
     found = kept(there, key)
     if found is not None:
         return found
-    try:
-        adjustment = adjust(survey, options=options)
-    except IndeterminateError as error:
-        raise SurveyError(
-            f"{project.folder}: the head is not calibrated without the epochs to navigate ({', '.join(epochs[:5])}"
-            f"{', ...' if len(epochs) > 5 else ''}); navigate fewer with --epochs, or calibrate with a target"
-            f"\n({error})"
-        ) from error
+    adjustment = adjust(survey, options=options)
     head, beacons = head_and_beacons(adjustment, station)
     calibration = Calibration(head, beacons, adjustment.sigma0 if adjustment.redundancy > 0 else None)
     keep(new, key, calibration)

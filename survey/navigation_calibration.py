@@ -23,13 +23,15 @@ from survey.shapes import POSITIVE, WHOLE, Either, misfit
 class Calibration:
     """Head and beacons of an adjustment without the navigated epochs.
 
-    sigma0: None without redundancy. reused: read from a file, not adjusted anew.
+    sigma0: None without redundancy. reused: read from a file, not adjusted anew. helped_by: epochs that were not asked
+    for and calibrate all the same.
     """
 
     head: Head
     beacons: Beacons
     sigma0: float | None
     reused: bool = False
+    helped_by: tuple[str, ...] = ()
 
 
 def digest(*values: Any) -> str:

@@ -10,9 +10,10 @@ import numpy as np
 from adjust.errors import SurveyError
 from adjust.model import Survey
 from adjust.navigation import NavigationEpoch, Spots
+from adjust.supported import supported
 from survey.files import Project
-from survey.files.text import natural_key
-from survey.parts import only_between, points_read
+from survey.files.text import decode, natural_key, read_bytes
+from survey.parts import in_use, only_between, points_read
 
 
 @dataclass(frozen=True)
@@ -52,21 +53,37 @@ def chosen_epochs(project: Project, station: str, request: NavigateRequest) -> l
     own = {c.camera_id for c in project.survey.cameras if c.station_id == station}
     if not own:
         raise SurveyError(f"{project.folder}/survey.toml: no camera is on station {station!r}")
-    blocks = [b for b in project.survey.image_blocks if b.camera_id in own]
-    lit = {s.epoch_id for s in project.spots if s.camera_id in own}
-    lit |= {b.epoch_id for b in blocks if b.target_id is None}
+    lit, shown = _lit_and_shown(project, own)
     if request.epochs is not None:
         unknown = [e for e in request.epochs if e not in lit]
         if unknown:
             raise SurveyError(f"{project.folder}: no beacon was observed at epoch {', '.join(unknown)} from {station}")
         return list(request.epochs)
-    found = sorted(lit - {b.epoch_id for b in blocks if b.target_id is not None}, key=natural_key)
+    found = sorted(lit - shown, key=natural_key)
     if not found:
         raise SurveyError(
             f"{project.folder}/observations: no epoch to navigate: none shows beacons to station {station} without a "
             "target; name epochs with --epochs, or detect spots first"
         )
     return found
+
+
+def _lit_and_shown(project: Project, own: set[str]) -> tuple[set[str], set[str]]:
+    """Epochs at which these cameras show beacons, and those at which they show a target."""
+    blocks = [b for b in in_use(project.survey).image_blocks if b.camera_id in own]
+    lit = {s.epoch_id for s in project.spots if s.camera_id in own}
+    lit |= {b.epoch_id for b in blocks if b.target_id is None}
+    return lit, {b.epoch_id for b in blocks if b.target_id is not None}
+
+
+def others_to_navigate(project: Project, station: str, epochs: Sequence[str]) -> list[str]:
+    """Epochs that could be navigated as well and were not asked for, in natural order.
+
+    They take no part in the calibration either, so that it is the same whichever epochs are asked for; none where no
+    epoch of the station shows a target, so that nothing else could calibrate it.
+    """
+    lit, shown = _lit_and_shown(project, {c.camera_id for c in project.survey.cameras if c.station_id == station})
+    return sorted(lit - shown - set(epochs), key=natural_key) if shown else []
 
 
 def chosen_times(epochs: Sequence[str], request: NavigateRequest) -> list[float] | None:
@@ -76,10 +93,7 @@ def chosen_times(epochs: Sequence[str], request: NavigateRequest) -> list[float]
         return None if step is None else [i * step for i in range(len(epochs))]
     if request.interval_s is not None:
         raise SurveyError("give either the interval between epochs or a table of their times, not both")
-    try:
-        rows = list(csv.DictReader(request.times.read_text("utf-8-sig").splitlines()))
-    except (OSError, UnicodeDecodeError) as error:
-        raise SurveyError(f"{request.times}: cannot be read as a table of epoch_id and time_s ({error})") from error
+    rows = list(csv.DictReader(decode(request.times, read_bytes(request.times)[0]).splitlines()))
     if not rows or not {"epoch_id", "time_s"} <= set(rows[0]):
         raise SurveyError(f"{request.times}:1: the columns epoch_id and time_s are needed")
     found: dict[str, float] = {}
@@ -108,7 +122,7 @@ def calibrating(project: Project, station: str, epochs: Sequence[str]) -> Survey
     blocks = tuple(b for b in survey.image_blocks if not (b.camera_id in own and b.epoch_id in out))
     carried = next(s for s in survey.stations if s.station_id == station).table_id
     readings = tuple(r for r in survey.table_readings if not (r.table_id == carried and r.epoch_id in out))
-    return _with_known_points(replace(survey, image_blocks=blocks, table_readings=readings))
+    return supported(_with_known_points(replace(survey, image_blocks=blocks, table_readings=readings)))[0]
 
 
 def _with_known_points(survey: Survey) -> Survey:
@@ -116,7 +130,7 @@ def _with_known_points(survey: Survey) -> Survey:
     seen: dict[int, set[tuple[str, str]]] = {}
     for b in survey.image_blocks:
         if b.target_id is None:
-            for i in b.point_idx.tolist():
+            for i in (b.point_idx if b.used is None else b.point_idx[b.used]).tolist():
                 seen.setdefault(i, set()).add((b.camera_id, b.epoch_id))
     given = {r.point_id for c in survey.coordinates if c.used for r in c.positions if r.frame is None}
     given |= points_read(survey)
@@ -143,8 +157,8 @@ def _with_known_points(survey: Survey) -> Survey:
 def observed_epoch(
     project: Project, station: str, epoch_id: str, time_s: float | None, request: NavigateRequest, named: set[str]
 ) -> NavigationEpoch:
-    """One epoch's spots, named or not, and its table reading."""
-    survey = project.survey
+    """One epoch's spots, named or not, and its table reading; what is not used is not navigated from."""
+    survey = in_use(project.survey)
     own = [c.camera_id for c in survey.cameras if c.station_id == station]
     spots = [Spots(s.camera_id, s.uv, s.cov) for s in project.spots if s.camera_id in own and s.epoch_id == epoch_id]
     for b in survey.image_blocks:

@@ -16,8 +16,8 @@ from survey.files.pairs import COVARIANCE_COLUMNS, EULER, PAIRS, QUATERNION, SIG
 from survey.files.project import OBSERVATIONS_FOLDER
 from survey.files.references import NameProblemError, Names, check_epochs, read_frame
 from survey.files.tables import Table, read_table
-from survey.jobs import AdjustOutcome, Clock, adjust_project, made
-from survey.merging import Merged, merge
+from survey.jobs import AdjustOutcome, Clock, adjust_project, command_line, made
+from survey.merging import Merged, merge, read_copy
 from survey.network_summary import network_dict, pair_network
 from survey.previous import Move, Previous, moves, read_previous
 from survey.replacing import complete, place_for, replace_parts
@@ -72,7 +72,8 @@ def plan_job(folder: Path) -> PlanOutcome:
     if path is None:
         raise SurveyError(
             f"{definition.folder / OBSERVATIONS_FOLDER}/pairs.csv: there is no such file; list the pairs to be "
-            "measured in it: pair_id,a_id,b_id (values may follow later)"
+            "measured in it: pair_id,a_id,b_id (values may follow later). What images will tell is planned by "
+            f"{definition.folder / 'plan.toml'}, which is not there either"
         )
     survey = replace(definition.survey, pairs=_planned(read_table(path, PAIRS), Names.of(definition.survey)))
     network = network_dict(pair_network(survey))
@@ -195,22 +196,23 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
         project = read(folder)
         before = read_previous(project)
         merged = merge(folder, new, place)
-        grown = _read_merged(merged)
-        grown = replace(grown, folder=out or folder, title=project.title)
+        grown = _read_merged(merged, project, out or folder)
         adjustment, start = warm_adjustment(grown, before, lambda p: adjust_project(p, progress), progress)
-        outcome = made(grown, adjustment, place, Clock({"adjust": time.perf_counter() - begin}))
+        said = command_line("add", folder, new, out=out)
+        outcome = made(grown, adjustment, place, Clock({"adjust": time.perf_counter() - begin}), command=said)
         if out is None:
             replace_parts(folder, [*merged.entries, RESULTS])
         else:
             complete(folder, place)
     outcome = outcome.at(out or folder)
     added = {**merged.new_ids, **merged.rows}
-    return AddOutcome(outcome, added, moves(before, adjustment), before, start, time.perf_counter() - begin)
+    moved = moves(before, adjustment, grown.options.sigmas)
+    return AddOutcome(outcome, added, moved, before, start, time.perf_counter() - begin)
 
 
-def _read_merged(merged: Merged) -> Project:
+def _read_merged(merged: Merged, project: Project, folder: Path) -> Project:
     try:
-        return read(merged.place)
+        return read_copy(merged.place, project, folder)
     except SurveyError as error:
         raise merged.translated(error) from error
 

@@ -38,6 +38,17 @@ def only_between(survey: Survey, keep: Callable[[PositionRef], bool]) -> Survey:
     )
 
 
+def in_use(survey: Survey) -> Survey:
+    """The survey less the image points and table readings that are not used: for what predicts nothing of them."""
+    blocks = tuple(
+        b if b.used is None
+        else replace(b, point_idx=b.point_idx[b.used], uv=b.uv[b.used], cov=b.cov[b.used], used=None)
+        for b in survey.image_blocks
+        if b.used is None or b.used.any()
+    )  # fmt: skip
+    return replace(survey, image_blocks=blocks, table_readings=tuple(r for r in survey.table_readings if r.used))
+
+
 def points_read(survey: Survey) -> set[str]:
     """Ids of the world points that used readings and coordinate differences reach."""
     refs = [r for x in survey.readings if x.used for r in (x.at, x.to, x.second) if r is not None]

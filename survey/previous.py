@@ -1,8 +1,8 @@
 """What an earlier adjustment of a project left in its results: values to start from, and sigmas to compare with."""
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from survey.files import Project
 from survey.files.locking import settled
 from survey.files.poses import rotation_from_quaternion
 from survey.files.text import read_bytes
-from survey.quantities import ARCSEC_PER_RAD
+from survey.quantities import ARCSEC_PER_RAD, SigmaKind, key_of, unit_for_people
 from survey.results import RESULTS, read_covariances
 
 # what damaged or foreign content makes the readers below raise
@@ -33,7 +33,8 @@ _POSES = {
 class Previous:
     """A solution that was written: poses and points by parameter name; covs as written, by the same names.
 
-    factor: by which sigmas were multiplied. clean: whether every observation was used.
+    factor: by which sigmas were multiplied. clean: whether the run left nothing out by itself. vectors: components as
+    ``solution.json`` has them, of lenses (with ``model``), table angles and geometry and warps, by parameter name.
     """
 
     poses: Mapping[ParameterName, Pose3]
@@ -42,11 +43,23 @@ class Previous:
     factor: float
     summary: Mapping[str, Any]
     clean: bool
+    vectors: Mapping[ParameterName, Mapping[str, Any]] = field(default_factory=dict)
+
+    def vector(self, name: ParameterName, names: Sequence[str], units: Sequence[str]) -> FloatArray | None:
+        """The components (n,) of a lens, a table, angles or a warp, in units inside; None where they are not there."""
+        entry, out = self.vectors.get(name, {}), []
+        for component, unit in zip(names, units, strict=True):
+            unit_shown, factor = unit_for_people(component, unit)
+            value = entry.get(key_of(component, unit_shown))
+            if not isinstance(value, int | float) or not np.isfinite(value):
+                return None
+            out.append(value / factor)
+        return np.array(out)
 
 
 @dataclass(frozen=True)
 class Move:
-    """How far a station or point went: mm, arcsec, and the largest component in its sigmas of before (a priori)."""
+    """How far a station or point went: mm, arcsec, and the largest component in its sigmas of before."""
 
     name: str
     mm: float
@@ -89,9 +102,23 @@ def _previous(found: Mapping[str, Any], covs: Mapping[str, FloatArray]) -> Previ
         raise ValueError("a covariance has not the size of its parameter")
     int(summary["redundancy"]), float(summary["sigma0"] or 0.0)
     factor = float(_numbers([summary["sigma_factor"]], 1)[0])
-    return Previous(
-        dict(_poses(found)), points, by_name, factor, summary, summary["suspects"]["n_not_used"] == 0
-    )  # fmt: skip
+    clean = found["left_out"]["in_this_run"] == 0
+    return Previous(dict(_poses(found)), points, by_name, factor, summary, clean, dict(_vectors(found)))
+
+
+def _vectors(found: Mapping[str, Any]) -> Iterator[tuple[ParameterName, Mapping[str, Any]]]:
+    for camera, entry in found["cameras"].items():
+        if isinstance(entry.get("lens"), dict):
+            yield ("lens", camera), entry["lens"]
+    for table, entry in found["tables"].items():
+        if isinstance(entry.get("geometry"), dict):
+            yield ("table_geometry", table), entry["geometry"]
+        for epoch, angles in entry.get("epochs", {}).items():
+            if isinstance(angles, dict):
+                yield ("table_angles", table, epoch), angles
+    for target, entry in found["targets"].items():
+        if isinstance(entry.get("warp"), dict):
+            yield ("warp", target), entry["warp"]
 
 
 def _numbers(values: Any, n: int) -> FloatArray:
@@ -122,33 +149,37 @@ def _pose(entry: Mapping[str, Any]) -> Pose3:
     return Pose3(rotation, 1e-3 * _numbers(entry["translation_mm"], 3))
 
 
-def moves(previous: Previous, adjustment: Adjustment) -> tuple[Move, ...]:
+def moves(previous: Previous, adjustment: Adjustment, sigmas: SigmaKind | None = None) -> tuple[Move, ...]:
     """How far stations and points went since, most sigmas first; those that were held are left out.
 
+    sigmas: those of before, as the project asks for; None: a priori.
     In a free network the datum may have moved too: the new solution is first laid onto the old one.
     """
     old, new = previous.poses, adjustment.estimates
     names = [n for n in old if n[0] == "world_from_station" and n in new]
     onto = _fit(previous, adjustment, names) if adjustment.survey.datum.kind == "inner" else Pose3()
+    factor = 1.0 if sigmas == "a_posteriori" else previous.factor
     out = []
     for name in names:
         value = new[name].value
         if isinstance(value, Pose3):
             d = np.asarray(Pose3.Logmap(old[name].between(onto.compose(value))))
-            out.append(_move(previous, name, d, float(ARCSEC_PER_RAD * np.linalg.norm(d[:3])), d[3:]))
+            out.append(_move(previous, name, factor, d, float(ARCSEC_PER_RAD * np.linalg.norm(d[:3])), d[3:]))
     for point, x in previous.points.items():
         estimate = new.get(("point", point))
         if estimate is not None and not isinstance(estimate.value, Pose3):
             d = np.asarray(onto.transformFrom(np.asarray(estimate.value))) - x
-            out.append(_move(previous, ("point", point), d, 0.0, d))
+            out.append(_move(previous, ("point", point), factor, d, 0.0, d))
     return tuple(sorted((m for m in out if m is not None), key=lambda m: -m.sigmas))
 
 
-def _move(previous: Previous, name: ParameterName, d: FloatArray, arcsec: float, shift: FloatArray) -> Move | None:
+def _move(
+    previous: Previous, name: ParameterName, factor: float, d: FloatArray, arcsec: float, shift: FloatArray
+) -> Move | None:
     cov = previous.covs.get(name)
     if cov is None:
         return None
-    sigma = np.sqrt(np.clip(np.diag(cov), 0.0, None)) / previous.factor
+    sigma = np.sqrt(np.clip(np.diag(cov), 0.0, None)) / factor
     known = sigma > 0.0
     if not known.any():
         return None

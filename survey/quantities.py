@@ -5,16 +5,20 @@ Everything that a report or a result file says about the precision of an unknown
 
 import re
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.distributions import chi2, fisher
+from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from adjust.result import Adjustment, Estimate
 
 SigmaKind = Literal["a_priori", "a_posteriori"]
+SIGMA_KINDS: tuple[SigmaKind, ...] = get_args(SigmaKind)
+USUAL: SigmaKind = "a_posteriori"
+"""Of results, where the project does not say."""
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
 PROBABILITY = 0.95
 
@@ -31,13 +35,17 @@ class Scale:
     ellipsoid: float
 
 
-def scale_of(adjustment: Adjustment, sigmas: SigmaKind) -> Scale:
-    """The scale asked for; without redundancy there is no sigma0, and sigmas stay a priori.
+def scale_of(adjustment: Adjustment, sigmas: SigmaKind | None) -> Scale:
+    """The scale asked for, ``USUAL`` where None; without redundancy there is no sigma0, and sigmas stay a priori.
+
+    Raises SurveyError for a word that is none of ``SIGMA_KINDS``.
 
     The ellipsoid follows the chi-square distribution with 3 degrees of freedom for a known, Fisher's F(3, r) for an
     estimated sigma0 (Koch 1999, Parameter Estimation and Hypothesis Testing in Linear Models, section 4.3).
     """
-    known = sigmas == "a_priori" or adjustment.redundancy <= 0 or not np.isfinite(adjustment.sigma0)
+    if sigmas not in (None, *SIGMA_KINDS):
+        raise SurveyError(f"there are no sigmas {sigmas!r}; write {' or '.join(SIGMA_KINDS)}")
+    known = (sigmas or USUAL) == "a_priori" or adjustment.redundancy <= 0 or not np.isfinite(adjustment.sigma0)
     if known:
         return Scale("a_priori", 1.0, float(np.sqrt(chi2.ppf(PROBABILITY, 3))))
     ellipsoid = float(np.sqrt(3.0 * fisher.ppf(PROBABILITY, 3, adjustment.redundancy)))

@@ -26,6 +26,8 @@ from adjust.result import Adjustment
 from survey.files import read
 from survey.files.observation_columns import pair_columns
 from survey.files.table_writing import write_table
+from survey.files.text import decode, read_bytes
+from survey.parts import in_use
 
 _INTERVALS_S = (1.0, 1.5, 2.0, 3.0, 4.0)
 _GROWTH_S = (0.1, 0.3, 1.0, 3.0, 9.0)
@@ -64,7 +66,7 @@ def relay_pairs(source: Path | str | Survey | Adjustment, station_id: str | None
     Raises SurveyError where nothing is found or determined.
     """
     survey = read(Path(source)).survey if isinstance(source, Path | str) else source
-    found = camera_sequences(survey, station_id)
+    found = camera_sequences(in_use(survey) if isinstance(survey, Survey) else survey, station_id)
     eyes = pairs_of(found)
     stations = {end.frame_id for p in eyes.pairs for end in (p.a, p.b)}
     closed = close_loops(eyes) if len(eyes.pairs) >= len(stations) else None
@@ -129,11 +131,7 @@ def read_trajectories(paths: Mapping[str, Path]) -> tuple[Trajectory, ...]:
     """Trajectory files by the ids of their eyes. Raises SurveyError naming file and line."""
     out = []
     for eye_id, path in paths.items():
-        try:
-            text = Path(path).read_text(encoding="utf-8-sig")
-        except (OSError, UnicodeDecodeError) as error:
-            raise SurveyError(f"{path}: cannot be read: {error}") from error
-        out.append(read_trajectory(text, eye_id, str(path)))
+        out.append(read_trajectory(decode(Path(path), read_bytes(Path(path))[0]), eye_id, str(path)))
     return tuple(out)
 
 

@@ -21,7 +21,7 @@ from scipy.special import erf
 
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
-from adjust.native.vision import Facets, draw_facets, pixel_corner_rays
+from adjust.native.vision import Facets, draw_facets, pixel_corner_rays, spread_and_sum
 from survey.detection.dictionaries import charuco_board, marker_cells
 from survey.targets import Charuco, Checkerboard, DetectableTarget, MarkerBlock, MarkerGrid
 
@@ -152,8 +152,7 @@ def _blurred_planes(camera: BrownCamera, facets: list[_Facet], imaging: Imaging)
     n = imaging.oversampling if imaging.blur_px > 0.0 else 1
     image = _planes(camera, n, facets, imaging)
     if imaging.blur_px > 0.0:
-        blurred = cv2.GaussianBlur(image, (0, 0), n * imaging.blur_px, borderType=cv2.BORDER_REPLICATE)
-        image = np.asarray(cv2.resize(blurred, camera.image_size, interpolation=cv2.INTER_AREA), np.float32)
+        image = spread_and_sum(image, n, n * imaging.blur_px)
     return image
 
 

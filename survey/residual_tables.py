@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from adjust.model import FloatArray, IntArray, Survey
 from adjust.result import Adjustment
+from survey.files.text import cell_text
 from survey.quantities import sigma_unit_for_people, unit_for_people
 
 Bytes = npt.NDArray[np.uint8]
@@ -70,11 +71,11 @@ def image_residuals_csv(adjustment: Adjustment) -> bytes:
     rows, found = image_rows(adjustment), adjustment.image_residuals
     blocks = adjustment.survey.image_blocks
     by_block = [
-        _text([b.epoch_id for b in blocks]),
-        _text([b.camera_id for b in blocks]),
-        _text([b.target_id or "" for b in blocks]),
+        _text([cell_text(b.epoch_id) for b in blocks]),
+        _text([cell_text(b.camera_id) for b in blocks]),
+        _text([cell_text(b.target_id or "") for b in blocks]),
     ]
-    points = _text(rows.point_ids)
+    points = _text([cell_text(p) for p in rows.point_ids])
     numbers = (
         (rows.uv, 4), (found.residuals, 6), (rows.sigmas, 6), (found.redundancy, 5), (found.standardized, 4),
         (found.test[:, None], 4), (found.used[:, None].astype(float), 0),
@@ -133,14 +134,14 @@ def other_residuals_csv(adjustment: Adjustment) -> bytes:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(OTHER_COLUMNS.split(","))
     for o in adjustment.other_residuals:
-        ids = " ".join(o.ids)
+        ids = cell_text(" ".join(o.ids))
         for i, (component, unit) in enumerate(zip(o.components, o.units, strict=True)):
             value_unit, value_factor = unit_for_people(component, unit)
             sigma_unit, sigma_factor = sigma_unit_for_people(unit)
             values = (o.observed[i] * value_factor, o.adjusted[i] * value_factor)
             small = (o.residual[i] * sigma_factor, o.sigma[i] * sigma_factor, o.redundancy[i], o.standardized[i])
             writer.writerow(
-                (o.kind, o.group, ids, component, value_unit, *map(_number, values), sigma_unit)
+                (o.kind, cell_text(o.group), ids, component, value_unit, *map(_number, values), sigma_unit)
                 + (*map(_number, (*small, o.test)), int(o.used))
             )
     return out.getvalue().encode()

@@ -9,13 +9,17 @@ from typing import Any
 import numpy as np
 
 from adjust.distributions import norm
+from adjust.epoch_states import datum_carriers, open_directions
 from adjust.model import FloatArray, Survey
 from adjust.result import Adjustment, Estimate, GroupSummary
+from survey.files.detected import DetectedImage
+from survey.files.project import LeftOut
+from survey.left_out import left_out_dict
 from survey.quantities import Scale, SigmaKind, point_entry, pose_entry, scale_of, vector_entry
 from survey.solution_instruments import instrument_entries
 from survey.statistics import Statistics
 from survey.statistics_dict import statistics_dict
-from survey.verdict import suspects, verdict
+from survey.verdict import findings, fit_of, suspects, verdict
 
 CORRELATION_LIMIT = 0.95
 # parameters for which "zero" is no sensible hypothesis
@@ -36,7 +40,8 @@ class RunInfo:
 
     date: time stamp, ISO 8601. seconds: duration per step; printed, but in no file, so that equal input gives equal
     files. sigmas: how sigmas of unknowns are given. identification: what the project says of itself (who, where, with
-    what), in its order.
+    what), in its order. command: as it can be given again. images: by camera/epoch, with their hashes. left_out,
+    n_left_out, n_unused_in_files: as of :class:`survey.files.Project`.
     """
 
     folder: str
@@ -48,6 +53,11 @@ class RunInfo:
     seconds: Mapping[str, float] = field(default_factory=dict)
     sigmas: SigmaKind = "a_posteriori"
     identification: tuple[tuple[str, str], ...] = ()
+    command: str = ""
+    images: Mapping[str, DetectedImage] = field(default_factory=dict)
+    left_out: tuple[LeftOut, ...] = ()
+    n_left_out: int = 0
+    n_unused_in_files: int = 0
 
 
 def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None = None) -> dict[str, Any]:
@@ -56,7 +66,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
     solution: dict[str, Any] = _plain(
         {
             "format": 1,
-            "summary": _summary(adjustment, run, scale, sum(not v.met for v in found.verdicts) if found else 0),
+            "summary": _summary(adjustment, run, scale, found),
             "conventions": CONVENTIONS,
             "cameras": _cameras(adjustment, scale),
             "stations": _stations(adjustment, scale),
@@ -66,13 +76,21 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
             "pairs": _pairs(adjustment, scale),
             **instrument_entries(adjustment, scale),
             **_network(adjustment.survey),
+            **_free_datum(adjustment),
             "groups": {g.group: _group(g) for g in adjustment.groups},
-            "warnings": list(adjustment.warnings),
+            **left_out_dict(adjustment, run.left_out, run.n_left_out, run.n_unused_in_files),
+            "warnings": [*findings(found.consistency if found else None), *adjustment.warnings],
             **(statistics_dict(adjustment, found, scale) if found is not None else {}),
             "inputs": {
                 "folder": run.folder,
                 "identification": dict(run.identification),
+                "command": run.command,
                 "hashes": dict(run.input_hashes),
+                "images": {
+                    name: {"file": i.file, "sha256": i.sha256, "points": i.status, "n_image_points": i.n_image_points,
+                           "n_spots": i.n_spots}
+                    for name, i in run.images.items()
+                },
                 "options": dict(run.options),
                 "versions": dict(run.versions),
                 "date": run.date,
@@ -80,6 +98,15 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
         }
     )
     return solution
+
+
+def _free_datum(adjustment: Adjustment) -> dict[str, Any]:
+    """Motions of the whole (t, rotation vector, ln scale) that the observations leave open, and what carries them."""
+    directions = open_directions(adjustment)
+    if not directions.shape[1]:
+        return {}
+    carriers = ["/".join(name) for name in datum_carriers(adjustment)]
+    return {"free_datum": {"open_motions": directions.T.tolist(), "carried_by": carriers}}
 
 
 def _plain(value: Any) -> Any:
@@ -102,13 +129,16 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, n_unmet: int) -> dict[str, Any]:
+def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, statistics: Statistics | None) -> dict[str, Any]:
     found, test = suspects(adjustment), adjustment.global_test
-    level, reason = verdict(adjustment, found, n_unmet)
+    n_unmet = sum(not v.met for v in statistics.verdicts) if statistics is not None else 0
+    tested = statistics.consistency if statistics is not None else None
+    level, reason = verdict(adjustment, found, n_unmet, tested)
     return {
         "title": run.title,
         "verdict": level,
         "reason": reason,
+        "fit": fit_of(adjustment, tested),
         "sigma0": adjustment.sigma0 if adjustment.redundancy > 0 else None,
         "redundancy": adjustment.redundancy,
         "n_observations": adjustment.n_observations,
@@ -130,6 +160,7 @@ def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, n_unmet: int) -
             "lower": test.lower,
             "upper": test.upper,
             "passed": test.passed,
+            "status": test.status,
         },
         "suspects": {
             "alpha": found.alpha,

@@ -6,12 +6,16 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model import FloatArray, IntArray
+from adjust.named_precision import NamedPrecision
 from adjust.result import Adjustment, Estimate, ParameterName
 from adjust.statistics.budget import uncertainty_budget
+from adjust.statistics.condensed import condensed_system
+from adjust.statistics.consistency import consistency
 from adjust.statistics.relative_precision import relative_precision
-from adjust.statistics.reliability import reliability
+from adjust.statistics.reliability import LARGEST_NETWORK, reliability
 from adjust.statistics.result import (
     BudgetEntry,
+    Consistency,
     Correlation,
     Decision,
     RelativePrecision,
@@ -19,8 +23,8 @@ from adjust.statistics.result import (
     VarianceComponents,
     WeakDirection,
 )
-from adjust.statistics.system import linear_system
-from adjust.statistics.weakness import correlations, weak_directions
+from adjust.statistics.system import LinearSystem, precision_of
+from adjust.statistics.weakness import compared_columns, correlations, weak_directions
 from survey.quantities import PROBABILITY, Scale
 from survey.tolerances import Tolerance, Verdict, verdicts
 
@@ -41,7 +45,8 @@ class Statistics:
 
     correlated: pairs of components above 95 %. weak: directions that the survey determines badly. relative: between
     neighbouring points and stations. budget: of points, stations and lenses. decisions: the log of the outlier search.
-    verdicts: on the tolerances of the project.
+    verdicts: on the tolerances of the project. consistency: of every part with the rest, and of cameras and targets
+    with themselves through time. left_out: for people, what is not all there, and why.
     """
 
     reliability: Reliability
@@ -53,6 +58,8 @@ class Statistics:
     correlations: CorrelationMatrix | None
     decisions: tuple[Decision, ...] = ()
     verdicts: tuple[Verdict, ...] = ()
+    consistency: Consistency | None = None
+    left_out: tuple[str, ...] = ()
 
 
 MOST_CORRELATED = 110
@@ -62,27 +69,53 @@ MOST_BUDGETS = 60
 _FEW_PLACES = 300
 """Places whose neighbours are found without a tree."""
 MOST_NEIGHBOURS = 150
-LARGE = 300_000
-"""Observed components above which correlations, weak directions and budgets are left out: they need minutes there."""
-
-
 def statistics_of(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], scale: Scale) -> Statistics:
-    """All of them. Raises SurveyError for a tolerance that is about nothing."""
+    """All of them, at every size. Raises SurveyError for a tolerance that is about nothing."""
     judged = verdicts(adjustment, tolerances, scale)
-    if adjustment.n_observations > LARGE:
-        found = reliability(adjustment)
-        return Statistics(found, adjustment.variance_components, (), (), neighbours(adjustment, scale), (),
-                          correlation_matrix(adjustment), adjustment.decisions, judged)  # fmt: skip
-    system = linear_system(adjustment)
-    components = adjustment.variance_components
+    alpha = adjustment.global_test.alpha if adjustment.global_test is not None else 0.05
+    drawn, near = correlation_matrix(adjustment), neighbours(adjustment, scale)
+    if _is_large_network(adjustment):
+        tested = consistency(adjustment, None, alpha)
+        return Statistics(reliability(adjustment), adjustment.variance_components, (), (), near, (), drawn,
+                          adjustment.decisions, judged, tested, (*tested.left_out, _LARGE_NETWORK))  # fmt: skip
+    condensed = condensed_system(precision_of(adjustment))
+    system, components = condensed.system, adjustment.variance_components
     names = _budgeted(adjustment)
-    budget = uncertainty_budget(adjustment, names, PROBABILITY, components, system) if names else ()
+    budget = uncertainty_budget(adjustment, names[:MOST_BUDGETS], PROBABILITY, components, system) if names else ()
+    tested = consistency(adjustment, condensed, alpha)
     return Statistics(
-        reliability(adjustment, system=system), components, correlations(adjustment, system=system),
-        weak_directions(adjustment, system=system), neighbours(adjustment, scale),
-        tuple(_scaled_budget(x, scale.factor) for x in budget), correlation_matrix(adjustment), adjustment.decisions,
-        judged,
+        reliability(adjustment, system=condensed), components, correlations(adjustment, system=system),
+        weak_directions(adjustment, system=system), near,
+        tuple(_scaled_budget(x, scale.factor) for x in budget), drawn, adjustment.decisions, judged, tested,
+        (*tested.left_out, *_left_out(adjustment, system, len(names))),
     )  # fmt: skip
+
+
+_LARGE_NETWORK = (
+    f"correlations, weak directions, uncertainty budgets and influences: not computed for a network of more than "
+    f"{LARGEST_NETWORK} pairs; the covariance of any stations is there (Solution.covariance)"
+)
+
+
+def _is_large_network(adjustment: Adjustment) -> bool:
+    return isinstance(adjustment.precision, NamedPrecision) and len(adjustment.other_residuals) > LARGEST_NETWORK
+
+
+def _left_out(adjustment: Adjustment, system: LinearSystem, n_budgets: int) -> tuple[str, ...]:
+    """For people: what the statistics show a part of, and which."""
+    out, n = [], len(system.columns)
+    compared = len(compared_columns(system))
+    if compared < n:
+        out.append(
+            f"correlations: {compared} of {n} components were compared with all others, points and then those of "
+            "single epochs last; the rest only within their own unknown"
+        )
+    if n_budgets > MOST_BUDGETS:
+        out.append(f"uncertainty budgets: of {MOST_BUDGETS} of {n_budgets} parameters, points last")
+    places = sum(1 for name in adjustment.estimates if len(name) == 2 and name[0] in ("point", "world_from_station"))
+    if places > MOST_NEIGHBOURS:
+        out.append(f"relative precision: of {MOST_NEIGHBOURS} pairs of neighbours among {places} points and stations")
+    return tuple(out)
 
 
 def _budgeted(adjustment: Adjustment) -> tuple[ParameterName, ...]:
@@ -90,7 +123,7 @@ def _budgeted(adjustment: Adjustment) -> tuple[ParameterName, ...]:
     rank = {"lens": 0, "station_from_camera": 1, "mount_from_station": 2, "world_from_table": 3, "table_geometry": 4,
             "world_from_station": 5, "point": 6}  # fmt: skip
     names = [n for n, e in adjustment.estimates.items() if n[0] in rank and len(n) == 2 and _unknown_components(e)]
-    return tuple(sorted(names, key=lambda n: rank[n[0]])[:MOST_BUDGETS])
+    return tuple(sorted(names, key=lambda n: rank[n[0]]))
 
 
 def _scaled_budget(entry: BudgetEntry, factor: float) -> BudgetEntry:

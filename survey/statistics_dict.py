@@ -7,7 +7,7 @@ import numpy as np
 
 from adjust.result import Adjustment, ParameterName
 from adjust.statistics.reliability import observation_name
-from adjust.statistics.result import BudgetEntry, Component, Influence, RelativePrecision
+from adjust.statistics.result import BudgetEntry, Component, Consistency, Influence, RelativePrecision
 from survey.quantities import Scale, key_of, sigma_unit_for_people
 from survey.statistics import Statistics
 from survey.tolerances import Verdict, coverage
@@ -31,6 +31,8 @@ def statistics_dict(adjustment: Adjustment, found: Statistics, scale: Scale) -> 
              "p_value": x.p, "error_sigmas": x.error, "round": x.round, "how": x.how}
             for x in found.decisions
         ],
+        "consistency": None if found.consistency is None else _consistency(found.consistency),
+        "not_computed": list(found.left_out),
         "reliability": {
             "method": r.criteria.options.method,
             "power": r.criteria.options.power,
@@ -49,6 +51,27 @@ def statistics_dict(adjustment: Adjustment, found: Statistics, scale: Scale) -> 
         ],
         "relative_precision": [_relative(x) for x in found.relative],
         "budget": [_budget(x) for x in found.budget],
+    }  # fmt: skip
+
+
+def _consistency(x: Consistency) -> dict[str, Any]:
+    """Parts by kind and name; amounts of changes in SI units beside the unit."""
+    parts: dict[str, dict[str, Any]] = {}
+    for p in x.parts:
+        parts.setdefault(p.kind, {})[p.name] = {
+            "n_observations": p.n, "redundancy": p.redundancy, "omega": p.omega, "variance_factor": p.factor,
+            "p_value": p.p, "fits": not p.fails,
+        }  # fmt: skip
+    return {
+        "alpha": x.alpha, "level_of_one_test": x.level, "n_tests": x.n_tests, "relative_to_the_rest": x.relative,
+        "parts": parts,
+        "changes": [
+            {"kind": c.kind, "name": c.name, "what": c.what, "from_epoch": c.epoch or None, "test": c.statistic,
+             "freedom": c.freedom, "p_value": c.p,
+             "shifts": [{"component": s.component, "unit": s.unit, "amount": s.amount, "sigma": s.sigma}
+                        for s in c.shifts]}
+            for c in x.changes
+        ],
     }  # fmt: skip
 
 

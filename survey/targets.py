@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.model import FloatArray
+from adjust.model import FloatArray, IntArray
 
 
 def _grid(columns: int, rows: int, spacing_m: float) -> tuple[tuple[str, ...], FloatArray]:
@@ -29,6 +29,18 @@ class Checkerboard:
     def points(self) -> tuple[tuple[str, ...], FloatArray]:
         """Ids and coordinates of the inner corners, row by row."""
         return _grid(self.columns, self.rows, self.square_m)
+
+    def turns(self) -> tuple[IntArray, ...]:
+        """Turns after which the board looks the same, colours included: where each point (n,) comes to lie; often none.
+
+        Half a turn takes the colours of the squares to themselves where the numbers of inner corners are both even or
+        both odd, a quarter turn where they are equal and even.
+        """
+        place = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
+        if (self.columns + self.rows) % 2:
+            return ()
+        steps = (2, 1, 3) if self.columns == self.rows and self.rows % 2 == 0 else (2,)
+        return tuple(np.rot90(place, step).ravel() for step in steps)
 
 
 @dataclass(frozen=True)

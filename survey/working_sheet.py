@@ -20,6 +20,7 @@ from adjust.observations import FrameRef
 from adjust.result import Adjustment
 from adjust.unknowns import FrameTree
 from survey.files.project import AlignmentTask
+from survey.quantities import SigmaKind, scale_of
 
 State = Literal["aligned", "turn", "measure", "held"]
 ARCSEC = math.pi / 648000.0
@@ -71,15 +72,18 @@ class Sheet:
         return "turn" if "turn" in states else "measure" if "measure" in states else "aligned"
 
 
-def working_sheets(adjustment: Adjustment, tasks: tuple[AlignmentTask, ...], alpha: float = 0.05) -> tuple[Sheet, ...]:
-    """A sheet for every task; sigmas a priori, multiplied by sigma0 only where that is above 1.
+def working_sheets(
+    adjustment: Adjustment, tasks: tuple[AlignmentTask, ...], alpha: float = 0.05, sigmas: SigmaKind | None = None
+) -> tuple[Sheet, ...]:
+    """A sheet for every task; where no ``sigmas`` are asked for a priori, times sigma0 only where that is above 1.
 
     Raises SurveyError where the survey observes nothing of a body.
     """
-    return tuple(_sheet(adjustment, task, alpha) for task in tasks)
+    factor = scale_of(adjustment, sigmas).factor
+    return tuple(_sheet(adjustment, task, alpha, factor if sigmas else max(1.0, factor)) for task in tasks)
 
 
-def _sheet(adjustment: Adjustment, task: AlignmentTask, alpha: float) -> Sheet:
+def _sheet(adjustment: Adjustment, task: AlignmentTask, alpha: float, factor: float) -> Sheet:
     onto_from_body, cov = relative_rotation(adjustment, task.body, task.onto)
     D = np.zeros((3, 3), order="F")
     off = np.asarray(Rot3.Logmap(task.onto_from_body.between(onto_from_body), D))
@@ -88,8 +92,7 @@ def _sheet(adjustment: Adjustment, task: AlignmentTask, alpha: float) -> Sheet:
             f"align.{task.task_id}: the body is {np.degrees(np.linalg.norm(off)):.0f} deg off, which is no error of "
             "alignment; give the rotation that is wanted as align.rotation_euler_xyz_deg"
         )
-    worse = max(1.0, adjustment.sigma0) if adjustment.redundancy > 0 else 1.0
-    cov = worse**2 * D @ cov @ D.T
+    cov = factor**2 * D @ cov @ D.T
     k = float(norm.isf(alpha / 2))
     axes = tuple(_axis_state(axis, float(off[i]), float(cov[i, i]) ** 0.5, k, task) for i, axis in enumerate("xyz"))
     to_world, _ = relative_rotation(adjustment, task.body, FrameRef("world"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.chain_kernels import table_motion
+from adjust.chains import table_motion
 from adjust.image_batch import square_root_information, warp_shape
 from adjust.lens import MODELS, lens_constants, project
 from adjust.model import (
@@ -39,10 +39,11 @@ def brown_pixel(x_in_camera: FloatArray) -> FloatArray:
 
 
 def motion(axes: tuple[str, ...], a: FloatArray, tilt: float = 0.0, offset: float = 0.0) -> FloatArray:
-    """(4, 4) table_from_mount of the core's kernel."""
-    R, t = np.zeros((3, 3)), np.zeros(3)
+    """(4, 4) table_from_mount of the core."""
     numbers = ["xyz".index(name) for name in axes] + [-1]
-    table_motion(numbers[0], numbers[1], a[0], a[1], tilt, offset, R, t, np.zeros((6, 4)))
+    (R,), (t,), _ = table_motion(
+        numbers[0], numbers[1], a[:1], np.append(a, 0.0)[1:2], np.array([tilt]), np.array([offset])
+    )
     return Pose3(Rot3(R), t).matrix()
 
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from survey.cli import build_parser, main
 from survey.completion import SHELLS, commands_of
@@ -95,3 +96,24 @@ def test_help_opens_with_a_command_and_names_the_next(capsys: pytest.CaptureFixt
         out = capsys.readouterr().out
         assert out.startswith(f"usage: labsurvey {command.name}")
         assert "Next: " in out
+
+
+def test_changes_citation_and_metadata_speak_of_the_same_version() -> None:
+    metadata = configparser.ConfigParser()
+    metadata.read(ROOT / "setup.cfg", encoding="utf-8")
+    version, author = metadata["metadata"]["version"], metadata["metadata"]["author"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert (citation["version"], citation["license"]) == (version, metadata["metadata"]["license"])
+    assert [a["name"] for a in citation["authors"]] == [author]
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    headings = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
+    assert version in headings[:2]
+    assert headings[0] in ("Unreleased", version)
+
+
+def test_every_entry_page_says_how_to_install() -> None:
+    pages = [ROOT / "README.md", ROOT / "docs" / "index.md", *(ROOT / "docs" / "tutorials").glob("*.md")]
+    pages += [ROOT / "docs" / f"{name}.md" for name in (
+        "report", "batch", "capture", "planning", "navigation", "networks", "relay", "formats", "python",
+        "observations", "hand-eye")]  # fmt: skip
+    assert [p.name for p in pages if "pip install ." not in p.read_text(encoding="utf-8")] == []

@@ -1,38 +1,37 @@
 """Solutions without a start: pure functions of arrays, each with the source of its formula."""
 
-from adjust.closed_forms.absolute_pose import (
-    PLANAR,
-    WIDEST,
-    PoseCandidates,
-    absolute_pose,
-    pose_solutions,
-    refine_poses,
-    view_errors,
-)
+from adjust.closed_forms.absolute_pose import PoseCandidates, absolute_pose, best_poses, pose_solutions
 from adjust.closed_forms.averaging import mean_pose, mean_rotation, pose_distance
-from adjust.closed_forms.hand_eye import degenerate_direction, relative_motions, solve_ax_xb, solve_ax_zb
-from adjust.closed_forms.homography import apply_homography, homography
+from adjust.closed_forms.hand_eye import (
+    degenerate_direction,
+    relative_motions,
+    solve_ax_xb,
+    solve_ax_zb,
+    solve_views,
+)
+from adjust.closed_forms.planes import homographies, plane_misfits, plane_poses
 from adjust.closed_forms.rigid import align, inverse, nearest_rotation, rigid, rotation_exp, rotation_log, transform
 from adjust.closed_forms.triangulation import Intersection, intersect
+from adjust.closed_forms.views import refine_poses, tangent_axes, view_errors, view_offsets
 from adjust.closed_forms.zhang import PinholeStart, pinhole_from_homographies, radial_distortion
 
 __all__ = [
-    "PLANAR",
-    "WIDEST",
     "Intersection",
     "PinholeStart",
     "PoseCandidates",
     "absolute_pose",
     "align",
-    "apply_homography",
+    "best_poses",
     "degenerate_direction",
-    "homography",
+    "homographies",
     "intersect",
     "inverse",
     "mean_pose",
     "mean_rotation",
     "nearest_rotation",
     "pinhole_from_homographies",
+    "plane_misfits",
+    "plane_poses",
     "pose_distance",
     "pose_solutions",
     "radial_distortion",
@@ -43,6 +42,9 @@ __all__ = [
     "rotation_log",
     "solve_ax_xb",
     "solve_ax_zb",
+    "solve_views",
+    "tangent_axes",
     "transform",
     "view_errors",
+    "view_offsets",
 ]

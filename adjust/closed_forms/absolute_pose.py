@@ -5,15 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.closed_forms.plane_kernels import first_poses, plane_poses
+from adjust.closed_forms.planes import PLANAR, WIDEST, plane_poses
 from adjust.closed_forms.rigid import rigid, rotation_exp, rotation_to
-from adjust.closed_forms.view_kernels import errors_of_views, refine_views
+from adjust.closed_forms.views import refine_poses, view_errors
 from adjust.errors import SurveyError
-from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.parallel import run_split, split_blocks
-
-PLANAR = 1e-4  # thickness against extent below which points count as a plane
-WIDEST = float(np.cos(np.deg2rad(80.0)))  # rays further off the mean direction are left to the refinement
+from adjust.model import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,24 +37,20 @@ def absolute_pose(x: FloatArray, rays: FloatArray, refinements: int = 5) -> Pose
 def best_poses(x: Sequence[FloatArray], rays: Sequence[FloatArray], refinements: int) -> tuple[FloatArray, FloatArray]:
     """The best pose (B, 4, 4) of :func:`absolute_pose` in every view and its error (B,) rad, infinite where none is."""
     n, ptr = len(x), np.cumsum([0] + [len(part) for part in x])
-    poses, error = np.tile(np.eye(4), (n, 2, 1, 1)), np.full((n, 2), np.inf)
-    in_front, planar = np.zeros((n, 2), dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+    poses, error, planar = np.tile(np.eye(4), (n, 2, 1, 1)), np.full((n, 2), np.inf), np.zeros(n, dtype=np.bool_)
     if n:
         all_x, all_rays = np.concatenate(x), np.concatenate(rays)
-        run_split(first_poses, split_blocks(ptr), all_x, all_rays, ptr, PLANAR, WIDEST, poses, error, in_front, planar)
-    for k in range(2 if planar.any() else 0):
-        mine = np.ascontiguousarray(poses[:, k])
-        refine_views(mine, all_x, all_rays, ptr, refinements, False)
-        rms, front = np.empty(n), np.empty(n, dtype=np.bool_)
-        errors_of_views(mine, all_x, all_rays, ptr, rms, front)
-        poses[:, k], error[:, k], in_front[:, k] = mine, rms, front
-    error[~in_front | ~planar[:, None]] = np.inf
+        poses, planar = plane_poses(all_x, all_rays, ptr)
+        of = np.repeat(np.flatnonzero(planar), 2)
+        found = refine_poses(poses[planar].reshape(-1, 4, 4), all_x, all_rays, ptr, refinements, of=of)
+        rms, in_front = view_errors(found, all_x, all_rays, ptr, of)
+        poses[planar], error[planar] = found.reshape(-1, 2, 4, 4), np.where(in_front, rms, np.inf).reshape(-1, 2)
     for i in np.flatnonzero(~planar).tolist():
         try:
-            found = absolute_pose(x[i], rays[i], refinements)
+            others = absolute_pose(x[i], rays[i], refinements)
         except SurveyError:
             continue
-        poses[i, 0], error[i, 0] = found.camera_from_target[0], found.error[0]
+        poses[i, 0], error[i, 0] = others.camera_from_target[0], others.error[0]
     best = np.argmin(error, axis=1)
     return poses[np.arange(n), best], error[np.arange(n), best]
 
@@ -67,8 +59,8 @@ def pose_solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
     """The unrefined poses (k, 4, 4) of :func:`absolute_pose`, in no order and not checked for what lies in front."""
     if len(x) < 3:
         raise SurveyError(f"a camera pose needs 3 known points, got {len(x)}: observe more of them")
-    both = np.empty((1, 2, 4, 4))
-    if len(x) > 3 and plane_poses(_flat(x), _flat(rays), 0, len(x), PLANAR, WIDEST, 0, both):
+    both, planar = plane_poses(x, rays, np.array([0, len(x)]))
+    if planar[0]:
         return np.asarray(both[0])
     mean = rays.mean(axis=0)
     front_from_camera = rotation_to(mean, np.array([0.0, 0.0, 1.0]))
@@ -83,14 +75,14 @@ def pose_solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
 
 
 def _refined(poses: FloatArray, x: FloatArray, rays: FloatArray, refinements: int) -> PoseCandidates:
-    k, n = len(poses), len(x)
-    if k:
-        ptr = np.arange(k + 1) * n
-        poses = refine_poses(poses, np.tile(x, (k, 1)), np.tile(rays, (k, 1)), ptr, refinements)
-        error, in_front = view_errors(poses, np.tile(x, (k, 1)), np.tile(rays, (k, 1)), ptr)
-        poses, error = poses[in_front], error[in_front]
+    ptr, of = np.array([0, len(x)]), np.zeros(len(poses), dtype=np.int64)
+    poses = refine_poses(poses, x, rays, ptr, refinements, of=of)
+    error, in_front = view_errors(poses, x, rays, ptr, of)
+    poses, error = poses[in_front], error[in_front]
     if not len(poses):
-        raise SurveyError(f"no camera pose has all {n} points in front: they are mis-identified or the lens is wrong")
+        raise SurveyError(
+            f"no camera pose has all {len(x)} points in front: they are mis-identified or the lens is wrong"
+        )
     order = np.argsort(error, kind="stable")
     poses, error = poses[order], error[order]
     keep = [i for i in range(len(poses)) if not any(np.allclose(poses[i], poses[j], atol=1e-6) for j in range(i))]
@@ -141,47 +133,3 @@ def _methods(n: int, thin: bool) -> tuple[int | None, ...]:
     if thin:
         return (cv2.SOLVEPNP_IPPE,)
     return (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_EPNP) if n >= 6 else (cv2.SOLVEPNP_SQPNP,)
-
-
-def tangent_axes(rays: FloatArray) -> FloatArray:
-    """Two unit vectors (n, 2, 3) across each unit ray (n, 3) (Duff et al., J. Comput. Graph. Techn. 6(1), 2017)."""
-    x, y, z = rays.T
-    sign = np.where(z >= 0, 1.0, -1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    out = np.empty((len(rays), 2, 3))
-    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
-    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = b, sign + y * y * a, -y
-    return out
-
-
-def view_errors(
-    camera_from_target: FloatArray, x: FloatArray, rays: FloatArray, ptr: IntArray
-) -> tuple[FloatArray, BoolArray]:
-    """Per view the rms (B,) of its point offsets, rad, and whether (B,) all its points lie in front."""
-    rms, in_front = np.empty(len(ptr) - 1), np.empty(len(ptr) - 1, dtype=np.bool_)
-    errors_of_views(_flat(camera_from_target), _flat(x), _flat(rays), np.asarray(ptr, dtype=np.int64), rms, in_front)
-    return rms, in_front
-
-
-def _flat(array: FloatArray) -> FloatArray:
-    """As the compiled code takes it."""
-    return np.ascontiguousarray(array, dtype=np.float64)
-
-
-def refine_poses(
-    camera_from_target: FloatArray,
-    x: FloatArray,
-    rays: FloatArray,
-    ptr: IntArray,
-    iterations: int = 5,
-    robust: bool = False,
-) -> FloatArray:
-    """Least-squares poses (B, 4, 4) of B views at once, by Levenberg-Marquardt on the offsets across their rays.
-
-    x, rays: (N, 3), view after view; ptr: (B + 1,) row ranges, none empty. With ``robust`` the points of a view carry
-    Cauchy weights at three times its median offset. A view keeps its pose where a step does not lower its error.
-    """
-    poses = np.array(camera_from_target, dtype=np.float64)
-    refine_views(poses, _flat(x), _flat(rays), np.asarray(ptr, dtype=np.int64), iterations, robust)
-    return poses

@@ -6,10 +6,13 @@ import numpy as np
 
 from adjust.closed_forms.rigid import inverse, nearest_rotation, rigid, rotation_log, rotation_to
 from adjust.errors import SurveyError
-from adjust.model import FloatArray
+from adjust.model import FloatArray, IntArray
 
 _SMALLEST_TURN = np.deg2rad(1.0)
 _PARALLEL = 0.02  # second against first singular value of the rotation vectors: about one degree between the axes
+_ONE_NULL_VECTOR = 30.0  # second against first eigenvalue, from which the first alone is a solution
+_SMALLEST_GAP = 1e-4  # the least second eigenvalue of the scaled system
+_ROUNDS = 8
 _FRAMES = "the frame in which the motions A are given"
 
 
@@ -96,6 +99,57 @@ def _kronecker(a: FloatArray, b: FloatArray, weights: FloatArray) -> tuple[Float
     if np.linalg.det(x) < 0:
         x, z = -x, -z
     return nearest_rotation(x), nearest_rotation(z)
+
+
+def solve_views(
+    a: FloatArray, b: FloatArray, first: IntArray, second: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``x`` (m, 4, 4), ``z`` (k, 4, 4) with a_n x[first_n] b_n = z[second_n] for poses a, b (n, 4, 4); weights (n,).
+
+    Several things on what moves before several in the world, each pair seen perhaps only once. Source: the Kronecker
+    form of :func:`solve_ax_zb` for all at once: vec(R_z) = (R_b' kron R_a) vec(R_x), a homogeneous system whose one
+    null vector holds every rotation; translations jointly by least squares. Reweighted. ``first`` and ``second`` number
+    all of 0 ... m - 1 and 0 ... k - 1. Raises SurveyError where the null vector is not the only one: too few views, or
+    all turns about one axis.
+    """
+    m, k = int(first.max()) + 1, int(second.max()) + 1
+    weights = np.ones(len(a))
+    blocks = np.einsum("nkl,nij->nkilj", np.swapaxes(b[:, :3, :3], 1, 2), a[:, :3, :3]).reshape(-1, 9, 9)
+    for _ in range(_ROUNDS):
+        r_x, r_z = _all_rotations(blocks, first, second, weights, m, k)
+        turned = a[:, :3, :3] @ r_x[first] @ b[:, :3, :3]
+        miss = np.linalg.norm(rotation_log(np.swapaxes(r_z[second], -1, -2) @ turned), axis=1)
+        weights = _weights(miss, floor=1e-9)
+    n = len(a)
+    factor = np.zeros((n, 3, 3 * (m + k)))
+    for c in range(3):
+        factor[np.arange(n), :, 3 * first + c] = a[:, :3, c]
+        factor[np.arange(n), c, 3 * (m + second) + c] = -1.0
+    right = -a[:, :3, 3] - np.einsum("nij,nj->ni", a[:, :3, :3] @ r_x[first], b[:, :3, 3])
+    t, shift_weights = _robust_least_squares(factor, right, weights)
+    shifts = t.reshape(-1, 3)
+    return rigid(r_x, shifts[:m]), rigid(r_z, shifts[m:]), weights * shift_weights
+
+
+def _all_rotations(
+    blocks: FloatArray, first: IntArray, second: IntArray, weights: FloatArray, m: int, k: int
+) -> tuple[FloatArray, FloatArray]:
+    """Rotations (m, 3, 3), (k, 3, 3) from the null vector of blocks (n, 9, 9) vec(x) - vec(z) = 0, vec by columns."""
+    N = np.zeros((m + k, m + k, 9, 9))
+    np.add.at(N, (first, first), weights[:, None, None] * np.eye(9))  # the blocks are orthogonal
+    np.add.at(N, (m + second, m + second), weights[:, None, None] * np.eye(9))
+    np.add.at(N, (m + second, first), -weights[:, None, None] * blocks)
+    np.add.at(N, (first, m + second), -weights[:, None, None] * np.swapaxes(blocks, 1, 2))
+    seen = np.sqrt(np.maximum(np.einsum("iijj->i", N) / 9.0, 1e-12))
+    N = (N / seen[:, None, None, None] / seen[None, :, None, None]).swapaxes(1, 2).reshape(9 * (m + k), -1)
+    w, v = np.linalg.eigh(N)
+    if not w[1] > max(_ONE_NULL_VECTOR * max(float(w[0]), 0.0), _SMALLEST_GAP):
+        raise SurveyError("the views leave rotations undetermined: more, or turns about a second axis, are needed")
+    found = (v[:, 0].reshape(m + k, 9) / seen[:, None]).reshape(m + k, 3, 3).swapaxes(1, 2)
+    if np.linalg.det(found / np.linalg.norm(found, axis=(1, 2), keepdims=True)).sum() < 0.0:
+        found = -found
+    r = np.array([nearest_rotation(x) for x in found])
+    return r[:m], r[m:]
 
 
 def _consensus(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -46,11 +46,12 @@ def frame_refs(survey: Survey) -> list[FrameRef]:
     refs = [level.frame for level in survey.levels]
     refs += [ref for a in survey.alignments for ref in (a.a, a.b)]
     for spot in survey.laser_spots:
-        refs += [_carrier(carriers, spot), FrameRef("target", spot.target_id, spot.epoch_id)]
+        refs += [carrier_of(carriers, spot), FrameRef("target", spot.target_id, spot.epoch_id)]
     return refs
 
 
-def _carrier(beams: Mapping[str, Beam], spot: LaserSpot) -> FrameRef:
+def carrier_of(beams: Mapping[str, Beam], spot: LaserSpot) -> FrameRef:
+    """The body that carries a spot's beam. Raises SurveyError for a beam that there is not."""
     if spot.beam_id not in beams:
         raise SurveyError(f"beam {spot.beam_id!r} is observed but not part of the survey; add it or correct the id")
     beam = beams[spot.beam_id]
@@ -66,7 +67,7 @@ class GeometryFactors:
         self.surfaces = {s.surface_id: s for s in survey.surfaces}
         self.starts: dict[ParameterName, FloatArray] = {}
         for spot in survey.laser_spots:
-            _carrier(self.beams, spot)
+            carrier_of(self.beams, spot)
             self._register(("beam", spot.beam_id), self.beams[spot.beam_id].parameters, BEAM_UNITS)
         for observation in survey.on_surfaces:
             surface = self._surface(observation)
@@ -92,7 +93,7 @@ class GeometryFactors:
         return self.surfaces[observation.surface_id]
 
     def _spot_chain(self, spot: LaserSpot) -> Chain:
-        return self.frames.relative(_carrier(self.beams, spot), FrameRef("target", spot.target_id, spot.epoch_id))
+        return self.frames.relative(carrier_of(self.beams, spot), FrameRef("target", spot.target_id, spot.epoch_id))
 
     def find_starts(
         self,

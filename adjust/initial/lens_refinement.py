@@ -1,11 +1,11 @@
 """Lens and target poses of one camera together, by a small Levenberg-Marquardt with the poses eliminated."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from adjust.closed_forms import rigid, rotation_exp
-from adjust.initial.refinement_kernels import lens_and_poses
 from adjust.lens import LensModel, lens_derivatives, lens_residuals
 from adjust.model import FloatArray, IntArray
 
@@ -105,12 +105,25 @@ def _normal_equations(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Lens block (p, p), mixed (B, 6, p), pose blocks (B, 6, 6) and right sides (p,), (B, 6)."""
     r, by_values, by_point = lens_derivatives(model, values, constants, p, uv)
-    m, n = directions.shape[1], len(ptr) - 1
-    out = (np.zeros((m, m)), np.zeros((n, 6, m)), np.zeros((n, 6, 6)), np.zeros(m), np.zeros((n, 6)))
-    a = (by_values.reshape(-1, len(values)) @ directions).reshape(len(p), 2, m)
-    by_point = np.ascontiguousarray(by_point)
-    lens_and_poses(np.asarray(ptr, dtype=np.int64), p, r, a, by_point, weights, *out)
-    return out
+    a = (by_values.reshape(-1, len(values)) @ directions).reshape(len(p), 2, directions.shape[1])
+    return lens_and_poses(ptr, p, r, a, by_point, weights)
+
+
+def lens_and_poses(
+    ptr: IntArray, p: FloatArray, r: FloatArray, a: FloatArray, by_point: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Lens block (m, m), mixed blocks (B, 6, m), pose blocks (B, 6, 6) and right sides (m,), (B, 6).
+
+    p: (N, 3) points in the camera. r: (N, 2) residuals. a: (N, 2, m) and by_point: (N, 2, 3) their derivatives.
+    weights: (N,). The tangent of a pose is a turn, then a shift, in the camera's frame.
+    """
+    turn = np.cross(p[:, None], by_point)  # d (turn x p) = by_point . (turn x p) = turn . (p x by_point)
+    rows = np.concatenate([turn, by_point, a, r[:, :, None]], axis=2)
+    weighted = (weights[:, None, None] * rows).reshape(-1, rows.shape[2])
+    rows = rows.reshape(weighted.shape)
+    N = np.array([weighted[2 * i : 2 * j].T @ rows[2 * i : 2 * j] for i, j in pairwise(ptr.tolist())])
+    lens = N[:, 6:, 6:].sum(axis=0)
+    return lens[:-1, :-1], N[:, :6, 6:-1], N[:, :6, :6], lens[:-1, -1], N[:, :6, -1]
 
 
 def _step(

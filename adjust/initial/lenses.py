@@ -5,9 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.closed_forms import homography, pinhole_from_homographies
-from adjust.closed_forms.absolute_pose import best_poses
-from adjust.closed_forms.plane_kernels import plane_misfits
+from adjust.closed_forms import best_poses, homographies, pinhole_from_homographies, plane_misfits
 from adjust.errors import SurveyError
 from adjust.initial.lens_refinement import LensFit, fit_lens
 from adjust.lens import (
@@ -124,9 +122,8 @@ class _LensSearch:
 
     def _screen(self, flat: Sequence[Sighting]) -> tuple[list[Sighting], dict[int, str]]:
         """Images whose points lie as on a plane; a wrong point order misses by a good part of the image."""
-        misfit = np.empty(len(flat))
         ptr = np.cumsum([0] + [len(s.x) for s in flat])
-        plane_misfits(np.concatenate([s.x for s in flat]), np.concatenate([s.uv for s in flat]), ptr, misfit)
+        misfit = plane_misfits(np.concatenate([s.x for s in flat]), np.concatenate([s.uv for s in flat]), ptr)
         limit = max(0.02, 6.0 * float(np.median(misfit)))
         good = [s for s, m in zip(flat, misfit, strict=True) if m <= limit]
         excluded = {
@@ -141,10 +138,11 @@ class _LensSearch:
         if flat and self.model.name != "fisheye":
             plane = {id(s.x): s.x for s in flat}  # one for all images that show the same array of points
             on_plane = {key: _unit(_plane_coordinates(x)) for key, x in plane.items()}
-            h = np.array([homography(on_plane[id(s.x)], s.uv)[0] for s in flat])
-            for variants in (("full",), ("centred", "square")):
+            xy, ptr = [on_plane[id(s.x)] for s in flat], np.cumsum([0] + [len(s.x) for s in flat])
+            h, _, good = homographies(np.concatenate(xy), np.concatenate([s.uv for s in flat]), ptr)
+            for variants in (("full",), ("centred", "square")) if good.any() else ():
                 try:
-                    found = pinhole_from_homographies(h, self.size, variants)
+                    found = pinhole_from_homographies(h[good], self.size, variants)
                 except SurveyError:
                     continue
                 values = self._values(

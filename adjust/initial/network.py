@@ -18,6 +18,8 @@ from adjust.result import ParameterName
 from adjust.unknowns import Chain, FrameTree, Unknowns
 
 IDENTITY = np.eye(4)
+_CONTRADICTION = np.deg2rad(10.0)
+"""Two poses that differ by more, as an angle at the typical distance, have no mean."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,12 +170,15 @@ class PoseNetwork:
         """
         if rotation_only:  # full poses say more than rotations
             said = [s for s in said if not s[0].rotation_only] or said
-        offers = [offer for _, offer in said]
+        # images before pairs: a whole image is wrong less often than the ends of a pair are exchanged
+        offers = [offer for _, offer in sorted(said, key=lambda s: s[0].block_idx < 0)]
         if len(offers) == 1:
             return np.asarray(offers[0][0])
         if len(offers) == 2:  # the pair of solutions in which the two agree
             d = pose_distance(offers[0][:, None], offers[1][None], self.lever)
             i, j = np.unravel_index(int(np.argmin(d)), d.shape)
+            if d[i, j] > _CONTRADICTION * self.lever:  # a mean of right and wrong is wrong for certain
+                return np.asarray(offers[0][0])
             return mean_pose(np.stack([offers[0][i], offers[1][j]]), self.lever)[0]
         members = np.repeat(np.arange(len(offers)), [len(o) for o in offers])
         return mean_pose(np.concatenate(offers), self.lever, members)[0]

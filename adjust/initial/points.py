@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from adjust.closed_forms import intersect, inverse
-from adjust.errors import SurveyError
+from adjust.initial import views as single
 from adjust.initial.network import ChainObservation, PoseNetwork
-from adjust.initial.views import View, block_text, make_view, refine_views, used_rows
+from adjust.initial.views import View, block_text, make_views, refine_views, used_rows
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.unknowns import Chain
 
@@ -32,16 +32,34 @@ class Sight:
 
 @dataclass(eq=False)
 class PointField:
-    """The world's points, (n, 3) m: nan until known. ``given`` (n,): coordinates that came with the survey."""
+    """The world's points, (n, 3) m: nan until known. ``given`` (n,): coordinates that came with the survey.
+
+    rough (n,): given ones that nothing but a start value tells. They stay unknown, and may be intersected, while there
+    is firmer ground to go on from (targets), until they are ``released``.
+    """
 
     x: FloatArray
     given: BoolArray
+    rough: BoolArray
     sights: list[Sight] = field(default_factory=list)
+    released: bool = False
 
     @property
     def known(self) -> BoolArray:
-        """Which points (n,) have coordinates by now."""
-        return np.asarray(np.isfinite(self.x[:, 0]))
+        """Which points (n,) have coordinates by now that may be used."""
+        known = np.isfinite(self.x[:, 0])
+        return np.asarray(known if self.released else known & ~self.rough)
+
+    def release(self) -> bool:
+        """Use the rough ones from now on; whether that is news."""
+        news = not self.released and bool(self.rough.any())
+        self.released = True
+        return news
+
+    def place(self, rows: BoolArray, x: FloatArray) -> None:
+        """Set coordinates that were found; they are no given ones any more."""
+        self.x[rows] = x[rows]
+        self.given[rows] = self.rough[rows] = False
 
     def add(self, survey: Survey, block_idx: int, rays: FloatArray, focal_px: float, chain: Chain) -> None:
         """Take in a block of world points."""
@@ -59,7 +77,7 @@ class PointField:
 
 
 def point_field(survey: Survey) -> PointField:
-    """The points of a survey with their given or observed coordinates."""
+    """The points of a survey, given or observed; those with a start value are rough where targets are seen."""
     x = np.full((len(survey.points), 3), np.nan)
     index = {p.point_id: i for i, p in enumerate(survey.points)}
     for observed in survey.coordinates:
@@ -67,25 +85,27 @@ def point_field(survey: Survey) -> PointField:
         for ref, value, whole in zip(observed.positions, observed.values, finite, strict=True):
             if ref.frame is None and ref.point_id in index and observed.used and whole:
                 x[index[ref.point_id]] = value
+    firm = np.isfinite(x[:, 0])
     for i, point in enumerate(survey.points):
-        if point.x_in_world.value is not None:
+        known = point.x_in_world.treatment != "free" or bool(point.x_in_world.held)
+        if point.x_in_world.value is not None and (known or not firm[i]):  # what was observed tells more than a start
             x[i] = point.x_in_world.value
-    return PointField(x, np.asarray(np.isfinite(x[:, 0])))
+            firm[i] |= known
+    given = np.asarray(np.isfinite(x[:, 0]))
+    boards = any(b.target_id is not None for b in survey.image_blocks)
+    return PointField(x, given, given & ~firm, released=not boards)
 
 
 def resect(network: PoseNetwork, points: PointField) -> bool:
     """Give a pose to the blocks that see enough known points and have none yet; whether there were any."""
     have = {o.block_idx for o in network.observations}
-    views, sights = [], {}
     known = points.known
-    for sight in points.sights:
-        if sight.block_idx in have or not network.unknown_links(sight.chain) or known[sight.rows].sum() < 3:
-            continue
-        try:
-            views.append(_view(sight, points, known))
-            sights[sight.block_idx] = sight
-        except SurveyError:  # on a line, or none in front: other blocks may do
-            continue
+    views = _views(
+        [s for s in points.sights
+         if s.block_idx not in have and network.unknown_links(s.chain) and known[s.rows].sum() >= 3],
+        points,
+    )  # fmt: skip
+    sights = {s.block_idx: s for s in points.sights}
     # three points fit up to four poses exactly: they count only where nothing better is left
     strong = [v for v in views if len(v.x) >= 4]
     if not strong and _resect_together(network, points):
@@ -96,9 +116,13 @@ def resect(network: PoseNetwork, points: PointField) -> bool:
     return bool(views)
 
 
-def _view(sight: Sight, points: PointField, known: BoolArray) -> View:
-    rows = known[sight.rows]
-    return make_view(sight.block_idx, points.x[sight.rows][rows], sight.rays[rows], sight.focal_px)
+def _views(sights: Sequence[Sight], points: PointField) -> list[View]:
+    """Views of the known points; not those on a line, or none in front: other blocks may do."""
+    seen = []
+    for s in sights:
+        rows = points.known[s.rows]
+        seen.append(single.Sight(s.block_idx, points.x[s.rows][rows], s.rays[rows], s.focal_px))
+    return make_views(seen)[0]
 
 
 def _resect_together(network: PoseNetwork, points: PointField) -> bool:
@@ -168,31 +192,26 @@ def intersect_points(network: PoseNetwork, points: PointField, parallax: float, 
     ahead = np.ones(len(points.x), dtype=bool)
     behind = np.bincount(row, weights=found.residual > np.pi / 2, minlength=len(points.x))
     ahead &= 2 * behind < np.bincount(row, minlength=len(points.x))
-    good = (found.parallax > parallax) & np.isfinite(found.x[:, 0]) & ahead & ~points.given
+    wanted = np.where(points.rough, PARALLAX[0], parallax)  # a rough value is better than rays almost in line
+    good = (found.parallax > wanted) & np.isfinite(found.x[:, 0]) & ahead & ~(points.given & points.known)
     new = good & ~points.known
-    points.x[good if renew else new] = found.x[good if renew else new]
+    points.place(good if renew else new, found.x)
     return int(new.sum())
 
 
 def improve(network: PoseNetwork, points: PointField, movable: set[int]) -> None:
     """One round: every block's pose from all points now known, the movable poses from these, and the points again."""
-    views, sights = [], {}
     known = points.known
-    for sight in points.sights:
-        if network.unknown_links(sight.chain) or known[sight.rows].sum() < 4:
-            continue
-        try:
-            view = _view(sight, points, known)
-        except SurveyError:
-            continue
-        present = network.product(sight.chain)[None]
-        views.append(replace(view, poses=np.concatenate([present, view.poses])))
-        sights[sight.block_idx] = sight
+    placed = [s for s in points.sights if not network.unknown_links(s.chain) and known[s.rows].sum() >= 4]
+    sights = {s.block_idx: s for s in placed}
+    found = _views(placed, points)
+    present = network.products([sights[v.block_idx].chain for v in found])
+    views = [replace(v, poses=np.concatenate([at[None], v.poses])) for v, at in zip(found, present, strict=True)]
     renewed = {
         v.block_idx: ChainObservation(sights[v.block_idx].chain, v.poses, sights[v.block_idx].text, v.block_idx)
         for v in refine_views(views)
     }
     network.observations = [renewed.pop(o.block_idx, o) for o in network.observations] + list(renewed.values())
-    touched = {link.slot for sight in sights.values() for link in sight.chain}
+    touched = {link.slot for view in views for link in sights[view.block_idx].chain}
     network.relax(movable & touched)
     intersect_points(network, points, PARALLAX[1], renew=True)

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csc_array
 
-from adjust.closed_forms import inverse, pose_distance, rigid, rotation_exp, rotation_log
-from adjust.closed_forms.absolute_pose import tangent_axes
+from adjust.closed_forms import inverse, pose_distance, rigid, rotation_exp, rotation_log, tangent_axes
 from adjust.closed_forms.rigid import skew
 from adjust.initial.network import ChainObservation, PoseNetwork
 from adjust.initial.views import View

@@ -1,10 +1,12 @@
 """From a survey to start values: lenses, the pose of every view, then the network of frames and points."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import numpy as np
 from gtsam import Pose3
 
-from adjust.closed_forms import align, rigid
-from adjust.closed_forms.view_kernels import offsets_of_views
+from adjust.closed_forms import align, pose_distance, rigid, view_offsets
 from adjust.errors import SurveyError
 from adjust.geometry.building import frame_refs, position_refs
 from adjust.initial.gauge import fix_one_gauge, frames_of, world_is_free
@@ -31,7 +33,6 @@ from adjust.initial.views import (
 )
 from adjust.model import FloatArray, Survey
 from adjust.observations import ImageBlock, PositionRef
-from adjust.parallel import run_split, split_blocks
 from adjust.result import ParameterName
 from adjust.terrestrial.building import reading_refs
 from adjust.unknowns import Chain, FrameTree, Unknowns
@@ -60,11 +61,34 @@ def find_start(survey: Survey) -> Start:
     return search.result()
 
 
-class _Search:
-    """The state of one search."""
+def turns_of_views(survey: Survey, turned: Mapping[str, FloatArray]) -> dict[int, int]:
+    """How the target of each block must be turned to agree with the other blocks, by position in ``image_blocks``.
 
-    def __init__(self, survey: Survey) -> None:
+    turned: by target id the motions (m, 4, 4) target_from_turned after which the target looks the same. 0 for a block
+    that is named as the others are, else 1 + the position of the motion; no entry where nothing tells.
+    Raises SurveyError as :func:`find_start`.
+    """
+    search = _Search(survey, turned)
+    search.find_lenses()
+    search.find_views()
+    search.solve()
+    out = {}
+    for i, view in search.views.items():
+        motions = turned.get(str(survey.image_blocks[i].target_id))
+        if motions is None or search.network.unknown_links(search.chains[i]):
+            continue
+        camera_from_target = search.network.product(search.chains[i])
+        away = pose_distance(search.alternatives(i, view.poses), camera_from_target, search.network.lever)
+        out[i] = int(np.argmin(away)) // len(view.poses)
+    return out
+
+
+class _Search:
+    """The state of one search. turned: see :func:`turns_of_views`."""
+
+    def __init__(self, survey: Survey, turned: Mapping[str, FloatArray] = MappingProxyType({})) -> None:
         self.survey = survey
+        self.turned = turned
         self.targets = {t.target_id: t for t in survey.targets}
         self.target_x: dict[str, FloatArray] = {}
         self.seen_x: dict[tuple[str, bytes], FloatArray] = {}
@@ -124,7 +148,11 @@ class _Search:
                 rows = used_rows(block) & known[block.point_idx]
                 sightings[block.camera_id].append(Sighting(i, self.points.x[block.point_idx[rows]], block.uv[rows]))
         for camera in self.survey.cameras:
-            found = start_lens(camera, [s for s in sightings[camera.camera_id] if len(s.x)])
+            mine = [s for s in sightings[camera.camera_id] if len(s.x)]
+            if not mine and camera.lens.values is None and self.points.release():
+                self.find_lenses()  # no target shows it: the points as they are given have to do
+                return
+            found = start_lens(camera, mine)
             self.lenses[camera.camera_id] = found.values
             self.notes.append(f"camera {camera.camera_id!r}: {found.note}")
             for i, reason in found.excluded.items():
@@ -154,10 +182,15 @@ class _Search:
         self.views = {v.block_idx: v for v in refined}
         for i, view in self.views.items():
             text = block_text(self.survey.image_blocks[i])
-            observation = ChainObservation(self.chains[i], view.poses, text, i)
+            observation = ChainObservation(self.chains[i], self.alternatives(i, view.poses), text, i)
             (self.doubtful if i in self.reasons else self.network.observations).append(observation)
         distances = [float(np.linalg.norm(v.poses[0][:3, 3])) for v in refined]
         self.network.lever = float(np.median(distances)) if distances else 1.0
+
+    def alternatives(self, i: int, poses: FloatArray) -> FloatArray:
+        """Poses (k, 4, 4) of a block as named, then after every motion that its target cannot be told from."""
+        motions = self.turned.get(str(self.survey.image_blocks[i].target_id), ())
+        return np.concatenate([poses, *(poses @ motion for motion in motions)])
 
     def solve(self) -> None:
         """Determine all poses and points, the safest first; what floats is set freely one by one."""
@@ -199,10 +232,12 @@ class _Search:
         if slot is not None:
             self.notes.append(f"{' '.join(network.names[slot])}: set freely, no observation tells it")
             return True
-        note = solve_motion(network)
+        note = solve_motion(network, degenerate=points.released)
         if note is not None:
             self.notes.append(note)
             self.motion_solved = True
+            return True
+        if points.release():
             return True
         if network.propagate(rotation_only=True):
             return True
@@ -215,7 +250,7 @@ class _Search:
     def _unseen_chains(self) -> list[ChainObservation]:
         """Chains of blocks of world points that have no pose yet; they bind the world as soon as any point is known."""
         have = {o.block_idx for o in self.network.observations}
-        bound = bool(self.points.known.any())
+        bound = bool(self.points.known.any() or self.points.rough.any())
         return [
             ChainObservation(s.chain, np.zeros((0, 4, 4)), s.text, s.block_idx, ends=(True, bound))
             for s in self.points.sights
@@ -301,13 +336,17 @@ class _Search:
         trusted = [i for i in range(len(rms)) if i not in self.reasons and np.isfinite(rms[i])]
         if not trusted:
             return
-        limit = max(15.0, _OFF * float(np.median([rms[i] for i in trusted])))
+        # blocks of points that are where a start value puts them are measured by their own kind
+        rough = {s.block_idx for s in self.points.sights if self.points.rough[s.rows].any()}
+        kinds = [[i for i in trusted if (i in rough) == kind and np.isfinite(rms[i])] for kind in (False, True)]
+        typical = [float(np.median(rms[kind])) if kind else 0.0 for kind in kinds]
         for i in range(len(rms)):
+            limit = max(15.0, _OFF * typical[i in rough])
             if i not in self.reasons and rms[i] > limit:
                 what = "has points behind the camera" if np.isinf(rms[i]) else f"is {rms[i]:.1f} px off"
                 text = block_text(self.survey.image_blocks[i])
                 self.reasons[i] = (
-                    f"{text}: {what} where the other blocks put it (typical: {np.median(rms[trusted]):.1f} px)"
+                    f"{text}: {what} where the other blocks put it (typical: {typical[i in rough]:.1f} px)"
                 )
 
     def _block_rms(self) -> FloatArray:
@@ -320,10 +359,8 @@ class _Search:
         seen = [self.views.get(i) or sights[i] for i in blocks]
         x = [s.x if isinstance(s, View) else self.points.x[s.rows] for s in seen]
         ptr = np.cumsum([0] + [len(part) for part in x])
-        offsets, medians = np.empty(int(ptr[-1])), np.empty(len(blocks))
         poses = self.network.products([self.chains[i] for i in blocks])
-        rays = np.concatenate([s.rays for s in seen])
-        run_split(offsets_of_views, split_blocks(ptr), poses, np.concatenate(x), rays, ptr, offsets, medians)
+        medians = view_offsets(poses, np.concatenate(x), np.concatenate([s.rays for s in seen]), ptr)[1]
         # the median of a circular normal's radius is 1.18 sigma, its rms 1.41 sigma
         rms[blocks] = 1.2 * np.array([s.focal_px for s in seen]) * medians
         return rms

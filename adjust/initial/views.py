@@ -6,18 +6,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from adjust.closed_forms import PLANAR, WIDEST, pose_solutions, view_errors
-from adjust.closed_forms.plane_kernels import first_poses
-from adjust.closed_forms.view_kernels import offsets_of_views, refine_candidates
+from adjust.closed_forms import plane_poses, pose_solutions, refine_poses, view_errors, view_offsets
 from adjust.errors import SurveyError
 from adjust.lens import camera_constants, focal_length_px, lens_model, unit_rays
 from adjust.model import BoolArray, Camera, FloatArray, IntArray, Survey, Target
 from adjust.observations import ImageBlock
-from adjust.parallel import run_split, split_blocks
 
 _RIVAL = 4.0  # a second pose whose error is within this factor of the best stays a candidate
 _NOISE_PX = 0.3  # ... or within this much of it
 _ENOUGH = 36  # points of a view from which its pose is found before all of them refine it
+_ALL_STEPS = 2  # of refinement with all points of a view
 _GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustworthy
 
 
@@ -106,37 +104,23 @@ class Sight:
 
 def make_views(sights: Sequence[Sight]) -> tuple[list[View], dict[int, str]]:
     """Views with their unrefined candidate poses, and for every block that has none the reason."""
-    n = len(sights)
-    poses, error = np.empty((n, 2, 4, 4)), np.zeros((n, 2))
-    in_front, planar = np.zeros((n, 2), dtype=np.bool_), np.empty(n, dtype=np.bool_)
-    if n:
-        rows, ptr = _samples(sights)
-        x, rays = np.concatenate([s.x for s in sights])[rows], np.concatenate([s.rays for s in sights])[rows]
-        run_split(first_poses, split_blocks(ptr), x, rays, ptr, PLANAR, WIDEST, poses, error, in_front, planar)
-    views: list[View] = []
-    failed: dict[int, str] = {}
-    error *= np.array([s.focal_px for s in sights]).reshape(-1, 1)
-    count = _rank_pairs(poses, error, in_front).tolist()
-    for i, (s, plane) in enumerate(zip(sights, planar.tolist(), strict=True)):
-        if plane:
-            views.append(View(s.block_idx, s.x, s.rays, s.focal_px, poses[i, : count[i]], error[i, : count[i]]))
-            continue
+    if not sights:
+        return [], {}
+    rows, ptr = _samples(sights)
+    x, rays = np.concatenate([s.x for s in sights])[rows], np.concatenate([s.rays for s in sights])[rows]
+    both, planar = plane_poses(x, rays, ptr)
+    candidates, failed = list(both), {}
+    for i in np.flatnonzero(~planar).tolist():
+        part = slice(ptr[i], ptr[i + 1])
         try:
-            views.append(make_view(s.block_idx, s.x, s.rays, s.focal_px))
+            candidates[i] = pose_solutions(x[part], rays[part])
+            if not len(candidates[i]):
+                n = len(sights[i].x)
+                raise SurveyError(f"no camera pose explains its {n} points; check their order and coordinates")
         except SurveyError as reason:
-            failed[s.block_idx] = str(reason)
-    return views, failed
-
-
-def make_view(block_idx: int, x: FloatArray, rays: FloatArray, focal: float) -> View:
-    """A view with its unrefined candidate poses; raises SurveyError where there are none."""
-    few = _sample(len(x))
-    poses = pose_solutions(x[few], rays[few])
-    if not len(poses):
-        raise SurveyError(f"no camera pose explains its {len(x)} points; check their order and coordinates")
-    ptr = np.arange(len(poses) + 1) * len(few)
-    error, in_front = view_errors(poses, np.tile(x[few], (len(poses), 1)), np.tile(rays[few], (len(poses), 1)), ptr)
-    return _ranked(Sight(block_idx, x, rays, focal), poses, error * focal, in_front)
+            candidates[i], failed[sights[i].block_idx] = np.zeros((0, 4, 4)), str(reason)
+    of, poses = np.repeat(np.arange(len(sights)), [len(c) for c in candidates]), np.concatenate(candidates)
+    return _with_poses(sights, poses, *view_errors(poses, x, rays, ptr, of), of), failed
 
 
 @lru_cache(maxsize=256)
@@ -145,7 +129,7 @@ def _sample(n: int) -> IntArray:
     return np.arange(n) if n <= _ENOUGH else np.sort(np.random.default_rng(n).permutation(n)[:_ENOUGH])
 
 
-def _samples(views: "Sequence[View | Sight]") -> tuple[IntArray, IntArray]:
+def _samples(views: Sequence[View | Sight]) -> tuple[IntArray, IntArray]:
     """Rows of all views' points, one after the other, that :func:`_sample` takes, and where each view's begin."""
     sizes = [len(v.x) for v in views]
     starts = np.cumsum([0, *sizes[:-1]])
@@ -162,43 +146,50 @@ def refine_views(views: Sequence[View], iterations: int = 8) -> list[View]:
     if not views:
         return []
     ptr = np.cumsum([0] + [len(v.x) for v in views])
-    first = np.cumsum([0] + [len(v.poses) for v in views])
+    of = np.repeat(np.arange(len(views)), [len(v.poses) for v in views])
+    poses = np.concatenate([v.poses for v in views])
     x, rays = np.concatenate([v.x for v in views]), np.concatenate([v.rays for v in views])
-    poses, focal = np.concatenate([v.poses for v in views]), np.array([v.focal_px for v in views])
-    error, in_front, kept = (np.empty(len(poses), dtype=t) for t in (np.float64, np.bool_, np.bool_))
-    run_split(
-        refine_candidates, split_blocks(ptr), x, rays, ptr, *_samples(views), first, iterations, _RIVAL,
-        _NOISE_PX / focal, poses, error, in_front, kept,
-    )  # fmt: skip
-    # by view, the best first, and of equal ones the first
-    owner = np.repeat(np.arange(len(views)), np.diff(first))[kept]
-    order = np.flatnonzero(kept)[np.lexsort((error[kept], owner))]
-    poses, error = poses[order], error[order] * focal[owner]
-    ends = np.cumsum(np.bincount(owner, minlength=len(views))).tolist()
+    rows, few_ptr = _samples(views)
+    poses = refine_poses(poses, x[rows], rays[rows], few_ptr, iterations, True, of)
+    error, in_front = view_errors(poses, x[rows], rays[rows], few_ptr, of)
+    kept = _likeliest(views, error, in_front, of)
+    poses, error, in_front, of = poses[kept], error[kept], in_front[kept], of[kept]
+    more = (np.diff(few_ptr) < np.diff(ptr))[of]
+    if more.any():
+        poses[more] = refine_poses(poses[more], x, rays, ptr, _ALL_STEPS, True, of[more])
+        error[more], in_front[more] = view_errors(poses[more], x, rays, ptr, of[more])
+    return _with_poses(views, poses, error, in_front, of)
+
+
+def _with_poses(
+    seen: Sequence[View | Sight], poses: FloatArray, error: FloatArray, in_front: BoolArray, of: IntArray
+) -> list[View]:
+    """Views with the likeliest of their candidate poses; those without any are left out."""
+    kept = _likeliest(seen, error, in_front, of)
+    poses, error_px = poses[kept], error[kept] * _focal(seen)[of[kept]]
+    ends = np.cumsum(np.bincount(of[kept], minlength=len(seen))).tolist()
     return [
-        View(v.block_idx, v.x, v.rays, v.focal_px, poses[a:b], error[a:b])
-        for v, a, b in zip(views, [0, *ends], ends, strict=False)
+        View(s.block_idx, s.x, s.rays, s.focal_px, poses[a:b], error_px[a:b])
+        for s, a, b in zip(seen, [0, *ends], ends, strict=False)
+        if b > a
     ]
 
 
-def _rank_pairs(poses: FloatArray, error_px: FloatArray, in_front: BoolArray) -> IntArray:
-    """Of two candidates each (n, 2, ...) the likelier first, in place; how many (n,) stay: as :func:`_ranked`."""
-    (e0, e1), (front0, front1) = error_px.T, in_front.T
-    swapped = (front1 & ~front0) | ((front0 == front1) & (e1 < e0))
-    for array in (poses, error_px, in_front):
-        array[swapped] = array[swapped, ::-1]
-    best = error_px[:, 0]
-    rivals = in_front[:, 1] & (error_px[:, 1] <= np.maximum(_RIVAL * best, best + _NOISE_PX))
-    return np.asarray(1 + rivals)
+def _likeliest(seen: Sequence[View | Sight], error: FloatArray, in_front: BoolArray, of: IntArray) -> IntArray:
+    """Of candidates (K,) of the views ``of`` (K,) the best, and those in front that come near it, if it is.
+
+    View by view, the best first. error: (K,) rad.
+    """
+    order = np.lexsort((error, ~in_front, of))
+    of, error, in_front = of[order], error[order], in_front[order]
+    first = np.diff(of, prepend=-1) > 0
+    best = np.flatnonzero(first)[np.cumsum(first) - 1]
+    limit = np.maximum(_RIVAL * error[best], error[best] + _NOISE_PX / _focal(seen)[of])
+    return np.asarray(order[first | (in_front & (error <= limit))])
 
 
-def _ranked(view: View | Sight, poses: FloatArray, error_px: FloatArray, in_front: BoolArray) -> View:
-    errors, front = error_px.tolist(), in_front.tolist()
-    order = sorted(range(len(errors)), key=lambda i: (not front[i], errors[i]))
-    best = errors[order[0]]
-    keep = [i for i in order if front[i] and errors[i] <= max(_RIVAL * best, best + _NOISE_PX)]
-    keep = keep or order[:1]
-    return View(view.block_idx, view.x, view.rays, view.focal_px, poses[keep], error_px[keep])
+def _focal(seen: Sequence[View | Sight]) -> FloatArray:
+    return np.array([s.focal_px for s in seen])
 
 
 def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str], list[str]]:
@@ -211,12 +202,11 @@ def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str]
     if not views:
         return reasons, notes
     ptr = np.cumsum([0] + [len(v.x) for v in views])
-    offsets, medians = np.empty(int(ptr[-1])), np.empty(len(views))
-    run_split(
-        offsets_of_views, split_blocks(ptr), np.array([v.poses[0] for v in views]),
-        np.concatenate([v.x for v in views]), np.concatenate([v.rays for v in views]), ptr, offsets, medians,
+    offsets, medians = view_offsets(
+        np.array([v.poses[0] for v in views]), np.concatenate([v.x for v in views]),
+        np.concatenate([v.rays for v in views]), ptr,
     )  # fmt: skip
-    focal = np.array([v.focal_px for v in views])
+    focal = _focal(views)
     worst = np.maximum.reduceat(offsets, ptr[:-1]) * focal
     by_camera: dict[str, list[int]] = {}
     for i, view in enumerate(views):

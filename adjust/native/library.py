@@ -47,7 +47,7 @@ def opened(name: str) -> dict[str, tuple[Callable[[int], int], str]]:
     if not path.exists():
         raise SurveyError(f"{path} is missing: build it by 'pip install .' or 'python setup.py build_ext --inplace'")
     library = ctypes.CDLL(str(path))
-    found = {}
+    found: dict[str, tuple[Callable[[int], int], str]] = {}
     for family in _FAMILIES:
         table = library[family]
         table.restype = ctypes.POINTER(_Entry)
@@ -55,7 +55,7 @@ def opened(name: str) -> dict[str, tuple[Callable[[int], int], str]]:
         i = 0
         while entries[i].name is not None:
             text = ctypes.create_string_buffer(256)
-            ctypes.CFUNCTYPE(None, ctypes.c_char_p)(entries[i].describe)(text)  # type: ignore[arg-type]  # an address
+            ctypes.CFUNCTYPE(None, ctypes.c_char_p)(entries[i].describe)(text)
             run = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)(entries[i].run)
             found[entries[i].name.decode()] = (run, text.value.decode())
             i += 1

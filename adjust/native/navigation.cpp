@@ -5,7 +5,7 @@
 extern "C" __attribute__((visibility("default"))) const Entry *navigation() {
     static constexpr Entry table[] = {
         entry<spot_rows>("spot_rows"), entry<gauss_newton>("gauss_newton"), entry<some_pose>("some_pose"),
-        entry<retracted_pose>("retracted"), entry<step_of_poses>("step_between"), entry<derivative_of_step>("step_derivative"), entry<roots_of_octic>("real_roots"),
+        entry<roots_of_octic>("real_roots"),
         entry<three_point_problem>("three_point_poses"), entry<search>("search"), {nullptr, nullptr, nullptr}};
     return table;
 }

@@ -74,23 +74,6 @@ inline int64_t spot_rows(const System &S, In<double, 2> pose, const Spots &spots
     return rows_of_spots(S, at, spots, residual.data, H.data, M.data);
 }
 
-inline void retracted_pose(In<double, 2> pose, Vector step, Out<double, 2> out) {
-    Pose from, to;
-    copy_pose(pose, from);
-    retracted(from, step.data, to);
-    std::memcpy(out.data, to, sizeof to);
-}
-inline void step_of_poses(In<double, 2> a, In<double, 2> b, Out<double, 1> step) {
-    Pose from, to;
-    copy_pose(a, from), copy_pose(b, to);
-    step_between(from, to, step.data);
-}
-inline void derivative_of_step(Vector step, Out<double, 2> out) {
-    double J[6][6];
-    step_derivative(step.data, J);
-    std::memcpy(out.data, J, sizeof J);
-}
-
 // Knowledge of the pose: rows of its tangent of which something is known.
 struct PriorRows {
     explicit PriorRows(Reader &r) : pose(r), B(r), rows(r) {}

@@ -27,9 +27,6 @@ _gauss_newton = Function(
     "M[k,r] C[6,6] gain[6,k] numbers[4] work[*]",
 )
 _some_pose = Function("some_pose", f"{_SYSTEM} start[4,4] {_SPOTS} pose[4,4] work[*]")
-_retracted = Function("retracted", "pose[4,4] step[6] out[4,4]")
-_step_between = Function("step_between", "a[4,4] b[4,4] step[6]")
-_step_derivative = Function("step_derivative", "step[6] out[6,6]")
 _real_roots = Function("real_roots", "coefficients[9] lo hi out[18]")
 _three_point_poses = Function("three_point_poses", "o[3,3] d[3,3] x[3,3] nearest farthest R[8,3,3] t[8,3]")
 _search = Function(
@@ -125,30 +122,6 @@ def some_pose(system: SystemArrays, start: FloatArray, spots: SpotArrays, pose: 
     """Fill pose (4, 4) with one of the many that explain too few spots, nearest to a start in a way (damped steps)."""
     n = 2 * len(spots.camera)
     _some_pose(*system, start, *spots, pose, np.empty(n * (n + 14 + system.F.shape[1])))
-
-
-def retracted(pose: FloatArray, step: FloatArray) -> FloatArray:
-    """``pose * (Exp(step[:3]), step[3:])`` (4, 4)."""
-    out = np.empty((4, 4))
-    _retracted(pose, step, out)
-    return out
-
-
-def step_between(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The step (6,) with ``retracted(a, step) = b``; the turn is exact up to half a turn."""
-    step = np.empty(6)
-    _step_between(a, b, step)
-    return step
-
-
-def step_derivative(step: FloatArray) -> FloatArray:
-    """Derivative (6, 6) of ``step_between(a, retracted(b, d))`` by d at zero, where ``step = step_between(a, b)``.
-
-    Source: inverse of the right Jacobian of SO(3) (Chirikjian 2012, eq. 10.86).
-    """
-    out = np.empty((6, 6))
-    _step_derivative(step, out)
-    return out
 
 
 def real_roots(coefficients: FloatArray, lo: float, hi: float) -> FloatArray:

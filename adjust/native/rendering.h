@@ -221,4 +221,48 @@ inline void draw_facets(int64_t first, int64_t last, In<double, 3> rays, int64_t
         }
 }
 
+typedef float Floats __attribute__((vector_size(8 * W), aligned(4), may_alias));
+
+// Pixels first .. last - 1 of a sum of n x n sub-pixels under a point spread: weights (T,) of the sub-pixels from reach
+// before a pixel's first one on, along rows and columns alike; beyond the border the image goes on as it is there. work:
+// scratch, n rows as wide as image and weights together.
+inline void spread_and_sum(int64_t first, int64_t last, In<float, 2> image, In<float, 1> weights, int64_t reach, int64_t n, Out<float, 2> out,
+                           Out<float, 2> work) {
+    constexpr int64_t LANES = 2 * W;
+    const int64_t taps = weights.n[0], height = image.n[0], width = image.n[1], columns = out.n[1], wide = work.n[1];
+    const auto load_floats = [](const float *p) { return *reinterpret_cast<const Floats *>(p); };
+    for (int64_t v = first; v < last; ++v) {
+        const auto above = [&](int64_t t) { return image.data + smaller(larger(n * v - reach + t, int64_t(0)), height - 1) * width; };
+        const auto column = [&](int64_t s, float sum) {  // sub-pixel s of the row, beside those with the same place in a pixel
+            const int64_t at = s + reach;
+            work(at % n, at / n) = sum;
+        };
+        int64_t s = 0;
+        for (; s + LANES <= width; s += LANES) {
+            Floats sum = {};
+            for (int64_t t = 0; t < taps; ++t) sum += weights[t] * load_floats(above(t) + s);
+            for (int64_t e = 0; e < LANES; ++e) column(s + e, sum[e]);
+        }
+        for (; s < width; ++s) {
+            float sum = 0.0f;
+            for (int64_t t = 0; t < taps; ++t) sum += weights[t] * above(t)[s];
+            column(s, sum);
+        }
+        const float left = work(reach % n, reach / n), right = work((width - 1 + reach) % n, (width - 1 + reach) / n);
+        for (int64_t k = -reach; k < 0; ++k) column(k, left);
+        for (int64_t k = width; k + reach < n * wide; ++k) column(k, right);
+        int64_t u = 0;
+        for (; u + LANES <= columns; u += LANES) {
+            Floats sum = {};
+            for (int64_t t = 0; t < taps; ++t) sum += weights[t] * load_floats(&work(t % n, u + t / n));
+            *reinterpret_cast<Floats *>(&out(v, u)) = sum;
+        }
+        for (; u < columns; ++u) {
+            float sum = 0.0f;
+            for (int64_t t = 0; t < taps; ++t) sum += weights[t] * work(t % n, u + t / n);
+            out(v, u) = sum;
+        }
+    }
+}
+
 }  // namespace

@@ -7,6 +7,6 @@ extern "C" __attribute__((visibility("default"))) const Entry *vision() {
     static constexpr Entry table[] = {
         entry<fit_corners>("fit_corners"), entry<corner_rows>("corner_rows"), entry<fit_spots>("fit_spots"),
         entry<spot_profile>("spot_rows_of_profile"), entry<pixel_corner_rays>("pixel_corner_rays"),
-        entry<draw_facets>("draw_facets"), {nullptr, nullptr, nullptr}};
+        entry<draw_facets>("draw_facets"), entry<spread_and_sum>("spread_and_sum"), {nullptr, nullptr, nullptr}};
     return table;
 }

@@ -4,7 +4,7 @@ The formulas are in ``corners.h``, ``spots.h``, ``fits.h`` and ``rendering.h``. 
 pixel is (0, 0).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +41,8 @@ _draw_facets = Function(
     "first last rays[*,*,2] n from_ray[f,3,3] bounds[f,4] counts[f,2] x_edges[f,*] y_edges[f,*] cells[f,*,*] "
     "background samples[*,2] image[*,*] candidates[f]",
 )
+
+_spread_and_sum = Function("spread_and_sum", "first last image[*,*] weights[t] reach n out[*,*] work[*,*]")
 
 
 class Facets(NamedTuple):
@@ -87,8 +89,8 @@ def corner_rows(xy: FloatArray, p: FloatArray, crossing: bool) -> tuple[FloatArr
 
 
 def fit_spots(
-    gray: Gray, labels: IntArray, saturation: float, start: FloatArray, label: IntArray, diameter: FloatArray,
-    peak: FloatArray, background: FloatArray,
+    gray: Gray, labels: npt.NDArray[np.integer[Any]], saturation: float, start: FloatArray, label: IntArray,
+    diameter: FloatArray, peak: FloatArray, background: FloatArray,
 ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, IntArray]:  # fmt: skip
     """Fit each spot with both profiles and keep the better one.
 
@@ -134,3 +136,18 @@ def draw_facets(rays: FloatArray, n: int, facets: Facets, background: float, sam
     image = np.empty((n * height, n * width), np.float32)
     _draw_facets(0, height, rays, n, *facets, background, samples, image, np.empty(len(facets.from_ray), np.int64))
     return image
+
+
+def spread_and_sum(image: Gray, n: int, sigma: float) -> Gray:
+    """Means over n x n sub-pixels of an image (n h, n w) under a Gaussian point spread, (h, w); sigma in sub-pixels.
+
+    The image goes on beyond its border as it is there. The point spread ends at four and a half sigma.
+    """
+    reach = int(np.ceil(4.5 * sigma))
+    spread = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    weights = np.convolve(spread / spread.sum(), np.full(n, 1.0 / n)).astype(np.float32)
+    height, width = image.shape[0] // n, image.shape[1] // n
+    out = np.empty((height, width), np.float32)
+    work = np.empty((n, width + (2 * reach + n) // n + 1), np.float32)
+    _spread_and_sum(0, height, image, weights, reach, n, out, work)
+    return out

@@ -9,10 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.closed_forms.rigid import inverse, rigid, rotation_exp, rotation_log
 from adjust.distributions import chi2
 from adjust.model import FloatArray, IntArray
-from adjust.native.navigation import DONE, SpotArrays, gauss_newton, retracted, step_between, step_derivative
+from adjust.native.navigation import DONE, SpotArrays, gauss_newton
 from adjust.navigation.system import Sightings, System
+from adjust.relay.motions import right_jacobian_inverse
+from adjust.statistics.criteria import cautious
 
 _NO_B: FloatArray = np.zeros((0, 0))
 _NO_ROWS: IntArray = np.zeros(0, dtype=np.int64)
@@ -67,17 +70,20 @@ class PoseFit:
 
 def retract(pose: FloatArray, step: FloatArray) -> FloatArray:
     """``pose * Exp(step)``: rotation and translation are stepped apart, exact to first order at ``step = 0``."""
-    return retracted(np.ascontiguousarray(pose), np.ascontiguousarray(step))
+    return np.asarray(pose @ rigid(rotation_exp(step[:3]), step[3:]))
 
 
 def local(a: FloatArray, b: FloatArray) -> FloatArray:
     """The step (6,) with ``retract(a, step) = b``."""
-    return step_between(np.ascontiguousarray(a), np.ascontiguousarray(b))
+    step = inverse(a) @ b
+    return np.concatenate([rotation_log(step[:3, :3]), step[:3, 3]])
 
 
 def local_derivative(step: FloatArray) -> FloatArray:
     """Derivative (6, 6) of ``local(a, retract(b, d))`` by d at zero, where ``step = local(a, b)``."""
-    return step_derivative(np.ascontiguousarray(step))
+    out = np.zeros((6, 6))
+    out[:3, :3], out[3:, 3:] = right_jacobian_inverse(step[:3]), rotation_exp(step[:3])
+    return out
 
 
 def fit_pose(
@@ -141,12 +147,15 @@ def fit_without_outliers(
     system: System, seen: Sightings, used: IntArray, beacon: IntArray, start: FloatArray, prior: Prior | None,
     alpha: float,
 ) -> tuple[PoseFit | None, tuple[int, ...]]:  # fmt: skip
-    """The fit after spots that fail the test (family-wise level alpha) were taken out, worst first; and which."""
+    """The fit after spots that fail the test (family-wise level alpha) were taken out, worst first; and which.
+
+    None is taken out where the residuals of all are together far smaller than their sigmas say.
+    """
     rejected: list[int] = []
     fit = fit_pose(system, seen, used, beacon, start, prior)
     while fit is not None and fit.redundancy > 0:
         values = spot_tests(fit)
-        if np.isnan(values).all():
+        if np.isnan(values).all() or (not rejected and cautious(values, np.full(len(values), 2))):
             break
         worst = int(np.nanargmax(values))
         if values[worst] < chi2.isf(alpha / len(values), 2):

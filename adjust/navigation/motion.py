@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3
 
-from adjust.chain_kernels import table_motion
+from adjust.chains import table_motion
 from adjust.model import FloatArray
 from adjust.navigation.fit import PoseFit, Prior, local, local_derivative
 from adjust.navigation.model import Motion, NavigationEpoch, PosePrior
@@ -39,9 +39,9 @@ def table_prior(system: System, epoch: NavigationEpoch) -> Prior | None:
     angles = np.zeros(2)
     angles[: len(table.axes)] = epoch.table_angles
     axes = [_AXES[a] for a in table.axes] + [-1]
-    R, t, D = np.empty((3, 3)), np.empty(3), np.empty((6, 4))
     tilt, offset, zero_1, zero_2 = table.geometry
-    table_motion(axes[0], axes[1], angles[0] + zero_1, angles[1] + zero_2, tilt, offset, R, t, D)
+    angle1, angle2 = (angles + (zero_1, zero_2))[:, None]
+    (R,), (t,), (D,) = table_motion(axes[0], axes[1], angle1, angle2, np.array([tilt]), np.array([offset]))
     mount = table.mount_from_station
     motion = Pose3(np.vstack([np.column_stack([R, t]), [0.0, 0.0, 0.0, 1.0]]))
     pose = table.world_from_table * motion * mount

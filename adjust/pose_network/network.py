@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from adjust.closed_forms import nearest_rotation
 from adjust.errors import IndeterminateError, SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.relay.graph_kernels import adjacency, covers, depth_first
+from adjust.relay.graphs import loop_labels
 
 _FEW = 8
 
@@ -237,11 +237,11 @@ def check_determined(network: PoseNetwork, used: BoolArray | None = None) -> Non
             )  # fmt: skip
 
 
-def loop_marks(network: PoseNetwork, used: BoolArray) -> tuple[IntArray, IntArray]:
-    """Of every pair (E,): the number of independent loops through it, and a mark equal for pairs that share them all.
+def loop_marks(network: PoseNetwork, used: BoolArray) -> tuple[BoolArray, IntArray]:
+    """Of every pair (E,): whether it closes any loop, and a mark equal for pairs that share all their loops.
 
     Pairs without a loop are controlled by nothing; pairs with the same mark cannot be told apart. All stations with a
-    given pose count as one. Pairs out of use have zero.
+    given pose count as one. Pairs out of use have none.
     """
     node = np.arange(network.n_stations)
     given = np.concatenate([network.held, np.array(sorted(network.prior_cov), dtype=np.int64)])
@@ -249,8 +249,6 @@ def loop_marks(network: PoseNetwork, used: BoolArray) -> tuple[IntArray, IntArra
         node[given] = given[0]
     rows = np.flatnonzero(used)
     a, b = node[network.a_idx[rows]], node[network.b_idx[rows]]
-    label = np.random.default_rng(0).integers(1, 2**63 - 1, size=len(rows), dtype=np.int64)
-    found = covers(*depth_first(*adjacency(network.n_stations, a, b)), a, b, label)
-    loops, mark = np.zeros((2, network.n_pairs), dtype=np.int64)
-    loops[rows], mark[rows] = found
-    return loops, mark
+    mark = np.zeros(network.n_pairs, dtype=np.int64)
+    mark[rows] = loop_labels(network.n_stations, a, b)
+    return mark != 0, mark

@@ -12,11 +12,9 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from adjust.closed_forms import rotation_log
 from adjust.distributions import chi2
 from adjust.model import FloatArray, IntArray
 from adjust.pose_network.network import PoseNetwork
-from adjust.pose_network.pair_kernels import covariances, derivatives, differences
 from adjust.pose_network.solve import Minimum
 from adjust.relay.motions import Motions, right_jacobian_inverse
 from adjust.tree_covariance import TreeCovariance
@@ -138,14 +136,16 @@ class NetworkPrecision:
         for e in np.flatnonzero(~network.used):
             Q[e] = self._joint([int(b[e]), int(a[e])])
         W = network.whitening
-        scatter, Qvv, own = np.empty((3, network.n_pairs, d, d))
-        covariances(by_b, by_a, turn, W, Q, network.used, scatter, Qvv, own)
+        B, J = np.concatenate([by_b, by_a], axis=2), np.concatenate([-turn, np.tile(np.eye(d), (len(a), 1, 1))], axis=2)
+        scatter, own = B @ Q @ np.swapaxes(B, 1, 2), J @ Q @ np.swapaxes(J, 1, 2)
+        sign = np.where(network.used, -1.0, 1.0)[:, None, None]
+        # a row of the whitening that is zero was not measured
+        Qvv = sign * (W @ scatter @ np.swapaxes(W, 1, 2)) + np.any(W, axis=2)[..., None] * np.eye(d)
         white = np.einsum("nij,nj->ni", W, residual)
         test, freedom = _quadratic(Qvv, white)
         with np.errstate(invalid="ignore"):
             p = np.where(freedom > 0, chi2.sf(test, np.maximum(freedom, 1)), np.nan)
         redundancy = np.where(network.used[:, None], np.diagonal(Qvv, axis1=1, axis2=2), 0.0)
-        sign = np.where(network.used, -1.0, 1.0)[:, None, None]
         return PairStatistics(
             residual, white, redundancy, test, freedom, p, own, network.cov[:, :d, :d] + sign * scatter
         )
@@ -156,20 +156,11 @@ def pair_jacobians(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Residuals (E, dim), their derivatives (E, dim, dim) by b and by a, and Ad(b_from_a^-1) (E, dim, dim)."""
     here = world_from_station
-    if here.translation is None:
-        b_from_a = here[network.b_idx].inverse() @ here[network.a_idx]
-        residual = (Motions(network.rotations).inverse() @ b_from_a).log()
-        by_a, turn = right_jacobian_inverse(residual), b_from_a.inverse().adjoint()
-        return residual, -by_a @ turn, by_a, turn
-    n = network.n_pairs
-    present, relative = np.empty((2, n, 3, 3))
-    place, arm = np.empty((2, n, 3))
-    differences(network.a_idx, network.b_idx, here.rotation, here.translation, network.rotations,
-                np.nan_to_num(network.translations), present, place, relative, arm)  # fmt: skip
-    residual = np.empty((n, 6))
-    by_a, turn, by_b = np.empty((3, n, 6, 6))
-    derivatives(rotation_log(relative), arm, present, place, residual, by_a, turn, by_b)
-    return residual, by_b, by_a, turn
+    shifts = None if here.translation is None else np.nan_to_num(network.translations)
+    b_from_a = here[network.b_idx].inverse() @ here[network.a_idx]
+    residual = (Motions(network.rotations, shifts).inverse() @ b_from_a).log()
+    by_a, turn = right_jacobian_inverse(residual), b_from_a.inverse().adjoint()
+    return residual, -by_a @ turn, by_a, turn
 
 
 def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:

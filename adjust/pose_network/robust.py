@@ -3,16 +3,19 @@
 Rotations first, then positions, each by a solver that needs no start, with the truncated least squares weights of Yang,
 Antonante, Tzoumas and Carlone (Graduated non-convexity for robust spatial perception, RA-L 2020). What that sorts out
 is only a proposal: a clean least squares over the rest decides, pair by pair, by the chi-square test of the pair
-against all others, at one level for the whole network (Sidak 1967).
+against all others, at one level for the whole network (Sidak 1967). Where the residuals are far smaller than the
+sigmas say, nothing is looked for; where sigmas that are too small throughout explain them better than wrong pairs, the
+limits grow.
 """
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.distributions import chi2
-from adjust.errors import NotConvergedError
+from adjust.errors import IndeterminateError, NotConvergedError
 from adjust.model import BoolArray, FloatArray
 from adjust.pose_network.network import PoseNetwork, loop_marks
 from adjust.pose_network.precision import NetworkPrecision, PairStatistics
@@ -23,6 +26,16 @@ from adjust.pose_network.start import (
     start_translations,
     translation_misfits,
     translation_sigmas,
+)
+from adjust.statistics.criteria import (
+    CAUTIOUS,
+    MANY,
+    cautious,
+    cost_of_leaving_out,
+    explanation_cost,
+    sidak,
+    typical_factor,
+    widening,
 )
 
 _TRUNCATION = float(chi2.isf(1e-4, 3))
@@ -65,23 +78,32 @@ class Cleaned:
     variance_factor: float
 
 
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Least squares of some pairs. limit: (E,) of the tests, at variance factor 1; factor: what these are widened by.
+
+    over: (E,) tests over their limits, 0 where untested. cost: of this explanation. supposed: the factor of
+    the limits that goes with it.
+    """
+
+    network: PoseNetwork
+    minimum: Minimum
+    precision: NetworkPrecision
+    limit: FloatArray
+    factor: float
+    over: FloatArray
+    cost: float
+    supposed: float
+
+
 def variance_factor(pairs: PairStatistics, used: BoolArray) -> float:
     """How much larger than claimed the typical pair's test is, at least 1: median over chi-square's median.
 
-    With sigmas that are too small throughout every pair would fail; a pair is wrong only beside the others.
+    With sigmas that are too small throughout every pair would fail; a pair is wrong only beside the others. Of few
+    pairs the median is no measure, for a wrong one shows in most of the others.
     """
     rows = used & (pairs.freedom > 0)
-    if int(rows.sum()) < 20:
-        return 1.0
-    return max(1.0, float(np.median(pairs.test[rows] / chi2.ppf(0.5, pairs.freedom[rows]))))
-
-
-def excess(pairs: PairStatistics, used: BoolArray, candidates: BoolArray, alpha: float) -> FloatArray:
-    """Test of every pair over its limit (E,); above 1 it fails at ``alpha`` for the whole network, 0 where untested."""
-    tested = candidates & (pairs.freedom > 0)
-    single = -np.expm1(np.log1p(-alpha) / max(1, int(tested.sum())))
-    limit = chi2.isf(single, np.maximum(pairs.freedom, 1)) * variance_factor(pairs, used)
-    return np.where(tested, np.nan_to_num(pairs.test) / limit, 0.0)
+    return max(1.0, typical_factor(pairs.test[rows], pairs.freedom[rows])) if int(rows.sum()) >= MANY else 1.0
 
 
 def _graduated(
@@ -105,8 +127,8 @@ def _graduated(
         r2 = fit(np.maximum(new, _LEAST))
 
 
-def graduated_weights(network: PoseNetwork) -> FloatArray:
-    """1 for the pairs (E,) that agree on rotations and positions, 0 for the others."""
+def graduated_weights(network: PoseNetwork, factor: float = 1.0) -> FloatArray:
+    """1 for the pairs (E,) that agree on rotations and positions, 0 for the others. factor: of all variances."""
     info = np.linalg.inv(network.cov[:, :3, :3])
 
     def rotations(weights: FloatArray) -> FloatArray:
@@ -114,7 +136,7 @@ def graduated_weights(network: PoseNetwork) -> FloatArray:
         e = rotation_residuals(network, R)
         return np.asarray(np.einsum("ni,nij,nj->n", e, info, e))
 
-    weights = _graduated(network, rotations, _TRUNCATION, network.used.astype(float))
+    weights = _graduated(network, rotations, factor * _TRUNCATION, network.used.astype(float))
     if not network.is_pose.any():
         return weights
     R = start_rotations(network, np.maximum(weights, _LEAST))
@@ -124,7 +146,7 @@ def graduated_weights(network: PoseNetwork) -> FloatArray:
         t = start_translations(network, R, w)
         return np.asarray((translation_misfits(network, R, t) / sigma) ** 2)
 
-    return _graduated(network, positions, _SLACK * _TRUNCATION, weights)
+    return _graduated(network, positions, factor * _SLACK * _TRUNCATION, weights)
 
 
 def clean(
@@ -132,49 +154,125 @@ def clean(
     progress: Progress | None = None,
 ) -> Cleaned:  # fmt: skip
     """Least squares over the pairs that pass their tests. Raises as :func:`adjust.pose_network.solve.minimize`."""
-    candidates = network.used
+    search = _Search(network, options, progress)
+    first: _State | None = None
     if options.robust == "auto":
-        try:
-            first = _judged(network, minimize(network, start, options, progress=progress), candidates, options)
-            if not (first[2] > 1.0).any():
-                return Cleaned(network, first[0], first[1], (), variance_factor(first[1].pairs, candidates))
-        except NotConvergedError:
-            pass  # wrong pairs can do that; without them the next attempt says more
-    used = _connected(network, graduated_weights(network))
-    taken_back = np.zeros(network.n_pairs, dtype=np.bool_)
-    poses: tuple[FloatArray, FloatArray] | None = None
-    for _ in range(_ROUNDS):
-        current = network.with_used(used)
-        minimum, precision, over = _judged(current, minimize(current, poses, options, progress=progress), candidates,
-                                           options)  # fmt: skip
-        poses = minimum.rotations, minimum.translations
-        back = candidates & ~used & (over <= 1.0) & ~taken_back
-        out = _worst_around(network, np.where(used, over, 0.0))
-        if not back.any() and not out.any():
-            return Cleaned(current, minimum, precision, _listed(current, precision, candidates),
-                           variance_factor(precision.pairs, used))  # fmt: skip
-        taken_back |= back
-        used = (used | back) & ~out
-    raise NotConvergedError(f"no set of pairs that agree was found in {_ROUNDS} rounds; the pairs contradict")
+        with contextlib.suppress(NotConvergedError):  # by wrong pairs; without them the next attempt says more
+            first = search.state(network.used, start)
+        if first is not None and (not (first.over > 1.0).any() or _far_below(first)):
+            return search.cleaned(first)
+    weights = graduated_weights(network, 1.0 if first is None else first.factor)
+    try:
+        last = search.settled(_connected(network, weights))
+        if first is not None and int(network.used.sum()) < MANY:
+            search.descend(first)
+            best = min(search.states, key=lambda state: state.cost)
+            if best.cost < last.cost:
+                last = search.settled(best.network.used, best.supposed)
+    except (IndeterminateError, NotConvergedError):
+        if first is None:
+            raise
+        last = first  # what contradicts is in its tests
+    return search.cleaned(last)
 
 
-def _judged(
-    network: PoseNetwork, minimum: Minimum, candidates: BoolArray, options: NetworkOptions
-) -> tuple[Minimum, NetworkPrecision, FloatArray]:
-    precision = NetworkPrecision(network, minimum)
-    return minimum, precision, excess(precision.pairs, network.used, candidates, options.alpha)
+def _far_below(state: _State) -> bool:
+    """Whether residuals are together far smaller than their sigmas say, by v'Pv or by the tests of the pairs."""
+    pairs, used = state.precision.pairs, state.network.used
+    redundancy = float(pairs.redundancy[used].sum())
+    return state.minimum.omega < CAUTIOUS**2 * redundancy or cautious(pairs.test[used], pairs.freedom[used])
+
+
+class _Search:
+    """The search in one network, and all states that it came through."""
+
+    def __init__(self, network: PoseNetwork, options: NetworkOptions, progress: Progress | None) -> None:
+        self.network, self.options, self.progress = network, options, progress
+        self.candidates = network.used
+        self.states: list[_State] = []
+
+    def state(
+        self, used: BoolArray, start: tuple[FloatArray, FloatArray] | None, least_factor: float = 1.0
+    ) -> _State:
+        """Least squares of the pairs in ``used`` (E,), judged."""
+        network = self.network.with_used(used)
+        minimum = minimize(network, start, self.options, progress=self.progress)
+        precision = NetworkPrecision(network, minimum)
+        pairs = precision.pairs
+        tested = self.candidates & (pairs.freedom > 0)
+        level = sidak(self.options.alpha, int(tested.sum()))
+        limit = np.asarray(chi2.isf(level, np.maximum(pairs.freedom, 1)))
+        factor = max(least_factor, variance_factor(pairs, used))
+        over = np.where(tested, np.nan_to_num(pairs.test) / (factor * limit), 0.0)
+        omega, redundancy = minimum.omega, float(pairs.redundancy[used].sum())
+        gone = tested & ~used
+        left_out = cost_of_leaving_out(pairs.test[gone], pairs.freedom[gone], limit[gone])
+        cost = explanation_cost([(omega, redundancy)], left_out)
+        supposed = widening(omega, redundancy, pairs.test[used], pairs.freedom[used])
+        found = _State(network, minimum, precision, limit, factor, over, cost, supposed)
+        self.states.append(found)
+        return found
+
+    def settled(self, used: BoolArray, least_factor: float = 1.0) -> _State:
+        """From these pairs on: what fails goes, what fits comes back, until neither is left."""
+        taken_back = np.zeros(self.network.n_pairs, dtype=np.bool_)
+        poses: tuple[FloatArray, FloatArray] | None = None
+        for _ in range(_ROUNDS):
+            now = self.state(used, poses, least_factor)
+            poses = now.minimum.rotations, now.minimum.translations
+            back = self.candidates & ~used & (now.over <= 1.0) & ~taken_back
+            out = _worst_around(now.network, np.where(used, now.over, 0.0))
+            if not back.any() and not out.any():
+                return now
+            taken_back |= back
+            used = (used | back) & ~out
+        raise NotConvergedError(f"no set of pairs that agree was found in {_ROUNDS} rounds; the pairs contradict")
+
+    def descend(self, state: _State) -> None:
+        """One pair after the other, the worst first, down to half of them: every state is an explanation."""
+        while (state.over[state.network.used] > 1.0).any():
+            used = state.network.used.copy()
+            over = np.where(used, state.over, 0.0)
+            over[over < over.max()] = 0.0
+            used &= ~_worst_around(state.network, over)
+            if used.sum() == state.network.used.sum() or 2 * used.sum() < self.candidates.sum():
+                return
+            state = self.state(used, (state.minimum.rotations, state.minimum.translations))
+
+    def cleaned(self, state: _State) -> Cleaned:
+        """As the result."""
+        rejected = _listed(state.network, state.precision, self.candidates)
+        return Cleaned(state.network, state.minimum, state.precision, rejected, state.factor)
 
 
 def _worst_around(network: PoseNetwork, over: FloatArray) -> BoolArray:
-    """Pairs that fail worse than every other pair at their stations: an error shows in its neighbours too."""
+    """Pairs that fail worse than every other pair at their stations: an error shows in its neighbours too.
+
+    Only as many as leave the network in one piece.
+    """
     bad = np.flatnonzero(over > 1.0)
     out = np.zeros(network.n_pairs, dtype=np.bool_)
     blocked = np.zeros(network.n_stations, dtype=np.bool_)
-    for e in bad[np.argsort(-over[bad], kind="stable")]:
+    chosen = []
+    for e in bad[np.argsort(-over[bad], kind="stable")].tolist():
         a, b = network.a_idx[e], network.b_idx[e]
-        out[e] = not blocked[a] and not blocked[b]
+        if not blocked[a] and not blocked[b]:
+            chosen.append(e)
         blocked[a] = blocked[b] = True
+    out[chosen] = True
+    whole = _pieces(network, network.used)
+    if chosen and _pieces(network, network.used & ~out) != whole:
+        out[:] = False
+        for e in chosen:  # worst first
+            out[e] = True
+            out[e] = _pieces(network, network.used & ~out) == whole
     return out
+
+
+def _pieces(network: PoseNetwork, used: BoolArray) -> tuple[int, int]:
+    """Into how many the network falls, by all pairs and by those that have a translation."""
+    by_all, by_poses = (int(network.components(used, poses).max(initial=0)) for poses in (False, True))
+    return by_all, by_poses
 
 
 def _connected(network: PoseNetwork, weights: FloatArray) -> BoolArray:

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
 
 from adjust.model import IntArray
-from adjust.relay.graph_kernels import adjacency, breadth_first, covers, depth_first
+from adjust.relay.graphs import loop_labels
 from adjust.relay.network import Topology
 
 
@@ -74,26 +75,24 @@ def count(topology: Topology, loop_equations: int = 3) -> Counts:
     n, m = topology.n_stations, topology.n_pairs
     part = parts(topology)
     c = int(part.max()) + 1 if n else 0
-    ptr, neighbour, pair = adjacency(n, topology.a_idx, topology.b_idx)
-    # equal labels of two pairs mean equal sets of loops; random 63-bit labels err once in 10^18 comparisons
-    label = np.random.default_rng(0).integers(1, 2**63 - 1, size=m, dtype=np.int64)
-    loops, mark = covers(*depth_first(ptr, neighbour, pair), topology.a_idx, topology.b_idx, label)
+    mark = loop_labels(n, topology.a_idx, topology.b_idx)
+    degree = np.bincount(np.concatenate([topology.a_idx, topology.b_idx]), minlength=n)
     grouped = [tuple(topology.station_ids[i] for i in g) for g in _groups(part, 1)]
     return Counts(
         n_stations=n, n_pairs=m, n_parts=c, independent_unknowns=n - c, measurable_pairs=n * (n - 1) // 2,
         triangle_conditions=_triangles(topology), independent_conditions=m - n + c, loop_equations=loop_equations,
         parts=tuple(sorted(grouped, key=len, reverse=True)),
-        uncontrolled_pairs=tuple(topology.pair_ids[e] for e in np.flatnonzero(loops == 0)),
-        inseparable_pairs=_inseparable(topology, loops, mark),
-        isolated_stations=tuple(topology.station_ids[i] for i in np.flatnonzero(np.diff(ptr) == 0)),
+        uncontrolled_pairs=tuple(topology.pair_ids[e] for e in np.flatnonzero(mark == 0)),
+        inseparable_pairs=_inseparable(topology, mark),
+        isolated_stations=tuple(topology.station_ids[i] for i in np.flatnonzero(degree == 0)),
     )  # fmt: skip
 
 
 def parts(topology: Topology) -> IntArray:
     """The connected part (n,) of every station, numbered from 0 in the order of their first stations."""
     n = topology.n_stations
-    walk = adjacency(n, topology.a_idx, topology.b_idx)
-    return np.asarray(breadth_first(*walk, np.arange(n))[4], dtype=np.int64)
+    joined = sp.coo_array((np.ones(topology.n_pairs), (topology.a_idx, topology.b_idx)), shape=(n, n))
+    return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)
 
 
 def _groups(label: IntArray, least: int) -> list[IntArray]:
@@ -104,8 +103,8 @@ def _groups(label: IntArray, least: int) -> list[IntArray]:
     return [order[i : i + n] for i, n in zip(first, size, strict=True) if n >= least]
 
 
-def _inseparable(topology: Topology, loops: IntArray, mark: IntArray) -> tuple[tuple[str, ...], ...]:
-    controlled = np.flatnonzero(loops > 0)
+def _inseparable(topology: Topology, mark: IntArray) -> tuple[tuple[str, ...], ...]:
+    controlled = np.flatnonzero(mark)
     return tuple(tuple(topology.pair_ids[e] for e in controlled[g]) for g in _groups(mark[controlled], 2))
 
 

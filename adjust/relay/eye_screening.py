@@ -10,6 +10,7 @@ from adjust.model import BoolArray, FloatArray
 from adjust.relay.eye_checks import OutlierEpoch
 from adjust.relay.eye_setup import EyeSetup
 from adjust.relay.eye_solver import EyeProblem, EyeSolution, linearise, solve_eyes
+from adjust.statistics.criteria import cautious
 
 _MEDIAN = float(chi2.ppf(0.5, 6))
 
@@ -18,14 +19,15 @@ def solve_screened(setup: EyeSetup, reject: bool, alpha: float) -> tuple[EyeSolu
     """Least squares of the epochs that agree, and the others, worst first.
 
     The worst epoch is left out while it fails (data snooping, Baarda 1968), then those that fit after all come back.
-    The limit follows the scatter of most epochs where that is larger than the a priori sigmas say.
+    The limit follows the scatter of most epochs where that is larger than the a priori sigmas say; where all are
+    together far smaller, none is left out.
     Raises SurveyError where more than a third of the epochs contradict each other.
     """
     m = len(setup.problem.conditions)
     used: BoolArray = np.ones(m, dtype=np.bool_)
     single = float(chi2.isf(-np.expm1(np.log1p(-alpha) / m), 6))
     solution = solve_eyes(setup.problem)
-    if not reject:
+    if not reject or cautious(solution.test, np.full(m, 6)):
         return solution, ()
     for _ in range(2 * m):
         test = _all_tests(setup.problem, solution, used)

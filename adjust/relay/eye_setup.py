@@ -12,7 +12,7 @@ from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.observations import FrameRef
 from adjust.relay.eye_solver import EyeConditions, EyeProblem, KnownMotion, stacked
-from adjust.relay.graph_kernels import adjacency
+from adjust.relay.graphs import adjacency
 from adjust.relay.motions import Motions, identities
 
 if TYPE_CHECKING:  # the frozen values live with the functions that take them

@@ -4,24 +4,26 @@ A loop is walked from its first station; the product of its pairs, each taken al
 the identity without errors. Its logarithm is the misclosure, in the frame of the first station.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
 from adjust.distributions import chi2
 from adjust.model import FloatArray, IntArray
-from adjust.relay.cycle_kernels import forest_loops, independent_of, meeting_stations, shortest_loops
-from adjust.relay.graph_kernels import adjacency, breadth_first
+from adjust.relay.cycles import bits_of, flat, forest_loops, shortest_loops
+from adjust.relay.graphs import adjacency, breadth_first
 from adjust.relay.motions import Motions, identities, right_jacobian_inverse
 from adjust.relay.network import Network, Topology
 
 LoopKind = Literal["shortest", "tree"]
 
-# a bit matrix of 50 MB; larger networks get the loops of a spanning tree
+# larger networks get the loops of a spanning tree
 MAX_SHORTEST_LOOPS = 20_000
 # elementary steps, some seconds
-SEARCH_BUDGET = 3_000_000_000
+SEARCH_BUDGET = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,40 +72,41 @@ def loop_basis(topology: Topology, kind: LoopKind = "shortest", budget: int = SE
     n = topology.n_stations
     walk = adjacency(n, topology.a_idx, topology.b_idx)
     busiest = np.argsort(-np.diff(walk[0]), kind="stable")
-    _, parent, by, depth, _ = breadth_first(*walk, busiest)
+    forest = breadth_first(*walk, busiest)
     in_tree = np.zeros(topology.n_pairs, dtype=np.bool_)
-    in_tree[by[by >= 0]] = True
+    in_tree[forest.by[forest.by >= 0]] = True
     chords = np.flatnonzero(~in_tree)
-    tree = forest_loops(topology.a_idx, topology.b_idx, parent, by, depth, chords)
-    from_tree = _basis(topology, *tree, topology.a_idx[chords], False, "loops of a spanning tree", chords)
+    first = topology.a_idx[chords]
+    tree = forest_loops(topology.a_idx, topology.b_idx, forest, chords)
     if kind == "tree" or not len(chords):
-        return from_tree
+        return _basis(topology, tree, first, False, "loops of a spanning tree", chords)
     if len(chords) > MAX_SHORTEST_LOOPS:
         note = f"loops of a spanning tree: more than {MAX_SHORTEST_LOOPS} loops are too many for the shortest ones"
-        return _basis(topology, *tree, topology.a_idx[chords], False, note, chords)
+        return _basis(topology, tree, first, False, note, chords)
     number = np.full(topology.n_pairs, -1, dtype=np.int64)
     number[chords] = np.arange(len(chords))
-    roots = meeting_stations(walk[0], walk[1])
-    ptr, pairs, start, rows, taken = shortest_loops(*walk, roots, number, len(chords), budget)
+    chord, ends = number.tolist(), walk[0].tolist()
+    entries = list(zip(walk[1].tolist(), walk[2].tolist(), strict=True))
+    ways = [entries[i:j] for i, j in pairwise(ends)]
+    loops, start, independent = shortest_loops(ways, chord, len(chords), budget)
     if len(start) == len(chords):
-        return _basis(topology, ptr, pairs, start, True, "shortest independent loops")
-    keep = independent_of(*tree, number, rows, taken)
-    more = np.concatenate([pairs, *(tree[1][tree[0][k] : tree[0][k + 1]] for k in np.flatnonzero(keep))])
-    ptr = np.concatenate([ptr, ptr[-1] + np.cumsum(np.diff(tree[0])[keep])])
-    note = f"the {len(start)} shortest loops, and {int(keep.sum())} of a spanning tree: the search used up its budget"
-    return _basis(topology, ptr, more, np.concatenate([start, topology.a_idx[chords[keep]]]), False, note)
+        return _basis(topology, loops, start, True, "shortest independent loops")
+    kept = [k for k, pairs in enumerate(tree) if independent.add(bits_of(pairs, chord))]
+    note = f"the {len(start)} shortest loops, and {len(kept)} of a spanning tree: the search used up its budget"
+    return _basis(topology, [*loops, *(tree[k] for k in kept)], [*start, *first[kept].tolist()], False, note)
 
 
 def _basis(
-    topology: Topology, ptr: IntArray, pairs: IntArray, start: IntArray, minimal: bool, note: str,
+    topology: Topology, loops: Sequence[Sequence[int]], first: Sequence[int] | IntArray, minimal: bool, note: str,
     chords: IntArray | None = None,
 ) -> LoopBasis:  # fmt: skip
+    (ptr, pairs), start = flat(loops), np.array(first, dtype=np.int64)
     sense, at = np.zeros(len(pairs), dtype=np.int64), start.copy()
-    for rows, loops in _steps(ptr):
+    for rows, some in _steps(ptr):
         a, b = topology.a_idx[pairs[rows]], topology.b_idx[pairs[rows]]
-        along = a == at[loops]
+        along = a == at[some]
         sense[rows] = np.where(along, 1, -1)
-        at[loops] = np.where(along, b, a)
+        at[some] = np.where(along, b, a)
     return LoopBasis(topology, ptr, pairs, sense, start, minimal, note, chords)
 
 

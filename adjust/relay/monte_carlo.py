@@ -11,10 +11,10 @@ from typing import Literal
 
 import numpy as np
 
-from adjust.closed_forms import rotation_exp, rotation_log
+from adjust.closed_forms import rotation_exp
 from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.relay.monte_carlo_kernels import adjust_trials
+from adjust.relay.trials import adjust_trials
 from adjust.rotation_forms import euler_from_matrix, euler_jacobian, matrix_from_euler
 
 Noise = Literal["euler", "tangent"]
@@ -86,15 +86,9 @@ def adjust_batch(b_from_a: FloatArray, information: FloatArray, n_cameras: int) 
     """Adjust T complete networks: measured (T, E, 3, 3) in the order (0, 1), (0, 2), ..., (1, 2), ...
 
     information: inverse covariances (T, E, 3, 3), in the tangents on the right. The estimator is that of
-    :mod:`adjust.relay.parametric`, compiled.
+    :mod:`adjust.relay.parametric`, of all networks at once.
     """
-    adjusted = np.empty_like(b_from_a)
-    omega, iterations = np.empty(len(b_from_a)), np.empty(len(b_from_a), dtype=np.int64)
-    adjust_trials(
-        np.ascontiguousarray(b_from_a), np.ascontiguousarray(information), n_cameras, _LIMIT, _MOST, adjusted, omega,
-        iterations,
-    )  # fmt: skip
-    return Batch(adjusted, omega, iterations)
+    return Batch(*adjust_trials(b_from_a, information, n_cameras, _LIMIT, _MOST))
 
 
 def simulate_complete(options: MonteCarloOptions = MonteCarloOptions()) -> MonteCarlo:
@@ -133,7 +127,10 @@ class _Sums:
         self.n += len(true)
         self.absolute += angles.sum(axis=0)
         self.absolute_squares += (angles**2).sum(axis=0)
-        self.squares += float((rotation_log(difference) ** 2).sum())
+        antisymmetric = difference - np.swapaxes(difference, -1, -2)
+        sine = np.sqrt((antisymmetric**2).sum(axis=(-1, -2)) / 8.0)
+        turn = np.arctan2(sine, 0.5 * (np.trace(difference, axis1=-2, axis2=-1) - 1.0))
+        self.squares += float((turn**2).sum())
         self.omega += float(omega.sum())
 
     def errors(self) -> Errors:

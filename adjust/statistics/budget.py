@@ -35,11 +35,20 @@ def uncertainty_budget(
     sources, of_row = _sources(system)
     estimated = components.components if components is not None else ()
     kinds = {c.group: c.freedom for c in estimated if c.status in ("estimated", "unseparable")}
-    used = system.used[system.row_of]
-    effects = np.asarray(system.A[used] @ covariance_columns(system, index)) ** 2
-    squares = np.zeros((len(sources), len(index)))
-    np.add.at(squares, of_row[used], effects)
+    squares = _squares(system, index, of_row, len(sources))
     return tuple(_entry(system, int(column), squares[:, i], sources, kinds, level) for i, column in enumerate(index))
+
+
+def _squares(system: LinearSystem, index: IntArray, of_row: IntArray, n_sources: int) -> FloatArray:
+    """Variance (sources, k) that every source makes; of the one with most rows what the others leave of the whole."""
+    used = system.used[system.row_of]
+    most = int(np.bincount(of_row[used], minlength=n_sources).argmax())
+    Q = covariance_columns(system, index)
+    rows = np.flatnonzero(used & (of_row != most))
+    squares = np.zeros((n_sources, len(index)))
+    np.add.at(squares, of_row[rows], np.asarray(system.A[rows] @ Q) ** 2)
+    squares[most] = np.maximum(Q[index, np.arange(len(index))] - squares.sum(axis=0), 0.0)
+    return squares
 
 
 def _sources(system: LinearSystem) -> tuple[list[str], IntArray]:

@@ -94,16 +94,18 @@ def _unsearched(now: Adjustment, options: CleanOptions) -> tuple[str, ...]:
 
 
 def _blamed_on_rays(survey: Survey, found: Adjustment) -> bool:
-    """Whether rays were left out to points that observations of another kind touch."""
+    """Whether rays were left out to points, or from stations, that observations of another kind touch."""
     touched = {r.point_id for d in survey.distances if d.used for r in (d.a, d.b) if r.frame is None}
     touched |= {r.point_id for c in survey.coordinates if c.used for r in c.positions if r.frame is None}
     touched |= {r.point_id for d in survey.coordinate_differences if d.used for r in (*d.at, *d.to) if r.frame is None}
     touched |= {p.point_id for x in survey.readings if x.used for p in (x.at, x.to) if p.frame is None}
     names = [p.point_id for p in found.survey.points]
+    paired = {r.frame_id for p in survey.pairs if p.used for r in (p.a, p.b) if r.kind == "station"}
+    carrying = {c.camera_id for c in survey.cameras if c.station_id in paired}
     return any(
-        names[int(i)] in touched
+        b.camera_id in carrying or names[int(i)] in touched
         for b in found.survey.image_blocks
-        if b.target_id is None and b.used is not None and b.used.any()
+        if b.target_id is None and b.used is not None
         for i in b.point_idx[~b.used]
     )
 
@@ -116,13 +118,17 @@ def _others_first(
     try:
         first = adjust_with_pairs(survey, unscreened, progress, start)
         search = _searched(first, replace(options, pairs=unscreened), progress)
-        if search is None or not search.rejected:
+        now = first if search is None else search.adjustment
+        pairs = sum(p.used for p in survey.pairs) - sum(p.used for p in now.survey.pairs)
+        if not pairs and (search is None or not search.rejected):
             return None
-        found = _cleaned(search.adjustment.survey, options, progress, values_of(search.adjustment))
+        found = _cleaned(now.survey, options, progress, values_of(now))
     except SurveyError:
         return None
-    kept = search.log if not found.decisions else (*search.log, *found.decisions)
-    notes = tuple(n for n in search.notes if n not in found.warnings)
+    log, said = ((), ()) if search is None else (search.log, search.notes)
+    said += tuple(w for w in first.warnings if w.startswith("left out"))  # the pairs that went first
+    kept = log if not found.decisions else (*log, *found.decisions)
+    notes = tuple(n for n in said if n not in found.warnings)
     return replace(found, decisions=kept, warnings=found.warnings + notes)
 
 

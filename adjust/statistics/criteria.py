@@ -1,16 +1,93 @@
 """Levels of tests, and biases that they find (Baarda 1968): by his B-method or at Sidak's (1967) family-wise level.
 
+Beside them what every search for gross errors asks before it leaves something out: whether the residuals are so small
+that nothing contradicts the sigmas, and whether sigmas that are too small explain them better than wrong observations.
+
 A bias of non-centrality ``lambda0`` is found by a chi-square test of q components at level alpha with the given power.
 Baarda's B-method asks the same lambda0 of all tests, so that a bias is found equally well whatever it is tested with.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 
 import numpy as np
 
 from adjust.distributions import chi2, ncx2
+from adjust.model import FloatArray, IntArray
 from adjust.statistics.result import Criteria, LevelOptions
+
+CAUTIOUS = 0.5
+"""Size of residuals over their sigmas, all together, below which no observation is left out."""
+MANY = 20
+"""Tests from which the typical one of a group, by itself, says whether its sigmas are too small."""
+_OF_A_FACTOR = 0.001
+
+
+def cautious(statistics: FloatArray, freedom: IntArray) -> bool:
+    """Whether tests (n,), with all observations in, are together far smaller than chi-square (freedom (n,)) says.
+
+    A single test presupposes the sigmas, and comes after that of the whole (Baarda 1968). Where residuals are less than
+    half of what the sigmas allow, the largest does not contradict them, however far it stands out among the others.
+    """
+    known = np.isfinite(statistics) & (freedom > 0)
+    total = float(freedom[known].sum())
+    return total > 0.0 and float(statistics[known].sum()) < CAUTIOUS**2 * total
+
+
+def variance_of(omega: float, redundancy: float) -> float:
+    """The variance factor, 1 or more, by which a group's residuals are explained best.
+
+    -2 ln likelihood is ``omega / f + redundancy ln f``, least at ``omega / redundancy``; a factor of its own costs what
+    a wrong observation of one component costs.
+    """
+    if redundancy <= 0.0 or omega <= redundancy:
+        return 1.0
+    f = omega / redundancy
+    return f if redundancy * (1.0 + np.log(f)) + float(chi2.isf(_OF_A_FACTOR, 1)) < omega else 1.0
+
+
+def widening(omega: float, redundancy: float, statistics: FloatArray, freedom: IntArray) -> float:
+    """What the limits of a group's tests (n,) grow by where its sigmas are taken as too small throughout; else 1.
+
+    Only where its typical test says so too, and then by as much: what errors of other groups add to a test is in it.
+    Nothing is said of a group with the redundancy of a single observation or two: there one error shows in all tests.
+    """
+    if redundancy < 2.0 * float(freedom.max(initial=0)) + 0.5:
+        return 1.0
+    typical = typical_factor(statistics, freedom)
+    factor = variance_of(omega, redundancy)
+    return max(factor, typical) if typical > 1.0 and factor > 1.0 else 1.0
+
+
+def cost_of_leaving_out(statistics: FloatArray, freedom: IntArray, limits: FloatArray) -> float:
+    """Of observations (n,) that are out, with their tests against what is left: each has a variance of its own.
+
+    At least the limit of its test, so that with sigmas that are right an observation goes if and only if it fails.
+    """
+    T, q = np.nan_to_num(statistics), np.maximum(freedom, 1)
+    own = q * (1.0 + np.log(np.maximum(T / q, 1.0))) + float(chi2.isf(_OF_A_FACTOR, 1))
+    return float(np.sum(np.maximum(limits, own)))
+
+
+def explanation_cost(groups: Iterable[tuple[float, float]], left_out: float) -> float:
+    """-2 ln likelihood of what is left, (omega, redundancy) of every group, and the cost of what was left out.
+
+    As ``J`` of :mod:`adjust.statistics.exchange`, where the sigmas of a group may also be too small throughout: the
+    least cost tells wrong observations from wrong sigmas, also among few.
+    """
+    total = left_out
+    for omega, redundancy in groups:
+        f = variance_of(omega, redundancy)
+        total += omega if f == 1.0 else redundancy * (1.0 + float(np.log(f))) + float(chi2.isf(_OF_A_FACTOR, 1))
+    return total
+
+
+def typical_factor(statistics: FloatArray, freedom: IntArray) -> float:
+    """How much larger than chi-square's median the typical of tests (n,) is; nan without any."""
+    known = np.isfinite(statistics) & (freedom > 0)
+    if not known.any():
+        return float("nan")
+    return float(np.median(statistics[known] / chi2.ppf(0.5, freedom[known])))
 
 
 def sidak(family_alpha: float, n_tests: int) -> float:

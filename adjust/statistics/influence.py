@@ -7,28 +7,40 @@ import numpy as np
 from adjust.datum import in_world
 from adjust.model import FloatArray
 from adjust.result import ParameterName
+from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Influence
 from adjust.statistics.system import LinearSystem
 
 _CHUNK = 256
 
 
-def shifts(system: LinearSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]) -> FloatArray:
-    """How all unknowns (n, k) move with a bias of each of k observations; biases (c,) in sigmas, observed too large."""
+def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]) -> FloatArray:
+    """How all unknowns (n, k) move with a bias of each of k observations; biases (c,) in sigmas, observed too large.
+
+    rows: image points first, then all others.
+    """
+    system = condensed.system
+    n_points = sum(len(b.uv) for b in system.precision.graph.survey.image_blocks)
     right = np.zeros((len(system.columns), len(rows)))
     for i, row in enumerate(rows):
-        right[:, i] = system.bias_column(row, bias[row])
+        if row < n_points:
+            columns, A = condensed.point_rows(row)
+            right[columns, i] = A.T @ bias[row]
+        else:
+            right[:, i] = system.bias_column(row - n_points + system.n_image, bias[row])
     return system.normal.solve(right)
 
 
-def influences(system: LinearSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]) -> tuple[Influence, ...]:
+def influences(
+    condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]
+) -> tuple[Influence, ...]:
     """The unknown and the position that each bias moves most; in the order of ``rows``."""
-    out: list[Influence] = []
+    system, out = condensed.system, list[Influence]()
     sigmas = np.where(system.sigmas > 0.0, system.sigmas, np.inf)
     places = _positions(system)
     for first in range(0, len(rows), _CHUNK):
         part = rows[first : first + _CHUNK]
-        dx = shifts(system, part, bias)
+        dx = shifts(condensed, part, bias)
         ratio = np.abs(dx) / sigmas[:, None]
         worst = ratio.argmax(axis=0)
         length, furthest = _furthest(dx, places)

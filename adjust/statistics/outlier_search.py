@@ -13,6 +13,7 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.distributions import chi2
+from adjust.errors import IndeterminateError, NotConvergedError
 from adjust.graph import StartValues
 from adjust.model import BoolArray, IntArray, Survey
 from adjust.pair_screen import values_of
@@ -22,7 +23,8 @@ from adjust.statistics.criteria import criteria, sidak
 from adjust.statistics.exchange import better_set, equal_sets
 from adjust.statistics.reliability import observation_name
 from adjust.statistics.result import Alternative, Decision, LevelOptions
-from adjust.statistics.snooping import Snooping, robust_squares, typical_factors
+from adjust.statistics.snooping import Snooping, robust_squares
+from adjust.statistics.supposed import cautious_groups, group_factors
 from adjust.statistics.system import LinearSystem, linear_system
 
 
@@ -55,7 +57,8 @@ class OutlierSearch:
     rejected: what is out in the end, worst first. log: every decision in order, also those taken back. suspects: what
     fails its test but cannot be left out, because something would be undetermined without it, or because it is a prior
     or of a kind that is kept. converged: whether the last round changed nothing. alternatives: where other observations
-    could be the wrong ones.
+    could be the wrong ones. cautious: groups whose residuals are all together far smaller than their sigmas say; of
+    them nothing is left out. widened: factors of the variances of groups that are too small throughout.
     """
 
     adjustment: Adjustment
@@ -66,14 +69,27 @@ class OutlierSearch:
     rounds: int
     converged: bool
     alternatives: tuple[Alternative, ...] = ()
+    cautious: tuple[str, ...] = ()
+    widened: tuple[tuple[str, float], ...] = ()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """For people, worst first."""
         notes = tuple(d.text() for d in self.rejected) + tuple(a.text() for a in self.alternatives)
-        return notes + tuple(
-            f"fails its test, but cannot be left out: {d.text().split(': ', 1)[1]}" for d in self.suspects
+        notes += tuple(
+            f"group {g}: its typical observation contradicts the rest; sigmas {np.sqrt(f):.1f} times as large explain "
+            "that better than wrong observations do, and none was left out for it; check its sigmas, and those of what "
+            "it is compared with, or estimate variance components"
+            for g, f in self.widened
         )
+        return notes + tuple(
+            f"fails its test, but {self._stays(d)}: {d.text().split(': ', 1)[1]}" for d in self.suspects
+        )
+
+    def _stays(self, suspect: Decision) -> str:
+        if suspect.group in self.cautious:
+            return f"stays, for the residuals of group {suspect.group} are together far smaller than its sigmas say"
+        return "cannot be left out"
 
 
 def search_outliers(
@@ -90,25 +106,45 @@ def search_outliers(
     out: tuple[int, ...] = ()
     log: list[Decision] = []
     seen: set[frozenset[int]] = {frozenset()}
+    needed: set[int] = set()
     converged, rounds = False, 0
     while not converged and rounds < options.max_rounds:
         rounds += 1
         system = linear_system(now)
         if found is None:
             given, found = system.used.copy(), candidates(system.precision.graph)
-        snooping = _searched(replace_used(system, given), found, now, options, out, rounds, log)
+        snooping = _searched(replace_used(system, given), found, now, options, out, rounds, log, needed)
         new = tuple(snooping.out)
         converged = set(new) == set(out)
-        if not converged:
-            if frozenset(new) in seen:
-                new = tuple(sorted(set(new) | set(out)))  # turning in circles: the cautious choice
-                converged = set(new) == set(out)
-            seen.add(frozenset(new))
+        if converged:
+            break
+        if frozenset(new) in seen:
+            new = tuple(sorted(set(new) | set(out)))  # turning in circles: the cautious choice
+            converged = set(new) == set(out)
+        seen.add(frozenset(new))
+        try:
+            now = adjust(without(survey, found, new), values_of(now), options.adjust, progress)
             out = new
-            now = adjust(without(survey, found, out), values_of(now), options.adjust, progress)
+        except (IndeterminateError, NotConvergedError):
+            # without all of these there is no solution: the last good one stays, and they take part in it
+            converged = set(new) <= set(out)
+            needed |= set(new) - set(out)
+    snooping.take_back([o for o in snooping.out if o not in out])
     rejected = _decisions("rejected", out, snooping, now, rounds, "test")
-    return OutlierSearch(now, now.survey, tuple(sorted(rejected, key=lambda d: -d.statistic / d.limit)), tuple(log),
-                         _suspects(snooping, now, rounds), rounds, converged, _alternatives(snooping, now))  # fmt: skip
+    names, factors = snooping.system.group_names, snooping.factors
+    few = factors if options.typical else np.ones(len(names))
+    return OutlierSearch(
+        now, now.survey, tuple(sorted(rejected, key=lambda d: -d.statistic / d.limit)), tuple(log),
+        _suspects(snooping, now, rounds), rounds, converged, _alternatives(snooping, now),
+        tuple(np.array(names)[cautious_groups(snooping, len(names))].tolist()),
+        tuple((n, float(f)) for n, f in zip(names, few, strict=True) if f > 1.0 and n in _kinds_groups(snooping)),
+    )  # fmt: skip
+
+
+def _kinds_groups(snooping: Snooping) -> set[str]:
+    """Groups of which something may be left out."""
+    names = snooping.system.group_names
+    return {names[int(g)] for g in snooping.system.group[snooping.candidates]}
 
 
 def replace_used(system: LinearSystem, used: BoolArray) -> LinearSystem:
@@ -118,23 +154,25 @@ def replace_used(system: LinearSystem, used: BoolArray) -> LinearSystem:
 
 def _searched(
     system: LinearSystem, found: Candidates, now: Adjustment, options: SearchOptions, out: Iterable[int], round_: int,
-    log: list[Decision],
+    log: list[Decision], needed: set[int],
 ) -> Snooping:  # fmt: skip
-    """The system without its gross errors; ``out`` are those of the round before."""
+    """The system without its gross errors; ``out`` are those of the round before, ``needed`` stay."""
     G = len(system.group_names)
     snooping = Snooping(system, _allowed(system, found, now, options), 1.0, np.ones(G), options.posterior)
+    snooping.candidates[list(needed)] = False
+    snooping.candidates &= ~cautious_groups(snooping, G)[system.group]
     _, freedom, _ = snooping.statistics()
     snooping.level = _level(options, int(np.count_nonzero((freedom > 0) & system.used)))
     begin = list(out)
     if options.typical:
-        snooping.factors = typical_factors(snooping, G)
+        snooping.factors = group_factors(snooping, G)
     if not begin and options.robust and _anything_fails(snooping):
         begin = _suspected(system, snooping, freedom, log, now, round_)
     for o in begin:
         if snooping.failing()[1][o]:
             snooping.leave_out(o)
     if options.typical and begin:
-        snooping.factors = typical_factors(snooping, G)
+        snooping.factors = group_factors(snooping, G)
     _settle(snooping, log, now, round_)
     for _ in range(2 * len(snooping.sizes) + 2):
         if not _exchanged(snooping, log, now, round_):

@@ -11,7 +11,7 @@ from adjust.errors import SurveyError
 from adjust.factors import ChainPose
 from adjust.graph import GraphBuilder
 from adjust.model import FloatArray
-from adjust.named_precision import NamedPrecision
+from adjust.named_precision import rotations_only
 from adjust.observations import FrameRef
 from adjust.pair_screen import values_of
 from adjust.result import Adjustment, ParameterName
@@ -96,8 +96,8 @@ class _Places:
         held = np.array([s == "held" for s in estimate.status], dtype=np.bool_)
         if isinstance(estimate.value, Pose3):
             R, x = estimate.value.rotation().matrix(), np.asarray(estimate.value.translation())
-            if _turning_only(self.adjustment):
-                return _Place(what, np.full(3, np.nan), R, {} if held.all() else {what: np.eye(6, 3)})
+            if rotations_only(self.adjustment):
+                return _Place(what, np.full(3, np.nan), R, {} if held.all() else {what: np.diag([1.0] * 3 + [0.0] * 3)})
             J = np.zeros((6, 6))
             J[:3, :3], J[3:, 3:] = np.eye(3), R
             return _Place(what, x, R, {} if held.all() else {what: J * ~held})
@@ -121,12 +121,6 @@ class _Places:
             by[name] = by[name] + J if name in by else J
         called: ParameterName = (ref.kind, ref.frame_id) + ((ref.epoch_id,) if ref.epoch_id else ())
         return _Place(called, np.asarray(pose.translation()), R, by)
-
-
-def _turning_only(adjustment: Adjustment) -> bool:
-    """Whether nothing but rotations was measured, so that nothing is where it seems to be."""
-    found = adjustment.precision
-    return isinstance(found, NamedPrecision) and found.solution.network.rotation_only
 
 
 def _scale(adjustment: Adjustment, scaled: bool) -> tuple[float | None, int]:

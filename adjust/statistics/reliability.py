@@ -9,6 +9,7 @@ from adjust.model import FloatArray, IntArray
 from adjust.named_precision import NamedPrecision
 from adjust.precision import Precision, noise_of
 from adjust.result import Adjustment
+from adjust.statistics.condensed import CondensedSystem, condensed_system
 from adjust.statistics.criteria import criteria
 from adjust.statistics.influence import influences
 from adjust.statistics.pose_networks import network_whitening
@@ -30,11 +31,12 @@ from adjust.statistics.single_tests import (
     p_tau,
     whitened,
 )
-from adjust.statistics.system import LinearSystem, linear_system, precision_of
+from adjust.statistics.system import precision_of
 from adjust.terrestrial.statistics import influences as influences_of_readings
 
 DEFAULT_LEVELS = LevelOptions()
-_LARGEST_NETWORK = 3000
+LARGEST_NETWORK = 3000
+"""Pairs and priors of a pose network above which no influences are named."""
 _OF_ROWS = ("redundancy", "least", "statistic", "p", "p_posterior", "detectable", "external")
 _OF_COMPONENTS = ("w", "p_w", "p_tau", "error", "detectable_component", "bias")
 
@@ -51,7 +53,7 @@ class _Batch:
 
 def reliability(
     adjustment: Adjustment, options: LevelOptions = DEFAULT_LEVELS, most_influences: int = 300,
-    system: LinearSystem | None = None,
+    system: CondensedSystem | None = None,
 ) -> Reliability:  # fmt: skip
     """Test every observation. most_influences: of how many the influence on the unknowns is named, worst first.
 
@@ -65,7 +67,7 @@ def reliability(
     n_tests = int(sum(np.count_nonzero(b.x.freedom) for b in batches))
     found = criteria(options, n_tests, int(sizes.max(initial=1)))
     tests = _table(adjustment, batches, ptr, found)
-    if isinstance(adjustment.precision, NamedPrecision) and len(ptr) > _LARGEST_NETWORK:
+    if isinstance(adjustment.precision, NamedPrecision) and len(ptr) > LARGEST_NETWORK:
         most_influences = 0
     return Reliability(
         found, tests, _ellipses(batches[0], found),
@@ -74,7 +76,7 @@ def reliability(
     )  # fmt: skip
 
 
-def _batches(adjustment: Adjustment, system: LinearSystem | None) -> list[_Batch]:
+def _batches(adjustment: Adjustment, system: CondensedSystem | None) -> list[_Batch]:
     """Image points first."""
     if isinstance(adjustment.precision, NamedPrecision):
         none = np.zeros((0, 2, 2))
@@ -83,7 +85,7 @@ def _batches(adjustment: Adjustment, system: LinearSystem | None) -> list[_Batch
         backs = [np.asarray(np.linalg.inv(W), dtype=float) for _, _, _, W, _ in found]
         return [first, *(_Batch(rows, whitened(e, M, used), W, back)
                          for (rows, e, M, W, used), back in zip(found, backs, strict=True))]  # fmt: skip
-    precision = system.precision if system is not None else precision_of(adjustment)
+    precision = system.system.precision if system is not None else precision_of(adjustment)
     return [_images(precision), *_others(precision), *_readings(precision)]
 
 
@@ -275,7 +277,7 @@ def _ellipses(batch: _Batch, found: Criteria) -> ImageEllipses:
 
 def _influences(
     adjustment: Adjustment, tests: ObservationTests, batches: Sequence[_Batch], found: Criteria, most: int,
-    system: LinearSystem | None,
+    system: CondensedSystem | None,
 ) -> tuple[Influence, ...]:  # fmt: skip
     if most <= 0:
         return ()
@@ -291,7 +293,7 @@ def _influences(
             weakest, direction = batch.x.weakest()
             size = np.sqrt(found.lambda0[np.maximum(batch.x.freedom, 1) - 1] / weakest)
             bias |= {int(r): d for r, d in zip(batch.rows[chosen], (direction * size[:, None])[chosen], strict=True)}
-    return influences(system or linear_system(adjustment), [int(r) for r in rows], bias)
+    return influences(system or condensed_system(precision_of(adjustment)), [int(r) for r in rows], bias)
 
 
 def _uncontrolled(adjustment: Adjustment, tests: ObservationTests) -> tuple[str, ...]:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.result import ParameterName
 
@@ -344,3 +346,102 @@ class BudgetEntry:
     coverage: float
     expanded: float
     lines: tuple[BudgetLine, ...]
+
+
+@dataclass(frozen=True)
+class PartTest:
+    """Whether the residuals of one part of a survey are as large as its sigmas say.
+
+    kind: "group", "camera", "epoch", "target", "table", "set-up" or "instrument"; name: which. n: components in use.
+    redundancy: sum of their redundancy numbers. omega: their weighted squares. factor: omega over redundancy, 1 where
+    the sigmas are right. p: probability of an omega as large or larger, or an upper bound of it. fails: below the level
+    of one test.
+    """
+
+    kind: str
+    name: str
+    n: int
+    redundancy: float
+    omega: float
+    factor: float
+    p: float
+    fails: bool
+
+    def text(self) -> str:
+        """For people."""
+        return (
+            f"{self.kind} {self.name} does not fit: its residuals are {np.sqrt(self.factor):.2f} times what the sigmas "
+            f"allow (variance factor {self.factor:.3g}, redundancy {self.redundancy:.1f}, p {self.p:.2g})"
+        )
+
+
+@dataclass(frozen=True)
+class ChangeShift:
+    """One component of a change: its amount in ``unit`` as the residuals have it, and the sigma of that."""
+
+    component: str
+    unit: str
+    amount: float
+    sigma: float
+
+
+_IN_UNITS = {"rad": (" arcsec", 180.0 * 3600.0 / np.pi), "m": (" mm", 1e3), "1": ("", 1.0)}
+
+
+@dataclass(frozen=True)
+class Change:
+    """What the residuals say that a camera, target or table has of its own: a score test of what was no unknown.
+
+    kind: "camera", "target" or "table"; name: which. what: "lens", "position", "shape", "zero", "reading of" an axis.
+    epoch: from which on, "" where it is the same at all epochs. statistic, freedom, p: of the test. shifts: the
+    components that explain it, largest first.
+    """
+
+    kind: str
+    name: str
+    what: str
+    epoch: str
+    statistic: float
+    freedom: int
+    p: float
+    shifts: tuple[ChangeShift, ...]
+
+    def text(self) -> str:
+        """For people."""
+        said = f"{self.kind} {self.name}: its {self.what} is not the one of the other epochs from {self.epoch} on"
+        if not self.epoch:
+            said = f"{self.kind} {self.name}: its {self.what} is not as given"
+        parts = []
+        for x in self.shifts:
+            unit, factor = _IN_UNITS.get(x.unit, (f" {x.unit}", 1.0))
+            parts.append(f"{x.component} {x.amount * factor:+.3g} +- {x.sigma * factor:.2g}{unit}")
+        return f"{said}: {', '.join(parts)} (p {self.p:.2g})"
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Whether every part of a survey fits, and whether cameras and targets stayed the same.
+
+    alpha: error probability of all n_tests together; level: of each. parts: all, smallest p first. changes: those
+    found, the clearest first, each given the ones before it. relative: tested against the rest, because the survey as a
+    whole does not fit its sigmas. n_changes: how many were asked for. left_out: what was not tested, and why.
+    """
+
+    alpha: float
+    level: float
+    n_tests: int
+    parts: tuple[PartTest, ...]
+    changes: tuple[Change, ...]
+    relative: bool
+    n_changes: int
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def failing(self) -> tuple[PartTest, ...]:
+        """Parts that do not fit, worst first."""
+        return tuple(x for x in self.parts if x.fails)
+
+    @property
+    def fits(self) -> bool:
+        """Whether nothing was found."""
+        return not self.changes and not any(x.fails for x in self.parts)

@@ -240,24 +240,6 @@ class Snooping:
         return [int(r) for r, x in zip(rows, excess, strict=True) if x <= 1.0]
 
 
-def typical_factors(snooping: Snooping, n_groups: int) -> FloatArray:
-    """By how much the typical test of every group (G,) is too large, where that cannot be chance; else 1.
-
-    Sigmas that are too small throughout make all tests large and no observation wrong.
-    """
-    T, freedom, _ = snooping.statistics()
-    out = np.ones(n_groups)
-    for g in range(n_groups):
-        mine = snooping.system.used & (snooping.system.group == g) & (freedom > 0)
-        n = int(mine.sum())
-        if n < 20:
-            continue
-        ratio = T[mine] / chi2.ppf(0.5, freedom[mine])
-        if np.mean(ratio > 1.0) > 0.5 + 1.5 / np.sqrt(n):  # three sigmas of a fair coin
-            out[g] = max(1.0, float(np.median(ratio)))
-    return out
-
-
 def robust_squares(system: LinearSystem, freedom: IntArray, factors: FloatArray, rounds: int = 20) -> FloatArray:
     """Weighted squares (M,), over the factors (G,) of the groups, where Cauchy weights settle (Huber 1981, 7.8).
 

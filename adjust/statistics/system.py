@@ -13,6 +13,7 @@ import scipy
 from gtsam import Pose3, Rot3, Values
 from scipy import sparse
 
+from adjust.bundle_batch import BundleBatch
 from adjust.datum import gauge
 from adjust.errors import SurveyError
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
@@ -28,6 +29,10 @@ DENSE = 3000
 """Unknowns up to which the normal matrix is factored as a full one."""
 FEW = 200
 """Unknowns up to which it is inverted at once."""
+_PLAIN = 600
+"""Unknowns up to which nothing is gained by their structure."""
+_SMALL_SET = 100
+"""Unknowns of one epoch, or one point, up to which they are eliminated by themselves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,25 +128,84 @@ class LinearSystem:
         return out
 
 
-def _solver(scaled: sparse.csc_matrix) -> Callable[[FloatArray], FloatArray]:
-    """The solution of a normal matrix with a unit diagonal."""
+Solver = tuple[Callable[[FloatArray], FloatArray], float]
+"""The solution of a normal matrix with a unit diagonal, and the multiplications that one right-hand side takes."""
+
+
+def _solver(scaled: sparse.csc_matrix) -> Solver:
     n = scaled.shape[0]
     if n <= FEW:  # its inverse: SciPy's linear algebra takes longer to load
         inverse = np.linalg.inv(scaled.toarray())
-        return lambda b: inverse @ b
+        return lambda b: inverse @ b, float(n**2)
+    arrow = _arrow(scaled) if n > _PLAIN else None
+    if arrow is not None:
+        return arrow
     if n <= DENSE:
         factor = scipy.linalg.cho_factor(scaled.toarray())
-        return lambda b: np.asarray(scipy.linalg.cho_solve(factor, b))
+        return lambda b: np.asarray(scipy.linalg.cho_solve(factor, b)), float(n**2)
     from scipy.sparse.linalg import splu  # here: as above
 
-    solve: Callable[[FloatArray], FloatArray] = splu(
-        scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
-    ).solve
-    return solve
+    lu = splu(scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    return lu.solve, 2.0 * lu.L.nnz
+
+
+def _arrow(scaled: sparse.csc_matrix) -> Solver | None:
+    """The solution by a few unknowns that most others touch and many small sets that touch nothing but these.
+
+    That is a survey of many epochs, or of many points seen from a few places; None for others.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    degree = np.diff(scaled.indptr)
+    core = np.flatnonzero(degree > 2 * np.median(degree))
+    rest = np.flatnonzero(degree <= 2 * np.median(degree))
+    if not 0 < len(core) <= DENSE:
+        return None
+    N = scaled.tocsr()
+    own, across, head = N[rest][:, rest], N[rest][:, core], N[core][:, core].toarray()
+    _, label = connected_components(own, directed=False)
+    sizes = np.bincount(label)
+    if sizes.max() > _SMALL_SET:
+        return None
+    sets = [np.argsort(label, kind="stable")[np.repeat(sizes, sizes) == k].reshape(-1, k) for k in np.unique(sizes)]
+    inverses = [np.linalg.inv(_blocks(own, x)) for x in sets]
+
+    def inner(b: FloatArray) -> FloatArray:
+        out = np.empty_like(b)
+        for index, inverse in zip(sets, inverses, strict=True):
+            out[index] = inverse @ b[index]
+        return out
+
+    T = inner(across.toarray())
+    factor = scipy.linalg.cho_factor(head - across.T @ T)
+
+    def solve(b: FloatArray) -> FloatArray:
+        columns = b.reshape(len(b), -1)
+        x = np.empty_like(columns)
+        x[core] = scipy.linalg.cho_solve(factor, columns[core] - T.T @ columns[rest])
+        x[rest] = inner(columns[rest]) - T @ x[core]
+        return x.reshape(b.shape)
+
+    return solve, 2.0 * len(rest) * len(core) + len(core) ** 2
+
+
+def _blocks(N: sparse.csr_matrix, sets: IntArray) -> FloatArray:
+    """The blocks (p, k, k) of a matrix that has no others; sets (p, k)."""
+    p, k = sets.shape
+    place, number = np.full(N.shape[0], -1), np.full(N.shape[0], -1)
+    place[sets], number[sets] = np.arange(k), np.arange(p)[:, None]
+    entries = N.tocoo()
+    kept = number[entries.row] >= 0
+    out = np.zeros((p, k, k))
+    out[number[entries.row[kept]], place[entries.row[kept]], place[entries.col[kept]]] = entries.data[kept]
+    return out
 
 
 class Normal:
-    """A normal matrix (n, n), factored: solutions, and its inverse in the datum of the survey."""
+    """A normal matrix (n, n), factored: solutions, and its inverse in the datum of the survey.
+
+    cost: multiplications of a solution.
+    """
 
     def __init__(self, N: sparse.csc_matrix, motions: FloatArray) -> None:
         self.N, self.motions = N, motions
@@ -149,7 +213,7 @@ class Normal:
         S = sparse.diags(self.scale)
         scaled = (S @ N @ S).tocsc()
         self.n = scaled.shape[0]
-        self._of_scaled = _solver(scaled)
+        self._of_scaled, self.cost = _solver(scaled)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """The solution (n, k) or (n,) of N x = right, with the datum's rows fulfilled where ``right`` is seen."""
@@ -169,42 +233,69 @@ class Normal:
         return np.asarray(self.inverse - self.motions @ np.linalg.inv(seen.T @ seen) @ self.motions.T)
 
 
+@dataclass(frozen=True, eq=False)
+class ImageRows:
+    """Whitened rows of the image points, as some observations: A (m, n), e (m,), how many rows each has, used, groups.
+
+    An observation is one image point here, or a whole block of them (see :mod:`adjust.statistics.condensed`).
+    """
+
+    A: sparse.csr_matrix
+    e: FloatArray
+    lengths: IntArray
+    used: BoolArray
+    groups: list[str]
+
+
+KeyColumns = dict[int, IntArray]
+"""By key: column of every component, -1 for held ones."""
+
+
 def linear_system(adjustment: Adjustment) -> LinearSystem:
     """The system of an adjustment; one that was solved as a pose network is built anew. Raises SurveyError."""
-    precision = precision_of(adjustment)
-    graph, values = precision.graph, precision.solved.values
-    graph.prepare(values, jacobians=True)
+    return assembled(precision_of(adjustment), _points_apart)
+
+
+def assembled(precision: Precision, image_rows: Callable[[Precision, int, KeyColumns], ImageRows]) -> LinearSystem:
+    """The system of these image rows over n columns, and of all other observations."""
+    graph = precision.graph
+    graph.prepare(precision.solved.values, jacobians=True)
     columns = _columns(graph)
     key_columns = {graph.unknowns.by_name[name].key: _all_columns(graph, columns, name) for name in columns.at}
     n = len(columns)
-    images = _image_rows(graph, n, key_columns, values)
+    images = image_rows(precision, n, key_columns)
     others = _other_rows(precision, n, key_columns)
     readings = _reading_rows(precision, n, key_columns)
-    n_image, n_before = images[0].shape[0] // 2, images[0].shape[0] + others[0].shape[0]
-    A = sparse.vstack([images[0], others[0], readings[0]]).tocsr()
-    lengths = np.concatenate([np.full(n_image, 2), others[2], np.ones(len(readings[1]))])
+    n_image, n_before = len(images.lengths), images.A.shape[0] + others[0].shape[0]
+    A = sparse.vstack([images.A, others[0], readings[0]]).tocsr()
+    lengths = np.concatenate([images.lengths, others[2], np.ones(len(readings[1]))])
     ptr = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-    used = used_observations(graph)
-    groups = observation_groups(graph)
+    used = np.concatenate([images.used, _used_others(graph)])
+    groups = images.groups + _groups_of_others(graph)
     names = tuple(dict.fromkeys(groups))
     number = {g: i for i, g in enumerate(names)}
     group = np.array([number[g] for g in groups], dtype=np.int64)
     datum, motions = _datum(precision, n, key_columns)
-    e = np.concatenate([images[1], others[1], readings[1]])
+    e = np.concatenate([images.e, others[1], readings[1]])
     joint = tuple(JointReadings(n_before + rows, W) for rows, W in joint_readings(graph))
     return LinearSystem(precision, columns, A, e, ptr, used, group, names, datum, motions, n_image, joint)
 
 
-def observation_groups(graph: AdjustmentGraph) -> list[str]:
-    """Group of every observation, in the order of a :class:`LinearSystem`."""
-    out = [b.group for b in graph.survey.image_blocks for _ in range(len(b.uv))] + [o.group for o in graph.others]
-    return out + [r.group for r in graph.survey.readings]
+def _points_apart(precision: Precision, n: int, key_columns: KeyColumns) -> ImageRows:
+    """Every image point an observation of its own."""
+    graph = precision.graph
+    A, e = _image_rows(graph, n, key_columns, precision.solved.values)
+    groups = [b.group for b in graph.survey.image_blocks for _ in range(len(b.uv))]
+    return ImageRows(A, e, np.full(len(groups), 2), graph.used(), groups)
 
 
-def used_observations(graph: AdjustmentGraph) -> BoolArray:
-    """Which observations take part, in the order of a :class:`LinearSystem`."""
+def _groups_of_others(graph: AdjustmentGraph) -> list[str]:
+    return [o.group for o in graph.others] + [r.group for r in graph.survey.readings]
+
+
+def _used_others(graph: AdjustmentGraph) -> BoolArray:
     readings = graph.terrestrial.used if graph.terrestrial is not None else np.zeros(0, dtype=np.bool_)
-    return np.concatenate([graph.used(), np.array([o.used for o in graph.others], dtype=np.bool_), readings])
+    return np.concatenate([np.array([o.used for o in graph.others], dtype=np.bool_), readings])
 
 
 def joint_readings(graph: AdjustmentGraph) -> list[tuple[IntArray, FloatArray]]:
@@ -273,19 +364,32 @@ def _all_columns(graph: AdjustmentGraph, columns: Columns, name: ParameterName) 
     return out
 
 
-class _Entries:
+class Entries:
     """Dense blocks gathered into one sparse matrix; columns of -1 are left out."""
 
     def __init__(self) -> None:
         self.parts: list[tuple[IntArray, IntArray, FloatArray]] = []
 
     def add(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
+        """Values (r, c) at these rows and columns."""
         kept = columns >= 0
         c = columns[kept]
         v = values[:, kept]
         self.parts.append((np.repeat(rows, len(c)), np.tile(c, len(rows)), v.ravel()))
 
+    def add_blocks(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
+        """Values (b, r, c) at rows (b, r) and columns (b, c)."""
+        down = np.broadcast_to(rows[:, :, None], values.shape)
+        across = np.broadcast_to(columns[:, None, :], values.shape)
+        kept = across >= 0
+        self.parts.append((down[kept], across[kept], values[kept]))
+
+    def add_many(self, points: IntArray, columns: IntArray, values: FloatArray) -> None:
+        """Two rows each of many points: columns (k, c), values (k, 2, c)."""
+        self.add_blocks(2 * points[:, None] + np.arange(2), columns, values)
+
     def matrix(self, shape: tuple[int, int]) -> sparse.csr_matrix:
+        """All together."""
         if not self.parts:
             return sparse.csr_matrix(shape)
         r, c, v = (np.concatenate(x) for x in zip(*self.parts, strict=True))
@@ -295,12 +399,12 @@ class _Entries:
 Rows = tuple[sparse.csr_matrix, FloatArray]
 
 
-def _image_rows(graph: AdjustmentGraph, n: int, key_columns: dict[int, IntArray], values: Values) -> Rows:
+def _image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns, values: Values) -> Rows:
     """Rows of all image points in the order of ``Survey.image_blocks``."""
     parts = [_known_rows(graph, n, key_columns)]
     n_known = parts[0][0].shape[0] // 2
     if graph.bundle is not None:
-        parts.append(_bundle_rows(graph, n, key_columns, values))
+        parts.append(bundle_rows(graph, n, key_columns, values))
     A, e = sparse.vstack([p[0] for p in parts]).tocsr(), np.concatenate([p[1] for p in parts])
     source, at = [], [0, n_known]
     for i, free in graph.image_order:
@@ -313,8 +417,8 @@ def _image_rows(graph: AdjustmentGraph, n: int, key_columns: dict[int, IntArray]
     return A[order], e[order]
 
 
-def _known_rows(graph: AdjustmentGraph, n: int, key_columns: dict[int, IntArray]) -> Rows:
-    images, entries = graph.images, _Entries()
+def _known_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows:
+    images, entries = graph.images, Entries()
     s, c = images.state, images.chains
     e = np.zeros(2 * images.n_points)
     for b, keys in enumerate(images.keys):
@@ -328,42 +432,45 @@ def _known_rows(graph: AdjustmentGraph, n: int, key_columns: dict[int, IntArray]
     return entries.matrix((len(e), n)), e
 
 
-def _bundle_rows(graph: AdjustmentGraph, n: int, key_columns: dict[int, IntArray], values: Values) -> Rows:
+def bundle_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns, values: Values) -> Rows:
+    """Whitened rows of the image points of unknown points, used or not, in the order of the bundle's blocks."""
     bundle = graph.bundle
     if bundle is None:
         raise ValueError("a survey without unknown points has no such rows")
     bundle.whitened_squares(values)  # leaves the rows of all points, used or not, with their own weights
     k = len(bundle.point)
-    local, rows = _Entries(), np.arange(2 * k).reshape(k, 2)
-    n_free = bundle.state.lenses.n_free
-    of_point = {int(i): key_columns[key] for i, key in bundle.point_key.items()}
-    points = _Entries()
-    reduced = set(bundle.reduced)
-    for j in range(k):
-        A, lens = bundle.A[j], int(n_free[bundle.camera_of[j]])
-        at = int(bundle.lens_at[bundle.camera_of[j]])
-        local.add(rows[j], np.arange(at, at + lens), A[:, :lens])
-        pose = int(bundle.pose_at[j])
-        local.add(rows[j], np.arange(pose, pose + 6), A[:, MAX_LENS : MAX_LENS + 6])
-        by_point, i = A[:, MAX_LENS + 3 : MAX_LENS + 6], int(bundle.point[j])
-        if bundle.point_at[j] >= 0:
-            local.add(rows[j], np.arange(bundle.point_at[j], bundle.point_at[j] + 3), by_point)
-        elif i in reduced:
-            points.add(rows[j], of_point[i], by_point)
+    local, points = Entries(), Entries()
+    for camera in np.unique(bundle.camera_of):
+        mine, lens = np.flatnonzero(bundle.camera_of == camera), int(bundle.state.lenses.n_free[camera])
+        local.add_many(mine, np.tile(int(bundle.lens_at[camera]) + np.arange(lens), (len(mine), 1)),
+                       bundle.A[mine, :, :lens])  # fmt: skip
+    local.add_many(np.arange(k), bundle.pose_at[:, None] + np.arange(6), bundle.A[:, :, MAX_LENS : MAX_LENS + 6])
+    by_point = bundle.A[:, :, MAX_LENS + 3 : MAX_LENS + 6]
+    tied = np.flatnonzero(bundle.point_at >= 0)
+    local.add_many(tied, bundle.point_at[tied][:, None] + np.arange(3), by_point[tied])
+    of_point = np.full((len(bundle.point_ids), 3), -1, dtype=np.int64)
+    for i in bundle.reduced:
+        of_point[i] = key_columns[bundle.point_key[i]]
+    points.add_many(np.arange(k), np.where(bundle.point_at[:, None] >= 0, -1, of_point[bundle.point]), by_point)
     columns = np.concatenate([key_columns[key] for key in bundle.order])
     kept = columns >= 0
     select = sparse.csr_matrix((np.ones(int(kept.sum())), (np.flatnonzero(kept), columns[kept])), (len(columns), n))
     A_keys = local.matrix((2 * k, bundle.n_local)) @ bundle.G @ select + points.matrix((2 * k, n))
-    back = np.empty(k, dtype=np.int64)
-    back[bundle.sorted] = np.arange(k)
-    order = (2 * back[:, None] + np.arange(2)).ravel()
+    order = bundle_order(bundle)
     return A_keys.tocsr()[order], bundle.A[:, :, MAX_LENS + 6].ravel()[order]
 
 
+def bundle_order(bundle: BundleBatch) -> IntArray:
+    """Rows (2 K,) of a bundle's image points as its blocks have them."""
+    back = np.empty(len(bundle.sorted), dtype=np.int64)
+    back[bundle.sorted] = np.arange(len(back))
+    return np.asarray((2 * back[:, None] + np.arange(2)).ravel())
+
+
 def _other_rows(
-    precision: Precision, n: int, key_columns: dict[int, IntArray]
+    precision: Precision, n: int, key_columns: KeyColumns
 ) -> tuple[sparse.csr_matrix, FloatArray, IntArray]:
-    entries, residuals, lengths, at = _Entries(), [np.zeros(0)], [], 0
+    entries, residuals, lengths, at = Entries(), [np.zeros(0)], [], 0
     for item in precision.graph.others:
         linear = item.factor.linearize(precision.solved.values)
         A, b = linear.jacobian()
@@ -375,22 +482,22 @@ def _other_rows(
     return entries.matrix((at, n)), np.concatenate(residuals), np.array(lengths, dtype=np.int64)
 
 
-def _reading_rows(precision: Precision, n: int, key_columns: dict[int, IntArray]) -> Rows:
+def _reading_rows(precision: Precision, n: int, key_columns: KeyColumns) -> Rows:
     batch = precision.graph.terrestrial
     if batch is None:
         return sparse.csr_matrix((0, n)), np.zeros(0)
-    e, entries = batch.unweighted(precision.solved.values).copy(), _Entries()
+    e, entries = batch.unweighted(precision.solved.values).copy(), Entries()
     for c, chunk in enumerate(batch.layout.chunks):
         if chunk.keys:  # those between held positions have none
             entries.add(chunk.rows, np.concatenate([key_columns[k] for k in chunk.keys]), batch.jacobian(c))
     return entries.matrix((len(e), n)), e
 
 
-def _datum(precision: Precision, n: int, key_columns: dict[int, IntArray]) -> tuple[sparse.csr_matrix, FloatArray]:
+def _datum(precision: Precision, n: int, key_columns: KeyColumns) -> tuple[sparse.csr_matrix, FloatArray]:
     datum = precision.solved.datum
     if datum is None:
         return sparse.csr_matrix((0, n)), np.zeros((n, 0))
-    entries, motions = _Entries(), np.zeros((n, datum.defect))
+    entries, motions = Entries(), np.zeros((n, datum.defect))
     for key, rows in datum.rows.items():
         entries.add(np.arange(datum.defect), key_columns[key], rows / datum.sigma)
     for key, columns in key_columns.items():

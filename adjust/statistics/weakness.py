@@ -7,48 +7,96 @@ import numpy as np
 from adjust.model import FloatArray, IntArray
 from adjust.result import Adjustment, ParameterName
 from adjust.statistics.result import Correlation, PrincipalComponent, WeakDirection, WeakPart
-from adjust.statistics.system import DENSE, LinearSystem, linear_system
+from adjust.statistics.system import DENSE, FEW, LinearSystem, linear_system
 
 _MOST = 200
 _SHARE = 0.1
+_AT_A_TIME = 500
+_WORK = 20_000_000
+"""Correlations that are looked at in surveys of more than ``DENSE`` unknowns."""
+_KRYLOV, _RESTARTS = 40, 50
 
 
 def covariance_columns(system: LinearSystem, columns: IntArray) -> FloatArray:
     """Columns (n, k) of the covariance matrix of all unknowns, a priori, in the survey's datum."""
     right = np.zeros((len(system.columns), len(columns)))
     right[columns, np.arange(len(columns))] = 1.0
+    return times_covariance(system, right)
+
+
+def times_covariance(system: LinearSystem, right: FloatArray) -> FloatArray:
+    """The covariance matrix of all unknowns, a priori, in the survey's datum, times (n,) or (n, k)."""
     out = system.normal.solve(right)
     if system.motions.shape[1]:
         seen = system.datum @ system.motions
-        out -= system.motions @ np.linalg.inv(seen.T @ seen) @ system.motions[columns].T
+        out = out - system.motions @ np.linalg.solve(seen.T @ seen, system.motions.T @ right)
     return out
 
 
-def chosen_columns(system: LinearSystem, names: Sequence[ParameterName] | None = None) -> IntArray:
-    """Columns of these unknowns; without names of all, or in large surveys of those that are no single epoch's."""
-    if names is not None:
-        return system.columns.of(names)
-    if len(system.columns) <= DENSE:
-        return np.arange(len(system.columns))
+def compared_columns(system: LinearSystem) -> IntArray:
+    """Columns that are compared with all others: all of them, or in large surveys first what is there once.
+
+    What is there at one epoch alone comes after, and points last; as many as ``_WORK`` allows.
+    """
+    n, columns = len(system.columns), system.columns
+    if n <= DENSE:
+        return np.arange(n)
     epochs = {b.epoch_id for b in system.precision.graph.survey.image_blocks}
-    return system.columns.of([n for n in system.columns.at if not (len(n) == 3 and n[2] in epochs)])[:DENSE]
+    rank = {name: 2 if len(name) == 3 and name[2] in epochs else 1 if name[0] == "point" else 0 for name in columns.at}
+    ordered = columns.of(sorted(columns.at, key=lambda name: rank[name]))
+    return ordered[: max(_WORK // n, 1)]
 
 
 def correlations(
     adjustment: Adjustment, limit: float = 0.95, names: Sequence[ParameterName] | None = None,
     system: LinearSystem | None = None,
 ) -> tuple[Correlation, ...]:  # fmt: skip
-    """Pairs of components whose correlation is at least ``limit`` in size, largest first, 200 at most."""
+    """Pairs of components whose correlation is at least ``limit`` in size, largest first, 200 at most.
+
+    Without names of all unknowns. Where these are too many, of the :func:`compared_columns` with all, and of the
+    components of every unknown with each other.
+    """
     system = system or linear_system(adjustment)
-    index = chosen_columns(system, names)
-    Q = covariance_columns(system, index)[index]
-    d = np.sqrt(np.maximum(np.diag(Q), 1e-300))
-    C = np.triu(Q / np.outer(d, d), 1)
-    a, b = np.nonzero(np.abs(C) >= limit)
-    order = np.argsort(-np.abs(C[a, b]), kind="stable")[:_MOST]
     c = system.columns
-    found = ((index[i], index[j], float(C[i, j])) for i, j in zip(a[order].tolist(), b[order].tolist(), strict=True))
-    return tuple(Correlation(c.names[i], c.components[i], c.names[j], c.components[j], x) for i, j, x in found)
+    index = compared_columns(system) if names is None else c.of(names)
+    among = np.arange(len(c)) if names is None else index
+    number = np.full(len(c), -1)
+    number[index] = np.arange(len(index))
+    sigma = np.sqrt(np.maximum(_variances(system, among), 1e-300))
+    found: list[tuple[int, int, float]] = []
+    for first in range(0, len(index), _AT_A_TIME):
+        part = index[first : first + _AT_A_TIME]
+        Q = covariance_columns(system, part)[among]
+        C = Q / np.outer(sigma, np.sqrt(np.maximum(_variances(system, part), 1e-300)))
+        a, b = np.nonzero(np.abs(C) >= limit)
+        i, j = among[a], part[b]
+        kept = np.where(number[i] < 0, True, number[i] < number[j])  # each pair once, nothing with itself
+        found += zip(i[kept].tolist(), j[kept].tolist(), C[a, b][kept].tolist(), strict=True)
+    if names is None and len(index) < len(c):
+        found += _within(system, number, limit)
+    order = sorted(found, key=lambda x: (-abs(x[2]), x[0], x[1]))[:_MOST]
+    return tuple(Correlation(c.names[i], c.components[i], c.names[j], c.components[j], x) for i, j, x in order)
+
+
+def _variances(system: LinearSystem, index: IntArray) -> FloatArray:
+    """Of these columns (k,): as they are solved in small surveys, as the tree has them in large ones."""
+    if len(system.columns) > DENSE:
+        return np.asarray(system.sigmas[index] ** 2)
+    return np.diag(system.normal.covariance(system.datum))[index]
+
+
+def _within(system: LinearSystem, number: IntArray, limit: float) -> list[tuple[int, int, float]]:
+    """Pairs of components of one unknown that is not compared with others."""
+    by_name, out = system.precision.graph.unknowns.by_name, list[tuple[int, int, float]]()
+    for name, at in system.columns.at.items():
+        if len(at) > 1 and (number[at] < 0).all():
+            free = system.columns.free[name]
+            Q = system.precision.cov(by_name[name].key)[np.ix_(free, free)]
+            d = np.sqrt(np.maximum(np.diag(Q), 1e-300))
+            C = np.triu(Q / np.outer(d, d), 1)
+            a, b = np.nonzero(np.abs(C) >= limit)
+            out += zip(at[a].tolist(), at[b].tolist(), C[a, b].tolist(), strict=True)
+    return out
 
 
 def correlation_matrix(
@@ -73,23 +121,49 @@ def weak_directions(
     Kuh and Welsch 1980, chapter 3).
     """
     system = system or linear_system(adjustment)
-    index = chosen_columns(system)
     used = system.used[system.row_of]
-    alone = np.sqrt(np.maximum(np.asarray(system.A[used].multiply(system.A[used]).sum(axis=0)).ravel()[index], 1e-300))
-    Q = covariance_columns(system, index)[index] * np.outer(alone, alone)
-    values, vectors = np.linalg.eigh(0.5 * (Q + Q.T))
+    alone = np.sqrt(np.maximum(np.asarray(system.A[used].multiply(system.A[used]).sum(axis=0)).ravel(), 1e-300))
+    values, vectors = _largest(system, np.arange(len(alone)), alone, most)
     out = []
-    for value, vector in zip(values[::-1][:most], vectors.T[::-1][:most], strict=True):
+    for value, vector in zip(values, vectors.T, strict=True):
         if value < least_inflation**2:
             break
         size = np.abs(vector) / np.abs(vector).max()
         amount = np.sqrt(value) * vector / alone * np.sign(vector[size.argmax()])
         order = [int(i) for i in np.argsort(-size, kind="stable") if size[i] > _SHARE]
         c = system.columns
-        parts = tuple(WeakPart(c.names[index[i]], c.components[index[i]], c.units[index[i]], float(amount[i]))
-                      for i in order)  # fmt: skip
+        parts = tuple(WeakPart(c.names[i], c.components[i], c.units[i], float(amount[i])) for i in order)
         out.append(WeakDirection(float(np.sqrt(value)), parts))
     return tuple(out)
+
+
+def _largest(system: LinearSystem, index: IntArray, scale: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
+    """Largest eigenvalues (k,), the first first, and vectors (n, k) of the covariance of these columns times scales.
+
+    In large surveys by Lanczos' method, every step of it one solution of the normal equations (Golub and Van Loan 2013,
+    chapter 10): the few directions that are asked for, and not all n.
+    """
+    n = len(index)
+    if n <= FEW:
+        Q = covariance_columns(system, index)[index] * np.outer(scale, scale)
+        values, vectors = np.linalg.eigh(0.5 * (Q + Q.T))
+        return values[::-1][:most], vectors[:, ::-1][:, :most]
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh  # here: they take long to load
+
+    inside = np.zeros(len(system.columns))
+
+    def times(x: FloatArray) -> FloatArray:
+        inside[index] = scale * x.ravel()
+        return np.asarray(scale * times_covariance(system, inside)[index])
+
+    operator = LinearOperator((n, n), matvec=times, dtype=np.float64)
+    first = 1.0 + 0.1 * np.cos(np.arange(n))  # the same every time, at right angles to nothing in particular
+    try:
+        values, vectors = eigsh(operator, most, which="LA", v0=first, ncv=_KRYLOV, tol=1e-6, maxiter=_RESTARTS)
+    except ArpackNoConvergence as found:  # those that came out are right
+        values, vectors = found.eigenvalues, found.eigenvectors
+    order = np.argsort(-values, kind="stable")
+    return np.asarray(values)[order], np.asarray(vectors)[:, order]
 
 
 def principal_component(adjustment: Adjustment, system: LinearSystem | None = None) -> PrincipalComponent | None:
@@ -98,16 +172,16 @@ def principal_component(adjustment: Adjustment, system: LinearSystem | None = No
     None without unknown points.
     """
     system = system or linear_system(adjustment)
-    names = tuple(n for n in system.columns.at if n[0] == "point")[: DENSE // 3]
+    names = tuple(n for n in system.columns.at if n[0] == "point")
     if not names:
         return None
     index = system.columns.of(names)
-    Q = covariance_columns(system, index)[index]
-    values, vectors = np.linalg.eigh(0.5 * (Q + Q.T))
-    largest = float(max(values[-1], 0.0))
-    shifts, vector, at = np.zeros((len(names), 3)), vectors[:, -1] * np.sqrt(largest), 0
+    values, vectors = _largest(system, index, np.ones(len(index)), 1)
+    largest = float(max(values[0], 0.0))
+    shifts, vector, at = np.zeros((len(names), 3)), vectors[:, 0] * np.sqrt(largest), 0
     for i, name in enumerate(names):
         free = system.columns.free[name]
         shifts[i, free] = vector[at : at + len(free)]
         at += len(free)
-    return PrincipalComponent(float(np.sqrt(largest)), largest / float(np.trace(Q)), names, shifts)
+    total = float(_variances(system, index).sum())
+    return PrincipalComponent(float(np.sqrt(largest)), largest / total, names, shifts)

@@ -13,6 +13,7 @@ from adjust.closed_forms import inverse, rotation_log
 from adjust.errors import SurveyError
 from adjust.model import FloatArray, IntArray, Survey, Table
 from adjust.result import Adjustment
+from adjust.table_checks.fit import fit_table
 from adjust.table_checks.places import (
     Places,
     Reread,
@@ -30,6 +31,8 @@ from adjust.table_checks.views import TableViews, table_views
 
 _UNEXPLAINED_RAD = np.radians(1.0)
 _SHOWN = 12
+_TORN = 100.0  # scale of a fit's residuals from which most views contradict each other
+_FEW, _MOST = 0.05, 0.8
 _EXACT = 5.0  # sigmas
 
 
@@ -97,6 +100,12 @@ def _causes(survey: Survey, views: TableViews) -> list[str]:
             f"agree to {np.degrees(verdict.corrected):.2f} deg instead of {np.degrees(verdict.as_given):.2f} deg "
             "(median); correct table_angles.csv"
         ]
+    camera = contradicting_camera(views)
+    if camera is not None:
+        return [
+            f"camera {camera}: its images contradict those of all others; without them the readings of {table} and all "
+            "targets agree: look for mirrored or turned images, or those of another camera under its name"
+        ]
     found = find_places(views)
     fits = found is not None and 2 * len(outlying(found.fit)) < len(views.poses)
     if found is None or not fits:
@@ -110,6 +119,25 @@ def _causes(survey: Survey, views: TableViews) -> list[str]:
     lines = [_moved_text(views, found)] if found.moved is not None else []
     lines += _epoch_lines(views, found)
     return lines or _sign_lines(survey, views, found)
+
+
+def contradicting_camera(views: TableViews) -> str | None:
+    """The one camera without whose images everything agrees; None where there is none, or not one alone."""
+    whole = fit_table(views, views.outer)
+    if whole is None:
+        return None
+    off = np.isin(np.arange(len(views.poses)), outlying(whole))
+    found = []
+    for kind, camera_id in (*views.inner_ids, *views.outer_ids):
+        mine = views.shows(kind, camera_id)
+        # either the whole fit is torn, or what does not belong to it are the views of this camera
+        if kind != "camera" or mine.all() or (whole.scale < _TORN and not off[mine].mean() > _MOST):
+            continue
+        rest = views.without(kind, camera_id)
+        fit = fit_table(rest, rest.outer)
+        if fit is not None and fit.scale < min(whole.scale, _TORN) and len(outlying(fit)) < _FEW * len(rest.poses):
+            found.append(camera_id)
+    return found[0] if len(found) == 1 else None
 
 
 def _sign_lines(survey: Survey, views: TableViews, found: Places) -> list[str]:

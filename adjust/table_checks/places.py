@@ -151,7 +151,7 @@ def reread(views: TableViews, found: Places, epoch: int) -> Reread:
     def misfit(a: FloatArray) -> tuple[FloatArray, FloatArray]:
         motions = part.motions(a[None], fit.geometry)
         r, cov, _ = residuals(part, motions, fit.mount_from_inner, fit.table_from_place, place)
-        return r, np.asarray(np.linalg.inv(cov), dtype=np.float64)
+        return r, np.asarray(np.linalg.pinv(cov, rcond=1e-14, hermitian=True), dtype=np.float64)
 
     step = 1e-6
     for _ in range(6):

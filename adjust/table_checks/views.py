@@ -12,16 +12,17 @@ from adjust.closed_forms.rigid import skew
 from adjust.errors import SurveyError
 from adjust.initial.lenses import Sighting, start_lens
 from adjust.initial.views import (
+    Sight,
     View,
     all_rays,
     focal_px,
-    make_view,
+    make_views,
     refine_views,
     target_points,
     untrustworthy,
     used_rows,
 )
-from adjust.model import FloatArray, IntArray, PoseParameter, Station, Survey, Table, Target
+from adjust.model import BoolArray, FloatArray, IntArray, PoseParameter, Station, Survey, Table, Target
 from adjust.observations import ImageBlock
 
 
@@ -79,6 +80,22 @@ class TableViews:
         return replace(
             self, inner=self.inner[rows], outer=self.outer[rows], epoch=self.epoch[rows], poses=self.poses[rows],
             cov=self.cov[rows],
+        )  # fmt: skip
+
+    def shows(self, kind: str, thing_id: str) -> BoolArray:
+        """Which views (n,) are those of one thing, a camera or a target."""
+        inner = np.array([name == (kind, thing_id) for name in self.inner_ids])
+        outer = np.array([name == (kind, thing_id) for name in self.outer_ids])
+        return np.asarray(inner[self.inner] | outer[self.outer])
+
+    def without(self, kind: str, thing_id: str) -> "TableViews":
+        """The same without the views of one thing, and without what only these show."""
+        rest = self.only(np.flatnonzero(~self.shows(kind, thing_id)))
+        left, place = np.unique(rest.inner, return_inverse=True)
+        right, other = np.unique(rest.outer, return_inverse=True)
+        return replace(
+            rest, inner=place, outer=other, inner_ids=tuple(self.inner_ids[i] for i in left),
+            outer_ids=tuple(self.outer_ids[i] for i in right),
         )  # fmt: skip
 
 
@@ -175,17 +192,15 @@ def poses_of_views(survey: Survey) -> dict[int, View]:
         seen = [Sighting(i, targets[str(b.target_id)][b.point_idx[used_rows(b)]], b.uv[used_rows(b)]) for i, b in mine]
         lenses[camera_id] = start_lens(cameras[camera_id], [s for s in seen if len(s.x)]).values
     rays, _ = all_rays(survey, lenses)
-    views = []
+    sights = []
     for i, block in enumerate(survey.image_blocks):
         used = used_rows(block)
         if i in rays and used.sum() >= 3:
             x = targets[str(block.target_id)][block.point_idx[used]]
-            try:
-                focal = focal_px(cameras[block.camera_id], lenses[block.camera_id])
-                views.append(make_view(i, x, rays[i][used], focal))
-            except SurveyError:  # no pose: the search for start values names the block
-                continue
-    refined = refine_views(views)
+            focal = focal_px(cameras[block.camera_id], lenses[block.camera_id])
+            sights.append(Sight(i, x, rays[i][used], focal))
+    # those without a pose are named by the search for start values
+    refined = refine_views(make_views(sights)[0])
     reasons, _ = untrustworthy(refined, survey)
     return {v.block_idx: v for v in refined if v.block_idx not in reasons}
 

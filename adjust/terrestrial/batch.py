@@ -1,6 +1,6 @@
-"""All readings of a survey: evaluated by one compiled kernel, served to GTSAM chunk by chunk."""
+"""All readings of a survey: evaluated together, served to GTSAM chunk by chunk."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gtsam
@@ -9,18 +9,18 @@ import numpy as np
 from adjust.errors import SurveyError
 from adjust.factors import Jacobians
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
-from adjust.terrestrial import kernels as k
+from adjust.terrestrial import equations as k
 from adjust.terrestrial.layout import Chunk, Layout, ReadingArrays
 from adjust.terrestrial.parameters import TerrestrialParameters
 from adjust.unknowns import VectorMap
-from adjust.vertical import Plumb
+from adjust.vertical import Horizon
 
 
 class TerrestrialBatch:
     """Readings with their predicted values and derivatives at the values last prepared.
 
     residual (N,): predicted minus observed, horizontal angles in (-pi, pi]. A (N, 22): derivatives by what
-    :mod:`adjust.terrestrial.kernels` lists. e (N,): residuals over their sigmas (not decorrelated). Arrays are in the
+    :mod:`adjust.terrestrial.equations` lists. e (N,): residuals over their sigmas (not decorrelated). Arrays are in the
     order of ``Survey.readings``.
     """
 
@@ -34,20 +34,20 @@ class TerrestrialBatch:
         self.curve = 0.5 / radius if radius else 0.0
         a = layout.arrays
         n, p = len(a.kind), len(layout.positions)
-        self.X, self.axes, self.by_x = np.zeros((p, 3)), np.zeros((p, 3, 3)), np.zeros((p, 3, 3))
-        self.by_tilt, self.level, self.level_by_tilt = np.zeros((p, 3, 2)), np.zeros(p), np.zeros((p, 2))
-        self.body_axes = np.zeros((max(1, len(layout.bodies)), 3, 3))
+        self.horizon = Horizon(*(np.zeros((p, *shape)) for shape in ((3, 3), (3, 3), (3, 2), (), (2,))))
+        self.X, self.body_axes = np.zeros((p, 3)), np.zeros((max(1, len(layout.bodies)), 3, 3))
         self.orientation = np.zeros(max(1, len(parameters.orientations)))
         self.centring = np.zeros((max(1, len(parameters.centrings)), 3))
         self.instrument = np.zeros((1 + len(parameters.instruments), 4))
+        self.geometry = k.Geometry(
+            self.X, self.horizon, self.body_axes, self.orientation, self.centring, self.instrument
+        )
         self.predicted, self.residual, self.A = np.zeros(n), np.zeros(n), np.zeros((n, k.N_COLUMNS))
         self.chain_jacobians: dict[int, Jacobians] = {}
         self.sigma = a.sigma.copy()
         self.weights = a.used.astype(np.float64)
         self.J = np.zeros(layout.size)
         self.e = np.zeros(n)
-        self._all = np.arange(n, dtype=np.int64)
-        self._all_positions = np.arange(p, dtype=np.int64)
         self._orientation_maps: list[VectorMap] = list(parameters.orientations.values())
         self._centring_maps: list[VectorMap] = list(parameters.centrings.values())
         self._instrument_maps: list[VectorMap] = list(parameters.instruments.values())
@@ -92,23 +92,13 @@ class TerrestrialBatch:
             self.chain_jacobians[len(self.X) + b] = [(key, J[:3]) for key, J in jacobians]
         for i, vector in enumerate(self._instrument_maps):
             self.instrument[i + 1] = vector.full(values)
-        self._horizons(self._all_positions if positions is None else positions, plumb)
+        where: IntArray | slice = slice(None) if positions is None else positions
+        for name, found in vars(plumb.horizon(self.X[where])).items():
+            getattr(self.horizon, name)[where] = found
 
     def _points_of(self, positions: IntArray) -> list[tuple[int, int]]:
         found = [(int(i), self.layout.positions[int(i)].point_key) for i in positions]
         return [(i, key) for i, key in found if key is not None]
-
-    def _horizons(self, positions: IntArray, plumb: Plumb) -> None:
-        k.horizons(positions, self.X, plumb.up, plumb.zero, plumb.turns, plumb.radius, self.axes, self.by_x,
-                   self.by_tilt, self.level, self.level_by_tilt)  # fmt: skip
-
-    def _predict(self, rows: IntArray) -> None:
-        a = self.layout.arrays
-        k.predict(
-            rows, a.kind, a.at, a.to, a.second, a.orientation, a.centring, a.instrument, a.body, a.heights, self.sign,
-            self.curve, self.X, self.axes, self.by_x, self.by_tilt, self.level, self.level_by_tilt, self.body_axes,
-            self.orientation, self.centring, self.instrument, self.predicted, self.A,
-        )  # fmt: skip
 
     def evaluate(self, values: gtsam.Values) -> None:
         """Predicted values, residuals and derivatives of all readings at ``values``."""
@@ -117,8 +107,9 @@ class TerrestrialBatch:
         for i, vector in enumerate(self._centring_maps):
             self.centring[i] = vector.full(values)
         self._load(values, None, range(len(self.layout.bodies)))
-        self._predict(self._all)
-        k.wrapped(self.layout.arrays.kind, self.predicted, self.layout.arrays.observed, self.residual)
+        a = self.layout.arrays
+        self.predicted, self.A = k.predict(a, self.geometry, self.sign, self.curve)
+        self.residual = k.wrapped(a.kind, self.predicted, a.observed)
 
     def prepare(self, values: gtsam.Values, jacobians: bool) -> None:
         """Evaluate everything at ``values``. Raises SurveyError where the first values give a reading no direction."""
@@ -159,11 +150,18 @@ class TerrestrialBatch:
         scale = root / self.sigma
         for c in self.correlated:
             scale[layout.chunks[c].rows] = 1.0
-        k.scatter(layout.goal, layout.row, layout.column, layout.factor, scale, self.A, self.J)
+        self._scatter(slice(None), scale)
         for c in layout.chain_rows:
             self._chain_blocks(c, scale)
         for c in self.correlated:
             self._decorrelate(c, root)
+
+    def _scatter(self, entries: slice, scale: FloatArray) -> None:
+        """Add the derivatives of these entries of the layout to their places in J, times ``scale`` (N,) of the row."""
+        layout = self.layout
+        row = layout.row[entries]
+        by = scale[row] * self.A[row, layout.column[entries]] * layout.factor[entries]
+        np.add.at(self.J, layout.goal[entries], by)
 
     def _chain_blocks(self, c: int, scale: FloatArray) -> None:
         for item in self.layout.chain_rows[c]:
@@ -199,7 +197,7 @@ class TerrestrialBatch:
         self.evaluate(values)
         self._prepared = None
         joint = [r for c in self.correlated for r in self.layout.chunks[c].rows]
-        before, self.sigma = self.sigma, sigmas(self.layout.arrays, self.axes, self.A)
+        before, self.sigma = self.sigma, sigmas(self.layout.arrays, self.horizon.axes, self.A)
         self.sigma[joint] = before[joint]
         return float(np.max(np.abs(self.sigma / before - 1.0)))
 
@@ -233,39 +231,45 @@ class TerrestrialBatch:
         chunk = layout.chunks[c]
         rows = chunk.rows
         for i in np.unique(a.orientation[rows][a.kind[rows] == k.DIRECTION]):
-            self.orientation[i] = values.atVector(self._orientation_maps[i].key)[0]
+            key = self._orientation_maps[i].key
+            self.orientation[i] = 0.0 if key is None else values.atVector(key)[0]
         for i in np.unique(a.centring[rows]):
             if i >= 0:
                 self.centring[i] = self._centring_maps[i].full(values)
         positions = np.unique(np.concatenate([a.at[rows], a.to[rows], a.second[rows]]))
         self._load(values, positions[positions >= 0], [int(b) for b in np.unique(a.body[rows]) if b >= 0])
-        self._predict(rows)
-        k.wrapped(a.kind[rows], self.predicted[rows], a.observed[rows], out := np.zeros(len(rows)))
-        self.residual[rows] = out
+        self.predicted[rows], self.A[rows] = k.predict(a.of(rows), self.geometry, self.sign, self.curve)
+        out = self.residual[rows] = k.wrapped(a.kind[rows], self.predicted[rows], a.observed[rows])
         root = np.sqrt(self.weights)
         scale = root / self.sigma
         if chunk.whitener is not None:
             scale[rows] = 1.0
         self.e[rows] = scale[rows] * out
         self.J[chunk.start : chunk.start + len(rows) * chunk.width] = 0.0
-        at = slice(layout.entry_ptr[c], layout.entry_ptr[c + 1])
-        k.scatter(layout.goal[at], layout.row[at], layout.column[at], layout.factor[at], scale, self.A, self.J)
+        self._scatter(slice(layout.entry_ptr[c], layout.entry_ptr[c + 1]), scale)
         if c in layout.chain_rows:
             self._chain_blocks(c, scale)
         if chunk.whitener is not None:
             self.e[rows] = root[rows] * (chunk.whitener @ out)
             self._decorrelate(c, root)
 
-    def orient(self, values: gtsam.Values, known: set[str]) -> None:
-        """Set the orientations not ``known`` (setups) to what their directions say at the other ``values``."""
+    def orient(self, values: gtsam.Values, known: set[str], poses: Mapping[str, int]) -> None:
+        """Set the orientations not ``known`` (setups) to what their directions say at the other ``values``.
+
+        poses: keys of stations that are turned instead, by setup whose orientation is held for their sake.
+        """
         self.evaluate(values)
         self._prepared = None
         a = self.layout.arrays
         for i, (setup_id, vector) in enumerate(self.parameters.orientations.items()):
             rows = np.flatnonzero((a.orientation == i) & (a.kind == k.DIRECTION))
+            turn = self.residual[rows]
             if setup_id not in known and vector.key is not None:
-                turn = self.residual[rows]
                 values.update(vector.key, self.orientation[i : i + 1] + _circular_median(turn[np.isfinite(turn)]))
+            elif setup_id not in known and setup_id in poses:
+                turn_about_z = self.sign * _circular_median(turn[np.isfinite(turn)])
+                station = values.atPose3(poses[setup_id])
+                values.update(poses[setup_id], station * gtsam.Pose3(gtsam.Rot3.Rz(turn_about_z), np.zeros(3)))
 
 
 def sigmas(a: ReadingArrays, axes: FloatArray, A: FloatArray) -> FloatArray:

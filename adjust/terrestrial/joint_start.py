@@ -1,20 +1,27 @@
 """Start values of surveys with readings, alone or together with cameras."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from gtsam import Pose3
 
+from adjust.errors import SurveyError
 from adjust.initial import Start, find_start
+from adjust.initial.given import given_poses
 from adjust.model import FloatArray, Survey
 from adjust.observations import PositionRef
+from adjust.result import ParameterName
 from adjust.terrestrial.building import reading_refs
 from adjust.terrestrial.start import explain, find_points, given_points, lacking_points, with_start
+from adjust.terrestrial.tilted_start import find_tilted, station_name, tilted_sights, with_poses
 
 
 def needs_points(survey: Survey) -> bool:
-    """Whether readings, distances or baselines have to give start values to points."""
+    """Whether readings, distances or baselines have to give start values to points or to tilted stations."""
     lacking = lacking_points(survey, given_points(survey))
-    return bool(lacking) and bool(survey.readings or survey.distances or survey.coordinate_differences)
+    observed = survey.readings or survey.distances or survey.coordinate_differences
+    return bool(observed) and (bool(lacking) or any(not s.levelled for s in survey.setups))
 
 
 def find_all(survey: Survey) -> Start:
@@ -24,24 +31,63 @@ def find_all(survey: Survey) -> Start:
     """
     seen = {int(i) for block in survey.image_blocks for i in block.point_idx if block.target_id is None}
     known = given_points(survey)
-    found = {**known}
+    found, poses = {**known}, dict[ParameterName, Pose3]()
     if any(np.isfinite(x).any() for x in known.values()) or not survey.image_blocks:
-        found = find_points(survey, known)
+        found, poses = _from_readings(survey, known, given_poses(survey), {})
     lacking = lacking_points(survey, found)
     by_readings = [n for i, n in enumerate(p.point_id for p in survey.points) if n in set(lacking) and i not in seen]
     if lacking and not survey.image_blocks:
         raise explain(survey, lacking)
     # what only readings reach gets a place for now: find_start looks at it nowhere
-    start = find_start(with_start(survey, found | dict.fromkeys(by_readings, np.zeros(3))))
-    if not by_readings:
+    survey = with_poses(survey, poses)
+    waiting = _waiting(survey) if survey.image_blocks else {}
+    placed = with_poses(with_start(survey, found | dict.fromkeys(by_readings, np.zeros(3))), waiting)
+    start = find_start(placed)
+    if not by_readings and not waiting:
         return start
     points = {n: np.asarray(x) for n, x in start.points.items() if n not in set(by_readings)}
-    more = find_points(survey, {**points, **{n: x for n, x in known.items() if n not in points}},
-                       _frames(survey, start))  # fmt: skip
+    have = {n: p for n, p in start.poses.items() if n not in waiting}
+    more, poses = _from_readings(survey, {**{n: x for n, x in known.items() if n not in points}, **points}, have,
+                                 _frames(survey, replace(start, poses=have)))  # fmt: skip
     lost = lacking_points(survey, points | more)
     if lost:
         raise explain(survey, lost)
-    return replace(start, points={**more, **points})
+    unmet = [" ".join(n) for n in waiting if n not in poses]
+    if unmet:
+        raise SurveyError(
+            f"no start value can be found for {', '.join(unmet)}: the set-ups that stand there are not levelled, and "
+            "see too few points whose places are known (3 by direction and zenith angle); give a start pose"
+        )
+    return replace(start, points={**more, **points}, poses={**start.poses, **{n: poses[n] for n in waiting}})
+
+
+def _from_readings(
+    survey: Survey, known: Mapping[str, FloatArray], poses: Mapping[ParameterName, Pose3],
+    frames: Mapping[PositionRef, FloatArray],
+) -> tuple[dict[str, FloatArray], dict[ParameterName, Pose3]]:  # fmt: skip
+    """Points and poses from levelled and from tilted set-ups by turns, since each may need what the other gives."""
+    found, given = dict(known), dict(poses)
+    ids = {p.point_id for p in survey.points}
+    for _ in range(len(survey.setups) + 1):
+        before = sum(np.isfinite(x).all() for x in found.values())
+        tilted = find_tilted(survey, found, given)
+        if tilted is not None:
+            given |= {n: p for n, p in tilted.poses().items() if n not in given}
+            found |= {n: x for n, x in tilted.known.items() if n in ids}
+            stand = {ref: T[:3, 3] for ref, T in tilted.stations.items()}
+            frames = {**frames, **stand}
+        found |= find_points(survey, found, frames)
+        if tilted is None or sum(np.isfinite(x).all() for x in found.values()) == before:
+            break
+    return found, {n: p for n, p in given.items() if n not in poses}
+
+
+def _waiting(survey: Survey) -> dict[ParameterName, Pose3]:
+    """Stations of tilted set-ups without a pose that no camera or target on them gives, at a place for now."""
+    carrying = {c.station_id for c in survey.cameras} | {t.station_id for t in survey.targets}
+    given = given_poses(survey)
+    names = {station_name(ref) for ref in tilted_sights(survey)}
+    return {n: Pose3() for n in names if n[1] not in carrying and n not in given and n[:2] not in given}
 
 
 def _frames(survey: Survey, start: Start) -> dict[PositionRef, FloatArray]:

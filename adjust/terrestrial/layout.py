@@ -14,7 +14,7 @@ from adjust.errors import SurveyError
 from adjust.factors import ChainPose, Position
 from adjust.model import BoolArray, FloatArray, IntArray, Setup, Survey
 from adjust.observations import PositionRef, Reading
-from adjust.terrestrial import kernels as k
+from adjust.terrestrial import equations as k
 from adjust.terrestrial.parameters import TerrestrialParameters, check_reading
 from adjust.unknowns import Unknowns, VectorMap
 
@@ -26,18 +26,9 @@ _DISTANCES = (k.SLOPE, k.HORIZONTAL)
 
 
 @dataclass(frozen=True, eq=False)
-class ReadingArrays:
-    """N readings in the order of ``Survey.readings``; see :func:`adjust.terrestrial.kernels.predict`."""
+class ReadingArrays(k.Readings):
+    """N readings in the order of ``Survey.readings``."""
 
-    kind: IntArray
-    at: IntArray
-    to: IntArray
-    second: IntArray
-    orientation: IntArray
-    centring: IntArray
-    instrument: IntArray
-    body: IntArray
-    heights: FloatArray
     observed: FloatArray
     sigma: FloatArray
     target_centring: FloatArray

@@ -6,7 +6,7 @@ import numpy as np
 from adjust.geometry.motions import vector_motions
 from adjust.model import FloatArray, Survey
 from adjust.motions import point_motions
-from adjust.terrestrial import kernels as k
+from adjust.terrestrial import equations as k
 from adjust.terrestrial.batch import TerrestrialBatch
 from adjust.unknowns import Unknown, Unknowns
 from adjust.vertical import VERTICAL
@@ -45,11 +45,11 @@ def _orientation(
     if a.body[first] >= 0:
         return out
     at = a.at[first]
-    turn = -batch.by_x[at] @ point_motions(batch.X[at])
+    turn = -batch.horizon.by_x[at] @ point_motions(batch.X[at])
     turn[:, 3:6] += np.eye(3)
     tilt = batch.parameters.vertical.tilt
     if tilt is not None and tilt.key is not None:
-        by_free = batch.by_tilt[at] @ tilt.matrix
+        by_free = batch.horizon.by_tilt[at] @ tilt.matrix
         turn -= by_free @ vector_motions(survey, unknowns, unknowns.by_name[VERTICAL], values)
-    out[0] = batch.sign * (batch.axes[at, 2] @ turn)
+    out[0] = batch.sign * (batch.horizon.axes[at, 2] @ turn)
     return out

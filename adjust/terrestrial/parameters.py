@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 
 from adjust.errors import SurveyError
-from adjust.model import INSTRUMENT, FloatArray, Instrument, Setup, Survey, VectorParameter, VectorPrior
+from adjust.model import INSTRUMENT, FloatArray, Instrument, PoseParameter, Setup, Survey, VectorParameter, VectorPrior
 from adjust.observations import PositionRef, Reading
 from adjust.result import ParameterName
 from adjust.unknowns import Unknowns, VectorMap, vector_map
@@ -30,6 +30,8 @@ class TerrestrialParameters:
     orientations: dict[str, VectorMap] = field(default_factory=dict)
     centrings: dict[str, VectorMap] = field(default_factory=dict)
     priors: dict[ParameterName, VectorPrior] = field(default_factory=dict)
+    repeated: dict[str, ParameterName] = field(default_factory=dict)
+    """Set-ups whose orientation would only repeat the turn of a station about its z axis: held at zero; that pose."""
 
 
 def collect_terrestrial(survey: Survey, unknowns: Unknowns) -> TerrestrialParameters:
@@ -39,7 +41,8 @@ def collect_terrestrial(survey: Survey, unknowns: Unknowns) -> TerrestrialParame
     """
     setups = _by_id("setup", ((s.setup_id, s) for s in survey.setups))
     instruments = _by_id("instrument", ((i.instrument_id, i) for i in survey.instruments))
-    out = TerrestrialParameters(collect_vertical(survey, unknowns), setups)
+    repeated = repeated_orientations(survey)
+    out = TerrestrialParameters(collect_vertical(survey, unknowns), setups, repeated=repeated)
     used = dict.fromkeys(r.setup_id for r in survey.readings if r.setup_id)
     turned = {r.setup_id for r in survey.readings if r.kind == "direction"}
     if "" in turned:
@@ -55,10 +58,64 @@ def collect_terrestrial(survey: Survey, unknowns: Unknowns) -> TerrestrialParame
             _instrument(instruments[setup.instrument_id], survey, unknowns, out)
         if setup_id in turned:
             name: ParameterName = ("orientation", setup_id)
-            parameter = VectorParameter(ORIENTATION, np.zeros(1), free=ORIENTATION)
+            free = () if setup_id in out.repeated else ORIENTATION
+            parameter = VectorParameter(ORIENTATION, np.zeros(1), free=free)
             out.orientations[setup_id] = unknowns.vectors[name] = vector_map(parameter, ("rad",), unknowns, name)
         _centring(setup, unknowns, out)
     return out
+
+
+def repeated_orientations(survey: Survey) -> dict[str, ParameterName]:
+    """Set-ups that are not levelled whose orientation nothing tells from the turn of their station, with that pose.
+
+    The first set-up with directions on each station whose frame nothing else uses: no camera or target stands on it, no
+    pair, level or beam refers to it, and its turn about z is not held or known, or it alone holds the world.
+    """
+    tilted = {s.setup_id for s in survey.setups if not s.levelled}
+    if not tilted:
+        return {}
+    used = {c.station_id for c in survey.cameras} | {t.station_id for t in survey.targets}
+    used |= {ref.frame_id for p in survey.pairs for ref in (p.a, p.b) if ref.kind == "station"}
+    used |= {level.frame.frame_id for level in survey.levels if level.frame.kind == "station"}
+    used |= {ref.frame_id for a in survey.alignments for ref in (a.a, a.b) if ref.kind == "station"}
+    used |= {b.carrier_id for b in survey.beams if b.carrier_kind == "station"}
+    stations = {s.station_id: s for s in survey.stations}
+    at: dict[str, set[PositionRef]] = {}
+    for r in survey.readings:
+        if r.setup_id in tilted and r.kind == "direction":
+            at.setdefault(r.setup_id, set()).add(r.at)
+    out: dict[str, ParameterName] = {}
+    for setup_id, places in at.items():
+        frame = next(iter(places)).frame
+        if len(places) > 1 or frame is None or frame.frame_id in used or frame.frame_id not in stations:
+            continue
+        station = stations[frame.frame_id]
+        name: ParameterName = ("world_from_station", frame.frame_id)
+        pose = station.world_from_station
+        if station.motion != "fixed":
+            name, pose = (*name, frame.epoch_id or ""), station.epochs.get(frame.epoch_id or "", pose)
+        free = _turns_freely(pose) or (pose.treatment == "held" and _alone_holds_the_world(survey, frame.frame_id))
+        if station.motion != "table" and free and name not in out.values():
+            out[setup_id] = name
+    return out
+
+
+def _turns_freely(pose: PoseParameter) -> bool:
+    """Whether nothing is known of the turn about the station's own z axis."""
+    known = pose.treatment == "prior" and pose.prior_cov is not None and np.isfinite(pose.prior_cov[2, 2])
+    return pose.treatment != "held" and not known and "rz" not in pose.held
+
+
+def _alone_holds_the_world(survey: Survey, station_id: str) -> bool:
+    """Whether a held station is all that tells the directions of the world's axes: its frame is the world's then."""
+    points = any(p.x_in_world.treatment != "free" or p.x_in_world.held for p in survey.points)
+    poses = [s.world_from_station for s in survey.stations if s.station_id != station_id]
+    poses += [p for s in survey.stations for p in s.epochs.values()]
+    poses += [t.carrier_from_target for t in survey.targets if t.station_id is None]
+    poses += [t.world_from_table for t in survey.tables]
+    held = any(p.treatment != "free" or p.held for p in poses)
+    observed = survey.coordinates or survey.coordinate_differences or survey.cameras or survey.on_surfaces
+    return not (points or held or observed or any(r.kind == "azimuth" for r in survey.readings))
 
 
 def _by_id(kind: str, items: Iterable[tuple[str, T]]) -> dict[str, T]:

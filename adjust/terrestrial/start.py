@@ -12,6 +12,7 @@ from adjust.observations import PositionRef
 from adjust.terrestrial.plane_start import PlaneStart
 from adjust.terrestrial.sights import Node, Sights, collect_sights, horizon_axes
 from adjust.terrestrial.space_start import spread_space
+from adjust.terrestrial.tilted_start import tilted_sights
 
 
 def given_points(survey: Survey) -> dict[str, FloatArray]:
@@ -158,6 +159,10 @@ def explain(survey: Survey, lacking: list[str]) -> SurveyError:
     """Why these points have no approximate coordinates, by name."""
     sights = collect_sights(survey)
     lost = set(lacking)
+    tilted: dict[str, list[str]] = {}
+    for mine in tilted_sights(survey).values():
+        for s in mine:
+            tilted.setdefault(s.node, []).append(s.setup_id)
     lines = []
     for n in lacking[:12]:
         directions = sorted({a for a, targets in sights.directions.values() if n in targets})
@@ -172,6 +177,13 @@ def explain(survey: Survey, lacking: list[str]) -> SurveyError:
             parts.append(f"{_count(len(near), 'distance')} ({', '.join(sorted(near)[:4])})")
         if seen:
             parts.append(f"its own directions to {', '.join(seen[:4])}")
+        if n in tilted and not parts:
+            from_setups = ", ".join(sorted(set(tilted[n]))[:4])
+            lines.append(
+                f"point {n!r} is seen from {from_setups}, which {'is' if len(set(tilted[n])) == 1 else 'are'} not "
+                "levelled: a second such sight, or a distance, and 3 known points for each station are needed"
+            )
+            continue
         floating = [m for m in {*directions, *near, *seen} if m in lost]
         also = f"; of these {', '.join(sorted(floating)[:4])} are not known either" if floating else ""
         lines.append(f"point {n!r} is reached by {' and '.join(parts) + ' only' if parts else 'nothing'}{also}")

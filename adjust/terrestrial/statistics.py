@@ -4,92 +4,86 @@ Q_vv = Q_ll - A Q A'; r = diag(Q_vv P); the test of one reading is w^2 with w = 
 the standardized residual where readings are not correlated (Baarda 1968; Foerstner 1979).
 """
 
-# mypy: disable-error-code="untyped-decorator"
-# reason: numba ships no types, so its decorator leaves the function below untyped
-
 from collections.abc import Iterator, Sequence
 from typing import overload
 
 import gtsam
 import numpy as np
 
-from adjust.compiling import njit
-from adjust.model import FloatArray, IntArray, Survey
+from adjust.model import BoolArray, FloatArray, IntArray, Survey
+from adjust.native.trees import TreeArrays
 from adjust.observation_factor import position_text
 from adjust.result import ObservationResidual, ReadingResiduals
 from adjust.terrestrial.batch import TerrestrialBatch
 from adjust.tree_covariance import TreeCovariance
-from adjust.tree_kernels import fill_block
 
 _ANGLES = ("direction", "angle", "zenith", "azimuth")
-
-
-@njit(cache=True, nogil=True)
-def chunk_influences(
-    key_ptr_of: IntArray, key_of: IntArray, start: IntArray, row_ptr: IntArray, J: FloatArray, home: IntArray,
-    key_ptr: IntArray, keys: IntArray, dims: IntArray, front: IntArray, width: IntArray, at: IntArray, cov: FloatArray,
-    out: FloatArray, lost: IntArray,
-) -> None:  # fmt: skip
-    """Diagonal of A Q A' of every chunk; lost (C,) is set to 1 where its unknowns share no clique.
-
-    Chunk c has the keys ``key_of[key_ptr_of[c]:key_ptr_of[c + 1]]`` (numbers of the tree), its blocks begin at
-    ``start[c]`` of J, its rows in ``out`` at ``row_ptr[c]``.
-    """
-    for c in range(len(start)):
-        first, last = key_ptr_of[c], key_ptr_of[c + 1]
-        m = row_ptr[c + 1] - row_ptr[c]
-        n = 0
-        for i in range(first, last):
-            n += dims[key_of[i]]
-        Q, A = np.empty((n, n)), np.empty((m, n))
-        o, r = start[c], 0
-        for i in range(first, last):
-            a = key_of[i]
-            da = dims[a]
-            A[:, r : r + da] = J[o : o + m * da].reshape(m, da)
-            o += m * da
-            s = 0
-            for j in range(first, i + 1):
-                b = key_of[j]
-                db = dims[b]
-                if not fill_block(
-                    a, b, home, key_ptr, keys, dims, front, width, at, cov, Q[r : r + da, s : s + db]
-                ):
-                    lost[c] = 1
-                    break
-                for p in range(da):
-                    for q in range(db):
-                        Q[s + q, r + p] = Q[r + p, s + q]
-                s += db
-            r += da
-        if lost[c] == 1:
-            continue
-        for i in range(m):
-            total = 0.0
-            for p in range(n):
-                if A[i, p] != 0.0:
-                    part = 0.0
-                    for q in range(n):
-                        part += Q[p, q] * A[i, q]
-                    total += A[i, p] * part
-            out[row_ptr[c] + i] = total
 
 
 def influences(batch: TerrestrialBatch, tree: TreeCovariance) -> FloatArray:
     """Whitened a Q a' (N,) of all readings; the batch serves its rows unweighted. Order of ``Survey.readings``."""
     chunks = batch.layout.chunks
-    key_of = np.array([tree.number[key] for chunk in chunks for key in chunk.keys], dtype=np.int64)
-    key_ptr_of = np.cumsum([0] + [len(chunk.keys) for chunk in chunks]).astype(np.int64)
-    row_ptr = np.cumsum([0] + [len(chunk.rows) for chunk in chunks]).astype(np.int64)
-    start = np.array([chunk.start for chunk in chunks], dtype=np.int64)
-    found, lost = np.zeros(int(row_ptr[-1])), np.zeros(len(chunks), dtype=np.int64)
-    chunk_influences(key_ptr_of, key_of, start, row_ptr, batch.J, *tree.arrays, found, lost)
+    rows, keys = np.array([(len(c.rows), len(c.keys)) for c in chunks], dtype=np.int64).reshape(-1, 2).T
+    of = np.repeat(np.arange(len(chunks)), keys)
+    key = np.array([tree.number[k] for chunk in chunks for k in chunk.keys], dtype=np.int64)
+    dim = np.array([d for chunk in chunks for d in chunk.dims], dtype=np.int64)
+    first, row_ptr = np.cumsum(keys) - keys, np.cumsum(rows) - rows
+    before = np.cumsum(dim) - dim
+    at = np.array([chunk.start for chunk in chunks], dtype=np.int64)[of] + rows[of] * (before - before[first[of]])
+    # every key of a chunk with itself and with those before it
+    number = np.arange(len(key)) - first[of] + 1
+    i = np.repeat(np.arange(len(key)), number)
+    j = first[of[i]] + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
+    found, lost, blocks = np.zeros(int(rows.sum())), np.zeros(len(chunks), dtype=np.bool_), _Blocks(tree.arrays)
+    most = int(dim.max(initial=0)) + 1
+    kinds, kind = np.unique((rows[of[i]] * most + dim[i]) * most + dim[j], return_inverse=True)
+    for n, shape in enumerate(kinds.tolist()):
+        e, (m, da), db = np.flatnonzero(kind == n), divmod(shape // most, most), shape % most
+        Q, there = blocks(key[i[e]], key[j[e]], da, db)
+        lost[of[i[e[~there]]]] = True
+        A, B = (batch.J[at[k[e], None] + np.arange(m * d)].reshape(-1, m, d) for k, d in ((i, da), (j, db)))
+        share = np.where(i[e] == j[e], 1.0, 2.0)[:, None] * ((A @ Q) * B).sum(axis=2)
+        np.add.at(found, row_ptr[of[i[e]], None] + np.arange(m), share)
     for c in np.flatnonzero(lost):
         A = batch.jacobian(int(c))
-        found[row_ptr[c] : row_ptr[c + 1]] = np.einsum("ip,pq,iq->i", A, tree.joint(chunks[c].keys), A)
+        found[row_ptr[c] : row_ptr[c] + rows[c]] = np.einsum("ip,pq,iq->i", A, tree.joint(chunks[c].keys), A)
     out = np.empty(len(found))
     out[np.concatenate([chunk.rows for chunk in chunks])] = found
     return out
+
+
+class _Blocks:
+    """Covariances of many pairs of keys that share a clique of a tree, at once."""
+
+    def __init__(self, tree: TreeArrays) -> None:
+        self.tree = tree
+        clique, dims = np.repeat(np.arange(len(tree.front)), np.diff(tree.key_ptr)), tree.dims[tree.keys]
+        before = np.cumsum(dims) - dims
+        place = clique * len(tree.dims) + tree.keys
+        order = np.argsort(place)
+        self.place, self.column = place[order], (before - before[tree.key_ptr[clique]])[order]
+
+    def __call__(self, a: IntArray, b: IntArray, da: int, db: int) -> tuple[FloatArray, BoolArray]:
+        """Blocks (p, da, db) of keys a, b (p,) of these dimensions, and which (p,) there are.
+
+        The key whose home lies deeper was eliminated first, so that its clique holds the other one.
+        """
+        tree = self.tree
+        flip = tree.home[b] > tree.home[a]
+        clique = np.maximum(tree.home[a], tree.home[b])
+        row, column = self._columns(clique, np.where(flip, b, a)), self._columns(clique, np.where(flip, a, b))
+        start, width = tree.at[clique] + row * tree.width[clique] + column, tree.width[clique]
+        down, along = np.arange(da)[:, None], np.arange(db)
+        flipped, wide = flip[:, None, None], width[:, None, None]
+        places = start[:, None, None] + np.where(flipped, along * wide + down, down * wide + along)
+        there = column >= 0
+        return tree.cov[np.where(there[:, None, None], places, 0)], there
+
+    def _columns(self, clique: IntArray, key: IntArray) -> IntArray:
+        """Columns (p,) at which keys begin in cliques, -1 where they are not in them."""
+        wanted = clique * len(self.tree.dims) + key
+        found = np.minimum(np.searchsorted(self.place, wanted), len(self.place) - 1)
+        return np.where(self.place[found] == wanted, self.column[found], -1)
 
 
 def reading_residuals(batch: TerrestrialBatch, tree: TreeCovariance, values: gtsam.Values) -> ReadingResiduals:

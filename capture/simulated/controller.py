@@ -23,7 +23,10 @@ from typing import Any, TextIO
 import numpy as np
 
 from capture.drivers.turntables.simulated_axis import AxisPhysics, SimulatedAxis
+from survey.commands.common import not_negative, positive, run_command
+from survey.commands.parser import Parser, port, port_error
 
+_PROGRAM = "python -m capture.simulated.controller"
 _TRUTH_S = 0.005
 
 
@@ -147,7 +150,10 @@ class _Server(socketserver.ThreadingTCPServer):
     def __init__(self, port: int, table: SimulatedTable, language: str) -> None:
         self.table, self.language = table, language
         self.connections: set[Any] = set()
-        super().__init__(("127.0.0.1", port), _Handler)
+        try:
+            super().__init__(("127.0.0.1", port), _Handler)
+        except OSError as error:
+            raise port_error(port, error) from error
 
 
 class _Handler(socketserver.StreamRequestHandler):
@@ -186,29 +192,42 @@ class _Handler(socketserver.StreamRequestHandler):
 
 
 def _publish(table: SimulatedTable, path: Path) -> None:
-    temporary = path.with_name(f".{path.name}.tmp")
     while True:
-        temporary.write_text(json.dumps(table.truth()), encoding="utf-8")
-        temporary.replace(path)
+        _write_truth(table, path)
         time.sleep(_TRUTH_S)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Serve until killed; the first line on stdout is the port."""
-    parser = argparse.ArgumentParser(prog="python -m capture.simulated.controller", description=__doc__)
-    parser.add_argument("--port", type=int, default=0, help="on loopback; 0 takes a free one")
+def _write_truth(table: SimulatedTable, path: Path) -> None:
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(json.dumps(table.truth()), encoding="utf-8")
+    temporary.replace(path)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Its flags."""
+    parser = Parser(prog=_PROGRAM, description=__doc__)
+    parser.add_argument("--port", type=port, default=0, help="on loopback; 0 takes a free one")
     parser.add_argument("--language", choices=tuple(_LANGUAGES), default="two-axis")
     parser.add_argument("--truth", type=Path, help="JSON file of the true angles, replaced every few milliseconds")
     parser.add_argument("--log", type=Path, help="every line received, with its monotonic time in ns")
-    parser.add_argument("--axes", type=int, default=2)
+    parser.add_argument("--axes", type=positive, default=2)
     parser.add_argument("--speed", type=float, default=20.0, help="deg/s")
     parser.add_argument("--acceleration", type=float, default=40.0, help="deg/s^2")
     parser.add_argument("--backlash", type=float, default=0.0, help="arcsec")
     parser.add_argument("--noise", type=float, default=0.0, help="of the encoder, arcsec")
     parser.add_argument("--hard-limit", type=float, default=370.0, help="deg, where the controller itself refuses")
     parser.add_argument("--turns-lost", action="store_true", help="the readback starts anew after 360 deg")
-    parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args(argv)
+    parser.add_argument("--seed", type=not_negative, default=1)
+    parser.set_defaults(run=_serve)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Serve until killed; the first line on stdout is the port."""
+    return run_command(_PROGRAM, build_parser, argv)
+
+
+def _serve(given: argparse.Namespace) -> int:
     arcsec = math.radians(1 / 3600)
     physics = AxisPhysics(
         math.radians(given.speed),
@@ -220,6 +239,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     table = SimulatedTable([physics] * given.axes, given.seed, given.log, math.radians(given.hard_limit))
     server = _Server(given.port, table, given.language)
     if given.truth is not None:
+        _write_truth(table, given.truth)  # where it cannot be written, that is said now
         threading.Thread(target=_publish, args=(table, given.truth), daemon=True).start()
     sys.stdout.write(f"{server.server_address[1]}\n")
     sys.stdout.flush()

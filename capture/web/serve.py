@@ -9,6 +9,7 @@ import json
 import secrets
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Callable
 from http import HTTPStatus
@@ -20,6 +21,7 @@ from urllib.parse import unquote, urlsplit
 from adjust.errors import SurveyError
 from capture.plan import read_plan
 from capture.web.state import FolderView, LiveView, View, png_with_overlay
+from survey.commands.parser import port_error
 
 _FILES = {
     "/": ("page.html", "text/html"),
@@ -34,6 +36,15 @@ _HEADERS = {
 }
 _LONGEST_BODY = 4096
 _ENDINGS = {signal.SIGINT, signal.SIGTERM}
+
+
+def _is_this_machine(host: str) -> bool:
+    """Whether the name in a Host header, whatever the port, is this machine's own: no name that others can give."""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+        return name == "localhost" or ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False
 
 
 def loopback_address(host: str) -> str:
@@ -64,7 +75,12 @@ class PageServer(ThreadingHTTPServer):
         try:
             super().__init__((address, port), _Handler)
         except OSError as error:
-            raise SurveyError(f"port {port} cannot be used ({error.strerror}); name another with --port") from error
+            raise port_error(port, error) from error
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that leaves in the middle of an answer is no error of ours."""
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
+            super().handle_error(request, client_address)
 
     @property
     def url(self) -> str:
@@ -98,6 +114,10 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._refuse(HTTPStatus.NOT_FOUND, "no such page")
 
+    def do_HEAD(self) -> None:
+        """What GET would answer, without its body."""
+        self.do_GET()
+
     def do_POST(self) -> None:
         """Commands to the table."""
         if not self._is_from_here() or not self._may_move():
@@ -123,10 +143,12 @@ class _Handler(BaseHTTPRequestHandler):
         return self._answer(b"{}", "application/json")
 
     def _is_from_here(self) -> bool:
-        """Whether the browser believes to talk to this machine, and no page of another site talks through it."""
-        allowed = {f"{name}:{self.server.server_address[1]}" for name in ("127.0.0.1", "localhost", "[::1]")}
+        """Whether the browser believes to talk to this machine, and no page of another site talks through it.
+
+        The port is what the browser was told: behind a forwarded one it is not ours.
+        """
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
-        if host in allowed and (origin is None or origin.removeprefix("http://") in allowed):
+        if _is_this_machine(host) and (origin is None or origin.partition("://")[2] == host):
             return True
         self._refuse(HTTPStatus.FORBIDDEN, "this page is for this machine only")
         return False
@@ -149,7 +171,8 @@ class _Handler(BaseHTTPRequestHandler):
         for name, value in {"Content-Type": kind, "Content-Length": str(len(data)), **_HEADERS}.items():
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(data)
+        if self.command != "HEAD":
+            self.wfile.write(data)
 
     def log_message(self, format: str, *args: Any) -> None:
         """Requests are not worth a line each."""

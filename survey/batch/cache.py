@@ -8,14 +8,18 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from adjust.errors import SurveyError
+from survey.files.detected import read_detected, same_file
+from survey.files.project import IMAGES_FOLDER
+
 _BESIDE = ("covariance.npz", "residuals.csv", "residuals_other.csv", "report.html")
 
 
 def unchanged_solution(folder: Path) -> dict[str, Any] | None:
     """What ``results/solution.json`` holds where it was made from the files that are there now, by these versions.
 
-    The files read, their sha256 and the versions stand in the solution itself; options are in ``survey.toml``. Images
-    count only through ``observations/image_points.csv``, which is what is adjusted once targets have been detected.
+    The files read, the images their points come from, the sha256 of all and the versions stand in the solution itself;
+    options are in ``survey.toml``.
     """
     results = folder / "results"
     try:
@@ -24,8 +28,9 @@ def unchanged_solution(folder: Path) -> dict[str, Any] | None:
         if not all((results / name).is_file() for name in _BESIDE) or not inputs["hashes"]:
             return None
         same = same_versions(inputs["versions"]) and _digests(folder, inputs["hashes"]) == inputs["hashes"]
-        return dict(solution) if same and _tables(folder) <= set(inputs["hashes"]) else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        same = same and _tables(folder) <= set(inputs["hashes"]) and _images_are(folder, inputs["images"])
+        return dict(solution) if same else None
+    except (SurveyError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None  # no results, or not ours: adjusting says what is wrong
 
 
@@ -56,6 +61,18 @@ def _tables(folder: Path) -> set[str]:
     }
 
 
+def _images_are(folder: Path, recorded: Mapping[str, Mapping[str, Any]]) -> bool:
+    """Whether the images are those of a solution; they are read only where size or time say nothing."""
+    hashes = {entry["file"]: entry["sha256"] for entry in recorded.values()}
+    images = folder / IMAGES_FOLDER
+    there = {p.relative_to(folder).as_posix(): p for p in images.glob("*/*") if not p.name.startswith(".")}
+    if set(there) != set(hashes):
+        return False
+    known = {entry.file: entry for entry in read_detected(folder / "observations").values()} if hashes else {}
+    found = {name: same_file(path, known.get(name)) for name, path in there.items()}
+    return all(entry is not None and entry.sha256 == hashes[name] for name, entry in found.items())
+
+
 def fingerprint(folder: Path) -> str:
     """One hash of all that decides how a folder fails: definition, tables, names of images, versions; "" for none."""
     digest = hashlib.sha256(platform.python_version().encode())
@@ -69,7 +86,8 @@ def fingerprint(folder: Path) -> str:
         for path in (*own, *(folder / name for name in sorted(_tables(folder)))):
             digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
         for path in sorted((folder / "images").glob("*/*")):
-            digest.update(f"{path.relative_to(folder).as_posix()} {path.stat().st_size}\n".encode())
+            status = path.stat()
+            digest.update(f"{path.relative_to(folder).as_posix()} {status.st_size} {status.st_mtime_ns}\n".encode())
     except OSError:
         return ""
     return digest.hexdigest()

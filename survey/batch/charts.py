@@ -12,7 +12,6 @@ from survey.report.markup import MINUS, esc, value_text
 
 _WIDE, _HIGH = 540.0, 178.0
 _LEFT, _RIGHT, _TOP, _BASE = 58.0, 8.0, 22.0, 26.0
-_BAND = "#e3ebf3"
 
 
 def control_chart(c: Chart, names: Sequence[str], failed: Sequence[int], title: str) -> str:
@@ -31,7 +30,7 @@ def control_chart(c: Chart, names: Sequence[str], failed: Sequence[int], title: 
     parts = [_heading(c, title), _band(x, middle, unit * np.minimum(c.by_sigma, reach), step)]
     parts += _lines(c, middle, unit, reach)
     parts += _runs(c, x, y)
-    parts += [d.polyline(np.column_stack([x, y]), "#9db4cc", 0.8)]
+    parts += [d.polyline(np.column_stack([x, y]), d.TRACE, 0.8)]
     for i in range(len(x)):
         bar = unit * c.series.sigma[i]
         ends = np.clip([y[i] - bar, y[i] + bar], _TOP, _HIGH - _BASE)
@@ -62,7 +61,7 @@ def _band(x: FloatArray, middle: float, half: FloatArray, step: float) -> str:
     at = np.column_stack([x - 0.5 * step, x + 0.5 * step]).ravel()
     up, down = np.repeat(middle - half, 2), np.repeat(middle + half, 2)
     outline = np.concatenate([np.column_stack([at, up]), np.column_stack([at, down])[::-1]])
-    return d.polygon(outline, _BAND, "none")
+    return d.polygon(outline, d.BAND, "none")
 
 
 def _lines(c: Chart, middle: float, unit: float, reach: float) -> list[str]:
@@ -82,7 +81,7 @@ def _lines(c: Chart, middle: float, unit: float, reach: float) -> list[str]:
 
 def _runs(c: Chart, x: FloatArray, y: FloatArray) -> list[str]:
     return [
-        d.polyline(np.column_stack([x, y])[r.first : r.last + 1], "#f0b45c", 4.0, ' stroke-opacity="0.6"')
+        d.polyline(np.column_stack([x, y])[r.first : r.last + 1], d.RUN, 4.0, ' stroke-opacity="0.6"')
         for r in c.runs
     ]
 
@@ -91,7 +90,7 @@ def _point(c: Chart, i: int, x: float, y: float, colour: str, names: Sequence[st
     value, sigma = c.series.value[i], c.series.sigma[i]
     words = f"{names[int(c.series.epoch[i])]}: {value_text(value, sigma)} ± {value_text(sigma, sigma)} {c.series.unit}"
     hollow = "" if c.used[i] else f' stroke="{colour}" stroke-width="1.2"'
-    dot = d.dot(x, y, 2.6, colour if c.used[i] else "#fff", hollow)
+    dot = d.dot(x, y, 2.6, colour if c.used[i] else d.PAPER, hollow)
     return dot.replace("/>", f"><title>{esc(words)}</title></circle>")
 
 

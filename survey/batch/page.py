@@ -7,7 +7,6 @@ from urllib.parse import quote
 
 import numpy as np
 
-import survey.report
 from survey.batch.causes import CAUSES
 from survey.batch.charts import control_chart
 from survey.batch.control import ONE_SIDE, TREND, Chart
@@ -15,7 +14,8 @@ from survey.batch.record import FAILED, TEST_FAILED, Record
 from survey.batch.run import counts
 from survey.batch.tables import short_names
 from survey.batch.trends import LEVEL, Trends
-from survey.report.language import known, language, message, speaking, t
+from survey.report.document import document
+from survey.report.language import group_name, known, message, speaking, t
 from survey.report.markup import (
     MISSING,
     count,
@@ -47,15 +47,8 @@ def overview_html(
             ("folders", "Folders", _folders(records, place)),
         )
         nav = "".join(f'<a href="#{anchor}">{esc(t(name))}</a>' for anchor, name, body in made if body)
-        style = Path(survey.report.__file__).with_name("style.css").read_text(encoding="utf-8")
-        return (
-            f'<!doctype html>\n<html lang="{language()}"><head><meta charset="utf-8">'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">'
-            f"<title>{esc(t('Overview of {n} surveys', n=count(len(records))))}</title><style>{style}</style></head>\n"
-            f"<body><main>{_header(records, trends, date)}<nav>{nav}</nav>"
-            + "\n".join(body for _, _, body in made)
-            + "</main></body></html>\n"
-        )
+        shown = f"{_header(records, trends, date)}<nav>{nav}</nav>" + "\n".join(body for _, _, body in made)
+        return document(t("Overview of {n} surveys", n=count(len(records))), shown)
 
 
 def _header(records: Sequence[Record], trends: Trends, date: str) -> str:
@@ -76,7 +69,7 @@ def _header(records: Sequence[Record], trends: Trends, date: str) -> str:
     seconds = sum(r.seconds for r in records if r.origin == "adjusted")
     cards = (
         (count(n["folders"]), t("surveys")), (count(n["done"]), t("passed")),
-        (count(n["test_failed"]), t("global test failed")), (count(n["failed"]), t("not adjusted")),
+        (count(n["test_failed"]), t("does not fit")), (count(n["failed"]), t("not adjusted")),
         (count(n["not_adjusted_again"]), t("unchanged, not adjusted again")),
         (t("{n} s", n=fixed(seconds, 1)), t("time of all adjustments")),
     )  # fmt: skip
@@ -108,7 +101,7 @@ def _failures(records: Sequence[Record], place: Path) -> str:
 
 
 def _wrapped(text: str) -> str:
-    return f'<div style="white-space: normal; max-width: 760px; min-width: 240px">{text.replace(chr(10), "<br>")}</div>'
+    return f'<div class="words">{text.replace(chr(10), "<br>")}</div>'
 
 
 def _tests(records: Sequence[Record], place: Path) -> str:
@@ -132,7 +125,7 @@ def _worst_group(record: Record) -> str:
     if not found:
         return MISSING
     _, name, scale = max(found)
-    return f"{name} × {fixed(scale, 2)}"
+    return f"{group_name(name)} × {fixed(scale, 2)}"
 
 
 def _why(record: Record) -> str:
@@ -163,7 +156,8 @@ def _control(records: Sequence[Record], trends: Trends) -> str:
     if calm:
         rest = t("{n} more charts", n=count(len(calm[:_MOST_MORE])))
         body += f"<details><summary>{rest}</summary>{_figures(calm[:_MOST_MORE], records)}</details>"
-    return section("control", "Control charts", body, note)
+    said = "".join(f"<p>{esc(message(n))}</p>" for n in trends.notes)
+    return section("control", "Control charts", said + body, note)
 
 
 def _figures(charts: Sequence[Chart], records: Sequence[Record]) -> str:
@@ -234,9 +228,9 @@ def _folders(records: Sequence[Record], place: Path) -> str:
         seconds = fixed(r.seconds, 2) if r.origin == "adjusted" else MISSING
         said = esc(message(r.error or s.get("reason", "")).splitlines()[0]) if (r.error or s.get("reason")) else ""
         classes.append("suspect" if r.state == FAILED else "")
-        rows.append((_link(r, name, place), esc(s.get("title", "")), pill(kind, word), fixed(s.get("sigma0"), 3),
-                     *numbers, MISSING if not_used is None else count(not_used), origin, seconds,
-                     _wrapped(said)))  # fmt: skip
-    columns = ("<Survey", "<Title", "<", "sigma0", "n", "u", "Redundancy", "Not used", "<", "s", "<Reason")
+        title = f'<span class="s">{esc(s["title"])}</span>' if s.get("title") else ""
+        rows.append((_link(r, name, place) + title, pill(kind, word), _wrapped(said), fixed(s.get("sigma0"), 3),
+                     *numbers, MISSING if not_used is None else count(not_used), origin, seconds))  # fmt: skip
+    columns = ("<Survey", "<", "<Reason", "sigma0", "n", "u", "Redundancy", "Not used", "<", "s")
     note = t("n observations, u unknowns. A name leads to the survey's own report.")
     return section("folders", "Folders", table(columns, rows, "", classes), note)

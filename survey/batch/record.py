@@ -3,10 +3,14 @@
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
+from adjust.unknowns import POSE_COMPONENTS
 from survey.batch.causes import CAUSES
+from survey.batch.common_datum import FreeDatum, Place, free_datum
 from survey.shapes import NUMBER, POSITIVE, REAL, WHOLE, Each, Either, misfit
+from survey.verdict import misfits
 
 DONE, TEST_FAILED, FAILED = "done", "test_failed", "failed"
 ORIGINS, VERDICTS = ("adjusted", "unchanged", "resumed"), ("passed", "check", "failed")
@@ -16,6 +20,7 @@ _SINGLE_POSES = (
     ("tables", "world_from_table"), ("targets", "world_from_target"), ("targets", "station_from_target"),
 )  # fmt: skip
 _VECTORS = (("cameras", "lens"), ("tables", "geometry"), ("targets", "warp"))
+_ROTATION = POSE_COMPONENTS[:3]
 _UNIT = re.compile(r"px|mm|deg|arcsec|ppm|m|1|per_\w+|")
 
 
@@ -26,13 +31,23 @@ _SUMMARY = {
 _SOLVED = {"redundancy": WHOLE, "sigma0": Either((POSITIVE, None)),
            "global_test": Either((None, {"omega": POSITIVE, "lower": POSITIVE, "upper": POSITIVE}))}  # fmt: skip
 _GROUP = {name: Either((REAL, None)) for name in ("deviation?", "sigma_scale?", "redundancy?")}
+_FREE = {
+    "open_motions": [lambda row: _is_row(row, 7)], "carried_by": [str],
+    "places": [{"name": str, "x_mm": lambda x: _is_row(x, 3), "wxyz": Either((None, lambda q: _is_turn(q, 4))),
+                "cov": lambda c: _is_row(c, 9) or _is_row(c, 36)}],
+}  # fmt: skip
 _RECORD = {
     "folder": str, "state": lambda word: word in EXIT_CODES, "origin": lambda word: word in ORIGINS,
     "cause": lambda word: word == "" or word in CAUSES, "error": str,
     "traceback": str, "summary": _SUMMARY, "warnings": [str], "groups": Each(_GROUP), "written": Each(str),
     "numbers": [{"name": str, "unit": str, "value": REAL, "sigma": REAL}], "tries": WHOLE, "seconds": POSITIVE,
     "turns": [{"name": str, "wxyz": lambda q: _is_turn(q, 4), "sigmas_arcsec": lambda s: _is_turn(s, 3)}],
+    "free_datum?": Either((None, _FREE)),
 }  # fmt: skip
+
+
+def _is_row(values: Any, n: int) -> bool:
+    return isinstance(values, list | tuple) and len(values) == n and all(map(NUMBER, values))
 
 
 def _is_turn(values: Any, n: int) -> bool:
@@ -67,7 +82,8 @@ class Record:
     folder: as it was named. state: ``done``, ``test_failed`` (residuals larger than the sigmas say) or ``failed``.
     origin: ``adjusted`` now, ``unchanged`` (its results were there), ``resumed`` (failed in the run that is resumed).
     cause: kind of a failure, a key of ``survey.batch.causes.CAUSES``. error: its message. summary, warnings, groups:
-    of the solution. tries: how often it was adjusted in this run. seconds: of the last try.
+    of the solution. free_datum: what its world takes to a common datum, None where its datum is given. tries: how often
+    it was adjusted in this run. seconds: of the last try.
     """
 
     folder: str
@@ -84,6 +100,7 @@ class Record:
     written: Mapping[str, str] = field(default_factory=dict)
     tries: int = 1
     seconds: float = 0.0
+    free_datum: FreeDatum | None = None
 
     @property
     def exit_code(self) -> int:
@@ -106,20 +123,30 @@ def record_from(plain: Mapping[str, Any]) -> Record:
         "warnings": tuple(plain["warnings"]),
         "numbers": tuple(Number(**n) for n in plain["numbers"]),
         "turns": tuple(Turn(t["name"], tuple(t["wxyz"]), tuple(t["sigmas_arcsec"])) for t in plain["turns"]),
+        "free_datum": _free_from(plain.get("free_datum")),
     }
     return Record(**{**plain, **more})
+
+
+def _free_from(plain: Mapping[str, Any] | None) -> FreeDatum | None:
+    if plain is None:
+        return None
+    places = tuple(
+        Place(p["name"], tuple(p["x_mm"]), None if p["wxyz"] is None else tuple(p["wxyz"]), tuple(p["cov"]))
+        for p in plain["places"]
+    )
+    return FreeDatum(tuple(tuple(row) for row in plain["open_motions"]), tuple(plain["carried_by"]), places)
 
 
 def solved_record(
     folder: str, solution: Mapping[str, Any], written: Mapping[str, str], seconds: float = 0.0, origin: str = "adjusted"
 ) -> Record:
     """The record of a folder that was adjusted, from what ``solution.json`` holds."""
-    test = solution["summary"]["global_test"]
-    too_large = test is not None and test["omega"] > test["upper"]
     return Record(
-        folder, TEST_FAILED if too_large else DONE, origin, summary=solution["summary"],
+        folder, TEST_FAILED if misfits(solution["summary"]) else DONE, origin, summary=solution["summary"],
         warnings=tuple(solution["warnings"]), groups=solution["groups"], numbers=tuple(_numbers(solution)),
         turns=tuple(_turns(solution)), written=dict(written), seconds=seconds,
+        free_datum=free_datum(solution, Path(written["covariance.npz"])) if "covariance.npz" in written else None,
     )  # fmt: skip
 
 
@@ -168,7 +195,8 @@ def _key(entry: Mapping[str, Any], component: str) -> str:
 def _turns(solution: Mapping[str, Any]) -> Iterator[Turn]:
     for section, key in _SINGLE_POSES:
         for name, entry in solution[section].items():
-            if entry.get(key, {}).get("status") == "free":
+            # in networks of rotations the translations are held
+            if key in entry and set(_ROTATION) <= set(_free(entry[key]["status"], POSE_COMPONENTS)):
                 pose = entry[key]
                 quaternion = tuple(pose["rotation_quaternion_wxyz"])
                 yield Turn(f"{key}/{name}", quaternion, tuple(pose["sigma_rotation_arcsec"]))

@@ -83,7 +83,7 @@ def _known(folder: str, path: Path, options: BatchOptions, before: Mapping[str, 
     solution = unchanged_solution(path)
     if solution is not None:
         written = {p.name: str(p) for p in sorted((path / "results").iterdir()) if not p.name.startswith(".")}
-        with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError):  # not as we write it: adjust anew
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):  # not ours: adjust anew
             return record_from(solved_record(folder, solution, written, origin="unchanged").plain())
     found = before.get(str(path))
     if found is None or found[1].state != FAILED or found[1].cause in MAY_PASS:

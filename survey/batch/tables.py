@@ -13,8 +13,9 @@ from survey.batch.control import Chart
 from survey.batch.record import DONE, FAILED, TEST_FAILED, Record
 from survey.batch.run import counts, exit_code
 from survey.batch.trends import LEVEL, Trends
+from survey.files.text import cell_text
 
-STATES = {DONE: "done", FAILED: "error", TEST_FAILED: "global test failed"}
+STATES = {DONE: "done", FAILED: "error", TEST_FAILED: "does not fit"}
 _MOST_TOLD = 8
 
 
@@ -48,7 +49,7 @@ def count_line(records: Sequence[Record]) -> str:
     """How many ended how, in one line."""
     n = counts(records)
     parts = [f"{n['done']} done"]
-    parts += [f"{n['test_failed']} global test failed"] if n["test_failed"] else []
+    parts += [f"{n['test_failed']} do not fit"] if n["test_failed"] else []
     parts += [f"{n['failed']} failed"] if n["failed"] else []
     again = n["not_adjusted_again"]
     more = f"; {again} not adjusted again, their inputs are unchanged" if again else ""
@@ -62,7 +63,7 @@ def trend_lines(trends: Trends, records: Sequence[Record]) -> list[str]:
     more = len(alarming) - len(lines)
     lines += [f"  and {more} more in the overview"] if more > 0 else []
     head = f"{len(alarming)} of {len(trends.charts)} numbers are not in control over the epochs"
-    return [head + (":" if lines else ""), *lines]
+    return [head + (":" if lines else ""), *lines, *(f"  ! {note}" for note in trends.notes)]
 
 
 def short_names(records: Sequence[Record]) -> list[str]:
@@ -105,7 +106,8 @@ def overview_json(records: Sequence[Record], trends: Trends) -> str:
     value = {
         "counts": counts(records), "exit_code": exit_code(records), "folders": [row_of(r) for r in records],
         "trends": {"alpha_of_all_tests": LEVEL, "level_of_a_test": trends.level, "n_points": trends.n_points,
-                   "points_outside_expected_by_chance": trends.expected, "charts": charts},
+                   "points_outside_expected_by_chance": trends.expected, "notes": list(trends.notes),
+                   "charts": charts},
     }  # fmt: skip
     return json.dumps(_finite(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
@@ -148,8 +150,8 @@ def folders_csv(records: Sequence[Record]) -> str:
         numbers = (s.get("verdict", ""), *(_cell(s.get(k)) for k in (
             "sigma0", "redundancy", "n_observations", "n_unknowns")), _cell(s.get("suspects", {}).get("n_not_used")))
         message = r.error or s.get("reason", "")
-        writer.writerow((r.folder, r.state, r.exit_code, r.origin, *numbers, r.tries, f"{r.seconds:.3f}", r.cause,
-                         message))  # fmt: skip
+        writer.writerow((cell_text(r.folder), r.state, r.exit_code, r.origin, *numbers, r.tries, f"{r.seconds:.3f}",
+                         cell_text(r.cause), cell_text(message)))  # fmt: skip
     return out.getvalue()
 
 
@@ -166,7 +168,8 @@ def trends_csv(records: Sequence[Record], trends: Trends) -> str:
     for c in trends.charts:
         scatter = f"{c.by_scatter:.9g}" if np.isfinite(c.by_scatter) else ""
         for i, epoch in enumerate(c.series.epoch.tolist()):
-            writer.writerow((c.series.name, c.series.unit, records[epoch].folder, f"{c.series.value[i]:.12g}",
+            folder = cell_text(records[epoch].folder)
+            writer.writerow((cell_text(c.series.name), c.series.unit, folder, f"{c.series.value[i]:.12g}",
                              f"{c.series.sigma[i]:.9g}", f"{c.mean:.12g}", f"{c.by_sigma[i]:.9g}", scatter,
                              int(c.outside[i]), int(c.outside_scatter[i])))  # fmt: skip
     return out.getvalue()

@@ -1,16 +1,24 @@
 """The numbers of all folders of a batch as series over the epochs, and their control charts."""
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from adjust.distributions import norm
 from adjust.statistics.criteria import sidak
+from survey.batch.common_datum import (
+    Moved,
+    in_common_datum,
+    incomparable,
+    moved_numbers,
+    moved_turns,
+    scale_is_open,
+)
 from survey.batch.control import WIDTH, Chart, Run, Series, chart
-from survey.batch.record import Record
+from survey.batch.record import FAILED, Record
 
 LEVEL = 0.05
 """Error probability of all charts together, for the tests of agreement and of slopes."""
@@ -22,12 +30,13 @@ class Trends:
     """Charts of all numbers that two epochs or more have, most alarming first.
 
     level: of a single test, so that all together have ``LEVEL``. n_points: of all charts. expected: points outside of
-    limits that chance alone would make of normally distributed numbers.
+    limits that chance alone would make of normally distributed numbers. notes: what could not be compared, and why.
     """
 
     charts: tuple[Chart, ...]
     level: float
     n_points: int
+    notes: tuple[str, ...] = ()
 
     @property
     def expected(self) -> float:
@@ -64,11 +73,57 @@ class Trends:
 
 def trends_of(records: Sequence[Record]) -> Trends:
     """Series of all numbers that are there in two epochs or more, and their charts."""
+    records, notes = comparable(records)
     charts = [chart(s) for s in all_series(records) if len(s.value) >= 2]
     level = sidak(LEVEL, max(2 * len(charts), 1))
     made = Trends((), level, sum(len(c.series.value) for c in charts))
     charts.sort(key=lambda c: (not made.is_alarming(c), -_alarm(c)))
-    return Trends(tuple(charts), level, made.n_points)
+    return Trends(tuple(charts), level, made.n_points, notes)
+
+
+def comparable(records: Sequence[Record]) -> tuple[tuple[Record, ...], tuple[str, ...]]:
+    """The records with the world of epochs that have free datums in a common one; what is not comparable is left out.
+
+    Also says what was left out, and why.
+    """
+    solved = [i for i, r in enumerate(records) if r.state != FAILED]
+    bad = {solved[k]: why for k, why in incomparable([records[i].free_datum for i in solved]).items()}
+    out, notes = list(records), []
+    for why in dict.fromkeys(bad.values()):
+        names = [records[i].folder for i in bad if bad[i] == why]
+        listed = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+        notes.append(f"coordinates and poses in the world are not compared with those of the other epochs: {listed}: "
+                     f"{why}")  # fmt: skip
+    for i in bad:
+        out[i] = _without_world(records[i])
+    free = [i for i in solved if i not in bad and records[i].free_datum is not None]
+    data = [d for i in free if (d := records[i].free_datum) is not None]
+    for i, datum, moved in zip(free, data, in_common_datum(data) if data else [], strict=True):
+        out[i] = _moved(records[i], moved, scale_is_open(datum))
+    if any(map(scale_is_open, data)):
+        notes.append(
+            "the observations do not determine the scale: lengths are in that of all epochs together, and those that "
+            "a camera, a station or a table has in itself are not compared"
+        )
+    return tuple(out), tuple(notes)
+
+
+_WORLD = ("point/", "world_from_")
+
+
+def _without_world(record: Record) -> Record:
+    return replace(
+        record, numbers=tuple(n for n in record.numbers if not n.name.startswith(_WORLD)),
+        turns=tuple(t for t in record.turns if not t.name.startswith(_WORLD)),
+    )  # fmt: skip
+
+
+def _moved(record: Record, moved: Mapping[str, Moved], without_lengths: bool) -> Record:
+    """The record with its world moved; without lengths of bodies where the scale is open."""
+    numbers = moved_numbers(record.numbers, moved)
+    if without_lengths:
+        numbers = (n for n in numbers if n.unit != "mm" or n.name.startswith(_WORLD))
+    return replace(record, numbers=tuple(numbers), turns=tuple(moved_turns(record.turns, moved)))
 
 
 def _alarm(c: Chart) -> float:

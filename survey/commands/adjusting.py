@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from survey.commands.common import is_set, not_negative, positive, postpone, print_json, require_project, say, tested
+from survey.commands.parser import project_folder
 
 if TYPE_CHECKING:
     from survey.batch.record import Record
@@ -21,7 +22,7 @@ def declare_adjust(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: open FOLDER/results/report.html, of a batch DIR/overview.html",
         **shaped,
     )
-    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="folder with a survey.toml")
+    parser.add_argument("folders", nargs="+", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
     parser.add_argument("--redetect", action="store_true", help="detect targets again, even where it was done before")
     batch = parser.add_argument_group("batch")
@@ -37,7 +38,7 @@ def declare_adjust(commands: Any, shaped: dict[str, Any]) -> None:
     )  # fmt: skip
     batch.add_argument("--scheduler", metavar="ADDRESS", help="work on the Dask cluster at ADDRESS")
     batch.add_argument("--language", choices=("en", "de"), default="en", help="of the overview; default: en")
-    parser.set_defaults(run=_adjust, parser=parser)
+    parser.set_defaults(run=_adjust)
 
 
 def _adjust(arguments: argparse.Namespace) -> int:
@@ -71,7 +72,7 @@ def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
         say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
     if is_set(arguments, "verbose"):
         say(arguments, *(f"{step}: {seconds:.2f} s" for step, seconds in outcome.run.seconds.items()))
-    return tested(outcome.adjustment.global_test)
+    return tested(outcome.solution["summary"])
 
 
 def _adjust_batch(arguments: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from survey.commands.common import DONE, TEST_FAILED, is_set, print_json, require_project
+from survey.commands.parser import project_folder
 
 
 def declare_align(commands: Any, shaped: dict[str, Any]) -> None:
@@ -19,9 +20,9 @@ def declare_align(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: turn, measure again, labsurvey align FOLDER",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="project folder")
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write DIR/results instead of FOLDER/results")
-    parser.set_defaults(run=_align, parser=parser)
+    parser.set_defaults(run=_align)
 
 
 def _align(arguments: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ import importlib.util
 import io
 import json
 import os
+import re
 import sys
 import unicodedata
 from collections.abc import Callable, Mapping, Sequence
@@ -125,17 +126,18 @@ class Version(argparse.Action):
 
 def positive(text: str) -> int:
     """A count from the command line, 1 or more."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"found {value}; expected 1 or more")
-    return value
+    return _at_least(1, text)
 
 
 def not_negative(text: str) -> int:
     """A number from the command line, 0 or more."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"found {value}; expected 0 or more")
+    return _at_least(0, text)
+
+
+def _at_least(least: int, text: str) -> int:
+    value = int(text) if re.fullmatch(r"\s*[+-]?\d{1,18}\s*", text, re.ASCII) else None
+    if value is None or value < least:
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected a whole number, {least} or more")
     return value
 
 
@@ -160,11 +162,38 @@ def require_project(folder: Path, out: Path | None = None) -> None:
     """Raises SurveyError where a folder is no project; there and in ``out`` undoes what was killed half way."""
     for place in (folder, *([out] if out is not None else [])):
         undo_killed(place)
+    if folder.is_file():
+        raise SurveyError(f"{folder}: is a file; give the folder that holds survey.toml, here {_holder(folder)}")
     if not folder.is_dir():
-        hint = "; 'labsurvey example full-lab lab' writes a ready one"
-        raise SurveyError(f"{folder}: no such folder{hint}")
+        meant = _nearest(folder)
+        raise SurveyError(f"{folder}: no such folder; {meant}'labsurvey example full-lab lab' writes a ready one")
     if not (folder / "survey.toml").is_file():
-        raise SurveyError(f"{folder}: there is no survey.toml in it; give the folder that holds one")
+        inside = _projects(folder)
+        hint = f", as {inside[0]} does" if inside else ""
+        raise SurveyError(f"{folder}: there is no survey.toml in it; give the folder that holds one{hint}")
+
+
+def _holder(file: Path) -> str:
+    """The nearest folder above a file that is a project, or where to look."""
+    return next((str(p) for p in file.parents if (p / "survey.toml").is_file()), "none above it does")
+
+
+def _nearest(folder: Path) -> str:
+    """The project beside a folder that is not there whose name is the most like its own."""
+    from survey.files.text import suggestion
+
+    by_name = {p.name: str(p) for p in _projects(folder.parent)}
+    near = suggestion(folder.name, by_name)
+    found = next((by_name[name] for name in by_name if near == f"did you mean {name!r}?"), None)
+    return "" if found is None else f"did you mean {found!r}? "
+
+
+def _projects(place: Path) -> list[Path]:
+    """The folders in ``place`` that hold a survey.toml."""
+    try:
+        return sorted(p.parent for p in place.glob("*/survey.toml"))
+    except OSError:
+        return []
 
 
 def undo_killed(folder: Path) -> None:
@@ -177,6 +206,8 @@ def undo_killed(folder: Path) -> None:
                   file=sys.stderr)  # fmt: skip
 
 
-def tested(omega_test: Any) -> int:
-    """Exit code by the global test: residuals that are too small mean cautious sigmas, which mislead nobody."""
-    return DONE if omega_test is None or omega_test.omega <= omega_test.upper else TEST_FAILED
+def tested(summary: Mapping[str, Any]) -> int:
+    """Exit code by what the summary of a solution says: cautious sigmas mislead nobody, and are no failure."""
+    from survey.verdict import misfits
+
+    return TEST_FAILED if misfits(summary) else DONE

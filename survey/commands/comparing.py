@@ -1,10 +1,10 @@
 """The command ``compare``."""
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from survey.commands.common import DONE, is_set, print_json, require_project
+from survey.commands.parser import project_folder
 
 
 def declare_compare(commands: Any, shaped: dict[str, Any]) -> None:
@@ -18,9 +18,9 @@ def declare_compare(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: labsurvey adjust B",
         **shaped,
     )
-    parser.add_argument("first", type=Path, metavar="A", help="project folder of the first epoch")
-    parser.add_argument("second", type=Path, metavar="B", help="project folder of the second epoch")
-    parser.set_defaults(run=_compare, parser=parser)
+    parser.add_argument("first", type=project_folder, metavar="A", help="project folder of the first epoch")
+    parser.add_argument("second", type=project_folder, metavar="B", help="project folder of the second epoch")
+    parser.set_defaults(run=_compare)
 
 
 def _compare(arguments: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from survey.commands.common import DONE, is_set, print_json, require_project
+from survey.commands.parser import project_folder
 
 FORMATS = (
     "gama", "krumm", "lgc", "csv", "dbat", "aicon", "g2o", "json", "sinex", "colmap", "colmap-text", "opencv", "ros",
@@ -28,7 +29,8 @@ def declare_convert(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: labsurvey adjust TO",
         **shaped,
     )
-    parser.add_argument("source", type=Path, metavar="FROM", help="file of another program, or project folder")
+    parser.add_argument("source", type=project_folder, metavar="FROM",
+                        help="file of another program, or project folder")
     parser.add_argument("target", type=Path, metavar="TO", help="new project folder, or new file")
     parser.add_argument("--format", choices=FORMATS, metavar="NAME",
                         help=f"of the file; default: by its ending. One of {', '.join(FORMATS)}")
@@ -37,7 +39,11 @@ def declare_convert(commands: Any, shaped: dict[str, Any]) -> None:
         "--information", choices=("tangent", "quaternion"), default="tangent",
         help="rotation part of g2o's information: of the rotation vector, or of the quaternion as g2o itself means it",
     )  # fmt: skip
-    parser.set_defaults(run=_convert, parser=parser)
+    parser.add_argument(
+        "--block-diagonal", action="store_true",
+        help="of g2o's information matrices read only the blocks of translation and of rotation",
+    )  # fmt: skip
+    parser.set_defaults(run=_convert)
 
 
 def _convert(arguments: argparse.Namespace) -> int:
@@ -47,7 +53,7 @@ def _convert(arguments: argparse.Namespace) -> int:
 
     outcome = convert_job(
         arguments.source, arguments.target, format=arguments.format, information=arguments.information,
-        station=arguments.station,
+        block_diagonal=arguments.block_diagonal, station=arguments.station,
     )  # fmt: skip
     if is_set(arguments, "json"):
         print_json(outcome.summary())

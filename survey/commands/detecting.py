@@ -1,10 +1,10 @@
 """The command ``detect``."""
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from survey.commands.common import DONE, is_set, positive, print_json, require_project, say
+from survey.commands.parser import project_folder
 
 
 def declare_detect(commands: Any, shaped: dict[str, Any]) -> None:
@@ -12,26 +12,30 @@ def declare_detect(commands: Any, shaped: dict[str, Any]) -> None:
     parser = commands.add_parser(
         "detect",
         help="find the targets and beacons in the images of a project folder",
-        usage="labsurvey detect lab   (labsurvey detect FOLDER [--jobs N] [--pictures])",
-        description="Writes FOLDER/observations/image_points.csv, and spots.csv where beacons are asked for.",
+        usage="labsurvey detect lab   (labsurvey detect FOLDER [--all] [--jobs N] [--pictures])",
+        description="Looks into images that are new or have changed, replaces their rows in "
+        "FOLDER/observations/image_points.csv,\nand in spots.csv where beacons are asked for. The rows of other "
+        "images stay.",
         epilog="Next: labsurvey adjust FOLDER",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder with a survey.toml and images/")
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml and images/")
+    parser.add_argument("--all", action="store_true", help="also in images that are as they were")
     parser.add_argument("--jobs", type=positive, metavar="N", help="images at a time; default: one per processor")
     parser.add_argument("--pictures", action="store_true", help="also write every image with what was found in it")
-    parser.set_defaults(run=_detect, parser=parser)
+    parser.set_defaults(run=_detect)
 
 
 def _detect(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder)
-    from survey.jobs import detect_job
+    from survey.detecting import detect_job
 
     outcome = detect_job(
         arguments.folder,
         jobs=arguments.jobs,
         pictures=arguments.pictures,
         progress=not is_set(arguments, "quiet"),
+        everything=arguments.all,
     )
     if is_set(arguments, "verbose"):
         say(arguments, *outcome.messages)

@@ -10,7 +10,7 @@ from survey.examples import EXAMPLES, write_example
 
 def declare_example(commands: Any, shaped: dict[str, Any]) -> None:
     """Add ``example`` to the commands."""
-    listed = "\n".join(f"  {name:<12}{what}" for name, what in EXAMPLES.items())
+    listed = "\n".join(f"  {name:<15}{what}" for name, what in EXAMPLES.items())
     parser = commands.add_parser(
         "example",
         help="write a ready project folder to try things on",
@@ -23,7 +23,7 @@ def declare_example(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument("folder", type=Path, metavar="DIR", help="new folder")
     parser.add_argument("--seed", type=not_negative, default=1, metavar="N", help="other numbers give other noise")
     parser.add_argument("--jobs", type=positive, metavar="N", help="images at a time; default: one per processor")
-    parser.set_defaults(run=_example, parser=parser)
+    parser.set_defaults(run=_example)
 
 
 def _example(arguments: argparse.Namespace) -> int:

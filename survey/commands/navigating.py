@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from survey.commands.common import DONE, is_set, print_json, require_project, say
+from survey.commands.parser import project_folder
 
 
 def declare_navigate(commands: Any, shaped: dict[str, Any]) -> None:
@@ -18,7 +19,7 @@ def declare_navigate(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: open FOLDER/results/trajectory.csv",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder with a survey.toml")
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
     parser.add_argument("--station", metavar="S", help="the head; default: the one that a table carries")
     parser.add_argument("--epochs", nargs="+", metavar="E", help="default: all that show beacons and no target")
     parser.add_argument("--interval", type=float, metavar="SECONDS", help="epochs follow each other: bridge by motion")
@@ -26,7 +27,7 @@ def declare_navigate(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument("--no-table", action="store_true", help="make no use of the table's angles")
     parser.add_argument("--unnamed", action="store_true", help="forget the names that spots have")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
-    parser.set_defaults(run=_navigate, parser=parser)
+    parser.set_defaults(run=_navigate)
 
 
 def _navigate(arguments: argparse.Namespace) -> int:

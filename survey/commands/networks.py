@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from survey.commands.common import DONE, is_set, print_json, require_project, say, tested
+from survey.commands.excluding import NAMES
+from survey.commands.parser import project_folder
 
 
 def declare_add(commands: Any, shaped: dict[str, Any]) -> None:
@@ -18,10 +20,10 @@ def declare_add(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: open FOLDER/results/report.html",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="adjusted project folder")
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="adjusted project folder")
     parser.add_argument("new", type=Path, metavar="NEW", help="folder with what is new")
     parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the grown project to DIR")
-    parser.set_defaults(run=_add, parser=parser)
+    parser.set_defaults(run=_add)
 
 
 def declare_remove(commands: Any, shaped: dict[str, Any]) -> None:
@@ -29,16 +31,18 @@ def declare_remove(commands: Any, shaped: dict[str, Any]) -> None:
     parser = commands.add_parser(
         "remove",
         help="adjust a project again without some observations",
-        usage="labsurvey remove lab p3   (labsurvey remove FOLDER ID [ID ...] [--out DIR])",
-        description="Writes used = false beside pairs, distances and coordinates, adjusts again and says what moved.\n"
-        "Refuses what the rest cannot do without; on any error FOLDER stays as it was.",
-        epilog="Next: open FOLDER/results/report.html",
+        usage="labsurvey remove lab p3   (labsurvey remove FOLDER NAME [NAME ...] [--reason TEXT] [--out DIR])",
+        description="Excludes observations as 'labsurvey exclude' does, adjusts again and says what moved.\nRefuses "
+        "what the rest cannot do without; on any error FOLDER stays as it was.\n\n" + NAMES,
+        epilog="Next: open FOLDER/results/report.html; labsurvey include FOLDER NAME takes back",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="project folder, adjusted or not")
-    parser.add_argument("ids", nargs="+", metavar="ID", help="pair, distance, point or set; pairs:ID where it is twice")
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder, adjusted or not")
+    parser.add_argument("names", nargs="+", metavar="NAME", help="what is to be left out")
+    parser.add_argument("--reason", default="", metavar="TEXT", help="why; stands in the report")
+    parser.add_argument("--author", default="", metavar="TEXT", help="who; default: $LABSURVEY_AUTHOR, or the user")
     parser.add_argument("--out", type=Path, metavar="DIR", help="leave FOLDER alone, write the new project to DIR")
-    parser.set_defaults(run=_remove, parser=parser)
+    parser.set_defaults(run=_remove)
 
 
 def declare_trackers(commands: Any, shaped: dict[str, Any]) -> None:
@@ -53,7 +57,7 @@ def declare_trackers(commands: Any, shaped: dict[str, Any]) -> None:
     )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="trajectories, three or more")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write the pairs to DIR/pairs.csv")
-    parser.set_defaults(run=_trackers, parser=parser)
+    parser.set_defaults(run=_trackers)
 
 
 def _add(arguments: argparse.Namespace) -> int:
@@ -66,7 +70,7 @@ def _add(arguments: argparse.Namespace) -> int:
     else:
         print(outcome.text())
         say(arguments, *(f"written: {path}" for path in outcome.outcome.paths.values()))
-    return tested(outcome.outcome.adjustment.global_test)
+    return tested(outcome.outcome.solution["summary"])
 
 
 def _remove(arguments: argparse.Namespace) -> int:
@@ -74,13 +78,16 @@ def _remove(arguments: argparse.Namespace) -> int:
     from survey.removing import remove_job
 
     progress = not is_set(arguments, "quiet")
-    outcome = remove_job(arguments.folder, arguments.ids, out=arguments.out, progress=progress)
+    outcome = remove_job(
+        arguments.folder, arguments.names, out=arguments.out, progress=progress, reason=arguments.reason,
+        author=arguments.author,
+    )  # fmt: skip
     if is_set(arguments, "json"):
         print_json(outcome.summary())
     else:
         print(outcome.text())
         say(arguments, *(f"written: {path}" for path in outcome.outcome.paths.values()))
-    return tested(outcome.outcome.adjustment.global_test)
+    return tested(outcome.outcome.solution["summary"])
 
 
 def _trackers(arguments: argparse.Namespace) -> int:

@@ -6,6 +6,7 @@ from typing import Any
 
 from adjust.errors import SurveyError
 from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say
+from survey.commands.parser import project_folder
 
 _DESCRIPTION = """\
 With FOLDER/plan.toml: predicts what will be seen and says what sigmas everything will have, which directions are weak,
@@ -25,7 +26,8 @@ def declare_plan(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: labsurvey adjust FOLDER",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, nargs="?", metavar="FOLDER", help="folder with survey.toml and plan.toml")
+    parser.add_argument("folder", type=project_folder, nargs="?", metavar="FOLDER",
+                        help="folder with survey.toml and plan.toml")
     parser.add_argument("--for", nargs="+", dest="wanted", metavar="NAME", default=[],
                         help="what is to become precise: lens.X, head.camera_X, point.B*, everything")  # fmt: skip
     parser.add_argument("--add", type=not_negative, default=5, metavar="N", help="candidates to choose (5)")
@@ -39,7 +41,7 @@ def declare_plan(commands: Any, shaped: dict[str, Any]) -> None:
                         help="pixel error by beacon and camera errors, 10000 trials a point")  # fmt: skip
     parser.add_argument("--pixels", type=float, default=5.0, metavar="PX", help="pixel error allowed in it (5)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
-    parser.set_defaults(run=_plan, parser=parser)
+    parser.set_defaults(run=_plan)
 
 
 def _plan(arguments: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from survey.commands.common import DONE, TEST_FAILED, is_set, print_json, require_project, say, tested
+from survey.commands.parser import project_folder
 
 
 def declare_report(commands: Any, shaped: dict[str, Any]) -> None:
@@ -18,7 +19,7 @@ def declare_report(commands: Any, shaped: dict[str, Any]) -> None:
         epilog="Next: open FOLDER/results/report.html",
         **shaped,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder with a survey.toml")
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
     parser.add_argument("--language", choices=("en", "de"), default="en", help="of the report; default: en")
     parser.add_argument("--pdf", action="store_true", help="write report.pdf too; needs Chromium, Chrome or WeasyPrint")
     parser.add_argument("--check", action="store_true", help="exit code 3 also where a tolerance is not met")
@@ -44,5 +45,5 @@ def _report(arguments: argparse.Namespace) -> int:
             times = f"{v.found / v.allowed:.2f} times what is allowed"
             print(f"  tolerance {v.tolerance} not met: {' '.join(v.result)} {v.quantity}, {times}")
         say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
-    code = tested(outcome.adjustment.global_test)
+    code = tested(outcome.solution["summary"])
     return TEST_FAILED if code == DONE and arguments.check and unmet else code

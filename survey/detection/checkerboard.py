@@ -4,7 +4,9 @@ import cv2
 import numpy as np
 
 from adjust.model import BoolArray, FloatArray
+from survey.detection.bent_edges import unbent
 from survey.detection.corners import CornerFit, refine_corners
+from survey.detection.extent import grown, is_of_neighbours
 from survey.detection.gray import Gray8, Gray32, reduced
 from survey.detection.results import Detection, nothing_found
 from survey.targets import Checkerboard
@@ -20,23 +22,49 @@ def find_checkerboard(gray: Gray32, gray8: Gray8, target: Checkerboard) -> Detec
     is dark. Where one of the two numbers of corners is odd and the other even, this leaves one order. Otherwise it is
     ambiguous: of the orders left, r0c0 is the one nearest the upper left of the image (least u + v).
     """
-    reason = f"no complete board of {target.columns} x {target.rows} inner corners"
+    reason, other = f"no complete board of {target.columns} x {target.rows} inner corners", None
     for _ in range(_MAX_DECOYS):
         found = _find(gray8, target.columns, target.rows)
         if found is None:
             break
-        detection = _measured(gray, gray8, found.reshape(target.rows, target.columns, 2))
-        if len(detection):
+        detection, whole = _measured(gray, gray8, found.reshape(target.rows, target.columns, 2))
+        if len(detection) and whole.size == found.size:
             return detection
-        # a ChArUco board or a picture of a board can look like the one that is wanted: cover it, search again
+        # a larger or a ChArUco board or a picture of a board can look like the one that is wanted: cover it
         reason = detection.reason
+        if len(detection):
+            other = _size(whole)
+            reason = f"the board goes on, to {other[0]} x {other[1]} inner corners at least"
         gray8 = gray8.copy()
-        cv2.fillConvexPoly(gray8, cv2.convexHull(np.rint(found).astype(np.int32)), (128,))
-    return nothing_found(reason)
+        cv2.fillConvexPoly(gray8, cv2.convexHull(np.rint(whole.reshape(-1, 2)).astype(np.int32)), (128,))
+    return nothing_found(reason, other_size=other)
 
 
-def _measured(gray: Gray32, gray8: Gray8, rough: FloatArray) -> Detection:
-    """The detection from corners (rows, columns, 2) px of a finder; empty where they are no corners of a board."""
+def other_board(gray: Gray32, gray8: Gray8, target: Checkerboard) -> tuple[int, int] | None:
+    """Columns and rows of inner corners of a board that has one fewer, as where squares were counted, or one more.
+
+    To be asked where the target itself was not found. None where there is no such board either.
+    """
+    c, r = target.columns, target.rows
+    for columns, rows in ((c - 1, r - 1), (c + 1, r + 1), (c - 1, r), (c, r - 1)):
+        found = _find(gray8, columns, rows) if min(columns, rows) >= 3 else None
+        if found is not None:
+            detection, whole = _measured(gray, gray8, found.reshape(rows, columns, 2))
+            if len(detection):
+                return _size(whole)
+    return None
+
+
+def _size(grid: FloatArray) -> tuple[int, int]:
+    """Columns and rows of a grid (rows, columns, 2)."""
+    return int(grid.shape[1]), int(grid.shape[0])
+
+
+def _measured(gray: Gray32, gray8: Gray8, rough: FloatArray) -> tuple[Detection, FloatArray]:
+    """The detection from corners (rows, columns, 2) px of a finder, and with all rows and columns that continue them.
+
+    Empty where they are no corners of a board.
+    """
     grid, ambiguous = _ordered(gray, rough)
     edges = grid_edges(grid)
     start = _settle(gray8, grid, edges)
@@ -44,14 +72,24 @@ def _measured(gray: Gray32, gray8: Gray8, rough: FloatArray) -> Detection:
     needed = max(6, fit.good.size // 2)
     keep = fit.good & _on_grid(fit, grid.shape[:2]) if fit.good.sum() >= needed else fit.good
     if keep.sum() < needed:
-        return nothing_found(f"board found, but only {int(keep.sum())} of {keep.size} corners could be measured")
+        reason = f"board found, but only {int(keep.sum())} of {keep.size} corners could be measured"
+        return nothing_found(reason), rough
+    there = keep.reshape(grid.shape[:2])
+    if not there[[0, -1]].any(1).all() or not there[:, [0, -1]].any(0).all():
+        return nothing_found("the board ends before the size that was looked for"), rough
+    row, column = np.divmod(np.arange(keep.size), grid.shape[1])
+    fit = unbent(fit, np.stack([column, row], axis=1).astype(float), keep)
     notes: tuple[str, ...] = ()
     if not keep.all():
         notes += (f"{int((~keep).sum())} of {keep.size} corners were not sharp or not free",)
     if ambiguous:
         notes += ("order is ambiguous: the board looks the same after a turn",)
     blur, contrast = float(np.median(fit.blur_px[keep])), float(np.median(fit.contrast[keep]))
-    return Detection(np.flatnonzero(keep), fit.uv[keep], fit.cov[keep], blur, contrast, notes, ambiguous)
+    measured = np.where(keep[:, None], fit.uv, start).reshape(grid.shape)
+    if not is_of_neighbours(gray, measured, contrast):
+        return nothing_found("corners found, but not those of neighbouring squares"), rough
+    whole = grown(gray, measured, contrast)
+    return Detection(np.flatnonzero(keep), fit.uv[keep], fit.cov[keep], blur, contrast, notes, ambiguous), whole
 
 
 def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:

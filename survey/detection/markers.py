@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from adjust.model import FloatArray, IntArray
+from survey.detection.bent_edges import unbent
 from survey.detection.corners import CornerFit, refine_corners
 from survey.detection.dictionaries import charuco_board, marker_dictionary
 from survey.detection.gray import Gray8, Gray32, reduced
@@ -34,6 +35,8 @@ def find_markers(gray: Gray32, gray8: Gray8, target: MarkerGrid | MarkerBlock) -
     cells = int(marker_dictionary(target.dictionary).markerSize) + 2
     fit = _fit_quads(gray, quads, cells, _gap_cells(target, cells))
     point_idx = np.array([wanted[m] + corner for m in markers.tolist() for corner in range(4)], np.int64)
+    # the faces of a block do not share a plane
+    fit = unbent(fit, target.points()[1][point_idx, :2], fit.good & isinstance(target, MarkerGrid))
     return _detection(point_idx, fit, notes, "marker corners")
 
 
@@ -52,6 +55,7 @@ def find_charuco(gray: Gray32, gray8: Gray8, target: Charuco) -> Detection:
         return nothing_found(f"the {len(point_idx)} corners found lie on one line")
     margin = (target.square_m - target.marker_m) / (2.0 * target.square_m)
     fit = refine_corners(gray, start, edges, margin * _across(edges))
+    fit = unbent(fit, target.points()[1][point_idx, :2], fit.good)
     return _detection(point_idx, fit, (), "corners")
 
 

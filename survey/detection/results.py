@@ -16,7 +16,7 @@ class Detection:
     point_idx: (n,) positions in the target's ``points()``. uv: (n, 2) px. cov: (n, 2, 2) px^2.
     blur_px: median standard deviation of the point spread. contrast: median step from dark to bright, grey values.
     ambiguous: the target looks the same after a turn, so its order is a convention (see ``find_checkerboard``).
-    notes: what was left out, and why.
+    notes: what was left out, and why. other_size: columns and rows of inner corners of a board that is there instead.
     """
 
     point_idx: IntArray
@@ -27,14 +27,16 @@ class Detection:
     notes: tuple[str, ...] = ()
     ambiguous: bool = False
     reason: str = ""
+    other_size: tuple[int, int] | None = None
 
     def __len__(self) -> int:
         return len(self.point_idx)
 
 
-def nothing_found(reason: str, notes: tuple[str, ...] = ()) -> Detection:
+def nothing_found(reason: str, notes: tuple[str, ...] = (), other_size: tuple[int, int] | None = None) -> Detection:
     """An empty detection."""
-    return Detection(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)), notes=notes, reason=reason)
+    none = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2))
+    return Detection(*none, notes=notes, reason=reason, other_size=other_size)
 
 
 @dataclass(frozen=True, eq=False)

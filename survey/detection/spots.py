@@ -12,8 +12,8 @@ from survey.detection.gray import AnyImage, Gray32, gray_values, saturation_leve
 from survey.detection.results import Detection, SpotOptions, Spots
 
 # Neither profile is quite that of a small disc under a point spread, least of all on the rim that saturation leaves;
-# measured on renderings (tests/survey/test_detection_spots.py).
-SPOT_FLOOR_PX = 0.003
+# measured on noiseless renderings (tests/survey/test_detection_spots.py): at most 0.0008 px rms where nothing is full.
+SPOT_FLOOR_PX = 0.0005
 SATURATED_FLOOR_PX = 0.006
 _FWHM = 2.3548200450309493
 

@@ -7,6 +7,7 @@ import numpy as np
 from gtsam import Rot3
 
 from adjust.model import Survey
+from survey.files.declarations import keys_of
 from survey.files.node import Node
 from survey.files.poses import quaternion_wxyz, rotation_from_euler, rotation_from_quaternion
 from survey.files.project import AlignmentTask, Foot
@@ -22,7 +23,7 @@ def read_alignment_tasks(root: Node, survey: Survey) -> tuple[AlignmentTask, ...
     names = Names.of(survey)
     tasks = []
     for task_id, node in root.tables("align"):
-        node.allow("body", "onto", *_ROTATIONS, "feet_mm", "pitch_mm", "tolerance_arcsec")
+        node.allow(*keys_of("align"))
         frames = []
         for key in ("body", "onto"):
             try:

@@ -5,16 +5,11 @@ from typing import Any, Literal
 import numpy as np
 
 from adjust.model import BEAM, Beam, FloatArray, Surface
+from survey.files.declarations import BEAM_UNITS, SURFACE_UNITS, keys_of
 from survey.files.node import Node
 from survey.files.toml_text import Section
 from survey.files.vectors import read_vector, vector_keys, vector_to_toml
 
-BEAM_UNITS = {"offset_1": "mm", "offset_2": "mm", "slope_1": "1", "slope_2": "1"}
-SURFACE_UNITS: dict[str, dict[str, str]] = {
-    "plane": {"normal_1": "deg", "normal_2": "deg", "distance": "mm"},
-    "line": {"direction_1": "deg", "direction_2": "deg", "offset_1": "mm", "offset_2": "mm"},
-    "sphere": {"x": "mm", "y": "mm", "z": "mm", "radius": "mm"},
-}
 _KINDS: tuple[Literal["plane", "line", "sphere"], ...] = ("plane", "line", "sphere")
 _REFERENCE = {"plane": "normal", "line": "direction"}
 
@@ -23,7 +18,7 @@ def read_beams(root: Node, station_ids: tuple[str, ...], table_ids: tuple[str, .
     """The tables [beams.*]: a laser on the mount of a turntable or on a station."""
     beams = []
     for beam_id, node in root.tables("beams"):
-        node.allow("mount", "station", "axis", *vector_keys(BEAM_UNITS))
+        node.allow(*keys_of("beam"))
         if node.has("mount") == node.has("station"):
             found = "both are given; keep one" if node.has("mount") else "neither is given; add one"
             raise node.error(f"a beam is fixed on the mount of a table or on a station: {found}", "station")
@@ -44,7 +39,7 @@ def read_surfaces(root: Node) -> tuple[Surface, ...]:
         kind = next(known for known in _KINDS if known == name)
         units = SURFACE_UNITS[kind]
         key = _REFERENCE.get(kind)
-        node.allow("kind", *((key,) if key else ()), *vector_keys(units))
+        node.allow(*keys_of(f"surface_{kind}"))
         reference: FloatArray | None = None
         if key and node.has(key):
             reference = node.numbers(key, (3,))

@@ -68,7 +68,7 @@ def read_differences(
         cov[np.isfinite(cov)] *= sigmas.scale.get(groups[rows[0]], 1.0) ** 2
         item = CoordinateDifferences(
             tuple(ends[row][0] for row in rows), tuple(ends[row][1] for row in rows), values[rows], cov,
-            groups[rows[0]], used[rows[0]],
+            groups[rows[0]], used[rows[0]], set_id or ids[rows[0]],
         )  # fmt: skip
         result.append((natural_key(ids[rows[0]]), item))
     return tuple(item for _, item in sorted(result, key=lambda pair: pair[0]))

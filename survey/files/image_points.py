@@ -9,7 +9,7 @@ from adjust.observations import ImageBlock
 from survey.files.covariance import covariance_from_sigmas
 from survey.files.project import ImagePointsWhere, Sigmas, SpotBlock
 from survey.files.references import Names
-from survey.files.tables import Layout, Table, TextColumn, first_row
+from survey.files.tables import Layout, Table, TextColumn, checked_groups, first_row
 from survey.files.text import natural_key, suggestion
 
 _SIGMAS = ("sigma_u_px", "sigma_v_px", "rho_uv")
@@ -98,7 +98,7 @@ def _runs(order: IntArray, keys: IntArray) -> list[IntArray]:
 
 
 def _groups(table: Table) -> TextColumn:
-    groups = table.text("group")
+    groups = checked_groups(table)
     return TextColumn(tuple(name or "image" for name in groups.names), groups.codes)
 
 

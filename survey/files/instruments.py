@@ -6,17 +6,14 @@ from dataclasses import asdict
 import numpy as np
 
 from adjust.model import Bearings, Instrument, Setup, Vertical
+from survey.files.declarations import INSTRUMENT_UNITS, TILT_UNITS, keys_of
 from survey.files.node import Node
 from survey.files.project import Accuracy
 from survey.files.text import suggestion
 from survey.files.toml_text import Section
 from survey.files.units import from_si
-from survey.files.vectors import read_vector, vector_keys, vector_to_toml
+from survey.files.vectors import read_vector, vector_to_toml
 
-TILT_UNITS = {"tilt_1": "arcsec", "tilt_2": "arcsec"}
-INSTRUMENT_UNITS = {
-    "distance_offset": "mm", "distance_scale": "ppm", "refraction": "1", "vertical_index": "arcsec",
-}  # fmt: skip
 _ANGLE = ("arcsec", "mgon", "cc", "deg")
 _LENGTH = ("mm",)
 _ACCURACY: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -32,12 +29,11 @@ _ACCURACY: dict[str, tuple[str, tuple[str, ...]]] = {
     "centring": ("sigma_centring", _LENGTH),
     "height": ("sigma_height", _LENGTH),
 }
-_KEYS = tuple(dict.fromkeys(f"{name}_{unit}" for name, units in _ACCURACY.values() for unit in units))
 
 
 def read_vertical(node: Node) -> Vertical:
     """The table [vertical]."""
-    node.allow("up_in_world", "radius_m", *vector_keys(TILT_UNITS))
+    node.allow(*keys_of("vertical"))
     up = node.numbers("up_in_world", (3,), [0.0, 0.0, 1.0])
     length = float(np.linalg.norm(up))
     if abs(length - 1.0) > 1e-3:
@@ -50,7 +46,7 @@ def read_vertical(node: Node) -> Vertical:
 
 def read_bearings(node: Node) -> Bearings:
     """The table [bearings]."""
-    node.allow("zero", "clockwise")
+    node.allow(*keys_of("bearings"))
     zero = node.choice("zero", ("x", "y"), "y")
     return Bearings("x" if zero == "x" else "y", node.flag("clockwise", True))
 
@@ -59,7 +55,7 @@ def read_instruments(root: Node) -> tuple[tuple[Instrument, ...], dict[str, Accu
     """The tables [instruments.*], and what their readings are worth."""
     instruments, accuracies = [], {}
     for instrument_id, node in root.tables("instruments"):
-        node.allow(*_KEYS, *vector_keys(INSTRUMENT_UNITS))
+        node.allow(*keys_of("instrument"))
         instruments.append(Instrument(instrument_id, read_vector(node, INSTRUMENT_UNITS, ())))
         given: dict[str, float] = {}
         for name, (key, units) in _ACCURACY.items():
@@ -77,7 +73,7 @@ def read_setups(root: Node, instruments: tuple[str, ...], accuracies: Mapping[st
     """The tables [setups.*]; centring is the instrument's where they do not say."""
     setups = []
     for setup_id, node in root.tables("setups"):
-        node.allow("instrument", "levelled", "sigma_centring_mm", "sigma_height_mm")
+        node.allow(*keys_of("setup"))
         instrument_id = None
         if node.has("instrument"):
             instrument_id = node.reference("instrument", instruments, "instrument")

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 
 from adjust.model import FloatArray, Target, VectorParameter, VectorPrior
+from survey.files.declarations import DECLARATIONS, keys_of
 from survey.files.node import Node
 from survey.files.owners import read_epochs
 from survey.files.poses import read_pose
@@ -14,14 +15,7 @@ from survey.files.text import suggestion
 from survey.files.units import to_si
 from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind
 
-_COMMON = ("kind", "station", "motion", "pose", "epochs", "warp", "cameras")
-_KEYS = {
-    "checkerboard": ("columns", "rows", "square_mm"),
-    "charuco": ("squares_x", "squares_y", "square_mm", "marker_mm", "dictionary", "legacy"),
-    "marker_grid": ("columns", "rows", "marker_mm", "gap_mm", "dictionary", "first_id"),
-    "marker_block": ("dictionary", "markers"),
-    "points": ("file",),
-}
+_KINDS = tuple(d.of[1] for d in DECLARATIONS if d.path == "targets.ID" and d.of is not None)
 _MOST_ON_BOARD = 250_000  # squares or markers
 WARP = ("warp_x", "warp_y")
 POINTS_LAYOUT = Layout("points of a target", ("point_id",), ("x_mm", "y_mm", "z_mm"))
@@ -36,8 +30,8 @@ def read_targets(
     """
     targets, kinds, seen_by = [], {}, {}
     for target_id, node in root.tables("targets"):
-        kind_name = node.choice("kind", _KEYS)
-        node.allow(*_COMMON, *_KEYS[kind_name])
+        kind_name = node.choice("kind", _KINDS)
+        node.allow(*keys_of(f"target_{kind_name}"))
         name = node.choice("motion", ("fixed", "epoch"), "fixed")
         motion: Literal["fixed", "epoch"] = "epoch" if name == "epoch" else "fixed"
         kind = _points(node, inputs) if kind_name == "points" else _READERS[kind_name](node)
@@ -143,7 +137,7 @@ def _points(node: Node, inputs: dict[str, str]) -> TargetKind:
 def _warp(node: Node, kind_name: str) -> VectorParameter:
     if kind_name == "marker_block":
         raise node.error(f"a target of kind {kind_name!r} is no flat board and has no warp; remove it")
-    node.allow("free", "sigma_mm", "warp_x_mm", "warp_y_mm")
+    node.allow(*keys_of("warp"))
     free = WARP if node.flag("free", True) else ()
     values = np.array([to_si(node.number(f"{name}_mm", 0.0), "mm") for name in WARP])
     sigma = node.sigmas("sigma", ("mm",), 2)

@@ -7,6 +7,7 @@ import numpy as np
 from adjust.lens import MODELS
 from adjust.model import FloatArray, LensParameter, Tie, VectorPrior
 from survey.files.covariance import covariance_problem
+from survey.files.declarations import keys_of
 from survey.files.node import Node
 from survey.files.text import suggestion
 
@@ -18,12 +19,11 @@ _ESSENTIAL = {
     "brown_backward_dbat": ("c", "px", "py"),
     "aicon": ("ck",),
 }
-_KEYS = ("model", "free", "values", "prior", "prior_covariance", "tie", "pixel_size_mm", "balance_radius_mm")
 
 
 def read_lens(node: Node) -> LensParameter:
     """The table [cameras.*.lens]."""
-    node.allow(*_KEYS)
+    node.allow(*keys_of("lens"))
     model = node.choice("model", MODELS)
     names = MODELS[model].names
     free = node.references("free", names, f"parameter of the model {model}")
@@ -74,7 +74,7 @@ def _prior(node: Node, names: tuple[str, ...], free: tuple[str, ...]) -> VectorP
         if name not in free:
             raise table.error("has a prior but is not free; add it to 'free' or remove the prior", name)
         entry = table.table(name)
-        entry.allow("value", "sigma")
+        entry.allow(*keys_of("lens_prior"))
         means.append(entry.number("value"))
         if has_matrix and entry.has("sigma"):
             raise entry.error("prior_covariance is given too; keep one of the two", "sigma")
@@ -96,7 +96,7 @@ def _ties(node: Node, names: tuple[str, ...], free: tuple[str, ...]) -> tuple[Ti
     ties = []
     for name in table.values:
         entry = table.table(name)
-        entry.allow("to", "factor")
+        entry.allow(*keys_of("lens_tie"))
         to = entry.reference("to", names, "lens parameter")
         if to == name or to in table.values:
             raise entry.error(f"{to!r} is tied itself; tie to a parameter that is not", "to")

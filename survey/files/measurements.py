@@ -156,7 +156,7 @@ def read_coordinates(table: Table, extra: Table | None, names: Names, sigmas: Si
         cov = _joint_covariance(table, rows, own, sets[name])
         cov[np.isfinite(cov)] *= sigmas.scale.get(groups[rows[0]], 1.0) ** 2
         refs = tuple(positions[row] for row in rows)
-        result.append(Coordinates(refs, values[rows], cov, groups[rows[0]], used[rows[0]]))
+        result.append(Coordinates(refs, values[rows], cov, groups[rows[0]], used[rows[0]], sets[name].name))
     return tuple(result)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
-from survey.files.text import LARGEST_NUMBER, decode, id_problem, read_bytes, suggestion
+from survey.files.text import LARGEST_NUMBER, choice_hint, decode, id_problem, read_bytes, suggestion
 from survey.files.toml_lines import KeyPath, key_lines
 from survey.files.units import to_si
 
@@ -132,7 +132,7 @@ class Node:
         options = tuple(options)
         value = self.text(key, default)
         if value not in options:
-            raise self.error(f"found {value!r}; {suggestion(value, options)} (one of: {', '.join(options)})", key)
+            raise self.error(f"found {value!r}; {choice_hint(value, options)}", key)
         return value
 
     def flag(self, key: str, default: bool) -> bool:

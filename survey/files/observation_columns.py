@@ -122,7 +122,7 @@ def coordinate_columns(coordinates: Sequence[Coordinates]) -> tuple[Columns, Col
     alone: set[str] = set()
     for number, observation in enumerate(coordinates, 1):
         names = [position_text(position) for position in observation.positions]
-        set_id = f"set{number}" if len(names) > 1 or names[0] in alone else ""
+        set_id = observation.set_id or (f"set{number}" if len(names) > 1 or names[0] in alone else "")
         alone.update(names if not set_id else ())
         for i, values in enumerate(observation.values):
             rows.append(triple_rows(values, observation.cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]))

@@ -14,6 +14,7 @@ from adjust.model import (
     VectorParameter,
     VectorPrior,
 )
+from survey.files.declarations import keys_of
 from survey.files.lenses import read_lens
 from survey.files.node import Node
 from survey.files.poses import read_pose
@@ -27,7 +28,7 @@ def read_cameras(root: Node, station_ids: tuple[str, ...]) -> tuple[Camera, ...]
     """The cameras under [cameras.*]."""
     cameras = []
     for camera_id, node in root.tables("cameras"):
-        node.allow("station", "image_size_px", "lens", "station_from_camera")
+        node.allow(*keys_of("camera"))
         station_id = node.reference("station", station_ids, "station")
         width, height = node.numbers("image_size_px", (2,))
         if min(width, height) < 1 or width % 1 or height % 1:
@@ -44,7 +45,7 @@ def read_stations(root: Node, table_ids: tuple[str, ...]) -> tuple[Station, ...]
     """The stations under [stations.*]."""
     stations = []
     for station_id, node in root.tables("stations"):
-        node.allow("motion", "table", "mount_from_station", "world_from_station", "epochs")
+        node.allow(*keys_of("station"))
         name = node.choice("motion", ("fixed", "epoch", "table"), "fixed")
         motion: Literal["fixed", "epoch", "table"] = name if name in ("epoch", "table") else "fixed"  # type: ignore[assignment]  # mypy does not narrow str by a tuple
         table_id = None
@@ -79,7 +80,7 @@ def read_tables(root: Node) -> tuple[tuple[Table, ...], dict[str, FloatArray]]:
     """The tables under [tables.*] and the sigmas (axes,) rad of their readings, by table id."""
     tables, sigmas = [], {}
     for table_id, node in root.tables("tables"):
-        node.allow("axes", "sigma_arcsec", "world_from_table", "geometry", "geometry_sigma")
+        node.allow(*keys_of("turntable"))
         axes = node.references("axes", ("x", "y", "z"), "axis", ("x", "z"))
         if len(axes) not in (1, 2):
             raise node.error(f"found {len(axes)} axes; a table has one or two, outermost first", "axes")

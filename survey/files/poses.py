@@ -12,22 +12,13 @@ from gtsam import Pose3, Rot3
 
 from adjust.model import FloatArray, PointParameter, PoseParameter, Treatment
 from survey.files.covariance import covariance_problem
+from survey.files.declarations import keys_of
 from survey.files.node import Node
 from survey.files.units import to_si
 
 TREATMENTS: tuple[Treatment, ...] = ("free", "held", "prior")
-POSE_KEYS = (
-    "treatment",
-    "translation_mm",
-    "rotation_quaternion_wxyz",
-    "rotation_euler_xyz_deg",
-    "sigma_translation_mm",
-    "sigma_rotation_deg",
-    "sigma_rotation_arcsec",
-    "covariance_rad_m",
-    "held",
-)
-POINT_KEYS = ("x_mm", "treatment", "held", "sigma_mm", "covariance_mm2")
+POSE_KEYS = keys_of("pose")
+POINT_KEYS = keys_of("point")
 _COMPONENTS = ("rx", "ry", "rz", "tx", "ty", "tz")
 _FLAT = {1: ("x", "y"), 2: ("z",)}  # what keeps its value in a network of so many dimensions
 _ROTATIONS = ("rotation_quaternion_wxyz", "rotation_euler_xyz_deg")

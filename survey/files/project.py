@@ -8,6 +8,9 @@ from gtsam import Rot3
 
 from adjust.model import FloatArray, IntArray, Survey
 from adjust.observations import FrameRef
+from survey.files.detected import DetectedImage
+from survey.files.exclusions import Exclusion
+from survey.quantities import SigmaKind
 from survey.targets import TargetKind
 from survey.tolerances import Tolerance
 
@@ -50,6 +53,8 @@ class AdjustmentOptions:
     alpha: error probability of the tests. reject_blocks: leave mis-detected images out of the start, then test them.
     reject_points: leave gross errors among the image points out, and list them. reject_pairs: the same for measured
     pairs and single observations of all other kinds. variance_components: estimate the variance of every group.
+    sigmas: of all that is estimated, as the observations' own sigmas say (a_priori) or times sigma0 (a_posteriori);
+    None where the project does not say: every job then has its usual ones, ``adjust`` a posteriori.
     tolerances: what is demanded of the results. identification: who measured what, where and with
     what, printed in the report as it is.
     """
@@ -59,6 +64,7 @@ class AdjustmentOptions:
     reject_points: bool = True
     reject_pairs: bool = True
     variance_components: bool = False
+    sigmas: SigmaKind | None = None
     tolerances: tuple[Tolerance, ...] = ()
     identification: tuple[tuple[str, str], ...] = ()
 
@@ -136,6 +142,17 @@ class ImagePointsWhere:
         return f"{self.file}:{self.lines[block][point]}"
 
 
+@dataclass(frozen=True)
+class LeftOut:
+    """An exclusion in force, and how many images, image points, spots without a name and readings it meets."""
+
+    exclusion: Exclusion
+    n_images: int = 0
+    n_image_points: int = 0
+    n_spots: int = 0
+    n_readings: int = 0
+
+
 @dataclass(frozen=True, eq=False)
 class Definition:
     """What survey.toml says, and the images that are there; ``survey`` has no observations.
@@ -162,11 +179,22 @@ class Definition:
 class Project(Definition):
     """A definition whose ``survey`` holds the observations too; ``spots`` are image points without identity.
 
-    The covariances of the observations contain ``sigmas.scale`` already.
+    The covariances of the observations contain ``sigmas.scale`` already. left_out: what people excluded; it is not used
+    in ``survey``, nor among the ``spots``. n_left_out: how many observations that are, each once. n_unused_in_files:
+    those that only a table marks ``used = false``. detected: what is known of every image and its points. to_detect:
+    images whose points are to be found anew. notes: exclusions that name nothing. image_notes: images that are new,
+    have changed or are gone.
     """
 
     spots: tuple[SpotBlock, ...] = ()
     image_points_where: ImagePointsWhere = ImagePointsWhere()
+    left_out: tuple[LeftOut, ...] = ()
+    n_left_out: int = 0
+    n_unused_in_files: int = 0
+    detected: Mapping[tuple[str, str], DetectedImage] = field(default_factory=dict)
+    to_detect: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+    image_notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """What is in the folder, in a few lines: a notebook prints it."""

@@ -42,7 +42,7 @@ def dms_angles(table: Table, column: str) -> FloatArray:
             example = "write degrees-minutes-seconds, as 12-34-56.7"
             raise table.error(first_row(rows), f"{column}: found {name!r}; {example}")
         sign, degrees, minutes, seconds = found.groups()
-        if int(minutes) >= 60 or float(seconds) >= 60:
+        if int(minutes) > 60 or float(seconds) > 60:  # 60 is what rounding makes of 59.99
             raise table.error(first_row(rows), f"{column}: found {name!r}; minutes and seconds go up to 60")
         arcseconds = int(degrees) * 3600 + int(minutes) * 60 + float(seconds)
         values[code] = to_si(-arcseconds if sign == "-" else arcseconds, "arcsec")

@@ -1,14 +1,20 @@
 """Reading a project folder."""
 
 import dataclasses
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.model import Datum, FloatArray, Point, PointParameter, Survey
 from survey.files.alignment_tasks import read_alignment_tasks
 from survey.files.bodies import read_beams, read_surfaces
+from survey.files.declarations import keys_of
+from survey.files.detected import DetectedImage, ImageKey, ImageNews, image_news, read_detected
 from survey.files.differences import DIFFERENCES, DIFFERENCES_COVARIANCE, read_differences
+from survey.files.exclusions import EXCLUSIONS, EXCLUSIONS_FILE, Exclusion, in_force, read_exclusions
 from survey.files.geometric import (
     ALIGNMENTS,
     LASER_SPOTS,
@@ -34,6 +40,7 @@ from survey.files.measurements import (
     read_distances,
 )
 from survey.files.node import Node, read_toml
+from survey.files.observed import Observed, union, without
 from survey.files.owners import read_cameras, read_stations, read_tables
 from survey.files.pairs import PAIRS, read_pairs
 from survey.files.poses import flat_point, read_point
@@ -45,15 +52,18 @@ from survey.files.project import (
     AdjustmentOptions,
     Definition,
     ImagePointsWhere,
+    LeftOut,
     Project,
     Sigmas,
     SpotsRequest,
 )
 from survey.files.references import Names
+from survey.files.sought import sought_in
 from survey.files.tables import Layout, Table, read_table
 from survey.files.terrestrial import KINDS, TERRESTRIAL, TERRESTRIAL_COVARIANCE, read_reading_covariances, read_readings
 from survey.files.text import id_problem, natural_key, suggestion
 from survey.files.tolerances import read_tolerances
+from survey.quantities import SIGMA_KINDS
 
 LAYOUTS = {
     layout.name: layout
@@ -71,30 +81,6 @@ _EXTRA = {  # tables that only make sense beside another
     "terrestrial_covariance": "terrestrial",
     "coordinate_differences_covariance": "coordinate_differences",
 }
-_TOP_LEVEL = (
-    "format",
-    "title",
-    "tie_points",
-    "cameras",
-    "stations",
-    "tables",
-    "targets",
-    "points",
-    "align",
-    "dimensions",
-    "vertical",
-    "bearings",
-    "instruments",
-    "setups",
-    "beams",
-    "surfaces",
-    "spots",
-    "sigmas",
-    "datum",
-    "adjustment",
-    "tolerances",
-    "identification",
-)
 
 
 def read_definition(folder: Path) -> Definition:
@@ -104,10 +90,84 @@ def read_definition(folder: Path) -> Definition:
 
 
 def read(folder: Path) -> Project:
-    """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError."""
+    """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError.
+
+    What ``exclusions.csv`` leaves out is not used. ``notes`` say which of its rows name nothing, ``image_notes``
+    which images are not those any more that the points come from.
+    """
+    project = read_all(folder)
+    return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
+
+
+def read_all(folder: Path) -> Project:
+    """:func:`read`, with what is excluded as if it were not."""
     with settled(Path(folder)):
         definition, root = _read_definition(Path(folder))
-        tables = _read_tables(definition.folder / OBSERVATIONS_FOLDER)
+        place = definition.folder / OBSERVATIONS_FOLDER
+        tables = _read_tables(place)
+        _, digest = read_exclusions(place)
+        known = read_detected(place)
+        images = _image_news(definition, tables, known)
+    project = _observed(definition, root, tables)
+    hashes = dict(sorted({**project.inputs, f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest}.items()))
+    if digest:
+        project = dataclasses.replace(project, inputs=hashes)
+    notes = images.notes(definition.folder)
+    detected = {**known, **(images.same or {})}
+    return dataclasses.replace(project, detected=detected, to_detect=images.to_detect, image_notes=notes)
+
+
+def leaving_out(project: Project, exclusions: Iterable[Exclusion]) -> Project:
+    """A project without what is excluded; what names nothing is said in its notes."""
+    exclusions = tuple(exclusions)
+    if not exclusions:
+        return dataclasses.replace(project, n_unused_in_files=_n_unused(project.survey))
+    observed = Observed(project.survey, project.spots)
+    path = project.folder / OBSERVATIONS_FOLDER / EXCLUSIONS_FILE
+    found, hits, notes = [], [], []
+    for one in exclusions:
+        hit = observed.hits(one.name, one.at)
+        if hit:
+            hits.append(hit)
+        else:
+            notes.append(f"{path}:{one.line}: {one.name} is left out, but nothing has that name; "
+                         f"{observed.near(one.name)}")  # fmt: skip
+        found.append(LeftOut(one, len(hit.images), hit.n_image_points, hit.n_spots, hit.n_readings))
+    survey, spots = without(project.survey, project.spots, hits)
+    every = union(hits)
+    in_files = _n_unused(survey) - (every.n - every.n_spots)
+    return dataclasses.replace(
+        project, survey=survey, spots=spots, left_out=tuple(found), n_left_out=every.n, n_unused_in_files=in_files,
+        notes=(*project.notes, *notes),
+    )  # fmt: skip
+
+
+def _n_unused(survey: Survey) -> int:
+    kinds = (survey.table_readings, survey.pairs, survey.distances, survey.coordinates, survey.readings, survey.levels,
+             survey.coordinate_differences, survey.alignments, survey.laser_spots, survey.on_surfaces)  # fmt: skip
+    images = sum(int((~b.used).sum()) for b in survey.image_blocks if b.used is not None)
+    return images + sum(not o.used for kind in kinds for o in kind)
+
+
+def _image_news(
+    definition: Definition, tables: Mapping[str, Table], known: Mapping[ImageKey, DetectedImage]
+) -> ImageNews:
+    if not definition.images and not known:
+        return ImageNews()
+    pointed: set[ImageKey] = set()
+    for name in ("image_points", "spots"):
+        if name in tables:
+            camera, epoch = (tables[name].text(c) for c in ("camera_id", "epoch_id"))
+            pairs = np.unique(camera.codes * len(epoch.names) + epoch.codes).tolist()
+            pointed |= {(camera.names[i // len(epoch.names)], epoch.names[i % len(epoch.names)]) for i in pairs}
+    if not known and not pointed:
+        return ImageNews()  # nothing was looked at yet
+    sought = {key: one.digest() for key, one in sought_in(definition).items()}
+    return image_news(definition.images, known, pointed, sought)
+
+
+def _observed(definition: Definition, root: Node, tables: dict[str, Table]) -> Project:
+    """All that the tables hold."""
     _check_scales(root, definition.sigmas, tables)
     survey = _with_tie_points(definition, tables, flat_point(root.integer("dimensions", 1, 3)))
     _check_datum_points(root, survey)
@@ -160,7 +220,7 @@ def _read_definition(folder: Path) -> tuple[Definition, Node]:
         raise SurveyError(f"{path}: there is no such file; a project folder holds a {DEFINITION_FILE}")
     root, digest = read_toml(path)
     _check_format(root)
-    root.allow(*_TOP_LEVEL)
+    root.allow(*keys_of("root"))
     inputs = {DEFINITION_FILE: digest}
     tables, table_sigmas = read_tables(root)
     stations = read_stations(root, tuple(table.table_id for table in tables))
@@ -209,7 +269,7 @@ def _check_format(root: Node) -> None:
 
 
 def _read_datum(node: Node, station_ids: tuple[str, ...]) -> Datum:
-    node.allow("kind", "points", "stations")
+    node.allow(*keys_of("datum"))
     kind = node.choice("kind", ("given", "inner"), "given")
     for key in ("points", "stations"):
         if kind == "given" and node.has(key):
@@ -224,7 +284,7 @@ def _check_datum_points(root: Node, survey: Survey) -> None:
 
 
 def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest:
-    node.allow("cameras", "epochs", "diameter_px", "gate_px")
+    node.allow(*keys_of("spots"))
     cameras = node.references("cameras", camera_ids, "camera")
     epochs = node.names("epochs") if node.has("epochs") else None
     for i, epoch_id in enumerate(epochs or ()):
@@ -240,18 +300,21 @@ def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest
 def _read_options(root: Node) -> AdjustmentOptions:
     """The tables [adjustment], [tolerances] and [identification]."""
     node, said = root.table("adjustment"), root.table("identification")
-    node.allow("alpha", "reject_blocks", "reject_points", "reject_pairs", "variance_components")
+    node.allow(*keys_of("adjustment"))
     alpha = node.number("alpha", 0.05, positive=True)
     if alpha >= 1:
         raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
     flags = {name: node.flag(name, True) for name in ("reject_blocks", "reject_points", "reject_pairs")}
     identification = tuple((key, said.text(key)) for key in said.values)
     flags["variance_components"] = node.flag("variance_components", False)
-    return AdjustmentOptions(alpha, **flags, tolerances=read_tolerances(root), identification=identification)
+    asked = node.choice("sigmas", SIGMA_KINDS) if node.has("sigmas") else ""
+    sigmas = next((kind for kind in SIGMA_KINDS if kind == asked), None)
+    tolerances = read_tolerances(root)
+    return AdjustmentOptions(alpha, **flags, sigmas=sigmas, tolerances=tolerances, identification=identification)
 
 
 def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:
-    node.allow("image_px", "scale")
+    node.allow(*keys_of("sigmas"))
     scale = node.table("scale")
     image_px = node.number("image_px", positive=True) if node.has("image_px") else None
     return Sigmas(image_px, {group: scale.number(group, positive=True) for group in scale.values}, tables)
@@ -272,9 +335,12 @@ def _read_tables(folder: Path) -> dict[str, Table]:
     for path in paths:
         if path.suffix not in (".csv", ".parquet") or path.name.startswith("."):
             continue
+        if path.stem == EXCLUSIONS.name:
+            continue
         layout: Layout | None = LAYOUTS.get(path.stem)
         if layout is None:
-            raise SurveyError(f"{path}: unknown table {path.stem!r}; {suggestion(path.stem, LAYOUTS)}")
+            near = suggestion(path.stem, (*LAYOUTS, EXCLUSIONS.name))
+            raise SurveyError(f"{path}: unknown table {path.stem!r}; {near}")
         if path.stem in tables:
             raise SurveyError(f"{path}: {tables[path.stem].path.name} is there too; keep one of the two")
         tables[path.stem] = read_table(path, layout)

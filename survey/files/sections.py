@@ -69,10 +69,12 @@ def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, si
         sections.append((("spots",), spots))
     if sigmas.image_px is not None:
         sections.append((("sigmas",), {"image_px": sigmas.image_px}))
-    flags = {"reject_blocks": options.reject_blocks, "reject_points": options.reject_points}
+    flags: dict[str, Any] = {"reject_blocks": options.reject_blocks, "reject_points": options.reject_points}
     flags["reject_pairs"] = options.reject_pairs
     if options.variance_components:
         flags["variance_components"] = True
+    if options.sigmas is not None:
+        flags["sigmas"] = options.sigmas
     sections.append((("adjustment",), {"alpha": options.alpha, **flags}))
     if options.identification:
         sections.append((("identification",), dict(options.identification)))

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
-from survey.files.text import atomic_write
+from survey.files.text import atomic_write, formula_problem
+
+_NUMBERS = re.compile(r"[-+.\deE ]+")  # the components of an axis in one cell
 
 Columns = Mapping[str, Sequence[str] | FloatArray]
 
@@ -17,8 +20,13 @@ Columns = Mapping[str, Sequence[str] | FloatArray]
 def write_table(folder: Path, name: str, columns: Columns, parquet: bool = False) -> Path:
     """Write ``folder/name.csv`` or ``.parquet`` and remove the other of the two; nan becomes blank.
 
-    Numbers keep all their digits: reading gives back the same doubles.
+    Numbers keep all their digits: reading gives back the same doubles. Raises SurveyError for a text that a spreadsheet
+    would take for a formula.
     """
+    for column, values in columns.items():
+        for text in () if isinstance(values, np.ndarray) else dict.fromkeys(values):
+            if (problem := formula_problem(text)) and not _NUMBERS.fullmatch(text):
+                raise SurveyError(f"{folder}/{name}: {column}: {text[:40]!r}: {problem}")
     path, other = folder / f"{name}.csv", folder / f"{name}.parquet"
     if parquet:
         path, other = other, path
@@ -31,11 +39,12 @@ def _csv(columns: Columns) -> str:
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows(zip(*(_cells(column) for column in columns.values()), strict=True))
+    writer.writerows(zip(*(cells_of(column) for column in columns.values()), strict=True))
     return stream.getvalue()
 
 
-def _cells(column: Sequence[str] | FloatArray) -> Sequence[object]:
+def cells_of(column: Sequence[str] | FloatArray) -> Sequence[object]:
+    """The cells of a column as the csv module writes them; nan is blank."""
     if not isinstance(column, np.ndarray):
         return column
     values: list[object] = column.tolist()

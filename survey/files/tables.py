@@ -14,7 +14,7 @@ import numpy.typing as npt
 from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
 from survey.files.csv_chunks import Chunk, csv_chunks
-from survey.files.text import LARGEST_NUMBER, decode, id_problem, read_bytes, suggestion
+from survey.files.text import LARGEST_NUMBER, decode, formula_problem, id_problem, read_bytes, suggestion
 
 LARGEST_ROWS = 50_000_000  # of one table: ten times what the largest surveys have
 _LARGEST_DECODED = 8 * 2**30  # bytes of the columns of a Parquet file
@@ -132,8 +132,18 @@ class Table:
 
 
 def group_names(table: Table, default: str) -> list[str]:
-    """The group of every row."""
-    return [name or default for name in table.text("group").values()]
+    """The group of every row. Raises SurveyError where a name would be taken for a formula."""
+    return [name or default for name in checked_groups(table).values()]
+
+
+def checked_groups(table: Table) -> TextColumn:
+    """The column ``group``, blank where absent. Raises SurveyError where a name would be taken for a formula."""
+    groups = table.text("group")
+    for code, name in enumerate(groups.names):
+        problem = formula_problem(name)
+        if problem and (groups.codes == code).any():
+            raise table.error(first_row(groups.codes == code), f"group: {name!r} cannot be a name; {problem}")
+    return groups
 
 
 def first_row(mask: npt.ArrayLike) -> int:

@@ -12,7 +12,7 @@ from survey.files.project import Accuracy, Sigmas
 from survey.files.quantity_columns import ANGLE_UNITS, dms_angles, one_of, quantity
 from survey.files.references import NameProblemError, Names, check_epochs, read_position
 from survey.files.tables import FLAGS, Layout, Table, first_row
-from survey.files.text import natural_key, suggestion
+from survey.files.text import choice_hint, natural_key, suggestion
 from survey.files.units import to_si
 
 KINDS: tuple[ReadingKind, ...] = (
@@ -74,7 +74,7 @@ def _kinds(table: Table) -> list[ReadingKind]:
     column = table.text("kind")
     for code, name in enumerate(column.names):
         if name not in KINDS and (column.codes == code).any():
-            found = f"kind: found {name!r}; {suggestion(name, KINDS)} (one of: {', '.join(KINDS)})"
+            found = f"kind: found {name!r}; {choice_hint(name, KINDS)}"
             raise table.error(first_row(column.codes == code), found)
     known = {name: name for name in KINDS}
     return [known[name] for name in column.values()]  # type: ignore[index]  # all are known, see above

@@ -120,10 +120,11 @@ def difference_columns(items: Sequence[CoordinateDifferences]) -> tuple[Columns,
     for number, item in enumerate(items, 1):
         first = len(rows)
         for i, pair in enumerate(zip(item.at, item.to, strict=True)):
-            names.append(f"d{len(rows) + 1}")
+            own = item.set_id if len(item.at) == 1 and item.set_id not in names else ""
+            names.append(own or f"d{len(rows) + 1}")
             ends.append(tuple(position_text(ref) for ref in pair))
             rows.append(triple_rows(item.values[i], item.cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]))
-            set_ids.append(f"set{number}" if len(item.at) > 1 else "")
+            set_ids.append((item.set_id or f"set{number}") if len(item.at) > 1 else "")
             groups.append(item.group)
             used.append(item.used)
         for i, j in zip(*np.nonzero(np.triu(item.cov, 1)), strict=True):

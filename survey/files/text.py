@@ -16,6 +16,7 @@ from survey.files.locking import hold, remove_unheld
 LARGEST_FILE = 4 * 2**30  # bytes; longer observations go into several projects
 LARGEST_NUMBER = 1e15  # its square and what is made of it stay finite
 _FORBIDDEN_IN_IDS = set('/\\:@,;"|<>*?')
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what spreadsheets take for the beginning of a formula
 _LONGEST_ID = 120  # bytes: an id with a prefix and an ending is still the name of a file
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{i}" for port in ("COM", "LPT") for i in range(1, 10))}
 
@@ -130,11 +131,35 @@ def id_problem(name: str) -> str | None:
         return f"{name!r} cannot be an id; {allowed}"
     if name != name.strip():
         return f"{name!r} cannot be an id; remove the blanks around it"
+    if problem := formula_problem(name):
+        return f"{name!r} cannot be an id; {problem}"
     if len(name.encode()) > _LONGEST_ID:
         return f"{name[:40]!r}... cannot be an id; use at most {_LONGEST_ID} bytes"
     if name.endswith(".") or name.partition(".")[0].upper() in _DEVICES:
         return f"{name!r} cannot be an id; Windows has no files of that name, choose another"
     return None
+
+
+def formula_problem(text: str) -> str | None:
+    """Why a spreadsheet that opens a table would compute ``text`` instead of showing it, or None."""
+    if not text.startswith(_FORMULA):
+        return None
+    return f"spreadsheets take what begins with {text[0]!r} for a formula; put a letter before it"
+
+
+def cell_text(text: str) -> str:
+    """Text for a table that no program reads again: no spreadsheet takes it for a formula.
+
+    An apostrophe in front, as people write it there; ids need none, because none begins like a formula.
+    """
+    return f"'{text}" if formula_problem(text) else text
+
+
+def choice_hint(name: str, options: Iterable[str]) -> str:
+    """What to do where one of few words is wanted: the nearest one, and all of them, once."""
+    options = tuple(options)
+    near, listed = suggestion(name, options), f"one of: {', '.join(options)}"
+    return f"{near} ({listed})" if near.startswith("did you mean") else listed
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

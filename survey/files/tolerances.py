@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from survey.files.declarations import keys_of
 from survey.files.node import Node
 from survey.files.toml_text import Section
 from survey.files.units import from_si, to_si
@@ -17,8 +18,11 @@ def read_tolerances(root: Node) -> tuple[Tolerance, ...]:
 
 
 def _read(name: str, node: Node) -> Tolerance:
-    keys = [f"{key}_{unit}" for key in ("expanded", "nominal", "tolerance") for unit in _UNITS[:-1]]
-    node.allow("of", "ids", "component", "expanded", "nominal", "tolerance", *keys)
+    node.allow(*keys_of("tolerance"))
+    for key in ("expanded", "nominal", "tolerance"):
+        given = [full for unit in _UNITS if node.has(full := key if unit == "1" else f"{key}_{unit}")]
+        if len(given) > 1 and not (key == "expanded" and not node.has("component")):  # which has its own words for it
+            raise node.error(f"{given[0]} is given too; keep one of the two", given[1])
     of = node.choice("of", OWNERS)
     ids = node.names("ids", ())
     if node.has("component"):

@@ -65,7 +65,7 @@ def read_aicon(path: Path) -> ForeignNetwork:
     distances = _distances(files[".scale"], {p.point_id for p in survey.points}) if ".scale" in there else ()
     notes = () if report else (f"no report beside the files: image points have {SIGMA_MM} mm, A3, C1, C2 are held",)
     survey = replace(survey, distances=distances, datum=Datum("inner"))
-    return ForeignNetwork(survey, path.stem, SIGMA_MM, True, notes=notes)
+    return ForeignNetwork(survey, path.stem, SIGMA_MM, "a_posteriori", notes=notes)
 
 
 def _report(path: Path) -> _Report:

@@ -120,7 +120,7 @@ def camera_values(project: Project) -> CameraValues:
         start = cast(Adjustment, _Start(survey, {}))
         return CameraValues(survey, project.title, AdjustedFrames(start), {}, 1.0, False, kinds)
     result = adjust_project(project, progress=False)
-    factor = scale_of(result, "a_posteriori").factor
+    factor = scale_of(result, project.options.sigmas).factor
     return CameraValues(
         result.survey, project.title, AdjustedFrames(result), result.estimates, factor, True, kinds
     )

@@ -59,7 +59,7 @@ def read_dbat(path: Path) -> ForeignNetwork:
     dropped = len(counts) - len(keep)
     notes = (f"left out, points seen in fewer than {least} images: {dropped}",) if dropped else ()
     survey = replace(image_blocks(rows, ordered), cameras=(camera[0],), stations=(camera[1],), datum=_datum(ordered))
-    return ForeignNetwork(survey, _title(root, path), 1.0, True, notes=notes)
+    return ForeignNetwork(survey, _title(root, path), 1.0, "a_posteriori", notes=notes)
 
 
 def _datum(points: list[Point]) -> Datum:

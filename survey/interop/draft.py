@@ -129,9 +129,13 @@ class NetworkDraft:
             self.covariances.append((names, cov))
 
     def survey(self, bearings: Bearings) -> Survey:
-        """The survey. What touches points without coordinates or status is left out, and said."""
+        """The survey. What touches points without coordinates or status is left out, and said.
+
+        So are coordinates that are to be adjusted though nothing observes them.
+        """
         points = {p.point_id: p for p in self.points.values() if p.status}
         readings = tuple(r for r in self.readings if self._usable(points, _ends(r), _NEEDS[r.kind]))
+        points = self._observed(points, readings)
         self._note("readings", len(self.readings) - len(readings))
         kept = {r.reading_id for r in readings}
         used = {r.setup_id for r in readings}
@@ -149,6 +153,24 @@ class NetworkDraft:
             coordinate_differences=tuple(CoordinateDifferences(_refs(a), _refs(t), v, c) for a, t, v, c in differences),
             coordinates=tuple(Coordinates(_refs(t), v, c) for _, t, v, c in observed),
         )
+
+    def _observed(self, points: Mapping[str, DraftPoint], readings: Iterable[Reading]) -> dict[str, DraftPoint]:
+        """The points without the unknown axes that no reading, baseline or coordinate touches."""
+        touched = {(p, a) for r in readings for p in _ends(r) for a in _NEEDS[r.kind]}
+        for v in (*self.differences, *self.coordinates):
+            seen = np.isfinite(np.diagonal(v.cov)).reshape(-1, 3)
+            rows = [(p, seen[k]) for ids in (v.at, v.to) for k, p in enumerate(ids)]
+            touched |= {(p, AXES[i]) for p, row in rows for i in np.flatnonzero(row)}
+        out, gone = {}, []
+        for name, point in points.items():
+            kept = {a: s for a, s in point.status.items() if s == "fixed" or (name, a) in touched}
+            gone += [f"{''.join(a for a in point.status if a not in kept)} of {name}"] if kept != point.status else []
+            if kept:
+                out[name] = replace(point, status=kept)
+        if gone:
+            more = f" and {len(gone) - 6} more" if len(gone) > 6 else ""
+            self.notes.append(f"left out, coordinates that nothing observes: {', '.join(gone[:6])}{more}")
+        return out
 
     def _usable(self, points: Mapping[str, DraftPoint], ends: Iterable[str], axes: str) -> bool:
         return all(p in points and all(a in points[p].status for a in axes) for p in ends)

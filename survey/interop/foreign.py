@@ -10,6 +10,7 @@ import numpy as np
 from adjust.errors import SurveyError
 from adjust.model import Survey
 from survey.files.text import decode, read_bytes
+from survey.quantities import SigmaKind
 from survey.targets import TargetKind
 
 GON = np.pi / 200.0
@@ -19,6 +20,7 @@ ARCSEC = DEGREE / 3600.0
 MM = 1e-3
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _LARGEST = 1e15
+LATIN_1 = "iso-8859-1"
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +28,7 @@ class ForeignNetwork:
     """A file of another program as a survey.
 
     sigma0: its a priori standard deviation of unit weight, in its own unit; weights do not depend on it.
-    scaled: whether the program multiplies its sigmas by the a posteriori sigma0. alpha: level of its tests, or None.
+    sigmas: which ones the program gives, or None where its file does not say. alpha: level of its tests, or None.
     reject: whether gross errors may be left out; False keeps what the file's owner decided to use, as its program does.
     notes: what was left out or changed, for people. target_kinds: of targets that are more than a list of points.
     """
@@ -34,7 +36,7 @@ class ForeignNetwork:
     survey: Survey
     title: str = ""
     sigma0: float = 1.0
-    scaled: bool = True
+    sigmas: SigmaKind | None = None
     alpha: float | None = None
     reject: bool = False
     notes: tuple[str, ...] = ()
@@ -71,8 +73,20 @@ class Line:
 
 
 def text_of(path: Path) -> str:
-    """The text of a file; raises SurveyError where it is not there or not UTF-8."""
-    return decode(path, read_bytes(path)[0])
+    """The text of a file in UTF-8, or else in Latin-1; raises SurveyError where it is not there, or UTF-16."""
+    data = read_bytes(path)[0]
+    return decode(path, data if is_utf8(data) else data.decode(LATIN_1).encode())
+
+
+def is_utf8(data: bytes) -> bool:
+    """Whether bytes are text in UTF-8 (or UTF-16, of which the readers say so themselves)."""
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return True
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def lines_of(path: Path, comment: str = "") -> Iterator[Line]:
@@ -103,10 +117,10 @@ def positive(text: str, what: str, where: Where) -> float:
 
 
 def sexagesimal(sign: str, parts: tuple[str, str, str], what: str, where: Where) -> float:
-    """Degrees, minutes and seconds as rad."""
+    """Degrees, minutes and seconds as rad; 60 is read as what rounding made of 59.99."""
     degrees, minutes, seconds = (number(part, what, where) for part in parts)
-    if minutes >= 60.0 or seconds >= 60.0 or min(degrees, minutes, seconds) < 0.0:
-        raise where.error(f"{what}: minutes and seconds are below 60 and not negative; correct the angle")
+    if minutes > 60.0 or seconds > 60.0 or min(degrees, minutes, seconds) < 0.0:
+        raise where.error(f"{what}: minutes and seconds are at most 60 and not negative; correct the angle")
     return (-1.0 if sign == "-" else 1.0) * (degrees + minutes / 60.0 + seconds / 3600.0) * DEGREE
 
 

@@ -3,34 +3,65 @@
 An edge ``i j`` holds ``i_from_j``, so j is the frame on the right. Its information matrix, upper triangle by rows, is
 ordered translation, rotation. g2o itself means by the rotation part the vector part of the quaternion (half the
 rotation vector); GTSAM, SE-Sync and the authors of most published files mean the rotation vector itself. The argument
-``information`` chooses.
+``information`` chooses. In some published files (those that were marginalised from images) the matrix is not positive
+definite as a whole although its blocks of translation and of rotation are; ``block_diagonal`` reads these alone.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from adjust.errors import SurveyError
-from adjust.model import FloatArray
+from adjust.model import BoolArray, FloatArray
 from adjust.pose_network.network import PoseNetwork, pose_network
 from survey.files.text import atomic_write
 
 Information = Literal["tangent", "quaternion"]
 _UPPER = np.triu_indices(6)
 _SWAP = np.array([3, 4, 5, 0, 1, 2])  # translation-rotation to rotation-translation and back
+_MOST_NAMED = 4
 
 
-def read_g2o(path: Path, information: Information = "tangent", use_vertices: bool = False) -> PoseNetwork:
+class _Edge(NamedTuple):
+    """``i_from_j``: seven numbers of the pose, 21 of the information matrix, and the line they stand in."""
+
+    i: str
+    j: str
+    row: FloatArray
+    line: int
+
+
+@dataclass(frozen=True, eq=False)
+class G2oFile:
+    """What a file was read as. notes: what was not taken as it stands, for people."""
+
+    network: PoseNetwork
+    notes: tuple[str, ...] = ()
+
+
+def read_g2o(
+    path: Path, information: Information = "tangent", use_vertices: bool = False, block_diagonal: bool = False
+) -> PoseNetwork:
+    """The network of :func:`read_g2o_file`."""
+    return read_g2o_file(path, information, use_vertices, block_diagonal).network
+
+
+def read_g2o_file(
+    path: Path, information: Information = "tangent", use_vertices: bool = False, block_diagonal: bool = False
+) -> G2oFile:
     """The network of a file. What ``FIX`` names is held at its vertex, else the first station at its vertex.
 
-    use_vertices: take the other vertices as a start; by default the program finds its own. Raises SurveyError with
-    file and line for what cannot be read.
+    use_vertices: take the other vertices as a start; by default the program finds its own. block_diagonal: of all
+    information matrices only the 3 x 3 blocks of translation and rotation count, what stands between them is dropped.
+    Raises SurveyError with file and line for what cannot be read, and for information matrices that are not positive
+    definite.
     """
     stations: dict[str, FloatArray] = {}
-    edges: list[tuple[str, str, FloatArray]] = []
+    edges: list[_Edge] = []
     fixed: list[str] = []
     with Path(path).open(encoding="utf-8-sig", errors="replace") as lines:
         for number, line in enumerate(lines, 1):
@@ -43,12 +74,13 @@ def read_g2o(path: Path, information: Information = "tangent", use_vertices: boo
             elif words[0] == "EDGE_SE3:QUAT":
                 if len(words) < 3:
                     raise SurveyError(f"{where}: an edge needs two vertices")
-                edges.append((words[1], words[2], _numbers(words[3:], 28, where)))
+                edges.append(_Edge(words[1], words[2], _numbers(words[3:], 28, where), number))
             elif words[0] == "FIX":
                 fixed += words[1:]
             else:
                 raise SurveyError(f"{where}: {words[0]!r} is not supported; VERTEX_SE3:QUAT, EDGE_SE3:QUAT and FIX are")
-    return _network(path, stations, edges, fixed, information, use_vertices)
+    info, notes = _information(path, edges, information, block_diagonal)
+    return G2oFile(_network(path, stations, edges, fixed, info, use_vertices), notes)
 
 
 def _id(words: Sequence[str], where: str) -> str:
@@ -76,43 +108,89 @@ def _poses(rows: FloatArray) -> FloatArray:
 
 
 def _network(
-    path: Path, stations: dict[str, FloatArray], edges: list[tuple[str, str, FloatArray]], fixed: list[str],
-    information: Information, use_vertices: bool,
+    path: Path, stations: dict[str, FloatArray], edges: list[_Edge], fixed: list[str], info: FloatArray,
+    use_vertices: bool,
 ) -> PoseNetwork:  # fmt: skip
-    if not edges:
-        raise SurveyError(f"{path}: no EDGE_SE3:QUAT in it")
-    ids = list(dict.fromkeys([*stations, *(x for i, j, _ in edges for x in (i, j))]))
+    ids = list(dict.fromkeys([*stations, *(x for e in edges for x in (e.i, e.j))]))
     index = {s: k for k, s in enumerate(ids)}
     unknown = next((f for f in fixed if f not in stations), None)
     if unknown is not None:
         raise SurveyError(f"{path}: FIX {unknown} names a vertex that the file does not hold")
     given = dict(zip(stations, _poses(np.array(list(stations.values())).reshape(-1, 7)), strict=True))
     held = {index[s]: given[s] for s in fixed} or {0: given.get(ids[0], np.eye(4))}
-    rows = np.array([row for _, _, row in edges])
-    info = np.zeros((len(rows), 6, 6))
-    info[:, _UPPER[0], _UPPER[1]] = info[:, _UPPER[1], _UPPER[0]] = rows[:, 7:]
-    info = info[:, _SWAP][:, :, _SWAP]
-    if information == "quaternion":  # the vector part of the quaternion is half the rotation vector
-        info[:, :3] *= 0.5
-        info[:, :, :3] *= 0.5
-    bad = np.linalg.eigvalsh(info).min(axis=1) <= 0.0
-    if bad.any():
-        i, j, _ = edges[int(np.argmax(bad))]
-        raise SurveyError(f"{path}: the information matrix of edge {i} {j} is not positive definite")
-    poses = _poses(rows)
+    poses = _poses(np.array([e.row for e in edges]))
     return pose_network(
-        ids, _edge_names(edges), [index[j] for _, j, _ in edges], [index[i] for i, _, _ in edges],
+        ids, _edge_names(edges), [index[e.j] for e in edges], [index[e.i] for e in edges],
         poses[:, :3, :3], poses[:, :3, 3], np.asarray(np.linalg.inv(info), dtype=float), held=held,
         start={index[s]: p for s, p in given.items()} if use_vertices else None,
     )  # fmt: skip
 
 
-def _edge_names(edges: list[tuple[str, str, FloatArray]]) -> list[str]:
+def _information(
+    path: Path, edges: list[_Edge], information: Information, block_diagonal: bool
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Information matrices (E, 6, 6), rotation first, in the tangent; what was dropped of them."""
+    if not edges:
+        raise SurveyError(f"{path}: no EDGE_SE3:QUAT in it")
+    info = np.zeros((len(edges), 6, 6))
+    info[:, _UPPER[0], _UPPER[1]] = info[:, _UPPER[1], _UPPER[0]] = np.array([e.row[7:] for e in edges])
+    info = info[:, _SWAP][:, :, _SWAP]
+    if information == "quaternion":  # the vector part of the quaternion is half the rotation vector
+        info[:, :3] *= 0.5
+        info[:, :, :3] *= 0.5
+    blocks = info.copy()
+    blocks[:, :3, 3:] = blocks[:, 3:, :3] = 0.0
+    bad, bad_blocks = _indefinite(info), _indefinite(blocks)
+    if bad_blocks.any() if block_diagonal else bad.any():
+        raise SurveyError(_not_definite(path, edges, bad_blocks if block_diagonal else bad, bool(bad_blocks.any())))
+    if not block_diagonal:
+        return info, ()
+    coupled = int(np.count_nonzero((info[:, :3, 3:] != 0.0).any(axis=(1, 2))))
+    if not coupled:
+        return blocks, ()
+    told = (
+        f"information between translation and rotation of {coupled} of {len(edges)} edges was dropped (block-diagonal "
+        "reading)"
+    )
+    if not bad.any():
+        return blocks, (told,)
+    n = int(bad.sum())
+    return blocks, (f"{told}; as a whole {n} of the matrices {_are(n)} not positive definite: {_lines(edges, bad)}",)
+
+
+def _indefinite(info: FloatArray) -> BoolArray:
+    return np.asarray(np.linalg.eigvalsh(info)[:, 0] <= 0.0)
+
+
+def _not_definite(path: Path, edges: list[_Edge], bad: BoolArray, blocks_too: bool) -> str:
+    n = int(bad.sum())
+    first = edges[int(np.argmax(bad))]
+    remedy = (
+        "correct the file" if blocks_too
+        else "where the file means its blocks of translation and rotation alone, read it with --block-diagonal"
+    )  # fmt: skip
+    return (
+        f"{path}, line {first.line}: the information matrix of edge {first.i} {first.j} is not positive definite"
+        + (f"; of {len(edges)} these {n} are not: {_lines(edges, bad)}" if n > 1 else "") + f"; {remedy}"
+    )  # fmt: skip
+
+
+def _are(n: int) -> str:
+    return "is" if n == 1 else "are"
+
+
+def _lines(edges: list[_Edge], bad: BoolArray) -> str:
+    rows = np.flatnonzero(bad).tolist()
+    named = ", ".join(f"{edges[k].i} {edges[k].j} (line {edges[k].line})" for k in rows[:_MOST_NAMED])
+    return named + (f" and {len(rows) - _MOST_NAMED} more" if len(rows) > _MOST_NAMED else "")
+
+
+def _edge_names(edges: list[_Edge]) -> list[str]:
     """``i-j``, with a running number where two stations were joined more than once."""
     seen: dict[str, int] = {}
     out = []
-    for i, j, _ in edges:
-        name = f"{i}-{j}"
+    for e in edges:
+        name = f"{e.i}-{e.j}"
         seen[name] = seen.get(name, 0) + 1
         out.append(name if seen[name] == 1 else f"{name}#{seen[name]}")
     return out

@@ -2,22 +2,26 @@
 
 Coordinates stay as they are in the file, whatever ``axes-xy`` calls the axes; a frame that is left-handed in nature
 (x north, y east) then has bearings that count the other way round. Angles are gon, or degrees where written
-``d-m-s``; deviations are mm, and cc (1e-4 gon) or arc seconds; Gama's weights do not depend on ``sigma-apr``, but a
-height difference without deviation has sigma-apr times the root of its length in km.
+``d-m-s``; deviations are mm, and of angles cc (1e-4 gon) or, where the value is in degrees, arc seconds, default
+deviations too; Gama's weights do not depend on ``sigma-apr``, but a height difference without deviation has sigma-apr
+times the root of its length in km. Readings beyond ``tol-abs`` are not used, as in Gama, and named.
 """
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from adjust.model import Bearings, FloatArray
+from adjust.model import Bearings, FloatArray, Survey
 from adjust.observations import ReadingKind
 from survey.files.text import suggestion
+from survey.interop.absolute_terms import within_tolerance
 from survey.interop.draft import AXES, DraftPoint, NetworkDraft, Vectors
 from survey.interop.foreign import ARCSEC, CC, GON, MM, ForeignNetwork, check_cov, number, positive, sexagesimal
 from survey.interop.safe_xml import Element, read_xml
+from survey.quantities import SigmaKind
 
 _DMS = re.compile(r"\s*([+-]?)(\d+)-(\d+)-(\d+\.?\d*)\s*")
 _COMMON = ("from", "to", "val", "stdev", "from_dh", "to_dh", "extern")
@@ -41,6 +45,10 @@ _DEVIATIONS = {
 _ANGULAR = ("direction", "angle", "z-angle", "azimuth")
 RIGHT_HANDED = ("en", "nw", "ws", "se")
 AXES_XY = (*RIGHT_HANDED, "ne", "sw", "es", "wn")
+_SIGMAS: dict[str, SigmaKind] = {"aposteriori": "a_posteriori", "apriori": "a_priori"}
+_OBEYED = ("sigma-apr", "conf-pr", "tol-abs", "sigma-act")
+_OF_THE_OUTPUT = ("algorithm", "language", "encoding", "angular", "angles", "cov-band")  # they change no number
+_CURVATURE = ("latitude", "ellipsoid")
 
 
 def read_gama(path: Path) -> ForeignNetwork:
@@ -81,7 +89,8 @@ class _Reader:
             if child.tag == "description":
                 self.title = next((line.strip() for line in child.text.splitlines() if line.strip()), "")
             elif child.tag == "parameters":
-                self.parameters = child
+                together = self.parameters.attributes | child.attributes
+                self.parameters = Element("parameters", together, child.where)
             elif child.tag == "points-observations":
                 bodies.append(child)
             else:
@@ -92,10 +101,30 @@ class _Reader:
         level = parameters.number("conf-pr", 0.95)
         if not 0.0 < level < 1.0:
             raise parameters.error(f"conf-pr is {level:g}; it is a probability between 0 and 1")
-        scaled = parameters.get("sigma-act", "aposteriori") != "apriori"
-        survey = self.draft.survey(self.bearings)
-        sigma0 = self._sigma0()
-        return ForeignNetwork(survey, self.title, sigma0, scaled, round(1.0 - level, 12), notes=tuple(self.draft.notes))
+        actual = parameters.get("sigma-act", "aposteriori")
+        if actual not in _SIGMAS:
+            raise parameters.error(f"sigma-act is {actual!r}; {suggestion(actual, _SIGMAS)}")
+        tolerance = positive(parameters.get("tol-abs", "1000"), "tol-abs", parameters.where) * MM
+        survey, beyond = within_tolerance(self.draft.survey(self.bearings), tolerance, self._sigma0() * CC)
+        notes = (*self.draft.notes, *beyond, *self._ignored(survey))
+        alpha = round(1.0 - level, 12)
+        return ForeignNetwork(survey, self.title, self._sigma0(), _SIGMAS[actual], alpha, notes=notes)
+
+    def _ignored(self, survey: Survey) -> Iterator[str]:
+        """What the file asks for and does not get, for people."""
+        given = self.parameters.attributes
+        curved = [f"{name} = {given[name].strip()}" for name in _CURVATURE if name in given]
+        if curved:
+            n = sum(r.kind in ("zenith", "direction") for r in survey.readings)
+            yield (
+                f"not applied: {', '.join(curved)}; the {n} zenith angles and directions are not reduced for the "
+                "curvature of the Earth, level surfaces are planes"
+            )
+        unknown = [name for name in given if name not in (*_OBEYED, *_OF_THE_OUTPUT, *_CURVATURE)]
+        if unknown:
+            yield f"not read: {', '.join(unknown)} of <parameters>"
+        if self.root.has("epoch"):
+            yield f"not kept: the epoch {self.root.get('epoch')} of the network"
 
     def _sigma0(self) -> float:
         return positive(self.parameters.get("sigma-apr", "10"), "sigma-apr", self.parameters.where)
@@ -125,7 +154,11 @@ class _Reader:
         for axis in AXES:
             if element.has(axis):
                 point.start[axis] = element.number(axis)
-        for key in ("fix", "adj"):
+        self._status(element, point)
+
+    def _status(self, element: Element, point: DraftPoint) -> None:
+        """Fixed, free or constrained by axis; ``fix`` goes before ``adj``."""
+        for key in ("adj", "fix"):
             axes = element.get(key, "")
             if set(axes.lower()) - set(AXES):
                 raise element.error(f"{key} is {axes!r}; it names axes: xy, z, xyz, XYZ")
@@ -134,7 +167,7 @@ class _Reader:
                 point.status[axis.lower()] = status
         for axis, status in point.status.items():
             if status == "fixed" and axis not in point.start:
-                raise element.error(f"{axis} of point {name!r} is fixed but not given; add {axis}=")
+                raise element.error(f"{axis} of point {point.point_id!r} is fixed but not given; add {axis}=")
 
     def _cluster(self, cluster: Element) -> None:
         cluster.allow("from", "orientation", "from_dh", "extern")
@@ -198,7 +231,7 @@ class _Reader:
         return sexagesimal(found[1], (found[2], found[3], found[4]), "val", e.where), ARCSEC
 
     def _sigma(self, e: Element, value: float, unit: float) -> float:
-        """From the element, the default of its kind (cc or mm, whatever the value is written in), or the length."""
+        """From the element, the default of its kind (both in the unit that the value demands), or the length."""
         if e.has("stdev"):
             return positive(e.get("stdev"), "stdev", e.where) * unit
         if e.tag == "dh":
@@ -213,7 +246,7 @@ class _Reader:
             raise self.defaults.error(f"{key} is empty; give the deviation, for distances up to three numbers")
         a, *rest = (number(word, key, self.defaults.where) for word in words)
         if e.tag in _ANGULAR:
-            sigma = a * CC
+            sigma = a * unit
         else:
             b, power = (*rest, 0.0, 1.0)[:2] if len(rest) != 1 else (rest[0], 1.0)
             sigma = (a + b * (value / 1000.0) ** power) * MM
@@ -236,14 +269,14 @@ class _Reader:
         points = [e for e in element.children if e.tag == "point"]
         values, rows = np.zeros((len(points), 3)), []
         for k, e in enumerate(points):
-            e.allow("id", "x", "y", "z", "extern")
+            e.allow("id", "x", "y", "z", "fix", "adj", "extern")
+            point = self.draft.points.setdefault(e.get("id"), DraftPoint(e.get("id"), e.where))
             for i, axis in enumerate(AXES):
                 if e.has(axis):
                     values[k, i] = e.number(axis)
                     rows.append(3 * k + i)
-                    point = self.draft.points.get(e.get("id"))
-                    if point is not None:
-                        point.start.setdefault(axis, values[k, i])
+                    point.start.setdefault(axis, values[k, i])
+            self._status(e, point)
         cov = np.diag(np.full(3 * len(points), np.inf))
         cov[np.ix_(rows, rows)] = covariance(self._matrix(element, "point"), len(rows)) * MM**2
         self.draft.coordinates.append(Vectors(element.where, [], [e.get("id") for e in points], values, cov))

@@ -16,13 +16,14 @@ from survey.interop.network_values import NetworkValues, between_points, point_o
 
 _TAGS = {kind: tag for tag, kind in KINDS.items()}
 _ANGULAR = ("direction", "angle", "zenith", "azimuth")
+_NO_LIMIT_MM = 1000000000  # of tol-abs, its default would leave readings out that this project uses
 # how Gama calls axes along which bearings count as ours do, with angles that it reads clockwise
 _AXES_XY = {("x", False): "ne", ("x", True): "nw", ("y", True): "en", ("y", False): "wn"}
 
 
 def gama_text(network: NetworkValues) -> str:
     """The .gkf file of a network. Raises SurveyError for correlated direction sets, which Gama keeps apart."""
-    survey = network.survey
+    survey, actual = network.survey, "apriori" if network.sigmas == "a_priori" else "aposteriori"
     body = [*_points(network), *_clusters(survey), *_vectors(survey), *_coordinates(network)]
     return "\n".join(
         [
@@ -30,7 +31,8 @@ def gama_text(network: NetworkValues) -> str:
             '<gama-local xmlns="http://www.gnu.org/software/gama/gama-local">',
             f'<network axes-xy="{axes_xy(survey.bearings)}" angles="left-handed">',
             f"<description>{escape(network.title)}</description>",
-            '<parameters sigma-apr="1" conf-pr="0.95" tol-abs="1000" sigma-act="aposteriori" />',
+            f'<parameters sigma-apr="1" conf-pr="{1.0 - network.alpha:.12g}" tol-abs="{_NO_LIMIT_MM}" '
+            f'sigma-act="{actual}" />',
             "<points-observations>",
             *body,
             "</points-observations>",

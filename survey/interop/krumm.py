@@ -78,7 +78,7 @@ def read_krumm(path: Path) -> ForeignNetwork:
     sigma0 = _sigma0(named["sigma0"]) if "sigma0" in named else 1.0
     title = " ".join(line.text for line in named["project"].lines) if "project" in named else path.stem
     survey = reader.draft.survey(Bearings("y", True))
-    return ForeignNetwork(survey, title, sigma0, True, notes=tuple(reader.draft.notes))
+    return ForeignNetwork(survey, title, sigma0, "a_posteriori", notes=tuple(reader.draft.notes))
 
 
 def _sections(path: Path) -> list[_Section]:

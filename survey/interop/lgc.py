@@ -38,7 +38,7 @@ def read_lgc(path: Path) -> ForeignNetwork:
     if not reader.draft.readings:
         raise SurveyError(f"{path}: there are no observations; sections *ANGL, *ZENH and *DMES are read")
     survey = reader.draft.survey(Bearings("y", True))
-    return ForeignNetwork(survey, reader.title, 1.0, True, notes=tuple(reader.draft.notes))
+    return ForeignNetwork(survey, reader.title, 1.0, "a_posteriori", notes=tuple(reader.draft.notes))
 
 
 class _Reader:

@@ -6,17 +6,18 @@ from typing import Any
 from adjust.model import Survey
 from adjust.observations import PositionRef
 from survey.files.text import _FORBIDDEN_IN_IDS as FORBIDDEN
-from survey.files.text import id_problem
+from survey.files.text import formula_problem, id_problem
 
 
 def safe_ids(names: list[str], taken: set[str] | None = None) -> dict[str, str]:
-    """For every name that cannot be an id one that can: forbidden characters become "_"; all stay different."""
+    """For every name that cannot be an id one that can: what is forbidden becomes "_"; all stay different."""
     used = {name for name in names if id_problem(name) is None} | (taken or set())
     out = {}
     for name in names:
         if id_problem(name) is None and name not in (taken or set()):
             continue
         plain = "".join("_" if c in FORBIDDEN or not c.isprintable() else c for c in name).strip().lstrip(".") or "_"
+        plain = f"_{plain[1:]}" if formula_problem(plain) else plain
         new, count = plain, 2
         while new in used:
             new, count = f"{plain}_{count}", count + 1
@@ -61,5 +62,6 @@ def with_safe_ids(survey: Survey) -> tuple[Survey, tuple[str, ...]]:
     }  # fmt: skip
     shown = [f"{old} -> {new}" for old, new in points.items()]
     more = f" and {len(shown) - 6} more" if len(shown) > 6 else ""
-    note = f"renamed, because a project's ids have none of / \\ : @ , ;: {', '.join(shown[:6])}{more}" if shown else ""
+    said = "renamed, because ids have none of / \\ : @ , ; and no = + - in front"
+    note = f"{said}: {', '.join(shown[:6])}{more}" if shown else ""
     return replace(survey, **changed), (note,) if note else ()

@@ -8,6 +8,7 @@ import numpy as np
 from adjust.errors import SurveyError
 from adjust.model import FloatArray, Survey
 from adjust.observations import PositionRef, Reading
+from survey.quantities import SigmaKind
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,6 +16,7 @@ class NetworkValues:
     """x: (3,) m by point, adjusted or start values; points without either are missing.
 
     covs: (3, 3) m^2 by point, empty where not adjusted; multiplied by factor^2. joint: of ``names`` (point, axis).
+    sigmas, alpha: what the project asks for.
     """
 
     survey: Survey
@@ -29,6 +31,8 @@ class NetworkValues:
     n_unknowns: int = 0
     redundancy: int = 0
     omega: float = 0.0
+    sigmas: SigmaKind | None = None
+    alpha: float = 0.05
 
 
 def point_of(position: PositionRef) -> str | None:

@@ -1,5 +1,10 @@
-"""XML without surprises: no document type, no entities, nothing fetched, every element with its line."""
+"""XML without surprises: no entities, nothing fetched, every element with its line.
 
+A document type that only names a grammar is passed over; one that declares anything itself is refused, because
+entities and default attributes can blow a short file up without end.
+"""
+
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -7,9 +12,14 @@ from xml.parsers import expat
 
 from adjust.errors import SurveyError
 from survey.files.text import read_bytes, suggestion
-from survey.interop.foreign import Where, number
+from survey.interop.foreign import LATIN_1, Where, is_utf8, number
 
 _DEEPEST = 40
+_LITERAL = rb"(?:\"[^\"]*\"|'[^']*')"
+_GRAMMAR = rb"\s+(?:SYSTEM|PUBLIC\s+" + _LITERAL + rb")\s*" + _LITERAL
+_DOCTYPE = re.compile(rb"<!DOCTYPE\s+[^\s<>\"'\[\]]+(?:" + _GRAMMAR + rb")?\s*>")
+_BLANK = re.compile(rb"(?:\xef\xbb\xbf)?\s+|\xef\xbb\xbf")
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
 @dataclass(eq=False)
@@ -77,13 +87,42 @@ class _Builder:
 
     def refuse(self, *_arguments: Any) -> int:
         where = Where(self.path, self.parser.CurrentLineNumber)
-        raise where.error("a document type or an entity is declared, which network files do not need; remove it")
+        raise where.error("the document type declares entities or the like, which network files do not need; remove it")
+
+
+def _without_doctype(data: bytes) -> bytes:
+    """Blanks instead of a document type that declares nothing; lines stay where they are.
+
+    Without it an entity that nobody declared is an error, as it should be, and no longer a gap in a value.
+    """
+    at, closing = 0, {b"<?": b"?>", b"<!--": b"-->"}
+    while True:
+        blank = _BLANK.match(data, at)
+        at = at if blank is None else blank.end()
+        begin = next((b for b in closing if data.startswith(b, at)), None)
+        if begin is None:
+            break
+        end = data.find(closing[begin], at)
+        if end < 0:
+            break
+        at = end + len(closing[begin])
+    found = _DOCTYPE.match(data, at)
+    if found is None:
+        return data
+    return data[:at] + re.sub(rb"[^\r\n]", b" ", found[0]) + data[found.end() :]
+
+
+def _declared(data: bytes) -> bool:
+    """Whether the file says itself that its text is in an encoding other than UTF-8."""
+    head = data[:200].removeprefix(b"\xef\xbb\xbf")
+    found = re.match(rb"<\?xml[^>]*?encoding\s*=\s*[\"']([\w.-]+)", head)
+    return data[:2] in _UTF_16 or (found is not None and found[1].lower() not in (b"utf-8", b"utf8"))
 
 
 def read_xml(path: Path, root_tag: str) -> Element:
     """The tree of a file whose root is ``root_tag``. Raises SurveyError with the line for what is no such XML."""
-    data = read_bytes(path)[0]
-    parser = expat.ParserCreate()
+    data = _without_doctype(read_bytes(path)[0])
+    parser = expat.ParserCreate() if is_utf8(data) or _declared(data) else expat.ParserCreate(LATIN_1)
     parser.buffer_text = True
     builder = _Builder(path, parser)
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end

@@ -9,7 +9,7 @@ import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.result import Adjustment
-from survey.files.text import atomic_write, suggestion
+from survey.files.text import atomic_write, choice_hint, suggestion
 from survey.quantities import Scale
 from survey.report import camera_plots, picture
 from survey.report.scene import scene_of
@@ -142,7 +142,7 @@ PLOTS: Mapping[str, Callable[..., str]] = {
 def plot(name: str, adjustment: Adjustment, scale: Scale, **chosen: str) -> Plot:
     """A plot by its name. Raises SurveyError for one that there is not, or a camera or group that there is not."""
     if name not in PLOTS:
-        raise SurveyError(f"there is no plot {name!r}; {suggestion(name, PLOTS)}; plots are {', '.join(PLOTS)}")
+        raise SurveyError(f"there is no plot {name!r}; {choice_hint(name, PLOTS)}")
     allowed = {"residuals": "camera", "mean_residuals": "camera", "histogram": "camera", "quantiles": "group"}
     for key in chosen:
         if key != allowed.get(name):

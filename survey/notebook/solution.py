@@ -21,6 +21,7 @@ from survey.quantities import Scale, scale_of
 from survey.results import ReportOptions, RunInfo, summary_text, write_results
 from survey.solution import solution_dict
 from survey.statistics import Statistics, statistics_of
+from survey.verdict import MISFIT, UNTESTED, fit_of
 
 _VECTOR_KINDS = {"lenses": ("lens",), "tables": ("table_geometry",), "warps": ("warp",),
                  "instruments": ("instrument",), "surfaces": ("surface",)}  # fmt: skip
@@ -49,8 +50,9 @@ class Solution:
 
     @property
     def passed(self) -> bool | None:
-        """Whether the global test is passed; None where nothing is redundant."""
-        return None if self.adjustment.global_test is None else self.adjustment.global_test.passed
+        """Whether no residuals are larger than the sigmas say, of the whole or a part; None: nothing is redundant."""
+        fit = fit_of(self.adjustment, self.precision.consistency)
+        return None if fit == UNTESTED else fit != MISFIT
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -174,12 +176,12 @@ class Solution:
 
     def __repr__(self) -> str:
         """The summary that the command line prints."""
-        return summary_text(self.adjustment, self.run, solution_dict(self.adjustment, self.run))
+        return summary_text(self.adjustment, self.run, dict(self.as_dict))
 
     def _repr_html_(self) -> str:
         a, test = self.adjustment, self.adjustment.global_test
-        said = "nothing redundant" if test is None else "global test passed" if test.passed else "global test failed"
-        colour = "#7b858f" if test is None else "#2f7d4f" if test.passed else "#b3261e"
+        said = "nothing redundant" if test is None else f"global test {test.said}"
+        colour = "#7b858f" if test is None else "#2f7d4f" if test.status != "failed" else "#b3261e"
         rows = [("sigma0", f"{a.sigma0:.4f}"), ("observations", f"{a.n_observations}"), ("unknowns", f"{a.n_unknowns}"),
                 ("redundancy", f"{a.redundancy}"), ("iterations", f"{a.iterations}")]  # fmt: skip
         rows += [(f"group {g.group}", f"{g.n_observations} observations, × {np.sqrt(max(g.factor, 0.0)):.3f}")

@@ -7,10 +7,12 @@ from typing import Any
 
 from adjust.errors import SurveyError
 from adjust.model import Survey
+from survey.detecting import DetectOutcome, detect_job
+from survey.excluding import ExcludeOutcome, exclude_job, include_job
 from survey.files import AdjustmentOptions, Project
 from survey.files import read as read_project
 from survey.files.text import suggestion
-from survey.jobs import DetectOutcome, adjust_project, detect_job, run_info
+from survey.jobs import adjust_project, run_info
 from survey.notebook.html import heading, html_table
 from survey.notebook.solution import Solution
 
@@ -27,9 +29,27 @@ def read(folder: str | Path) -> Project:
     return read_project(Path(folder))
 
 
-def detect(folder: str | Path, *, progress: bool = False, jobs: int | None = None) -> DetectOutcome:
-    """Find targets and spots in the images of a folder and write their tables there. Raises SurveyError."""
-    return detect_job(Path(folder), jobs=jobs, progress=progress)
+def detect(
+    folder: str | Path, *, progress: bool = False, jobs: int | None = None, everything: bool = False
+) -> DetectOutcome:  # fmt: skip
+    """Find targets and spots in the images of a folder that are new or have changed, and write their tables there.
+
+    everything: in the other images too. Raises SurveyError.
+    """
+    return detect_job(Path(folder), jobs=jobs, progress=progress, everything=everything)
+
+
+def exclude(folder: str | Path, *names: str, reason: str, author: str = "") -> ExcludeOutcome:
+    """Leave observations of a folder out from now on, such as ``"X/hX05"`` or ``"distances:B1-B2"``.
+
+    All of ``names`` or none; nothing is adjusted. Raises SurveyError.
+    """
+    return exclude_job(Path(folder), names, reason, author)
+
+
+def include(folder: str | Path, *names: str, reason: str = "", author: str = "") -> ExcludeOutcome:
+    """Take back what was excluded from a folder, all of ``names`` or none. Raises SurveyError."""
+    return include_job(Path(folder), names, reason, author)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,17 +1,16 @@
 """A plan as one HTML page that needs nothing but itself."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from gtsam import Pose3
 
-import survey.report
 from adjust.design import group_redundancy
 from survey.planning.plots import Series, bars, chart, seen_map
 from survey.planning.summary import meets, people, pose_sigmas, tolerance_values
 from survey.quantities import scale_of
 from survey.report import drawing as d
+from survey.report.document import document
 from survey.report.markup import count, definition, esc, fixed, general, pill, section, sigma_text, table
 from survey.report.picture import pictures
 from survey.report.scene import Scene, Spot, scene_of
@@ -21,18 +20,12 @@ if TYPE_CHECKING:
     from survey.planning.navigation import NavigationOutcome
 
 _MOST_CANDIDATES = 30
-_COLOURS = {"epoch": d.BLUE, "beacon": d.RED, "distance": d.GREEN, "pair": d.ORANGE, "coordinates": "#7a3e9d"}
+_COLOURS = {"epoch": d.BLUE, "beacon": d.RED, "distance": d.GREEN, "pair": d.ORANGE, "coordinates": d.PURPLE}
 
 
 def html_page(title: str, heading: str, sections: list[str]) -> str:
     """A page in the style of the reports."""
-    style = Path(survey.report.__file__).with_name("style.css").read_text(encoding="utf-8")
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{esc(title)}</title><style>{style}</style></head>\n<body><main>"
-        f'<p class="meta">{esc(heading)}</p><h1>{esc(title)}</h1>' + "\n".join(sections) + "</main></body></html>\n"
-    )
+    return document(title, f'<p class="meta">{esc(heading)}</p><h1>{esc(title)}</h1>' + "\n".join(sections))
 
 
 def plan_page(o: "PlanningOutcome") -> str:

@@ -113,11 +113,11 @@ def seen_map(rows: Sequence[str], columns: Sequence[str], counts: FloatArray, ti
         for j, value in enumerate(counts[i].tolist()):
             look = f' fill-opacity="{0.25 + 0.75 * value / high:.2f}"' if value else ""
             tip = f"{row}, {columns[j]}: {int(value)} points" if value else f"{row}, {columns[j]}: nothing"
-            box = d.rect(left + j * cell, y, cell - 1, 15, d.BLUE if value else "#eef1f4", look)
+            box = d.rect(left + j * cell, y, cell - 1, 15, d.BLUE if value else d.EMPTY, look)
             parts.append(f"<g>{box}<title>{esc(tip)}</title></g>")
     step = max(1, int(np.ceil(34.0 / cell)))
     below = top + 17 * len(rows) + 12
     for j in range(0, len(columns), step):
         parts.append(d.text(left + (j + 0.5) * cell, below, columns[j], "middle", 9.5))
-    return d.svg(left + cell * len(columns) + 20, below + 6, parts, title)
+    return d.svg(max(left + cell * len(columns) + 20, 5.6 * len(title)), below + 6, parts, title)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from adjust.model import BoolArray, FloatArray
 from survey.report import drawing as d
-from survey.report.language import t
+from survey.report.language import localised, t
 from survey.report.markup import MINUS, count
 
 WIDTH = 316.0
@@ -38,7 +38,7 @@ def _frame(size: tuple[int, int], heading: str) -> tuple[float, float, list[str]
         height,
         [
             d.text(0, 11, heading, colour=d.INK, size=11.5),
-            d.rect(0.5, _TOP, WIDTH - 1, height, "#fbfcfd", f' stroke="{d.FAINT}"'),
+            d.rect(0.5, _TOP, WIDTH - 1, height, d.FRAME, f' stroke="{d.FAINT}"'),
         ],
     )
 
@@ -51,7 +51,7 @@ def _arrow_scale(lengths: FloatArray, wanted: float) -> float:
 
 def _bar(y: float, scale: float) -> str:
     step = d.round_below(60.0 / scale)
-    return d.scale_bar(1, y, step * scale, f"{step:g} px")
+    return d.scale_bar(1, y, step * scale, localised(f"{step:g} px"))
 
 
 def vector_field(c: CameraResiduals) -> str:
@@ -63,7 +63,7 @@ def vector_field(c: CameraResiduals) -> str:
     grow = _arrow_scale(np.hypot(*c.residuals[ordinary].T), 15.0)
     start = c.uv * scale + (0.5 * scale, _TOP + 0.5 * scale)
     end = start + grow * c.residuals
-    parts.append(d.arrows(start[shown], end[shown], "#5b87b5", 0.7))
+    parts.append(d.arrows(start[shown], end[shown], d.ARROWS, 0.7))
     for mask, colour in ((~c.used, d.ORANGE), (c.used & c.suspect, d.RED)):
         few = np.flatnonzero(mask)[:_MOST_ARROWS]
         length = np.hypot(*c.residuals[few].T)[:, None]
@@ -121,7 +121,7 @@ def histogram(c: CameraResiduals) -> str:
     for left, tall in zip(edges[:-1], heights, strict=True):
         if tall > 0.0:
             at = origin + unit * (left, tall)
-            parts.append(d.rect(at[0] + 0.3, at[1], WIDE / n_bins - 0.6, base - at[1], "#9dbbda"))
+            parts.append(d.rect(at[0] + 0.3, at[1], WIDE / n_bins - 0.6, base - at[1], d.BARS))
     parts.append(d.polyline(origin + unit * np.column_stack([x, normal]), d.INK, 1.3))
     parts.append(d.line(0, base, WIDE, base))
     for tick in range(-4, 5):

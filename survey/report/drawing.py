@@ -7,9 +7,31 @@ import numpy as np
 from adjust.model import FloatArray
 from survey.report.markup import esc
 
-INK, GREY, FAINT = "#1c2733", "#7b8794", "#d5dbe1"
-BLUE, RED, ORANGE, GREEN = "#2166ac", "#c0392b", "#d98200", "#2f7d4f"
-CAMERA_COLOURS = ("#2166ac", "#b2560d", "#2f7d4f", "#7a3e9d", "#a8324a", "#00798c", "#6b6b00", "#4a4a8a")
+# every colour of a picture has its counterpart on a dark page; a picture names no other one
+INK, GREY, FAINT, PAPER, FRAME = "#1c2733", "#66727f", "#d5dbe1", "#ffffff", "#fbfcfd"
+BLUE, RED, ORANGE, GREEN, PURPLE = "#2166ac", "#c0392b", "#d98200", "#2f7d4f", "#7a3e9d"
+GRID, BAND, EMPTY, BODY = "#e3e8ed", "#e3ebf3", "#eef1f4", "#4d5b69"
+ARROWS, BARS, TRACE, RUN = "#5b87b5", "#9dbbda", "#9db4cc", "#f0b45c"
+X_AXIS, Y_AXIS, Z_AXIS = "#b03030", GREEN, "#2b50a8"
+CAMERA_COLOURS = (BLUE, "#b2560d", GREEN, PURPLE, "#a8324a", "#00798c", "#6b6b00", "#4a4a8a")
+DARK = {
+    INK: "#e4eaf0", GREY: "#9aa7b4", FAINT: "#3a4653", PAPER: "#12181f", FRAME: "#18202a",
+    BLUE: "#6aa9e9", RED: "#f0776a", ORANGE: "#f2a93b", GREEN: "#63bd86", PURPLE: "#c293e4",
+    GRID: "#2a343f", BAND: "#223040", EMPTY: "#222c37", BODY: "#a9b7c5",
+    ARROWS: "#7fb0e0", BARS: "#41678d", TRACE: "#5f7d9c", RUN: "#b97a1c",
+    X_AXIS: "#f08080", Z_AXIS: "#8ea8f5",
+    "#b2560d": "#f0985a", "#a8324a": "#ee7f97", "#00798c": "#4fc3d6", "#6b6b00": "#c9c95a", "#4a4a8a": "#a5a5ee",
+}  # fmt: skip
+"""What each colour becomes where the reader's screen is dark."""
+
+
+def dark_rules() -> str:
+    """Rules of a style sheet that bring pictures to a dark page: their attributes stay those of paper."""
+    return "".join(
+        f'svg [{attribute}="{light}"]{{{attribute}:{dark}}}'
+        for light, dark in DARK.items()
+        for attribute in ("fill", "stroke")
+    )
 
 
 def svg(width: float, height: float, parts: Iterable[str], title: str) -> str:

@@ -15,7 +15,7 @@ from adjust.model import FloatArray, IntArray
 from survey.quantities import sigma_unit_for_people, unit_for_people
 from survey.report.context import Context
 from survey.report.embedding import json_script
-from survey.report.language import known, t
+from survey.report.language import group_name, known, t
 from survey.report.markup import count, esc, fixed, section
 
 MOST = 20_000
@@ -30,8 +30,15 @@ class _Rows:
     flags: IntArray
 
 
+# what the rows are sorted by stands beside what they are of: the rest may be off a small screen
+COLUMNS = (
+    "Where", "Point", "Component", "w", "Residual", "σ", "Unit of σ", "Redundancy", "Gross error", "MDB", "λ̄",
+    "Observed", "Adjusted", "Unit", "σ adj.", "Kind", "Group",
+)  # fmt: skip
 _NAMES = ("Kind", "Group", "Where", "Point", "Component", "Unit", "Unit of σ")
-_NUMBERS = ("Observed", "σ", "Adjusted", "σ adj.", "Residual", "Redundancy", "w", "Gross error", "MDB", "λ̄")
+_NUMBERS = tuple(name for name in COLUMNS if name not in _NAMES)
+_SORTED_BY = COLUMNS.index("w")
+_SORTED = ' aria-sort="descending"'
 _BY_SIZE = {"Residual", "w", "Gross error"}
 
 
@@ -43,8 +50,12 @@ def every_observation(c: Context) -> str:
         return ""
     worst = np.argsort(-np.nan_to_num(np.abs(rows.numbers["w"]), nan=-1.0), kind="stable")
     kept = worst[:MOST]
-    columns = [_coded(name, [rows.names[name][i] for i in kept]) for name in _NAMES]
-    columns += [_numeric(name, rows.numbers[name][kept], _digits(name, rows, kept)) for name in _NUMBERS]
+    columns = [
+        _coded(name, [rows.names[name][i] for i in kept])
+        if name in _NAMES
+        else _numeric(name, rows.numbers[name][kept], _digits(name, rows, kept))
+        for name in COLUMNS
+    ]
     data = {"rows": len(kept), "columns": columns, "flags": rows.flags[kept].tolist()}
     more = ""
     if n > len(kept):
@@ -62,8 +73,10 @@ def every_observation(c: Context) -> str:
 
 
 def _controls() -> str:
-    heads = "".join(f'<th class="l">{known(x)}</th>' for x in _NAMES)
-    heads += "".join(f'<th class="r">{known(x)}</th>' for x in _NUMBERS)
+    heads = "".join(
+        f'<th class="{"l" if x in _NAMES else "r"}"{_SORTED if i == _SORTED_BY else ""}>{known(x)}</th>'
+        for i, x in enumerate(COLUMNS)
+    )
     buttons = "".join(
         f'<button type="button" id="all-{name}" aria-label="{esc(t(label))}">{sign}</button>'
         for name, sign, label in (
@@ -127,7 +140,7 @@ def _image_rows(c: Context) -> _Rows:
     for i in range(n):
         b = int(c.rows.block[i])
         for component in ("u", "v"):
-            row = (kind, blocks[b].group, where[b], points[c.rows.point[i]], component, "px", "px")
+            row = (kind, group_name(blocks[b].group), where[b], points[c.rows.point[i]], component, "px", "px")
             for k, value in zip(_NAMES, row, strict=True):
                 names[k].append(value)
     observed, sigma = c.rows.uv.ravel(), c.rows.sigmas.ravel()
@@ -149,7 +162,8 @@ def _other_rows(c: Context) -> _Rows:
         for i, component in enumerate(o.components):
             unit, factor = unit_for_people(component, o.units[i])
             sigma_unit, sigma_factor = sigma_unit_for_people(o.units[i])
-            row = (known(o.kind.replace("_", " ")), o.group, " · ".join(o.ids), "", component, unit, sigma_unit)
+            kind, where = known(o.kind.replace("_", " ")), " · ".join(o.ids)
+            row = (kind, group_name(o.group), where, "", component, unit, sigma_unit)
             for k, value in zip(_NAMES, row, strict=True):
                 names[k].append(value)
             columns.append((o.observed[i], o.sigma[i], o.residual[i], o.redundancy[i], o.standardized[i], float(o.used),

@@ -30,6 +30,30 @@ GERMAN = {
     "Pairs": "Paare",
     "Observations": "Beobachtungen",
     "Image points": "Bildpunkte",
+    "Excluded by people": "Von Personen ausgeschlossen",
+    "What": "Was",
+    "Reason": "Grund",
+    "Who": "Wer",
+    "When": "Wann",
+    "Readings": "Ablesungen",
+    "Largest |w| now": "Größtes |w| jetzt",
+    "no reason given": "ohne Angabe eines Grundes",
+    "names nothing": "bezeichnet nichts",
+    "fits now": "passt jetzt",
+    "does not fit": "passt nicht",
+    "Nothing is excluded by people.": "Von Personen ist nichts ausgeschlossen.",
+    "{people} observations are left out by people (observations/exclusions.csv), {files} only by used = false in "
+    "their table, {run} by this adjustment. What is left out is predicted and tested as long as the others "
+    "determine it: a small residual says that it would fit now.": "{people} Beobachtungen sind von Personen "
+    "ausgeschlossen (observations/exclusions.csv), {files} nur durch used = false in ihrer Tabelle, {run} durch diese "
+    "Ausgleichung. Ausgeschlossenes wird vorhergesagt und getestet, solange die übrigen es bestimmen: Eine kleine "
+    "Verbesserung sagt, dass es jetzt passen würde.",
+    "{n} observations were left out by this adjustment.": "{n} Beobachtungen hat diese Ausgleichung weggelassen.",
+    '<a href="#excluded">{n} observations</a> are left out by people or their tables.':
+    '<a href="#excluded">{n} Beobachtungen</a> sind von Personen oder in ihren Tabellen ausgeschlossen.',
+    "Command": "Befehl",
+    "{n} images, each with the hash of the file that its points come from":
+    "{n} Bilder, jedes mit der Prüfsumme der Datei, aus der seine Punkte stammen",
     "Inputs": "Eingangsdaten",
     "Options": "Einstellungen",
     "Versions": "Programmstände",
@@ -45,7 +69,8 @@ GERMAN = {
     '<a href="#observations">{n} other observations</a> are suspect.': (
         '<a href="#observations">{n} andere Beobachtungen</a> sind verdächtig.'
     ),
-    "{n} observations were not used.": "{n} Beobachtungen wurden nicht verwendet.",
+    "Image": "Bild",
+    "Images": "Bilder",
     "No warnings, nothing suspect, nothing left out.": "Keine Warnungen, nichts verdächtig, nichts ausgelassen.",
     "sigma0 (a priori 1)": "sigma0 (a priori 1)",
     "observations": "Beobachtungen",
@@ -69,6 +94,21 @@ GERMAN = {
         "Verbesserungen sind ausgeglichen minus beobachtet."
     ),
     "Global test": "Globaltest",
+    "cautious sigmas": "vorsichtige Sigmas",
+    "Not computed": "Nicht berechnet",
+    "Parts of the survey": "Teile der Vermessung",
+    "Part": "Teil",
+    "Parts": "Teile",
+    "Table": "Drehtisch",
+    "Set-up": "Aufstellung",
+    "Factor": "Faktor",
+    "fits": "passt",
+    "Every group, camera, epoch, target, table, set-up and instrument tested for itself, and {n} changes and shapes of "
+    "cameras, targets and tables: {all} tests at {level} % together. The {most} with the smallest p are listed.": (
+        "Jede Gruppe, Kamera, Epoche, Zieltafel, jeder Tisch, Aufbau und jedes Instrument für sich geprüft, dazu {n} "
+        "Änderungen und Formen von Kameras, Zieltafeln und Tischen: {all} Prüfungen, zusammen mit {level} %. Gezeigt "
+        "sind die {most} mit dem kleinsten p."
+    ),
     "No global test: there is no redundancy.": "Kein Globaltest: es gibt keine Redundanz.",
     "Global test {word} omega = {omega}, redundancy {r}, accepted between {lower} and {upper} at {level} %": (
         "Globaltest {word} Omega = {omega}, Redundanz {r}, angenommen zwischen {lower} und {upper} bei {level} %"
@@ -115,9 +155,9 @@ GERMAN = {
     "|value| / σ": "|Wert| / σ",
     "Held at zero: {names}.": "Auf null gehalten: {names}.",
     "Residual vectors point from the observed to the adjusted position. Red: suspect, orange: not used. "
-    "A pattern in the mean per cell is what the lens model leaves over; white cells hold no points.": (
+    "A pattern in the mean per cell is what the lens model leaves over; empty cells hold no points.": (
         "Die Vektoren zeigen von der beobachteten zur ausgeglichenen Lage. Rot: verdächtig, orange: nicht verwendet. "
-        "Ein Muster in den Zellmitteln ist, was das Objektivmodell übrig lässt; weiße Zellen haben keine Punkte."
+        "Ein Muster in den Zellmitteln ist, was das Objektivmodell übrig lässt; leere Zellen haben keine Punkte."
     ),
     "{width} × {height} px on station {station} · {images} images, {points} points": (
         "{width} × {height} px auf Standpunkt {station} · {images} Bilder, {points} Punkte"
@@ -266,6 +306,9 @@ GERMAN = {
     "Gross error": "Grober Fehler",
     "MDB": "Grenzwert",
     "image point": "Bildpunkt",
+    "image": "Bild",
+    "reading": "Ablesung",
+    "closure": "Schleifenschluss",
     "The worst {shown} of {n}; all in residuals.csv and residuals_other.csv.": (
         "Die {shown} schlechtesten von {n}; alle in residuals.csv und residuals_other.csv."
     ),
@@ -289,9 +332,12 @@ GERMAN = {
     "last page": "letzte Seite",
     "page {{page}} of {{pages}}, {{n}} rows": "Seite {{page}} von {{pages}}, {{n}} Zeilen",
     "The survey in space": "Die Vermessung im Raum",
-    "Drag to turn, wheel to zoom, arrow keys turn too. Ellipsoids enlarged": (
-        "Ziehen dreht, das Rad vergrößert, auch Pfeiltasten drehen. Ellipsoide vergrößert"
+    "Drag to turn, Ctrl and wheel to zoom; arrow keys, + and − do the same.": (
+        "Ziehen dreht, Strg und Rad vergrößern; Pfeiltasten, + und − ebenso."
     ),
+    "Ellipsoids enlarged": "Ellipsoide vergrößert",
+    "nearer": "näher",
+    "further away": "weiter weg",
     "times": "mal",
     # what is demanded
     "Identification": "Angaben zur Messung",
@@ -404,8 +450,8 @@ GERMAN = {
     "Correlations": "Korrelationen",
     "Correlated above 95 %": "Über 95 % korreliert",
     "Weak directions": "Schwache Richtungen",
-    "Blue: positive, red: negative; white: none. Lines separate the parameters.": (
-        "Blau: positiv, rot: negativ, weiß: keine. Linien trennen die Parameter."
+    "Blue: positive, red: negative; empty: none. Lines separate the parameters.": (
+        "Blau: positiv, rot: negativ, leer: keine. Linien trennen die Parameter."
     ),
     "Distribution": "Verteilung",
     "Distribution of residuals": "Verteilung der Verbesserungen",
@@ -426,10 +472,34 @@ GERMAN_MESSAGES = (
         "(v'Pv = {}, erwartet {} bis {})",
     ),
     (
-        r"global test failed: sigma0 = ([\d.]+), the residuals are smaller than the a priori sigmas say "
+        r"cautious sigmas: sigma0 = ([\d.]+), the residuals are smaller than the a priori sigmas say "
         r"\(v'Pv = ([\d.]+), expected ([\d.]+) to ([\d.]+)\)",
-        "Globaltest nicht bestanden: sigma0 = {}, die Verbesserungen sind kleiner, als die Sigmas a priori sagen "
+        "Vorsichtige Sigmas: sigma0 = {}, die Verbesserungen sind kleiner, als die Sigmas a priori sagen "
         "(v'Pv = {}, erwartet {} bis {})",
+    ),
+    (
+        r"left out, because every observation of it is left out: (.*)",
+        "ausgelassen, weil jede Beobachtung davon ausgelassen ist: {}",
+    ),
+    (
+        r"(.*): (\S+) is left out, but nothing has that name; (.*)",
+        "{}: {} ist ausgeschlossen, bezeichnet aber nichts; {}",
+    ),
+    (r"detection: (.*): nothing: (.*)", "Erkennung: {}: nichts gefunden: {}"),
+    (r"detection: (.*): failed: (.*)", "Erkennung: {}: nicht lesbar: {}"),
+    (r"images: (.*) are gone, their points are used: .*", "Bilder: {} fehlen, ihre Punkte werden verwendet"),
+    (
+        r"images: (.*) have no points, while those of other images were given; .*",
+        "Bilder: {} haben keine Punkte, während die anderer Bilder gegeben sind",
+    ),
+    (
+        r"images: (.*) have changed since their points were (?:found|given).*",
+        "Bilder: {} sind andere als die, von denen ihre Punkte stammen",
+    ),
+    (r"images: (.*) were never looked at: .*", "Bilder: {} wurden nie ausgewertet, ihre Zieltafeln fehlen"),
+    (
+        r"images: (.*) were searched for other targets than survey.toml names now; .*",
+        "Bilder: {} wurden nach anderen Zieltafeln durchsucht, als survey.toml jetzt nennt",
     ),
     (_WHERE + ": not used", "Kamera {}, Epoche {}, Zieltafel {}: nicht verwendet"),
     (
@@ -446,10 +516,27 @@ GERMAN_MESSAGES = (
         "erlauben. Nach groben Fehlern, falschen Sigmas oder einem lückenhaften Modell suchen, zuerst bei den Gruppen.",
     ),
     (
-        r"Global test failed on the low side: residuals are only ([\d.]+) times the sigmas of the observations\. .*",
-        "Globaltest nach unten nicht bestanden: die Verbesserungen sind nur das {}-fache der Sigmas der Beobachtungen. "
-        "Die angegebenen Sigmas sind zu groß.",
+        r"Observations and model agree, with cautious sigmas: residuals are ([\d.]+) times what the sigmas of the "
+        r"observations claim\.",
+        "Beobachtungen und Modell stimmen überein, die Sigmas sind vorsichtig: die Verbesserungen sind {}-mal so groß, "
+        "wie die Sigmas der Beobachtungen angeben.",
     ),
+    (
+        r"The survey as a whole fits its sigmas, but not every part of it; .*",
+        "Das Ganze passt zu seinen Sigmas, aber nicht jeder Teil; was nicht passt, steht zuerst bei den Warnungen.",
+    ),
+    (
+        r"(\S+) (.*) does not fit: its residuals are ([\d.]+) times what the sigmas allow \(variance factor (\S+), "
+        r"redundancy ([\d.]+), p (\S+)\)",
+        "{} {} passt nicht: die Verbesserungen sind {}-mal so groß, wie die Sigmas erlauben (Varianzfaktor {}, "
+        "Redundanz {}, p {})",
+    ),
+    (r"and (\d+) more parts do not fit", "und {} weitere Teile passen nicht"),
+    (
+        r"(camera|target|table) (.*): its (.*) is not the one of the other epochs from (.*) on: (.*)",
+        "{} {}: {} ist ab {} nicht wie in den anderen Epochen: {}",
+    ),
+    (r"(camera|target|table) (.*): its (.*) is not as given: (.*)", "{} {}: {} ist nicht wie angegeben: {}"),
     (
         r"The adjustment did not converge: the numbers below are no solution\.",
         "Die Ausgleichung ist nicht konvergiert: die Zahlen unten sind keine Lösung.",

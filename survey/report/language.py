@@ -13,6 +13,11 @@ from adjust.errors import SurveyError
 from survey.report.german import GERMAN, GERMAN_MESSAGES
 
 LANGUAGES = ("en", "de")
+GROUPS_BY_KIND = frozenset((
+    "image", "table", "pair", "closure", "distance", "coordinates", "coordinate_difference", "level", "alignment",
+    "laser", "surface", "reading", "direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance",
+    "height_difference",
+))  # fmt: skip
 _current: ContextVar[str] = ContextVar("language", default="en")
 
 
@@ -54,13 +59,20 @@ def known(text: str) -> str:
     return GERMAN.get(text, text) if _current.get() == "de" else text
 
 
+def group_name(name: str) -> str:
+    """A group of observations: one named after its kind is said in the language, one that people named as it is."""
+    return known(name.replace("_", " ")) if name in GROUPS_BY_KIND else name
+
+
 def message(text: str) -> str:
     """A message that the adjustment has made, translated where its pattern is known, else as it is."""
     if _current.get() == "de":
         for pattern, german in GERMAN_MESSAGES:
             found = re.fullmatch(pattern, text, re.DOTALL)
             if found:
-                return german.format(*found.groups())
+                numeric = re.findall(r"(?<!\\)\(([^()]*)\)", pattern)
+                values = zip(found.groups(), numeric, strict=True)
+                return german.format(*(localised(x) if kind == r"[\d.]+" else x for x, kind in values))
     return text
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from adjust.result import ObservationResidual
 from survey.quantities import sigma_unit_for_people, unit_for_people
 from survey.report.context import Context
-from survey.report.language import known, t
+from survey.report.language import group_name, known, t
 from survey.report.markup import count, esc, fixed, general, pill, section, sigma_text, table, value_text
 
 _MOST_OTHER = 200
@@ -53,7 +53,7 @@ def _other_row(o: ObservationResidual, i: int, suspect: bool) -> list[str]:
     # an r of zero means that nothing controls the observation: its residual says nothing
     redundancy = fixed(o.redundancy[i], 2) + ("" if o.redundancy[i] > 0.05 else " " + pill("warn", t("uncontrolled")))
     word = esc(known(o.kind.replace("_", " ")))
-    kind = word if o.group == o.kind else f"{word} <small>{esc(o.group)}</small>"
+    kind = word if o.group == o.kind else f"{word} <small>{esc(group_name(o.group))}</small>"
     return [
         kind, esc(" · ".join(o.ids)), f"<code>{esc(o.components[i])}</code>",
         value_text(float(o.observed[i] * factor), shown_sigma), value_text(float(o.adjusted[i] * factor), shown_sigma),
@@ -75,7 +75,7 @@ def image_points(c: Context) -> str:
         numbers = [fixed(v, n) for v, n in zip(values, (2, 2, 3, 3, 2, 2), strict=True)]
         names = (block.camera_id, block.epoch_id, block.target_id or "world", c.rows.point_ids[c.rows.point[k]])
         redundancy = [fixed(r, 2) for r in found.redundancy[k]]
-        rows.append([*(esc(n) for n in names), *numbers, *redundancy, general(found.test[k], 4), _flag(used, suspect)])
+        rows.append([*(esc(n) for n in names), *numbers, *redundancy, fixed(found.test[k], 2), _flag(used, suspect)])
         classes.append(_row_class(used, suspect))
     columns = (
         "<Camera", "<Epoch", "<Target", "<Point", "u [px]", "v [px]", "res. u [px]", "res. v [px]", "std. u", "std. v",

@@ -5,7 +5,7 @@ from typing import Any
 from survey.quantities import sigma_unit_for_people
 from survey.report import drawing as d
 from survey.report.context import Context
-from survey.report.language import known, message, t
+from survey.report.language import group_name, known, message, t
 from survey.report.markup import count, definition, esc, fixed, general, pill, section, table
 from survey.report.picture import pictures
 from survey.report.scene import scene_of
@@ -15,6 +15,9 @@ from survey.tolerances import Verdict, coverage
 _WORDS = {"passed": "Passed", "check": "Needs a look", "failed": "Failed"}
 _MOST_WARNINGS = 25
 _MOST_VERDICTS = 200
+_MOST_PARTS = 20
+_KINDS = {"group": "Group", "camera": "Camera", "epoch": "Epoch", "target": "Target", "table": "Table",
+          "set-up": "Set-up", "instrument": "Instrument"}  # fmt: skip
 _CLEAR = 3.0  # deviations of a group beyond this many sigmas are marked
 
 
@@ -34,8 +37,12 @@ def header(c: Context) -> str:
     if found["n_other"]:
         n = count(found["n_other"])
         problems.append(t('<a href="#observations">{n} other observations</a> are suspect.', n=n))
-    if found["n_not_used"]:
-        problems.append(t("{n} observations were not used.", n=count(found["n_not_used"])))
+    out = c.solution["left_out"]
+    if out["in_this_run"]:
+        problems.append(t("{n} observations were left out by this adjustment.", n=count(out["in_this_run"])))
+    if out["by_people"] + out["in_files"]:
+        n = count(out["by_people"] + out["in_files"])
+        problems.append(t('<a href="#excluded">{n} observations</a> are left out by people or their tables.', n=n))
     unmet = [v for v in c.statistics.verdicts if not v.met] if c.statistics is not None else []
     if unmet:
         most = count(len(c.statistics.verdicts) if c.statistics is not None else 0)
@@ -95,7 +102,7 @@ def _global_test(test: dict[str, Any] | None) -> str:
     x = {
         k: left + (v - low + 0.1 * span) / (1.2 * span) * (width - 2 * left) for k, v in (marks | {"one": 1.0}).items()
     }
-    colour = d.GREEN if test["passed"] else d.RED
+    colour = {"passed": d.GREEN, "cautious": d.ORANGE, "failed": d.RED}[test["status"]]
     parts = [
         d.line(left, 28, width - left, 28, d.FAINT, 2),
         d.rect(x["lower"], 22, x["upper"] - x["lower"], 12, d.GREEN, ' fill-opacity="0.22" rx="2"'),
@@ -108,13 +115,14 @@ def _global_test(test: dict[str, Any] | None) -> str:
     else:
         words = t("{low} to {high}", low=general(marks["lower"]), high=general(marks["upper"]))
         parts.append(d.text(0.5 * (x["lower"] + x["upper"]), 50, words, "middle"))
-    word = pill("good", t("passed")) if test["passed"] else pill("bad", t("failed"))
+    said = {"passed": "passed", "cautious": "cautious sigmas", "failed": "failed"}[test["status"]]
+    word = pill({"passed": "good", "cautious": "warn", "failed": "bad"}[test["status"]], t(said))
     sentence = t(
         "Global test {word} omega = {omega}, redundancy {r}, accepted between {lower} and {upper} at {level} %",
         word=word, omega=general(test["omega"], 6), r=count(r), lower=general(test["lower"], 6),
         upper=general(test["upper"], 6), level=general(100 * (1 - test["alpha"])),
     )  # fmt: skip
-    return f'<p class="lead">{sentence}</p>{d.svg(width, height, parts, t("Global test"))}'
+    return f'<p class="lead">{sentence}</p><div class="wide">{d.svg(width, height, parts, t("Global test"))}</div>'
 
 
 def groups(c: Context) -> str:
@@ -125,9 +133,8 @@ def groups(c: Context) -> str:
         if g["deviation"] is not None and abs(g["deviation"]) > _CLEAR:
             deviation = pill("warn", deviation)
         numbers = (fixed(g["variance_factor"], 3), fixed(g["sigma_scale"], 3), deviation)
-        rows.append(
-            (esc(name), count(g["n_observations"]), fixed(g["redundancy"], 1), general(g["omega"], 6), *numbers)
-        )
+        sums = (count(g["n_observations"]), fixed(g["redundancy"], 1), general(g["omega"], 6))
+        rows.append((esc(group_name(name)), *sums, *numbers))
     note = t(
         "The variance factor is the weighted square sum omega over the redundancy of the group; its root is the number "
         "by which the sigmas given for the group would have to be multiplied to agree with its residuals. Deviation: "
@@ -135,6 +142,34 @@ def groups(c: Context) -> str:
     )
     columns = ("<Group", "Observations", "Redundancy", "Omega", "Variance factor", "Scale of sigmas", "Deviation [σ]")
     return section("groups", "Groups of observations", table(columns, rows) if rows else "", note)
+
+
+def parts(c: Context) -> str:
+    """Every part of the survey tested for itself, the least likely first; what the statistics leave out."""
+    s = c.statistics
+    if s is None:
+        return ""
+    tested, out = s.consistency, ""
+    if tested is not None and tested.parts:
+        rows = [
+            (esc(f"{t(_KINDS[x.kind])} {x.name}"), count(x.n), fixed(x.redundancy, 1), fixed(x.factor, 3),
+             general(x.p, 2), pill("bad", t("does not fit")) if x.fails else pill("good", t("fits")))
+            for x in tested.parts[:_MOST_PARTS]
+        ]  # fmt: skip
+        classes = ["suspect" if x.fails else "" for x in tested.parts[:_MOST_PARTS]]
+        columns = ("<Part", "Observations", "Redundancy", "Factor", "p", "<")
+        note = t(
+            "Every group, camera, epoch, target, table, set-up and instrument tested for itself, and {n} changes and "
+            "shapes of cameras, targets and tables: {all} tests at {level} % together. The {most} with the smallest p "
+            "are listed.",
+            n=count(tested.n_changes), all=count(tested.n_tests), level=general(100 * tested.alpha),
+            most=count(len(rows)),
+        )  # fmt: skip
+        out = section("parts", "Parts of the survey", table(columns, rows, "", classes), note)
+    if s.left_out:
+        listed = "".join(f"<li>{esc(message(x))}</li>" for x in s.left_out)
+        out += section("not-computed", "Not computed", f"<ul>{listed}</ul>")
+    return out
 
 
 def identification(c: Context) -> str:
@@ -188,7 +223,14 @@ def inputs(c: Context) -> str:
     """What went in: files with their hashes, options, versions."""
     i = c.solution["inputs"]
     files = table(("<File", "<Hash"), [(esc(k), f"<code>{esc(v)}</code>") for k, v in i["hashes"].items()])
-    parts = [files] if i["hashes"] else []
+    parts = [definition([(t("Command"), f"<code>{esc(i['command'])}</code>")])] if i["command"] else []
+    parts += [files] if i["hashes"] else []
+    if i["images"]:
+        rows = [(esc(e["file"]), f"<code>{esc(e['sha256'])}</code>", count(e["n_image_points"] + e["n_spots"]))
+                for e in i["images"].values()]  # fmt: skip
+        listed = table(("<Image", "<Hash", "Points"), rows)
+        said = t("{n} images, each with the hash of the file that its points come from", n=count(len(rows)))
+        parts.append(f"<details><summary>{said}</summary>{listed}</details>")
     for title, entries in (("Options", i["options"]), ("Versions", i["versions"])):
         if entries:
             parts.append(f"<h3>{t(title)}</h3>" + definition((k, esc(v)) for k, v in entries.items()))

@@ -5,10 +5,12 @@ from typing import Any
 
 from adjust.result import Adjustment
 from survey.quantities import scale_of
-from survey.report import every, instruments, loops, observations, overview, statistics, unknowns
+from survey.report import every, instruments, left_out, loops, observations, overview, statistics, unknowns
 from survey.report.context import Context
+from survey.report.document import document
+from survey.report.drawing import DARK
 from survey.report.embedding import json_script
-from survey.report.language import language, localised, speaking, t
+from survey.report.language import localised, speaking, t
 from survey.report.markup import esc
 from survey.residual_tables import image_rows
 from survey.solution import RunInfo, solution_dict
@@ -20,6 +22,7 @@ _SECTIONS = (
     ("Tolerances", "tolerances", overview.tolerances),
     ("Variance components", "components", statistics.components),
     ("Groups", "groups", overview.groups),
+    ("Parts", "parts", overview.parts),
     ("Picture", "picture", overview.picture),
     ("Cameras", "cameras", unknowns.cameras),
     ("Poses", "poses", unknowns.stations),
@@ -30,6 +33,7 @@ _SECTIONS = (
     ("Network", "network", loops.network),
     ("Loops", "loops", loops.loops),
     ("Pairs", "pairs", loops.pairs),
+    ("Excluded by people", "excluded", left_out.excluded),
     ("Observations", "observations", observations.others),
     ("Image points", "image-points", observations.image_points),
     ("All observations", "all-observations", every.every_observation),
@@ -67,24 +71,17 @@ def report_html(
 def _page(c: Context) -> str:
     made = [(name, anchor, make(c)) for name, anchor, make in _SECTIONS]
     nav = "".join(f'<a href="#{anchor}">{esc(t(name))}</a>' for name, anchor, body in made if body)
-    here = Path(__file__)
-    style = here.with_name("style.css").read_text(encoding="utf-8")
-    script = here.with_name("script.js").read_text(encoding="utf-8")
-    title = esc(c.solution["summary"]["title"] or c.run.folder)
-    return (
-        f'<!doctype html>\n<html lang="{language()}"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title} – {t('Adjustment report')}</title><style>{style}</style></head>\n<body><main>"
-        f"{overview.header(c)}<nav>{nav}</nav>"
-        + "\n".join(body for _, _, body in made)
-        + f"</main>{json_script('words', _words())}<script>{script}</script></body></html>\n"
-    )
+    script = Path(__file__).with_name("script.js").read_text(encoding="utf-8")
+    title = f"{c.solution['summary']['title'] or c.run.folder} – {t('Adjustment report')}"
+    shown = f"{overview.header(c)}<nav>{nav}</nav>" + "\n".join(body for _, _, body in made)
+    return document(title, shown, f"{json_script('words', _words())}<script>{script}</script>")
 
 
 def _words() -> dict[str, Any]:
     """What the script says."""
     return {
         "decimal": localised("."),
+        "dark": DARK,
         "filter": t("filter"),
         "flags": ["", t("suspect"), t("not used")],
         "where": t("page {{page}} of {{pages}}, {{n}} rows").replace("{{", "{").replace("}}", "}"),

@@ -7,7 +7,7 @@ import numpy as np
 
 from adjust.model import FloatArray
 from survey.report import drawing as d
-from survey.report.language import t
+from survey.report.language import localised, t
 from survey.report.scene import Scene, Shot
 
 WIDTH, HEIGHT, MARGIN = 540.0, 450.0, 36.0
@@ -91,9 +91,9 @@ def _ground(view: View, everything: FloatArray) -> list[str]:
     parts = []
     (x0, y0), (x1, y1) = low[:2], high[:2]
     for x in np.arange(np.ceil(x0 / step), np.floor(x1 / step) + 1) * step:
-        parts.append(d.polyline(view.to_picture(np.array([(x, y0, low[2]), (x, y1, low[2])])), "#e3e8ed"))
+        parts.append(d.polyline(view.to_picture(np.array([(x, y0, low[2]), (x, y1, low[2])])), d.GRID))
     for y in np.arange(np.ceil(y0 / step), np.floor(y1 / step) + 1) * step:
-        parts.append(d.polyline(view.to_picture(np.array([(x0, y, low[2]), (x1, y, low[2])])), "#e3e8ed"))
+        parts.append(d.polyline(view.to_picture(np.array([(x0, y, low[2]), (x1, y, low[2])])), d.GRID))
     return parts
 
 
@@ -135,7 +135,7 @@ class _Labels:
             free = all(box[0] > b[2] or box[2] < b[0] or box[1] > b[3] or box[3] < b[1] for b in self.boxes)
             if inside and free:
                 self.boxes.append(box)
-                halo = ' paint-order="stroke" stroke="#fff" stroke-width="2.5"'
+                halo = f' paint-order="stroke" stroke="{d.PAPER}" stroke-width="2.5"'
                 return d.text(x, y, words, size=size, colour=colour, more=halo)
         return ""
 
@@ -155,7 +155,7 @@ def _world_axes(view: View, reach: float) -> list[str]:
     start = view.to_picture(np.zeros((1, 3)))[0]
     inside = 0 <= start[0] <= WIDTH and 0 <= start[1] <= HEIGHT
     parts = []
-    for i, (name, colour) in enumerate((("x", "#b03030"), ("y", "#2f7d4f"), ("z", "#2b50a8"))):
+    for i, (name, colour) in enumerate((("x", d.X_AXIS), ("y", d.Y_AXIS), ("z", d.Z_AXIS))):
         end = view.to_picture(reach * np.eye(3)[i])[0]
         if inside and np.hypot(*(end - start)) > 3.0:
             parts.append(d.arrows(start[None], end[None], colour, 1.6, 5.0))
@@ -177,7 +177,7 @@ def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, elli
         for spot in scene.spots:
             foot = view.to_picture(np.array([spot.x, (*spot.x[:2], floor)]))
             parts.append(d.polyline(foot, d.FAINT, 0.8, ' stroke-dasharray="2 2"'))
-    parts += [d.polygon(view.to_picture(x), "#4d5b69", d.INK, 1.0, ' fill-opacity="0.18"') for _, x in scene.outlines]
+    parts += [d.polygon(view.to_picture(x), d.BODY, d.INK, 1.0, ' fill-opacity="0.18"') for _, x in scene.outlines]
     parts += [d.dot(x, y, 1.2, d.INK) for _, cloud in scene.clouds for x, y in view.to_picture(cloud)]
     parts += [d.dot(x, y, 1.4, d.GREEN, ' fill-opacity="0.6"') for m in scene.moves for x, y in view.to_picture(m)]
     parts += _tables(view, scene, 0.06 * extent)
@@ -190,7 +190,7 @@ def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, elli
         parts.append(d.dot(x, y, 2.2 if spot.kind == "point" else 3.0, colour))
     parts += _labels(view, scene, 0.09 * extent)
     step = d.round_below(0.25 * WIDTH / view.unit)
-    parts.append(d.scale_bar(2, HEIGHT - 8, step * view.unit, f"{step:g} m"))
+    parts.append(d.scale_bar(2, HEIGHT - 8, step * view.unit, localised(f"{step:g} m")))
     return d.svg(WIDTH, HEIGHT, parts, view.name)
 
 

@@ -4,6 +4,7 @@
 (() => {
   const words = JSON.parse(document.getElementById("words").textContent);
   const decimal = words.decimal;
+  document.documentElement.classList.add("ready"); // first: what is drawn needs its place on the page
   const number = (text) => {
     const clean = text.replace(/[\u2009\s]/g, "").replace("−", "-").replace(decimal, ".");
     const found = clean.match(/^[<±]?(-?\d+(\.\d+)?(e-?\d+)?)/);
@@ -152,9 +153,11 @@
       const scale = ((zoom * Math.min(view.width, view.height) * 0.8) / reach) * (2.4 * reach) / Math.max(2.4 * reach - near, 0.3 * reach);
       return [view.width / 2 + scale * right, view.height / 2 - scale * up];
     };
+    const night = window.matchMedia("(prefers-color-scheme: dark)");
+    const seen = (colour) => (night.matches && words.dark[colour]) || colour;
     const path = (points, colour, width, alpha = 1) => {
       context.globalAlpha = alpha;
-      context.strokeStyle = colour;
+      context.strokeStyle = seen(colour);
       context.lineWidth = width * (window.devicePixelRatio || 1);
       context.beginPath();
       points.forEach((x, k) => { const [u, v] = project(x); if (k) context.lineTo(u, v); else context.moveTo(u, v); });
@@ -175,7 +178,7 @@
           path(ring, spot.colour, 0.9, 0.75);
         }
         const [u, v] = project(spot.x);
-        context.fillStyle = spot.colour;
+        context.fillStyle = seen(spot.colour);
         context.beginPath();
         context.arc(u, v, 2.4 * ratio, 0, 7);
         context.fill();
@@ -184,9 +187,9 @@
       for (const label of scene.labels) {
         const [u, v] = project(label.x);
         context.lineWidth = 3 * ratio;
-        context.strokeStyle = "#fff";
+        context.strokeStyle = seen("#ffffff");
         context.strokeText(label.text, u + 5 * ratio, v - 4 * ratio);
-        context.fillStyle = label.colour;
+        context.fillStyle = seen(label.colour);
         context.fillText(label.text, u + 5 * ratio, v - 4 * ratio);
       }
     };
@@ -197,12 +200,21 @@
       elevation = Math.min(1.55, Math.max(-1.55, elevation + event.movementY * 0.008));
       draw();
     });
-    view.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      zoom = Math.min(40, Math.max(0.2, zoom * Math.exp(-event.deltaY * 0.0012)));
+    const nearer = (factor) => {
+      zoom = Math.min(40, Math.max(0.2, zoom * factor));
       draw();
+    };
+    // the bare wheel scrolls the page, here as everywhere
+    view.addEventListener("wheel", (event) => {
+      if (!event.ctrlKey && !event.metaKey) return;
+      event.preventDefault();
+      nearer(Math.exp(-event.deltaY * 0.0012));
     }, { passive: false });
+    document.getElementById("space-in").addEventListener("click", () => nearer(1.25));
+    document.getElementById("space-out").addEventListener("click", () => nearer(0.8));
     view.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      if (event.key === "+" || event.key === "-") nearer(event.key === "+" ? 1.25 : 0.8);
       const turn = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
       if (!turn) return;
       event.preventDefault();
@@ -211,8 +223,7 @@
       draw();
     });
     enlarge.addEventListener("input", draw);
-    window.addEventListener("resize", draw);
-    draw();
+    night.addEventListener("change", draw);
+    new ResizeObserver(draw).observe(view); // also when the page is first laid out
   }
-  document.documentElement.classList.add("ready");
 })();

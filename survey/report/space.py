@@ -30,13 +30,17 @@ def space(scene: Scene, ellipsoid: float) -> str:
         "spots": [_spot(s.x, s.cov, ellipsoid, s.kind) for s in scene.spots],
         "labels": _labels(scene),
     }
-    hint = t("Drag to turn, wheel to zoom, arrow keys turn too. Ellipsoids enlarged")
-    times = t("times")
+    hint = t("Drag to turn, Ctrl and wheel to zoom; arrow keys, + and − do the same.")
+    enlarged, times = t("Ellipsoids enlarged"), t("times")
+    buttons = "".join(
+        f'<button type="button" id="space-{name}" aria-label="{esc(t(label))}">{sign}</button>'
+        for name, sign, label in (("in", "+", "nearer"), ("out", "−", "further away"))
+    )
     return (
         '<div class="screen"><canvas id="space" tabindex="0" role="img" '
         f'aria-label="{esc(t("The survey in space"))}"></canvas>'
-        f'<p class="note">{hint} <b id="space-factor"></b> {times} '
-        f'<input id="space-enlarge" type="range" min="-2" max="1" step="0.05" value="0" aria-label="{hint}"></p></div>'
+        f'<p class="controls">{buttons} <span>{hint}</span> <label>{enlarged} <b id="space-factor"></b> {times} '
+        '<input id="space-enlarge" type="range" min="-2" max="1" step="0.05" value="0"></label></p></div>'
         f"{json_script('space-data', data)}"
     )
 
@@ -66,13 +70,13 @@ def _ground(low: FloatArray, high: FloatArray) -> list[dict[str, Any]]:
         for at in np.arange(np.ceil(low[axis] / step), np.floor(high[axis] / step) + 1) * step:
             ends = np.array([low, low])
             ends[:, axis], ends[1, other] = at, high[other]
-            out.append(_line(ends, "#dfe4e9", 1.0))
+            out.append(_line(ends, d.GRID, 1.0))
     return out
 
 
 def _lines(scene: Scene, reach: float) -> list[dict[str, Any]]:
     out = [_line(np.vstack([x, x[:1]]), d.INK, 1.2) for _, x in scene.outlines]
-    for i, colour in enumerate(("#b03030", "#2f7d4f", "#2b50a8")):
+    for i, colour in enumerate((d.X_AXIS, d.Y_AXIS, d.Z_AXIS)):
         out.append(_line(np.array([np.zeros(3), 0.14 * reach * np.eye(3)[i]]), colour, 2.0))
     for _, pose, axes in scene.tables:
         for axis in axes:

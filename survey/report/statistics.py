@@ -9,7 +9,7 @@ from adjust.statistics.result import BudgetEntry, Component, Influence, Relative
 from survey.quantities import sigma_unit_for_people
 from survey.report import drawing as d
 from survey.report.context import Context
-from survey.report.language import known, t
+from survey.report.language import group_name, known, t
 from survey.report.markup import (
     MISSING,
     count,
@@ -61,7 +61,8 @@ def components(c: Context) -> str:
 def _component_row(x: Component) -> tuple[str, ...]:
     kind = "warn" if x.status == "estimated" and x.p < 0.01 else "quiet" if x.status == "estimated" else "soft"
     return (
-        esc(x.group), value_text(x.factor, x.sigma), sigma_text(x.sigma), fixed(float(np.sqrt(max(x.factor, 0.0))), 3),
+        esc(group_name(x.group)), value_text(x.factor, x.sigma), sigma_text(x.sigma),
+        fixed(float(np.sqrt(max(x.factor, 0.0))), 3),
         count(x.n), fixed(x.redundancy, 1), general(x.p, 2), pill(kind, known(x.status)),
     )  # fmt: skip
 
@@ -184,7 +185,7 @@ def correlations(c: Context) -> str:
     strong = f"<h3>{t('Correlated above 95 %')}</h3><ul>{pairs}</ul>" if pairs else ""
     weak = "".join(f"<li>{_weak_text(x)}</li>" for x in s.weak[:10])
     weakly = f"<h3>{t('Weak directions')}</h3><ul>{weak}</ul>" if weak else ""
-    note = t("Blue: positive, red: negative; white: none. Lines separate the parameters.")
+    note = t("Blue: positive, red: negative; empty: none. Lines separate the parameters.")
     return section("correlations", "Correlations", drawn + strong + weakly, note)
 
 
@@ -204,7 +205,7 @@ def heat_map(m: CorrelationMatrix) -> str:
     n, left = len(m.labels), 150.0
     cell = min(18.0, 620.0 / max(n, 1))
     size = n * cell
-    parts = [d.rect(left, 4, size, size, "#fff", f' stroke="{d.FAINT}"')]
+    parts = [d.rect(left, 4, size, size, d.PAPER, f' stroke="{d.FAINT}"')]
     # one path per shade keeps a matrix of a hundred rows small
     shade = np.clip(np.round(20.0 * m.matrix), -20, 20).astype(int)
     for value in np.unique(shade[shade != 0]).tolist():
@@ -240,7 +241,7 @@ def normality(c: Context) -> str:
         w = np.concatenate(parts)
         w = np.sort(w[np.isfinite(w)])
         if len(w) >= 8:
-            drawn.append(f"<figure>{quantiles(name, w)}</figure>")
+            drawn.append(f"<figure>{quantiles(group_name(name), w)}</figure>")
     note = t(
         "Standardized residuals of each group in order, against the quantiles that as many normally distributed ones "
         "would have. The band holds 95 % of such points one by one."
@@ -266,7 +267,7 @@ def quantiles(name: str, w: FloatArray) -> str:
     band = np.concatenate([at(x, low), at(x, high)[::-1]])
     parts = [
         d.text(0, 11, name, colour=d.INK, size=11.5),
-        d.polygon(band, "#e3ebf3", "none"),
+        d.polygon(band, d.BAND, "none"),
         d.polyline(at(np.array([-reach, reach]), np.array([-reach, reach])), d.GREY, 0.9),
     ]
     parts += [d.dot(a, b, 1.7, d.BLUE) for a, b in at(x, w[keep])]

@@ -12,7 +12,7 @@ from survey.solution import RunInfo, solution_dict
 _WIDTH = 100
 _WORDS = {"passed": "PASSED", "check": "NEEDS A LOOK", "failed": "FAILED"}
 _MOST_WARNINGS, _MOST_GROUPS, _MOST_CAMERAS, _MOST_OTHER, _MOST_POINTS = 6, 6, 6, 4, 3
-_MOST_LOOPS = 3
+_MOST_LOOPS, _MOST_EXCLUSIONS = 3, 5
 
 
 def summary_text(adjustment: Adjustment, run: RunInfo, solution: dict[str, Any] | None = None) -> str:
@@ -22,7 +22,7 @@ def summary_text(adjustment: Adjustment, run: RunInfo, solution: dict[str, Any] 
     """
     solution = solution_dict(adjustment, run) if solution is None else solution
     lines: list[str] = []
-    for part in (_head, _warnings, _figures, _groups, _cameras, _network, _loops):
+    for part in (_head, _warnings, _figures, _exclusions, _groups, _cameras, _network, _loops):
         lines += part(solution)
     lines += _observations(adjustment, solution["summary"]["suspects"]["standardized_limit"])
     lines += _points(solution)
@@ -61,14 +61,42 @@ def _figures(solution: dict[str, Any]) -> Iterator[str]:
         f"redundancy {s['redundancy']}   iterations {s['iterations']}"
     )
     if test:
+        said = {"passed": "passed", "cautious": "passed with cautious sigmas", "failed": "FAILED"}[test["status"]]
         yield (
-            f"  global test {'passed' if test['passed'] else 'FAILED'}: omega {test['omega']:.1f}, accepted "
+            f"  global test {said}: omega {test['omega']:.1f}, accepted "
             f"{test['lower']:.1f} to {test['upper']:.1f} at {100 * (1 - test['alpha']):g} %"
         )
+    parts = solution.get("consistency")
+    if parts and parts["n_tests"]:
+        failed = [f"{kind} {name}" for kind, x in parts["parts"].items() for name, p in x.items() if not p["fits"]]
+        changed = [f"{x['kind']} {x['name']}" for x in parts["changes"]]
+        listed = ", ".join(dict.fromkeys(changed + failed)) or "all fit"
+        yield f"  parts and changes: {parts['n_tests']} tests: {_cut(listed, _WIDTH - 30)}"
+    yield from (f"  not computed: {line}" for line in solution.get("not_computed", ()))
     yield (
         f"  suspect: {found['n_image_points']} image points, {found['n_other']} other observations; "
         f"not used: {found['n_not_used']}   (sigmas below {s['sigmas'].replace('_', ' ')})"
     )
+    out = solution["left_out"]
+    if any(out.values()):
+        yield (
+            f"  left out: {out['by_people']} by people, {out['in_files']} marked used = false, "
+            f"{out['in_this_run']} by this run"
+        )
+
+
+def _exclusions(solution: dict[str, Any]) -> Iterator[str]:
+    found = solution["exclusions"]
+    if found:
+        yield ""
+        yield f"  excluded by people ({len(found)})"
+    for e in found[-_MOST_EXCLUSIONS:]:
+        w = e["largest_standardized_residual"]
+        now = "" if w is None else f"  now w {w:.1f}"
+        said = f"{e['reason'] or 'no reason given'} ({e['author'] or 'nobody named'})"
+        yield f"  {_cut(e['name'], 36):<36}{now:<13} {_cut(said, _WIDTH - 52)}"
+    if len(found) > _MOST_EXCLUSIONS:
+        yield f"  and {len(found) - _MOST_EXCLUSIONS} before these"
 
 
 def _groups(solution: dict[str, Any]) -> Iterator[str]:

@@ -122,7 +122,7 @@ def cameras(c: Context) -> str:
         parts.append(_camera(camera.camera_id, entry, residuals))
     note = t(
         "Residual vectors point from the observed to the adjusted position. Red: suspect, orange: not used. "
-        "A pattern in the mean per cell is what the lens model leaves over; white cells hold no points."
+        "A pattern in the mean per cell is what the lens model leaves over; empty cells hold no points."
     )
     return section("cameras", "Cameras", "".join(parts), note)
 

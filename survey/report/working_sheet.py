@@ -3,6 +3,8 @@
 import math
 from collections.abc import Sequence
 
+from survey.report import drawing as d
+from survey.report.document import document
 from survey.report.markup import esc
 from survey.working_sheet import ARCSEC, AxisState, FootMove, Sheet
 
@@ -14,14 +16,13 @@ _STATES = {
     "held": "held, not measured",
 }
 _CSS = """
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 56em; color: #1b2430; padding: 0 1em; }
-h1 { font-size: 1.5em; } h2 { margin-top: 2em; } .state { padding: .2em .8em; border-radius: 1em; color: #fff; }
-.aligned { background: #19794a; } .turn { background: #b3261e; } .measure { background: #9a6700; }
-.held { background: #5b6672; } ol { font-size: 1.15em; } li { margin: .4em 0; }
-table { border-collapse: collapse; }
-td, th { padding: .25em .8em; border-bottom: 1px solid #d5dbe1; text-align: right; }
-td:first-child, th:first-child { text-align: left; } .note { color: #5b6672; } svg { max-width: 100%; }
-@media print { body { margin: 0; } .state { border: 1px solid #000; color: #000; background: none; } }
+ol { font-size: 1.15em; } li { margin: .4em 0; } td, th { text-align: right; }
+td:first-child, th:first-child { text-align: left; }
+.state { padding: .1em .8em; border-radius: 1em; font-size: 14px; font-weight: 600; white-space: nowrap; }
+.aligned { background: var(--good-pill); color: var(--good); } .turn { background: var(--bad-pill); color: var(--bad); }
+.measure { background: var(--warn-pill); color: var(--warn); }
+.held { background: var(--plain-back); color: var(--plain); }
+@media print { .state { border: 1px solid currentColor; } }
 """
 
 
@@ -95,13 +96,9 @@ def sheet_text(sheets: Sequence[Sheet]) -> str:
 
 def sheet_html(sheets: Sequence[Sheet], title: str, date: str, rounds: Sequence[Sequence[str]] = ()) -> str:
     """One page that needs nothing but itself; ``rounds`` are rows of ``ROUND_COLUMNS``, oldest first."""
-    parts = [
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
-        f'content="width=device-width"><title>{esc(title)}: alignment</title><style>{_CSS}</style></head><body>',
-        f'<h1>{esc(title)}: alignment</h1><p class="note">{esc(date)}</p>',
-    ]
+    parts = [f'<style>{_CSS}</style><h1>{esc(title)}: alignment</h1><p class="meta">{esc(date)}</p>']
     parts += [_sheet_html(sheet, [row for row in rounds if row[1] == sheet.task.task_id]) for sheet in sheets]
-    return "".join([*parts, "</body></html>\n"])
+    return document(f"{title}: alignment", "".join(parts))
 
 
 def _sheet_html(sheet: Sheet, rounds: Sequence[Sequence[str]]) -> str:
@@ -118,8 +115,8 @@ def _sheet_html(sheet: Sheet, rounds: Sequence[Sequence[str]]) -> str:
         "<tr>" + "".join(f"<td>{esc(cell)}</td>" for cell in (row[0], row[2], *row[3:6])) + "</tr>" for row in rounds
     )
     history = (
-        "<h3>Rounds</h3><table><tr><th>Date</th><th>State</th><th>x ″</th><th>y ″</th><th>z ″</th></tr>"
-        f"{past}</table>"
+        '<h3>Rounds</h3><div class="t"><table><tr><th>Date</th><th>State</th><th>x ″</th><th>y ″</th><th>z ″</th></tr>'
+        f"{past}</table></div>"
         if len(rounds) > 1
         else ""
     )
@@ -127,7 +124,8 @@ def _sheet_html(sheet: Sheet, rounds: Sequence[Sequence[str]]) -> str:
         f'<h2>{esc(task.task_id)} <span class="state {sheet.state}">{_STATES[sheet.state]}</span></h2>'
         f"<p>{esc(task.body.kind)} <b>{esc(task.body.frame_id)}</b> is to be parallel to {esc(task.onto.kind)} "
         f"<b>{esc(task.onto.frame_id)}</b>.{tolerance}</p>{listed}{drawing(sheet)}"
-        f"<table><tr><th>Axis</th><th>Off by</th><th>σ</th><th>{sheet.level:.0%}</th><th></th></tr>{rows}</table>"
+        f'<div class="t"><table><tr><th>Axis</th><th>Off by</th><th>σ</th><th>{sheet.level:.0%}</th><th></th></tr>'
+        f"{rows}</table></div>"
         f'<p class="note">Off by: how far {esc(task.body.frame_id)} is turned about its own axis, right-handed.</p>'
         f"{history}"
     )
@@ -148,19 +146,17 @@ def drawing(sheet: Sheet) -> str:
     width, height = 2 * margin + (max(xs) - min(xs)) * scale, 2 * margin + (max(ys) - min(ys)) * scale
     outline = " ".join(f"{u:.1f},{v:.1f}" for u, v in (place(*at[name]) for name in at))
     parts = [
-        f'<svg viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" role="img" aria-label="feet and moves">'
         '<defs><marker id="tip" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" markerHeight="7" orient="auto">'
-        '<path d="M0 0L10 5L0 10z" fill="#b3261e"/></marker></defs>'
-        f'<polygon points="{outline}" fill="#eef2f6" stroke="#8a97a5"/>'
+        f'<path d="M0 0L10 5L0 10z" fill="{d.RED}"/></marker></defs>'
+        f'<polygon points="{outline}" fill="{d.EMPTY}" stroke="{d.GREY}"/>'
     ]
     for foot in sheet.feet:
         u, v = place(*at[foot.name])
         text_v = v + 26 if v > height / 2 else v - 16  # beside the body, not on it
         label = "stays" if foot.stays else f"{1e3 * foot.move:+.2f} mm"
-        colour = "#5b6672" if foot.stays else "#b3261e"
+        colour = d.GREY if foot.stays else d.RED
         parts.append(
-            f'<circle cx="{u:.1f}" cy="{v:.1f}" r="9" fill="{colour}"/><text x="{u:.1f}" y="{text_v:.1f}" '
-            f'text-anchor="middle" font-size="15">{esc(foot.name)}: {label}</text>'
+            d.dot(u, v, 9, colour) + d.text(u, text_v, f"{foot.name}: {label}", "middle", 15, d.INK)
         )
     z = next(axis for axis in sheet.axes if axis.axis == "z")
     if z.state == "turn":
@@ -169,7 +165,7 @@ def drawing(sheet: Sheet) -> str:
         sweep = 1 if z.angle > 0 else 0  # in the picture y points down: 1 is clockwise
         parts.append(
             f'<path d="M{ends[0][0]:.1f} {ends[0][1]:.1f}A{r} {r} 0 0 {sweep} {ends[1][0]:.1f} {ends[1][1]:.1f}" '
-            'fill="none" stroke="#b3261e" stroke-width="3" marker-end="url(#tip)"/>'
-            f'<text x="{u:.1f}" y="{v + 5:.1f}" text-anchor="middle" font-size="15">{angle_text(abs(z.angle))}</text>'
+            f'fill="none" stroke="{d.RED}" stroke-width="3" marker-end="url(#tip)"/>'
+            + d.text(u, v + 5, angle_text(abs(z.angle)), "middle", 15, d.INK)
         )
-    return "".join([*parts, "</svg>"])
+    return d.svg(width, height, parts, "feet and moves")

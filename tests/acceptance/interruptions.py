@@ -276,10 +276,14 @@ def steps_of(argv: list[str], home: Path) -> list[str]:
 # what must hold then
 
 
+_DATED = re.compile(rb"(exclusions\.csv\D{1,60}?)[0-9a-f]{64}")
+"""The hash of a file that holds an instant."""
+
+
 def content(folder: Path) -> dict[str, bytes]:
     """All files of a folder that its owner sees, by name, without the instants that are written in them."""
     found = (p for p in sorted(folder.rglob("*")) if p.is_file() and not _hidden(p.relative_to(folder)))
-    return {str(p.relative_to(folder)): _TIMES.sub(b"(time)", p.read_bytes()) for p in found}
+    return {str(p.relative_to(folder)): _DATED.sub(rb"\1(hash)", _TIMES.sub(b"(time)", p.read_bytes())) for p in found}
 
 
 def _hidden(name: Path) -> bool:

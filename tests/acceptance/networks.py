@@ -1,28 +1,37 @@
-"""Every published network, adjusted by the package and held against what was published; for tests and for the table.
+"""Every published network through ``convert`` and ``adjust``, held against what was published; for tests and the table.
 
 Where GNU Gama stopped after its one linearisation before it had converged, ``dense_network`` repeats exactly that step
 from Gama's own start values; ``gap`` fields are what remains then.
 """
 
+import contextlib
+import csv
+import io
+import json
 import re
-from dataclasses import dataclass, field, replace
+import tempfile
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from adjust.adjustment import adjust
 from adjust.model import FloatArray, Survey
-from adjust.result import Adjustment
+from survey.cli import main
 from survey.interop.foreign import ForeignNetwork
 from survey.interop.gama import read_gama
 from survey.interop.krumm import read_adjusted, read_krumm
 from survey.interop.lgc import read_lgc
+from survey.interop.names import with_safe_ids
 from tests.acceptance.dense_network import DenseResult, dense_adjust, gradient_at, sparse_sigmas
 from tests.acceptance.gama_results import GamaResult, gama_result
 
 GAMA = (
     "2019-zeman", "2020-barta-phase_0-1TK", "2020-barta-phase_1-1TK", "cube-1", "local_3d", "tst-tetrahedron-3-gon",
     "zoltan-test_2d_gon",
+)  # fmt: skip
+DEFAULTS = (
+    "krasovsky-1926", "zoltan-test_2d_dms", "stroner-levelling-a", "seq-dsuloha-d", "LotherStrehle_Direction7",
 )  # fmt: skip
 SYNTHETIC = ("net100", "free100")
 LARGE = ("net1000", "free1000")
@@ -37,21 +46,40 @@ LGC = "MathisLGC_V1_20150709-141437"
 LGC_SIGMA0 = 17.927129
 
 
+# --- what a user gets: convert, adjust, and the files in results ------------------------------------------------------
+
+_SI = {"mm": 1e-3, "arcsec": np.pi / 648000}
+
+
 @dataclass(frozen=True, eq=False)
-class Compared:
-    """A network as adjusted and the largest differences from what was published, by what they are of."""
+class UserRun:
+    """What ``results`` of a converted and adjusted file says: ``solution.json`` and ``residuals_other.csv``.
 
-    name: str
-    network: ForeignNetwork
-    result: Adjustment
-    sigma0: float
-    published_sigma0: float | None
-    differences: dict[str, float] = field(default_factory=dict)
-    limits: dict[str, float] = field(default_factory=dict)
-    note: str = ""
+    points, readings: ids in the project by those in the file.
+    """
+
+    solution: dict[str, Any]
+    residuals: list[dict[str, str]]
+    points: dict[str, str]
+    readings: dict[str, str]
+
+    def __getattr__(self, name: str) -> Any:
+        """sigma0, redundancy, datum_defect and all else of the summary."""
+        return self.solution["summary"][name]
 
 
-# --- what the package gives, in the order of the dense adjustment -----------------------------------------------------
+def as_a_user(path: Path, survey: Survey) -> UserRun:
+    """``labsurvey convert`` and ``labsurvey adjust``; ``survey``: the same file as a reader gives it, for its names."""
+    safe, _ = with_safe_ids(survey)
+    points = {a.point_id: b.point_id for a, b in zip(survey.points, safe.points, strict=True)}
+    readings = {a.reading_id: b.reading_id for a, b in zip(survey.readings, safe.readings, strict=True)}
+    with tempfile.TemporaryDirectory() as scratch, contextlib.redirect_stdout(io.StringIO()):
+        project = Path(scratch) / path.stem
+        assert main(["convert", str(path), str(project), "--quiet"]) == 0
+        assert main(["adjust", str(project), "--quiet"]) in (0, 3)
+        solution = json.loads((project / "results" / "solution.json").read_text(encoding="utf-8"))
+        text = (project / "results" / "residuals_other.csv").read_text(encoding="utf-8")
+    return UserRun(solution, list(csv.DictReader(io.StringIO(text))), points, readings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,24 +92,48 @@ class CoreRows:
     standardized: FloatArray
 
 
-def core_rows(survey: Survey, result: Adjustment) -> CoreRows:
+def core_rows(survey: Survey, result: UserRun) -> CoreRows:
     """Readings in the survey's order, then baselines, then coordinates."""
-    readings = {o.ids[0]: o for o in result.other_residuals if o.kind not in ("coordinate_difference", "coordinates")}
-    rows = [readings[r.reading_id] for r in survey.readings]
-    rows += [o for o in result.other_residuals if o.kind == "coordinate_difference"]
-    rows += [o for o in result.other_residuals if o.kind == "coordinates"]
-    names = ("residual", "standardized", "sigma")
-    residual, standardized, sigma = (np.concatenate([np.atleast_1d(getattr(o, n)) for o in rows]) for n in names)
+    readings = {row["ids"].split()[0]: row for row in result.residuals if row["kind"] not in _VECTORS}
+    rows = [readings[result.readings[r.reading_id]] for r in survey.readings]
+    rows += [row for kind in _VECTORS for row in result.residuals if row["kind"] == kind]
+    numbers = [[float(row[n] or "nan") for row in rows] for n in ("residual", "sigma", "standardized")]
+    unit = np.array([_SI[row["residual_unit"]] for row in rows])
+    residual, sigma, standardized = unit * numbers[0], unit * numbers[1], np.array(numbers[2])
     with np.errstate(invalid="ignore", divide="ignore"):
         return CoreRows(residual, (residual / standardized) ** 2, sigma, standardized)
 
 
-def core_points(result: Adjustment) -> dict[str, FloatArray]:
-    return {n[1]: np.asarray(e.value) for n, e in result.estimates.items() if n[0] == "point"}
+_VECTORS = ("coordinate_difference", "coordinates")
 
 
-def core_sigmas(result: Adjustment) -> dict[str, FloatArray]:
-    return {n[1]: np.sqrt(np.diag(e.cov)) for n, e in result.estimates.items() if n[0] == "point"}
+def core_points(result: UserRun) -> dict[str, FloatArray]:
+    """m, by the names of the file."""
+    return _by_point(result, "")
+
+
+def core_sigmas(result: UserRun) -> dict[str, FloatArray]:
+    """m, as the result file gives them: a priori or a posteriori, as the other program's file asks for."""
+    return _by_point(result, "sigma_")
+
+
+def _by_point(result: UserRun, what: str) -> dict[str, FloatArray]:
+    entries = {name: result.solution["points"].get(own) for name, own in result.points.items()}
+    return {name: np.array([1e-3 * e[f"{what}{a}_mm"] for a in "xyz"]) for name, e in entries.items() if e}
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A network as adjusted and the largest differences from what was published, by what they are of."""
+
+    name: str
+    network: ForeignNetwork
+    result: UserRun
+    sigma0: float
+    published_sigma0: float | None
+    differences: dict[str, float] = field(default_factory=dict)
+    limits: dict[str, float] = field(default_factory=dict)
+    note: str = ""
 
 
 # --- GNU Gama ---------------------------------------------------------------------------------------------------------
@@ -106,7 +158,7 @@ class GamaCase:
     name: str
     network: ForeignNetwork
     published: GamaResult
-    result: Adjustment
+    result: UserRun
     one: DenseResult
     converged: DenseResult
 
@@ -129,7 +181,7 @@ def gama_case(folder: Path, name: str) -> GamaCase:
     start = gama_start(network.survey, published)
     one = dense_adjust(network.survey, start, steps=1)
     converged = dense_adjust(network.survey, start)
-    return GamaCase(name, network, published, adjust(network.survey), one, converged)
+    return GamaCase(name, network, published, as_a_user(folder / f"{name}.gkf", network.survey), one, converged)
 
 
 def gama_statistics(case: GamaCase, sigma: FloatArray, residual: FloatArray, residual_var: FloatArray, sigma0: float):
@@ -161,7 +213,7 @@ def compare_gama(folder: Path, name: str) -> Compared:
     published, result = case.published, case.result
     xyz = np.array(list(published.adjusted.values()))
     sigma = case.published_sigmas()
-    ours = case.sigmas(core_sigmas(result), result.sigma0)
+    ours = case.coordinates(core_sigmas(result))
     rows = core_rows(case.network.survey, result)
     statistics = gama_statistics(case, rows.sigma, rows.residual, rows.residual_var, result.sigma0)
     one = gama_statistics(case, case.one.sigma, case.one.residuals, case.one.decorrelated, case.one.sigma0)
@@ -184,7 +236,7 @@ def compare_gama(folder: Path, name: str) -> Compared:
 def compare_large(folder: Path, name: str) -> Compared:
     """Networks of 1000 points: coordinates, and deviations at Gama's linearisation and at the solution."""
     network, published = read_gama(folder / f"{name}.gkf"), gama_result(folder / f"{name}-variances.xml")
-    result = adjust(network.survey)
+    result = as_a_user(folder / f"{name}.gkf", network.survey)
     points, sigmas = core_points(result), core_sigmas(result)
     known = np.sqrt(np.diagonal(published.cov))[: len(published.adjusted)]
     ours = np.array([sigmas[p]["xyz".index(a)] for p, a in published.adjusted])
@@ -255,9 +307,8 @@ def compare_krumm(folder: Path, name: str) -> Compared:
     """In half units of the last printed digit; ``gap``: the same for Gauss-Newton stopped at steps of 1e-6 m."""
     network = read_krumm(folder / f"{name}.dat")
     survey = network.survey
-    result = adjust(survey)
-    ours = {p: result.sigma0 * s for p, s in core_sigmas(result).items()}
-    rows = krumm_rows(folder, name, core_points(result), ours, network)
+    result = as_a_user(folder / f"{name}.dat", survey)
+    rows = krumm_rows(folder, name, core_points(result), core_sigmas(result), network)
     start = {p.point_id: np.asarray(p.x_in_world.value) for p in survey.points}
     stopped = dense_adjust(survey, start, tolerance=1e-6)
     theirs = {p: stopped.sigma0 * s for p, s in stopped.sigmas.items()}
@@ -283,24 +334,15 @@ def lgc_published(path: Path) -> dict[str, FloatArray]:
 
 def compare_lgc(folder: Path) -> Compared:
     network = read_lgc(folder / f"{LGC}.lgc")
-    result = adjust(network.survey)
+    result = as_a_user(folder / f"{LGC}.lgc", network.survey)
     published = lgc_published(folder / f"{LGC}.output")
     points, sigmas = core_points(result), core_sigmas(result)
     differences = {
         "coordinate_m": max(float(np.abs(points[p] - row[:3]).max()) for p, row in published.items()),
-        "sigma_m": max(float(np.abs(result.sigma0 * sigmas[p] - row[3:]).max()) for p, row in published.items()),
+        "sigma_m": max(float(np.abs(sigmas[p] - row[3:]).max()) for p, row in published.items()),
         "points": float(len(published)),
     }
     return Compared("HIE-ISOLDE", network, result, result.sigma0, LGC_SIGMA0, differences)
-
-
-def with_start(survey: Survey, start: dict[str, FloatArray]) -> Survey:
-    """The survey with these start values of its points."""
-    points = tuple(
-        replace(p, x_in_world=replace(p.x_in_world, value=start[p.point_id])) if p.point_id in start else p
-        for p in survey.points
-    )
-    return replace(survey, points=points)
 
 
 # --- the railway: 833 points, no published result ---------------------------------------------------------------------
@@ -312,9 +354,10 @@ def compare_railway(folder: Path) -> Compared:
     """Whether v'Pv is at its minimum (steps left, in sigmas) and the datum's points have not moved as a whole (m)."""
     network = read_gama(folder / f"{RAILWAY}.gkf")
     survey = network.survey
-    result = adjust(survey)
+    result = as_a_user(folder / f"{RAILWAY}.gkf", survey)
     points = core_points(result)
-    turned = {n[1]: float(np.asarray(e.value)[0]) for n, e in result.estimates.items() if n[0] == "orientation"}
+    setups = result.solution["setups"]
+    turned = {name: np.radians(entry["orientation"]["orientation_deg"]) for name, entry in setups.items()}
     gradient, diagonal = gradient_at(survey, points, turned)
     start = np.array([p.x_in_world.value for p in survey.points if p.point_id in survey.datum.points])
     moved = np.array([points[p] for p in survey.datum.points]) - start

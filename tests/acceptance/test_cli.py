@@ -13,7 +13,6 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from adjust.errors import SurveyError
-from adjust.result import GlobalTest
 from capture.cli import main as capture_main
 from survey.cli import build_parser, main
 
@@ -29,12 +28,12 @@ def _run(*arguments, **more):
 @dataclass
 class _Outcome:
     folder: Path
-    omega: float = 100.0
+    fit: str = "fits"
     paths: dict = field(default_factory=dict)
 
     @property
-    def adjustment(self):
-        return SimpleNamespace(global_test=GlobalTest(self.omega, 100, 0.05, 74.0, 130.0))
+    def solution(self):
+        return {"summary": {"fit": self.fit, "global_test": None}}
 
     def summary(self):
         return {"summary": {"sigma0": 1.25, "redundancy": 77}}
@@ -58,7 +57,7 @@ def jobs(monkeypatch):
             raise KeyboardInterrupt
         if folder.name == "gone":
             raise PermissionError(13, "Permission denied", str(folder / "results"))
-        return _Outcome(folder, {"poor": 200.0, "cautious": 50.0}.get(folder.name, 100.0))
+        return _Outcome(folder, {"poor": "does_not_fit", "cautious": "cautious"}.get(folder.name, "fits"))
 
     module = ModuleType("survey.jobs")
     module.adjust_job = adjust_job
@@ -116,6 +115,54 @@ def test_wrong_usage_is_2(arguments, capsys):
     assert "error: " in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["ajust", "lab"], "labsurvey: error: command 'ajust' is unknown; did you mean 'adjust'?"),
+        (["example", "full_lab", "x"], "labsurvey example: error: NAME 'full_lab' is unknown; did you mean 'full-lab'"),
+        (["adjust", "lab", "--redetct"], "labsurvey adjust: error: unknown flag --redetct; did you mean '--redetect'?"),
+        (["--josn", "adjust", "lab"], "unknown flag --josn; did you mean '--json'?"),
+        (["adjust"], "labsurvey adjust: error: FOLDER is missing"),
+        ([], "labsurvey: error: no command is given; labsurvey --help lists them"),
+        (["detect", "lab", "--jobs", "two"], "--jobs: found 'two'; expected a whole number, 1 or more"),
+        (["plan", "lab", "--pixels", "few"], "labsurvey plan: error: --pixels: found 'few'; expected a number"),
+        (["report", "lab", "--language", "fr"], "--language 'fr' is unknown; one of: en, de"),
+        (["report", "lab", "other"], "'other' is one too many"),
+    ],
+)
+def test_wrong_usage_offers_what_was_meant(arguments, expected, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    said = capsys.readouterr().err.splitlines()
+    assert stop.value.code == 2
+    assert said[0].startswith("usage: labsurvey ")
+    assert expected in said[-1]
+    assert "(labsurvey COMMAND ...)" not in said[-1]
+
+
+def test_a_project_is_found_by_its_definition_too(jobs, project):
+    folder = project("lab")
+    assert main(["adjust", f"{folder}/survey.toml"]) == 0
+    assert [call.folder for call in jobs] == [Path(folder)]
+
+
+def test_a_folder_that_is_not_there_is_sought_nearby(project, capsys):
+    folder = Path(project("full-lab"))
+    assert main(["adjust", str(folder.with_name("full_lab"))]) == 1
+    assert f"no such folder; did you mean {str(folder)!r}?" in capsys.readouterr().err
+    (folder / "notes.txt").write_text("x")
+    assert main(["adjust", str(folder / "notes.txt")]) == 1
+    assert f"is a file; give the folder that holds survey.toml, here {folder}" in capsys.readouterr().err
+    assert main(["adjust", str(folder.parent)]) == 1
+    assert f"as {folder} does" in capsys.readouterr().err
+
+
+def test_known_words_are_listed_once(tmp_path, capsys):
+    (tmp_path / "survey.toml").write_text('format = 1\n[datum]\nkind = "nonsense"\n')
+    assert main(["detect", str(tmp_path)]) == 1
+    assert "known:" not in capsys.readouterr().err
+
+
 def test_an_error_of_the_user_is_one_message_without_traceback(tmp_path):
     result = _run("adjust", str(tmp_path / "nowhere"))
     assert result.returncode == 1
@@ -138,7 +185,7 @@ def test_adjust_prints_the_result_and_is_0(jobs, project, capsys):
     assert jobs[0].out is None
 
 
-def test_a_failed_global_test_is_3(jobs, project):
+def test_what_does_not_fit_is_3(jobs, project):
     assert main(["adjust", project("poor")]) == 3
 
 
@@ -214,7 +261,7 @@ def test_every_command_line_of_the_readme_is_understood(line, capsys):
 def test_every_flag_of_the_readme_exists(capsys):
     flags = set(re.findall(r"`(--?[a-z]+)", (ROOT / "README.md").read_text())) - {"--strict"}
     known = ""
-    for command in ("adjust", "report", "plan", "add", "convert", "navigate", "align", "detect"):
+    for command in ("adjust", "report", "plan", "add", "convert", "navigate", "align", "detect", "schema"):
         with pytest.raises(SystemExit):
             main([command, "--help"])
         known += capsys.readouterr().out

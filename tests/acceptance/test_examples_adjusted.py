@@ -72,7 +72,7 @@ def test_json_holds_the_summary(lab, tmp_path, capsys):
 
 
 def test_detect_says_what_it_found(lab, capsys):
-    assert main(["--quiet", "detect", str(lab)]) == 0
+    assert main(["--quiet", "detect", str(lab), "--all"]) == 0
     out = capsys.readouterr().out
     assert "24 of 24 images" in out
     assert out.endswith(f"Next: labsurvey adjust {lab}\n")

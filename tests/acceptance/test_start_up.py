@@ -1,7 +1,9 @@
 """What a small network loads: the clock is for benchmarks, the list of modules does not depend on the machine."""
 
+import re
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -16,6 +18,7 @@ COMPILER = ("numba.cpython.cmathimpl", "numba.misc.cffiimpl")
 """Loaded by numba when it registers what it can compile."""
 CODE = """
 import sys
+import time
 from survey.cli import main
 code = main(["adjust", sys.argv[1], "--quiet"])
 print("CODE", code, "LOADED", *sorted(set(sys.argv[2:]) & set(sys.modules)))
@@ -45,3 +48,17 @@ def test_a_network_of_readings_loads_nothing_that_it_does_not_need(network):
 def test_cached_kernels_open_without_the_compiler(network):
     loaded(network, ())  # fills the cache where it is empty
     assert loaded(network, COMPILER) == []
+
+
+def test_the_times_of_the_stages_are_the_time_that_passed(network, capsys):
+    """No stage is counted twice, and nothing that takes long is counted by none."""
+    assert main(["adjust", str(network), "--quiet"]) == 0  # compiles and loads
+    capsys.readouterr()
+    begin = time.perf_counter()
+    assert main(["adjust", str(network), "--quiet"]) == 0
+    passed = time.perf_counter() - begin
+    told = capsys.readouterr().out.strip().splitlines()[-1]
+    stages = {name: float(s) for name, s in re.findall(r"(\w+) ([\d.]+) s", told)}
+    assert set(stages) == {"read", "adjust", "statistics", "report"}
+    rounding = 0.005 * len(stages)
+    assert 0.6 * passed - rounding <= sum(stages.values()) <= passed + rounding

@@ -69,22 +69,22 @@ def test_homography_of_a_known_map_and_of_noisy_points():
     true = np.array([[900.0, 40, 300], [-30, 950, 200], [0.3, -0.2, 1]])
     xy = board()[:, :2]
     uv = cv2.perspectiveTransform(xy[None], true)[0]
-    h, rms = cf.homography(xy, uv)
-    np.testing.assert_allclose(h / h[2, 2], true, rtol=1e-9)
-    assert rms < 1e-9
     noisy = uv + rng.normal(0, 0.5, uv.shape)
-    h, rms = cf.homography(xy, noisy)
+    n = len(xy)
+    xys, uvs = np.concatenate([xy, xy, xy[:11], xy[:3]]), np.concatenate([uv, noisy, uv[:11], uv[:3]])
+    h, rms, good = cf.homographies(xys, uvs, np.array([0, n, 2 * n, 2 * n + 11, 2 * n + 14]))
+    np.testing.assert_allclose(h[0] / h[0, 2, 2], true, rtol=1e-9)
+    assert rms[0] < 1e-9
     reference = cv2.findHomography(xy, noisy)[0]
     reference_rms = np.sqrt(np.mean(np.sum((cv2.perspectiveTransform(xy[None], reference)[0] - noisy) ** 2, axis=1)))
-    assert rms <= reference_rms * 1.0001
-    with pytest.raises(SurveyError, match="one line"):
-        cf.homography(xy[:11], uv[:11])
+    assert rms[1] <= reference_rms * 1.0001
+    assert good.tolist() == [True, True, False, False]  # points on one line, and three
 
 
 def homographies(rng, n, tilt=0.4, noise=0.0):
     xy = board()[:, :2] / 0.2
     images = [pixels(board(), m) + rng.normal(0, noise, (88, 2)) for m in views(rng, n, tilt)]
-    return np.array([cf.homography(xy, uv)[0] for uv in images])
+    return cf.homographies(np.tile(xy, (n, 1)), np.concatenate(images), 88 * np.arange(n + 1))[0]
 
 
 def test_zhang_is_exact_without_noise_and_near_with_it():

@@ -7,10 +7,12 @@ import pytest
 from gtsam import Pose3
 from scipy.stats import binom
 
-from adjust.adjustment import adjust
+from adjust.adjustment import AdjustOptions, adjust
+from adjust.errors import NotConvergedError
 from adjust.graph import StartValues
 from adjust.model import FloatArray, Point, PointParameter, Survey
 from adjust.observations import Distance, FrameRef, Pair, PositionRef, Reading, ReadingCovariance
+from adjust.robust import limit
 from adjust.statistics.candidates import candidates, without
 from adjust.statistics.outlier_search import SearchOptions, search_outliers
 from adjust.statistics.reliability import reliability
@@ -249,3 +251,70 @@ def test_two_explanations_that_cannot_be_told_apart_are_both_named() -> None:
     assert {other.kept[0][1], other.instead[0][1]} == {"S1", "S2"}
     assert other.odds == pytest.approx(1.0, abs=1e-6)
     assert any("either" in n and "S1" in n and "S2" in n for n in found.notes)
+
+
+def test_nothing_is_left_out_of_a_group_whose_residuals_are_far_below_its_sigmas() -> None:
+    survey, start = net.hall(4, n_points=60, n_stations=4)
+    readings = [replace(r, sigma=20.0 * r.sigma) if r.group == "direction" else r for r in survey.readings]
+    number = next(i for i, r in enumerate(readings) if r.group == "direction")
+    wrong = [*readings]
+    wrong[number] = replace(wrong[number], value=wrong[number].value + 6.0 * wrong[number].sigma)
+    found = search_outliers(replace(survey, readings=tuple(wrong)), start)
+    assert not found.rejected
+    assert "direction" in found.cautious
+    (suspect,) = found.suspects
+    assert suspect.ids[0] == wrong[number].reading_id
+    assert "stays, for the residuals of group direction are together far smaller" in found.notes[-1]
+    # of the others something is, and of the same with sigmas that are right
+    distance = next(i for i, r in enumerate(readings) if r.group == "slope_distance")
+    wrong[distance] = replace(wrong[distance], value=wrong[distance].value + 20.0 * wrong[distance].sigma)
+    again = search_outliers(replace(survey, readings=tuple(wrong)), start)
+    assert [d.ids[0] for d in again.rejected] == [wrong[distance].reading_id]
+    right = tuple(replace(r, sigma=r.sigma / 20.0) if r.group == "direction" else r for r in wrong)
+    both = search_outliers(replace(survey, readings=right), start)
+    assert {d.ids[0] for d in both.rejected} == {wrong[number].reading_id, wrong[distance].reading_id}
+
+
+def test_the_last_solution_stays_where_there_is_none_without_an_observation(monkeypatch: pytest.MonkeyPatch) -> None:
+    survey, start = net.hall(4)
+    wrong = net.with_reading(survey, 4, value=survey.readings[4].value + 100.0 * survey.readings[4].sigma)
+    wrong = net.with_reading(wrong, 40, value=wrong.readings[40].value + 100.0 * wrong.readings[40].sigma)
+    needed = wrong.readings[4].reading_id
+
+    def fragile(given: Survey, *arguments: object) -> object:
+        if any(r.reading_id == needed and not r.used for r in given.readings):
+            raise NotConvergedError("it went astray")
+        return adjust(given, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("adjust.statistics.outlier_search.adjust", fragile)
+    found = search_outliers(wrong, start)
+    assert needed not in {d.ids[0] for d in found.rejected}
+    assert any(f"cannot be left out: {wrong.readings[4].kind}" in n and needed in n for n in found.notes)
+    assert all(r.used for r in found.survey.readings if r.reading_id == needed)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_small_group_with_sigmas_too_small_loses_only_what_is_wrong(seed: int) -> None:
+    survey, start = net.hall(seed, factors={"tape": 64.0})
+    assert sum(d.group == "tape" for d in survey.distances) == 12
+    assert not [d for d in search_outliers(survey, start).rejected if d.group == "tape"]
+    tapes = list(survey.distances)
+    tapes[3] = replace(tapes[3], value=tapes[3].value + 150.0 * tapes[3].sigma)
+    found = search_outliers(replace(survey, distances=tuple(tapes)), start)
+    assert [d.ids[0] for d in found.rejected if d.group == "tape"] == [tapes[3].distance_id]
+    assert "tape" in dict(found.widened)
+
+
+def test_image_points_stay_where_residuals_are_far_below_their_sigmas() -> None:
+    survey, truth = h.network(7, n_epochs=3, n_points=40, coordinates=2)
+    blocks = [replace(b, cov=100.0 * b.cov) for b in survey.image_blocks]
+    uv = blocks[0].uv.copy()
+    uv[3] += 7.0 * np.sqrt(blocks[0].cov[3, 0, 0]) * np.array([1.0, 0.0])
+    blocks[0] = replace(blocks[0], uv=uv)
+    options = AdjustOptions(reject_points=True)
+    timid = adjust(replace(survey, image_blocks=tuple(blocks)), h.start_at(truth), options)
+    assert timid.image_residuals.used.all()
+    assert timid.image_residuals.test[3] > limit(len(timid.image_residuals.test))
+    right = tuple(replace(b, cov=b.cov / 100.0) for b in blocks)
+    bold = adjust(replace(survey, image_blocks=right), h.start_at(truth), options)
+    assert np.flatnonzero(~bold.image_residuals.used).tolist() == [3]

@@ -7,14 +7,14 @@ from scipy.stats import chi2
 
 from adjust.adjustment import adjust
 from adjust.errors import IndeterminateError, SurveyError
-from adjust.model import Datum, PoseParameter, Station, Survey
+from adjust.model import Datum, FloatArray, PoseParameter, Station, Survey
 from adjust.observations import FrameRef, Pair
 from adjust.pose_network import NetworkOptions, pose_network, solve_network
 from adjust.pose_network.chordal import chordal_cost, minimize_chordal
 from adjust.pose_network.from_survey import network_adjustment, network_from_survey
 from adjust.pose_network.network import PoseNetwork, loop_marks
 from adjust.pose_network.precision import pair_jacobians
-from adjust.pose_network.robust import graduated_weights
+from adjust.pose_network.robust import _worst_around, graduated_weights
 from adjust.pose_network.solve import minimize
 from adjust.relay.motions import Motions
 from tests.adjust.pose_networks import exp6, simulate
@@ -191,7 +191,7 @@ def test_pairs_sorted_out_by_mistake_are_taken_back(monkeypatch: pytest.MonkeyPa
     sim = simulate(6, 5, seed=1, wrong=2, extra=25)
     first = graduated_weights(sim.network)
     first[[n for n in range(5, 15) if sim.network.pair_ids[n] not in sim.wrong]] = 0.0
-    monkeypatch.setattr("adjust.pose_network.robust.graduated_weights", lambda network: first)
+    monkeypatch.setattr("adjust.pose_network.robust.graduated_weights", lambda *_: first)
     solution = solve_network(sim.network, options=NetworkOptions(robust="on"))
     assert {r.pair_id for r in solution.rejected} == set(sim.wrong)
     assert solution.network.used.sum() == sim.network.n_pairs - 2
@@ -200,7 +200,7 @@ def test_pairs_sorted_out_by_mistake_are_taken_back(monkeypatch: pytest.MonkeyPa
 def test_wrong_pairs_that_passed_the_first_sorting_are_found_by_their_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     sim = simulate(6, 5, seed=1, wrong=2, extra=25)
     ones = np.ones(sim.network.n_pairs)
-    monkeypatch.setattr("adjust.pose_network.robust.graduated_weights", lambda network: ones)
+    monkeypatch.setattr("adjust.pose_network.robust.graduated_weights", lambda *_: ones)
     assert {r.pair_id for r in solve_network(sim.network).rejected} == set(sim.wrong)
 
 
@@ -211,6 +211,53 @@ def test_sigmas_that_are_too_small_throughout_make_no_pair_wrong() -> None:
     solution = solve_network(bold)
     assert not solution.rejected
     assert solution.sigma0 == pytest.approx(5.0, rel=0.2)
+
+
+def _with_sigmas(net: PoseNetwork, factor: float, **changes: FloatArray) -> PoseNetwork:
+    """The network with sigmas that are given ``factor`` times as large."""
+    return pose_network(net.station_ids, net.pair_ids, net.a_idx, net.b_idx, net.rotations,
+                        changes.get("translations", net.translations), net.cov * factor**2,
+                        held={0: np.eye(4)})  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sigmas_that_are_too_small_throughout_make_no_pair_of_a_few_wrong(seed: int) -> None:
+    net = simulate(3, 2, seed=seed, extra=9).network
+    assert net.n_pairs < 20
+    solution = solve_network(_with_sigmas(net, 0.2))
+    assert not solution.rejected
+    assert solution.sigma0 == pytest.approx(5.0, rel=0.4)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_wrong_pair_of_a_few_is_found_with_sigmas_right_and_too_small(seed: int) -> None:
+    sim = simulate(3, 2, seed=seed, extra=9, wrong=1)
+    for factor in (1.0, 0.2):
+        solution = solve_network(_with_sigmas(sim.network, factor))
+        assert {r.pair_id for r in solution.rejected} == set(sim.wrong)
+
+
+def test_nothing_is_rejected_where_residuals_are_far_smaller_than_their_sigmas() -> None:
+    net = simulate(6, 5, seed=4, extra=25).network
+    moved = net.translations.copy()
+    moved[60, 0] += 10.0 * np.sqrt(net.cov[60, 3, 3]) * 7.0
+    timid = _with_sigmas(net, 10.0, translations=moved)
+    solution = solve_network(timid)
+    assert solution.sigma0 < 0.5
+    assert solution.precision.pairs.test[60] > 30.0  # far beyond the limit of a single test
+    assert not solution.rejected
+    # the same pair with sigmas that are right
+    bold = solve_network(_with_sigmas(net, 1.0, translations=moved))
+    assert [r.pair_id for r in bold.rejected] == [net.pair_ids[60]]
+
+
+def test_pairs_that_hold_the_network_together_are_not_rejected() -> None:
+    net = simulate(4, 1, seed=0).network
+    ring = pose_network(net.station_ids, ["ab", "bc", "cd", "da"], [1, 2, 3, 0], [0, 1, 2, 3],
+                        np.tile(np.eye(3), (4, 1, 1)), np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0], [1, 0, 0]]),
+                        np.tile(np.eye(6) * 1e-6, (4, 1, 1)), held={0: np.eye(4)})  # fmt: skip
+    out = _worst_around(ring, np.array([5.0, 2.0, 4.0, 3.0]))  # ab and cd share no station, but both close the ring
+    assert out.tolist() == [True, False, False, False]
 
 
 def test_wrong_turns_are_found_among_rotations() -> None:

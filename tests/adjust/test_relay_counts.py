@@ -106,8 +106,8 @@ def test_grid_of_4900_loops_has_its_faces_as_basis_in_seconds():
     top = grid(71, 71)
     start = time.perf_counter()
     basis = loop_basis(top)
-    # 0.1 s and the time to compile
-    assert time.perf_counter() - start < 60.0
+    # 0.1 s measured alone
+    assert time.perf_counter() - start < 20.0
     assert basis.minimal
     assert (len(basis), basis.lengths.max()) == (4900, 4)
 
@@ -146,7 +146,6 @@ def test_hundred_thousand_stations_take_about_a_second():
     rows = [(f"t{i}", str(i), str(int(rng.integers(0, i)))) for i in range(1, n)]
     rows += [(f"c{i}", str(i), str((i * 7919 + 13) % n)) for i in range(0, n, 2)]
     top = topology(rows)
-    count(complete(4))  # compiled
     start = time.perf_counter()
     counts = count(top)
     # 0.5 s measured alone

@@ -17,6 +17,7 @@ from adjust.named_precision import NamedPrecision
 from adjust.observations import FrameRef, Pair
 from adjust.pair_screen import adjust_with_pairs
 from adjust.result import Adjustment
+from adjust.statistics.condensed import condensed_system
 from adjust.statistics.criteria import criteria, noncentrality, sidak
 from adjust.statistics.influence import shifts
 from adjust.statistics.relative_precision import relative_precision
@@ -72,9 +73,31 @@ def test_the_whole_reliability_against_one_dense_matrix(case: Callable[[], tuple
     mine = system.normal.covariance(system.datum)
     assert h.relative(mine, Q[np.ix_(columns, columns)]) < 1e-6
     np.testing.assert_allclose(system.sigmas, np.sqrt(np.diag(mine)), rtol=1e-6)
-    found = reliability(adjustment, most_influences=10**6, system=system)
+    found = reliability(adjustment, most_influences=10**6)
     check_tests(adjustment, full, Q, found)
     check_influences(adjustment, full, Q, found, columns, system.columns.names)
+
+
+@pytest.mark.parametrize("case", [known_targets, bundle, free_network, table])
+def test_the_condensed_system_is_the_same_system(case: Callable[[], tuple[Survey, StartValues]]) -> None:
+    adjustment, _, _ = both(*case())
+    full = linear_system(adjustment)
+    condensed = condensed_system(full.precision)
+    small = condensed.system
+    for a, b in ((full, small), (small, full)):
+        assert a.columns.names == b.columns.names
+    A, B = full.A[full.used[full.row_of]], small.A[small.used[small.row_of]]
+    scale = 1.0 / np.sqrt((A.T @ A).diagonal())
+    np.testing.assert_allclose((B.T @ B).toarray() * np.outer(scale, scale),
+                               (A.T @ A).toarray() * np.outer(scale, scale), atol=1e-9)  # fmt: skip
+    e, f = full.e[full.used[full.row_of]], small.e[small.used[small.row_of]]
+    assert float(f @ f) == pytest.approx(float(e @ e), rel=1e-9)
+    np.testing.assert_allclose(scale * (B.T @ f), scale * (A.T @ e), atol=1e-7)
+    for row in np.flatnonzero(full.used[: full.n_image])[::7].tolist():
+        columns, rows = condensed.point_rows(row)
+        whole = np.zeros((2, A.shape[1]))
+        whole[:, columns] = rows
+        np.testing.assert_allclose(whole * scale, full.A[2 * row : 2 * row + 2].toarray() * scale, atol=1e-9)
 
 
 def check_tests(adjustment: Adjustment, full: h.Dense, Q: FloatArray, found) -> None:  # type: ignore[no-untyped-def]
@@ -203,7 +226,7 @@ def test_a_bias_moves_the_unknowns_as_predicted() -> None:
     system = linear_system(adjustment)
     row = system.n_image + 1
     d = survey.distances[1]
-    moved = shifts(system, [row], {row: np.array([0.1])})[:, 0]
+    moved = shifts(condensed_system(system.precision), [row], {row: np.array([0.1])})[:, 0]
     wrong = (survey.distances[0], replace(d, value=d.value + 0.1 * d.sigma))
     after, _, _ = both(replace(survey, distances=wrong), start)
     for point in ("P9", "P8"):

@@ -230,12 +230,14 @@ def test_a_tilted_scanner_on_a_station() -> None:
         survey = measured(survey, truth, 6)
         # its own zero direction is the station's axis: the orientation would only repeat the turn about its z axis
         station = Station("scanner", world_from_station=PoseParameter(pose.compose(Pose3.Expmap(0.01 * np.ones(6)))))
-        angles = replace(survey, stations=(station,))
         start = StartValues({}, {("world_from_station", "scanner"): station.world_from_station.value}, {})
-        with pytest.raises(SurveyError, match="undetermined"):
-            adjust(angles, start)
-        held = replace(angles, stations=(Station("scanner", world_from_station=PoseParameter(pose, held=("rz",))),))
+        free = adjust(replace(survey, stations=(station,)), start)
+        assert free.estimates["orientation", "S0"].status == ("held",)
+        held = replace(survey, stations=(Station("scanner", world_from_station=PoseParameter(pose, held=("rz",))),))
         result = adjust(held, start)
+        assert result.estimates["orientation", "S0"].status == ("free",)
+        assert (free.n_unknowns, free.redundancy) == (result.n_unknowns, result.redundancy)
+        assert free.sigma0 == pytest.approx(result.sigma0, rel=1e-9)
         found = result.estimates["world_from_station", "scanner"]
         off = Pose3.Logmap(pose.between(found.value))
         kept = [0, 1, 3, 4, 5]

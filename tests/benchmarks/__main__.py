@@ -19,7 +19,7 @@ CASES: dict[str, Callable[[Session], None]] = {
     "graphs": sections_networks.published_graphs, "additions": sections_networks.additions,
     "large": sections_networks.large_networks, "readings": sections_networks.readings,
     "trials": sections_networks.simulations, "targets": sections_other.targets, "start": sections_other.start_up,
-    "stages": sections_other.stages,
+    "stages": sections_other.stages, "script": sections_other.script,
 }  # fmt: skip
 PACKAGES = ("gtsam", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "pycolmap")
 
@@ -36,7 +36,8 @@ def main() -> int:
     options = parser.parse_args()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     session = Session(options)
-    session.say("# Benchmarks", "", f"Measured by `{_command()}`.", "", _machine(options.threads))
+    measured = f"Measured on {time.strftime('%d %B %Y')} by `{_command()}`."
+    session.say("# Benchmarks", "", measured, "", _machine(options.threads))
     session.top = len(session.text)
     for name in options.only:
         begin = time.perf_counter()

@@ -56,21 +56,36 @@ class Session:
             plots.write(self.doc.parent / "pictures", name, plots.loglog(lines, title, x_label, y_label))
             self.say("", f"![{title}](pictures/benchmark-{name}.svg)")
 
-    def claim(self, what: str, measured: float, wanted: float, unit: str = "", least: bool = False) -> None:
-        """One line of the summary: the measured number is to be at most (or at least) the wanted one."""
+    def claim(
+        self, what: str, measured: float, wanted: float, unit: str = "", least: bool = False, starts: str = ""
+    ) -> None:
+        """One line of the summary: the measured number is to be at most (or at least) the wanted one.
+
+        starts: what starts from what, where somebody else is compared.
+        """
         if measured != measured:
             met = "not measured"
         else:
             met = "yes" if (measured >= wanted if least else measured <= wanted) else "no"
         bound = f"{'at least' if least else 'at most'} {wanted:g} {unit}".strip()
-        self.claims.append((what, f"{measured:.3g} {unit}".strip(), bound, met))
+        self.claims.append((what, f"{measured:.3g} {unit}".strip(), bound, met, starts))
+
+    def compare(self, what: str, ratio: float, starts: str, said: str = "") -> None:
+        """One line of the summary without a bound: how many times as long as ours the other takes, whoever wins."""
+        who = said or ("the other is faster" if ratio < 1.0 else "ours is faster")
+        self.claims.append((what, f"{ratio:.3g}", "", "not measured" if ratio != ratio else who, starts))
 
     def summary(self) -> list[str]:
         """The claims as a table."""
         if not self.claims:
             return []
-        how = "Times are those that passed, ratios those of processor time, which a busy machine disturbs least."
-        return ["", "## In short", "", how, "", tables.table(("", "measured", "wanted", "met"), self.claims)]
+        how = (
+            "Times are those that passed, ratios those of processor time, which a busy machine disturbs least. Ratios "
+            "are how many times as long as ours the other takes: below 1 the other is faster. Rows without a wanted "
+            "number are there because of who wins, or to show what a faster row leaves out."
+        )
+        head = ("", "measured", "wanted", "met", "starts from")
+        return ["", "## In short", "", how, "", tables.table(head, self.claims)]
 
     def write(self, path: Path | None) -> None:
         """All measurements as JSON, and the document."""

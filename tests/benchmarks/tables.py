@@ -97,7 +97,7 @@ def stages(found: Sequence[Measured]) -> str:
     return table(("case", "", *names), rows)
 
 
-def against(found: dict[str, Measured], ours: str, others: Sequence[str]) -> str:
-    """One sentence: how many times as long as ours the others take, run by run."""
+def against(found: dict[str, Measured], ours: str, others: Sequence[str], what: str) -> str:
+    """One sentence: how many times as long as ours (which is ``what``) the others take, run by run."""
     parts = [f"{name} {ratio(found[name], found[ours])}" for name in others if name in found and found[name].seconds]
-    return f"“{ours}” (build, solve, precision) against: {'; '.join(parts)} times its time."
+    return f"“{ours}” ({what}) against: {'; '.join(parts)} times its time."

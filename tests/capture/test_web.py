@@ -3,6 +3,7 @@
 import http.client
 import json
 import socket
+import struct
 import threading
 from contextlib import contextmanager
 
@@ -14,6 +15,7 @@ from adjust.errors import SurveyError
 from capture.cli import main
 from capture.plan import read_plan
 from capture.session_run import run_plan
+from capture.simulated import controller
 from capture.web.serve import PageServer, loopback_address
 from capture.web.state import FolderView, LiveView, Shown, png_with_overlay
 from tests.capture.session_runs import write_plan
@@ -117,8 +119,12 @@ def test_no_other_file_is_served(tmp_path, path):
     [
         {"Host": "evil.example"},
         {"Host": "evil.example:80"},
-        {"Host": "127.0.0.1"},
         {"Host": ""},
+        {"Host": "127.0.0.1.evil.example"},
+        {"Host": "[::1"},
+        {"Host": "127.0.0.1@evil.example"},
+        {"Host": "192.168.1.7"},
+        {"Origin": "http://127.0.0.1:1"},
         {"Origin": "http://evil.example"},
         {"Origin": "null"},
     ],
@@ -129,6 +135,56 @@ def test_other_sites_are_kept_out(tmp_path, headers):
         for path in ("/", "/status.json", "/image/X.png"):
             assert ask(server, "GET", path, headers)[0] == 403
         assert ask(server, "POST", "/stop", headers, {})[0] == 403
+
+
+@pytest.mark.parametrize("host", ["localhost:9000", "127.0.0.1", "127.0.0.1:8780", "[::1]:22"])
+def test_page_answers_through_a_forwarded_port(tmp_path, host):
+    """The browser knows the port at its own end; an origin must still be the page itself."""
+    with served(FolderView(read_plan(write_plan(tmp_path)))) as server:
+        assert ask(server, "GET", "/status.json", {"Host": host})[0] == 200
+        assert ask(server, "GET", "/status.json", {"Host": host, "Origin": f"http://{host}"})[0] == 200
+        assert ask(server, "GET", "/status.json", {"Host": host, "Origin": "http://localhost:1"})[0] == 403
+
+
+def test_head_is_answered_without_a_body(tmp_path):
+    with served(FolderView(read_plan(write_plan(tmp_path)))) as server:
+        status, body, headers = ask(server, "HEAD", "/")
+        assert (status, body) == (200, b"")
+        assert int(headers["Content-Length"]) == len(ask(server, "GET", "/")[1])
+        assert ask(server, "HEAD", "/image/X.png")[0] == 404
+        assert ask(server, "HEAD", "/", {"Host": "evil.example"})[0] == 403
+
+
+def test_client_that_leaves_is_no_traceback(tmp_path, capsys):
+    with served(FolderView(read_plan(write_plan(tmp_path)))) as server:
+        for sent in (b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"GET /app.js HTTP/1.1\r\nHost: localhost\r\n\r\n"):
+            for _ in range(20):
+                with socket.create_connection(server.server_address[:2]) as client:
+                    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # leaves by a reset
+                    client.sendall(sent)
+        assert ask(server, "GET", "/")[0] == 200
+        try:
+            raise ValueError("a bug")
+        except ValueError:
+            server.handle_error(None, ("127.0.0.1", 1))
+    said = capsys.readouterr().err
+    assert "a bug" in said  # what is not about the client is still shown
+    assert "Connection" not in said
+    assert "Broken pipe" not in said
+
+
+def test_port_in_use_and_wrong_ports_are_one_line(tmp_path, capsys):
+    plan = str(write_plan(tmp_path))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert main(["view", plan, "--port", port]) == 1
+        assert controller.main(["--port", port]) == 1
+    for line in capsys.readouterr().err.splitlines():
+        assert f"port {port} cannot be used" in line
+    for wrong in ("70000", "-1", "x"):
+        with pytest.raises(SystemExit) as stop:
+            controller.main([f"--port={wrong}"])
+        assert stop.value.code == 2
 
 
 def test_nothing_moves_without_flag_and_token(tmp_path):

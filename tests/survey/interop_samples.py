@@ -6,7 +6,7 @@ GKF = """<?xml version="1.0" ?>
 <description>
 A small net &amp; more
 </description>
-<parameters sigma-apr="2" conf-pr="0.99" tol-abs="1000" sigma-act="apriori" />
+<parameters sigma-apr="2" conf-pr="0.99" tol-abs="1e6" sigma-act="apriori" />
 <points-observations distance-stdev="1.0 2.0 1" direction-stdev="5" zenith-angle-stdev="7" angle-stdev="6">
 <point id="A" x="0" y="0" z="10" fix="xyz" />
 <point id="B" x="100" y="0" z="12" adj="xyz" />

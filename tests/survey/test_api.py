@@ -75,6 +75,7 @@ def test_the_api_gives_what_the_command_line_writes(solution: survey.Solution, f
     ours, theirs = (json.loads((f / "results" / "solution.json").read_text()) for f in (tmp_path, folder))
     ours["inputs"].pop("date")
     theirs["inputs"].pop("date")
+    assert (ours["inputs"].pop("command"), theirs["inputs"].pop("command")) == ("", f"labsurvey adjust {folder.name}")
     assert ours == theirs
     for name in ("residuals.csv", "residuals_other.csv", "covariance.npz"):
         assert paths[name].read_bytes() == (folder / "results" / name).read_bytes()

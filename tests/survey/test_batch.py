@@ -33,6 +33,7 @@ from survey.batch.trends import all_series, trends_of
 from survey.batch.worker import Worker, WorkerDiedError
 from survey.report.german import GERMAN
 from tests.survey.epochs import write_epochs
+from tests.survey.test_report_browser import CONTRAST, seen
 
 DRIFT_PX = 5.0
 N = 7
@@ -372,3 +373,17 @@ def test_no_scheduler_is_said_at_once(nights: list[Path], monkeypatch: pytest.Mo
     monkeypatch.setattr("survey.batch.cluster._WAIT_SECONDS", 1)
     with pytest.raises(SurveyError, match="no Dask scheduler at 'nonsense://x'"):
         run_batch(nights[:1], BatchOptions(scheduler="nonsense://x", fresh=True, progress=False))
+
+
+@pytest.mark.parametrize(("width", "dark"), [(390, False), (1280, True)])
+def test_reasons_are_on_the_screen(records: tuple[Record, ...], tmp_path: Path, width: int, dark: bool) -> None:
+    """Also on a phone; every word can be read on a dark screen too."""
+    page = write_overview(tmp_path / "o", records, trends_of(records))["overview.html"].read_text(encoding="utf-8")
+    measure = """[document.documentElement.scrollWidth,
+      Math.max(...[...document.querySelectorAll("#failures .words, #folders .words")]
+        .map((e) => e.getBoundingClientRect().right))]"""
+    page_width, reasons = seen(page, measure, tmp_path, width, dark)
+    assert page_width <= width
+    assert reasons <= width
+    ratio, words = seen(page, CONTRAST, tmp_path, width, dark)
+    assert ratio >= 4.5, words

@@ -65,7 +65,12 @@ def test_rotations_leave_the_displacement_empty(tmp_path, capsys):
     assert found["deformations"][0]["displacement_mm"] == [None] * 3
     assert found["deformations"][0]["test_displacement"] == {"chi_square": None, "freedom": 0, "p": None}
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--quiet"]) == 0
-    assert "      -      -      -" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "      -      -      -" in text
+    assert "0.000" not in text
+    assert "rotations alone were measured: they are compared, displacements are not known" in text
+    assert all(m["displacement_mm"] == [None] * 3 for m in found["congruence"]["motions"])
+    assert all(m["sigma_rotation_arcsec"][0] > 1.0 for m in found["congruence"]["motions"])
 
 
 def test_errors_say_which_folder(epochs, tmp_path, capsys):

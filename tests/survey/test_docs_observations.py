@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from survey import files
-from survey.files.bodies import SURFACE_UNITS
-from survey.files.instruments import _KEYS, INSTRUMENT_UNITS
+from survey.files.declarations import INSTRUMENT_UNITS, SURFACE_UNITS, keys_of
 from survey.files.reading import LAYOUTS
 from survey.files.vectors import vector_keys
 
@@ -51,7 +50,7 @@ def test_every_column_and_key_is_named() -> None:
     assert missing == set()
     keys = {k for units in (INSTRUMENT_UNITS, *SURFACE_UNITS.values()) for k in vector_keys(units)}
     assert {k for k in keys if k not in text} == set()
-    assert {k for k in _KEYS if k.rsplit("_", 1)[0] not in text} == set()
+    assert {k for k in keys_of("instrument") if k.rsplit("_", 1)[0] not in text} == set()
     for name in LAYOUTS:
         if name in NEW:
             assert name in text

@@ -222,9 +222,10 @@ def test_what_only_programs_write(tmp_path: Path) -> None:
         pairs=(Pair("a", FrameRef("world"), FrameRef("station", "S", "e2"), pose, cov(6), "laser", False),),
         coordinates=tuple(
             Coordinates(
-                (PositionRef("P"), PositionRef(None, FrameRef("camera", "C", "e2"))), rng.normal(size=(2, 3)), cov(6)
+                (PositionRef("P"), PositionRef(None, FrameRef("camera", "C", "e2"))), rng.normal(size=(2, 3)), cov(6),
+                set_id=f"set{i}",
             )
-            for _ in range(2)
+            for i in (1, 2)
         ),
     )  # fmt: skip
     files.write_project(tmp_path, survey)

@@ -6,7 +6,11 @@ import pytest
 
 from adjust.errors import SurveyError
 from adjust.pose_network import NetworkOptions, solve_network
-from survey.interop.g2o import read_g2o, write_g2o
+from survey.cli import main
+from survey.converting import convert_job
+from survey.files import read
+from survey.interop.g2o import read_g2o, read_g2o_file, write_g2o
+from survey.jobs import adjust_project
 from tests.adjust.pose_networks import simulate
 from tests.data import data_folder
 
@@ -68,6 +72,54 @@ def test_damage_is_named(tmp_path: Path, line: str, message: str) -> None:
     path.write_text("\n".join([VERTEX.format(0), VERTEX.format(1), line]) + "\n")
     with pytest.raises(SurveyError, match=message):
         read_g2o(path)
+
+
+INDEFINITE = "EDGE_SE3:QUAT {} {} 1 2 3 0 0 0 1 " + " ".join(
+    ["4 0 0 0 0 8", "4 0 0 0 0", "4 0 0 0", "9 0 0", "9 0", "9"]  # 4 * 9 < 8 * 8 between x and the turn about z
+)
+
+
+def _partly_indefinite(path: Path) -> Path:
+    lines = [*map(VERTEX.format, range(4)), EDGE, INDEFINITE.format(1, 2), INDEFINITE.format(2, 3)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_indefinite_information_is_counted_and_named_with_its_lines(tmp_path: Path) -> None:
+    with pytest.raises(SurveyError, match="line 6: the information matrix of edge 1 2") as caught:
+        read_g2o(_partly_indefinite(tmp_path / "n.g2o"))
+    assert "of 3 these 2 are not: 1 2 (line 6), 2 3 (line 7); " in str(caught.value)
+    assert "--block-diagonal" in str(caught.value)
+
+
+def test_blocks_alone_are_read_where_that_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = _partly_indefinite(tmp_path / "n.g2o")
+    found = read_g2o_file(path, block_diagonal=True)
+    assert np.diag(found.network.cov[1]) == pytest.approx([1 / 9] * 3 + [1 / 4] * 3)
+    assert np.count_nonzero(found.network.cov[1]) == 6
+    assert "dropped (block-diagonal reading); as a whole 2 of the matrices are not" in found.notes[0]
+    assert main(["convert", str(path), str(tmp_path / "p"), "--block-diagonal"]) == 0
+    assert "2 of 3 edges was dropped" in capsys.readouterr().out
+    # blocks that are indefinite themselves cannot be helped
+    path.write_text(path.read_text().replace("9 0 0 9 0 9", "9 0 0 9 0 -9"))
+    with pytest.raises(SurveyError, match=r"line 6: .* not positive definite.*; correct the file"):
+        read_g2o(path, block_diagonal=True)
+
+
+def test_a_converted_network_gives_the_minimum_of_all_its_pairs(tmp_path: Path) -> None:
+    sim = simulate(4, 3, seed=5, extra=8, wrong=2)
+    plain = solve_network(sim.network, options=NetworkOptions(robust="off"))
+    write_g2o(tmp_path / "n.g2o", sim.network, plain.rotations, plain.translations)
+    convert_job(tmp_path / "n.g2o", tmp_path / "n")
+    kept = adjust_project(read(tmp_path / "n"), progress=False)
+    assert all(o.used for o in kept.other_residuals)
+    assert kept.omega == pytest.approx(plain.omega, rel=1e-8)
+    # its owner may let the program look for wrong pairs
+    toml = tmp_path / "n" / "survey.toml"
+    assert "reject_pairs = false" in toml.read_text()
+    toml.write_text(toml.read_text().replace("reject_pairs = false", "reject_pairs = true"))
+    cleaned = adjust_project(read(tmp_path / "n"), progress=False)
+    assert sum(not o.used for o in cleaned.other_residuals) == len(sim.wrong) == 2
 
 
 def test_rotations_alone_cannot_be_written(tmp_path: Path) -> None:

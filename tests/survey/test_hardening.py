@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +21,14 @@ from survey.commands.common import message
 from survey.detection.gray import read_image
 from survey.detection.image_header import image_size
 from survey.files.node import read_toml
-from survey.files.tables import Layout, read_table
-from survey.files.text import id_problem, natural_key, read_bytes
+from survey.files.table_writing import write_table
+from survey.files.tables import Layout, group_names, read_table
+from survey.files.text import cell_text, id_problem, natural_key, read_bytes
 from survey.jobs import adjust_job
 from survey.previous import read_previous
 from survey.replacing import recover
+from survey.residual_tables import other_residuals_csv
+from tests.adjust.test_deformation import adjusted, chain, measured
 from tests.fuzz.replaced import unfinished_project
 from tests.fuzz.small import small_project
 
@@ -144,10 +148,36 @@ def test_a_billion_equal_rows_of_parquet(tmp_path: Path) -> None:
     ("name", "said"),
     [("CON", "Windows has no files"), ("nul.txt", "Windows has no files"), ("a.", "Windows has no files"),
      ("..", "cannot be an id"), ("a/b", "cannot be an id"), ("a\x00", "cannot be an id"), ("x" * 121, "at most 120"),
-     ("\u202eevil", "cannot be an id"), ("ö" * 61, "at most 120")],
+     ("\u202eevil", "cannot be an id"), ("ö" * 61, "at most 120"), ("=1+1", "for a formula"), ("+A1", "for a formula"),
+     ("-1", "for a formula"), ("@SUM(A1)", "cannot be an id")],
 )  # fmt: skip
 def test_ids_that_are_no_names_of_files(name: str, said: str) -> None:
     assert said in str(id_problem(name))
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+A1", "-A1", "@SUM(A1)", "\t=1", "\r=1"])
+def test_no_cell_of_a_table_is_taken_for_a_formula(tmp_path: Path, text: str) -> None:
+    """Refused where a table is read again, shown with an apostrophe where it is not; in projects made in Python too."""
+    assert cell_text(text) == f"'{text}"
+    assert [cell_text(x) for x in ("", "A1", "a=b", "1-2")] == ["", "A1", "a=b", "1-2"]
+    with pytest.raises(SurveyError, match=r"distances: group: .*takes? what begins with"):
+        write_table(tmp_path, "distances", {"group": ["ok", text], "value_m": np.array([-1.0, 2.0])})
+    assert list(tmp_path.iterdir()) == []
+    if text[0] in "\t\r":  # no cell that is read begins with these
+        return
+    path = tmp_path / "distances.csv"
+    path.write_text(f'a_id,value_m,group\nA,1.0,image\nA,2.0,"{text}"\n', encoding="utf-8", newline="")
+    table = read_table(path, Layout("distances", ("a_id",), ("value_m",), ("group",)))
+    with pytest.raises(SurveyError, match=r"distances.csv:3: group: .* cannot be a name"):
+        group_names(table, "distance")
+
+
+def test_residuals_of_evil_names_are_shown_as_text() -> None:
+    survey = measured(chain(), np.random.default_rng(1))
+    evil = replace(survey, pairs=(replace(survey.pairs[0], pair_id="=1+1", group="@x"), *survey.pairs[1:]))
+    lines = other_residuals_csv(adjusted(evil)).decode().splitlines()
+    cells = next(line.split(",") for line in lines if "=1+1" in line)
+    assert cells[1:3] == ["'@x", "'=1+1 station:S0 station:S1"]
 
 
 def test_ids_of_every_language_are_fine() -> None:

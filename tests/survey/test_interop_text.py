@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from adjust.errors import SurveyError
+from survey.cli import main
+from survey.files import read
 from survey.interop.krumm import read_krumm
 from survey.interop.lgc import read_lgc
 from survey.interop.plain_csv import read_plain_csv
@@ -55,7 +57,7 @@ def test_krumm_dynamic_datum_is_observed_coordinates(tmp_path):
         ("300°00'30.5\"", "300.5", "line 20: found '300.5' where an angle like"),
         ("0.5 cm", "0.5 furlong", "line 12: the unit 'furlong' is not known"),
         ("100.001 0.002", "100.001", "line 14: has no deviation"),
-        ("68°15'20.7\"", "68°75'20.7\"", "line 22: angle: minutes and seconds are below 60"),
+        ("68°15'20.7\"", "68°75'20.7\"", "line 22: angle: minutes and seconds are at most 60"),
         ("B M A 30", "B Q A 30", "line 24: points without coordinates: Q"),
     ],
 )
@@ -119,3 +121,19 @@ def test_plain_table(tmp_path):
 def test_bad_tables_are_named_with_their_line(tmp_path, old, new, message):
     with pytest.raises(SurveyError, match=message):
         read_plain_csv(_file(tmp_path, CSV.replace(old, new, 1), "net.csv"))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_text_in_latin_1_is_read_and_said(tmp_path, capsys, encoding):
+    """Degree signs and umlauts of an older editor; a project is UTF-8 in any case."""
+    path = tmp_path / "net.dat"
+    text = KRUMM.replace("Small", "Höhe über Zürich").replace("′", "'").replace("″", '"')
+    path.write_bytes(text.encode(encoding))
+    assert main(["convert", str(path), str(tmp_path / "net")]) == 0
+    assert ("not UTF-8" in capsys.readouterr().out) == (encoding == "latin-1")
+    project = read(tmp_path / "net")
+    assert project.title == "Höhe über Zürich"
+    assert project.options.sigmas == "a_posteriori"
+    path.write_bytes(text.encode("utf-16"))
+    assert main(["convert", str(path), str(tmp_path / "again")]) == 1
+    assert "save it as UTF-8" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -156,9 +157,7 @@ def test_calibration_is_used_again_until_something_changes(folder, capsys):
     for a, b in zip(first.trajectory.epochs, again.trajectory.epochs, strict=True):
         np.testing.assert_array_equal(a.cov, b.cov)
     assert "has not changed" in again.text()
-    # fewer navigated epochs: the others calibrate too
     fewer = NavigateRequest(epochs=tuple(e.epoch_id for e in first.trajectory.epochs[:3]))
-    assert not navigate_job(folder, fewer, progress=False).calibration.reused
     readings = folder / "observations/table_angles.csv"
     text = readings.read_text().splitlines()
     header, row = text[0].split(","), text[1].split(",")
@@ -166,6 +165,29 @@ def test_calibration_is_used_again_until_something_changes(folder, capsys):
     row[k] = repr(float(row[k]) + 1e-4)
     readings.write_text("\n".join([text[0], ",".join(row), *text[2:]]) + "\n")
     assert not navigate_job(folder, fewer, progress=False).calibration.reused
+
+
+def test_epochs_that_were_not_asked_for_take_no_part(folder):
+    """One epoch alone has the calibration, and the pose, that it has among all."""
+    every = navigate_job(folder, progress=False)
+    for epoch in every.trajectory.epochs[:2]:
+        alone = navigate_job(folder, NavigateRequest(epochs=(epoch.epoch_id,)), progress=False)
+        assert alone.calibration.reused
+        assert "not asked for" not in alone.text()
+        np.testing.assert_array_equal(alone.trajectory.epochs[0].world_from_station.matrix(),
+                                      epoch.world_from_station.matrix())  # fmt: skip
+
+
+def test_epochs_that_calibrate_all_the_same_are_named(lab, tmp_path):
+    """A camera that shows no target has its place on the head from beacons alone."""
+    survey, truth = lab
+    cameras = tuple(
+        replace(c, lens=replace(c.lens, values=truth["lens", c.camera_id], free=())) for c in survey.cameras
+    )
+    blocks = tuple(b for b in survey.image_blocks if b.target_id is None or b.camera_id != "Y")
+    write_project(tmp_path / "lab", replace(survey, cameras=cameras, image_blocks=blocks))
+    outcome = navigate_job(tmp_path / "lab", NavigateRequest(epochs=("n01",)), progress=False)
+    assert "epochs that were not asked for (n02, n03" in outcome.text()
 
 
 def test_damaged_calibration_is_made_anew(folder):

@@ -10,12 +10,13 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.adjustment import AdjustOptions, adjust
-from adjust.errors import SurveyError
+from adjust.errors import IndeterminateError, SurveyError
 from adjust.model import Datum, Point, PointParameter, PoseParameter, Station, Survey
 from adjust.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
 from adjust.pair_screen import PairOptions, adjust_with_pairs, is_pure
+from survey import problem, solve
 from survey.cli import main
-from survey.files import write_project
+from survey.files import read, write_project
 from survey.merging import merge
 from survey.network_summary import loops_dict, network_dict, pair_loops, pair_network
 from survey.quantities import ARCSEC_PER_RAD, scale_of
@@ -188,13 +189,76 @@ def test_a_wrong_pair_in_a_survey_with_other_observations_is_left_out():
 
 def test_sigmas_too_small_throughout_reject_no_pair():
     survey, _ = _network(12, combinations(range(12), 2), 5.0)
-    point = Point("B", PointParameter())
-    seen = Coordinates((PositionRef("B"),), np.zeros((1, 3)), np.eye(3) * 1e-6)
-    mixed = replace(survey, points=(point,), coordinates=(seen,))
-    for each in (survey, mixed):
+    for each in (survey, _mixed(survey)):
         result = adjust_with_pairs(each)
         assert all(p.used for p in result.survey.pairs)
         assert result.sigma0 == pytest.approx(5.0, rel=0.15)
+
+
+def _mixed(survey):
+    """With a point that is measured for itself, so that it is no pose network."""
+    seen = Coordinates((PositionRef("B"),), np.zeros((1, 3)), np.eye(3) * 1e-6)
+    return replace(survey, points=(Point("B", PointParameter()),), coordinates=(seen,))
+
+
+def test_sigmas_too_large_throughout_reject_no_pair():
+    """One pair at seven sigmas among residuals of a tenth: together they are far below what the sigmas say."""
+    survey, _ = _network(12, combinations(range(12), 2), 0.1)
+    off = Pose3(Rot3(), np.array([7e-3, 0.0, 0.0]))
+    pairs = (replace(survey.pairs[30], b_from_a=survey.pairs[30].b_from_a.compose(off)),)
+    survey = replace(survey, pairs=survey.pairs[:30] + pairs + survey.pairs[31:])
+    for each in (survey, _mixed(survey)):
+        result = adjust_with_pairs(each)
+        assert all(p.used for p in result.survey.pairs)
+        assert result.sigma0 < 0.5
+        assert max(o.test for o in result.other_residuals if o.kind == "pair") > 38.0  # the limit of a single pair
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sigmas_too_small_throughout_reject_no_pair_of_a_few(seed):
+    survey, _ = _network(6, combinations(range(6), 2), 5.0, seed=seed)
+    for each in (survey, _mixed(survey)):
+        assert all(p.used for p in adjust_with_pairs(each).survey.pairs)
+    wrong = survey.pairs[4].b_from_a.compose(Pose3(Rot3.Rz(0.02), np.array([0.1, 0.0, 0.0])))
+    pairs = survey.pairs[:4] + (replace(survey.pairs[4], b_from_a=wrong),) + survey.pairs[5:]
+    for each in (replace(survey, pairs=pairs), _mixed(replace(survey, pairs=pairs))):
+        assert [p.pair_id for p in adjust_with_pairs(each).survey.pairs if not p.used] == [survey.pairs[4].pair_id]
+
+
+def test_a_pair_without_which_there_is_no_solution_stays(monkeypatch):
+    survey, _ = _network(6, combinations(range(6), 2), 1.0)
+    wrong = survey.pairs[4].b_from_a.compose(Pose3(Rot3.Rz(0.02), np.array([0.1, 0.0, 0.0])))
+    survey = _mixed(replace(survey, pairs=survey.pairs[:4] + (replace(survey.pairs[4], b_from_a=wrong),)
+                            + survey.pairs[5:]))  # fmt: skip
+    name = survey.pairs[4].pair_id
+
+    def fragile(given, *arguments):
+        if any(p.pair_id == name and not p.used for p in given.pairs):
+            raise IndeterminateError("2 directions are undetermined", ("S1",))
+        return adjust(given, *arguments)
+
+    monkeypatch.setattr("adjust.pair_screen.adjust", fragile)
+    result = adjust_with_pairs(survey)
+    assert next(p for p in result.survey.pairs if p.pair_id == name).used
+    assert [w for w in result.warnings if w.startswith(f"fails its test, but cannot be left out: pair {name}")]
+
+
+def test_covariances_of_two_stations_of_a_network_of_rotations(tmp_path):
+    made, _ = _network(5, combinations(range(5), 2), 1.0, rotations=True)
+    write_project(tmp_path / "lab", made)
+    solution = solve(problem(read(tmp_path / "lab")))
+    cov = solution.covariance("S2", "S4", sigmas="a_priori")
+    assert cov.labels[3:] == tuple(f"world_from_station/S4/{c}" for c in ("rx", "ry", "rz"))
+    estimates = solution.adjustment.estimates
+    for at, name in ((0, "S2"), (3, "S4")):
+        own = estimates["world_from_station", name].cov[:3, :3]
+        np.testing.assert_allclose(cov.matrix[at : at + 3, at : at + 3], own, rtol=1e-9)
+    # both hang on the held S0 by independent and by common pairs: in rotations of one frame a third of S2 is S4's
+    a, b = (estimates["world_from_station", n].value.rotation().matrix() for n in ("S2", "S4"))
+    np.testing.assert_allclose(a @ cov.matrix[:3, 3:] @ b.T, 0.5 * a @ cov.matrix[:3, :3] @ a.T, rtol=0.02, atol=1e-11)
+    shown = solution.precision.correlations
+    assert shown is not None
+    assert len(shown.labels) == len(shown.matrix)
 
 
 def test_networks_of_rotations_go_through_the_command(tmp_path, capsys):

@@ -11,6 +11,7 @@ from adjust.errors import IndeterminateError, SurveyError
 from adjust.model import Point, PoseParameter, Station, Survey
 from adjust.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
 from survey.cli import main
+from survey.excluding import include_job
 from survey.files import read, write_project
 from survey.jobs import adjust_job
 from survey.removing import remove_job
@@ -49,7 +50,7 @@ def test_without_a_pair_is_as_if_it_had_not_been_measured(lab, tmp_path, capsys)
     wanted = adjust_job(tmp_path / "less", progress=False).adjustment
     assert main(["remove", str(lab), "p0-2", "--json", "--quiet"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert said["removed"] == {"pairs": ["p0-2"]}
+    assert said["removed"] == ["pairs:p0-2"]
     assert (said["redundancy_before"], said["redundancy_after"]) == (12, 6)
     assert {m["name"] for m in said["moved"]} == {"S1", "S2", "S3", "S4"}
     assert not (lab / ".adding").exists()
@@ -70,15 +71,14 @@ def test_moves_are_counted_in_the_sigmas_of_before(lab):
         assert move.mm == pytest.approx(np.linalg.norm(now - was), rel=1e-6, abs=1e-9)
         assert move.sigmas > 0.0
     assert "sigmas" in outcome.text()
-    assert "used = true" in outcome.text()
+    assert "labsurvey include FOLDER pairs:p0-2" in outcome.text()
 
 
 def test_taken_back_all_is_as_before(lab):
     solution = json.loads((lab / "results/solution.json").read_text())["stations"]
     remove_job(lab, ["p0-2", "p1-2"], progress=False)
-    path = lab / "observations/pairs.csv"
-    assert path.read_text().count("false") == 2
-    path.write_text(path.read_text().replace("false", "true"))
+    assert "false" not in (lab / "observations/pairs.csv").read_text()
+    include_job(lab, ["p0-2", "pairs:p1-2"])
     adjust_job(lab, progress=False)
     again = json.loads((lab / "results/solution.json").read_text())["stations"]
     for station, entry in solution.items():
@@ -89,8 +89,8 @@ def test_taken_back_all_is_as_before(lab):
 @pytest.mark.parametrize(
     ("ids", "message"),
     [
-        (["p3-4"], "cannot do without p3-4"),
-        (["p0-1", "p1-2"], "cannot do without p0-1, p1-2"),
+        (["p3-4"], "cannot do without pairs:p3-4"),
+        (["p0-1", "p1-2"], "cannot do without pairs:p0-1, pairs:p1-2"),
         (["p0-22"], "did you mean 'p0-2'"),
         (["distances:p0-2"], "none is known here"),
     ],
@@ -146,14 +146,14 @@ def _with_points(folder):
 
 def test_distances_and_sets_of_coordinates(tmp_path):
     lab = _with_points(tmp_path / "lab")
-    with pytest.raises(SurveyError, match="stands in pairs and distances"):
+    with pytest.raises(SurveyError, match="stands for pairs:twice and distances:twice"):
         remove_job(lab, ["twice"], progress=False)
-    with pytest.raises(SurveyError, match="remove the set by its id"):
-        remove_job(lab, ["A"], progress=False)
-    with pytest.raises(SurveyError, match="cannot do without C"):
+    with pytest.raises(SurveyError, match="name the set by its id"):
+        remove_job(lab, ["coordinates:A"], progress=False)
+    with pytest.raises(SurveyError, match="cannot do without coordinates:C"):
         remove_job(lab, ["C"], progress=False)
     outcome = remove_job(lab, ["distances:twice"], progress=False)
-    assert outcome.removed == {"distances": ("twice",)}
+    assert outcome.removed == ("distances:twice",)
     survey = read(lab).survey
     assert not survey.distances[0].used
     assert all(p.used for p in survey.pairs)

@@ -2,7 +2,7 @@ import ast
 import json
 import re
 import xml.etree.ElementTree as ET
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from adjust.model import Survey
 from adjust.result import Adjustment, ImageResiduals
 from survey import report as report_package
 from survey.quantities import scale_of
-from survey.report import drawing, markup, report_html, summary_text
+from survey.report import drawing, every, markup, report_html, summary_text
 from survey.report.camera_plots import CameraResiduals, histogram, mean_field, vector_field
 from survey.report.german import GERMAN
 from survey.report.picture import enlargement, perspective, pictures, plan
@@ -356,8 +356,9 @@ def test_all_observations_are_in_the_page_with_what_was_observed(page: str, adju
     assert data["rows"] == n
     columns = [c["values"] if "values" in c else [c["names"][k] for k in c["codes"]] for c in data["columns"]]
     assert {len(c) for c in columns} == {n}
-    kind, _, where, point, component = columns[:5]
-    observed, sigma, adjusted, _, residual = columns[7:12]
+    by_name = dict(zip(every.COLUMNS, columns, strict=True))
+    kind, where, point, component = (by_name[name] for name in ("Kind", "Where", "Point", "Component"))
+    observed, sigma, adjusted, residual = (by_name[name] for name in ("Observed", "σ", "Adjusted", "Residual"))
     block = adjustment.survey.image_blocks[5]
     k = int(adjustment.image_residuals.block_ptr[5])
     text = f"{block.camera_id} · {block.epoch_id} · {block.target_id or 'points'}"
@@ -399,3 +400,31 @@ def test_german_has_every_text_of_the_program() -> None:
     assert missing == []
     for english, german in GERMAN.items():
         assert set(re.findall(r"\{(\w+)\}", english)) == set(re.findall(r"\{(\w+)\}", german)), english
+
+
+def test_groups_named_after_their_kind_are_said_in_the_language_and_others_as_they_are() -> None:
+    from adjust import observations
+    from survey.files.terrestrial import KINDS
+    from survey.report.language import GROUPS_BY_KIND, group_name, speaking
+
+    named = {
+        field.default
+        for kind in vars(observations).values() if is_dataclass(kind)
+        for field in fields(kind) if field.name == "group"
+    }  # fmt: skip
+    assert {"image", "distance", "coordinates"} <= named
+    assert named | set(KINDS) <= GROUPS_BY_KIND
+    with speaking("de"):
+        assert group_name("slope_distance") == "Schrägstrecke"
+        assert [x for x in GROUPS_BY_KIND if group_name(x) == x.replace("_", " ")] == []
+        assert group_name("points") == "points"  # a name that people gave
+    assert group_name("slope_distance") == "slope distance"
+
+
+def test_german_messages_have_german_numbers() -> None:
+    from survey.report.language import message, speaking
+
+    said = "Global test failed: residuals are 1.37 times what the sigmas of the observations allow. Look for errors."
+    with speaking("de"):
+        assert "das 1,37-fache" in message(said)
+        assert "Epoche 1.5" in message("camera X at epoch 1.5, target board: not used")

@@ -1,19 +1,49 @@
-"""The page and its script in a real browser, and the report on paper."""
+"""The pages and their script in a real browser, as first opened, on a phone, on a dark screen, and on paper."""
 
+import html
+import json
 import os
 import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from adjust.errors import SurveyError
-from survey.report import pdf, report_html
+from survey.report import every, pdf, report_html
+from survey.report.drawing import DARK
 from survey.solution import RunInfo
 from tests.survey.adjustments import Lab, lab_adjustment
 
 RUN = RunInfo("lab", "Full lab", {"survey.toml": "12ab"}, {"alpha": 0.05}, {"labsurvey": "0.1.0"}, "2026-01-02")
+COMPONENT, W, OBSERVED = (every.COLUMNS.index(name) for name in ("Component", "w", "Observed"))
+PHONE = 390
+# the smallest contrast of any text with what is behind it, by the formula of WCAG 2.1, with that text
+CONTRAST = """(() => {
+  const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
+  const light = (c) => c.slice(0, 3).map((x) => x / 255)
+    .map((x) => (x <= 0.03928 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4))
+    .reduce((sum, x, k) => sum + x * [0.2126, 0.7152, 0.0722][k], 0);
+  const behind = (e) => {
+    for (; e; e = e.parentElement) {
+      const c = rgb(getComputedStyle(e).backgroundColor);
+      if (c.length < 4 || c[3] > 0) return c;
+    }
+    return [255, 255, 255];
+  };
+  let worst = [99, ""];
+  for (const e of document.body.querySelectorAll("*")) {
+    const own = [...e.childNodes].filter((n) => n.nodeType === 3).map((n) => n.textContent.trim()).join("");
+    if (!own || e.closest("script, style, title") || !e.getClientRects().length) continue;
+    const style = getComputedStyle(e);
+    const [a, b] = [light(rgb(e.closest("svg") ? style.fill : style.color)), light(behind(e))].sort((x, y) => y - x);
+    const ratio = (a + 0.05) / (b + 0.05);
+    if (ratio < worst[0]) worst = [ratio, own.slice(0, 60)];
+  }
+  return worst;
+})()"""
 BROWSER = next((path for name in pdf.BROWSERS if (path := shutil.which(name))), None)
 
 
@@ -31,18 +61,40 @@ def german() -> str:
     return report_html(lab_adjustment(Lab(n_epochs=6, n_beacons=6)), RUN, in_language="de")
 
 
-def dom_after(page: str, actions: str, folder: Path) -> str:
+@pytest.fixture(scope="module")
+def english() -> str:
+    return report_html(lab_adjustment(Lab(n_epochs=6, n_beacons=6, blunders=2)), RUN)
+
+
+def dom_after(page: str, actions: str, folder: Path, dark: bool = False) -> str:
     """The document after the page's script and then ``actions`` have run; what is logged stands in its title."""
     path = folder / "page.html"
     path.write_text(page.replace("</body>", f"<script>{actions}</script></body>"), encoding="utf-8")
     command = [
-        need_browser(), "--headless", "--disable-gpu", "--no-first-run", "--disable-background-networking",
+        f"--blink-settings=preferredColorScheme={0 if dark else 1}",
+        "--headless", "--disable-gpu", "--no-first-run", "--disable-background-networking",
         "--disable-component-update", "--disable-sync", "--disable-quic", f"--user-data-dir={folder / 'profile'}",
         "--virtual-time-budget=2000", "--dump-dom", path.as_uri(),
     ]  # fmt: skip
     if os.geteuid() == 0:
-        command.insert(1, "--no-sandbox")
-    return subprocess.run(command, capture_output=True, timeout=120, check=True).stdout.decode()
+        command.insert(0, "--no-sandbox")
+    return subprocess.run([need_browser(), *command], capture_output=True, timeout=120, check=True).stdout.decode()
+
+
+def seen(page: str, measure: str, folder: Path, width: int = 1280, dark: bool = False) -> Any:
+    """What the expression ``measure`` is on the page as first opened in a window of this width, px; nothing resizes."""
+    inner = page.replace("</body>", f"<script>setTimeout(() => top.found({measure}), 400)</script></body>")
+    text = json.dumps(inner).replace("<", "\\u003c")
+    outer = (
+        f'<!doctype html><body><iframe style="border:0;width:{width}px;height:900px"></iframe><p id="found"></p></body>'
+    )
+    actions = (
+        "top.found = (x) => { document.getElementById('found').textContent = JSON.stringify(x); };"
+        f"document.querySelector('iframe').srcdoc = {text};"
+    )
+    found = re.search(r'<p id="found">(.*?)</p>', dom_after(outer, actions, folder, dark), re.S)
+    assert found is not None
+    return json.loads(html.unescape(found[1]))
 
 
 def cells(dom: str, column: int) -> list[str]:
@@ -57,22 +109,79 @@ def numbers(texts: list[str]) -> list[float]:
 
 
 def test_all_observations_can_be_paged_sorted_and_searched(german: str, tmp_path: Path) -> None:
-    """Columns: 0 kind, 4 component, 7 observed, 11 residual, 13 w."""
     first = dom_after(german, "", tmp_path)
     assert "ready" in first[: first.index("<head")]
-    w = [abs(x) for x in numbers(cells(first, 13))]
-    assert len(cells(first, 13)) == 50
+    w = [abs(x) for x in numbers(cells(first, W))]
+    assert len(cells(first, W)) == 50
     assert w == sorted(w, reverse=True)
-    click = "document.querySelectorAll('#all th')[7].click();" * 2
-    observed = numbers(cells(dom_after(german, click, tmp_path), 7))
+    click = f"document.querySelectorAll('#all th')[{OBSERVED}].click();" * 2
+    observed = numbers(cells(dom_after(german, click, tmp_path), OBSERVED))
     assert observed == sorted(observed)
     search = (
         "const f = document.getElementById('all-filter'); f.value = 'drehtisch axis2';"
         "f.dispatchEvent(new Event('input'));"
     )
     found = dom_after(german, search, tmp_path)
-    assert set(cells(found, 4)) == {"axis2"}
-    assert len(cells(found, 4)) == 6
+    assert set(cells(found, COMPONENT)) == {"axis2"}
+    assert len(cells(found, COMPONENT)) == 6
+
+
+def test_view_in_space_is_drawn_when_the_page_opens(english: str, tmp_path: Path) -> None:
+    drawn = """(() => { const v = document.getElementById("space");
+      const d = v.getContext("2d").getImageData(0, 0, v.width, v.height).data;
+      return [v.width, d.filter((x, k) => k % 4 === 3 && x > 0).length]; })()"""
+    width, n = seen(english, drawn, tmp_path)
+    assert width > 1000
+    assert n > 2000
+
+
+def test_wheel_scrolls_the_page_and_zooms_with_ctrl(english: str, tmp_path: Path) -> None:
+    turned = """[false, true].map((ctrlKey) => {
+      const e = new WheelEvent("wheel", { deltaY: 100, ctrlKey, cancelable: true, bubbles: true });
+      document.getElementById("space").dispatchEvent(e);
+      return e.defaultPrevented; })"""
+    assert seen(english, turned, tmp_path) == [False, True]
+    assert seen(english, "getComputedStyle(document.getElementById('space')).touchAction", tmp_path) == "pan-y"
+
+
+@pytest.mark.parametrize("width", [PHONE, 1280])
+def test_nothing_is_wider_than_the_screen_and_no_figure_vanishes(
+    english: str, german: str, tmp_path: Path, width: int
+) -> None:
+    measure = """[document.documentElement.scrollWidth,
+      Math.min(...[...document.querySelectorAll("figure svg, canvas")].map((e) => e.getBoundingClientRect().width)),
+      document.querySelector("#all th[aria-sort]").getBoundingClientRect().right]"""
+    for page in (english, german):
+        page_width, smallest, sort_key = seen(page, measure, tmp_path, width)
+        assert page_width <= width
+        assert smallest > 200
+        assert sort_key <= width  # what the rows are sorted by is on the screen
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_every_word_can_be_read_in_light_and_dark(english: str, tmp_path: Path, dark: bool) -> None:
+    ratio, words = seen(english, CONTRAST, tmp_path, dark=dark)
+    assert ratio >= 4.5, words
+    background = seen(english, "getComputedStyle(document.body).backgroundColor", tmp_path, dark=dark)
+    assert (background != "rgb(255, 255, 255)") == dark
+
+
+def test_pictures_use_colours_that_have_a_dark_counterpart(english: str) -> None:
+    used = set(re.findall(r'(?:fill|stroke)="(#[^"]+)"', english))
+    assert {"#1c2733", "#2166ac"} <= used
+    assert used <= set(DARK)
+
+
+def test_a_camera_is_one_page_of_paper(german: str, tmp_path: Path) -> None:
+    need_browser()
+    pypdf = pytest.importorskip("pypdf")
+    path = tmp_path / "report.pdf"
+    path.write_bytes(pdf.report_pdf(german))
+    pages = [page.extract_text() for page in pypdf.PdfReader(path).pages]
+    at = [next(i for i, text in enumerate(pages) if f"Kamera {name}" in text) for name in "XYZ"]
+    assert at == list(range(at[0], at[0] + 3))
+    for name, i in zip("XYZ", at, strict=True):
+        assert f"{name} station_from_camera" in pages[i]
 
 
 def test_report_on_paper_has_the_words_of_the_page(german: str, tmp_path: Path) -> None:

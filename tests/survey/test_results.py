@@ -379,7 +379,7 @@ def test_suspects_are_counted_at_a_common_level(adjustment: Adjustment) -> None:
         ({}, "passed", "agree"),
         ({"converged": False}, "failed", "converge"),
         ({"global_test": GlobalTest(200.0, 100, 0.05, 74.2, 129.6)}, "failed", "times what"),
-        ({"global_test": GlobalTest(50.0, 100, 0.05, 74.2, 129.6)}, "check", "too large"),
+        ({"global_test": GlobalTest(50.0, 100, 0.05, 74.2, 129.6)}, "passed", "cautious"),
         ({"global_test": None}, "check", "redundant"),
         ({"warnings": ("Look.",)}, "check", "warnings"),
     ],

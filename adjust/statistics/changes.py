@@ -1,0 +1,337 @@
+"""Whether cameras and targets stayed the same through a session, and targets are as given: score tests, no adjustment.
+
+A parameter that the model does not have, with the whitened columns B, is tested at the solution (Lagrange multiplier or
+score test; Rao 1948, Silvey 1959; in geodesy the test of an additional parameter, Teunissen 2006): with
+``g = B' e`` and ``M = B' (I - A Q A') B`` the statistic ``g' M^+ g`` is chi-square with rank M degrees of freedom, and
+``-M^+ g`` estimates it. A change is looked for at every border between two epochs, or between as many runs of them as
+can be paid for; each that is found is added to the model before the next is looked for.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy import sparse
+
+from adjust.distributions import chi2, fisher, norm
+from adjust.model import FloatArray, IntArray
+from adjust.precision import noise_of
+from adjust.result import Adjustment
+from adjust.statistics.condensed import CondensedSystem
+from adjust.statistics.result import Change, ChangeShift
+from adjust.statistics.system import LinearSystem
+from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
+
+_SEEN = 1e-4
+"""Share of a column that no unknown takes over, below which it is not told from rounding."""
+_MOST_RUNS = 256
+_WORK, _ROOM = 1e10, 2e7
+"""Multiplications that possible changes may cost, and numbers that they may need."""
+_MOST, _MOST_OF_ONE = 20, 2
+"""Changes that are named: in all, and of the same kind of one camera, target or table, which may drift without end."""
+_SHAPES = {True: (("width", "1"), ("height", "1"), ("sag along x", "m"), ("sag along y", "m")),
+           False: (("width", "1"), ("height", "1"), ("depth", "1"), ("", "1"))}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Unit:
+    """What may change: kind and name of its owner, rows (k,) of the condensed system, columns B (k, q) in these.
+
+    run: (k,) of which run of epochs a row is; epochs: the first epoch of every run; one run: the same at all epochs.
+    """
+
+    kind: str
+    name: str
+    what: str
+    rows: IntArray
+    B: FloatArray
+    run: IntArray
+    epochs: tuple[str, ...]
+    components: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """A unit's possible changes (J, ...), scaled so that B'B has a unit diagonal: M (J, q, q), g (J, q), scale (J, q).
+
+    Y: (J, n, q) Q A'B.
+    """
+
+    unit: Unit
+    M: FloatArray
+    g: FloatArray
+    scale: FloatArray
+    Y: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Chosen:
+    """What was found: B (m, q) over all rows, g (q,), X = A'B and Y = Q A'B (n, q)."""
+
+    B: FloatArray
+    g: FloatArray
+    X: FloatArray
+    Y: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """All that was found: B (m, q) over all rows, X (n, q), the inverse (q, q) of their M, and that times their g."""
+
+    B: FloatArray
+    X: FloatArray
+    inverse: FloatArray
+    amounts: FloatArray
+
+
+def natural(name: str) -> tuple[tuple[int, str], ...]:
+    """Key that sorts names with numbers as people do: e2 before e10."""
+    parts = re.split(r"(\d+)", name)
+    return tuple((int(x), "") if x.isdigit() else (0, x) for x in parts)
+
+
+class ChangeSearch:
+    """Score tests of a survey's cameras, targets and tables."""
+
+    def __init__(self, adjustment: Adjustment, condensed: CondensedSystem) -> None:
+        self.adjustment, self.condensed = adjustment, condensed
+        self.system: LinearSystem = condensed.system
+        s = self.system
+        rows = s.used[s.row_of]
+        step = s.normal.solve(np.asarray(s.A[rows].T @ s.e[rows]))
+        self.A, self.e = s.A, s.e - s.A @ step
+        n = len(s.columns)
+        units, self.runs = list(self._units(_MOST_RUNS)), _MOST_RUNS
+        most = min(_WORK / s.normal.cost, _ROOM / max(n, 1))
+        if sum(u.B.shape[1] * len(u.epochs) for u in units) > most:
+            self.runs = int(np.clip(most / sum(u.B.shape[1] for u in units), 2, _MOST_RUNS))
+            units = list(self._units(self.runs))
+        self.candidates = [self._candidates(_by_runs(u)) for u in units]
+        self.n_tests = sum(len(c.g) for c in self.candidates)
+
+    def left_out(self) -> tuple[str, ...]:
+        """For people: between which epochs no change was looked for."""
+        longest = max((len(set(self._epoch_names(rows))) for _, _, rows in self._owners()), default=0)
+        if longest <= self.runs:
+            return ()
+        return (f"changes of cameras and targets were looked for at {self.runs - 1} of {longest - 1} borders between "
+                "epochs, evenly spread; a change elsewhere is found at the next of them",)  # fmt: skip
+
+    def found(self, level: float, relative: bool) -> tuple[Change, ...]:
+        """Changes significant at this level of one test, the clearest first, each given those before."""
+        out: list[Change] = []
+        chosen: list[_Chosen] = []
+        omega, left = self.adjustment.omega, self.adjustment.redundancy
+        while len(out) < _MOST:
+            best: tuple[float, _Candidates, int, FloatArray, FloatArray] | None = None
+            known, named = _joint(chosen), Counter((x.kind, x.name, x.what) for x in out)
+            for c in self.candidates:
+                if named[c.unit.kind, c.unit.name, c.unit.what] >= _MOST_OF_ONE:
+                    continue
+                M, g = _given(c, known)
+                T, q = _statistics(M, g)
+                z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)
+                j = int(z.argmax()) if len(z) else -1
+                if j >= 0 and z[j] > (best[0] if best is not None else -np.inf):
+                    best = float(z[j]), c, j, M[j], g[j]
+            if best is None:
+                break
+            _, c, j, M, g = best
+            (T,), (q,) = _statistics(M[None], g[None])
+            p = float(chi2.sf(T, max(q, 1)))
+            if relative and left > q and omega > T:
+                p = max(p, float(fisher.sf(T / q / ((omega - T) / (left - q)), q, left - q)))
+            if not p < level:
+                break
+            spread = (omega - T) / (left - q) if relative and left > q and omega > T else 1.0
+            out.append(_change(c, j, M, g, float(T), int(q), p, max(spread, 1.0)))
+            chosen.append(self._chosen(c, j))
+            omega, left = omega - float(T), left - int(q)
+        return tuple(out)
+
+    # -- what may change ---------------------------------------------------------------------------------------------
+
+    def _owners(self) -> Iterator[tuple[str, str, IntArray]]:
+        """Cameras and targets with their rows."""
+        blocks, of_row = self.adjustment.survey.image_blocks, self.condensed.block
+        some = np.zeros(len(blocks), dtype=np.bool_)
+        some[of_row] = True
+        for kind in ("camera", "target"):
+            names = [b.camera_id if kind == "camera" else b.target_id or "" for b in blocks]
+            for name in dict.fromkeys(n for n, used in zip(names, some, strict=True) if used and n):
+                mine = np.array([n == name for n in names], dtype=np.bool_)
+                yield kind, name, np.flatnonzero(mine[of_row])
+
+    def _epoch_names(self, rows: IntArray) -> list[str]:
+        """Of every image row."""
+        blocks = self.adjustment.survey.image_blocks
+        return [blocks[b].epoch_id for b in self.condensed.block[rows].tolist()]
+
+    def _units(self, most_runs: int) -> Iterator[Unit]:
+        c, survey = self.condensed, self.adjustment.survey
+        vectors = self.system.precision.graph.unknowns.vectors
+        poses = tuple(zip(POSE_COMPONENTS, POSE_UNITS, strict=True))
+        whole = {t.target_id: t.x_in_target for t in survey.targets}
+        for kind, name, rows in self._owners():
+            run, first = _runs(self._epoch_names(rows), most_runs)
+            if kind == "camera":
+                lens = vectors[("lens", name)]
+                free = tuple((x, lens.units[lens.names.index(x)]) for x in lens.free) if lens.key is not None else ()
+                if free and len(first) > 1:
+                    yield Unit(kind, name, "lens", rows, c.lens[rows, : len(free)], run, first, free)
+            if len(first) > 1:
+                B = c.camera[rows] if kind == "camera" else c.target[rows]
+                yield Unit(kind, name, "position", rows, B, run, first, poses)
+            if kind == "target":
+                flat = bool(np.ptp(whole[name][:, 2]) < 1e-9)
+                yield Unit(kind, name, "shape", rows, c.shape[rows], np.zeros_like(run), first[:1], _SHAPES[flat])
+        yield from self._table_units(most_runs)
+
+    def _table_units(self, most_runs: int) -> Iterator[Unit]:
+        """Readings of tables: their zeros from some epoch on, and errors that repeat with the turn of an axis.
+
+        The latter are those of an eccentric circle (once a turn) and of an inclined or oval one (twice); each axis.
+        """
+        s, others = self.system, self.system.precision.graph.others
+        for table in self.adjustment.survey.tables:
+            mine = [i for i, o in enumerate(others) if o.kind == "table" and o.ids[0] == table.table_id and o.used]
+            if not mine:
+                continue
+            W = [np.asarray(noise_of(others[i]).R()) for i in mine]
+            rows = np.concatenate([np.arange(s.ptr[s.n_image + i], s.ptr[s.n_image + i + 1]) for i in mine])
+            epochs = [others[i].ids[1] for i, w in zip(mine, W, strict=True) for _ in range(len(w))]
+            run, first = _runs(epochs, most_runs)
+            axes = tuple(others[mine[0]].components)
+            if len(first) > 1:
+                zeros = tuple((x, "rad") for x in axes)
+                yield Unit("table", table.table_id, "zero", rows, np.vstack(W), run, first, zeros)
+            for axis, name in enumerate(axes):
+                angle = np.array([others[i].observed[axis] for i in mine])
+                waves = np.stack([f(k * angle) for k in (1, 2) for f in (np.sin, np.cos)], axis=1)
+                B = np.concatenate([w[:, axis, None] * wave for w, wave in zip(W, waves, strict=True)])
+                said = tuple((f"{name} {f} {k}a".replace(" 1a", " a"), "rad") for k in (1, 2) for f in ("sin", "cos"))
+                yield Unit("table", table.table_id, f"reading of {name}", rows, B, np.zeros_like(run), first[:1], said)
+
+    # -- tests -------------------------------------------------------------------------------------------------------
+
+    def _candidates(self, u: Unit) -> _Candidates:
+        """Of the runs from j on, j = 1, 2, ..., or of the only one."""
+        J, q = len(u.epochs), u.B.shape[1]
+        A, e = self.A[u.rows], self.e[u.rows]
+        columns = (u.run[:, None] * q + np.arange(q)).ravel()
+        wide = sparse.csr_matrix((u.B.ravel(), columns, np.arange(len(u.rows) + 1) * q), (len(u.rows), J * q))
+        X = (A.T @ wide).toarray()
+        Y = self.system.normal.solve(X)
+        P = _by_run(u, u.B)
+        g = _by_run(u, e[:, None])[:, :, 0]
+        X, Y = (x.reshape(-1, J, q).transpose(1, 0, 2) for x in (X, Y))
+        X, Y, P, g = (np.cumsum(x[::-1], axis=0)[::-1] for x in (X, Y, P, g))
+        kept = slice(1, None) if J > 1 else slice(None)
+        X, Y, P, g = X[kept], Y[kept], P[kept], g[kept]
+        size = np.sqrt(np.einsum("jqq->jq", P))
+        scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+        M = (P - X.transpose(0, 2, 1) @ Y) * scale[:, :, None] * scale[:, None, :]
+        return _Candidates(u, 0.5 * (M + M.transpose(0, 2, 1)), g * scale, scale, Y)
+
+    def _chosen(self, c: _Candidates, j: int) -> _Chosen:
+        """Its directions that show, with columns of unit length."""
+        u, B = c.unit, np.zeros((len(self.e), c.unit.B.shape[1]))
+        mine = u.run >= (j + 1 if len(u.epochs) > 1 else 0)
+        B[u.rows[mine]] = u.B[mine] * c.scale[j]
+        values, vectors = np.linalg.eigh(c.M[j])
+        V = vectors[:, values > _SEEN]
+        return _Chosen(B @ V, V.T @ c.g[j], np.asarray(self.A.T @ (B @ V)), c.Y[j] * c.scale[j] @ V)
+
+
+def _by_runs(u: Unit) -> Unit:
+    """With its rows in the order of the runs."""
+    order = np.argsort(u.run, kind="stable")
+    return replace(u, rows=u.rows[order], B=u.B[order], run=u.run[order])
+
+
+def _runs(epochs: Sequence[str], most: int) -> tuple[IntArray, tuple[str, ...]]:
+    """Number (k,) of the run of epochs that each belongs to, at most so many, and the first epoch of every run."""
+    names = sorted(set(epochs), key=natural)
+    n = min(most, len(names))
+    number = {e: i * n // len(names) for i, e in enumerate(names)}
+    first: dict[int, str] = {}
+    for e in names:
+        first.setdefault(number[e], e)
+    return np.array([number[e] for e in epochs], dtype=np.int64), tuple(first.values())
+
+
+def _by_run(u: Unit, other: FloatArray) -> FloatArray:
+    """B' times other columns (k, r), of every run apart: (J, q, r)."""
+    first = np.searchsorted(u.run, np.arange(len(u.epochs) + 1))
+    return np.array([u.B[i:j].T @ other[i:j] for i, j in pairwise(first.tolist())])
+
+
+def _joint(chosen: Sequence[_Chosen]) -> _Known | None:
+    """All that was found, together."""
+    if not chosen:
+        return None
+    B, X, Y = (np.hstack([getattr(x, name) for x in chosen]) for name in ("B", "X", "Y"))
+    inverse = np.linalg.pinv(B.T @ B - X.T @ Y, rcond=1e-12, hermitian=True)
+    return _Known(B, X, inverse, inverse @ np.concatenate([x.g for x in chosen]))
+
+
+def _given(c: _Candidates, known: _Known | None) -> tuple[FloatArray, FloatArray]:
+    """M and g of candidates where the chosen changes are part of the model."""
+    if known is None:
+        return c.M, c.g
+    u, J = c.unit, len(c.unit.epochs)
+    direct = np.cumsum(_by_run(u, known.B[u.rows])[::-1], axis=0)[::-1][1 if J > 1 else 0 :]
+    K = (direct - c.Y.transpose(0, 2, 1) @ known.X) * c.scale[:, :, None]
+    M = c.M - K @ known.inverse @ K.transpose(0, 2, 1)
+    return 0.5 * (M + M.transpose(0, 2, 1)), c.g - K @ known.amounts
+
+
+def _statistics(M: FloatArray, g: FloatArray) -> tuple[FloatArray, IntArray]:
+    """T (J,) and its degrees of freedom (J,)."""
+    values, vectors = np.linalg.eigh(M)
+    seen = values > _SEEN
+    along = np.einsum("jqk,jq->jk", vectors, g)
+    return np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0).sum(axis=1), seen.sum(axis=1)
+
+
+def _normal_score(T: FloatArray, q: IntArray) -> FloatArray:
+    """As a standard normal quantity, also where p is too small for a number (Wilson and Hilferty 1931)."""
+    c = 2.0 / (9.0 * q)
+    return np.asarray(((T / q) ** (1.0 / 3.0) - 1.0 + c) / np.sqrt(c))
+
+
+def _change(
+    c: _Candidates, j: int, M: FloatArray, g: FloatArray, T: float, q: int, p: float, spread: float
+) -> Change:
+    u = c.unit
+    epoch = u.epochs[j + 1] if len(u.epochs) > 1 else ""
+    index = _explaining(M, g, T, spread)
+    inverse = np.linalg.pinv(M[np.ix_(index, index)], rcond=1e-9, hermitian=True)
+    amount, sigma = -inverse @ g[index] * c.scale[j, index], np.sqrt(spread * np.diag(inverse)) * c.scale[j, index]
+    order = np.argsort(-np.abs(amount) / np.maximum(sigma, 1e-300), kind="stable")
+    said = [u.components[i] for i in index]
+    shifts = tuple(ChangeShift(said[i][0], said[i][1], float(amount[i]), float(sigma[i])) for i in order)
+    return Change(u.kind, u.name, u.what, epoch, T, q, p, shifts)
+
+
+def _explaining(M: FloatArray, g: FloatArray, T: float, spread: float) -> list[int]:
+    """The fewest components whose own change leaves nothing significant of T, one added after the other."""
+    index: list[int] = []
+    possible = [i for i in range(len(g)) if M[i, i] > _SEEN]
+    limit = spread * float(norm.isf(0.005)) ** 2
+    while possible:
+        taken = [_part(M, g, [*index, i]) for i in possible]
+        best = int(np.argmax(taken))
+        if index and taken[best] - _part(M, g, index) < limit:
+            break
+        index.append(possible.pop(best))
+        if T - taken[best] < limit:
+            break
+    return index
+
+
+def _part(M: FloatArray, g: FloatArray, index: list[int]) -> float:
+    return float(g[index] @ np.linalg.pinv(M[np.ix_(index, index)], rcond=_SEEN, hermitian=True) @ g[index])

@@ -1,0 +1,219 @@
+"""A solved survey as one linear system that stays small: the image points of a block stand in a few rows.
+
+A block's 2n whitened rows over its local unknowns are turned (orthogonally) into as many rows as there are columns: the
+same normal equations, gradients and quadratic forms for any n. Beside the columns of the unknowns the rows are kept by
+what a block could have besides: a motion of its camera, of its target, other lens parameters than those of the other
+epochs, another shape of its target. What the residuals say of these is asked in :mod:`adjust.statistics.changes`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from adjust.bundle_batch import BundleBatch
+from adjust.graph import AdjustmentGraph
+from adjust.image_batch import warp_shape
+from adjust.model import FloatArray, IntArray
+from adjust.native.images import block_rows
+from adjust.native.lenses import MAX_LENS
+from adjust.precision import Precision
+from adjust.statistics.system import Entries, ImageRows, KeyColumns, LinearSystem, assembled, bundle_order, bundle_rows
+
+N_SHAPE = 4
+_FLAT = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class CondensedSystem:
+    """The system, whose first observations are the image blocks, and its m image rows by what a block has of its own.
+
+    block: (m,) index into ``Survey.image_blocks``. lens: (m, MAX_LENS) by the free lens parameters of its camera.
+    camera, target: (m, 6) by a motion of the camera in its own axes, of the target in its own axes (rotation,
+    translation). shape: (m, 4) by the shape of the target: flat ones grow along x and y, and bend (unit sags) along x
+    and y; others grow along x, y and z, the last column is zero. e: (m,). numbers: the image block
+    of each of the first observations. key_columns: of the system.
+    """
+
+    system: LinearSystem
+    block: IntArray
+    lens: FloatArray
+    camera: FloatArray
+    target: FloatArray
+    shape: FloatArray
+    e: FloatArray
+    numbers: IntArray
+    key_columns: KeyColumns
+
+    def point_rows(self, row: int) -> tuple[IntArray, FloatArray]:
+        """Columns (k,) and the whitened rows (2, k) over them of an image point that is in use."""
+        graph = self.system.precision.graph
+        ptr = np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks])
+        i = int(np.searchsorted(ptr, row, side="right")) - 1
+        point, known = row - int(ptr[i]), [k for k, free in graph.image_order if not free]
+        if i not in known:  # its rows are among those of the system
+            first = int(np.flatnonzero(self.block == i)[0])
+            A = self.system.A[first + 2 * point : first + 2 * point + 2]
+            columns = np.unique(A.indices)
+            return columns, A[:, columns].toarray()
+        b = known.index(i)
+        local = _block_rows(graph, b)[2 * point : 2 * point + 2, :-1]
+        columns = np.concatenate([self.key_columns[key] for key in graph.images.keys[b]])
+        kept = columns >= 0
+        return columns[kept], (local @ graph.images.local_from_keys(b))[:, kept]
+
+
+def condensed_system(precision: Precision) -> CondensedSystem:
+    """The system of a solved survey, of any size."""
+    kept: dict[str, list[FloatArray]] = {k: [] for k in ("lens", "camera", "target", "shape")}
+    blocks: list[IntArray] = []
+    numbers: list[IntArray] = []
+    columns: KeyColumns = {}
+
+    def image_rows(precision: Precision, n: int, key_columns: KeyColumns) -> ImageRows:
+        graph = precision.graph
+        columns.update(key_columns)
+        parts = [_known(graph, n, key_columns, kept, blocks, numbers)]
+        if graph.bundle is not None:
+            parts.append(_unknown(precision, graph.bundle, n, key_columns, kept, blocks, numbers))
+        A = sparse.vstack([p.A for p in parts]).tocsr()
+        e, lengths, used = (np.concatenate([getattr(p, x) for p in parts]) for x in ("e", "lengths", "used"))
+        return ImageRows(A, e, lengths, used, [g for p in parts for g in p.groups])
+
+    system = assembled(precision, image_rows)
+    block = np.concatenate([np.zeros(0, dtype=np.int64), *blocks])
+    lens, camera, target, shape = (
+        np.concatenate([np.zeros((0, w)), *kept[k]])
+        for k, w in (("lens", MAX_LENS), ("camera", 6), ("target", 6), ("shape", N_SHAPE))
+    )
+    return CondensedSystem(system, block, lens, camera, target, shape, system.e[: len(block)],
+                           np.concatenate([np.zeros(0, dtype=np.int64), *numbers]), columns)  # fmt: skip
+
+
+def _known(
+    graph: AdjustmentGraph, n: int, key_columns: KeyColumns, kept: dict[str, list[FloatArray]], blocks: list[IntArray],
+    numbers: list[IntArray],
+) -> ImageRows:  # fmt: skip
+    """Blocks of known targets, those of the same size together."""
+    images, entries = graph.images, Entries()
+    number = np.array([i for i, free in graph.image_order if not free], dtype=np.int64)
+    shapes: dict[str | None, FloatArray] = {}
+    shapes.update({t.target_id: _shape_factors(t.x_in_target) for t in graph.survey.targets})
+    sizes = np.stack([np.diff(images.ptr), images.n_rows, images.of_blocks.columns], axis=1)
+    kinds, kind = np.unique(sizes, axis=0, return_inverse=True)
+    at, order, lengths, e = 0, np.zeros(0, dtype=np.int64), [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+    for j in range(len(kinds)):
+        mine = np.flatnonzero(kind.ravel() == j)
+        rows = _condensed_rows(graph, mine, shapes)
+        g, k, width = len(mine), rows.shape[1], int(kinds[j, 1]) - 1
+        if kinds[j, 2]:
+            columns = np.array([np.concatenate([key_columns[key] for key in images.keys[b]]) for b in mine])
+            by_key = rows[:, :, :width] @ np.array([images.local_from_keys(int(b)) for b in mine])
+            entries.add_blocks(at + np.arange(g * k).reshape(g, k), columns, by_key)
+        _keep(graph, mine, rows, width, kept)
+        blocks.append(np.repeat(number[mine], k))
+        e.append(rows[:, :, -1].ravel())
+        lengths.append(np.full(g, k))
+        order, at = np.concatenate([order, mine]), at + g * k
+    numbers.append(number[order])
+    groups = [images.blocks[b].group for b in order]
+    used = np.ones(len(groups), dtype=np.bool_)
+    return ImageRows(entries.matrix((at, n)), np.concatenate(e), np.concatenate(lengths), used, groups)
+
+
+def _condensed_rows(
+    graph: AdjustmentGraph, mine: IntArray, shapes: Mapping[str | None, FloatArray]
+) -> FloatArray:
+    """Rows (g, k, lens + pose + warp + shape + 1) of g blocks with equally many points and columns."""
+    images = graph.images
+    local = np.array([_block_rows(graph, int(b)) for b in mine])
+    n = local.shape[1] // 2
+    none = np.zeros((0, N_SHAPE))
+    factors = np.zeros((len(mine), n, N_SHAPE))
+    for i, b in enumerate(mine):
+        given = shapes.get(images.blocks[b].target_id, none)
+        if len(given):
+            factors[i] = given[images.blocks[b].point_idx]
+    nl = images.state.lenses.n_free[images.camera[mine]]
+    pose = nl[:, None] + 3 + np.array([0, 1, 2, 2])
+    by_point = np.take_along_axis(local, np.broadcast_to(pose[:, None], (len(mine), 2 * n, N_SHAPE)), axis=2)
+    rows = np.concatenate([local[:, :, :-1], by_point * np.repeat(factors, 2, axis=1), local[:, :, -1:]], axis=2)
+    used = images.used[images.ptr[mine][:, None] + np.arange(n)]
+    rows *= np.repeat(used, 2, axis=1)[:, :, None]
+    return np.asarray(np.linalg.qr(rows, mode="r")) if rows.shape[1] > rows.shape[2] else rows
+
+
+def _keep(
+    graph: AdjustmentGraph, mine: IntArray, rows: FloatArray, width: int, kept: dict[str, list[FloatArray]]
+) -> None:
+    """The columns of what a block may have of its own."""
+    images = graph.images
+    nl = images.state.lenses.n_free[images.camera[mine]]
+    lens = np.zeros((*rows.shape[:2], MAX_LENS))
+    pose = np.empty((*rows.shape[:2], 6))
+    for count in np.unique(nl):  # warps make up for lens parameters in the number of columns
+        those = nl == count
+        lens[those, :, :count] = rows[those][:, :, :count]
+        pose[those] = rows[those][:, :, count : count + 6]
+    by_camera = _of_cameras(images.chains.R[mine], images.chains.t[mine])
+    kept["lens"].append(lens.reshape(-1, MAX_LENS))
+    kept["target"].append(pose.reshape(-1, 6))
+    kept["camera"].append((pose @ by_camera).reshape(-1, 6))
+    kept["shape"].append(rows[:, :, width:-1].reshape(-1, N_SHAPE))
+
+
+def _block_rows(graph: AdjustmentGraph, b: int) -> FloatArray:
+    """Whitened rows (2 n, local unknowns and 1) of all points of the b-th block of known targets, residual last."""
+    images = graph.images
+    s, c = images.state, images.chains
+    local = np.zeros((2 * int(images.ptr[b + 1] - images.ptr[b]), int(images.n_rows[b])))
+    block_rows(b, images.arrays, images.points, images.W_all_columns, s.lenses, c.R, c.t, s.warp, local)
+    return local
+
+
+def _of_cameras(R: FloatArray, t: FloatArray) -> FloatArray:
+    """Motions (B, 6, 6) in the target of a motion d of the camera: Exp(d) T = T Exp(Ad(inv T) d), T = (R, t)."""
+    out = np.zeros((len(R), 6, 6))
+    turned = R.transpose(0, 2, 1)
+    out[:, :3, :3] = out[:, 3:, 3:] = turned
+    cross = np.zeros((len(R), 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        cross[:, i, j], cross[:, j, i] = -t[:, k], t[:, k]
+    out[:, 3:, :3] = -turned @ cross
+    return out
+
+
+def _shape_factors(x: FloatArray) -> FloatArray:
+    """By what the derivatives by x, y, z and z again of the points (P, 3) of a target are to be multiplied: (P, 4)."""
+    out = np.zeros((len(x), N_SHAPE))
+    out[:, :3] = x
+    if np.ptp(x[:, 2]) < _FLAT:
+        out[:, 2:] = warp_shape(x)
+    return out
+
+
+def _unknown(
+    precision: Precision, bundle: BundleBatch, n: int, key_columns: KeyColumns, kept: dict[str, list[FloatArray]],
+    blocks: list[IntArray], numbers: list[IntArray],
+) -> ImageRows:  # fmt: skip
+    """Blocks of unknown points, whose rows differ in the columns of their points: as they are, two per point."""
+    A, e = bundle_rows(precision.graph, n, key_columns, precision.solved.values)
+    order = bundle_order(bundle)
+    used = np.repeat(bundle.unsorted(bundle.used), 2).astype(float)
+    local = bundle.A.reshape(-1, MAX_LENS + 7)[order] * used[:, None]
+    number = np.array([i for i, free in precision.graph.image_order if free], dtype=np.int64)
+    lengths = 2 * np.diff(bundle.block_ptr)
+    of_row = np.repeat(np.arange(len(lengths)), lengths)
+    pose = local[:, MAX_LENS : MAX_LENS + 6]
+    c = bundle.chains
+    by_camera = _of_cameras(c.R, c.t)
+    kept["lens"].append(local[:, :MAX_LENS])
+    kept["target"].append(np.zeros_like(pose))
+    kept["camera"].append(np.einsum("ni,nij->nj", pose, by_camera[of_row]))
+    kept["shape"].append(np.zeros((len(local), N_SHAPE)))
+    blocks.append(number[of_row])
+    numbers.append(number)
+    groups = [b.group for b in bundle.blocks]
+    A = sparse.diags(used) @ A
+    return ImageRows(A.tocsr(), e * used, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)

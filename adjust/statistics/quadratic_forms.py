@@ -1,0 +1,60 @@
+"""The distribution of a sum of weighted squares of residuals that belong together: ``sum of lambda_i chi-square_1``.
+
+v'Pv of a group has the eigenvalues lambda of its part R_gg of the redundancy matrix: they lie between 0 and 1, add up
+to its redundancy r, and their squares to half its variance.
+"""
+
+import numpy as np
+
+from adjust.distributions import chi2, norm
+from adjust.model import FloatArray
+
+_STEPS = 100
+_NEAR = 1e-4
+
+
+def upper_tail(x: float, weights: FloatArray) -> float:
+    """P(sum of weights_i chi-square_1 > x), weights (k,) positive: the saddlepoint formula of Lugannani and Rice.
+
+    Kuonen (1999), Biometrika 86, 929-935; its relative error stays small far out, where that of chi-square with the
+    same two moments (Satterthwaite 1946) grows without bound. At the mean its limit.
+    """
+    weights = weights[weights > 0.0]
+    mean, squares = float(weights.sum()), float((weights**2).sum())
+    if x <= 0.0:
+        return 1.0
+    if len(weights) == 1 or np.ptp(weights) < 1e-9 * weights.max():
+        return float(chi2.sf(x / weights[0], len(weights)))
+    if abs(x - mean) > _NEAR * np.sqrt(2.0 * squares):
+        t = _saddlepoint(x, weights)
+        rest = 1.0 - 2.0 * t * weights
+        w = np.sign(t) * np.sqrt(max(2.0 * t * x + float(np.log(rest).sum()), 0.0))
+        v = t * np.sqrt(2.0 * float(((weights / rest) ** 2).sum()))
+        if abs(w) > _NEAR and v != 0.0:
+            return float(np.clip(norm.sf(w + np.log(v / w) / w), 0.0, 1.0))
+    skewness = 8.0 * float((weights**3).sum()) / (2.0 * squares) ** 1.5
+    return float(0.5 - skewness / (6.0 * np.sqrt(2.0 * np.pi)))
+
+
+def _saddlepoint(x: float, weights: FloatArray) -> float:
+    """T with K'(t) = sum of lambda / (1 - 2 t lambda) = x, which grows with t up to 1 / (2 max lambda)."""
+    high = 0.5 / float(weights.max())
+    # K' is at least its largest term, and at most k of them
+    low = min(0.0, 0.5 * (1.0 / float(weights.max()) - len(weights) / x)) - 1.0
+    while float((weights / (1.0 - 2.0 * low * weights)).sum()) > x:
+        low *= 2.0
+    for _ in range(_STEPS):
+        middle = 0.5 * (low + high)
+        if float((weights / np.maximum(1.0 - 2.0 * middle * weights, 1e-300)).sum()) > x:
+            high = middle
+        else:
+            low = middle
+    return low
+
+
+def upper_tail_bound(x: float, redundancy: float) -> float:
+    """At least P(sum > x), far above its mean, whatever the weights: chi-square with r degrees of freedom.
+
+    Of all weights up to 1 with the sum r those that are 1 or 0 spread most (Szekely and Bakirov 2003).
+    """
+    return float(chi2.sf(x, redundancy))

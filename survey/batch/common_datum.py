@@ -1,0 +1,268 @@
+"""Epochs with a free datum each, brought to a common one: else their coordinates differ by the motion of the whole.
+
+The inner constraints of an epoch hold about its own start values, and these are not the same in two epochs. Each is
+moved, along the motions that its observations leave open, onto the median of all by least squares over the points and
+stations that carry its datum. That is the S-transformation (Baarda 1973) to the inner datum about those coordinates:
+covariances, already those of an inner datum over the same names, only turn and grow along.
+
+What has moved in an epoch must not carry its datum, or the others seem to move too: while a carrier fails its test, the
+worst is taken out (Niemeier 2008, 13). The motion of the whole then gains ``(G_s' G_s)^-1 G_m' d_m`` of those that are
+out; epochs come without covariances between their points, so the sigma of this is added to that of a coordinate, which
+is more than both have together. Epochs whose datum is carried by other names, or leaves other motions open, are not
+comparable; they are left out by name.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.distributions import chi2
+from adjust.epoch_states import differences_of, moved_value, origin, value_motions
+from adjust.model import FloatArray
+from adjust.statistics.criteria import sidak
+from survey.quantities import ARCSEC_PER_RAD
+from survey.results import read_covariances
+
+_TURNED = 1e-6
+_ROUNDS, _SETTLED = 20, 1e-13
+_SCALE = 6
+_LEVEL = 0.01
+_DETERMINED = 1e-9
+
+
+@dataclass(frozen=True)
+class Place:
+    """A point or pose in the world: x_mm, quaternion w x y z (of a pose), covariance row by row in its tangent, SI."""
+
+    name: str
+    x_mm: tuple[float, ...]
+    wxyz: tuple[float, ...] | None
+    cov: tuple[float, ...]
+
+    @property
+    def value(self) -> Pose3 | FloatArray:
+        """As the mathematics takes it."""
+        x = 1e-3 * np.array(self.x_mm)
+        return x if self.wxyz is None else Pose3(Rot3.Quaternion(*self.wxyz), x)
+
+
+@dataclass(frozen=True)
+class FreeDatum:
+    """Of an epoch: open_motions (k, 7) t, rotation vector, ln scale; names that carry it; everything in the world."""
+
+    open_motions: tuple[tuple[float, ...], ...]
+    carried_by: tuple[str, ...]
+    places: tuple[Place, ...]
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A place in the common datum: x_mm and sigmas_mm (3,), and of a pose its quaternion and sigmas (arcsec)."""
+
+    x_mm: tuple[float, ...]
+    sigmas_mm: tuple[float, ...]
+    wxyz: tuple[float, ...] | None
+    sigmas_arcsec: tuple[float, ...] | None
+
+
+def free_datum(solution: Mapping[str, Any], covariances: Path) -> FreeDatum | None:
+    """Of a solution, as ``solution.json`` and ``covariance.npz`` hold it; None where its datum is given.
+
+    Raises OSError or ValueError for what is no ``covariance.npz``.
+    """
+    datum = solution.get("free_datum")
+    if datum is None:
+        return None
+    covs = read_covariances(covariances)
+    places = tuple(
+        Place(name, tuple(x), None if q is None else tuple(q), tuple(np.asarray(covs[key]).ravel().tolist()))
+        for name, key, x, q in _world(solution) if key in covs
+    )  # fmt: skip
+    motions = tuple(tuple(float(x) for x in row) for row in datum["open_motions"])
+    return FreeDatum(motions, tuple(datum["carried_by"]), places)
+
+
+def _world(solution: Mapping[str, Any]) -> Iterator[tuple[str, str, Sequence[float], Sequence[float] | None]]:
+    """Name as in records, name in ``covariance.npz``, mm, quaternion."""
+    for name, entry in solution["points"].items():
+        yield f"point/{name}", f"point/{name}", [entry[f"{axis}_mm"] for axis in "xyz"], None
+    for section, key, parameter in (
+        ("stations", "world_from_station", "world_from_station"), ("tables", "world_from_table", "world_from_table"),
+        ("targets", "world_from_target", "carrier_from_target"),
+    ):  # fmt: skip
+        for name, entry in solution[section].items():
+            if key in entry:
+                pose = entry[key]
+                yield (f"{key}/{name}", f"{parameter}/{name}", pose["translation_mm"],
+                       pose["rotation_quaternion_wxyz"])  # fmt: skip
+
+
+def incomparable(data: Sequence[FreeDatum | None]) -> dict[int, str]:
+    """Epochs whose world is in no common datum with that of the others, and why; None stands for a given datum."""
+    kinds: dict[Any, list[int]] = {}
+    for i, datum in enumerate(data):
+        kinds.setdefault(None if datum is None else (_span(datum), frozenset(datum.carried_by)), []).append(i)
+    if len(kinds) < 2:
+        return {}
+    most = max(kinds, key=lambda kind: (len(kinds[kind]), -kinds[kind][0]))
+    out: dict[int, str] = {}
+    for kind, epochs in kinds.items():
+        if kind != most:
+            out |= dict.fromkeys(epochs, _why(kind, most))
+    return out
+
+
+def _why(kind: Any, most: Any) -> str:
+    if kind is None or most is None:
+        return "its datum is given" if kind is None else "its datum is free"
+    if kind[0] != most[0]:
+        return "its observations leave other motions open"
+    lost, more = sorted(most[1] - kind[1]), sorted(kind[1] - most[1])
+    said = [f"without {_named(lost)}"] if lost else []
+    said += [f"with {_named(more)}"] if more else []
+    return "its datum is carried by other points or stations, " + " and ".join(said)
+
+
+def _named(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def _span(datum: FreeDatum) -> tuple[bool, ...]:
+    """Which of the seven motions are open."""
+    size = np.abs(np.array(datum.open_motions).reshape(-1, 7)).max(axis=0, initial=0.0)
+    return tuple((size > _TURNED * size.max(initial=0.0)).tolist())
+
+
+def scale_is_open(datum: FreeDatum) -> bool:
+    """Whether lengths themselves are not determined."""
+    return _span(datum)[_SCALE]
+
+
+def in_common_datum(data: Sequence[FreeDatum]) -> list[dict[str, Moved]]:
+    """The world of all epochs in one datum; their datums have the same carriers and open motions."""
+    first = data[0]
+    target = {p.name: p.value for p in first.places}
+    carriers = [n for n in first.carried_by if all(n in {p.name for p in d.places} for d in data)]
+    epochs = [_Epoch(d, np.array(first.open_motions).reshape(-1, 7).T) for d in data]
+    for epoch in epochs:
+        epoch.align(target, carriers)
+    middle = {n: _median(target[n], [e.values[n] for e in epochs]) for n in carriers}
+    level = sidak(_LEVEL, len(carriers) * len(epochs))
+    return [epoch.moved(middle, carriers, level, 1.0 + 0.5 * np.pi / len(epochs)) for epoch in epochs]
+
+
+def _median(about: Pose3 | FloatArray, values: Sequence[Pose3 | FloatArray]) -> Pose3 | FloatArray:
+    """Component by component, of poses in the tangent of the first."""
+    d = np.median([differences_of(about, v) for v in values], axis=0)
+    return about.retract(d) if isinstance(about, Pose3) else about + d
+
+
+class _Epoch:
+    """An epoch on its way: values by name, and by how much they have turned and grown. directions: (7, k)."""
+
+    def __init__(self, datum: FreeDatum, directions: FloatArray) -> None:
+        self.datum, self.directions = datum, directions
+        self.values = {p.name: p.value for p in datum.places}
+        self.places = {p.name: p for p in datum.places}
+        self.turn, self.scale = np.eye(3), 1.0
+
+    def align(self, target: Mapping[str, Pose3 | FloatArray], stable: Sequence[str]) -> None:
+        """Move onto the target by least squares over the stable ones."""
+        for _ in range(_ROUNDS):
+            d = np.concatenate([differences_of(target[n], self.values[n]) for n in stable])
+            known = np.isfinite(d)
+            step = self.directions @ np.linalg.lstsq(self._motions(target, stable)[known], -d[known], rcond=1e-10)[0]
+            self.values = {n: moved_value(v, step) for n, v in self.values.items()}
+            self.turn = Rot3.Expmap(step[3:6]).matrix() @ self.turn
+            self.scale *= float(np.exp(step[6]))
+            if np.abs(step).max(initial=0.0) < _SETTLED:
+                break
+
+    def _motions(self, target: Mapping[str, Pose3 | FloatArray], names: Sequence[str]) -> FloatArray:
+        return np.concatenate([value_motions(target[n]) for n in names]) @ self.directions
+
+    def moved(
+        self, target: Mapping[str, Pose3 | FloatArray], carriers: Sequence[str], level: float, spread: float
+    ) -> dict[str, Moved]:
+        """In the datum of the carriers that stayed. spread: variance of a difference over that of the epoch."""
+        stable = list(carriers)
+        self.align(target, stable)
+        while 2 * (len(stable) - 1) >= len(carriers):
+            tests = {n: self._test(target, n) / spread for n in stable}
+            limits = {n: float(chi2.isf(level, len(self.cov(n)))) for n in stable}
+            worst = max(tests, key=lambda n: tests[n] / limits[n])
+            rest = [n for n in stable if n != worst]
+            short = np.linalg.matrix_rank(self._motions(target, rest)) < self.directions.shape[1]
+            if tests[worst] <= limits[worst] or short:
+                break
+            stable = rest
+            self.align(target, stable)
+        out = [n for n in carriers if n not in stable]
+        return {n: self._place(n, self._gained(target, stable, out, n)) for n in self.places}
+
+    def cov(self, name: str) -> FloatArray:
+        """Covariance as it turned and grew along, in the tangent of a pose."""
+        place = self.places[name]
+        n = 3 if place.wxyz is None else 6
+        J = np.eye(n)
+        J[-3:, -3:] = self.scale * (self.turn if n == 3 else np.eye(3))
+        return np.asarray(J @ np.array(place.cov).reshape(n, n) @ J.T)
+
+    def _test(self, target: Mapping[str, Pose3 | FloatArray], name: str) -> float:
+        d, C = differences_of(target[name], self.values[name]), self.cov(name)
+        sigma = np.sqrt(np.diag(C))
+        seen = np.isfinite(d) & (sigma > 0.0)
+        rho = C[np.ix_(seen, seen)] / np.outer(sigma[seen], sigma[seen])
+        z = d[seen] / sigma[seen]
+        return float(z @ np.linalg.pinv(rho, rcond=_DETERMINED, hermitian=True) @ z)
+
+    def _gained(
+        self, target: Mapping[str, Pose3 | FloatArray], stable: Sequence[str], out: Sequence[str], name: str
+    ) -> FloatArray:
+        """Sigmas (3 or 6,) of what the motion of the whole gained, in the tangent of a pose."""
+        own = value_motions(self.values[name]) @ self.directions
+        total = np.zeros(len(own))
+        if out:
+            G = self._motions(target, stable)
+            own = own @ np.linalg.inv(G.T @ G)
+        for m in out:
+            B = own @ self._motions(target, [m]).T
+            total += np.sqrt(np.clip(np.diag(B @ self.cov(m) @ B.T), 0.0, None))
+        return total
+
+    def _place(self, name: str, gained: FloatArray) -> Moved:
+        value, cov = self.values[name], self.cov(name)
+        axes = value.rotation().matrix() if isinstance(value, Pose3) else np.eye(3)
+        own = np.sqrt(np.clip(np.diag(axes @ cov[-3:, -3:] @ axes.T), 0.0, None)) + np.abs(axes) @ gained[-3:]
+        x, sigmas = tuple((1e3 * origin(value)).tolist()), tuple((1e3 * own).tolist())
+        if not isinstance(value, Pose3):
+            return Moved(x, sigmas, None, None)
+        q: Any = value.rotation().toQuaternion()  # a class that the stubs leave out
+        turned = ARCSEC_PER_RAD * (np.sqrt(np.clip(np.diag(cov)[:3], 0.0, None)) + gained[:3])
+        return Moved(x, sigmas, (q.w(), q.x(), q.y(), q.z()), tuple(turned.tolist()))
+
+
+def moved_numbers(numbers: Sequence[Any], moved: Mapping[str, Moved]) -> Iterator[Any]:
+    """Numbers of a record, those of the world in the common datum."""
+    for number in numbers:
+        path, _, axis = number.name.rpartition("/")
+        place = moved.get(path)
+        if place is None or axis not in ("x", "y", "z"):
+            yield number
+        else:
+            k = "xyz".index(axis)
+            yield replace(number, value=place.x_mm[k], sigma=place.sigmas_mm[k])
+
+
+def moved_turns(turns: Sequence[Any], moved: Mapping[str, Moved]) -> Iterator[Any]:
+    """Rotations of a record, those of the world in the common datum."""
+    for turn in turns:
+        place = moved.get(turn.name)
+        if place is None or place.wxyz is None or place.sigmas_arcsec is None:
+            yield turn
+        else:
+            yield replace(turn, wxyz=place.wxyz, sigmas_arcsec=place.sigmas_arcsec)

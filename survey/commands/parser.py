@@ -1,0 +1,91 @@
+"""The parser of both programs: wrong usage is said in one line that offers what was probably meant."""
+
+import argparse
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from adjust.errors import SurveyError
+
+_CHOICE = re.compile(
+    r"argument (?P<what>.+?): invalid choice: '?(?P<found>.*?)'? \(choose from (?P<known>.*)\)", re.DOTALL
+)
+_NUMBER = re.compile(r"argument (?P<what>.+?): invalid (?:int|float) value: '(?P<found>.*)'", re.DOTALL)
+_FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
+
+
+class Parser(argparse.ArgumentParser):
+    """As argparse's, with other words where the usage is wrong; commands are of this class too."""
+
+    def add_subparsers(self, **options: Any) -> Any:
+        """Commands are called by the program's name; argparse would put the whole usage in front of them."""
+        return super().add_subparsers(**{"prog": self.prog, **options})
+
+    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
+        """The arguments; what is left over is an error of the command that it was given to."""
+        found, left = self.parse_known_args(args, namespace)
+        if left:
+            command = getattr(found, "parser", self)
+            command.error(_left_over(left, command))
+        return found
+
+    def error(self, message: str) -> NoReturn:
+        """Exit code 2, after the usage and what is wrong."""
+        self.print_usage(sys.stderr)
+        self.exit(2, f"{self.prog}: error: {_mended(message, self.prog)}\n")
+
+
+def name_commands(commands: Any) -> None:
+    """Every command's arguments know the parser that they came through."""
+    for parser in commands.choices.values():
+        parser.set_defaults(parser=parser)
+
+
+def project_folder(text: str) -> Path:
+    """A project's folder from the command line, also where its survey.toml was named."""
+    path = Path(text)
+    return path.parent if path.name == "survey.toml" and path.is_file() else path
+
+
+def _left_over(left: Sequence[str], command: argparse.ArgumentParser) -> str:
+    word = left[0]
+    if not word.startswith("-"):
+        return f"{word!r} is one too many; see the usage above"
+    from survey.files.text import suggestion
+
+    flags = _FLAG.findall(command.format_help())
+    return f"unknown flag {word.split('=')[0]}; {suggestion(word.split('=')[0], flags)}"
+
+
+def _mended(message: str, program: str) -> str:
+    """A message of argparse in the words of the project: what was found, what to do."""
+    choice, number = _CHOICE.fullmatch(message), _NUMBER.fullmatch(message)
+    if choice:
+        from survey.files.text import choice_hint
+
+        known = [a or b for a, b in re.findall(r"'([^']*)'|([^',\s]+)", choice["known"])]
+        what = "command" if choice["what"] == "COMMAND" else choice["what"]
+        return f"{what} {choice['found']!r} is unknown; {choice_hint(choice['found'], known)}"
+    if number:
+        return f"{number['what']}: found {number['found']!r}; expected a number"
+    if message == "the following arguments are required: COMMAND":
+        return f"no command is given; {program} --help lists them"
+    missing = re.fullmatch(r"the following arguments are required: (.*)", message)
+    if missing:
+        return f"{missing[1]} is missing; see the usage above"
+    return message
+
+
+def port(text: str) -> int:
+    """A port from the command line, 0 for any that is free."""
+    value = int(text) if re.fullmatch(r"\d{1,5}", text, re.ASCII) else -1
+    if not 0 <= value <= 65535:
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected a port, 1 to 65535, or 0 for one that is free")
+    return value
+
+
+def port_error(number: int, error: OSError) -> SurveyError:
+    """What to say where a port cannot be listened on."""
+    return SurveyError(f"port {number} cannot be used ({error.strerror}); name another with --port, 0 takes a free one")

@@ -1,0 +1,115 @@
+"""Whether a grid of corners is a whole board: of neighbouring squares, and ending where it was said to end."""
+
+import cv2
+import numpy as np
+
+from adjust.model import BoolArray, FloatArray
+from survey.detection.corners import refine_corners
+from survey.detection.gray import Gray32
+
+_MOST = 60  # rows or columns of the largest board
+_SEEN = 0.75  # share of the corners of the next row that must be there
+_NEAR = 0.2  # squares that they may be from where the grid puts them
+_CONTRAST = 0.5  # of the board's own
+
+
+def is_of_neighbours(gray: Gray32, grid: FloatArray, contrast: float) -> bool:
+    """Whether the colours change across every edge of a grid (rows, columns, 2) px, and in turn.
+
+    They do not where a finder took every second corner of a larger board, or went across it. contrast: median step
+    from dark to bright. One in five places may be hidden or lit from the side.
+    """
+    for g in (grid, grid.transpose(1, 0, 2)):
+        start, edge, across = g[:-1, 1:-1], g[1:, 1:-1] - g[:-1, 1:-1], (g[:-1, 2:] - g[:-1, :-2]) / 2.0
+        row, column = np.indices(start.shape[:2])
+        turn = 1.0 - 2.0 * ((row + column) % 2)
+        agree = []
+        for along in (0.25, 0.5, 0.75):
+            side = [_bilinear(gray, start + along * edge + k * across) for k in (0.2, -0.2)]
+            step = turn * (side[0] - side[1])
+            agree.append((np.abs(step) > 0.4 * contrast) * np.sign(step))
+        # four of five one way and none the other; which way says whether the first square is dark
+        if abs(np.mean(agree)) < 0.8:
+            return False
+    return True
+
+
+def grown(gray: Gray32, grid: FloatArray, contrast: float) -> FloatArray:
+    """The grid (rows, columns, 2) px, continued on its four sides as far as there are corners of the same board.
+
+    contrast: median step from dark to bright of the corners that were given. A next row is one where at least three
+    quarters of its places show a crossing of two edges, of half that contrast, of the colours that follow, where the
+    grid puts it. Margins, backgrounds and boards of another pitch do not; nor do places outside the image.
+    """
+    size = 0
+    while size < grid.size and max(grid.shape) < _MOST:
+        size = grid.size
+        for turn in range(4):  # a wider side may go on where a narrow one lacked a corner
+            side = np.rot90(grid, turn)
+            while max(side.shape) < _MOST and (row := _next_row(gray, side, contrast)) is not None:
+                side = np.concatenate([row[None], side])
+            grid = np.rot90(side, -turn)
+    return np.asarray(grid)
+
+
+def _next_row(gray: Gray32, grid: FloatArray, contrast: float) -> FloatArray | None:
+    """The corners (columns, 2) px before the first row of a grid; None where the board ends there."""
+    rows, columns = grid.shape[:2]
+    if min(rows, columns) < 2:
+        return None
+    place, edges = _extrapolated(grid)
+    inside = np.all((place > 3.0) & (place < np.array(gray.shape[::-1]) - 4.0), axis=1)
+    if inside.sum() < max(2.0, _SEEN * columns):
+        return None
+    spacing = np.linalg.norm(edges, axis=2).min(axis=1)
+    fit = refine_corners(gray, place, edges)
+    there = fit.good & inside & (np.linalg.norm(fit.uv - place, axis=1) < np.maximum(_NEAR * spacing, 1.5))
+    step = _CONTRAST * contrast
+    there &= (fit.contrast > step) & _squares_follow(gray, grid, place, edges, step)
+    if there.sum() < _SEEN * columns:
+        return None
+    return np.asarray(np.where(there[:, None], fit.uv, place))
+
+
+def _extrapolated(grid: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Places (columns, 2) px of the row before the first, and edges (columns, 2, 2) px along the row and the column.
+
+    By the homography of the rows nearest to it, which a lens bends less than the whole board, and what that leaves at
+    the first row.
+    """
+    columns = grid.shape[1]
+    near = grid[: min(4, len(grid))]
+    y, x = np.indices(near.shape[:2])
+    xy = np.stack([x, y], axis=2).reshape(-1, 2).astype(float)
+    H = np.asarray(cv2.findHomography(xy, near.reshape(-1, 2), 0)[0], float)
+
+    def at(x: FloatArray, y: float) -> FloatArray:
+        q = np.column_stack([x, np.full(len(x), y), np.ones(len(x))]) @ H.T
+        return np.asarray(q[:, :2] / q[:, 2:])
+
+    along = np.arange(columns, dtype=float)
+    place = at(along, -1.0) + grid[0] - at(along, 0.0)
+    edges = np.stack([at(along + 0.5, -1.0) - at(along - 0.5, -1.0), at(along, -0.5) - at(along, -1.5)], axis=1)
+    return place, edges
+
+
+def _squares_follow(gray: Gray32, grid: FloatArray, place: FloatArray, edges: FloatArray, step: float) -> BoolArray:
+    """Whether the two squares beyond each corner differ by more than ``step``, and the other way than those before it.
+
+    (columns,) bool. On a margin they are alike, whatever the board's own squares do there.
+    """
+    beyond, before = _difference(gray, place, edges), _difference(gray, grid[0], edges)
+    return np.asarray((beyond * before < 0.0) & (np.abs(beyond) > step))
+
+
+def _difference(gray: Gray32, at: FloatArray, edges: FloatArray) -> FloatArray:
+    """Right square minus left square on the far side of a corner, (n,) grey values."""
+    right, left = (_bilinear(gray, at + k * edges[:, 0] - 0.3 * edges[:, 1]) for k in (0.3, -0.3))
+    return np.asarray(right - left)
+
+
+def _bilinear(gray: Gray32, uv: FloatArray) -> FloatArray:
+    """Grey values (...) at places (..., 2) px."""
+    p = np.asarray(uv, np.float32).reshape(-1, 1, 2)
+    level = cv2.remap(gray, p[..., 0], p[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(level, float).reshape(uv.shape[:-1])

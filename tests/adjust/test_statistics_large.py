@@ -1,0 +1,113 @@
+"""What the statistics do in large surveys, against what they do in small ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from adjust.adjustment import adjust
+from adjust.result import Adjustment
+from adjust.statistics import system as system_module
+from adjust.statistics import weakness
+from adjust.statistics.budget import uncertainty_budget
+from adjust.statistics.condensed import condensed_system
+from adjust.statistics.system import linear_system, precision_of
+from adjust.statistics.weakness import correlations, principal_component, weak_directions
+from survey.simulate import head_on_table
+from tests.adjust import helpers as h
+from tests.adjust import statistics_networks as net
+
+
+def lab() -> Adjustment:
+    survey, truth = head_on_table(2, n_cameras=2, n_table_epochs=12, n_free_epochs=8)
+    return adjust(survey, h.start_at(truth))
+
+
+def test_few_unknowns_that_many_touch_and_many_small_sets() -> None:
+    """Against a dense solution; right-hand sides of one and of several columns."""
+    rng = np.random.default_rng(1)
+    sizes = rng.integers(1, 7, 200)
+    n, core = int(sizes.sum()) + 30, 30
+    N = np.zeros((n, n))
+    at = core
+    for k in sizes:
+        A = rng.normal(size=(20, core + k)) * (rng.random((20, core + k)) < 0.9)
+        index = np.r_[np.arange(core), np.arange(at, at + k)]
+        N[np.ix_(index, index)] += A.T @ A
+        at += k
+    order = rng.permutation(n)
+    N = N[np.ix_(order, order)]
+    found = system_module._arrow(sparse.csc_matrix(N))
+    assert found is not None
+    solve, cost = found
+    assert cost < n**2
+    for b in (rng.normal(size=n), rng.normal(size=(n, 3))):
+        x = solve(b)
+        assert x.shape == b.shape
+        np.testing.assert_allclose(x, np.linalg.solve(N, b), rtol=1e-8, atol=1e-10)
+    full = rng.normal(size=(n, n))
+    assert system_module._arrow(sparse.csc_matrix(full @ full.T)) is None
+
+
+def test_lanczos_finds_the_directions_of_the_whole_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+    for adjustment in (lab(), adjust(*net.hall(2, n_points=30)), free()):
+        system = condensed_system(precision_of(adjustment)).system
+        small = weak_directions(adjustment, least_inflation=1.0, system=system)
+        main = principal_component(adjustment, system)
+        with monkeypatch.context() as m:
+            m.setattr(weakness, "FEW", 10)
+            large = weak_directions(adjustment, least_inflation=1.0, system=system)
+            again = principal_component(adjustment, system)
+        assert len(large) == 5
+        for a, b in zip(small, large, strict=True):
+            assert b.inflation == pytest.approx(a.inflation, rel=1e-6)
+            assert (b.parts[0].name, b.parts[0].component) == (a.parts[0].name, a.parts[0].component)
+            assert abs(b.parts[0].amount) == pytest.approx(abs(a.parts[0].amount), rel=1e-3)
+        if main is not None and again is not None:
+            assert again.sigma == pytest.approx(main.sigma, rel=1e-6)
+            assert again.share == pytest.approx(main.share, rel=1e-6)
+
+
+def free() -> Adjustment:
+    """A network with inner constraints."""
+    survey, start = net.hall(3)
+    points = tuple(replace(p, x_in_world=replace(p.x_in_world, treatment="free", held=())) for p in survey.points)
+    return adjust(replace(survey, points=points, datum=replace(survey.datum, kind="inner")), start)
+
+
+def test_correlations_of_a_large_survey_leave_out_only_what_they_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between single epochs; all others are those of a small one."""
+    adjustment = lab()
+    system = condensed_system(precision_of(adjustment)).system
+    every = correlations(adjustment, 0.8, system=system)
+    assert every == correlations(adjustment, 0.8, system=system)
+    n_once = len([n for n in system.columns.names if len(n) < 3])
+    n = len(system.columns)
+    monkeypatch.setattr(weakness, "DENSE", 10)
+    monkeypatch.setattr(weakness, "_WORK", n_once * n)
+    assert len(weakness.compared_columns(system)) == n_once
+    found = correlations(adjustment, 0.8, system=system)
+    key = lambda x: frozenset([(x.a, x.a_component), (x.b, x.b_component)])  # noqa: E731  # said twice
+    expected = {key(x): x.coefficient for x in every if len(x.a) < 3 or len(x.b) < 3 or x.a == x.b}
+    got = {key(x): x.coefficient for x in found}
+    assert len(got) == len(found)
+    assert got.keys() == expected.keys()
+    assert len(got) > 10
+    for k, value in got.items():
+        assert value == pytest.approx(expected[k], abs=1e-6)
+
+
+def test_the_budget_is_that_of_all_rows() -> None:
+    """By the condensed system, whose largest source is what the others leave, and source by source from every row."""
+    adjustment = lab()
+    full, small = linear_system(adjustment), condensed_system(precision_of(adjustment)).system
+    names = [("lens", c.camera_id) for c in adjustment.survey.cameras] + [("table_geometry", "turntable")]
+    Q = np.linalg.inv((full.A.T @ full.A + full.datum.T @ full.datum).toarray())
+    effects = (full.A @ Q) ** 2
+    for entry in uncertainty_budget(adjustment, names, system=small):
+        at = full.columns.names.index(entry.name)
+        at += full.columns.components[at:].index(entry.component)
+        for line in entry.lines:
+            group = full.group[full.row_of] == full.group_names.index(line.source)
+            assert line.u**2 == pytest.approx(float(effects[group, at].sum()), rel=1e-5, abs=1e-9 * entry.u**2)

@@ -1,0 +1,28 @@
+"""One camera whose images contradict all others before a table: it is named, not the boards that it sees."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from adjust.model import Survey
+from adjust.table_checks import probable_causes
+from survey.simulate import head_on_table
+
+
+def mirrored(survey: Survey, camera_id: str) -> Survey:
+    """Its images mirrored left to right."""
+    width = next(c.image_size[0] for c in survey.cameras if c.camera_id == camera_id)
+    blocks = tuple(
+        replace(b, uv=np.stack([width - 1.0 - b.uv[:, 0], b.uv[:, 1]], axis=1)) if b.camera_id == camera_id else b
+        for b in survey.image_blocks
+    )
+    return replace(survey, image_blocks=blocks)
+
+
+def test_a_mirrored_camera_is_named() -> None:
+    survey, _ = head_on_table(2, n_cameras=3, n_table_epochs=8, n_free_epochs=2)
+    assert probable_causes(survey) == ()
+    wrong = survey.cameras[1].camera_id
+    causes = probable_causes(mirrored(survey, wrong))
+    assert len(causes) == 1
+    assert causes[0].startswith(f"camera {wrong}: its images contradict those of all others")

@@ -1,0 +1,211 @@
+"""The declarations of ``survey.toml``: readers check what they name, page and schema follow from them."""
+
+import copy
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adjust.errors import SurveyError
+from adjust.lens import MODELS
+from survey.cli import main
+from survey.examples import EXAMPLES, write_example
+from survey.files.column_texts import COLUMN_TEXTS, column_text
+from survey.files.declarations import DECLARATIONS, declared
+from survey.files.declared import NOTHING, REQUIRED, Declared, Key
+from survey.files.exclusions import EXCLUSIONS
+from survey.files.reading import LAYOUTS, read_definition
+from survey.reference import reference_page
+from survey.schema import survey_schema
+from survey.tolerances import OWNERS
+
+jsonschema = pytest.importorskip("jsonschema")
+ROOT = Path(__file__).parents[2]
+PRIOR = {
+    "treatment": "prior", "translation_mm": [0, 0, 0], "rotation_quaternion_wxyz": [1, 0, 0, 0],
+    "sigma_translation_mm": 1.0, "sigma_rotation_deg": 1.0,
+}  # fmt: skip
+EVERYTHING: dict[str, Any] = {
+    "format": 1,
+    "stations": {
+        "head": {"motion": "epoch", "world_from_station": PRIOR, "epochs": {"e1": PRIOR}},
+        "carried": {"motion": "table", "table": "tt"},
+    },
+    "tables": {"tt": {"geometry": {"free": ["non_orthogonality", "axis_offset", "zero_1", "zero_2"]}}},
+    "cameras": {
+        "X": {"station": "head", "image_size_px": [640, 480], "lens": {
+            "model": "brown", "free": ["fx"], "values": {"fx": 1000, "fy": 1000, "u0": 320, "v0": 240},
+            "prior": {"fx": {"value": 1000, "sigma": 1}}, "tie": {"fy": {"to": "fx"}},
+        }},
+    },
+    "targets": {
+        "board": {"kind": "checkerboard", "columns": 9, "rows": 6, "square_mm": 10, "warp": {"sigma_mm": 1.0}},
+        "cha": {"kind": "charuco", "squares_x": 9, "squares_y": 6, "square_mm": 10, "marker_mm": 7,
+                "dictionary": "DICT_4X4_50"},
+        "grid": {"kind": "marker_grid", "columns": 3, "rows": 2, "marker_mm": 10, "gap_mm": 2,
+                 "dictionary": "DICT_4X4_50"},
+        "block": {"kind": "marker_block", "dictionary": "DICT_4X4_50",
+                  "markers": {"7": [[0, 0, 0], [40, 0, 0], [40, -40, 0], [0, -40, 0]]}},
+        "list": {"kind": "points", "file": "list.csv"},
+    },
+    "points": {"P1": {"x_mm": [1, 2, 3], "treatment": "prior", "sigma_mm": 1.0}},
+    "datum": {"kind": "inner"},
+    "sigmas": {"scale": {"distance": 2.0}},
+    "adjustment": {}, "vertical": {"free": ["tilt_1", "tilt_2"], "sigma": {"tilt_1_arcsec": 1.0}}, "bearings": {},
+    "spots": {"cameras": ["X"]},
+    "instruments": {"ts": {"sigma_distance_mm": 1.0}},
+    "setups": {"s1": {}},
+    "beams": {"b1": {"mount": "tt"}},
+    "surfaces": {"floor": {"kind": "plane"}, "rail": {"kind": "line"}, "ball": {"kind": "sphere"}},
+    "align": {"a1": {"body": "target:board", "onto": "table:tt", "feet_mm": {"a": [0, 0], "b": [9, 0], "c": [0, 9]}}},
+    "tolerances": {"t1": {"of": "lenses", "component": "fx", "tolerance_px": 1.0}},
+    "identification": {"operator": "somebody"},
+}  # fmt: skip
+PLACES: dict[str, tuple[str, ...]] = {
+    "root": (), "camera": ("cameras", "X"), "lens": ("cameras", "X", "lens"),
+    "lens_values": ("cameras", "X", "lens", "values"), "lens_prior": ("cameras", "X", "lens", "prior", "fx"),
+    "lens_tie": ("cameras", "X", "lens", "tie", "fy"), "station": ("stations", "carried"),
+    "pose": ("stations", "head", "world_from_station"), "poses": ("stations", "head", "epochs"),
+    "turntable": ("tables", "tt"), "turntable_geometry": ("tables", "tt", "geometry"),
+    "turntable_sigma": ("tables", "tt", "geometry_sigma"), "target_checkerboard": ("targets", "board"),
+    "target_charuco": ("targets", "cha"), "target_marker_grid": ("targets", "grid"),
+    "target_marker_block": ("targets", "block"), "target_points": ("targets", "list"),
+    "markers": ("targets", "block", "markers"), "warp": ("targets", "board", "warp"), "point": ("points", "P1"),
+    "datum": ("datum",), "sigmas": ("sigmas",), "scale": ("sigmas", "scale"), "adjustment": ("adjustment",),
+    "spots": ("spots",), "vertical": ("vertical",), "bearings": ("bearings",), "instrument": ("instruments", "ts"),
+    "setup": ("setups", "s1"), "beam": ("beams", "b1"), "surface_plane": ("surfaces", "floor"),
+    "surface_line": ("surfaces", "rail"), "surface_sphere": ("surfaces", "ball"),
+    "vector_sigma": ("vertical", "sigma"), "align": ("align", "a1"), "feet": ("align", "a1", "feet_mm"),
+    "tolerance": ("tolerances", "t1"), "identification": ("identification",),
+}  # fmt: skip
+NEED_MORE = {("station", "motion"), ("lens", "balance_radius_mm")}
+KEYS = [(d, key) for d in DECLARATIONS for key in d.keys]
+WRONG = {"text": 1, "choice": "wrong", "flag": "wrong", "whole": "wrong", "number": "wrong", "numbers": "wrong",
+         "matrix": "wrong", "names": 1, "sigma": "wrong", "table": 1}  # fmt: skip
+
+
+def _named(value: Any) -> str:
+    return value.name if isinstance(value, Declared | Key) else ""
+
+
+def _toml(values: dict[str, Any], path: tuple[str, ...] = ()) -> str:
+    plain = {k: v for k, v in values.items() if not isinstance(v, dict)}
+    lines = [f"[{'.'.join(json.dumps(p) for p in path)}]"] if path else []
+    lines += [f"{json.dumps(k)} = {json.dumps(v)}" for k, v in plain.items()]
+    below = [_toml(v, (*path, k)) for k, v in values.items() if isinstance(v, dict)]
+    return "\n".join([*lines, *below])
+
+
+def _project(folder: Path, change: dict[str, Any], place: tuple[str, ...] = ()) -> Any:
+    values = copy.deepcopy(EVERYTHING)
+    at = values
+    for name in place:
+        at = at.setdefault(name, {})
+    at |= change
+    (folder / "list.csv").write_text("point_id,x_mm,y_mm,z_mm\np,1,2,3\n")
+    (folder / "survey.toml").write_text(_toml(values), encoding="utf-8")
+    return values
+
+
+@pytest.fixture(scope="module")
+def validator() -> Any:
+    schema = survey_schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
+
+
+def test_a_project_with_everything_is_read_and_fits_the_schema(tmp_path: Path, validator: Any) -> None:
+    values = _project(tmp_path, {})
+    read_definition(tmp_path)
+    assert list(validator.iter_errors(values)) == []
+    assert set(PLACES) == {d.name for d in DECLARATIONS}
+
+
+@pytest.mark.parametrize(("table", "key"), KEYS, ids=_named)
+def test_every_declared_key_is_read_and_its_kind_checked_by_both(
+    table: Declared, key: Key, tmp_path: Path, validator: Any
+) -> None:
+    values = _project(tmp_path, {key.name: WRONG[key.kind]}, PLACES[table.name])
+    with pytest.raises(SurveyError) as found:
+        read_definition(tmp_path)
+    assert key.name in str(found.value)
+    assert "unknown key" not in str(found.value)
+    assert list(validator.iter_errors(values)) != []
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_what_is_not_declared_is_refused_by_both(name: str, tmp_path: Path, validator: Any) -> None:
+    if name in ("identification", "poses"):
+        pytest.skip("any name is allowed there")
+    values = _project(tmp_path, {"nonsense": {}}, PLACES[name])
+    with pytest.raises(SurveyError, match="nonsense"):
+        read_definition(tmp_path)
+    if name != "scale":
+        assert list(validator.iter_errors(values)) != []
+
+
+@pytest.mark.parametrize(
+    ("table", "key"), [(d, k) for d, k in KEYS if k.default not in (REQUIRED, NOTHING)], ids=_named
+)
+def test_a_declared_default_is_what_its_absence_means(table: Declared, key: Key, tmp_path: Path) -> None:
+    def read(change: dict[str, Any]) -> str:
+        _project(tmp_path, change, PLACES[table.name])
+        d = read_definition(tmp_path)
+        said = (d.survey, d.options, d.sigmas, d.spots_request, d.title, d.tie_points, d.target_kinds)
+        with np.printoptions(threshold=10_000):
+            return repr(said)
+
+    at = EVERYTHING
+    for name in PLACES[table.name]:
+        at = at.get(name, {})
+    if key.name in at:
+        pytest.skip("the project says something else")
+    if (table.name, key.name) in NEED_MORE:
+        pytest.skip("only with other keys beside it")
+    if table.path == "surfaces.ID":
+        pytest.skip("a surface of which nothing is said is wholly found by the program")
+    assert read({}) == read({key.name: key.default})
+
+
+def test_choices_are_those_of_the_program() -> None:
+    assert declared("lens").keys[0].choices == tuple(MODELS)
+    assert next(k for k in declared("tolerance").keys if k.name == "of").choices == tuple(OWNERS)
+
+
+def test_the_page_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["schema", "--markdown"]) == 0
+    assert capsys.readouterr().out == reference_page()
+    page = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
+    assert page == reference_page(), "run: labsurvey schema --markdown --out docs/reference.md"
+
+
+def test_the_schema_is_what_the_command_writes(tmp_path: Path) -> None:
+    assert main(["schema", "--out", str(tmp_path / "s.json")]) == 0
+    assert json.loads((tmp_path / "s.json").read_text(encoding="utf-8")) == json.loads(json.dumps(survey_schema()))
+
+
+def test_every_column_is_described_and_nothing_else() -> None:
+    layouts = {**LAYOUTS, EXCLUSIONS.name: EXCLUSIONS}
+    missing = {f"{n}.{c}" for n, layout in layouts.items() for c in layout.columns if not column_text(n, c)}
+    assert missing == set()
+    assert set(COLUMN_TEXTS) == set(layouts)
+    assert {f"{n}.{c}" for n, (_, own) in COLUMN_TEXTS.items() for c in own if c not in layouts[n].columns} == set()
+
+
+def test_a_demand_in_two_units_is_refused(tmp_path: Path) -> None:
+    _project(tmp_path, {"tolerance_mm": 2.0}, PLACES["tolerance"])
+    with pytest.raises(SurveyError, match="tolerance_mm is given too; keep one of the two"):
+        read_definition(tmp_path)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_every_example_fits_the_schema(
+    name: str, tmp_path: Path, validator: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("survey.examples.pictures.write_images", lambda *_: None)
+    write_example(name, tmp_path / name, progress=False)
+    values = tomllib.loads((tmp_path / name / "survey.toml").read_text(encoding="utf-8"))
+    assert [e.message for e in validator.iter_errors(values)] == []
