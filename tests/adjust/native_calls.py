@@ -129,8 +129,6 @@ def _navigation() -> None:
     navigate(*known, [simulated(*known, turned(0.0), rng, Sight(1e-6, only=("B9", "B10")))[0]])
     pose = Pose3(Rot3.Rodrigues(np.array([0.3, -0.2, 0.5])), np.array([0.1, 0.2, -0.3])).matrix()
     pose = np.ascontiguousarray(pose)
-    step = navigation.step_between(np.eye(4), navigation.retracted(pose, np.full(6, 0.1)))
-    navigation.step_derivative(step)
     navigation.real_roots(np.array([0.1, -1.0, 2.0, 0.5, -3.0, 0.2, 1.0, -0.4, 0.1]), 0.0, 3.0)
     rays = np.array([[0.1, 0.2, 1.0], [-0.2, 0.1, 1.0], [0.1, -0.3, 1.0]])
     rays /= np.linalg.norm(rays, axis=1)[:, None]
