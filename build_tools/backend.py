@@ -24,7 +24,12 @@ __all__ = [
     "prepare_metadata_for_build_wheel",
 ]  # fmt: skip
 
-_NEEDED = b"#include <bit>\n#include <cmath>\ntemplate <class T> concept Any = true;\nauto f = []<Any T>(T x) { return x; };\n"
+_NEEDED = b"""
+#include <bit>
+#include <cmath>
+template <class T> concept Any = true;
+auto f = []<Any T>(T x) { return x; };
+"""
 
 
 @cache

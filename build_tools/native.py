@@ -79,7 +79,8 @@ class NativeBuild:
                 name, path = item
                 mine = [o for o in objects if o.stem.endswith(f"_{name}")]
                 path.parent.mkdir(parents=True, exist_ok=True)
-                _made(path, mine, [*self.link, *map(str, mine)], environment, self.temp.parent / f"{name}.command", ["-lm"])
+                command = [*self.link, *map(str, mine)]
+                _made(path, mine, command, environment, self.temp.parent / f"{name}.command", ["-lm"])
 
             list(pool.map(compiled, objects.items()))
             list(pool.map(linked, libraries.items()))

@@ -18,8 +18,8 @@ _TITLE = """# Licences
 each under its own licence. This page is written by `python docs/make_licences.py` from what the packages say of
 themselves.
 
-The native core is built by setuptools (MIT) and the compiler of the machine; where there is none by `ziglang` (MIT), which
-is fetched for the build alone. Nothing of a compiler's C++ library is in it.
+The native core is built by setuptools (MIT) and the compiler of the machine; where there is none by `ziglang` (MIT),
+which is fetched for the build alone. Nothing of a compiler's C++ library is in it.
 """
 
 

@@ -1,6 +1,6 @@
-"""Builds the native library with address and undefined-behaviour sanitizers and checked indices, and runs tests with it.
+"""Builds the native library with sanitizers of addresses and undefined behaviour and checked indices, and tests it.
 
-    python tests/native_checked.py                              # the tests of the kernels, with the widest vectors here
+    python tests/native_checked.py                          # the tests of the kernels, with the widest vectors here
     python tests/native_checked.py --vectors base -k lens tests/adjust/test_lens_kernels.py
     python tests/native_checked.py -m tests.adjust.native_fuzz --seconds 60
 
@@ -53,11 +53,11 @@ def _environment(vectors: str | None) -> dict[str, str]:
     """The sanitizers' own libraries come first: Python itself was built without them."""
     compiler = os.environ.get("CXX", "g++")
     found = [
-        subprocess.run([compiler, f"-print-file-name={name}"], capture_output=True, text=True, check=True).stdout.strip()
+        subprocess.run([compiler, f"-print-file-name={name}"], capture_output=True, text=True, check=True).stdout
         for name in ("libasan.so", "libubsan.so", "libstdc++.so")
     ]
     more = {
-        "LD_PRELOAD": " ".join(str(Path(f).resolve()) for f in found),
+        "LD_PRELOAD": " ".join(str(Path(f.strip()).resolve()) for f in found),
         "ASAN_OPTIONS": "detect_leaks=0:handle_segv=1",  # Python keeps what it has
         "UBSAN_OPTIONS": "print_stacktrace=1",
         "LABSURVEY_DATA": os.environ.get("LABSURVEY_DATA", str(ROOT.parent / "shared" / "data")),

@@ -100,9 +100,9 @@ class Function:
         return Function(self.name, self._arguments, instructions)
 
     def kinds(self) -> list[tuple[str, str]]:
-        """Name and kind of every argument, as the library knows them: f, i, s, u, b (``_KINDS``), large ones written to.
+        """Name and kind of every argument, as the library knows them: f, i, s, u, b (``_KINDS``).
 
-        A number is n (integer) or d.
+        Capital letters are written to. A number is n (integer) or d.
         """
         if self._run is None:
             self._open()

@@ -104,7 +104,8 @@ def _solution(monkeypatch: pytest.MonkeyPatch, threads: int) -> str:
         graph, done = h.solved(survey, h.shaken(h.start_at(truth), 2, 0.002, 0.002))
         precision = Precision(graph, done)
         for name, unknown in graph.unknowns.by_name.items():
-            value = done.values.atPose3(unknown.key).matrix() if unknown.kind == "pose" else done.values.atVector(unknown.key)
+            posed, key = unknown.kind == "pose", unknown.key
+            value = done.values.atPose3(key).matrix() if posed else done.values.atVector(key)
             digest.update(value.tobytes() + h.covariance_of(precision, name).tobytes())
         residuals = image_residuals(precision)
         digest.update(residuals.residuals.tobytes() + residuals.redundancy.tobytes())
