@@ -26,8 +26,8 @@ from tests.lower_bounds import build_requirements, chosen, pins, requirements  #
 _IMPORTS = "import adjust, survey, capture; print(adjust.__file__)"
 _COMMANDS = (
     "labsurvey --help", "labsurvey --version", "labcapture --help", "labsurvey example total-station lab",
-    "labsurvey adjust lab", "labsurvey report lab --language de", "labsurvey convert lab lab.snx", "labsurvey example relay relay",
-    "labsurvey adjust relay --json", "labsurvey completion bash", "labcapture cameras",
+    "labsurvey adjust lab", "labsurvey report lab --language de", "labsurvey convert lab lab.snx",
+    "labsurvey example relay relay", "labsurvey adjust relay --json", "labsurvey completion bash", "labcapture cameras",
 )  # fmt: skip
 _SHIPPED = (
     *("adjust/py.typed", "survey/py.typed", "capture/py.typed", "survey/report/style.css", "survey/report/script.js"),
