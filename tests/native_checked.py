@@ -5,8 +5,8 @@
     python tests/native_checked.py -m tests.adjust.native_fuzz --seconds 60
 
 What is not an option of this script goes to pytest; after ``-m``, to a module. Needs g++ with its sanitizers, Linux.
-The build and a copy of the packages are in ``build/checked``; what is installed stays as it is. What a sanitizer finds ends
-the run with its report; an index outside its array ends it with a line that says so.
+The build and a copy of the packages are in ``build/checked``; what is installed stays as it is. What a sanitizer finds
+ends the run with its report; an index outside its array ends it with a line that says so.
 """
 
 import argparse
