@@ -20,7 +20,12 @@ def _pool(workers: int) -> ThreadPoolExecutor:
 def workers() -> int:
     """Threads used: ``LABSURVEY_THREADS``, or the cores this process may use."""
     wanted = os.environ.get("LABSURVEY_THREADS", "")
-    return int(wanted) if wanted.isdigit() and int(wanted) > 0 else len(os.sched_getaffinity(0))
+    return int(wanted) if wanted.isdigit() and int(wanted) > 0 else cores()
+
+
+def cores() -> int:
+    """Cores that this process may use; all of the machine where the system does not tell."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def split_blocks(ptr: IntArray) -> list[IntArray]:

@@ -1,9 +1,11 @@
-"""setuptools' build backend; where no C++ compiler is found, it asks for one that the package index has."""
+"""setuptools' build backend; where no able C++ compiler is found, it asks for one that the package index has."""
 
 import os
 import shlex
 import shutil
+import subprocess
 import sysconfig
+from functools import cache
 from typing import Any
 
 from setuptools import build_meta
@@ -22,14 +24,31 @@ __all__ = [
     "prepare_metadata_for_build_wheel",
 ]  # fmt: skip
 
+_NEEDED = b"""
+#include <bit>
+#include <cmath>
+template <class T> concept Any = true;
+auto f = []<Any T>(T x) { return x; };
+"""
 
+
+@cache
 def compiler() -> list[str] | None:
-    """The C++ compiler of this machine as the beginning of a command, None where there is none."""
+    """The C++ compiler of this machine as the beginning of a command, None where there is none for C++20.
+
+    What ``CXX`` names is taken as it is.
+    """
     named = shlex.split(os.environ.get("CXX") or "")
     if named:
         return named
     configured = shlex.split(sysconfig.get_config_var("CXX") or "")[:1]
-    return next(([name] for name in [*configured, "c++", "g++", "clang++"] if shutil.which(name)), None)
+    names = dict.fromkeys([*configured, "c++", "g++", "clang++"])
+    return next(([name] for name in names if shutil.which(name) and _able(name)), None)
+
+
+def _able(name: str) -> bool:
+    command = [name, "-std=c++20", "-x", "c++", "-fsyntax-only", "-"]
+    return subprocess.run(command, input=_NEEDED, capture_output=True, check=False).returncode == 0
 
 
 def _more() -> list[str]:

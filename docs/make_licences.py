@@ -17,6 +17,9 @@ _TITLE = """# Licences
 `labsurvey` is under the Apache License 2.0. It contains no code of others; it imports the packages below,
 each under its own licence. This page is written by `python docs/make_licences.py` from what the packages say of
 themselves.
+
+The native core is built by setuptools (MIT) and the compiler of the machine; where there is none by `ziglang` (MIT),
+which is fetched for the build alone. Nothing of a compiler's C++ library is in it.
 """
 
 

@@ -25,14 +25,18 @@ from tests.lower_bounds import build_requirements, chosen, pins, requirements  #
 
 _IMPORTS = "import adjust, survey, capture; print(adjust.__file__)"
 _COMMANDS = (
-    "labsurvey --help", "labcapture --help", "labsurvey example total-station lab", "labsurvey adjust lab",
-    "labsurvey report lab --language de", "labsurvey convert lab lab.snx", "labsurvey example relay relay",
-    "labsurvey adjust relay --json", "labsurvey completion bash", "labcapture cameras",
+    "labsurvey --help", "labsurvey --version", "labcapture --help", "labsurvey example total-station lab",
+    "labsurvey adjust lab", "labsurvey report lab --language de", "labsurvey convert lab lab.snx",
+    "labsurvey example relay relay", "labsurvey adjust relay --json", "labsurvey completion bash", "labcapture cameras",
 )  # fmt: skip
 _SHIPPED = (
     *("adjust/py.typed", "survey/py.typed", "capture/py.typed", "survey/report/style.css", "survey/report/script.js"),
     *("capture/web/page.html", "capture/drivers/turntables/dialects/two-axis.toml"),
 )
+_BUILT_FROM = (
+    "LICENSE", "README.md", "setup.py", "build_tools/backend.py", "build_tools/native.py", "adjust/native/lenses.h",
+    "adjust/native/images.cpp",
+)  # fmt: skip
 
 
 def main() -> int:
@@ -122,8 +126,9 @@ def _checked(dist: Path) -> Path:
     held = set(zipfile.ZipFile(wheel).namelist())
     with tarfile.open(source) as archive:
         sent = {n.partition("/")[2] for n in archive.getnames()}
-    problems = [f"wheel lacks {n}" for n in _SHIPPED if n not in held]
-    problems += [f"source distribution lacks {n}" for n in (*_SHIPPED, "LICENSE", "README.md") if n not in sent]
+    problems = [f"wheel lacks {n}" for n in (*_SHIPPED, "adjust/native/kernels_base.so") if n not in held]
+    problems += [] if "-py3-none-" in wheel.name else [f"{wheel.name} is for one Python alone"]
+    problems += [f"source distribution lacks {n}" for n in (*_SHIPPED, *_BUILT_FROM) if n not in sent]
     problems += [f"wheel holds {n}" for n in held if n.split("/")[0] in ("tests", "docs", "examples", "build")]
     if problems:
         print("\n".join(f"  FAILED {p}" for p in problems))

@@ -4,6 +4,7 @@
 #include <bit>
 #include <cmath>
 #include <cstdint>
+#include <cstdio>
 #include <cstring>
 #include <tuple>
 #include <type_traits>
@@ -13,8 +14,13 @@ namespace {  // one copy for every instruction set: nothing here may be shared b
 
 #ifdef CHECKED  // set by the debug build alone: an index outside its array stops the program
 constexpr bool checked = true;
+[[noreturn]] inline void outside(int64_t at, int64_t n) {
+    std::fprintf(stderr, "index %lld is outside an array of %lld\n", static_cast<long long>(at), static_cast<long long>(n));
+    __builtin_trap();
+}
 #else
 constexpr bool checked = false;
+[[noreturn]] inline void outside(int64_t, int64_t) { __builtin_trap(); }
 #endif
 
 struct Argument {
@@ -71,14 +77,14 @@ template <class T, int N> struct Array {
         const int64_t at[] = {int64_t(index)...};
         int64_t offset = 0;
         for (int i = 0; i < N; ++i) {
-            if (checked && (at[i] < 0 || at[i] >= n[i])) __builtin_trap();
+            if (checked && (at[i] < 0 || at[i] >= n[i])) outside(at[i], n[i]);
             offset = offset * n[i] + at[i];
         }
         return data[offset];
     }
     // Part i along the first dimension.
     auto operator[](int64_t i) const {
-        if (checked && (i < 0 || i >= n[0])) __builtin_trap();
+        if (checked && (i < 0 || i >= n[0])) outside(i, n[0]);
         if constexpr (N == 1) {
             return data[i];
         } else {

@@ -103,7 +103,9 @@ struct Collected {
 // half width of the strips, length of strip 1, length of strip 2, in px.
 inline int corner_window(In<float, 2> image, int64_t u0, int64_t v0, const double *p, const double *shape, bool crossing, Collected &out) {
     const double radius = shape[0], width = shape[1], c[2] = {std::cos(p[2]), std::cos(p[3])}, s[2] = {std::sin(p[2]), std::sin(p[3])};
-    const int reach = int(std::ceil(larger(radius, larger(shape[2], shape[3]) + width)));
+    const double extent = larger(radius, larger(shape[2], shape[3]) + width);
+    if (!(magnitude(extent) < LARGEST_WINDOW)) return -1;
+    const int reach = int(std::ceil(extent));
     int n = 0;
     for (int j = -reach; j <= reach; ++j)
         for (int i = -reach; i <= reach; ++i) {
@@ -147,6 +149,10 @@ inline void fit_corners(In<float, 2> image, In<double, 2> start, In<double, 2> a
     static thread_local Collected window;
     const auto clamp = [](double *p) { p[6] = smaller(larger(p[6], std::log(0.2)), std::log(12.0)); };
     for (int64_t c = 0; c < start.n[0]; ++c) {
+        if (!lies_on(image, start(c, 0), start(c, 1))) {
+            pixels.data[c] = -1, status.data[c] = AT_BORDER;
+            continue;
+        }
         const int64_t u0 = std::lrint(start(c, 0)), v0 = std::lrint(start(c, 1));
         double p[CORNER] = {start(c, 0) - double(u0), start(c, 1) - double(v0), angles(c, 0), angles(c, 1), 0, 0, std::log(blur[c]), 0, 0};
         const int n = corner_window(image, u0, v0, p, &shapes(c, 0), crossing, window), n_free = n >= enough ? 9 : 7;

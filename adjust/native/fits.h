@@ -42,6 +42,12 @@ template <int N, int K> inline bool scaled_solve(const double (&H)[N][N], int n,
     return true;
 }
 
+constexpr double LARGEST_WINDOW = 1e4;  // px, half of its width
+// Whether a place (px) lies on an image: false also where it is no number.
+inline bool lies_on(In<float, 2> image, double u, double v) {
+    return u >= -0.5 && v >= -0.5 && u <= double(image.n[1]) - 0.5 && v <= double(image.n[0]) - 0.5;
+}
+
 // Pixels of a window: places x, y from its centre, and grey values.
 struct Pixels {
     const double *x, *y, *value;

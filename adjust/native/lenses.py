@@ -32,6 +32,7 @@ def lens_rows(
 
     And their derivatives (n, 2, 17): columns 0 .. N_LENS[kind] - 1 by the parameters, 14 .. 16 by q (px/m), else zero.
     """
+    _check(kind, lens)
     residuals, rows = np.empty((len(q), 2)), np.empty((len(q), 2, N_COLUMNS))
     if len(q):
         _lens_rows(kind, lens, constants, q, uv, residuals, rows)
@@ -40,6 +41,14 @@ def lens_rows(
 
 def lens_residuals(kind: int, lens: FloatArray, constants: FloatArray, q: FloatArray, uv: FloatArray) -> FloatArray:
     """The residuals (n, 2) px of :func:`lens_rows` alone."""
+    _check(kind, lens)
     residuals = np.empty((len(q), 2))
     _lens_rows(kind, lens, constants, q, uv, residuals, _NO_ROWS)
     return residuals
+
+
+def _check(kind: int, lens: FloatArray) -> None:
+    if not 0 <= kind < len(N_LENS):
+        raise ValueError(f"no lens model has the number {kind}")
+    if len(lens) < N_LENS[kind]:
+        raise ValueError(f"lens model {kind} has {N_LENS[kind]} parameters, {len(lens)} were given")

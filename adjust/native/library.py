@@ -7,14 +7,16 @@ shape is said here, beside its Python face. A function runs without Python's loc
 
 import ctypes
 import os
-import platform
 from array import array
 from collections.abc import Callable
 from functools import cache
+from operator import index
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+
+from adjust.errors import SurveyError
 
 _KINDS = {"f": np.float64, "i": np.int64, "s": np.float32, "u": np.uint8, "b": np.bool_}
 _FOLDER = Path(__file__).parent
@@ -34,12 +36,16 @@ class Compiled(Protocol):
         """Run it."""
 
 
+def _path(name: str) -> Path:
+    return _FOLDER / f"kernels_{name}.so"
+
+
 @cache
 def opened(name: str) -> dict[str, tuple[Callable[[int], int], str]]:
     """Functions and kinds of arguments of the library for a set of instructions, which the processor must have."""
-    path = _FOLDER / f"kernels_{name}.so"
+    path = _path(name)
     if not path.exists():
-        raise ImportError(f"{path} is missing: build it by 'pip install .' or 'python setup.py build_ext --inplace'")
+        raise SurveyError(f"{path} is missing: build it by 'pip install .' or 'python setup.py build_ext --inplace'")
     library = ctypes.CDLL(str(path))
     found: dict[str, tuple[Callable[[int], int], str]] = {}
     for family in _FAMILIES:
@@ -57,18 +63,21 @@ def opened(name: str) -> dict[str, tuple[Callable[[int], int], str]]:
 
 
 @cache
+def instruction_sets() -> tuple[str, ...]:
+    """The sets of vector instructions that both the processor and the build have, the widest last."""
+    if not _path("base").exists():
+        opened("base")  # tells what to do
+    widest = ctypes.CDLL(str(_path("base"))).widest_instructions()
+    return tuple(name for i, name in enumerate(SETS) if i <= widest and _path(name).exists())
+
+
+@cache
 def instruction_set() -> str:
-    """The set of vector instructions in use: the widest that processor and build have, or ``LABSURVEY_VECTORS``."""
-    built = [name for name in SETS if (_FOLDER / f"kernels_{name}.so").exists()]
-    wanted = os.environ.get("LABSURVEY_VECTORS")
-    if wanted:
-        if wanted not in built:
-            raise ImportError(f"LABSURVEY_VECTORS is {wanted!r}; built are: {', '.join(built)}")
-        return wanted
-    if platform.machine() not in ("x86_64", "AMD64") or len(built) < 2:
-        return "base"
-    widest = ctypes.CDLL(str(_FOLDER / "kernels_base.so")).widest_instructions
-    return [name for name in built if SETS.index(name) <= widest()][-1]
+    """The set in use: the widest, or that of ``LABSURVEY_VECTORS``."""
+    wanted, found = os.environ.get("LABSURVEY_VECTORS"), instruction_sets()
+    if wanted and wanted not in found:
+        raise SurveyError(f"LABSURVEY_VECTORS is {wanted!r}; here run: {', '.join(found)}")
+    return wanted or found[-1]
 
 
 class Function:
@@ -80,10 +89,28 @@ class Function:
 
     def __init__(self, name: str, arguments: str, instructions: str | None = None) -> None:
         self.name = name
+        self._arguments = arguments
         self._declared = [_declared(part) for part in arguments.split()]
         self._instructions = instructions
         self._run: Callable[[int], int] | None = None
         self._kinds = ""
+
+    def using(self, instructions: str | None) -> "Function":
+        """The same function with a set of vector instructions; that in use for None."""
+        return Function(self.name, self._arguments, instructions)
+
+    def kinds(self) -> list[tuple[str, str]]:
+        """Name and kind of every argument, as the library knows them: f, i, s, u, b (``_KINDS``).
+
+        Capital letters are written to. A number is n (integer) or d.
+        """
+        if self._run is None:
+            self._open()
+        return [(name, kind) for (name, _), kind in zip(self._declared, self._kinds, strict=True)]
+
+    def shapes(self) -> list[tuple[str, "tuple[_Dimension, ...]"]]:
+        """Name and declared dimensions of every argument; a number has none."""
+        return list(self._declared)
 
     def _open(self) -> Callable[[int], int]:
         run, described = opened(self._instructions or instruction_set())[self.name]
@@ -103,10 +130,13 @@ class Function:
         sizes: dict[str, int] = {}
         packed = array("q")
         for kind, (name, shape), value in zip(self._kinds, self._declared, arguments, strict=True):
-            if kind == "n":
-                packed.extend((int(value), 0, 0, 0, 0))
-            elif kind == "d":
-                packed.extend((*array("q", array("d", [value]).tobytes()), 0, 0, 0, 0))
+            if kind in "nd":
+                try:
+                    number = index(value) if kind == "n" else array("q", array("d", [value]).tobytes())[0]
+                    packed.extend((number, 0, 0, 0, 0))
+                except (TypeError, OverflowError):
+                    wanted = "a whole number" if kind == "n" else "a number"
+                    raise TypeError(f"{self.name}: {name} must be {wanted}, not {_told(value)}") from None
             else:
                 if not isinstance(value, np.ndarray) or value.dtype != _KINDS[kind.lower()]:
                     raise TypeError(f"{self.name}: {name} must be an array of {_KINDS[kind.lower()].__name__}, "

@@ -53,6 +53,7 @@ inline void fit_spots(In<float, 2> gray, In<int64_t, 2> labels, double saturatio
         for (int i = 4; i < SPOT; ++i) p[i] = smaller(larger(p[i], std::log(0.15)), std::log(100.0));
     };
     for (int64_t c = 0; c < start.n[0]; ++c) {
+        if (!lies_on(gray, start(c, 0), start(c, 1)) || !(magnitude(diameter[c]) < LARGEST_WINDOW)) continue;
         const int64_t u0 = std::lrint(start(c, 0)), v0 = std::lrint(start(c, 1)), reach = int64_t(std::ceil(diameter[c] + 3.0));
         int n = 0;
         for (int64_t j = larger(-reach, -v0); j <= smaller(reach, gray.n[0] - 1 - v0); ++j)

@@ -104,16 +104,23 @@ def postpone(names: Sequence[str] = ("numpy.f2py", "numpy.testing")) -> None:
 
 
 class Version(argparse.Action):
-    """Prints the version, which is looked up only when it is asked for."""
+    """Prints the version and which vector instructions run, looked up only when it is asked for."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         """Print it and stop."""
         from importlib.metadata import PackageNotFoundError, version
 
+        from adjust.errors import SurveyError
+        from adjust.native import instruction_set
+
         try:
-            print(f"{parser.prog} {version('labsurvey')}")
+            core = f"(native core: {instruction_set()})"
+        except SurveyError as error:
+            parser.exit(1, f"{parser.prog}: {error}\n")
+        try:
+            print(f"{parser.prog} {version('labsurvey')} {core}")
         except PackageNotFoundError:
-            print(f"{parser.prog}, run from its source folder without being installed")
+            print(f"{parser.prog}, run from its source folder without being installed {core}")
         parser.exit()
 
 

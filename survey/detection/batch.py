@@ -1,6 +1,5 @@
 """Many images, in parallel; one that fails is reported and the others go on."""
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -13,6 +12,7 @@ import cv2
 from tqdm import tqdm
 
 from adjust.errors import SurveyError
+from adjust.parallel import cores
 from survey.detection.detect import detect_image
 from survey.detection.gray import read_image
 from survey.detection.pictures import write_picture
@@ -45,11 +45,11 @@ def detect_images(
     """
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
-    cores = len(os.sched_getaffinity(0))
-    if jobs is None and min(cores, len(tasks)) > 1 and len(tasks) < 2 * _IMAGES_PER_PROCESS:
-        jobs, run = cores, _in_threads
+    most = cores()
+    if jobs is None and min(most, len(tasks)) > 1 and len(tasks) < 2 * _IMAGES_PER_PROCESS:
+        jobs, run = most, _in_threads
     else:
-        jobs = min(cores, len(tasks) // _IMAGES_PER_PROCESS) if jobs is None else jobs
+        jobs = min(most, len(tasks) // _IMAGES_PER_PROCESS) if jobs is None else jobs
         run = _in_processes if jobs > 1 and len(tasks) > 1 else _here
     reports: dict[int, ImageReport] = {}
     with tqdm(total=len(tasks), desc="detect", unit="image", disable=not progress) as bar:

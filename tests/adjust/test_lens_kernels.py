@@ -8,41 +8,82 @@ from tests.adjust.lenses import IMAGE_SIZE, NAMES, PIXEL_SIZE_MM, R0_MM, lens, p
 
 
 def fourth_order(f, x, column, h):
-    """Derivative of f by one component of x, central differences of fourth order."""
+    """Derivative of f (n, 2) by one component of x, and how far off it may be; h: a step, or one for each point.
 
-    def at(k):
-        y = x.copy()
-        y[..., column] += k * h
-        return f(y)
+    Central differences of fourth order with two steps; what they differ by, and rounding, is left open.
+    """
 
-    return (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * h)
+    def difference(h):
+        def at(k):
+            y = x.copy()
+            y[..., column] += k * h
+            return f(y)
+
+        return (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * h)[..., None]
+
+    h = np.asarray(h)
+    wide, narrow = difference(h), difference(h / 2)
+    return narrow, np.abs(wide - narrow) + 1e-14 * (np.abs(f(x)) + 1000.0) / h[..., None]
+
+
+def agree(found, expected, open_by, what, least=0.0):
+    scale = max(np.abs(expected).max(), least)
+    assert np.median(open_by) < 1e-5 * scale, f"{what}: the differences say too little"
+    assert np.all(np.abs(found - expected) < 1e-7 * scale + 2 * open_by), what
+
+
+_AROUND = np.array([[1.0, 0.0], [0.6, 0.8], [0.0, -1.0], [-0.8, 0.6]])
+_FIELD_DEG = {"brown": 20.0, "fisheye": 179.0, "brown_backward": 20.0, "brown_backward_dbat": 20.0, "aicon": 20.0}
+"""Half angle to which the lenses of these tests are steep; the fisheye goes on to beside and behind the camera."""
+
+
+def at_angle(degrees, depth=1.1):
+    """Points (4, 3) m at an angle from the axis, all around it."""
+    theta = np.radians(degrees)
+    return depth * np.column_stack([np.sin(theta) * _AROUND, np.full(4, np.cos(theta))])
+
+
+def places(name):
+    """Groups of points (n, 3): in the field, on the axis and near it, at the edge of validity, beyond and behind."""
+    steps = (60.0, 89.999, 90.0, 90.001, 100.0, 120.0, 150.0, 151.0, 170.0) if name == "fisheye" else (10.0, 15.0)
+    return {
+        "field": np.vstack([points_in_camera(60), *map(at_angle, steps)]),
+        "axis": np.vstack([[[0.0, 0.0, 1.2]], *map(at_angle, (1e-10, 1e-6, 1e-3, 0.1, 1.0, 3.0))]),
+        "edge": at_angle(_FIELD_DEG[name]),
+        "beyond": np.vstack([at_angle(_FIELD_DEG[name] + more) for more in (0.5, 20.0, 60.0)])
+        if name != "fisheye" else at_angle(179.5),
+        "behind": np.vstack([at_angle(140.0), at_angle(175.0)]),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("where", ["field", "axis", "edge", "beyond", "behind"])
+@pytest.mark.parametrize("name", NAMES)
+def test_derivatives_agree_with_differences_far_from_zero_error(name, where):
+    model, values, constants = lens(name)
+    q = places(name)[where]
+    # observed pixels anywhere: derivatives must hold far from zero error
+    uv = np.random.default_rng(2).uniform([0, 0], IMAGE_SIZE, (len(q), 2))
+    residuals, by_lens, by_q = lens_derivatives(model, values, constants, q, uv)
+    assert np.isfinite(residuals).all()
+    assert np.sqrt(np.mean(residuals**2)) > 50
+    for column, parameter in enumerate(model.names):
+        expected, open_by = fourth_order(
+            lambda v: lens_residuals(model, v, constants, q, uv), values, column, 0.01 * abs(values[column])
+        )
+        agree(by_lens[:, :, column], expected, open_by, parameter, 1.0 if where == "axis" else 0.0)  # px; little moves
+    # what is singular: the camera's plane, for the fisheye the axis behind it
+    far = np.hypot(q[:, 0], q[:, 1]) + np.maximum(q[:, 2], 0.0) if name == "fisheye" else np.abs(q[:, 2])
+    for column in range(3):
+        expected, open_by = fourth_order(
+            lambda x: lens_residuals(model, values, constants, x, uv), q, column, np.minimum(1e-3, 5e-3 * far)
+        )
+        agree(by_q[:, :, column], expected, open_by, f"q{column}")
 
 
 def scene(name):
     model, values, constants = lens(name)
-    q = points_in_camera(60)
-    if name == "fisheye":
-        q = np.vstack([q, [[1.0, 0.4, 0.05], [0.7, -0.5, -0.3], [-0.099, 0.01, 1.0], [-0.101, 0.01, 1.0]]])
-    # observed pixels anywhere: derivatives must hold far from zero error
-    uv = np.random.default_rng(2).uniform([0, 0], IMAGE_SIZE, (len(q), 2))
-    return model, values, constants, q, uv
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_derivatives_agree_with_differences_far_from_zero_error(name):
-    model, values, constants, q, uv = scene(name)
-    residuals, by_lens, by_q = lens_derivatives(model, values, constants, q, uv)
-    assert np.sqrt(np.mean(residuals**2)) > 50
-    for column, parameter in enumerate(model.names):
-        expected = fourth_order(
-            lambda v: lens_residuals(model, v, constants, q, uv), values, column, 0.02 * abs(values[column])
-        )
-        error = np.abs(by_lens[:, :, column] - expected).max() / np.abs(expected).max()
-        assert error < 1e-7, parameter
-    for column in range(3):
-        expected = fourth_order(lambda x: lens_residuals(model, values, constants, x, uv), q, column, 2e-4)
-        error = np.abs(by_q[:, :, column] - expected).max() / np.abs(expected).max()
-        assert error < 1e-7, f"q{column}"
+    q = np.vstack(list(places(name).values()))
+    return model, values, constants, q, np.random.default_rng(2).uniform([0, 0], IMAGE_SIZE, (len(q), 2))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -105,13 +146,22 @@ def test_fisheye_is_opencv():
     np.testing.assert_allclose(project(model, values, constants, q), expected.reshape(-1, 2), atol=1e-9)
 
 
-def test_fisheye_sees_behind_the_camera_at_the_angle():
+@pytest.mark.parametrize("degrees", [1e-7, 1.0, 30.0, 60.0, 80.0, 89.9, 90.0, 100.0, 120.0, 150.0, 151.5, 170.0, 179.0])
+def test_fisheye_is_its_closed_form_up_to_the_axis_behind(degrees):
+    """Its value and its derivatives by the point, radial and across, from theta itself."""
     model, values, constants = lens("fisheye")
-    theta = np.radians([100.0, 120.0, 150.0])
-    uv = project(model, values, constants, np.column_stack([np.sin(theta), 0 * theta, np.cos(theta)]))
-    k = values[5:]
+    values[2] = 0.0
+    theta, k = np.radians(degrees), values[5:]
+    q = at_angle(degrees, 1.3)
     theta_d = theta * (1 + k[0] * theta**2 + k[1] * theta**4 + k[2] * theta**6 + k[3] * theta**8)
-    np.testing.assert_allclose(uv[:, 0], values[0] * theta_d + values[3], rtol=1e-14)
+    slope = 1 + 3 * k[0] * theta**2 + 5 * k[1] * theta**4 + 7 * k[2] * theta**6 + 9 * k[3] * theta**8
+    uv = project(model, values, constants, q)
+    np.testing.assert_allclose(uv, values[:2] * _AROUND * theta_d + values[3:5], rtol=1e-13)
+    _, _, by_q = lens_derivatives(model, values, constants, q[:1], uv[:1])
+    by_theta = 1.3 * np.array([np.cos(theta), 0.0, -np.sin(theta)])
+    assert by_q[0, 0] @ by_theta == pytest.approx(values[0] * slope, rel=1e-11)
+    assert by_q[0, 1, 1] == pytest.approx(values[1] * theta_d / (1.3 * np.sin(theta)), rel=1e-11)
+    assert by_q[0] @ q[0] == pytest.approx(np.zeros(2), abs=1e-9)  # nothing changes along the ray
 
 
 @pytest.mark.parametrize("tangent", [0.0, 1e-12, 1e-6, 1e-3, 0.0999999, 0.1000001])

@@ -1,0 +1,162 @@
+"""Calls of the compiled core as surveys, navigation, detection and rendering make them, kept to be made again."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from gtsam import Pose3, Rot3
+
+from adjust.model import PoseParameter
+from adjust.native import bundles, images, lenses, navigation, reduction, trees, vision
+from adjust.native.library import Function
+from adjust.navigation import navigate
+from adjust.pose_network import solve_network
+from adjust.precision import Precision, image_residuals
+from survey.detection import SpotOptions, detect_image, detect_spots
+from survey.rendering import Beacons, BrownCamera, PlacedTarget, render
+from survey.simulate import head_on_table
+from survey.targets import Checkerboard
+from tests.adjust import helpers as h
+from tests.adjust import pose_networks
+from tests.adjust.lenses import IMAGE_SIZE, NAMES, lens, points_in_camera
+from tests.adjust.navigation import (
+    Sight,
+    mfns_head,
+    printed_beacons,
+    scattered_beacons,
+    simulated,
+    turned,
+    wide_head,
+)
+from tests.adjust.test_image_reduction import near, warped_stereo
+
+_MODULES = (lenses, images, trees, reduction, bundles, navigation, vision)
+FUNCTIONS = {f.name: f for module in _MODULES for f in vars(module).values() if isinstance(f, Function)}
+"""All functions of the core that have a face in Python."""
+_KEPT = 2
+_LARGEST = 20_000_000  # bytes of arguments
+
+
+@dataclass(frozen=True)
+class Call:
+    """A function and what it was given, arrays as they were before."""
+
+    function: Function
+    arguments: tuple[Any, ...]
+
+    def again(self, instructions: str | None = None) -> tuple[int, list[np.ndarray]]:
+        """Its answer, and the arrays after the call, with these vector instructions."""
+        arguments = [a.copy() if isinstance(a, np.ndarray) else a for a in self.arguments]
+        answer = self.function.using(instructions)(*arguments)
+        return answer, [a for a in arguments if isinstance(a, np.ndarray)]
+
+
+@contextmanager
+def recorded() -> Iterator[list[Call]]:
+    """The first calls of every function, while this lasts."""
+    calls: list[Call] = []
+    counts: dict[str, int] = {}
+    plain = Function.__call__
+
+    def kept(self: Function, *arguments: Any) -> int:
+        count = counts.get(self.name, 0)
+        if count < _KEPT and sum(a.nbytes for a in arguments if isinstance(a, np.ndarray)) < _LARGEST:
+            counts[self.name] = count + 1
+            calls.append(Call(self, tuple(a.copy() if isinstance(a, np.ndarray) else a for a in arguments)))
+        return plain(self, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Function, "__call__", kept)
+        yield calls
+
+
+@cache
+def calls() -> tuple[Call, ...]:
+    """Some calls of every function of the core: all that the functions below make."""
+    with recorded() as kept:
+        _images()
+        _bundles()
+        _navigation()
+        _pictures()
+        _lenses()
+    return tuple(kept)
+
+
+def _images() -> None:
+    survey, truth = warped_stereo()
+    graph, done = h.solved(survey, near(truth))
+    precision = Precision(graph, done)
+    image_residuals(precision)
+    names = list(graph.unknowns.by_name)
+    precision.joint([names[0], names[-1]])
+    batch = graph.images
+    rows = np.zeros((2 * int(batch.ptr[1]), int(batch.n_rows[0])))
+    state, chains = batch.state, batch.chains
+    images.block_rows(0, batch.arrays, batch.points, batch.W_all_columns, state.lenses, chains.R, chains.t, state.warp,
+                      rows)  # fmt: skip
+    batch.local_from_keys(0)
+    solve_network(pose_networks.simulate(3, 2).network)
+    survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
+    graph, done = h.solved(survey, near(truth))  # nothing to reduce: every block is condensed for itself
+    graph.prepare(done.values, jacobians=False)
+
+
+def _bundles() -> None:
+    for n_cameras in (2, 1):
+        survey, truth = h.network(1, n_cameras=n_cameras)
+        if n_cameras == 1:
+            camera = survey.cameras[0]
+            mount = truth["station_from_camera", camera.camera_id]
+            assert isinstance(mount, Pose3)
+            survey = replace(survey, cameras=(replace(camera, station_from_camera=PoseParameter(mount, "held")),))
+        graph, done = h.solved(survey, h.shaken(h.start_at(truth), 1, 0.003, 0.003))
+        precision = Precision(graph, done)
+        image_residuals(precision)
+        names = list(graph.unknowns.by_name)
+        precision.products({graph.unknowns.by_name[n].key: np.eye(graph.unknowns.by_name[n].dim) for n in names[:1]})
+
+
+def _navigation() -> None:
+    place = wide_head(), scattered_beacons(20)
+    rng = np.random.default_rng(1)
+    for named in (True, False):
+        navigate(*place, [simulated(*place, Pose3(), rng, Sight(0.2, named=named))[0]])
+    known = mfns_head(), printed_beacons()
+    navigate(*known, [simulated(*known, turned(0.0), rng, Sight(1e-6, only=("B9", "B10")))[0]])
+    pose = Pose3(Rot3.Rodrigues(np.array([0.3, -0.2, 0.5])), np.array([0.1, 0.2, -0.3])).matrix()
+    pose = np.ascontiguousarray(pose)
+    navigation.real_roots(np.array([0.1, -1.0, 2.0, 0.5, -3.0, 0.2, 1.0, -0.4, 0.1]), 0.0, 3.0)
+    rays = np.array([[0.1, 0.2, 1.0], [-0.2, 0.1, 1.0], [0.1, -0.3, 1.0]])
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    origins = np.zeros((3, 3))
+    x = np.ascontiguousarray((origins + rays * np.array([[1.0], [1.2], [0.9]])) @ pose[:3, :3].T + pose[:3, 3])
+    navigation.three_point_poses(origins, rays, x, 0.1, 10.0)
+
+
+def _pictures() -> None:
+    board = Checkerboard(8, 5, 0.02)
+    camera = BrownCamera((480, 360), 600.0, 600.0, 239.5, 179.5, (-0.2, 0.05, 1e-3, -5e-4))
+    turn = Rot3.Rx(0.3) * Rot3.Ry(0.25) * Rot3.Rz(0.2)
+    centre = board.points()[1].mean(0)
+    view = PlacedTarget(board, Pose3(turn, np.array([0.005, -0.003, 0.35]) - turn.matrix() @ centre))
+    assert len(detect_image(render(camera, [view], seed=1), board)) == 40
+    lights = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 4), np.linspace(-0.15, 0.15, 3), [1.0]), -1).reshape(-1, 3)
+    assert len(detect_spots(render(camera, beacons=Beacons(lights, 0.006, 200.0, "disc"), seed=1), SpotOptions())) == 12
+    xy = np.random.default_rng(1).uniform(-4.0, 4.0, (50, 2))
+    for crossing in (True, False):
+        vision.corner_rows(xy, np.array([0.2, -0.1, 0.3, 1.7, 20.0, 80.0, -0.2, 0.1, -0.3]), crossing)
+    for profile in (vision.GAUSSIAN, vision.DISC):
+        vision.spot_rows(xy, np.array([0.2, -0.3, 10.0, 80.0, 0.4, 0.6, -0.1]), profile)
+
+
+def _lenses() -> None:
+    q = points_in_camera(50)
+    uv = np.random.default_rng(1).uniform([0, 0], IMAGE_SIZE, (len(q), 2))
+    for name in NAMES:
+        model, values, constants = lens(name)
+        lenses.lens_rows(model.kind, values, constants, q, uv)
+        lenses.lens_residuals(model.kind, values, constants, q, uv)

@@ -1,0 +1,145 @@
+"""How the native library is built: with a compiler that only writes down what it is asked for."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+_COMPILER = """
+import json, os, sys
+words = sys.argv[1:]
+with open(os.environ["ASKED"], "a") as log:
+    log.write(json.dumps(words) + "\\n")
+if any(os.environ.get("REFUSED", "nothing") in word for word in words):
+    print("vision.cpp:3:1: error: unknown wonder")
+    sys.exit(1)
+open(words[words.index("-o") + 1], "w").write("made")
+"""
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """A copy of what is built, and the compiler."""
+    for name in ("adjust", "build_tools"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
+    for name in ("setup.py", "setup.cfg", "pyproject.toml", "README.md", "LICENSE", "MANIFEST.in"):
+        shutil.copy(ROOT / name, tmp_path)
+    (tmp_path / "compiler.py").write_text(_COMPILER, encoding="utf-8")
+    return tmp_path
+
+
+def _run(place: Path, *words: str, **more: str) -> tuple[int, str, list[list[str]]]:
+    """Exit code, what was printed, and what the compiler was asked for; ``setup.py`` with these words."""
+    asked = place / "asked"
+    asked.unlink(missing_ok=True)
+    environment = {"CXX": f"{sys.executable} {place / 'compiler.py'}", "ASKED": str(asked)}
+    done = subprocess.run([sys.executable, "setup.py", "-q", *words], cwd=place, env=os.environ | environment | more,
+                          capture_output=True, text=True, check=False)  # fmt: skip
+    calls = [json.loads(line) for line in asked.read_text().splitlines()] if asked.exists() else []
+    return done.returncode, done.stdout + done.stderr, calls
+
+
+def _sources(calls: list[list[str]]) -> list[str]:
+    return sorted(Path(c[c.index("-c") + 1]).name for c in calls if "-c" in c)
+
+
+def _build(place: Path, **more: str) -> tuple[int, str, list[list[str]]]:
+    return _run(place, "build_ext", "--inplace", **more)
+
+
+def _sets(place: Path) -> int:
+    return len(list((place / "adjust" / "native").glob("kernels_*.so")))
+
+
+def test_only_what_is_older_than_its_sources_is_built_again(place: Path) -> None:
+    code, text, calls = _build(place)
+    assert code == 0, text
+    sets = _sets(place)
+    assert sets in (1, 3)
+    assert _sources(calls).count("images.cpp") == sets
+    assert _sources(calls).count("processor.cpp") == 1
+    assert len([c for c in calls if "-shared" in c]) == sets
+    assert not any("-march=native" in word for c in calls for word in c)
+    assert _build(place)[2] == []
+    later = (place / "adjust/native/kernels_base.so").stat().st_mtime + 10
+    os.utime(place / "adjust/native/corners.h", (later, later))  # included by vision.cpp alone
+    assert set(_sources(_build(place)[2])) == {"vision.cpp"}
+
+
+def test_other_flags_build_everything_again_and_elsewhere(place: Path) -> None:
+    plain = _build(place)[2]
+    checked = _build(place, LABSURVEY_NATIVE="checked")[2]
+    assert len(checked) == len(plain)
+    assert all(any(word.startswith("-fsanitize=address,undefined") for word in c) for c in checked)
+    back = _build(place)[2]
+    assert _sources(back) == []  # the objects of the other kind are still there
+    assert len(back) == _sets(place)
+
+
+def test_a_failing_compiler_is_quoted_with_what_to_do(place: Path) -> None:
+    code, text, calls = _build(place, REFUSED="vision.cpp")
+    assert code == 1
+    command = next(" ".join(c) for c in calls if "vision.cpp" in " ".join(c))
+    assert command in text
+    assert "vision.cpp:3:1: error: unknown wonder" in text
+    assert "install one ('apt install g++'" in text
+    assert "Traceback" not in text
+    code, text, _ = _build(place, CXX="/nowhere/c++")
+    assert code == 1
+    assert "No such file or directory: '/nowhere/c++'" in text
+    assert "name it (CXX=" in text
+
+
+def test_the_wheel_is_for_a_platform_and_any_python(place: Path) -> None:
+    stale = place / "adjust" / "native" / "kernels_base.so"
+    stale.write_text("from an older or a checked build in place", encoding="utf-8")
+    code, text, _ = _run(place, "bdist_wheel")
+    assert code == 0, text
+    (wheel,) = (place / "dist").glob("*.whl")
+    assert wheel.name.split("-")[2:4] == ["py3", "none"]
+    assert not wheel.name.endswith("any.whl")
+    with zipfile.ZipFile(wheel) as file:
+        held = [n for n in file.namelist() if n.startswith("adjust/native/")]
+        about = next(n for n in file.namelist() if n.endswith(".dist-info/WHEEL"))
+        assert "Root-Is-Purelib: false" in file.read(about).decode()
+        assert file.read("adjust/native/kernels_base.so") == b"made"
+    assert {Path(n).suffix for n in held} == {".py", ".so"}
+
+
+def test_the_source_distribution_has_what_is_compiled(place: Path) -> None:
+    code, text, _ = _run(place, "sdist", "--formats=zip")
+    assert code == 0, text
+    (source,) = (place / "dist").glob("*.zip")
+    with zipfile.ZipFile(source) as file:
+        held = {n.partition("/")[2] for n in file.namelist()}
+    native = {p.relative_to(place).as_posix() for p in (place / "adjust" / "native").glob("*.[hc]*")}
+    assert native <= held
+    assert {"setup.py", "build_tools/backend.py", "build_tools/native.py"} <= held
+    assert not any(n.endswith(".so") for n in held)
+
+
+_BACKEND = "import backend; print(backend.compiler(), *backend.get_requires_for_build_wheel())"
+
+
+def test_a_compiler_is_asked_for_where_none_is_able(tmp_path: Path) -> None:
+    def asked(path: str, **more: str) -> str:
+        environment = {"PATH": path, "PYTHONPATH": str(ROOT / "build_tools")} | more
+        done = subprocess.run([sys.executable, "-c", _BACKEND], cwd=ROOT, env=environment, capture_output=True,
+                              text=True, check=True)  # fmt: skip
+        return done.stdout
+
+    assert "None ziglang" in asked(str(tmp_path))
+    old = tmp_path / "c++"
+    old.write_text("#!/bin/sh\nexit 1\n", encoding="utf-8")  # knows no C++20
+    old.chmod(0o755)
+    assert "None ziglang" in asked(str(tmp_path))
+    old.write_text("#!/bin/sh\nexit 0\n", encoding="utf-8")
+    assert "['c++']" in asked(str(tmp_path))
+    assert "ziglang" not in asked(str(tmp_path))
+    assert "['/some/where/c++', '-m64']" in asked("", CXX="/some/where/c++ -m64")
