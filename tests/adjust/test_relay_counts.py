@@ -146,10 +146,9 @@ def test_hundred_thousand_stations_take_about_a_second():
     rows = [(f"t{i}", str(i), str(int(rng.integers(0, i)))) for i in range(1, n)]
     rows += [(f"c{i}", str(i), str((i * 7919 + 13) % n)) for i in range(0, n, 2)]
     top = topology(rows)
-    start = time.perf_counter()
+    start = time.process_time()
     counts = count(top)
-    # 0.5 s measured alone
-    assert time.perf_counter() - start < 5.0
+    assert time.process_time() - start < 5.0
     assert counts.independent_conditions == len(rows) - n + 1
 
 
