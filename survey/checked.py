@@ -28,7 +28,9 @@ def checked(survey: Survey, run: Callable[[], Adjustment]) -> Adjustment:
 
         warnings = sign_warnings(survey, result)
     if _contradicted(survey, result):
-        warnings += tuple(c for c in _probable_causes(survey, result) if c not in warnings)
+        # what does not fit may have spoilt the lenses too: then those that the images alone give
+        causes = _probable_causes(survey, result) or _probable_causes(survey)
+        warnings += tuple(c for c in causes if c not in warnings)
     return replace(result, warnings=tuple(f"probable cause: {c}" for c in warnings) + result.warnings)
 
 
