@@ -70,7 +70,7 @@ def test_loops_between_eyes_close(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert entry["misclosure_after_arcsec"] < 1e-6
         assert entry["misclosure_after_mm"] < 1e-8
     for pair in solution["pairs"].values():
-        assert 0.0 < min(pair["adjusted"]["sigma_rotation_arcsec"])
+        assert min(pair["adjusted"]["sigma_rotation_arcsec"]) > 0.0
     shown = capsys.readouterr().out
     assert "loops: 5, closed by the adjustment" in shown
     page = (tmp_path / "lab" / "results" / "report.html").read_text()
