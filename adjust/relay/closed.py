@@ -23,7 +23,7 @@ from adjust.model import FloatArray, PoseParameter, Station, Survey
 from adjust.named_precision import NamedPrecision
 from adjust.observations import Closure, FrameRef, Pair
 from adjust.precision import adjusted_motion, global_test
-from adjust.relay.conditions import adjust_conditions
+from adjust.relay.conditions import adjust_loops
 from adjust.relay.network import network_from_pairs
 from adjust.relay.result import AdjustedPairs, whitening
 from adjust.result import Adjustment, ObservationResidual
@@ -210,7 +210,7 @@ def in_condition_form(result: Adjustment) -> Adjustment:
     kinds = {isinstance(p.b_from_a, Rot3) for p in used}
     if len(given) > 1 or any(s.world_from_station.treatment == "prior" for s in given) or len(kinds) != 1:
         return result
-    found = adjust_conditions(network_from_pairs(used))
+    found = adjust_loops(network_from_pairs(used))
     pairs, precision = found.pairs, result.precision
     if not len(found.basis) or not isinstance(precision, NamedPrecision):
         return result

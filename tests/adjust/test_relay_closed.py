@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.errors import SurveyError
+from adjust.errors import NotConvergedError, SurveyError
 from adjust.model import Camera, LensParameter, PoseParameter, Station, Survey, Target
 from adjust.observations import Closure, FrameRef, Pair
 from adjust.pair_screen import PairOptions, adjust_with_pairs
 from adjust.relay.closed import closed, play
+from adjust.relay.condition_factors import MAX_HARD_LOOPS
+from adjust.relay.conditions import adjust_condition_factors, adjust_conditions, adjust_loops
 from adjust.result import Adjustment
 from survey.simulate import resample, stereo
 from tests.adjust import helpers as h
+from tests.adjust.relay_networks import grid, simulate
 
 ARCSEC = np.radians(1.0 / 3600.0)
 UNSCREENED = PairOptions(reject_pairs=False)
@@ -77,6 +80,35 @@ def test_eyes_that_are_no_stations_close_their_loops(rotations: bool) -> None:
     for pair_id, cov in expected.precision.pair_covariances().items():
         assert h.relative(covs[pair_id], cov) < 1e-6
     assert not any("differ" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize("n", [4, 16])
+def test_few_loops_by_closure_factors_many_by_normal_equations(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same from both, and from the normal equations where the factors give up or lose a constraint."""
+    network = simulate(grid(n, n), 3, seed=4).network
+    expected = adjust_conditions(network).pairs
+    used: list[int] = []
+
+    def counted(*given, **named):  # type: ignore[no-untyped-def]  # passes on whatever it is given
+        used.append(1)
+        return adjust_condition_factors(*given, **named)
+
+    monkeypatch.setattr("adjust.relay.conditions.adjust_condition_factors", counted)
+    found = adjust_loops(network).pairs
+    assert len(used) == ((n - 1) ** 2 <= MAX_HARD_LOOPS)
+    np.testing.assert_allclose(found.residual, expected.residual, atol=1e-10)
+    np.testing.assert_allclose(found.cov, expected.cov, atol=1e-8 * np.abs(expected.cov).max())
+
+    def lost(*given, **named):  # type: ignore[no-untyped-def]  # as above
+        done = adjust_condition_factors(*given, **named)
+        return replace(done, pairs=replace(done.pairs, redundancy=done.pairs.redundancy * 0.99, omega=-1.0))
+
+    def stuck(*_given, **_named):  # type: ignore[no-untyped-def]  # as above
+        raise NotConvergedError("the hard loop closures did not settle")
+
+    for wrong in (lost, stuck):
+        monkeypatch.setattr("adjust.relay.conditions.adjust_condition_factors", wrong)
+        assert adjust_loops(network).pairs.omega == pytest.approx(expected.omega, rel=1e-9)
 
 
 def test_conditions_that_contradict_the_poses_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
