@@ -157,7 +157,7 @@ def rig(pair_of_eyes: bool) -> tuple[Survey, h.StartValues]:
     """Two cameras that see boards, joined by pairs over a block and a third camera that no image shows."""
     survey, truth = stereo(5, n_pairs=10)
     rng = np.random.default_rng(3)
-    left, right = (FrameRef("camera", c, survey.image_blocks[0].epoch_id) for c in ("left", "right"))
+    left, right = (FrameRef("camera", c) for c in ("left", "right"))
     block, third = FrameRef("target", "M"), FrameRef("camera", "X")
     at = {("world_from_station", "own"): Pose3()}
     named = FrameRef("station", "target M"), FrameRef("station", "camera X")

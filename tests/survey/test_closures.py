@@ -11,7 +11,7 @@ from gtsam import Pose3
 from adjust.observations import Closure
 from survey.cli import main
 from survey.files import AdjustmentOptions, read, write_project
-from tests.adjust.test_relay_closed import ARCSEC, eyes
+from tests.adjust.test_relay_closed import ARCSEC, eyes, rig
 
 MOUNT = Closure("plate", ("C1-C2", "C2-C3", "C1-C3"), 300.0 * ARCSEC, 1e-3)
 LENS = """[cameras.{0}.lens]
@@ -129,3 +129,25 @@ def test_options_are_written_as_they_are_read(tmp_path: Path) -> None:
     )
     assert closure.rotation_sigma == pytest.approx(MOUNT.rotation_sigma, rel=1e-12)
     assert closure.translation_sigma == pytest.approx(MOUNT.translation_sigma, rel=1e-12)
+
+
+def test_eyes_beside_cameras_with_images(tmp_path: Path) -> None:
+    """One graph: a block and a camera that no image shows, between two cameras that see boards."""
+    survey, _ = rig(True)
+    options = AdjustmentOptions(pairs="closed", reject_points=False)
+    write_project(tmp_path / "lab", survey, options=options)
+    solution = adjusted(tmp_path / "lab")
+    alone = tmp_path / "alone"
+    write_project(alone, replace(survey, pairs=(), cameras=survey.cameras[:2], targets=survey.targets[:-1],
+                                 stations=survey.stations[:-1]), options=replace(options, pairs="poses"))  # fmt: skip
+    without = adjusted(alone)
+    assert {"camera X", "target M"} <= set(solution["stations"])
+    assert set(solution["cameras"]) == {"left", "right"}
+    assert solution["summary"]["redundancy"] - without["summary"]["redundancy"] == 6 * (4 - 2)
+    assert solution["summary"]["global_test"]["passed"]
+    (loop,) = solution["loops"]["worst_first"]
+    assert set(loop["pairs"]) == {"l-M", "M-X", "l-X"}
+    assert loop["misclosure_arcsec"] > 1.0
+    assert loop["misclosure_after_arcsec"] < 1e-6
+    now, then = (s["cameras"]["right"]["station_from_camera"]["sigma_translation_mm"] for s in (solution, without))
+    assert sum(now) < sum(then)
