@@ -46,3 +46,9 @@ def rotations_only(adjustment: Adjustment) -> bool:
     """Whether nothing but rotations was measured, so that nothing is where it seems to be."""
     found = adjustment.precision
     return isinstance(found, NamedPrecision) and found.solution.network.rotation_only
+
+
+def in_conditions(adjustment: Adjustment) -> bool:
+    """Whether what the adjustment says of pairs is from the conditions of their loops, not from the poses of frames."""
+    found = adjustment.precision
+    return isinstance(found, NamedPrecision) and found.closed is not None

@@ -208,12 +208,13 @@ def network_dict(network: PairNetwork) -> dict[str, Any]:
 
 
 def loops_dict(
-    loops: LoopMisclosures, left_out: Sequence[str] = (), after: FloatArray | None = None, form: str = "poses"
+    loops: LoopMisclosures, left_out: Sequence[str] = (), after: FloatArray | None = None, form: str = "poses",
+    solved_by: str = "poses",
 ) -> dict[str, Any]:
     """The loops, worst first, as plain values; left_out: pairs that are not used, named beside the loops they are in.
 
     sigma_misclosure: along the direction of the misclosure. after: misclosures (L, dim) by the adjusted pairs. form:
-    "poses" or "closed", how the pairs were adjusted.
+    "poses" or "closed", as asked for. solved_by: "poses" or "conditions", how the pairs were adjusted.
     """
     failed = set(loops.failed(ALPHA).tolist())
     order = np.argsort(loops.p_value, kind="stable")[:_MOST_LOOPS].tolist()
@@ -225,6 +226,7 @@ def loops_dict(
         "note": loops.basis.note,
         "alpha": ALPHA,
         "form": form,
+        "solved_by": solved_by,
         "worst_first": [
             _loop(loops, k, k in failed, set(left_out)) | ({} if after is None else _after(after[k])) for k in order
         ],

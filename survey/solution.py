@@ -11,6 +11,7 @@ import numpy as np
 from adjust.distributions import norm
 from adjust.epoch_states import datum_carriers, open_directions
 from adjust.model import FloatArray
+from adjust.named_precision import in_conditions
 from adjust.result import Adjustment, Estimate, GroupSummary
 from survey.files.detected import DetectedImage
 from survey.files.project import LeftOut
@@ -328,7 +329,8 @@ def _network(adjustment: Adjustment) -> dict[str, Any]:
     if loops is None:
         return {}
     left_out = [p.pair_id for p in survey.pairs if not p.used]
-    listed = loops_dict(loops, left_out, loops_after(adjustment, loops), survey.pair_form)
+    how = "conditions" if in_conditions(adjustment) else "poses"
+    listed = loops_dict(loops, left_out, loops_after(adjustment, loops), survey.pair_form, how)
     closures = {"closures": closures_dict(adjustment)} if survey.closures else {}
     return {"network": network_dict(pair_network(survey)), "loops": listed, **closures}
 

@@ -98,7 +98,8 @@ def loops(c: Context) -> str:
     )  # fmt: skip
     note += " " + t(
         "After: by the adjusted pairs, {form}.",
-        form=t("all loops closed as conditions") if found["form"] == "closed" else t("each by the poses of its frames"),
+        form=t("all loops closed as conditions" if found["solved_by"] == "conditions" else
+               "each by the poses of its frames"),
     )
     classes = ["" if e["closes"] else "suspect" for e in entries]
     return section("loops", "Loop closures", table(columns, rows, "", classes), note) + _mounts(c)

@@ -63,6 +63,7 @@ def test_loops_between_eyes_close(tmp_path: Path, capsys: pytest.CaptureFixture[
     solution = adjusted(project(tmp_path / "lab"))
     loops = solution["loops"]
     assert loops["form"] == "closed"
+    assert loops["solved_by"] == "conditions"
     assert loops["n_loops"] == loops["n_listed"] == 5
     assert solution["summary"]["redundancy"] == 30
     for entry in loops["worst_first"]:
@@ -145,6 +146,7 @@ def test_eyes_beside_cameras_with_images(tmp_path: Path) -> None:
     assert set(solution["cameras"]) == {"left", "right"}
     assert solution["summary"]["redundancy"] - without["summary"]["redundancy"] == 6 * (4 - 2)
     assert solution["summary"]["global_test"]["passed"]
+    assert solution["loops"]["solved_by"] == "poses"
     (loop,) = solution["loops"]["worst_first"]
     assert set(loop["pairs"]) == {"l-M", "M-X", "l-X"}
     assert loop["misclosure_arcsec"] > 1.0
