@@ -72,6 +72,7 @@ class BundleBatch:
         self._place_local_unknowns()
         self._place_derivatives()
         self._prepared: gtsam.Values | None = None
+        self._rows_at: tuple[gtsam.Values | None, FloatArray] = (None, self.W)
         self._blind_directions: FloatArray | None = None
         self._damping = 0.0
         self._with_jacobians = False
@@ -238,6 +239,12 @@ class BundleBatch:
         rows(
             self.block, self.camera, s.lenses, c.R, c.t, self.X, self.uv, W, self.A, self.chi, self.depth,
         )  # fmt: skip
+        self._rows_at = (values, W)
+
+    def rows_at(self, values: gtsam.Values) -> FloatArray | None:
+        """The rows A as they are, where they and the chains are those of ``values`` and of the weights; else None."""
+        at, W = self._rows_at
+        return self.A if at is values and W is self.W else None
 
     def _load_points(self, values: gtsam.Values) -> None:
         """The free points: in one call where ``values`` hold no others, which it gives in the order of their keys."""
@@ -455,8 +462,8 @@ class BundleBatch:
         self._prepared = None
         return self.unsorted((self.A[:, :, MAX_LENS + 6] ** 2).sum(axis=1))
 
-    def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        """The one factor of this batch."""
+    def add_factor(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """The one factor of this batch, for :func:`adjust.solve.solve`, which moves what it hides."""
         n = self.n_keys - self.n_hidden + 1
         graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n), self.interface, _callback(self)))
 

@@ -52,8 +52,10 @@ def joint_survey(epochs: Mapping[str, Survey], stable: Collection[str]) -> Surve
     first = next(iter(epochs.values()))
     inner = any(s.datum.kind == "inner" for s in epochs.values())
     datum = Datum("inner", points=tuple(p for p in points if p in stable)) if inner else first.datum
-    return Survey(points=tuple(points.values()), datum=datum, vertical=first.vertical, bearings=first.bearings,
-                  instruments=tuple(instruments.values()), **{k: tuple(v) for k, v in parts.items()})  # fmt: skip
+    whole = Survey(points=tuple(points.values()), datum=datum, vertical=first.vertical, bearings=first.bearings,
+                   instruments=tuple(instruments.values()))  # fmt: skip
+    observed: dict[str, Any] = {k: tuple(v) for k, v in parts.items()}
+    return replace(whole, **observed)
 
 
 def _renamed(item: Any, epoch: str, stable: Collection[str]) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.bundle_batch import BundleBatch
+from adjust.bundle_points import add_point_factors
 from adjust.errors import SurveyError
 from adjust.factors import (
     ChainPose,
@@ -52,6 +53,8 @@ class StartValues:
 class AdjustmentGraph:
     """The graph, its start and the batches that serve it. Held together with the survey only by the solver.
 
+    ``graph`` has every observation as a factor on its unknowns and nothing else; ``system`` is a view of it for the
+    solver, in which points and poses that nothing else touches are reduced.
     reduction: of the poses that only image points touch, while ``system`` is without them; None where nothing is
     reduced, or no longer.
     """
@@ -70,27 +73,43 @@ class AdjustmentGraph:
 
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """All factors, right at any values and in any of GTSAM's algorithms (but for what a bundle hides)."""
-        return self._factors(None)
+        """All factors on all unknowns, right at any values and in any of GTSAM's algorithms."""
+        if self.bundle is None:
+            return self._unreduced
+        graph = self._factors(None)
+        add_point_factors(self.bundle, graph)
+        return graph
 
     @cached_property
     def _reduced(self) -> gtsam.NonlinearFactorGraph:
-        return self._factors(self.reduction)
+        graph = self._factors(self.reduction)
+        if self.bundle is not None:
+            self.bundle.add_factor(graph)
+        if self.reduction is not None:
+            self.reduction.add_factor(graph)
+        return graph
+
+    @cached_property
+    def _unreduced(self) -> gtsam.NonlinearFactorGraph:
+        graph = self._factors(None)
+        if self.bundle is not None:
+            self.bundle.add_factor(graph)
+        return graph
 
     @property
     def system(self) -> gtsam.NonlinearFactorGraph:
-        """What the solver linearises, after :meth:`prepare` at the same values."""
-        return self.graph if self.reduction is None else self._reduced
+        """What the solver linearises, after :meth:`prepare` at the same values: a view of ``graph``.
+
+        Of the same chi-square, with what :attr:`reduction` and :attr:`bundle` reduce eliminated already.
+        """
+        return self._unreduced if self.reduction is None else self._reduced
 
     def _factors(self, reduction: PoseReduction | None) -> gtsam.NonlinearFactorGraph:
+        """All factors but those of a bundle, and of the image blocks that ``reduction`` takes."""
         graph = gtsam.NonlinearFactorGraph(self.others_graph)
         self.images.add_factors(graph, None if reduction is None else reduction.others)
         if self.terrestrial is not None:
             self.terrestrial.add_factors(graph)
-        if self.bundle is not None:
-            self.bundle.add_factors(graph)
-        if reduction is not None:
-            reduction.add_factor(graph)
         return graph
 
     def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:

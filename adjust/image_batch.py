@@ -68,6 +68,16 @@ class Chains:
         """Fill R (B, 3, 3), t (B, 3) and C (links, 6, 6)."""
         self.R, self.t, self.C = evaluate_chains(state.slot_R, state.slot_t, self.ptr, self.slot, self.inverse)
 
+    def one(self, state: State, b: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """R (1, 3, 3), t (1, 3) and C (links, 6, 6) of chain ``b`` alone; fills nothing."""
+        links = slice(self.ptr[b], self.ptr[b + 1])
+        ptr: IntArray = np.array([0, self.ptr[b + 1] - self.ptr[b]])
+        return evaluate_chains(state.slot_R, state.slot_t, ptr, self.slot[links], self.inverse[links])
+
+    def slots(self, b: int) -> list[int]:
+        """The slots of chain ``b``."""
+        return [int(slot) for slot in self.slot[self.ptr[b] : self.ptr[b + 1]]]
+
 
 class ImageBatch:
     """Image points of known targets (and of held world points), grouped per block.
@@ -128,6 +138,11 @@ class ImageBatch:
         self._evaluate(self._all, jacobians)
         self._prepared, self._with_jacobians = values, jacobians
 
+    @property
+    def prepared(self) -> gtsam.Values | None:
+        """The values at which everything was evaluated last."""
+        return self._prepared
+
     def forget(self) -> None:
         """Evaluate again when next asked, whatever the values."""
         self._prepared = None
@@ -168,21 +183,24 @@ class ImageBatch:
             self._views.append(views)
 
     def _evaluate_alone(self, b: int, values: gtsam.Values, jacobians: bool) -> None:
-        links = slice(self.chains.ptr[b], self.chains.ptr[b + 1])
-        self.state.load(values, [int(slot) for slot in self.chains.slot[links]])
-        self.chains.evaluate(self.state)
+        self.state.load(values, self.chains.slots(b))
+        c, links = self.chains, slice(self.chains.ptr[b], self.chains.ptr[b + 1])
+        c.R[b : b + 1], c.t[b : b + 1], c.C[links] = c.one(self.state, b)
         self._prepared = None
         self._evaluate([np.array([b], dtype=np.int64)], jacobians)
 
     def residual(self, b: int, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         """What GTSAM's custom factor of block ``b`` returns: its condensed residual, and its rows by key."""
-        if values is not self._prepared or (jacobians is not None and not self._with_jacobians):
+        alone = values is not self._prepared or (jacobians is not None and not self._with_jacobians)
+        if alone:
             self._evaluate_alone(b, values, jacobians is not None)
         if jacobians is None:  # only the length of a residual is asked for: zeros, then the length
             length = np.zeros(int(self.n_rows[b]))
             length[-1] = np.sqrt(self.chi[b])
             return length
         if not self._served[b]:
+            if not alone and self.state.loaded is not values:  # another factor was asked at other values in between
+                self.state.load(values)
             self.serve(np.array([b], dtype=np.int64))
         for i, view in enumerate(self._views[b]):
             jacobians[i] = view

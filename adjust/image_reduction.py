@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 import scipy
 
+from adjust.errors import IndeterminateError
 from adjust.image_batch import ImageBatch
 from adjust.image_segments import first_seen, ranges
 from adjust.model import FloatArray, IntArray
@@ -78,7 +79,8 @@ class PoseReduction:
         self._place(of_pose, owner[k.block[of_pose]], number, np.array(widths, dtype=np.int64), order, block_ptr)
         runs = split_blocks(np.concatenate([[0], np.cumsum(np.diff(batch.ptr)[order])])[block_ptr])
         self._turns = [np.append(turn, run) for turn, run in enumerate(runs)]
-        self.ready = False
+        self._blocks = order
+        self._served: tuple[gtsam.Values | None, FloatArray] = (None, batch.W)
 
     def _place(
         self, at: IntArray, pose: IntArray, number: IntArray, widths: IntArray, order: IntArray, block_ptr: IntArray
@@ -106,13 +108,16 @@ class PoseReduction:
         batch, n, count = self.batch, self.interface.n, len(self._turns)
         rest, diagonal = np.zeros((count, n + 1, n + 1)), np.zeros((count, n))
         bad = np.full(count, -1, dtype=np.int64)
-        self.ready = False
+        self._served = (None, batch.W)
         run_split(
             reduce_poses, self._turns, self.arrays, batch.arrays, batch.state.lenses, batch.of_blocks.segments,
             batch.of_blocks.columns, batch.chains.C, batch.state.D, damping, batch.H, self.L, self.T, diagonal, rest,
             bad,
         )  # fmt: skip
-        return bool((bad < 0).all()) and self._serve(rest.sum(axis=0), diagonal.sum(axis=0))
+        done = bool((bad < 0).all()) and self._serve(rest.sum(axis=0), diagonal.sum(axis=0))
+        if done:
+            self._served = (batch.prepared, batch.W)
+        return done
 
     def _serve(self, N: FloatArray, diagonal: FloatArray) -> bool:
         """Square root of what is left, as the rows of the factor."""
@@ -131,21 +136,34 @@ class PoseReduction:
         self._views = [
             np.ascontiguousarray(R[:, at:end]) for at, end in zip(self.interface.at.values(), ends, strict=True)
         ]
-        self.ready = True
         return True
 
     def add_factor(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        """The one factor, which only serves what :meth:`reduce` left."""
+        """The one factor, which serves what :meth:`reduce` left of these values, and reduces others by itself."""
 
-        def residual(_factor, _values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
-            if jacobians is None or not self.ready:
-                raise RuntimeError("a reduced factor serves linearised rows only")
-            for i, view in enumerate(self._views):
-                jacobians[i] = view
-            return self._r
+        def residual(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
+            return self._residual(values, jacobians)
 
         noise = gtsam.noiseModel.Unit.Create(self.interface.n + 1)
         graph.add(gtsam.CustomFactor(noise, list(self.interface.keys), residual))
+
+    def _residual(self, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        batch = self.batch
+        if jacobians is None:  # only the length of the residual is asked for
+            if values is not batch.prepared:
+                batch.state.load(values)
+                batch.prepare(values, False)
+            length = np.zeros(self.interface.n + 1)
+            length[-1] = np.sqrt(batch.chi[self._blocks].sum())
+            return length
+        if values is not self._served[0] or batch.W is not self._served[1]:
+            batch.state.load(values)
+            batch.prepare(values, True)
+            if not self.reduce(0.0):
+                raise IndeterminateError("a pose that was reduced has no solution at these values")
+        for i, view in enumerate(self._views):
+            jacobians[i] = view
+        return self._r
 
     def complete(self, delta: gtsam.VectorValues) -> float:
         """Insert the steps of the reduced poses; returns by how much these alone lower chi-square."""

@@ -331,3 +331,7 @@ class Survey:
     alignments: tuple[Any, ...] = ()
     laser_spots: tuple[Any, ...] = ()
     on_surfaces: tuple[Any, ...] = ()
+    pair_form: Literal["poses", "closed"] = "poses"
+    """Pairs by the poses of their frames, or every loop of them closed; set by :mod:`adjust.relay.closed`."""
+    closures: tuple[Any, ...] = ()
+    """Mounts (``adjust.observations.Closure``) whose play the covariances of their pairs already contain."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model import BoolArray, FloatArray, IntArray
@@ -71,6 +72,25 @@ class Pair:
     cov: FloatArray
     group: str = "pair"
     used: bool = True
+
+
+@dataclass(frozen=True)
+class Closure:
+    """A loop of pairs that a mechanical mount closes: only as well as the mount repeats.
+
+    pair_ids: in the order of the walk; the mount sits at end a of the last of them. rotation_sigma (rad),
+    translation_sigma (m): of the mount about and along each axis.
+    """
+
+    closure_id: str
+    pair_ids: tuple[str, ...]
+    rotation_sigma: float
+    translation_sigma: float = 0.0
+
+    def cov(self, dim: int) -> FloatArray:
+        """Covariance (dim, dim) of the mount's play, a tangent in frame a of its pair."""
+        sigma = np.repeat([self.rotation_sigma, self.translation_sigma], 3)[:dim]
+        return np.diag(sigma**2)
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,12 @@ def adjust_with_pairs(
     start: where the adjustment begins; found where not given. Raises as :func:`adjust.adjustment.adjust`.
     """
     if is_pure(survey):
-        return adjusted_network(survey, network_solution(survey, options, progress), options)
+        found = adjusted_network(survey, network_solution(survey, options, progress), options)
+        if survey.pair_form == "poses":
+            return found
+        from adjust.relay.closed import in_condition_form  # here: as below
+
+        return in_condition_form(found)
     result = adjust(survey, start, options.adjust, progress)
     if options.reject_pairs and any(p.used for p in survey.pairs):
         result = _PairSearch(survey, result, options, progress).result()

@@ -43,6 +43,8 @@ class State:
             if key is not None and slot not in unknowns.table_slots
         ]
         self._pose_keys = {key for _, key in self._free_slots}
+        self.loaded: gtsam.Values | None = None
+        """The values that everything here is of; None while some of it is of others."""
         self._slots_by_key = np.array([s for s, _ in sorted(self._free_slots, key=lambda x: x[1])], dtype=np.int64)
 
     def _lens_arrays(self, survey: Survey) -> LensArrays:
@@ -74,7 +76,9 @@ class State:
         if slots is None:
             self._load_poses(values)
             self._move_tables(values, self.unknowns.table_slots.values())
+            self.loaded = values if lenses else None
         else:
+            self.loaded = self.loaded if values is self.loaded else None
             asked = list(slots)
             self._move_tables(values, [t for s, t in self.unknowns.table_slots.items() if s in asked])
             for slot in asked:

@@ -54,9 +54,7 @@ def _covariances(adjustment: Adjustment) -> dict[str, FloatArray]:
     """A priori covariances (k, k) of the adjusted pairs by id, in the tangent in frame a."""
     precision = adjustment.precision
     if isinstance(precision, NamedPrecision):
-        network, cov = precision.solution.network, precision.solution.precision.pairs.adjusted_cov
-        sizes = np.where(network.is_pose, 6, 3).tolist()
-        return {p: cov[e, :k, :k] for e, (p, k) in enumerate(zip(network.pair_ids, sizes, strict=True))}
+        return precision.pair_covariances()
     if not isinstance(precision, Precision):
         return {}
     out = {}

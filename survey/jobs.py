@@ -179,6 +179,10 @@ def adjust_project(project: Project, progress: bool, begin: Begin = lambda _: No
             f"{project.folder}: there is nothing to adjust; put images at images/<camera_id>/<epoch_id>.png or tables "
             "into observations/"
         )
+    if project.options.pairs == "closed" and survey.pairs:
+        from adjust.relay.closed import closed  # here: a survey without pairs starts without it
+
+        survey = closed(survey, project.options.closures)
     options = AdjustOptions(project.options.alpha, project.options.reject_blocks, project.options.reject_points)
     survey, turned = consistent_turns(survey, project.target_kinds)
     project = replace(project, survey=survey)

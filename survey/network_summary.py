@@ -13,10 +13,12 @@ from gtsam import Pose3, Rot3
 
 from adjust.model import FloatArray, PoseParameter, Survey
 from adjust.observations import FrameRef, Pair
+from adjust.relay.closed import play
 from adjust.relay.counts import Counts, count
-from adjust.relay.loops import LoopMisclosures, loop_misclosures
+from adjust.relay.loops import LoopMisclosures, evaluate_loops, loop_misclosures
 from adjust.relay.motions import Motions
 from adjust.relay.network import Network, Topology, topology
+from adjust.result import Adjustment
 from survey.files.text import natural_key
 from survey.quantities import ARCSEC_PER_RAD
 
@@ -145,6 +147,36 @@ def pair_loops(survey: Survey) -> LoopMisclosures | None:
     return loop_misclosures(network)
 
 
+def loops_after(adjustment: Adjustment, loops: LoopMisclosures) -> FloatArray:
+    """Misclosures (L, dim) of the same loops by the adjusted pairs, predicted where not used; a mount keeps its play.
+
+    From the residuals: each pair as measured, moved by its own. Nan where a pair has none.
+    """
+    basis, survey = loops.basis, adjustment.survey
+    top, dim = basis.topology, loops.vector.shape[1]
+    by_id = {p.pair_id: p for p in survey.pairs}
+    found = {o.ids[0]: np.asarray(o.residual) for o in adjustment.other_residuals if o.kind == "pair"}
+    stations = {s.station_id: s.world_from_station for s in survey.stations}
+    motions: list[Pose3 | Rot3] = []
+    moved, lost = np.zeros((top.n_pairs, dim)), np.zeros(top.n_pairs, dtype=np.bool_)
+    for e, pair_id in enumerate(top.pair_ids):
+        pair = by_id.get(pair_id)
+        if pair is None:  # what is given: its adjusted pose, where it is known no better than that
+            given = stations[pair_id.removeprefix(_GIVEN)]
+            estimate = adjustment.estimates.get(("world_from_station", pair_id.removeprefix(_GIVEN)))
+            now = None if estimate is None else estimate.value
+            motions.append(now if isinstance(now, Pose3) else given.value or Pose3())
+            continue
+        motions.append(pair.b_from_a)
+        v = found.get(pair_id)
+        lost[e] = v is None
+        if v is not None:
+            moved[e] = (v - play(survey.closures, pair, v))[:dim]
+    w = evaluate_loops(basis, _motions(motions, dim).retract(moved))[0]
+    w[np.logical_or.reduceat(lost[basis.pair_idx], basis.ptr[:-1])] = np.nan
+    return w
+
+
 def _motions(motions: Sequence[Pose3 | Rot3], dim: int) -> Motions:
     rotation = np.array([(m.rotation() if isinstance(m, Pose3) else m).matrix() for m in motions])
     if dim == 3:
@@ -175,10 +207,14 @@ def network_dict(network: PairNetwork) -> dict[str, Any]:
     }
 
 
-def loops_dict(loops: LoopMisclosures, left_out: Sequence[str] = ()) -> dict[str, Any]:
+def loops_dict(
+    loops: LoopMisclosures, left_out: Sequence[str] = (), after: FloatArray | None = None, form: str = "poses",
+    solved_by: str = "poses",
+) -> dict[str, Any]:
     """The loops, worst first, as plain values; left_out: pairs that are not used, named beside the loops they are in.
 
-    sigma_misclosure: along the direction of the misclosure.
+    sigma_misclosure: along the direction of the misclosure. after: misclosures (L, dim) by the adjusted pairs. form:
+    "poses" or "closed", as asked for. solved_by: "poses" or "conditions", how the pairs were adjusted.
     """
     failed = set(loops.failed(ALPHA).tolist())
     order = np.argsort(loops.p_value, kind="stable")[:_MOST_LOOPS].tolist()
@@ -189,8 +225,48 @@ def loops_dict(loops: LoopMisclosures, left_out: Sequence[str] = ()) -> dict[str
         "minimal": loops.basis.minimal,
         "note": loops.basis.note,
         "alpha": ALPHA,
-        "worst_first": [_loop(loops, k, k in failed, set(left_out)) for k in order],
+        "form": form,
+        "solved_by": solved_by,
+        "worst_first": [
+            _loop(loops, k, k in failed, set(left_out)) | ({} if after is None else _after(after[k])) for k in order
+        ],
     }
+
+
+def _after(w: FloatArray) -> dict[str, Any]:
+    out = {"misclosure_after_arcsec": float(ARCSEC_PER_RAD * np.linalg.norm(w[:3]))}
+    return out if len(w) == 3 else out | {"misclosure_after_mm": float(1e3 * np.linalg.norm(w[3:]))}
+
+
+def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
+    """Every loop through a mount: its misclosure as measured, and the play of the mount that the adjustment leaves.
+
+    sigma: of the mount, as given. play_over_sigma: length of the play over its sigmas, of dim components.
+    """
+    survey, out = adjustment.survey, {}
+    by_id = {p.pair_id: p for p in survey.pairs}
+    found = {o.ids[0]: np.asarray(o.residual) for o in adjustment.other_residuals if o.kind == "pair"}
+    for closure in survey.closures:
+        pairs = [by_id[i] for i in closure.pair_ids]
+        dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3
+        covs = np.array([np.asarray(p.cov)[:dim, :dim] for p in pairs])
+        loop = loop_misclosures(Network(topology(_ends(pairs)), _motions([p.b_from_a for p in pairs], dim), covs))
+        w, cov = loop.vector[0], loop.cov[0]
+        entry: dict[str, Any] = {"pairs": list(closure.pair_ids), "used": pairs[-1].used}
+        entry |= {"sigma_arcsec": ARCSEC_PER_RAD * closure.rotation_sigma, "sigma_mm": 1e3 * closure.translation_sigma}
+        entry["misclosure_arcsec"], entry["sigma_misclosure_arcsec"] = _along(w[:3], cov[:3, :3], ARCSEC_PER_RAD)
+        if dim == 6:
+            entry["misclosure_mm"], entry["sigma_misclosure_mm"] = _along(w[3:], cov[3:, 3:], 1e3)
+        entry |= {"test": loop.test[0], "freedom": dim, "p_value": loop.p_value[0]}
+        v = found.get(closure.pair_ids[-1])
+        if v is not None:
+            d = play(survey.closures, pairs[-1], v)
+            entry["play_arcsec"] = float(ARCSEC_PER_RAD * np.linalg.norm(d[:3]))
+            entry |= {"play_mm": float(1e3 * np.linalg.norm(d[3:]))} if len(d) == 6 else {}
+            sigma = np.sqrt(np.diag(closure.cov(len(d))))
+            entry["play_over_sigma"] = float(np.linalg.norm(d[sigma > 0.0] / sigma[sigma > 0.0]))
+        out[closure.closure_id] = entry
+    return out
 
 
 def _loop(loops: LoopMisclosures, k: int, failed: bool, left_out: set[str]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from survey.files.declarations import DECLARATIONS, declared
 from survey.files.declared import NOTHING, REQUIRED, Declared, Key
 
 _BY_ID = {"cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces", "align",
-          "tolerances"}  # fmt: skip
+          "tolerances", "closures"}  # fmt: skip
 _NO_ID = '[/\\\\:@,;"|<>*?]'
 _NUMBER = {"type": "number"}
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from adjust.distributions import norm
 from adjust.epoch_states import datum_carriers, open_directions
-from adjust.model import FloatArray, Survey
+from adjust.model import FloatArray
+from adjust.named_precision import in_conditions
 from adjust.result import Adjustment, Estimate, GroupSummary
 from survey.files.detected import DetectedImage
 from survey.files.project import LeftOut
@@ -75,7 +76,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
             "targets": _targets(adjustment, scale),
             "pairs": _pairs(adjustment, scale),
             **instrument_entries(adjustment, scale),
-            **_network(adjustment.survey),
+            **_network(adjustment),
             **_free_datum(adjustment),
             "groups": {g.group: _group(g) for g in adjustment.groups},
             **left_out_dict(adjustment, run.left_out, run.n_left_out, run.n_unused_in_files),
@@ -316,18 +317,22 @@ def _pairs(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
     return pairs_dict(adjustment, scale)
 
 
-def _network(survey: Survey) -> dict[str, Any]:
+def _network(adjustment: Adjustment) -> dict[str, Any]:
     """What the pairs can tell, and how well their loops close; nothing where there are no pairs."""
+    survey = adjustment.survey
     if not survey.pairs:
         return {}
     # here: a survey without pairs is reported without it
-    from survey.network_summary import loops_dict, network_dict, pair_loops, pair_network
+    from survey.network_summary import closures_dict, loops_after, loops_dict, network_dict, pair_loops, pair_network
 
     loops = pair_loops(survey)
     if loops is None:
         return {}
     left_out = [p.pair_id for p in survey.pairs if not p.used]
-    return {"network": network_dict(pair_network(survey)), "loops": loops_dict(loops, left_out)}
+    how = "conditions" if in_conditions(adjustment) else "poses"
+    listed = loops_dict(loops, left_out, loops_after(adjustment, loops), survey.pair_form, how)
+    closures = {"closures": closures_dict(adjustment)} if survey.closures else {}
+    return {"network": network_dict(pair_network(survey)), "loops": listed, **closures}
 
 
 def solution_json(solution: Mapping[str, Any]) -> str:

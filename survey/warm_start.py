@@ -39,7 +39,7 @@ def warm_adjustment(
     itself is tested anew, because what it contradicted may be gone.
     """
     survey = project.survey
-    if survey.datum.kind == "inner" or (is_pure(survey) and not previous.clean):
+    if survey.datum.kind == "inner" or project.options.pairs == "closed" or (is_pure(survey) and not previous.clean):
         return cold(project), COLD
     if is_pure(survey):
         return _warm_network(project, previous, progress) or (cold(project), COLD)

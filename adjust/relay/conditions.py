@@ -17,7 +17,8 @@ import numpy as np
 
 from adjust.errors import NotConvergedError
 from adjust.model import FloatArray
-from adjust.relay.condition_factors import FactorSolution, solve_factors
+from adjust.relay.condition_factors import MAX_HARD_LOOPS, FactorSolution, solve_factors
+from adjust.relay.counts import parts
 from adjust.relay.loops import LoopBasis, evaluate_loops, loop_basis, loop_misclosures
 from adjust.relay.motions import Motions, right_jacobian
 from adjust.relay.network import Network
@@ -96,6 +97,28 @@ def adjust_condition_factors(network: Network, options: ConditionOptions = Condi
     total = network.dim * len(basis)
     pairs = adjusted_pairs(network, found.b_from_a, found.cov, total, found.iterations, joint)
     return ConditionAdjustment(pairs, basis, found.closure)
+
+
+def adjust_loops(network: Network, options: ConditionOptions = ConditionOptions()) -> ConditionAdjustment:
+    """By GTSAM's graph of priors and hard closures where that is safe, else by the normal equations; any size.
+
+    Safe: few enough loops, all of them closed, and redundancy numbers that sum to the equations, which constraints lost
+    in the elimination would not do. Raises NotConvergedError, naming the loop that closes worst.
+    """
+    top = network.topology
+    if top.n_pairs - top.n_stations + int(parts(top).max(initial=0)) + 1 <= MAX_HARD_LOOPS:
+        try:
+            found = adjust_condition_factors(network, options)
+        except NotConvergedError:
+            return adjust_conditions(network, options)
+        except RuntimeError as error:
+            if "ndetermin" not in str(error):
+                raise
+            return adjust_conditions(network, options)
+        total = found.pairs.redundancy_total
+        if abs(float(found.pairs.redundancy.sum()) - total) < 1e-6 * max(1, total):
+            return found
+    return adjust_conditions(network, options)
 
 
 def _loop_kind(network: Network, options: ConditionOptions) -> Literal["shortest", "tree"]:

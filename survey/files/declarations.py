@@ -85,6 +85,7 @@ DECLARATIONS: tuple[Declared, ...] = (
             Key("datum", "table", "what fixes the coordinates", table="datum"),
             Key("sigmas", "table", "sigmas of image points, factors of groups", table="sigmas"),
             Key("adjustment", "table", "tests and what a run may leave out", table="adjustment"),
+            Key("closures", "table", "loops of pairs through a mount, by name", table="closure"),
             Key("spots", "table", "beacons as bright spots, found without a name", table="spots"),
             Key("vertical", "table", "the plumb line", table="vertical"),
             Key("bearings", "table", "how horizontal angles count", table="bearings"),
@@ -293,6 +294,18 @@ DECLARATIONS: tuple[Declared, ...] = (
             Key("variance_components", "flag", "estimate the variance of every group", False),
             Key("sigmas", "choice", "sigmas of results as the observations' own say, or scaled by sigma0; without it "
                 "scaled", choices=("a_priori", "a_posteriori")),
+            Key("pairs", "choice", "poses: pairs by the poses of their frames; closed: every loop of them closed, also "
+                "of cameras and marker blocks of which nothing but pairs is known", "poses",
+                choices=("poses", "closed")),
+        ),
+    ),
+    Declared(
+        "closure", "closures.NAME",
+        "A loop of pairs that a mechanical mount closes, only as well as the mount repeats; needs pairs = \"closed\".",
+        (
+            Key("pairs", "names", "ids of the pairs as they are walked; the mount sits at end a of the last", REQUIRED),
+            Key("sigma_arcsec", "number", "how well the mount repeats, about each axis", REQUIRED, positive=True),
+            Key("sigma_mm", "number", "and along each axis, where pairs are poses", 0.0),
         ),
     ),
     Declared(

@@ -3,11 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from gtsam import Rot3
 
 from adjust.model import FloatArray, IntArray, Survey
-from adjust.observations import FrameRef
+from adjust.observations import Closure, FrameRef
 from survey.files.detected import DetectedImage
 from survey.files.exclusions import Exclusion
 from survey.quantities import SigmaKind
@@ -56,7 +57,8 @@ class AdjustmentOptions:
     sigmas: of all that is estimated, as the observations' own sigmas say (a_priori) or times sigma0 (a_posteriori);
     None where the project does not say: every job then has its usual ones, ``adjust`` a posteriori.
     tolerances: what is demanded of the results. identification: who measured what, where and with
-    what, printed in the report as it is.
+    what, printed in the report as it is. pairs: by the poses of their frames, or with all their loops closed, through
+    the mounts of ``closures``.
     """
 
     alpha: float = 0.05
@@ -65,6 +67,8 @@ class AdjustmentOptions:
     reject_pairs: bool = True
     variance_components: bool = False
     sigmas: SigmaKind | None = None
+    pairs: Literal["poses", "closed"] = "poses"
+    closures: tuple[Closure, ...] = ()
     tolerances: tuple[Tolerance, ...] = ()
     identification: tuple[tuple[str, str], ...] = ()
 

@@ -11,6 +11,7 @@ from adjust.errors import SurveyError
 from adjust.model import Datum, FloatArray, Point, PointParameter, Survey
 from survey.files.alignment_tasks import read_alignment_tasks
 from survey.files.bodies import read_beams, read_surfaces
+from survey.files.closures import read_closures
 from survey.files.declarations import keys_of
 from survey.files.detected import DetectedImage, ImageKey, ImageNews, image_news, read_detected
 from survey.files.differences import DIFFERENCES, DIFFERENCES_COVARIANCE, read_differences
@@ -298,7 +299,7 @@ def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest
 
 
 def _read_options(root: Node) -> AdjustmentOptions:
-    """The tables [adjustment], [tolerances] and [identification]."""
+    """The tables [adjustment], [closures], [tolerances] and [identification]."""
     node, said = root.table("adjustment"), root.table("identification")
     node.allow(*keys_of("adjustment"))
     alpha = node.number("alpha", 0.05, positive=True)
@@ -309,8 +310,11 @@ def _read_options(root: Node) -> AdjustmentOptions:
     flags["variance_components"] = node.flag("variance_components", False)
     asked = node.choice("sigmas", SIGMA_KINDS) if node.has("sigmas") else ""
     sigmas = next((kind for kind in SIGMA_KINDS if kind == asked), None)
-    tolerances = read_tolerances(root)
-    return AdjustmentOptions(alpha, **flags, sigmas=sigmas, tolerances=tolerances, identification=identification)
+    form, closures = read_closures(root)
+    return AdjustmentOptions(
+        alpha, **flags, sigmas=sigmas, pairs=form, closures=closures, tolerances=read_tolerances(root),
+        identification=identification,
+    )  # fmt: skip
 
 
 def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:

@@ -18,6 +18,7 @@ from adjust.model import (
     VectorParameter,
 )
 from survey.files.bodies import body_sections
+from survey.files.closures import closure_sections
 from survey.files.instruments import instrument_sections, vertical_sections
 from survey.files.kinds import WARP
 from survey.files.lenses import lens_to_toml
@@ -59,7 +60,7 @@ def head_section(title: str, tie_points: bool) -> Section:
 
 
 def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, sigmas: Sigmas) -> list[Section]:
-    """The sections [spots], [sigmas], [adjustment] and [tolerances]."""
+    """The sections [spots], [sigmas], [adjustment], [closures] and [tolerances]."""
     sections: list[Section] = []
     if request is not None:
         spots: dict[str, Any] = {"cameras": request.cameras, "diameter_px": request.diameter_px}
@@ -75,7 +76,10 @@ def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, si
         flags["variance_components"] = True
     if options.sigmas is not None:
         flags["sigmas"] = options.sigmas
+    if options.pairs != "poses":
+        flags["pairs"] = options.pairs
     sections.append((("adjustment",), {"alpha": options.alpha, **flags}))
+    sections += closure_sections(options.closures)
     if options.identification:
         sections.append((("identification",), dict(options.identification)))
     return sections + tolerance_sections(options.tolerances)

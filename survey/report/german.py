@@ -253,6 +253,19 @@ GERMAN = {
         "Freiheitsgraden; offen ist eine Schleife, deren p bei {alpha} % für alle zusammen zu klein für Zufall ist "
         "({failed} sind es)."
     ),
+    "After": "Danach",
+    "After: by the adjusted pairs, {form}.": "Danach: mit den ausgeglichenen Paaren, {form}.",
+    "all loops closed as conditions": "alle Schleifen als Bedingungen geschlossen",
+    "each by the poses of its frames": "jedes aus den Lagen seiner Systeme",
+    "Loops through a mount": "Schleifen über eine Aufnahme",
+    "Mount": "Aufnahme",
+    "σ of the mount": "σ der Aufnahme",
+    "Its play": "Ihr Spiel",
+    "Loops through a mount close as well as it repeats: σ as given, about and along each axis; its play is "
+    "what the adjustment leaves of the misclosure to it.": (
+        "Schleifen über eine Aufnahme schließen so gut, wie diese sich wiederholt: σ wie gegeben, um und entlang jeder "
+        "Achse; ihr Spiel ist, was die Ausgleichung ihr vom Widerspruch lässt."
+    ),
     "Adjusted pairs": "Ausgeglichene Paare",
     "Pair, from a to b": "Paar, von a nach b",
     "Residual": "Verbesserung",

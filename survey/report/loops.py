@@ -74,7 +74,7 @@ def _named(ids: Sequence[str]) -> str:
 
 
 def loops(c: Context) -> str:
-    """Misclosures from the measured pairs alone, before any adjustment."""
+    """Misclosures from the measured pairs alone, before any adjustment, and what is left of them after it."""
     found = c.solution.get("loops")
     if found is None or not found["n_loops"]:
         return ""
@@ -82,7 +82,7 @@ def loops(c: Context) -> str:
     poses = any("misclosure_mm" in e for e in entries)
     rows = [_loop_row(e, poses) for e in entries]
     columns = ["<Loop", "<", "Misclosure", "σ [″]"] + (["[mm]", "σ [mm]"] if poses else [])
-    columns += ["Test", "p", "<Pairs"]
+    columns += ["Test", "p", "After", *(["[mm]"] if poses else []), "<Pairs"]
     shown = (
         t("All {n}", n=count(found["n_loops"]))
         if len(rows) == found["n_loops"]
@@ -96,8 +96,42 @@ def loops(c: Context) -> str:
         shown=shown, note=esc(found["note"]), freedom=6 if poses else 3, alpha=general(100 * found["alpha"]),
         failed=count(found["n_failed"]),
     )  # fmt: skip
+    note += " " + t(
+        "After: by the adjusted pairs, {form}.",
+        form=t("all loops closed as conditions" if found["solved_by"] == "conditions" else
+               "each by the poses of its frames"),
+    )
     classes = ["" if e["closes"] else "suspect" for e in entries]
-    return section("loops", "Loop closures", table(columns, rows, "", classes), note)
+    return section("loops", "Loop closures", table(columns, rows, "", classes), note) + _mounts(c)
+
+
+def _mounts(c: Context) -> str:
+    """Loops that a mechanical mount closes."""
+    entries = c.solution.get("closures", {})
+    if not entries:
+        return ""
+    rows = []
+    for name, e in entries.items():
+        measured = _both(e["misclosure_arcsec"], e.get("misclosure_mm"))
+        given = _both(e["sigma_arcsec"], e["sigma_mm"] if "misclosure_mm" in e else None)
+        play = _both(e["play_arcsec"], e.get("play_mm")) if "play_arcsec" in e else ""
+        rows.append([esc(name), measured, given, play, general(e["test"], 4), p_text(e["p_value"]),
+                     f"<small>{', '.join(esc(p) for p in _shortened(e['pairs']))}</small>"])  # fmt: skip
+    columns = ["<Mount", "Misclosure", "σ of the mount", "Its play", "Test", "p", "<Pairs"]
+    note = t("Loops through a mount close as well as it repeats: σ as given, about and along each axis; its play is "
+             "what the adjustment leaves of the misclosure to it.")  # fmt: skip
+    return section("mounts", "Loops through a mount", table(columns, rows, ""), note)
+
+
+def _both(arcsec: float, mm: float | None) -> str:
+    return f"{general(arcsec, 3)}″" + ("" if mm is None else f" {general(mm, 3)} mm")
+
+
+def _left(value: float | None, unit: str) -> str:
+    """What is left of a misclosure; below a millionth of its unit it is rounding."""
+    if value is None:
+        return ""
+    return f"{general(value, 3) if value > 1e-6 else '0'}{unit}"
 
 
 def _loop_row(e: dict[str, Any], poses: bool) -> list[str]:
@@ -110,7 +144,8 @@ def _loop_row(e: dict[str, Any], poses: bool) -> list[str]:
     cells = [stations, flag, angle_text(e["misclosure_arcsec"], sigma), sigma_text(sigma)]
     if poses:
         cells += [value_text(e["misclosure_mm"], e["sigma_misclosure_mm"]), sigma_text(e["sigma_misclosure_mm"])]
-    cells += [general(e["test"], 4), p_text(e["p_value"])]
+    cells += [general(e["test"], 4), p_text(e["p_value"]), _left(e.get("misclosure_after_arcsec"), "″")]
+    cells += [_left(e.get("misclosure_after_mm"), "")] if poses else []
     return [*cells, f"<small>{pairs}</small>"]
 
 

@@ -163,11 +163,25 @@ def _loops(solution: dict[str, Any]) -> Iterator[str]:
     if not found or not found["n_loops"]:
         return
     yield ""
-    yield f"  loops: {found['n_loops']}, of which {found['n_failed']} do not close; the worst"
+    how = ", closed by the adjustment" if found["form"] == "closed" else ""
+    yield f"  loops: {found['n_loops']}{how}, of which {found['n_failed']} do not close as measured; worst, and after"
     for e in found["worst_first"][:_MOST_LOOPS]:
         size = f"{e['misclosure_arcsec']:.4g}″" + (f" {e['misclosure_mm']:.4g} mm" if "misclosure_mm" in e else "")
         flag = "" if e["closes"] else "  OPEN"
-        yield f"  {_cut(' '.join(e['stations']), 50):<50}{size:>22}  p {e['p_value']:.2g}{flag}"
+        yield f"  {_cut(' '.join(e['stations']), 40):<40}{size:>22} {_left(e):>14}  p {e['p_value']:.2g}{flag}"
+    for name, e in solution.get("closures", {}).items():
+        size = f"{e['misclosure_arcsec']:.4g}″" + (f" {e['misclosure_mm']:.4g} mm" if "misclosure_mm" in e else "")
+        play = f"{e['play_arcsec']:.4g}″" + (f" {e['play_mm']:.4g} mm" if "play_mm" in e else "")
+        yield f"  mount {_cut(name, 34):<34}{size:>22} {play:>14}  p {e['p_value']:.2g}"
+
+
+def _left(e: dict[str, Any]) -> str:
+    """The misclosure that is left; what is below a microarcsecond or a nanometre is none."""
+    turn, shift = e.get("misclosure_after_arcsec"), e.get("misclosure_after_mm")
+    if turn is None:
+        return ""
+    parts = [f"{turn if turn > 1e-6 else 0:.4g}″"]
+    return " ".join(parts + ([] if shift is None else [f"{shift if shift > 1e-6 else 0:.4g} mm"]))
 
 
 def _observations(adjustment: Adjustment, limit: float) -> Iterator[str]:

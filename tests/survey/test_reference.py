@@ -54,7 +54,8 @@ EVERYTHING: dict[str, Any] = {
     "points": {"P1": {"x_mm": [1, 2, 3], "treatment": "prior", "sigma_mm": 1.0}},
     "datum": {"kind": "inner"},
     "sigmas": {"scale": {"distance": 2.0}},
-    "adjustment": {}, "vertical": {"free": ["tilt_1", "tilt_2"], "sigma": {"tilt_1_arcsec": 1.0}}, "bearings": {},
+    "adjustment": {"pairs": "closed"}, "vertical": {"free": ["tilt_1", "tilt_2"], "sigma": {"tilt_1_arcsec": 1.0}},
+    "bearings": {},
     "spots": {"cameras": ["X"]},
     "instruments": {"ts": {"sigma_distance_mm": 1.0}},
     "setups": {"s1": {}},
@@ -63,6 +64,7 @@ EVERYTHING: dict[str, Any] = {
     "align": {"a1": {"body": "target:board", "onto": "table:tt", "feet_mm": {"a": [0, 0], "b": [9, 0], "c": [0, 9]}}},
     "tolerances": {"t1": {"of": "lenses", "component": "fx", "tolerance_px": 1.0}},
     "identification": {"operator": "somebody"},
+    "closures": {"plate": {"pairs": ["a-b", "b-a"], "sigma_arcsec": 10, "sigma_mm": 0.1}},
 }  # fmt: skip
 PLACES: dict[str, tuple[str, ...]] = {
     "root": (), "camera": ("cameras", "X"), "lens": ("cameras", "X", "lens"),
@@ -79,7 +81,7 @@ PLACES: dict[str, tuple[str, ...]] = {
     "setup": ("setups", "s1"), "beam": ("beams", "b1"), "surface_plane": ("surfaces", "floor"),
     "surface_line": ("surfaces", "rail"), "surface_sphere": ("surfaces", "ball"),
     "vector_sigma": ("vertical", "sigma"), "align": ("align", "a1"), "feet": ("align", "a1", "feet_mm"),
-    "tolerance": ("tolerances", "t1"), "identification": ("identification",),
+    "tolerance": ("tolerances", "t1"), "identification": ("identification",), "closure": ("closures", "plate"),
 }  # fmt: skip
 NEED_MORE = {("station", "motion"), ("lens", "balance_radius_mm")}
 KEYS = [(d, key) for d in DECLARATIONS for key in d.keys]

@@ -1,0 +1,250 @@
+"""Pairs with every loop closed: eyes without a place of their own get one, mounts their play, and the conditions hold.
+
+An eye is a camera or marker block of which nothing is known but pairs: no image shows it, and its pose on what carries
+it is free. Its loops close in the same graph as cameras and readings once it is a frame of its own: a station named
+after it. A survey of nothing but pairs is solved in the condition form (Chao et al. 2011;
+:mod:`adjust.relay.conditions`), any other one by the poses of all frames, whose loops close by themselves: the same
+numbers and covariances.
+
+A mount's play is one more motion at end a of its pair. With the pair's covariance C and that of the play S both act as
+one with C + S, in the condition form as in the parametric one; of the residual v the play's share is S (C + S)^-1 v.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.errors import SurveyError
+from adjust.model import FloatArray, PoseParameter, Station, Survey
+from adjust.named_precision import NamedPrecision
+from adjust.observations import Closure, FrameRef, Pair
+from adjust.precision import adjusted_motion, global_test
+from adjust.relay.conditions import adjust_loops
+from adjust.relay.network import network_from_pairs
+from adjust.relay.result import AdjustedPairs, whitening
+from adjust.result import Adjustment, ObservationResidual
+
+_OBSERVED = (
+    "image_blocks", "distances", "coordinates", "readings", "coordinate_differences", "levels", "alignments",
+    "laser_spots", "on_surfaces", "setups", "beams",
+)  # fmt: skip
+_AGREEMENT = 1e-4
+"""Sigmas by which the two forms may differ; rounding reaches 1e-8."""
+
+
+def closed(survey: Survey, closures: Sequence[Closure] = ()) -> Survey:
+    """The survey with all loops of its pairs to be closed. Raises SurveyError for a closure that is no loop."""
+    survey = _with_stations_for_eyes(survey)
+    return replace(survey, pairs=_with_play(survey, closures), pair_form="closed", closures=tuple(closures))
+
+
+# -- eyes --------------------------------------------------------------------------------------------------------------
+
+
+def _with_stations_for_eyes(survey: Survey) -> Survey:
+    names = _eye_names(survey)
+    if not names:
+        return survey
+    eyes = {(ref.kind, ref.frame_id) for ref in names}
+    carriers = {c.station_id for c in survey.cameras if ("camera", c.camera_id) in eyes}
+    carriers |= {t.station_id for t in survey.targets if t.station_id and ("target", t.target_id) in eyes}
+    cameras = tuple(c for c in survey.cameras if ("camera", c.camera_id) not in eyes)
+    targets = tuple(t for t in survey.targets if ("target", t.target_id) not in eyes)
+    seen = {(f.kind, f.frame_id) for f in _frames_of(survey)}
+    needed = {c.station_id for c in cameras} | {t.station_id for t in targets}
+    needed |= {ref.frame_id for p in survey.pairs for ref in (p.a, p.b) if ref.kind == "station"}
+    kept = tuple(s for s in survey.stations if s.station_id not in carriers or s.station_id in needed
+                 or ("station", s.station_id) in seen)  # fmt: skip
+    pairs = tuple(replace(p, a=_renamed(p.a, names, survey), b=_renamed(p.b, names, survey)) for p in survey.pairs)
+    held = set() if survey.datum.kind == "inner" else _one_of_each_part(pairs, set(names.values()))
+    own = dict.fromkeys(names.values())
+    stations = tuple(Station(i, world_from_station=PoseParameter(Pose3(), "held") if i in held else PoseParameter())
+                     for i in own)  # fmt: skip
+    return replace(survey, cameras=cameras, targets=targets, stations=(*kept, *stations), pairs=pairs)
+
+
+def _eye_names(survey: Survey) -> dict[FrameRef, str]:
+    """The station that each eye becomes."""
+    cameras = {c.camera_id: c for c in survey.cameras}
+    targets = {t.target_id: t for t in survey.targets}
+    seen = {(f.kind, f.frame_id) for f in _frames_of(survey)}
+    out: dict[FrameRef, str] = {}
+    for ref in (r for p in survey.pairs for r in (p.a, p.b)):
+        pose = None
+        if ref.kind == "camera" and ref.frame_id in cameras:
+            pose = cameras[ref.frame_id].station_from_camera
+        elif ref.kind == "target" and ref.frame_id in targets:
+            pose = targets[ref.frame_id].carrier_from_target
+        if pose is not None and pose.treatment == "free" and (ref.kind, ref.frame_id) not in seen:
+            ref = _of_epoch(ref, survey)
+            out[ref] = f"{ref.kind} {ref.frame_id}" + (f" {ref.epoch_id}" if ref.epoch_id else "")
+    return out
+
+
+def _of_epoch(ref: FrameRef, survey: Survey) -> FrameRef:
+    """The frame without its epoch, where it does not move between epochs."""
+    still = {s.station_id for s in survey.stations if s.motion == "fixed"}
+    if ref.kind == "camera":
+        carrier = next(c.station_id for c in survey.cameras if c.camera_id == ref.frame_id)
+        return replace(ref, epoch_id=None) if carrier in still else ref
+    target = next(t for t in survey.targets if t.target_id == ref.frame_id)
+    fixed = target.motion != "epoch" and (target.station_id is None or target.station_id in still)
+    return replace(ref, epoch_id=None) if fixed else ref
+
+
+def _renamed(ref: FrameRef, names: dict[FrameRef, str], survey: Survey) -> FrameRef:
+    if ref.kind not in ("camera", "target") or not any((n.kind, n.frame_id) == (ref.kind, ref.frame_id) for n in names):
+        return ref
+    return FrameRef("station", names[_of_epoch(ref, survey)])
+
+
+def _frames_of(survey: Survey) -> Iterator[FrameRef]:
+    """Every frame that an observation other than a pair names."""
+    for block in survey.image_blocks:
+        yield FrameRef("camera", block.camera_id)
+        if block.target_id is not None:
+            yield FrameRef("target", block.target_id)
+    for spot in survey.laser_spots:
+        yield FrameRef("target", spot.target_id)
+    for beam in survey.beams:
+        yield FrameRef(beam.carrier_kind, beam.carrier_id)
+    for kind in _OBSERVED[1:]:
+        yield from _frames_in(getattr(survey, kind))
+
+
+def _frames_in(value: Any) -> Iterator[FrameRef]:
+    if isinstance(value, FrameRef):
+        yield value
+    elif isinstance(value, tuple):
+        for item in value:
+            yield from _frames_in(item)
+    elif is_dataclass(value):
+        for f in fields(value):
+            yield from _frames_in(getattr(value, f.name))
+
+
+def _one_of_each_part(pairs: Sequence[Pair], eyes: set[str]) -> set[str]:
+    """The first eye of every part of the pairs in use that has nothing but eyes: their places are relative to it."""
+    part: dict[FrameRef, FrameRef] = {}
+
+    def root(ref: FrameRef) -> FrameRef:
+        part.setdefault(ref, ref)
+        while part[ref] != ref:
+            part[ref] = part[part[ref]]
+            ref = part[ref]
+        return ref
+
+    for pair in pairs:
+        a, b = root(pair.a), root(pair.b)
+        part[b] = a
+    anchored = {root(r) for r in list(part) if not (r.kind == "station" and r.frame_id in eyes)}
+    first: dict[FrameRef, str] = {}
+    for ref in list(part):
+        if root(ref) not in anchored:
+            first.setdefault(root(ref), ref.frame_id)
+    return set(first.values())
+
+
+# -- mounts ------------------------------------------------------------------------------------------------------------
+
+
+def _with_play(survey: Survey, closures: Sequence[Closure]) -> tuple[Pair, ...]:
+    by_id = {p.pair_id: p for p in survey.pairs}
+    mounts = Counter(c.pair_ids[-1] for c in closures if c.pair_ids)
+    for closure in closures:
+        _check(closure, by_id)
+        last = closure.pair_ids[-1]
+        if mounts[last] > 1:
+            raise SurveyError(f"closure {closure.closure_id!r}: another closure ends with pair {last!r} too; one mount "
+                              "sits at one pair")  # fmt: skip
+        pair = by_id[last]
+        by_id[last] = replace(pair, cov=pair.cov + closure.cov(len(pair.cov)))
+    return tuple(by_id[p.pair_id] for p in survey.pairs)
+
+
+def _check(closure: Closure, by_id: dict[str, Pair]) -> None:
+    """Raises SurveyError unless the pairs, in their order, come back to where the first of them began."""
+    what = f"closure {closure.closure_id!r}"
+    for pair_id in closure.pair_ids:
+        if pair_id not in by_id:
+            raise SurveyError(f"{what}: there is no pair {pair_id!r} in pairs.csv; correct the id")
+    if len(closure.pair_ids) < 2 or len(set(closure.pair_ids)) < len(closure.pair_ids):
+        raise SurveyError(f"{what}: a loop has two pairs or more, none of them twice; found {list(closure.pair_ids)}")
+    ends = [(by_id[i].a, by_id[i].b) for i in closure.pair_ids]
+    for start in ends[0]:
+        here: FrameRef | None = start
+        for a, b in ends:
+            here = b if here == a else a if here == b else None
+        if here == start:
+            return
+    walk = "; ".join(f"{i} joins {a.frame_id} and {b.frame_id}" for i, (a, b) in zip(closure.pair_ids, ends,
+                                                                                 strict=True))  # fmt: skip
+    raise SurveyError(f"{what}: its pairs are no loop in this order ({walk}); list them as they are walked")
+
+
+def play(closures: Sequence[Closure], pair: Pair, residual: FloatArray) -> FloatArray:
+    """The mount's share (dim,) of a pair's residual, zero where the pair has no mount. pair: with the mount's play."""
+    for closure in closures:
+        if closure.pair_ids[-1] == pair.pair_id:
+            return np.asarray(closure.cov(len(residual)) @ np.linalg.solve(pair.cov, residual))
+    return np.zeros(len(residual))
+
+
+# -- the condition form of a survey of pairs ---------------------------------------------------------------------------
+
+
+def in_condition_form(result: Adjustment) -> Adjustment:
+    """A survey of nothing but pairs, adjusted once more: one unknown per pair, all independent loops as conditions.
+
+    ``result``: by the poses of its stations, screened. What it says of stations stays; what it says of pairs is then
+    from the conditions, and a warning tells where the two forms differ. Where priors or several given stations close
+    loops as well, where rotations and poses are mixed, or where there is no loop, ``result`` is returned as it is.
+    """
+    survey = result.survey
+    used = [p for p in survey.pairs if p.used]
+    given = [s for s in survey.stations if s.world_from_station.treatment != "free"]
+    kinds = {isinstance(p.b_from_a, Rot3) for p in used}
+    if len(given) > 1 or any(s.world_from_station.treatment == "prior" for s in given) or len(kinds) != 1:
+        return result
+    found = adjust_loops(network_from_pairs(used))
+    pairs, precision = found.pairs, result.precision
+    if not len(found.basis) or not isinstance(precision, NamedPrecision):
+        return result
+    residuals, apart = _residuals(result, pairs)
+    warnings = result.warnings
+    if apart > _AGREEMENT:
+        warnings += (f"the conditions and the poses of the stations give residuals that differ by {apart:.2g} sigmas",)
+    omegas = np.square((whitening(pairs.network.cov) @ pairs.residual[..., None])[..., 0]).sum(axis=1)
+    groups = []
+    for g in result.groups:
+        mine = np.array([p.group == g.group for p in used])
+        groups.append(replace(g, redundancy=float(pairs.redundancy[mine].sum()), omega=float(omegas[mine].sum())))
+    alpha = result.global_test.alpha if result.global_test is not None else 0.05
+    return replace(
+        result, other_residuals=residuals, groups=tuple(groups), omega=pairs.omega, sigma0=pairs.sigma0,
+        redundancy=pairs.redundancy_total, global_test=global_test(pairs.omega, pairs.redundancy_total, alpha),
+        iterations=pairs.iterations, warnings=warnings,
+        precision=NamedPrecision(precision.solution, pairs),
+    )  # fmt: skip
+
+
+def _residuals(result: Adjustment, pairs: AdjustedPairs) -> tuple[tuple[ObservationResidual, ...], float]:
+    """All residuals, those of the adjusted pairs from the conditions; and by how many sigmas these differ at most."""
+    index = {pair_id: e for e, pair_id in enumerate(pairs.network.topology.pair_ids)}
+    out, apart = [], 0.0
+    for o in result.other_residuals:
+        e = index.get(o.ids[0]) if o.kind == "pair" else None
+        if e is None or not o.used:
+            out.append(o)
+            continue
+        v = pairs.residual[e]
+        apart = max(apart, float(np.max(np.abs(v - o.residual) / o.sigma)))
+        out.append(
+            replace(o, adjusted=adjusted_motion(o.observed, v), residual=v, redundancy=pairs.redundancy[e],
+                    standardized=pairs.standardized[e], test=float(pairs.test[e]))
+        )  # fmt: skip
+    return tuple(out), apart

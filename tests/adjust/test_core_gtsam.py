@@ -1,0 +1,203 @@
+"""GTSAM's own optimiser and marginals on the graph of a survey: the same optimum and covariances as the solver's.
+
+The graph is asked as any graph of GTSAM is, at any values; what the solver reduces is a view of it.
+"""
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from adjust.graph import AdjustmentGraph, StartValues
+from adjust.model import Survey, VectorPrior
+from adjust.observations import FrameRef, Pair
+from adjust.precision import Precision
+from adjust.solve import SolveOptions, solve
+from survey.simulate import resample, stereo
+from tests.adjust import helpers as h
+from tests.adjust.terrestrial_networks import measured, polar_network, start_near
+from tests.adjust.test_core_jacobians import others
+from tests.adjust.test_geometry import geometric
+from tests.adjust.test_terrestrial_joint import laboratory, start_of
+
+Problem = tuple[Survey, StartValues]
+
+
+def bundle() -> Problem:
+    """Unknown points: most of them, and most epochs, are hidden from the solver's view."""
+    survey, truth = h.network(3)
+    return survey, h.shaken(h.start_at(truth), 1, 0.002, 0.002)
+
+
+def reduced_epochs() -> Problem:
+    """Boards at enough epochs for the solver to reduce their poses; some image points not used; a pair of cameras."""
+    survey, truth = stereo(3, n_pairs=10)
+    blocks = tuple(replace(b, used=np.arange(len(b.uv)) % 5 > 0) for b in survey.image_blocks)
+    epoch = blocks[0].epoch_id
+    ends = FrameRef("camera", "left", epoch), FrameRef("camera", "right", epoch)
+    cov = h.random_cov(np.random.default_rng(2), [1e-3] * 6)
+    survey = replace(survey, image_blocks=blocks, pairs=(Pair("rig", *ends, gtsam.Pose3(), cov),))
+    return resample(survey, truth, 4), h.shaken(h.start_at(truth), 1, 0.003)
+
+
+def lab() -> Problem:
+    """Boards and a table, beacons seen by cameras and total station."""
+    survey, truth = laboratory(2)
+    return survey, start_of(truth, survey)
+
+
+def readings() -> Problem:
+    """Every kind of reading."""
+    survey, truth = polar_network(4)
+    return measured(survey, truth, 4), start_near(survey, truth, 2, 1e-3)
+
+
+def loose(survey: Survey, factor: float) -> Survey:
+    """Every observation with sigmas ``factor`` times as large."""
+
+    def one(item: Any) -> Any:
+        names = {f.name for f in fields(item)}
+        if "cov" in names:
+            return replace(item, cov=item.cov * factor**2)
+        return replace(item, sigma=item.sigma * factor)
+
+    kinds = ("image_blocks", "table_readings", "pairs", "distances", "coordinates", "coordinate_differences",
+             "levels", "alignments", "laser_spots", "on_surfaces")  # fmt: skip
+    return replace(survey, **{kind: tuple(one(i) for i in getattr(survey, kind)) for kind in kinds})
+
+
+def anchored(graph: AdjustmentGraph, sigma: float) -> AdjustmentGraph:
+    """Every unknown kept near its start, so that observations of random values have a minimum there."""
+    for unknown in graph.unknowns.by_key.values():
+        noise = gtsam.noiseModel.Isotropic.Sigma(unknown.dim, sigma)
+        if unknown.kind == "pose":
+            prior = gtsam.PriorFactorPose3(unknown.key, graph.start.atPose3(unknown.key), noise)
+        elif unknown.kind == "point":
+            prior = gtsam.PriorFactorPoint3(unknown.key, graph.start.atPoint3(unknown.key), noise)
+        else:
+            scale = 100.0 if unknown.name[0] == "lens" else 1.0
+            noise = gtsam.noiseModel.Isotropic.Sigma(unknown.dim, sigma * scale)
+            prior = gtsam.PriorFactorVector(unknown.key, graph.start.atVector(unknown.key), noise)
+        graph.others_graph.add(prior)
+    return graph
+
+
+def of_pairs_and_others() -> AdjustmentGraph:
+    survey, start = others(*h.everything(5))
+    return anchored(h.build(loose(replace(survey, image_blocks=()), 30.0), start), 1e-3)
+
+
+def of_geometry() -> AdjustmentGraph:
+    survey, start = geometric(3)
+    beam = survey.beams[0]  # whose start is where its spots are, far from its prior
+    prior = VectorPrior(("slope_1",), np.array([0.02]), np.array([[1.0]]))
+    beams = (replace(beam, parameters=replace(beam.parameters, prior=prior)), *survey.beams[1:])
+    survey = replace(survey, beams=beams)
+    return anchored(h.build(loose(replace(survey, image_blocks=()), 30.0), start), 1e-3)
+
+
+def problem(make: Callable[[], Problem]) -> Callable[[], AdjustmentGraph]:
+    return lambda: h.build(*make())
+
+
+GRAPHS = {
+    "bundle": problem(bundle), "reduced epochs": problem(reduced_epochs), "lab": problem(lab),
+    "readings": problem(readings), "pairs and others": of_pairs_and_others, "geometry": of_geometry,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", GRAPHS)
+def test_gtsams_own_algorithms_reach_the_same_optimum_and_covariances(kind: str) -> None:
+    graph = GRAPHS[kind]()
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-13)
+    parameters.setAbsoluteErrorTol(1e-10)
+    theirs = gtsam.LevenbergMarquardtOptimizer(graph.graph, graph.start, parameters).optimize()
+    ours = solve(graph, SolveOptions(max_step=1e-10))
+    precision = Precision(graph, ours)
+    marginals = gtsam.Marginals(graph.graph, gtsam.Values(ours.values))
+    assert 2.0 * graph.graph.error(ours.values) == pytest.approx(ours.omega, rel=1e-9)
+    assert set(graph.graph.keyVector()) == set(graph.unknowns.by_key)
+    for name, unknown in graph.unknowns.by_name.items():
+        mine = h.covariance_of(precision, name)
+        free = [i for i in range(unknown.dim) if i not in graph.unknowns.held.get(unknown.key, ())]
+        step = theirs.localCoordinates(ours.values).at(unknown.key)[free]
+        assert np.all(np.abs(step) < 1e-3 * np.sqrt(np.diag(mine))[free]), name
+        expected = marginals.marginalCovariance(unknown.key)
+        assert h.relative(mine[np.ix_(free, free)], expected[np.ix_(free, free)]) < 2e-6, name
+
+
+def test_all_kinds_of_observations_are_among_these() -> None:
+    seen = {"image": False, "bundle": False, "hidden points": False, "reduced poses": False}
+    kinds: set[str] = set()
+    for make in GRAPHS.values():
+        graph = make()
+        kinds |= {item.kind for item in graph.others} | {r.kind for r in graph.survey.readings}
+        seen["image"] |= bool(graph.images.blocks)
+        seen["bundle"] |= graph.bundle is not None
+        seen["hidden points"] |= graph.bundle is not None and bool(graph.bundle.reduced)
+        seen["reduced poses"] |= graph.reduction is not None
+    assert all(seen.values()), seen
+    assert kinds == {
+        "table", "pair", "distance", "coordinates", "prior", "level", "alignment", "laser", "surface",
+        "coordinate_difference", "direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance",
+        "height_difference",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["bundle", "reduced epochs", "lab"])
+def test_the_solvers_view_is_of_the_same_chi_square_anywhere(kind: str) -> None:
+    """Neither graph needs anything prepared, nor minds what the other was asked in between."""
+    graph = GRAPHS[kind]()
+    far = h.disturbed(graph.start, graph, 3, 0.1)
+    for values in (far, graph.start, far):
+        expected = graph.omega(gtsam.Values(values))
+        assert 2.0 * graph.system.error(values) == pytest.approx(expected, rel=1e-10)
+        assert 2.0 * graph.graph.error(values) == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["bundle", "reduced epochs", "lab"])
+def test_the_solvers_view_has_the_step_of_the_graph(kind: str) -> None:
+    """Also at values that nothing was prepared for."""
+    graph = GRAPHS[kind]()
+    far = h.disturbed(graph.start, graph, 3, 0.02)
+    whole, view = graph.graph.linearize(gtsam.Values(far)), graph.system.linearize(far)
+    expected, found = whole.optimize(), view.optimize()
+    for key in graph.system.keyVector():
+        scale = np.abs(expected.at(key)).max()
+        np.testing.assert_allclose(found.at(key), expected.at(key), rtol=1e-5, atol=1e-6 * scale)
+
+
+def test_served_rows_do_not_mix_values() -> None:
+    """A factor asked elsewhere in between leaves the prepared rows of the others as they are."""
+    for kind in ("reduced epochs", "lab"):
+        graph = GRAPHS[kind]()
+        far = h.disturbed(graph.start, graph, 3, 0.1)
+        plain = graph.graph.linearize(gtsam.Values(graph.start))
+        graph.prepare(graph.start, jacobians=True)
+        for i in range(graph.graph.size()):
+            graph.graph.at(i).error(far)
+        if graph.bundle is not None:  # whose rows need the derivatives of the table, which these errors have moved
+            assert set(graph.bundle.chains.slot.tolist()) & set(graph.unknowns.table_slots)
+            assert graph.bundle.rows_at(graph.start) is not None
+        served = graph.graph.linearize(graph.start)
+        for i in range(plain.size()):
+            (A, b), (C, d) = plain.at(i).jacobian(), served.at(i).jacobian()
+            np.testing.assert_allclose(A.T @ A, C.T @ C, rtol=1e-9, atol=1e-12 * np.abs(A.T @ A).max())
+            np.testing.assert_allclose(np.linalg.norm(b), np.linalg.norm(d), rtol=1e-9)
+
+
+def test_unused_weights_are_those_of_the_graph() -> None:
+    """Weights set after the graph was made are its own."""
+    graph = h.build(*bundle())
+    before = graph.graph.error(graph.start)
+    n = len(graph.used())
+    weights = np.where(np.arange(n) % 3 == 0, 0.25, 1.0)
+    graph.set_weights(weights)
+    assert 2.0 * graph.graph.error(graph.start) == pytest.approx(graph.omega(graph.start), rel=1e-12)
+    assert graph.graph.error(graph.start) < before
+
+

@@ -1,0 +1,233 @@
+"""Pairs with all loops closed: eyes that are no stations, mounts with play, and the two forms held together."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gtsam import Pose3, Rot3
+
+from adjust.errors import NotConvergedError, SurveyError
+from adjust.model import Camera, LensParameter, PoseParameter, Station, Survey, Target
+from adjust.observations import Closure, FrameRef, Pair
+from adjust.pair_screen import PairOptions, adjust_with_pairs
+from adjust.relay.closed import closed, play
+from adjust.relay.condition_factors import MAX_HARD_LOOPS
+from adjust.relay.conditions import adjust_condition_factors, adjust_conditions, adjust_loops
+from adjust.result import Adjustment
+from survey.simulate import resample, stereo
+from tests.adjust import helpers as h
+from tests.adjust.relay_networks import grid, simulate
+
+ARCSEC = np.radians(1.0 / 3600.0)
+UNSCREENED = PairOptions(reject_pairs=False)
+LENS = LensParameter("brown", ("fx", "fy", "u0", "v0"), None)
+BLOCK = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
+EYES = [("camera", "C1"), ("camera", "C2"), ("target", "M1"), ("target", "M2"), ("camera", "C3")]
+
+
+def eyes(seed: int, rotations: bool = False) -> Survey:
+    """Cameras and marker blocks on two stations, calibrated one with another: every pair but one, nothing else."""
+    rng = np.random.default_rng(seed)
+    world = {e: Pose3.Expmap(rng.normal(size=6)) for e in EYES}
+    pairs = []
+    for i, a in enumerate(EYES):
+        for b in EYES[i + 1 :]:
+            if (a, b) == (EYES[0], EYES[3]):
+                continue
+            cov = h.random_cov(rng, [20.0 * ARCSEC] * 3 + [3e-4] * 3)
+            m = world[b].between(world[a]).retract(np.linalg.cholesky(cov) @ rng.normal(size=6))
+            ends = FrameRef(*a), FrameRef(*b)
+            motion, cov = (m.rotation(), cov[:3, :3]) if rotations else (m, cov)
+            pairs.append(Pair(f"{a[1]}-{b[1]}", *ends, motion, cov))
+    return Survey(
+        cameras=tuple(Camera(c, "R1", (640, 480), LENS) for c in ("C1", "C2", "C3")),
+        stations=(Station("R1"), Station("R2")),
+        targets=tuple(Target(t, ("a", "b", "c", "d"), BLOCK, station_id="R2") for t in ("M1", "M2")),
+        pairs=tuple(pairs),
+    )
+
+
+def as_stations(survey: Survey) -> Survey:
+    """The same network with every eye written as a station by hand."""
+    named = tuple(replace(p, a=FrameRef("station", p.a.frame_id), b=FrameRef("station", p.b.frame_id))
+                  for p in survey.pairs)  # fmt: skip
+    held = PoseParameter(Pose3(), "held")
+    stations = tuple(Station(e, world_from_station=held if e == "C1" else PoseParameter()) for _, e in EYES)
+    return Survey(stations=stations, pairs=named)
+
+
+def check_equal(found: Adjustment, expected: Adjustment) -> None:
+    assert found.omega == pytest.approx(expected.omega, rel=1e-8)
+    assert found.redundancy == expected.redundancy
+    mine, theirs = ({o.ids[0]: o for o in r.other_residuals if o.kind == "pair"} for r in (found, expected))
+    for pair_id, o in theirs.items():
+        np.testing.assert_allclose(mine[pair_id].residual, o.residual, atol=1e-6 * o.sigma.max())
+        np.testing.assert_allclose(mine[pair_id].redundancy, o.redundancy, atol=1e-6)
+        assert mine[pair_id].test == pytest.approx(o.test, rel=1e-5)
+
+
+@pytest.mark.parametrize("rotations", [False, True])
+def test_eyes_that_are_no_stations_close_their_loops(rotations: bool) -> None:
+    """Conditions on the pairs against poses of hand-made stations: residuals, tests and covariances."""
+    survey = eyes(1, rotations)
+    found = adjust_with_pairs(closed(survey), UNSCREENED)
+    expected = adjust_with_pairs(as_stations(survey), UNSCREENED)
+    assert found.precision.closed is not None
+    assert expected.precision.closed is None
+    assert found.redundancy == (3 if rotations else 6) * (9 - 5 + 1)
+    check_equal(found, expected)
+    covs = found.precision.pair_covariances()
+    for pair_id, cov in expected.precision.pair_covariances().items():
+        assert h.relative(covs[pair_id], cov) < 1e-6
+    assert not any("differ" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize("n", [4, 16])
+def test_few_loops_by_closure_factors_many_by_normal_equations(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same from both, and from the normal equations where the factors give up or lose a constraint."""
+    network = simulate(grid(n, n), 3, seed=4).network
+    expected = adjust_conditions(network).pairs
+    used: list[int] = []
+
+    def counted(*given, **named):  # type: ignore[no-untyped-def]  # passes on whatever it is given
+        used.append(1)
+        return adjust_condition_factors(*given, **named)
+
+    monkeypatch.setattr("adjust.relay.conditions.adjust_condition_factors", counted)
+    found = adjust_loops(network).pairs
+    assert len(used) == ((n - 1) ** 2 <= MAX_HARD_LOOPS)
+    np.testing.assert_allclose(found.residual, expected.residual, atol=1e-10)
+    np.testing.assert_allclose(found.cov, expected.cov, atol=1e-8 * np.abs(expected.cov).max())
+
+    def lost(*given, **named):  # type: ignore[no-untyped-def]  # as above
+        done = adjust_condition_factors(*given, **named)
+        return replace(done, pairs=replace(done.pairs, redundancy=done.pairs.redundancy * 0.99, omega=-1.0))
+
+    def stuck(*_given, **_named):  # type: ignore[no-untyped-def]  # as above
+        raise NotConvergedError("the hard loop closures did not settle")
+
+    for wrong in (lost, stuck):
+        monkeypatch.setattr("adjust.relay.conditions.adjust_condition_factors", wrong)
+        assert adjust_loops(network).pairs.omega == pytest.approx(expected.omega, rel=1e-9)
+
+
+def test_conditions_that_contradict_the_poses_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    survey = closed(eyes(1))
+    monkeypatch.setattr("adjust.relay.closed._AGREEMENT", 1e-15)
+    assert any("differ by" in w for w in adjust_with_pairs(survey, UNSCREENED).warnings)
+
+
+@pytest.mark.parametrize("sigmas", [(200.0 * ARCSEC, 2e-3), (1e-3 * ARCSEC, 1e-8)])
+def test_a_mount_is_one_more_motion_with_its_own_sigmas(sigmas: tuple[float, float]) -> None:
+    """Against the same network with the mount as a pair of its own between two stations; a stiff one, and a loose."""
+    survey = eyes(2)
+    closure = Closure("plate", ("C1-C2", "C2-C3", "C1-C3"), *sigmas)
+    found = adjust_with_pairs(closed(survey, (closure,)), UNSCREENED)
+    plain = as_stations(survey)
+    here, there = FrameRef("station", "C1"), FrameRef("station", "plate")
+    mount = Pair("mount", there, here, Pose3(), closure.cov(6))
+    pairs = tuple(replace(p, a=there) if p.pair_id == "C1-C3" else p for p in plain.pairs)
+    plain = replace(plain, pairs=(*pairs, mount), stations=(*plain.stations, Station("plate")))
+    expected = adjust_with_pairs(plain, UNSCREENED)
+    assert found.omega == pytest.approx(expected.omega, rel=2e-4)
+    assert found.redundancy == expected.redundancy
+    theirs = {o.ids[0]: o for o in expected.other_residuals}
+    over = next(p for p in found.survey.pairs if p.pair_id == "C1-C3")
+    v = next(o.residual for o in found.other_residuals if o.ids[0] == "C1-C3")
+    share = play(found.survey.closures, over, v)
+    # to first order in the play, which turns the tangents of what follows it
+    size = np.linalg.norm(theirs["mount"].residual[:3])
+    assert np.linalg.norm(share[:3]) == pytest.approx(size, rel=0.02)
+    left = v - share
+    np.testing.assert_allclose(left, theirs["C1-C3"].residual, atol=0.02 * over.cov.diagonal().max() ** 0.5)
+
+
+def test_a_loose_mount_leaves_its_loops_open_and_the_others_closed() -> None:
+    survey = eyes(3)
+    hard = adjust_with_pairs(closed(survey), UNSCREENED)
+    loose = Closure("plate", ("C1-C2", "C2-C3", "C1-C3"), 1.0, 10.0)
+    found = adjust_with_pairs(closed(survey, (loose,)), UNSCREENED)
+    without = replace(survey, pairs=tuple(p for p in survey.pairs if p.pair_id != "C1-C3"))
+    expected = adjust_with_pairs(closed(without), UNSCREENED)
+    assert found.omega == pytest.approx(expected.omega, rel=1e-4)
+    assert hard.omega > found.omega
+
+
+def rig(pair_of_eyes: bool) -> tuple[Survey, h.StartValues]:
+    """Two cameras that see boards, joined by pairs over a block and a third camera that no image shows."""
+    survey, truth = stereo(5, n_pairs=10)
+    rng = np.random.default_rng(3)
+    left, right = (FrameRef("camera", c) for c in ("left", "right"))
+    block, third = FrameRef("target", "M"), FrameRef("camera", "X")
+    at = {("world_from_station", "own"): Pose3()}
+    named = FrameRef("station", "target M"), FrameRef("station", "camera X")
+    for name in named:
+        at["world_from_station", name.frame_id] = Pose3.Expmap(rng.normal(0.0, 0.3, 6))
+    ends = [("l-M", left, named[0]), ("M-X", *named), ("X-r", named[1], right), ("l-X", left, named[1])]
+    pairs = tuple(Pair(i, a, b, Pose3(), h.random_cov(rng, [1e-4] * 6)) for i, a, b in ends)
+    stations = tuple(Station(n.frame_id) for n in named)
+    truth |= {name: pose for name, pose in at.items() if name[1] != "own"}
+    by_hand = resample(replace(survey, stations=(*survey.stations, *stations), pairs=pairs), truth, 7)
+    start = h.shaken(h.start_at(truth), 1, 0.001)
+    if not pair_of_eyes:
+        return by_hand, start
+    back = {named[0]: block, named[1]: third}
+    given = tuple(replace(p, a=back.get(p.a, p.a), b=back.get(p.b, p.b)) for p in by_hand.pairs)
+    return replace(
+        by_hand, stations=(*survey.stations, Station("relay")), pairs=given,
+        cameras=(*survey.cameras, Camera("X", "relay", (640, 480), LENS)),
+        targets=(*survey.targets, Target("M", ("a", "b", "c", "d"), BLOCK, station_id="relay")),
+    ), start  # fmt: skip
+
+
+def test_eyes_close_their_loops_in_the_graph_of_the_cameras() -> None:
+    """The same as with stations written by hand; and the pairs over them tell something of the rig."""
+    by_hand, start = rig(False)
+    given, _ = rig(True)
+    found = adjust_with_pairs(closed(given), UNSCREENED, start=start)
+    expected = adjust_with_pairs(by_hand, UNSCREENED, start=start)
+    check_equal(found, expected)
+    alone = adjust_with_pairs(replace(by_hand, pairs=(), stations=by_hand.stations[:-2]), UNSCREENED, start=start)
+    name = ("station_from_camera", "right")
+    assert h.relative(found.estimates[name].cov, expected.estimates[name].cov) < 1e-6
+    assert found.redundancy - alone.redundancy == 6 * (4 - 2)
+    assert np.trace(found.estimates[name].cov) < np.trace(alone.estimates[name].cov)
+
+
+def test_what_images_show_or_is_held_is_no_eye() -> None:
+    given, _ = rig(True)
+    done = closed(given)
+    assert [c.camera_id for c in done.cameras] == ["left", "right"]
+    assert {s.station_id for s in done.stations} >= {"camera X", "target M"}
+    assert "relay" not in {s.station_id for s in done.stations}
+    fixed = replace(given.targets[-1], carrier_from_target=PoseParameter(Pose3(), "held"))
+    held = closed(replace(given, targets=(*given.targets[:-1], fixed)))
+    assert "M" in {t.target_id for t in held.targets}
+    assert "relay" in {s.station_id for s in held.stations}
+
+
+def test_parts_of_nothing_but_eyes_each_have_their_place() -> None:
+    survey = eyes(1)
+    apart = tuple(p for p in survey.pairs if (p.a.kind == "camera") == (p.b.kind == "camera"))
+    done = closed(replace(survey, pairs=apart))
+    held = {s.station_id for s in done.stations if s.world_from_station.treatment == "held"}
+    assert len(held) == 2
+
+
+@pytest.mark.parametrize(
+    ("pairs", "message"),
+    [
+        (("C1-C2", "C2-M1", "C1-C3"), "no loop in this order"), (("C1-C2", "C2-C9", "C1-C3"), "no pair 'C2-C9'"),
+        (("C1-C2",), "two pairs or more"), (("C1-C2", "C1-C2"), "none of them twice"),
+    ],
+)  # fmt: skip
+def test_a_closure_that_is_no_loop_is_refused(pairs: tuple[str, ...], message: str) -> None:
+    with pytest.raises(SurveyError, match=message):
+        closed(eyes(1), (Closure("plate", pairs, 1e-3),))
+
+
+def test_two_mounts_at_one_pair_are_refused() -> None:
+    loops = Closure("one", ("C1-C2", "C2-C3", "C1-C3"), 1e-3), Closure("two", ("C1-M1", "M1-C3", "C1-C3"), 1e-3)
+    with pytest.raises(SurveyError, match="one mount sits at one pair"):
+        closed(eyes(1), loops)
+    assert isinstance(eyes(1, True).pairs[0].b_from_a, Rot3)
