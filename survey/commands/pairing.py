@@ -15,9 +15,9 @@ def declare_pairs(commands: Any, shaped: dict[str, Any]) -> None:
         help="pairs of a station's cameras, marker blocks or trackers, from what each of them saw",
         usage="labsurvey pairs lab --out closed   (labsurvey pairs FOLDER [--station ID] [--out DIR] [--joint])",
         description="Each camera is adjusted by itself before its own targets, which stand still; each marker block\n"
-        "before a camera that stands still; then every two of them, without a common view. FOLDER/trajectories/EYE.csv\n"
-        "(t,x,y,z,qx,qy,qz,qw) are read instead where they are there. DIR becomes a project in which every eye is a\n"
-        "station, with observations/pairs.csv.",
+        "before a camera that stands still; then every two of them, without a common view.\n"
+        "FOLDER/trajectories/EYE.csv (t,x,y,z,qx,qy,qz,qw) are read instead where they are there.\n"
+        "DIR becomes a project in which every eye is a station, with observations/pairs.csv.",
         epilog="Next: labsurvey adjust DIR closes the loops",
         **shaped,
     )
