@@ -241,7 +241,7 @@ def _joint_sigma(adjusted: Adjustment, names: tuple[ParameterName, ...], J: Floa
 def _outside(cov: FloatArray, pose: Pose3) -> FloatArray:
     """Sigmas (6,) of a tangent's covariance: turns as they are, the translation along the axes on the left."""
     turn = block_diag(np.eye(3), pose.rotation().matrix())
-    return np.sqrt(np.clip(np.diag(turn @ cov @ turn.T), 0.0, None))
+    return np.asarray(np.sqrt(np.clip(np.diag(turn @ cov @ turn.T), 0.0, None)))
 
 
 def _table_pose(

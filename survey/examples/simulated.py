@@ -1,7 +1,7 @@
 """The examples of image points without images: a head calibrated as published, and a relay station of four cameras."""
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,10 +61,10 @@ def head_files(seed: int) -> dict[str, str]:
         targets=(board,),
     )
     photographer = _Photographer(survey, truth, sigma_px, rng)
-    draws: dict[str, Callable[[int], Sequence[float]]] = {
+    draws: dict[str, Callable[[int], FloatArray]] = {
         "X": lambda i: (1, -1)[i % 2] * rng.uniform((50, 50), (130, 130)),
         "Y": lambda _: rng.uniform((50, -40), (130, 40)),
-        "Z": lambda i: (0.0, rng.uniform(-95, 40)) if i < 6 else (rng.uniform(-8.5, 3.5), 0.0),
+        "Z": lambda i: np.array([0.0, rng.uniform(-95, 40)] if i < 6 else [rng.uniform(-8.5, 3.5), 0.0]),
     }
     for k in looks:
         for i in range(11):
@@ -84,13 +84,13 @@ def station_files(seed: int) -> dict[str, str]:
     looking = Rot3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
     for i, name in enumerate(names):
         turned = Rot3.Rz(i * np.pi / 2)
-        truth["lens", name] = _lens(rng, 1500.0)
+        own = truth["lens", name] = _lens(rng, 1500.0)
         wobble = Rot3.Expmap(rng.normal(0.0, 0.05, 3))
         place = turned.rotate(np.array([0.15, 0.02, 0.01]))
         truth["station_from_camera", name] = Pose3(turned * looking * wobble, place)
         plate = Pose3(turned * looking, turned.rotate(np.array([2.0, 0.1, 0.0])))
         truth["carrier_from_target", f"plate_{name}"] = plate
-        lens = LensParameter("brown", (), truth["lens", name])
+        lens = LensParameter("brown", (), own)
         cameras.append(Camera(name, "relay", _SIZE, lens, PoseParameter() if i else _held(truth, name)))
         ids = tuple(f"p{j}" for j in range(len(points)))
         targets.append(Target(f"plate_{name}", ids, points, carrier_from_target=PoseParameter(
@@ -145,11 +145,11 @@ class _Photographer:
         self._blocks.append(ImageBlock(camera_id, epoch_id, target_id, seen, noisy, cov))
         return True
 
-    def on_table(self, camera_id: str, epoch_id: str, draw: Callable[[], Sequence[float]]) -> None:
+    def on_table(self, camera_id: str, epoch_id: str, draw: Callable[[], FloatArray]) -> None:
         """At angles (deg) from which the whole board is seen, with readings good to 8 arcsec."""
         name = ("table_angles", "turntable", epoch_id)
         for _ in range(_TRIES):
-            angles = np.radians(np.asarray(draw(), dtype=float))
+            angles = np.radians(draw())
             self._truth[name] = angles
             if self.image(camera_id, epoch_id, "board", 88):
                 read = angles + 8.0 * _ARCSEC * self._rng.standard_normal(2)

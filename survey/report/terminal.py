@@ -196,9 +196,9 @@ def _published(solution: dict[str, Any]) -> Iterator[str]:
         for pair_id in worst_pairs(pairs)[:_MOST_PAIRS]:
             e = pairs["pairs"][pair_id]
             off, sigma = (e["weighted"].get(k) or [None] * 3 for k in ("difference_arcsec", "sigma_rotation_arcsec"))
-            joint = e["joint"]["sigma_rotation_arcsec"] or [None] * 3
-            cells = ("".join(_number(x, 8, 2) for x in three) for three in (off, sigma, joint))
-            yield f"  {_cut(pair_id, 30):<34}{''.join(cells)}"
+            ours = e["joint"]["sigma_rotation_arcsec"] or [None] * 3
+            cells = "".join(_number(x, 8, 2) for x in (*off, *sigma, *ours))
+            yield f"  {_cut(pair_id, 30):<34}{cells}"
     for name, why in found["not_run"].items():
         yield f"  not run ({name}): {_cut(' '.join(why.split()), _WIDTH - 20)}"
     yield from (f"  {note}" for part in ("head", "pairs") for note in found.get(part, {}).get("notes", ()))
