@@ -148,6 +148,8 @@ def _on_table(
     every = [c.camera_id for c in survey.cameras if c.station_id == station.station_id]
     seen = {b.camera_id for b in survey.image_blocks if b.epoch_id in angles}
     without = [k for k in every if k not in seen]
+    if len({k.lower() for k in every}) < len(every):
+        raise SurveyError(f"they name cameras in lower case; give {', '.join(every)} ids that differ in more than case")
     if not seen:
         raise SurveyError("no camera of the head has an image of the held board at an epoch with a table reading")
     notes = tuple(f"camera {k} has no image of the held board at a reading of the table; left out" for k in without)

@@ -11,15 +11,14 @@ from gtsam import Pose3
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.errors import SurveyError
 from adjust.model import Camera, PoseParameter, Station, Survey, Target
-from adjust.observations import FrameRef, ImageBlock, Pair
-from adjust.relay.eye_pairs import EyePairs, pairs_of
+from adjust.observations import FrameRef, ImageBlock
 from adjust.relay.eye_setup import from_matrix
 from adjust.relay.eye_solver import stacked
-from adjust.relay.eyes import EyeOptions, PoseSequence, symmetric
+from adjust.relay.eyes import PoseSequence, symmetric
 from adjust.result import Adjustment
 
 ROOM = "room"  # the world of targets that the survey holds
-_ADJUST, _EYES = AdjustOptions(), EyeOptions()
+_ADJUST = AdjustOptions()
 
 
 def camera_sequence(survey: Survey, camera_id: str, options: AdjustOptions = _ADJUST) -> PoseSequence:
@@ -182,19 +181,3 @@ def eye_sequences(
         else target_sequence(found, eye.frame_id, options)
         for eye in eyes[station_id]
     )
-
-
-def image_pairs(
-    survey: Survey | Adjustment, station_id: str | None = None,
-    adjust_options: AdjustOptions = _ADJUST, eye_options: EyeOptions = _EYES,
-) -> EyePairs:  # fmt: skip
-    """All pairs of a station's eyes with what they share, and the reasons for those that cannot be found."""
-    return pairs_of(eye_sequences(survey, station_id, adjust_options), eye_options)
-
-
-def pairs_from_images(survey: Survey | Adjustment, station_id: str | None = None) -> tuple[Pair, ...]:
-    """Pairs of a station's cameras with their covariances, from its images of unmoved targets.
-
-    Each camera is adjusted by itself, then every two of them; see :func:`image_pairs` for what was refused.
-    """
-    return image_pairs(survey, station_id).pairs
