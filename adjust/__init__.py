@@ -16,29 +16,37 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from adjust.adjustment import AdjustOptions
     from adjust.adjustment import adjust as solve
+    from adjust.epochs import joint_survey
     from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
-    from adjust.model import Survey
+    from adjust.model import Datum, Survey
+    from adjust.other_datum import in_datum
     from adjust.result import Adjustment, Estimate
 
 _PLACES = {
     "AdjustOptions": ("adjust.adjustment", "AdjustOptions"),
     "Adjustment": ("adjust.result", "Adjustment"),
+    "Datum": ("adjust.model", "Datum"),
     "Estimate": ("adjust.result", "Estimate"),
     "IndeterminateError": ("adjust.errors", "IndeterminateError"),
     "NotConvergedError": ("adjust.errors", "NotConvergedError"),
     "Survey": ("adjust.model", "Survey"),
     "SurveyError": ("adjust.errors", "SurveyError"),
+    "in_datum": ("adjust.other_datum", "in_datum"),
+    "joint_survey": ("adjust.epochs", "joint_survey"),
     "solve": ("adjust.adjustment", "adjust"),
 }
 
 __all__ = [
     "AdjustOptions",
     "Adjustment",
+    "Datum",
     "Estimate",
     "IndeterminateError",
     "NotConvergedError",
     "Survey",
     "SurveyError",
+    "in_datum",
+    "joint_survey",
     "solve",
 ]
 

@@ -24,10 +24,12 @@ if TYPE_CHECKING:
     from survey.notebook.plots import Plot
     from survey.notebook.solution import Solution
     from survey.notebook.steps import Problem, adjust, detect, exclude, include, problem, read, solve
+    from survey.pair_job import PairsOutcome, station_pairs
 
 _PLACES = {
     "Batch": "survey.batch.python",
     "Covariance": "survey.notebook.covariance",
+    "PairsOutcome": "survey.pair_job",
     "Plot": "survey.notebook.plots",
     "Problem": "survey.notebook.steps",
     "Project": "survey.files",
@@ -41,6 +43,7 @@ _PLACES = {
     "problem": "survey.notebook.steps",
     "read": "survey.notebook.steps",
     "solve": "survey.notebook.steps",
+    "station_pairs": "survey.pair_job",
     "write_example": "survey.examples",
     "write_project": "survey.files",
 }
@@ -48,6 +51,7 @@ _PLACES = {
 __all__ = [
     "Batch",
     "Covariance",
+    "PairsOutcome",
     "Plot",
     "Problem",
     "Project",
@@ -61,6 +65,7 @@ __all__ = [
     "problem",
     "read",
     "solve",
+    "station_pairs",
     "write_example",
     "write_project",
 ]

@@ -35,7 +35,7 @@ def pairs_dict(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
         entry["measured"] = pose_dict(measured)
         if a is not None and b is not None:
             adjusted = b.between(a)
-            entry["adjusted"] = pose_dict(adjusted) | _sigmas(adjusted, covs.get(pair.pair_id), scale)
+            entry["adjusted"] = pose_dict(adjusted) | pair_sigmas(adjusted, covs.get(pair.pair_id), scale.factor)
         if not is_pose:
             for form in ("measured", "adjusted"):
                 entry.get(form, {}).pop("translation_mm", None)
@@ -65,15 +65,19 @@ def _covariances(adjustment: Adjustment) -> dict[str, FloatArray]:
     return out
 
 
-def _sigmas(adjusted: Pose3, cov: FloatArray | None, scale: Scale) -> dict[str, Any]:
+def pair_sigmas(adjusted: Pose3, cov: FloatArray | None, factor: float = 1.0) -> dict[str, Any]:
+    """Sigmas of ``b_from_a`` times factor: rotation about the axes of a, translation along the axes of b.
+
+    cov: (6, 6) or (3, 3) in the tangent in frame a; without it there are none.
+    """
     if cov is None:
         return {}
-    sigma = scale.factor * np.sqrt(np.clip(np.diag(cov), 0.0, None))
+    sigma = factor * np.sqrt(np.clip(np.diag(cov), 0.0, None))
     out = {"sigma_rotation_arcsec": (ARCSEC_PER_RAD * sigma[:3]).tolist()}
     if len(cov) == 6:
         R = adjusted.rotation().matrix()
         along = np.sqrt(np.clip(np.diag(R @ cov[3:, 3:] @ R.T), 0.0, None))
-        out["sigma_translation_mm"] = (1e3 * scale.factor * along).tolist()
+        out["sigma_translation_mm"] = (1e3 * factor * along).tolist()
     return out
 
 

@@ -20,6 +20,7 @@ from survey.commands.examples import declare_example
 from survey.commands.excluding import declare_exclude, declare_include
 from survey.commands.navigating import declare_navigate
 from survey.commands.networks import declare_add, declare_remove, declare_trackers
+from survey.commands.pairing import declare_pairs
 from survey.commands.parser import Parser, name_commands
 from survey.commands.planning import declare_plan
 from survey.commands.reporting import declare_report
@@ -49,6 +50,7 @@ _COMMANDS = (
     declare_exclude,
     declare_include,
     declare_convert,
+    declare_pairs,
     declare_trackers,
     declare_navigate,
     declare_align,

@@ -63,6 +63,7 @@ class AdjustOutcome:
             "folder": self.run.folder,
             "summary": solution["summary"],
             "warnings": solution["warnings"],
+            **{name: solution[name] for name in ("published",) if name in solution},
             "written": {name: str(path) for name, path in self.paths.items()},
         }
 
@@ -96,11 +97,15 @@ def adjust_job(
     progress: bool = True,
     redetect: bool = False,
     report: ReportOptions = ENGLISH_PAGE,
+    method: str = "joint",
 ) -> AdjustOutcome:
-    """The main job: detect where that has not been done, adjust everything, write the results. Raises SurveyError."""
+    """The main job: detect where that has not been done, adjust everything, write the results. Raises SurveyError.
+
+    method: "published" runs the published step-by-step methods too and sets them beside the adjustment.
+    """
     clock, folder = Clock(), Path(folder)
     target = folder if out is None else Path(out)
-    said = command_line("adjust", folder, redetect=redetect, out=out)
+    said = command_line("adjust", folder, redetect=redetect, method=None if method == "joint" else method, out=out)
     with changing(target) as place:
 
         def detected() -> None:
@@ -121,7 +126,7 @@ def adjust_job(
             project = replace(project, detected=remember_images(folder, place))
         with clock.step("adjust"):
             adjustment = adjust_project(project, progress)
-        outcome = made(project, adjustment, place, clock, report, said)
+        outcome = made(project, adjustment, place, clock, report, said, published=method == "published")
         replace_parts(target)
     return outcome.at(target)
 
@@ -152,14 +157,22 @@ def image_warnings(images: Mapping[tuple[str, str], DetectedImage]) -> tuple[str
 
 def made(
     project: Project, adjustment: Adjustment, place: Path, clock: Clock, report: ReportOptions = ENGLISH_PAGE,
-    command: str = "",
+    command: str = "", published: bool = False,
 ) -> AdjustOutcome:  # fmt: skip
-    """The statistics of an adjusted project, and its result files made in ``place``. command: what asked for it."""
-    run = run_info(project, clock.seconds, command)
+    """The statistics of an adjusted project, and its result files made in ``place``. command: what asked for it.
+
+    published: with the published methods beside it; raises SurveyError where none can be run.
+    """
+    run, beside = run_info(project, clock.seconds, command), {}
+    if published:
+        from survey.published_methods import published_dict
+
+        with clock.step("published methods"):
+            beside = {"published": published_dict(adjustment, scale_of(adjustment, run.sigmas))}
     with clock.step("statistics"):
         found = statistics_of(adjustment, project.options.tolerances, scale_of(adjustment, run.sigmas))
     with clock.step("report"):
-        solution = solution_dict(adjustment, run, found)
+        solution = solution_dict(adjustment, run, found) | beside
         paths = make_results(place, adjustment, run, solution, found, report)
     return AdjustOutcome(adjustment, run, solution, paths, found)
 

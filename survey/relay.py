@@ -17,7 +17,7 @@ from adjust.errors import SurveyError
 from adjust.model import FloatArray, Survey
 from adjust.observations import FrameRef, Pair
 from adjust.relay.eye_drift import DriftModel, choose_interval, growth, rescaled, sequences
-from adjust.relay.eye_images import camera_sequences
+from adjust.relay.eye_images import eye_sequences
 from adjust.relay.eye_pairs import EyePairs, LoopedPairs, close_loops, pairs_of
 from adjust.relay.eye_trajectories import CommonMotions, TimeOffset, Trajectory, time_offset
 from adjust.relay.eyes import EyeAdjustment, EyeOptions, adjust_eyes
@@ -66,7 +66,7 @@ def relay_pairs(source: Path | str | Survey | Adjustment, station_id: str | None
     Raises SurveyError where nothing is found or determined.
     """
     survey = read(Path(source)).survey if isinstance(source, Path | str) else source
-    found = camera_sequences(in_use(survey) if isinstance(survey, Survey) else survey, station_id)
+    found = eye_sequences(in_use(survey) if isinstance(survey, Survey) else survey, station_id)
     eyes = pairs_of(found)
     stations = {end.frame_id for p in eyes.pairs for end in (p.a, p.b)}
     closed = close_loops(eyes) if len(eyes.pairs) >= len(stations) else None

@@ -64,7 +64,7 @@ class RunInfo:
 def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None = None) -> dict[str, Any]:
     """The whole solution as plain values, floats in full, None where there is no number; ``found``: its statistics."""
     scale = scale_of(adjustment, run.sigmas)
-    solution: dict[str, Any] = _plain(
+    solution: dict[str, Any] = plain(
         {
             "format": 1,
             "summary": _summary(adjustment, run, scale, found),
@@ -110,7 +110,7 @@ def _free_datum(adjustment: Adjustment) -> dict[str, Any]:
     return {"free_datum": {"open_motions": directions.T.tolist(), "carried_by": carriers}}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Only what JSON knows: mappings and sequences kept, numbers as Python's, None for what is not finite."""
     kind = type(value)
     if kind is str or kind is int or kind is bool or value is None:
@@ -118,9 +118,9 @@ def _plain(value: Any) -> Any:
     if kind is float:
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, bool | np.bool_):
         return bool(value)
     if isinstance(value, float | np.floating):

@@ -5,6 +5,7 @@ squares separates table and camera Z, then the other cameras follow one after th
 same observations reaches the Cramer-Rao bound; this shows what the steps leave.
 """
 
+from adjust.cpc.head import ComparedPose, HeadComparison, compare_head
 from adjust.cpc.method import Calibration, CpcInput, calibrate, propagate
 from adjust.cpc.quantities import PaperRotation, PaperVector
 from adjust.cpc.steps import Fit, TableImages
@@ -12,13 +13,16 @@ from adjust.cpc.surveys import body_on_main_axis, single_camera_survey, table_im
 
 __all__ = [
     "Calibration",
+    "ComparedPose",
     "CpcInput",
     "Fit",
+    "HeadComparison",
     "PaperRotation",
     "PaperVector",
     "TableImages",
     "body_on_main_axis",
     "calibrate",
+    "compare_head",
     "propagate",
     "single_camera_survey",
     "table_images",

@@ -1,6 +1,9 @@
-"""Eyes that are cameras: from images of targets to poses of every camera by itself, with their joint covariance."""
+"""Eyes from images: poses of every camera before its targets, and of marker blocks before a camera that stands still.
 
-from collections.abc import Mapping
+Each eye is adjusted by itself; its poses come with their joint covariance.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from gtsam import Pose3
@@ -8,15 +11,14 @@ from gtsam import Pose3
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.errors import SurveyError
 from adjust.model import Camera, PoseParameter, Station, Survey, Target
-from adjust.observations import FrameRef, ImageBlock, Pair
-from adjust.relay.eye_pairs import EyePairs, pairs_of
+from adjust.observations import FrameRef, ImageBlock
 from adjust.relay.eye_setup import from_matrix
 from adjust.relay.eye_solver import stacked
-from adjust.relay.eyes import EyeOptions, PoseSequence, symmetric
+from adjust.relay.eyes import PoseSequence, symmetric
 from adjust.result import Adjustment
 
 ROOM = "room"  # the world of targets that the survey holds
-_ADJUST, _EYES = AdjustOptions(), EyeOptions()
+_ADJUST = AdjustOptions()
 
 
 def camera_sequence(survey: Survey, camera_id: str, options: AdjustOptions = _ADJUST) -> PoseSequence:
@@ -28,26 +30,79 @@ def camera_sequence(survey: Survey, camera_id: str, options: AdjustOptions = _AD
     camera = next((c for c in survey.cameras if c.camera_id == camera_id), None)
     if camera is None:
         raise SurveyError(f"camera {camera_id!r} is not part of the survey; correct the id")
-    blocks = tuple(b for b in survey.image_blocks if b.camera_id == camera_id and b.target_id and len(b.uv))
+    blocks = _before_targets(survey, camera)
     if not blocks:
-        raise SurveyError(f"camera {camera_id!r} has no image of a target; it cannot be an eye")
+        raise SurveyError(f"camera {camera_id!r} has no image of a target that it could be an eye before")
     targets = _unmoved(survey, blocks)
     world_of = _worlds(blocks, targets)
     epochs = tuple(dict.fromkeys(b.epoch_id for b in blocks))
     alone = adjust(_alone(camera, blocks, targets, world_of), options=options)
-    names = [("world_from_station", camera_id, epoch) for epoch in epochs if _seen(alone, camera_id, epoch)]
-    if alone.precision is None or not names:
-        raise SurveyError(f"camera {camera_id!r}: no epoch is left after adjusting it by itself")
-    poses = [alone.estimates[name].value for name in names]
     first = {b.epoch_id: world_of[b.target_id] for b in blocks if b.target_id}
+    return _sequence(alone, FrameRef("camera", camera_id), "world_from_station", epochs, first)
+
+
+def _sequence(
+    alone: Adjustment, eye: FrameRef, kind: str, epochs: Sequence[str], world_of: Mapping[str, str]
+) -> PoseSequence:
+    """The poses of an eye out of its own adjustment; world_of: by epoch."""
+    every = [(kind, eye.frame_id, epoch) for epoch in epochs]
+    names = [name for name in every if name in alone.estimates]
+    if alone.precision is None or not names:
+        raise SurveyError(f"{eye.kind} {eye.frame_id!r}: no epoch is left after adjusting it by itself")
+    poses = [alone.estimates[name].value for name in names]
     found = stacked([from_matrix(p.matrix()) for p in poses if isinstance(p, Pose3)])
     ids = tuple(name[2] for name in names)
     cov = symmetric(alone.precision.joint(names))
-    return PoseSequence(FrameRef("camera", camera_id), ids, tuple(first[e] for e in ids), found, cov)
+    return PoseSequence(eye, ids, tuple(world_of[e] for e in ids), found, cov)
 
 
-def _seen(alone: Adjustment, camera_id: str, epoch_id: str) -> bool:
-    return ("world_from_station", camera_id, epoch_id) in alone.estimates
+def target_sequence(survey: Survey, target_id: str, options: AdjustOptions = _ADJUST) -> PoseSequence:
+    """Poses of a marker block that a station carries, before a camera that stands still, with their joint covariance.
+
+    Of several such cameras the one that saw the block at most epochs counts; it is the world, by its id, and its lens
+    is treated as in the survey. Raises SurveyError where no such camera saw the block.
+    """
+    target = next((t for t in survey.targets if t.target_id == target_id), None)
+    if target is None:
+        raise SurveyError(f"target {target_id!r} is not part of the survey; correct the id")
+    watched = _watched(survey, target)
+    if not watched:
+        raise SurveyError(
+            f"target {target_id!r}: no camera of another station that stands still has seen it; it cannot be an eye"
+        )
+    camera, blocks = max(watched, key=lambda x: len(x[1]))
+    still = PoseParameter(Pose3(), "held")
+    moving = replace(target, station_id=None, motion="epoch", carrier_from_target=PoseParameter(), epochs={})
+    own = replace(camera, station_id=camera.camera_id, station_from_camera=still)
+    alone = adjust(
+        Survey(
+            cameras=(own,), stations=(Station(camera.camera_id, "fixed", still),), targets=(moving,),
+            image_blocks=blocks,
+        ), options=options,
+    )  # fmt: skip
+    epochs = tuple(dict.fromkeys(b.epoch_id for b in blocks))
+    world = dict.fromkeys(epochs, f"camera {camera.camera_id}")
+    return _sequence(alone, FrameRef("target", target_id), "carrier_from_target", epochs, world)
+
+
+def _watched(survey: Survey, target: Target) -> list[tuple[Camera, tuple[ImageBlock, ...]]]:
+    """The cameras that stand still on other stations than the target's, with their images of it."""
+    still = {s.station_id for s in survey.stations if s.motion == "fixed"} - {target.station_id}
+    cameras = {c.camera_id: c for c in survey.cameras if c.station_id in still}
+    seen: dict[str, list[ImageBlock]] = {}
+    for b in survey.image_blocks:
+        if b.target_id == target.target_id and b.camera_id in cameras and len(b.uv):
+            seen.setdefault(b.camera_id, []).append(b)
+    return [(cameras[c], tuple(blocks)) for c, blocks in seen.items()]
+
+
+def _before_targets(survey: Survey, camera: Camera) -> tuple[ImageBlock, ...]:
+    """Images of targets, but for marker blocks that stations carry: those are eyes themselves."""
+    carried = {t.target_id for t in survey.targets if t.station_id is not None}
+    return tuple(
+        b for b in survey.image_blocks
+        if b.camera_id == camera.camera_id and b.target_id and b.target_id not in carried and len(b.uv)
+    )  # fmt: skip
 
 
 def _unmoved(survey: Survey, blocks: tuple[ImageBlock, ...]) -> dict[str, Target]:
@@ -98,38 +153,31 @@ def _alone(
     )
 
 
-def camera_sequences(
+def eye_sequences(
     survey: Survey | Adjustment, station_id: str | None = None, options: AdjustOptions = _ADJUST
 ) -> tuple[PoseSequence, ...]:
-    """One sequence for each camera of a station (None: of the one station with two or more cameras).
+    """One sequence for each eye of a station (None: of the one station with two or more), cameras before blocks.
 
-    Raises SurveyError for an unknown station, and where the station is not named and there are several.
+    Eyes are the station's cameras, and the marker blocks it carries that a camera of another station, which stands
+    still, has seen. Raises SurveyError for an unknown station, and where it is not named and there are several.
     """
     found = survey.survey if isinstance(survey, Adjustment) else survey
-    by_station: dict[str, list[str]] = {}
+    eyes: dict[str, list[FrameRef]] = {}
     for camera in found.cameras:
-        by_station.setdefault(camera.station_id, []).append(camera.camera_id)
+        eyes.setdefault(camera.station_id, []).append(FrameRef("camera", camera.camera_id))
+    for target in found.targets:
+        if target.station_id is not None and _watched(found, target):
+            eyes.setdefault(target.station_id, []).append(FrameRef("target", target.target_id))
     if station_id is None:
-        several = [s for s, cameras in by_station.items() if len(cameras) > 1]
+        several = [s for s, of in eyes.items() if len(of) > 1]
         if len(several) != 1:
-            raise SurveyError(f"stations with two or more cameras: {', '.join(several) or 'none'}; name one of them")
+            raise SurveyError(f"stations with two or more eyes: {', '.join(several) or 'none'}; name one of them")
         station_id = several[0]
-    if station_id not in by_station:
-        raise SurveyError(f"station {station_id!r} has no camera; those with cameras are {', '.join(by_station)}")
-    return tuple(camera_sequence(found, camera_id, options) for camera_id in by_station[station_id])
-
-
-def image_pairs(
-    survey: Survey | Adjustment, station_id: str | None = None,
-    adjust_options: AdjustOptions = _ADJUST, eye_options: EyeOptions = _EYES,
-) -> EyePairs:  # fmt: skip
-    """All pairs of a station's cameras with what they share, and the reasons for those that cannot be found."""
-    return pairs_of(camera_sequences(survey, station_id, adjust_options), eye_options)
-
-
-def pairs_from_images(survey: Survey | Adjustment, station_id: str | None = None) -> tuple[Pair, ...]:
-    """Pairs of a station's cameras with their covariances, from its images of unmoved targets.
-
-    Each camera is adjusted by itself, then every two of them; see :func:`image_pairs` for what was refused.
-    """
-    return image_pairs(survey, station_id).pairs
+    if station_id not in eyes:
+        raise SurveyError(f"station {station_id!r} has no camera; those with cameras are {', '.join(eyes)}")
+    return tuple(
+        camera_sequence(found, eye.frame_id, options)
+        if eye.kind == "camera"
+        else target_sequence(found, eye.frame_id, options)
+        for eye in eyes[station_id]
+    )

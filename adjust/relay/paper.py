@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy.linalg
 
 from adjust.closed_forms.rigid import skew
 from adjust.errors import NotConvergedError, SurveyError
@@ -21,7 +22,7 @@ from adjust.model import FloatArray
 from adjust.relay.loops import LoopBasis, evaluate_loops, loop_basis
 from adjust.relay.motions import Motions, exp, right_jacobian
 from adjust.relay.network import Network
-from adjust.rotation_forms import euler_from_matrix, euler_jacobian, matrix_from_euler
+from adjust.rotation_forms import euler_cov_from_tangent, euler_from_matrix, euler_jacobian, matrix_from_euler
 
 ARCSECOND = np.pi / (180.0 * 3600.0)
 # [u]x = sum over l of u_l CROSS[:, l, :]
@@ -107,6 +108,29 @@ def loop_equations(basis: LoopBasis, angles: FloatArray, equations: Literal[9, 3
     C = np.zeros((len(basis), equations, basis.topology.n_pairs, 3))
     C[loop, :, basis.pair_idx] = by_angle
     return C.reshape(len(basis) * equations, -1), B
+
+
+def adjusted_covariances(found: PaperSolution, options: PaperOptions, cov: FloatArray) -> FloatArray:
+    """(E, 3, 3) rad^2 of the adjusted pairs in their tangents that the errors of the measured pairs cause.
+
+    cov: (E, 3, 3) of the measured pairs in their tangents, whatever the weights were. First order at the solution: the
+    corrections are G (B - C dX), G the generalised inverse of eq. 30, so that errors come through I - G C.
+    """
+    n = found.basis.topology.n_pairs
+    C, _ = loop_equations(found.basis, found.angles, options.equations)
+    root = _weight_root(options, n)
+    through = np.eye(3 * n) - root @ np.linalg.pinv(C @ root, rcond=1e-10) @ C
+    J = euler_jacobian(found.angles)
+    inverse = np.linalg.inv(J)
+    D = scipy.linalg.block_diag(*(inverse @ cov @ np.swapaxes(inverse, -1, -2)))
+    at = np.arange(n)
+    out = (through @ D @ through.T).reshape(n, 3, n, 3)[at, :, at, :]
+    return np.asarray(J @ out @ np.swapaxes(J, -1, -2))
+
+
+def euler_covariances(network: Network) -> FloatArray:
+    """D (E, 3, 3) rad^2 of the measured Euler angles. Raises SurveyError at gimbal lock."""
+    return euler_cov_from_tangent(euler_from_matrix(network.b_from_a.rotation), network.cov)
 
 
 def _weight_root(options: PaperOptions, n_pairs: int) -> FloatArray:

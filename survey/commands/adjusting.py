@@ -25,6 +25,11 @@ def declare_adjust(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument("folders", nargs="+", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
     parser.add_argument("--redetect", action="store_true", help="detect targets again, even where it was done before")
+    parser.add_argument(
+        "--method", choices=("joint", "published"), default="joint",
+        help="published: also the published step-by-step methods (head on a table, measured pairs), beside the joint "
+        "adjustment; default: joint",
+    )  # fmt: skip
     batch = parser.add_argument_group("batch")
     batch.add_argument("--jobs", type=positive, metavar="N", help="folders at a time; default: one per core")
     batch.add_argument(
@@ -47,6 +52,8 @@ def _adjust(arguments: argparse.Namespace) -> int:
     if len(folders) > 1 or only_batch:
         if arguments.out is not None:
             arguments.parser.error("--out needs a single FOLDER: the results of several would be mixed up")
+        if arguments.method != "joint":
+            arguments.parser.error("--method published needs a single FOLDER: it is beside one adjustment")
         if len({folder.resolve() for folder in folders}) < len(folders):
             arguments.parser.error("a FOLDER is named twice")
         if arguments.resume and arguments.report is None:
@@ -63,7 +70,8 @@ def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
     from survey.jobs import adjust_job
 
     outcome = adjust_job(
-        folder, out=arguments.out, progress=not is_set(arguments, "quiet"), redetect=arguments.redetect
+        folder, out=arguments.out, progress=not is_set(arguments, "quiet"), redetect=arguments.redetect,
+        method=arguments.method,
     )
     if is_set(arguments, "json"):
         print_json(outcome.summary())

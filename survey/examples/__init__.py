@@ -14,6 +14,8 @@ EXAMPLES = {
     "total-station": "beacons of a laboratory by total station, caliper and levelling; no images",
     "alignment": "board to be made parallel to a turntable by levels and a laser's trace; no images",
     "relay": "thirty stations through four rooms and a corridor, joined by measured pairs; no images",
+    "relay-station": "four cameras on one station, each before a plate of its own; image points, no images",
+    "head": "three-camera head on a two-axis table before one board; image points, no images",
 }
 
 

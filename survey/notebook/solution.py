@@ -17,6 +17,7 @@ from survey.notebook.html import heading, html_table
 from survey.notebook.names import components, rows_in_joint
 from survey.notebook.plots import Plot
 from survey.notebook.plots import plot as plot_by_name
+from survey.published_methods import published_dict
 from survey.quantities import Scale, scale_of
 from survey.results import ReportOptions, RunInfo, summary_text, write_results
 from survey.solution import solution_dict
@@ -73,6 +74,14 @@ class Solution:
     def as_dict(self) -> Mapping[str, Any]:
         """All that ``solution.json`` holds."""
         return solution_dict(self.adjustment, self.run, self.precision)
+
+    @cached_property
+    def published(self) -> Mapping[str, Any]:
+        """The published step-by-step methods beside this adjustment, as in ``solution.json``.
+
+        Raises SurveyError naming what the project lacks for them.
+        """
+        return published_dict(self.adjustment, self.scale)
 
     @property
     def points(self) -> Any:

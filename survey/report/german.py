@@ -236,6 +236,29 @@ GERMAN = {
     "Errors seen but not told apart: {names}": "Fehler bemerkbar, aber nicht zu trennen: {names}",
     "{n} more such groups in solution.json": "{n} weitere solche Gruppen in solution.json",
     " and {n} more": " und {n} weitere",
+    "Published methods": "Veröffentlichte Verfahren",
+    "The published step-by-step methods on the same observations. Claimed: the sigma as its step states it, with "
+    "all steps before taken as free of error. Published: the sigma that the observations cause, through all "
+    "steps. Difference: published minus joint, rotations as small turns about the axes on the right.": (
+        "Die veröffentlichten schrittweisen Verfahren mit denselben Beobachtungen. Behauptet: das σ, wie es der "
+        "Schritt selbst angibt, alle Schritte davor als fehlerfrei genommen. Veröffentlicht: das σ, das die "
+        "Beobachtungen durch alle Schritte verursachen. Differenz: veröffentlicht minus gemeinsam, Drehungen als "
+        "kleine Drehungen um die Achsen des rechten Systems."
+    ),
+    "Calibration of the head, step by step": "Kalibrierung des Kopfes, Schritt für Schritt",
+    "Iteration of measured pairs over their loops": "Iteration gemessener Paare über ihre Schleifen",
+    "not run": "nicht gerechnet",
+    "Published": "Veröffentlicht",
+    "Claimed σ": "Behauptetes σ",
+    "Published σ": "σ davon",
+    "Equal weights σ": "σ bei gleichen Gewichten",
+    "Joint": "Gemeinsam",
+    "Joint σ": "Gemeinsames σ",
+    "Difference": "Differenz",
+    "σ ratio": "Verhältnis der σ",
+    "Weighted": "Gewichtet",
+    "Equal weights": "Gleiche Gewichte",
+    "{name}: {n} iterations, misclosure left {left}″": "{name}: {n} Iterationen, restlicher Widerspruch {left}″",
     "Loop closures": "Schleifenschlüsse",
     "Loop": "Schleife",
     "Misclosure": "Widerspruch",

@@ -5,7 +5,7 @@ from typing import Any
 
 from adjust.result import Adjustment
 from survey.quantities import scale_of
-from survey.report import every, instruments, left_out, loops, observations, overview, statistics, unknowns
+from survey.report import every, instruments, left_out, loops, observations, overview, published, statistics, unknowns
 from survey.report.context import Context
 from survey.report.document import document
 from survey.report.drawing import DARK
@@ -33,6 +33,7 @@ _SECTIONS = (
     ("Network", "network", loops.network),
     ("Loops", "loops", loops.loops),
     ("Pairs", "pairs", loops.pairs),
+    ("Published methods", "published", published.published),
     ("Excluded by people", "excluded", left_out.excluded),
     ("Observations", "observations", observations.others),
     ("Image points", "image-points", observations.image_points),

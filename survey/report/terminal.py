@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from adjust.result import Adjustment
+from survey.report.published import head_rows, worst_pairs
 from survey.solution import RunInfo, solution_dict
 
 _WIDTH = 100
 _WORDS = {"passed": "PASSED", "check": "NEEDS A LOOK", "failed": "FAILED"}
 _MOST_WARNINGS, _MOST_GROUPS, _MOST_CAMERAS, _MOST_OTHER, _MOST_POINTS = 6, 6, 6, 4, 3
-_MOST_LOOPS, _MOST_EXCLUSIONS = 3, 5
+_MOST_LOOPS, _MOST_EXCLUSIONS, _MOST_PAIRS = 3, 5, 5
 
 
 def summary_text(adjustment: Adjustment, run: RunInfo, solution: dict[str, Any] | None = None) -> str:
@@ -22,7 +23,7 @@ def summary_text(adjustment: Adjustment, run: RunInfo, solution: dict[str, Any] 
     """
     solution = solution_dict(adjustment, run) if solution is None else solution
     lines: list[str] = []
-    for part in (_head, _warnings, _figures, _exclusions, _groups, _cameras, _network, _loops):
+    for part in (_head, _warnings, _figures, _exclusions, _groups, _cameras, _network, _loops, _published):
         lines += part(solution)
     lines += _observations(adjustment, solution["summary"]["suspects"]["standardized_limit"])
     lines += _points(solution)
@@ -182,6 +183,39 @@ def _left(e: dict[str, Any]) -> str:
         return ""
     parts = [f"{turn if turn > 1e-6 else 0:.4g}″"]
     return " ".join(parts + ([] if shift is None else [f"{shift if shift > 1e-6 else 0:.4g} mm"]))
+
+
+def _published(solution: dict[str, Any]) -> Iterator[str]:
+    found = solution.get("published")
+    if not found:
+        return
+    yield ""
+    yield "  published methods, step by step, beside this adjustment"
+    if "head" in found:
+        yield f"  {'':<30}{'published':>12}{'claimed σ':>11}{'σ':>11}{'joint':>12}{'σ':>11}{'ratio':>7}"
+        for pose, name, unit, e in head_rows(found["head"]):
+            small = "arcsec" if unit == "deg" else "mm"
+            sigmas = (e[f"{which}_sigma_{small}"] for which in ("claimed", "published", "joint"))
+            claimed, own, joint = (_number(x, 11, 1 if unit == "deg" else 3) for x in sigmas)
+            values = (_number(e[f"{which}_{unit}"], 12, 4 if unit == "deg" else 3) for which in ("published", "joint"))
+            value, other = values
+            place = f"{_cut(pose, 22)} {name} {unit}"
+            yield f"  {place:<30}{value}{claimed}{own}{other}{joint}{_number(e['sigma_ratio'], 7, 1)}"
+        yield "  σ of angles in arcsec; claimed: as each step states it, σ: through all steps"
+    if "pairs" in found:
+        pairs, steps = found["pairs"], found["pairs"]["steps"]["weighted"]
+        said = f"{pairs['n_loops']} loops closed in {steps['iterations']} iterations"
+        yield f"  {said}; the farthest from this adjustment, arcsec"
+        yield f"  {'':<30}{'published - joint x y z':>28}{'published σ x y z':>24}{'joint σ x y z':>24}"
+        for pair_id in worst_pairs(pairs)[:_MOST_PAIRS]:
+            e = pairs["pairs"][pair_id]
+            off, sigma = (e["weighted"].get(k) or [None] * 3 for k in ("difference_arcsec", "sigma_rotation_arcsec"))
+            ours = e["joint"]["sigma_rotation_arcsec"] or [None] * 3
+            cells = "".join(_number(x, 8, 2) for x in (*off, *sigma, *ours))
+            yield f"  {_cut(pair_id, 30):<34}{cells}"
+    for name, why in found["not_run"].items():
+        yield f"  not run ({name}): {_cut(' '.join(why.split()), _WIDTH - 20)}"
+    yield from (f"  {note}" for part in ("head", "pairs") for note in found.get(part, {}).get("notes", ()))
 
 
 def _observations(adjustment: Adjustment, limit: float) -> Iterator[str]:

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from adjust.adjustment import adjust
 from adjust.errors import SurveyError
-from adjust.positioner import (
+from tests.acceptance.positioner import (
     POSITIONER,
     PoseWeights,
     axis_tests,

@@ -315,7 +315,7 @@ def test_commands_of_the_page_work(tmp_path, monkeypatch, capsys):
     text = (ROOT / "docs" / "relay.md").read_text()
     commands = [line for block in re.findall(r"^```\w*\n(.*?)^```", text, re.S | re.M) for line in block.splitlines()]
     commands = [shlex.split(line)[1:] for line in commands if line.startswith("labsurvey ")]
-    assert [c[0] for c in commands] == ["example", "plan", "adjust", "add", "add"]
+    assert [c[0] for c in commands] == ["example", "plan", "adjust", "example", "pairs", "adjust", "add", "add"]
     for command in commands:
         assert main([*command, "--quiet"]) == 0, command
     assert (tmp_path / "grown" / "results" / "report.html").is_file()

@@ -12,11 +12,11 @@ from adjust.relay.condition_factors import MAX_HARD_LOOPS
 from adjust.relay.conditions import ConditionOptions, adjust_condition_factors, adjust_conditions
 from adjust.relay.counts import count
 from adjust.relay.loops import loop_misclosures
-from adjust.relay.monte_carlo import MonteCarloOptions, simulate_complete
 from adjust.relay.motions import Motions
 from adjust.relay.network import Network, topology
 from adjust.relay.paper import paper_iteration
 from adjust.relay.parametric import adjust_parametric
+from tests.adjust.relay_monte_carlo import MonteCarloOptions, simulate_complete
 from tests.adjust.relay_networks import ARCMIN, chain_with_chords, complete, differences, grid, simulate
 
 # table 1: mean absolute errors (arcmin) of Ax, Ay, Az of the pairs C1-C2, C2-C3, C3-C4 over 1000 trials

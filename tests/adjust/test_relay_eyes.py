@@ -14,7 +14,7 @@ from adjust.adjustment import adjust
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from adjust.observations import FrameRef
-from adjust.relay.eye_images import camera_sequence, camera_sequences, image_pairs, pairs_from_images
+from adjust.relay.eye_images import camera_sequence, eye_sequences, target_sequence
 from adjust.relay.eye_pairs import close_loops, pairs_of, triangle_misclosure
 from adjust.relay.eye_setup import motion_setup, pose_setup
 from adjust.relay.eye_solver import EyeProblem, linearise
@@ -361,7 +361,7 @@ def test_what_condensing_costs(free: tuple[str, ...], capsys: pytest.CaptureFixt
     station = Station4(1)
     survey = station.survey(2, 0.005, free)
     joint = adjust(survey)
-    sequences = camera_sequences(survey)
+    sequences = eye_sequences(survey)
     found = pairs_of(sequences)
     assert not found.refused
     assert len(found.pairs) == 6
@@ -392,7 +392,7 @@ def test_condensing_costs_nothing_in_the_limit_of_small_noise() -> None:
     off = []
     for sigma_px in (5e-2, 5e-4, 5e-5):
         survey = Station4(1).survey(2, sigma_px)
-        joint, complete = adjust(survey), adjust_eyes(camera_sequences(survey))
+        joint, complete = adjust(survey), adjust_eyes(eye_sequences(survey))
         worst = 0.0
         for a, b in (("a", "c"), ("b", "d")):
             value, cov = _joint_pair(joint, a, b)
@@ -409,7 +409,7 @@ def test_actual_covariance_of_closed_loops_is_the_scatter() -> None:
     actual, claimed = [], []
     station = Station4(5, n_epochs=8)
     for seed in range(20):
-        closed = close_loops(image_pairs(station.survey(seed, 0.05)))
+        closed = close_loops(pairs_of(eye_sequences(station.survey(seed, 0.05))))
         adjusted = closed.adjusted.pairs
         for i in (0, 4):
             pair = adjusted.network.topology.ends(i)
@@ -433,12 +433,16 @@ def test_pairs_of_one_station_share_their_errors() -> None:
 
 def test_pairs_from_images_and_what_they_need() -> None:
     survey = Station4(20).survey(3, 0.05)
-    pairs = pairs_from_images(survey, "relay")
+    pairs = pairs_of(eye_sequences(survey, "relay")).pairs
     assert [p.pair_id for p in pairs] == [f"{a}-{b}" for i, a in enumerate(EYES) for b in EYES[i + 1 :]]
     with pytest.raises(SurveyError, match="has no camera"):
-        camera_sequences(survey, "other")
+        eye_sequences(survey, "other")
     with pytest.raises(SurveyError, match="not part of the survey"):
         camera_sequence(survey, "x")
+    with pytest.raises(SurveyError, match="target 'x' is not part of the survey"):
+        target_sequence(survey, "x")
+    with pytest.raises(SurveyError, match="no camera of another station that stands still has seen it"):
+        target_sequence(survey, "Ta")
     moving = replace(survey, targets=tuple(replace(t, motion="epoch") for t in survey.targets))
     with pytest.raises(SurveyError, match="moves between epochs"):
-        camera_sequences(moving)
+        eye_sequences(moving)

@@ -9,8 +9,8 @@ import numpy as np
 
 from adjust.closed_forms import rotation_exp
 from adjust.model import IntArray
-from adjust.relay.monte_carlo import MonteCarloOptions, simulate_complete
 from survey.planning.errors import error_analysis_job
+from tests.adjust.relay_monte_carlo import MonteCarloOptions, simulate_complete
 from tests.benchmarks.cases import Arrays
 from tests.benchmarks.outcome import Competitor, Outcome
 

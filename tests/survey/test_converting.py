@@ -126,7 +126,7 @@ def test_names_and_unused_pairs_are_said_to_be_lost(tmp_path, capsys):
     assert "tripod" in said["left_out"][1]
 
 
-def _trajectories(folder, turns, levers):
+def tracker_files(folder, turns, levers):
     """Files of trackers on one station that is carried about: time, position, quaternion."""
     rng, t = np.random.default_rng(3), np.arange(0.0, 40.0, 0.1)
     f = np.array([[0.31, 0.47, 0.73], [0.23, 0.37, 0.59]])
@@ -145,7 +145,7 @@ def _trajectories(folder, turns, levers):
 def test_trackers_are_joined(tmp_path, capsys):
     turns = [Rotation.identity(), Rotation.from_rotvec([0.1, 0.5, -0.2]), Rotation.from_rotvec([0.9, 0.0, 0.3])]
     levers = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.05], [0.0, 0.15, -0.1]])
-    paths = _trajectories(tmp_path, turns, levers)
+    paths = tracker_files(tmp_path, turns, levers)
     assert main(["trackers", *map(str, paths), "--out", str(tmp_path / "out"), "--quiet"]) == 0
     assert "clock of b: " in capsys.readouterr().out
     header, *rows = (tmp_path / "out/pairs.csv").read_text().splitlines()

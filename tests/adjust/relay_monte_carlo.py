@@ -14,8 +14,8 @@ import numpy as np
 from adjust.closed_forms import rotation_exp
 from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.relay.trials import adjust_trials
 from adjust.rotation_forms import euler_from_matrix, euler_jacobian, matrix_from_euler
+from tests.adjust.relay_trials import adjust_trials
 
 Noise = Literal["euler", "tangent"]
 
