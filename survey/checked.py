@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-from adjust.errors import SurveyError
+from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.model import Survey
 from adjust.result import Adjustment
 from survey.epoch_names import separate_epochs
@@ -21,7 +21,7 @@ def checked(survey: Survey, run: Callable[[], Adjustment]) -> Adjustment:
         if not causes:
             raise
         lines = "\n  - ".join(["probable cause:", *causes])
-        raise SurveyError(f"{lines}\nwithout that: {error}") from error
+        raise SurveyError(f"{lines}\n{_consequence(error)}") from error
     warnings: tuple[str, ...] = ()
     if survey.tables:
         from adjust.table_checks import sign_warnings  # here: a survey without a table starts without it
@@ -30,6 +30,13 @@ def checked(survey: Survey, run: Callable[[], Adjustment]) -> Adjustment:
     if _contradicted(survey, result):
         warnings += tuple(c for c in _probable_causes(survey, result) if c not in warnings)
     return replace(result, warnings=tuple(f"probable cause: {c}" for c in warnings) + result.warnings)
+
+
+def _consequence(error: SurveyError) -> str:
+    """What failed. Directions and steps are those of a survey that contradicts itself: they would mislead."""
+    if isinstance(error, IndeterminateError | NotConvergedError):
+        return "mend that first: as it is, the observations lead to no solution"
+    return f"without that: {error}"
 
 
 def _probable_causes(survey: Survey, result: Adjustment | None = None) -> tuple[str, ...]:

@@ -96,11 +96,15 @@ def adjust_job(
     progress: bool = True,
     redetect: bool = False,
     report: ReportOptions = ENGLISH_PAGE,
+    said: str = "",
 ) -> AdjustOutcome:
-    """The main job: detect where that has not been done, adjust everything, write the results. Raises SurveyError."""
+    """The main job: detect where that has not been done, adjust everything, write the results. Raises SurveyError.
+
+    said: the command that asked for it, where it is not ``adjust``.
+    """
     clock, folder = Clock(), Path(folder)
     target = folder if out is None else Path(out)
-    said = command_line("adjust", folder, redetect=redetect, out=out)
+    said = said or command_line("adjust", folder, redetect=redetect, out=out)
     with changing(target) as place:
 
         def detected() -> None:
@@ -143,10 +147,15 @@ def _plain_name(folder: Path) -> str:
 
 
 def image_warnings(images: Mapping[tuple[str, str], DetectedImage]) -> tuple[str, ...]:
-    """Images in which nothing was found, or that could not be read; at every adjustment, not only at the first."""
-    return tuple(
+    """Boards of a wrong size, once each; images in which nothing was found for another reason, or not readable.
+
+    At every adjustment, not only at the first.
+    """
+    sizes = dict.fromkeys(entry.wrong_size for entry in images.values() if entry.wrong_size)
+    return tuple(f"detection: {text}" for text in sizes) + tuple(
         f"detection: {entry.file}: {entry.status}{': ' + entry.message if entry.message else ''}"
-        for entry in images.values() if entry.status in ("nothing", "failed")
+        for entry in images.values()
+        if entry.status == "failed" or (entry.status == "nothing" and not entry.wrong_size)
     )  # fmt: skip
 
 

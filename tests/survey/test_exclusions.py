@@ -140,7 +140,7 @@ def test_what_cannot_be_excluded_or_included_says_why(mine, capsys):
     before = table(mine)
     for command, name, message in (
         ("exclude", f"epoch:{epoch}", "exclusions.csv:2: "),
-        ("exclude", f"left/{epoch}", "is not used already"),
+        ("exclude", f"left/{epoch}", "is left out already"),
         ("include", f"left/{epoch}", f"is left out by epoch:{epoch}; take that back"),
         ("include", "r1c1", "point:board/r1c1 is not excluded"),
     ):
