@@ -124,7 +124,8 @@ def new_rows(project: Project, names: Sequence[str], reason: str, author: str = 
             advice = f"; its coordinates belong to {member}: name the set by its id" if member else ""
             raise SurveyError(f"{place}: {error}{advice}") from error
         if name in there:
-            raise SurveyError(f"{place / EXCLUSIONS_FILE}:{there[name].line}: {name} is left out already; name only what is not")
+            where = f"{place / EXCLUSIONS_FILE}:{there[name].line}"
+            raise SurveyError(f"{where}: {name} is left out already; name only what is not")
         if not left.is_used(name):
             by = f"'{project.folder.name}/{FILE}'" if there else "a table, by used = false"
             raise SurveyError(f"{place}: {name} is left out already, by {by}; name only what is not")
