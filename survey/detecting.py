@@ -185,7 +185,8 @@ def detect_in(
         lines = "\n".join(f"  {r.path}: {r.message}" for r in reports[:10])
         raise SurveyError(f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}")
     names = _write(folder, place, state, wanted, dropped, blocks, spots)
-    known = {key: entry for key, entry in _known_now(state, files, reports, _without_folder(folder, wrong)).items() if key not in dropped}
+    now = _known_now(state, files, reports, _without_folder(folder, wrong))
+    known = {key: entry for key, entry in now.items() if key not in dropped}
     atomic_write(place / OBSERVATIONS_FOLDER / DETECTED_FILE, detected_text(known))
     replace_parts(folder, gone=[name.with_suffix(".parquet").as_posix() for name in names])
     gone = [key for key in state.news.gone if key not in dropped]
