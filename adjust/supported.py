@@ -163,8 +163,8 @@ class _Needs:
                 if n < len(block.uv):
                     reduced.add(name)
         few = {n for n in reduced if 0 < points[n] < _OF_A_POSE and not self._unknowns.parameters[n].held}
-        for name, all_needs in others.items() if few else ():
-            for item, needs in zip(getattr(self.survey, name), all_needs, strict=True):
+        for kind, all_needs in others.items() if few else ():
+            for item, needs in zip(getattr(self.survey, kind), all_needs, strict=True):
                 few -= needs if item.used else _NOTHING
         return frozenset(few)
 
