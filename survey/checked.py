@@ -17,11 +17,12 @@ def checked(survey: Survey, run: Callable[[], Adjustment]) -> Adjustment:
     try:
         result = run()
     except SurveyError as error:
-        causes = separate_epochs(survey) + _probable_causes(survey)
-        if not causes:
+        apart, contradictions = separate_epochs(survey), _probable_causes(survey)
+        if not apart and not contradictions:
             raise
-        lines = "\n  - ".join(["probable cause:", *causes])
-        raise SurveyError(f"{lines}\n{_consequence(error)}") from error
+        lines = "\n  - ".join(["probable cause:", *apart, *contradictions])
+        said = _consequence(error) if contradictions else f"without that: {error}"
+        raise SurveyError(f"{lines}\n{said}") from error
     warnings: tuple[str, ...] = ()
     if survey.tables:
         from adjust.table_checks import sign_warnings  # here: a survey without a table starts without it
