@@ -2,9 +2,9 @@
 
 An observation that is not used is still predicted and tested, which needs every unknown in its chain. Where the last
 observation in use of an unknown is gone (the only image of an epoch, every sight of a beacon, all images of a camera),
-the unknown would stand in the normal equations with nothing to determine it: it goes, with the unused observations
-that hang on it. What an unused observation does not touch is never dropped: a station that nobody has measured is an
-error of the survey, not a decision of its owner.
+or fewer than three image points of an epoch's pose are left, the unknown would stand in the normal equations with
+nothing to determine it: it goes, with the observations that hang on it. What an unused observation does not touch is
+never dropped: a station that nobody has measured is an error of the survey, not a decision of its owner.
 """
 
 from collections.abc import Callable, Iterable
@@ -22,6 +22,8 @@ from adjust.unknowns import Chain, FrameTree, Unknowns
 
 Needs = frozenset[ParameterName]
 _NOTHING: Needs = frozenset()
+_OF_A_POSE = 3
+"""Image points that a pose needs at least."""
 
 
 def supported(survey: Survey) -> tuple[Survey, tuple[ParameterName, ...]]:
@@ -129,8 +131,11 @@ class _Needs:
         """All that observations in use need, and what each of the others needs."""
         used: set[ParameterName] = set()
         unused: list[Needs] = []
+        others = self.others()
+        few = self._seen_by_too_few(others)
         for block, needs in zip(self.survey.image_blocks, self.of_blocks, strict=True):
             taking = np.ones(len(block.uv), dtype=np.bool_) if block.used is None else block.used
+            taking = taking & (not needs & few)
             if taking.any():
                 used |= needs
             if not taking.all():
@@ -139,13 +144,33 @@ class _Needs:
                 for index in np.unique(block.point_idx[taking]).tolist():
                     used |= self.of_point(index)
                 unused += [self.of_point(index) for index in np.unique(block.point_idx[~taking]).tolist()]
-        for name, all_needs in self.others().items():
+        for name, all_needs in others.items():
             for item, needs in zip(getattr(self.survey, name), all_needs, strict=True):
                 if item.used:
                     used |= needs
                 else:
                     unused.append(needs)
         return frozenset(used), unused
+
+    def _seen_by_too_few(self, others: dict[str, list[Needs]]) -> Needs:
+        """Poses of an epoch of which people left less than a pose needs, all images of it together, and no reading."""
+        points: dict[ParameterName, int] = {}
+        reduced: set[ParameterName] = set()
+        for block, needs in zip(self.survey.image_blocks, self.of_blocks, strict=True):
+            n = len(block.uv) if block.used is None else int(block.used.sum())
+            for name in (name for name in needs if _is_of_epoch(name)):
+                points[name] = points.get(name, 0) + n
+                if n < len(block.uv):
+                    reduced.add(name)
+        few = {n for n in reduced if 0 < points[n] < _OF_A_POSE and not self._unknowns.parameters[n].held}
+        for kind, all_needs in others.items() if few else ():
+            for item, needs in zip(getattr(self.survey, kind), all_needs, strict=True):
+                few -= needs if item.used else _NOTHING
+        return frozenset(few)
+
+
+def _is_of_epoch(name: ParameterName) -> bool:
+    return len(name) == 3 and name[0] in ("world_from_station", "carrier_from_target")
 
 
 def _without(survey: Survey, needs: _Needs, lost: Needs) -> Survey:
@@ -190,4 +215,4 @@ def lost_notes(lost: Iterable[ParameterName], text: Callable[[ParameterName], st
     if not names:
         return ()
     more = f" and {len(names) - 12} more" if len(names) > 12 else ""
-    return (f"left out, because every observation of it is left out: {', '.join(names[:12])}{more}",)
+    return (f"left out, because every observation of it is left out, or too many are: {', '.join(names[:12])}{more}",)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-from adjust.errors import SurveyError
+from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.model import Survey
 from adjust.result import Adjustment
 from survey.epoch_names import separate_epochs
@@ -17,11 +17,12 @@ def checked(survey: Survey, run: Callable[[], Adjustment]) -> Adjustment:
     try:
         result = run()
     except SurveyError as error:
-        causes = separate_epochs(survey) + _probable_causes(survey)
-        if not causes:
+        apart, contradictions = separate_epochs(survey), _probable_causes(survey)
+        if not apart and not contradictions:
             raise
-        lines = "\n  - ".join(["probable cause:", *causes])
-        raise SurveyError(f"{lines}\nwithout that: {error}") from error
+        lines = "\n  - ".join(["probable cause:", *apart, *contradictions])
+        said = _consequence(error) if contradictions else f"without that: {error}"
+        raise SurveyError(f"{lines}\n{said}") from error
     warnings: tuple[str, ...] = ()
     if survey.tables:
         from adjust.table_checks import sign_warnings  # here: a survey without a table starts without it
@@ -32,6 +33,13 @@ def checked(survey: Survey, run: Callable[[], Adjustment]) -> Adjustment:
         causes = _probable_causes(survey, result) or _probable_causes(survey)
         warnings += tuple(c for c in causes if c not in warnings)
     return replace(result, warnings=tuple(f"probable cause: {c}" for c in warnings) + result.warnings)
+
+
+def _consequence(error: SurveyError) -> str:
+    """What failed. Directions and steps are those of a survey that contradicts itself: they would mislead."""
+    if isinstance(error, IndeterminateError | NotConvergedError):
+        return "mend that first: as it is, the observations lead to no solution"
+    return f"without that: {error}"
 
 
 def _probable_causes(survey: Survey, result: Adjustment | None = None) -> tuple[str, ...]:

@@ -70,7 +70,7 @@ class DetectOutcome:
         return (*self.wrong_sizes.values(), *lines)
 
     def _news(self, report: "ImageReport") -> bool:
-        missed = {t for t, d in report.detections.items() if not len(d)}
+        missed = _missed(report)
         return report.status == "failed" or not missed or not missed <= self.wrong_sizes.keys()
 
     def summary(self) -> dict[str, Any]:
@@ -98,6 +98,15 @@ class DetectOutcome:
             same = f"{self.n_same} images are as they were, their points stay (--all finds them anew)"
             head = f"{head}\n  {same}" if self.reports else f"{self.folder}: {same}"
         return "\n".join([head, *(f"  {line}" for line in (*self.problems, *self.notes))])
+
+
+def _missed(report: "ImageReport") -> set[str]:
+    return {target_id for target_id, found in report.detections.items() if not len(found)}
+
+
+def _without_folder(folder: Path, texts: Mapping[str, str]) -> dict[str, str]:
+    """As they stay true where the folder is moved."""
+    return {name: text.removeprefix(f"{folder}/") for name, text in texts.items()}
 
 
 def detect_job(
@@ -176,7 +185,8 @@ def detect_in(
         lines = "\n".join(f"  {r.path}: {r.message}" for r in reports[:10])
         raise SurveyError(f"{folder}: no target and no spot was found in {len(reports)} images:\n{lines}")
     names = _write(folder, place, state, wanted, dropped, blocks, spots)
-    known = {key: entry for key, entry in _known_now(state, files, reports).items() if key not in dropped}
+    now = _known_now(state, files, reports, _without_folder(folder, wrong))
+    known = {key: entry for key, entry in now.items() if key not in dropped}
     atomic_write(place / OBSERVATIONS_FOLDER / DETECTED_FILE, detected_text(known))
     replace_parts(folder, gone=[name.with_suffix(".parquet").as_posix() for name in names])
     gone = [key for key in state.news.gone if key not in dropped]
@@ -296,8 +306,9 @@ def author_name(said: Iterable[tuple[str, str]] = ()) -> str:
 
 
 def _known_now(
-    state: _State, files: Mapping[ImageKey, DetectedImage], reports: "Sequence[ImageReport]"
-) -> dict[ImageKey, DetectedImage]:
+    state: _State, files: Mapping[ImageKey, DetectedImage], reports: "Sequence[ImageReport]",
+    wrong_sizes: Mapping[str, str],
+) -> dict[ImageKey, DetectedImage]:  # fmt: skip
     """What is known of all images from now on; of images that are gone while their points are used, too."""
     known = {key: entry for key, entry in state.known.items() if key in state.news.gone}
     known |= state.news.same or {}
@@ -307,6 +318,7 @@ def _known_now(
             files[key], looked_for=state.sought[key].digest(), status=report.status, message=report.message,
             rows=state.rows_digest(key), n_image_points=sum(map(len, report.detections.values())),
             n_spots=0 if report.spots is None else len(report.spots),
+            wrong_size=next((text for t, text in wrong_sizes.items() if t in _missed(report)), ""),
         )  # fmt: skip
     return known | _given(state, known)
 

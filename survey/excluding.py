@@ -62,7 +62,7 @@ def exclude_job(
 
     names: ``image:X/h05``, ``epoch:h05``, ``camera:X``, ``target:board``, ``point:board/r7c2``, ``distances:B1-B2`` and
     so on, bare where one thing only has that name. author: who decides; the surveyor of the project where not given.
-    Raises SurveyError for what is unknown, may mean several things or is not used already.
+    Raises SurveyError for what is unknown, may mean several things or is left out already.
     """
     folder = Path(folder)
     if not reason.strip():
@@ -124,10 +124,11 @@ def new_rows(project: Project, names: Sequence[str], reason: str, author: str = 
             advice = f"; its coordinates belong to {member}: name the set by its id" if member else ""
             raise SurveyError(f"{place}: {error}{advice}") from error
         if name in there:
-            raise SurveyError(f"{place / EXCLUSIONS_FILE}:{there[name].line}: {name} is not used already; leave it out")
+            where = f"{place / EXCLUSIONS_FILE}:{there[name].line}"
+            raise SurveyError(f"{where}: {name} is left out already; name only what is not")
         if not left.is_used(name):
             by = f"'{project.folder.name}/{FILE}'" if there else "a table, by used = false"
-            raise SurveyError(f"{place}: {name} is not used already, by {by}; leave it out")
+            raise SurveyError(f"{place}: {name} is left out already, by {by}; name only what is not")
         rows[name] = Row(True, _said(project, name, reason, author, observed.place_of(name)))
     return list(rows.values())
 

@@ -98,14 +98,17 @@ def adjust_job(
     redetect: bool = False,
     report: ReportOptions = ENGLISH_PAGE,
     method: str = "joint",
+    said: str = "",
 ) -> AdjustOutcome:
     """The main job: detect where that has not been done, adjust everything, write the results. Raises SurveyError.
 
-    method: "published" runs the published step-by-step methods too and sets them beside the adjustment.
+    method: "published" runs the published step-by-step methods too and sets them beside the adjustment. said: the
+    command that asked for it, where it is not ``adjust``.
     """
     clock, folder = Clock(), Path(folder)
     target = folder if out is None else Path(out)
-    said = command_line("adjust", folder, redetect=redetect, method=None if method == "joint" else method, out=out)
+    chosen = None if method == "joint" else method
+    said = said or command_line("adjust", folder, redetect=redetect, method=chosen, out=out)
     with changing(target) as place:
 
         def detected() -> None:
@@ -148,10 +151,15 @@ def _plain_name(folder: Path) -> str:
 
 
 def image_warnings(images: Mapping[tuple[str, str], DetectedImage]) -> tuple[str, ...]:
-    """Images in which nothing was found, or that could not be read; at every adjustment, not only at the first."""
-    return tuple(
+    """Boards of a wrong size, once each; images in which nothing was found for another reason, or not readable.
+
+    At every adjustment, not only at the first.
+    """
+    sizes = dict.fromkeys(entry.wrong_size for entry in images.values() if entry.wrong_size)
+    return tuple(f"detection: {text}" for text in sizes) + tuple(
         f"detection: {entry.file}: {entry.status}{': ' + entry.message if entry.message else ''}"
-        for entry in images.values() if entry.status in ("nothing", "failed")
+        for entry in images.values()
+        if entry.status == "failed" or (entry.status == "nothing" and not entry.wrong_size)
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 
@@ -16,6 +17,7 @@ _RIVAL = 4.0  # a second pose whose error is within this factor of the best stay
 _NOISE_PX = 0.3  # ... or within this much of it
 _ENOUGH = 36  # points of a view from which its pose is found before all of them refine it
 _ALL_STEPS = 2  # of refinement with all points of a view
+_FEW = 4, 5  # points of a view, not in a plane, that have poses from each three of them too
 _GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustworthy
 
 
@@ -113,7 +115,7 @@ def make_views(sights: Sequence[Sight]) -> tuple[list[View], dict[int, str]]:
     for i in np.flatnonzero(~planar).tolist():
         part = slice(ptr[i], ptr[i + 1])
         try:
-            candidates[i] = pose_solutions(x[part], rays[part])
+            candidates[i] = _solutions(x[part], rays[part])
             if not len(candidates[i]):
                 n = len(sights[i].x)
                 raise SurveyError(f"no camera pose explains its {n} points; check their order and coordinates")
@@ -121,6 +123,23 @@ def make_views(sights: Sequence[Sight]) -> tuple[list[View], dict[int, str]]:
             candidates[i], failed[sights[i].block_idx] = np.zeros((0, 4, 4)), str(reason)
     of, poses = np.repeat(np.arange(len(sights)), [len(c) for c in candidates]), np.concatenate(candidates)
     return _with_poses(sights, poses, *view_errors(poses, x, rays, ptr, of), of), failed
+
+
+def _solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
+    """Poses (k, 4, 4) from all points, and where these are four or five from each three of them too.
+
+    The square sum of so few points has several minima, and SQPnP may end in one that is not the least.
+    """
+    every = pose_solutions(x, rays)
+    if not _FEW[0] <= len(x) <= _FEW[1]:
+        return every
+    found = [every]
+    for three in combinations(range(len(x)), 3):
+        try:
+            found.append(pose_solutions(x[list(three)], rays[list(three)]))
+        except SurveyError:  # on a line
+            continue
+    return np.concatenate(found)
 
 
 @lru_cache(maxsize=256)

@@ -16,6 +16,7 @@ from adjust.pose_network.graph import network_graph, network_ordering, network_v
 from adjust.pose_network.network import PoseNetwork, check_determined
 from adjust.pose_network.start import find_network_start
 
+_MOST_DAMPED = 1e10
 Progress = Callable[[int, float], None]
 
 
@@ -74,8 +75,13 @@ class GaussNewton:
                 if "ndetermin" not in str(error):
                     raise
                 self.use_qr = True  # weak, but determined: GTSAM's Cholesky refuses pivots that QR still resolves
-        delta = system.optimize(self.ordering, gtsam.EliminateQR)
-        if not np.isfinite(delta.norm()):
+        try:
+            delta = system.optimize(self.ordering, gtsam.EliminateQR)
+        except RuntimeError as error:
+            if "ndetermin" not in str(error):
+                raise
+            delta = None
+        if delta is None or not np.isfinite(delta.norm()):
             raise IndeterminateError("the pairs do not determine the stations; look for pairs with absurd covariances")
         return delta
 
@@ -103,7 +109,17 @@ class GaussNewton:
         steps: list[float] = []
         for iteration in range(1, options.max_iterations + 1):
             linear = self.graph.linearize(self.values)
-            delta = self.solve(linear)
+            try:
+                delta = self.solve(linear)
+            except IndeterminateError:
+                if iteration == 1:
+                    raise
+                # what the pairs determine was judged at the start: on the way out it is the place that is bad
+                self.values, steps = best_values, []
+                self.damping = max(10.0 * self.damping, 1e-5)
+                if self.damping > _MOST_DAMPED:
+                    break
+                continue
             moved = float(np.sqrt(max(0.0, -delta.dot(linear.gradientAtZero()))))
             self.values = self.values.retract(delta)
             history.append(2.0 * float(self.graph.error(self.values)))
@@ -120,7 +136,7 @@ class GaussNewton:
             if (self.damping > 0.0 or waited >= options.patience) and not moved < 1e-3:
                 self.values, steps = best_values, []
                 self.damping = max(10.0 * self.damping, 1e-5)
-            if not np.isfinite(history[-1]) or self.damping > 1e10:
+            if not np.isfinite(history[-1]) or self.damping > _MOST_DAMPED:
                 break
         raise NotConvergedError(
             f"the network did not converge in {iteration} steps (the last moved {moved:.2g} sigma); "

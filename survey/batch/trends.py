@@ -54,7 +54,7 @@ class Trends:
     def strays(self, c: Chart) -> bool:
         """Whether a single epoch is further off than chance makes one of all points of all charts."""
         bound = float(norm.isf(0.5 * sidak(LEVEL, max(self.n_points, 1))))
-        return bool((WIDTH * np.abs(c.series.value - c.mean) > bound * c.by_sigma).any())
+        return bool((np.abs(c.deviation) > bound).any())
 
     def unlikely(self, run: Run) -> bool:
         """Whether chance makes a run as long or longer in all charts together at most as often as ``LEVEL`` says.
@@ -136,6 +136,7 @@ def _alarm(c: Chart) -> float:
 def all_series(records: Sequence[Record]) -> Iterator[Series]:
     """sigma0, groups, then every number and rotation, in the order in which the first epoch has them."""
     rows: dict[tuple[str, str], list[tuple[int, float, float]]] = {}
+    freedom = np.array([_freedom(record) for record in records])
     for epoch, record in enumerate(records):
         for name, unit, value, sigma in (*_quality(record), *((n.name, n.unit, n.value, n.sigma)
                                                               for n in record.numbers)):  # fmt: skip
@@ -145,7 +146,17 @@ def all_series(records: Sequence[Record]) -> Iterator[Series]:
         rows.setdefault((name, unit), []).append((epoch, value, sigma))
     for (name, unit), found in rows.items():
         epochs, values, sigmas = (np.array(column) for column in zip(*found, strict=True))
-        yield Series(name, unit, epochs.astype(np.int64), values.astype(float), sigmas.astype(float))
+        at, known = epochs.astype(np.int64), name == "sigma0" or name.startswith("group/")
+        if known:  # sigma over value is known: with each its own, small values would count more
+            sigmas = sigmas / values * float(np.median(values))
+        free = np.full(len(at), np.inf) if known else freedom[at]
+        yield Series(name, unit, at, values.astype(float), sigmas.astype(float), free)
+
+
+def _freedom(record: Record) -> float:
+    """Of the sigma0 that scales all sigmas of an epoch; infinite where they are a priori."""
+    redundancy = record.summary.get("redundancy") or 0
+    return float(redundancy) if record.summary.get("sigmas") == "a_posteriori" and redundancy > 0 else float("inf")
 
 
 def _quality(record: Record) -> Iterator[tuple[str, str, float, float]]:

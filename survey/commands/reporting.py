@@ -29,12 +29,14 @@ def declare_report(commands: Any, shaped: dict[str, Any]) -> None:
 
 def _report(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder, arguments.out)
-    from survey.jobs import adjust_job
+    from survey.jobs import adjust_job, command_line
     from survey.results import ReportOptions
 
+    language = arguments.language if arguments.language != "en" else None
+    flags = {"language": language, "pdf": arguments.pdf, "check": arguments.check, "out": arguments.out}
     outcome = adjust_job(
         arguments.folder, out=arguments.out, progress=not is_set(arguments, "quiet"),
-        report=ReportOptions(arguments.language, arguments.pdf),
+        report=ReportOptions(arguments.language, arguments.pdf), said=command_line("report", arguments.folder, **flags),
     )  # fmt: skip
     unmet = [v for v in outcome.statistics.verdicts if not v.met] if outcome.statistics is not None else []
     if is_set(arguments, "json"):

@@ -43,10 +43,13 @@ def find_checkerboard(gray: Gray32, gray8: Gray8, target: Checkerboard) -> Detec
 def other_board(gray: Gray32, gray8: Gray8, target: Checkerboard) -> tuple[int, int] | None:
     """Columns and rows of inner corners of a board that has one fewer, as where squares were counted, or one more.
 
+    In both numbers or in one of them.
+
     To be asked where the target itself was not found. None where there is no such board either.
     """
     c, r = target.columns, target.rows
-    for columns, rows in ((c - 1, r - 1), (c + 1, r + 1), (c - 1, r), (c, r - 1)):
+    steps = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1), (1, -1), (-1, 1))
+    for columns, rows in ((c + i, r + j) for i, j in steps):
         found = _find(gray8, columns, rows) if min(columns, rows) >= 3 else None
         if found is not None:
             detection, whole = _measured(gray, gray8, found.reshape(rows, columns, 2))

@@ -514,12 +514,18 @@ GERMAN_MESSAGES = (
         "(v'Pv = {}, erwartet {} bis {})",
     ),
     (
-        r"left out, because every observation of it is left out: (.*)",
-        "ausgelassen, weil jede Beobachtung davon ausgelassen ist: {}",
+        r"left out, because every observation of it is left out, or too many are: (.*)",
+        "ausgelassen, weil alle oder zu viele Beobachtungen davon ausgelassen sind: {}",
     ),
     (
         r"(.*): (\S+) is left out, but nothing has that name; (.*)",
         "{}: {} ist ausgeschlossen, bezeichnet aber nichts; {}",
+    ),
+    (
+        r"detection: survey\.toml: \[targets\.(.*)\] says columns = (\d+), rows = (\d+), but the images show "
+        r"a board of (\d+) x (\d+) inner corners; .*",
+        "Erkennung: survey.toml: [targets.{}] nennt columns = {}, rows = {}, die Bilder zeigen aber eine Tafel von "
+        "{} x {} inneren Ecken (Ecken werden gezählt, nicht Felder)",
     ),
     (r"detection: (.*): nothing: (.*)", "Erkennung: {}: nichts gefunden: {}"),
     (r"detection: (.*): failed: (.*)", "Erkennung: {}: nicht lesbar: {}"),

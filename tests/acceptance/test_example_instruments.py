@@ -59,9 +59,9 @@ def test_commands(tmp_path, capsys):
         assert solution["vertical"]["up_in_world"] == [0.0, 0.0, 1.0]
         # a reading without an id is called by its row
         assert main(["remove", folder, "r11", "--quiet"]) in (0, 3)
-        assert "removed: terrestrial r11" in capsys.readouterr().out
-        rows = (tmp_path / name / "observations" / "terrestrial.csv").read_text().splitlines()
-        assert [row.endswith(",false") for row in rows].index(True) == 11
+        assert "removed: terrestrial:r11" in capsys.readouterr().out
+        rows = (tmp_path / name / "observations" / "exclusions.csv").read_text().splitlines()
+        assert [row.split(",")[:3] for row in rows[1:]] == [["terrestrial", "r11", "excluded"]]
 
 
 def test_report_shows_instruments_surfaces_and_beams_in_both_languages(tmp_path):

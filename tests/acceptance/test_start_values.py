@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.errors import NotConvergedError
+from adjust.errors import NotConvergedError, SurveyError
 from survey.files import read
 from survey.jobs import adjust_project
 from survey.navigation import NavigateRequest, navigate_job
@@ -38,6 +38,13 @@ def test_what_diverges_names_the_set_up(name: str) -> None:
     said = str(caught.value)
     assert "look first at setup S2a" in said
     assert "undetermined" not in said
+
+
+def test_a_mirrored_camera_is_named_and_nothing_is_undetermined() -> None:
+    with pytest.raises(SurveyError) as caught:
+        adjusted(data_folder("calibration", "wobbling", "mirror"))
+    assert "camera B: its images contradict those of all others" in str(caught.value)
+    assert "undetermined" not in str(caught.value)
 
 
 def test_an_inverted_pair_is_left_out_alone() -> None:

@@ -15,7 +15,7 @@ from adjust.pose_network.from_survey import network_adjustment, network_from_sur
 from adjust.pose_network.network import PoseNetwork, loop_marks
 from adjust.pose_network.precision import pair_jacobians
 from adjust.pose_network.robust import _worst_around, graduated_weights
-from adjust.pose_network.solve import minimize
+from adjust.pose_network.solve import GaussNewton, minimize
 from adjust.relay.motions import Motions
 from tests.adjust.pose_networks import exp6, simulate
 
@@ -421,3 +421,24 @@ def test_our_least_squares_equals_gtsams_optimiser() -> None:
     assert ours.omega == pytest.approx(2 * graph.error(theirs), rel=1e-6)
     for i, s in enumerate(net.station_ids):
         assert theirs.atPose3(i).matrix() == pytest.approx(ours.pose(s).matrix(), abs=1e-4)
+
+
+def test_a_place_without_a_step_on_the_way_is_no_verdict_on_the_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The step that cannot be taken is damped from the best place; only at the start it speaks of what is measured."""
+    sim = simulate(4, 3)
+    plain, solve, calls = minimize(sim.network), GaussNewton.solve, []
+
+    def failing(loop: GaussNewton, linear: gtsam.GaussianFactorGraph) -> gtsam.VectorValues:
+        calls.append(loop.damping)
+        if len(calls) == at:
+            raise IndeterminateError("the pairs do not determine the stations")
+        return solve(loop, linear)
+
+    monkeypatch.setattr(GaussNewton, "solve", failing)
+    at = 2
+    found = minimize(sim.network)
+    assert found.omega == pytest.approx(plain.omega, rel=1e-9)
+    assert calls[2] > 0.0
+    at, calls[:] = 1, []
+    with pytest.raises(IndeterminateError):
+        minimize(sim.network)

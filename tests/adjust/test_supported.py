@@ -10,7 +10,7 @@ from adjust.adjustment import adjust
 from adjust.model import Point, PointParameter, PoseParameter, Setup, Station, Survey
 from adjust.observations import Coordinates, Distance, FrameRef, Pair, PositionRef, Reading
 from adjust.supported import lost_notes, supported
-from survey.simulate import head_on_table
+from survey.simulate import head_on_table, single_camera
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +50,21 @@ def test_an_epoch_without_reading_and_image_goes(table):
     assert adjust(kept).omega == pytest.approx(adjust(without).omega, rel=1e-9)
 
 
+def test_an_epoch_of_which_two_points_are_left_goes_and_one_of_three_stays():
+    survey = single_camera(1, n_images=8)[0]
+    block = survey.image_blocks[0]
+    for left, names in ((1, {block.epoch_id}), (2, {block.epoch_id}), (3, set())):
+        used = np.arange(len(block.uv)) < left
+        less = replace(survey, image_blocks=(replace(block, used=used), *survey.image_blocks[1:]))
+        kept, lost = supported(less)
+        assert {name[2] for name in lost} == names
+        assert len(kept.image_blocks) == len(survey.image_blocks) - len(names)
+    whole = adjust(replace(survey, image_blocks=survey.image_blocks[1:]))
+    used = np.arange(len(block.uv)) < 2
+    less = replace(survey, image_blocks=(replace(block, used=used), *survey.image_blocks[1:]))
+    assert adjust(supported(less)[0]).omega == pytest.approx(whole.omega, rel=1e-9)
+
+
 def _ring():
     held = PoseParameter(Pose3(), "held")
     stations = tuple(Station(f"S{i}", world_from_station=held if i == 0 else PoseParameter()) for i in range(4))
@@ -81,7 +96,7 @@ def test_points_and_what_would_reach_them():
     assert [p.point_id for p in kept.points] == ["A", "B"]
     assert [d.distance_id for d in kept.distances] == ["ab"]
     assert len(kept.coordinates) == 1
-    assert lost_notes(lost) == ("left out, because every observation of it is left out: point C",)
+    assert lost_notes(lost) == ("left out, because every observation of it is left out, or too many are: point C",)
     one_ray = replace(survey, distances=(Distance("bc", b, c, 1.7, 1e-3),))
     assert supported(one_ray)[1] == ()  # one distance still observes it, which is not enough, and that is an error
 

@@ -8,11 +8,13 @@ from adjust.closed_forms import (
     plane_misfits,
     plane_poses,
     refine_poses,
+    rigid,
     rotation_exp,
     rotation_log,
     view_errors,
     view_offsets,
 )
+from adjust.initial.views import Sight, make_views, refine_views
 
 
 def board_views(n, seed=3, sigma=0.0):
@@ -156,3 +158,22 @@ def test_refinement_ends_at_the_least_squares_pose():
         for step in 1e-4 * np.eye(6):
             up, down = square_sum(step), square_sum(-step)
             assert abs(up - down) < 1e-2 * (up + down - 2.0 * here)
+
+
+def test_few_points_off_a_plane_have_their_pose_in_any_order():
+    """Four points have several minima, of which a solution from all of them may give a wrong one alone."""
+    rng, f, views, true = np.random.default_rng(5), 1900.0, [], []
+    for i in range(60):
+        R, t = rotation_exp(rng.normal(0.0, 0.5, 3)), np.array([0.0, 0.0, 3.0])
+        x = rng.uniform(-1.2, 1.2, (4, 3))
+        p = x @ R.T + t
+        uv = p[:, :2] / p[:, 2:] + rng.normal(0.0, 0.3 / f, (4, 2))
+        rays = np.column_stack([uv, np.ones(4)])
+        views.append(Sight(i, x, rays / np.linalg.norm(rays, axis=1)[:, None], f))
+        true.append(rigid(R, t))
+    for order in ([0, 1, 2, 3], [0, 2, 3, 1], [3, 0, 1, 2], [1, 3, 2, 0]):
+        found, failed = make_views([Sight(s.block_idx, s.x[order], s.rays[order], f) for s in views])
+        assert not failed
+        for view, pose in zip(refine_views(found), true, strict=True):
+            off = np.linalg.norm(view.poses[:, :3, 3] - pose[:3, 3], axis=1)
+            assert off.min() < 0.05, view.block_idx

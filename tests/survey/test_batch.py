@@ -50,9 +50,25 @@ def records(nights: list[Path]) -> tuple[Record, ...]:
     return tuple(adjust_task({"folder": str(f), "path": str(f), "redetect": False}) for f in nights)
 
 
-def series(values: np.ndarray, sigma: float | np.ndarray = 1.0, name: str = "x") -> Series:
+def series(values: np.ndarray, sigma: float | np.ndarray = 1.0, name: str = "x", freedom: float = np.inf) -> Series:
     n = len(values)
-    return Series(name, "mm", np.arange(n), np.asarray(values, float), np.broadcast_to(sigma, n).astype(float))
+    sigmas = np.broadcast_to(sigma, n).astype(float)
+    return Series(name, "mm", np.arange(n), np.asarray(values, float), sigmas, np.full(n, freedom))
+
+
+def test_sigmas_from_few_observations_raise_no_more_alarms_than_known_ones() -> None:
+    """Sigmas scaled by a sigma0 with ten degrees of freedom each; taken as known, noise leaves the limits too often."""
+    rng, freedom, n, trials = np.random.default_rng(4), 10.0, 8, 1500
+    found = {f: np.zeros(3) for f in (freedom, np.inf)}
+    for _ in range(trials):
+        sigma = np.sqrt(rng.chisquare(freedom, n) / freedom)
+        values = rng.normal(size=n)
+        for f, counts in found.items():
+            c = chart(series(values, sigma, freedom=f))
+            counts += [c.p < 0.01, c.p_slope < 0.01, np.abs(c.deviation).max() > 3.5]
+    expected = trials * np.array([0.01, 0.01, n * 4.65e-4])
+    assert (found[np.inf][[0, 2]] > 4.0 * expected[[0, 2]]).all()
+    assert (found[freedom] < 2.5 * expected + 5.0).all(), found
 
 
 def test_broken_folders_are_failures_with_a_reason(records: tuple[Record, ...]) -> None:

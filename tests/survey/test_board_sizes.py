@@ -8,7 +8,7 @@ from gtsam import Pose3, Rot3
 from adjust.errors import SurveyError
 from survey.detection import detect_image
 from survey.detection.extent import grown, is_of_neighbours
-from survey.jobs import detect_job
+from survey.jobs import adjust_job, detect_job
 from survey.rendering import BrownCamera, Imaging, PlacedTarget, render
 from survey.targets import Checkerboard
 from tests.data import data_folder
@@ -117,7 +117,8 @@ def project(folder, columns, rows, n=3):
 
 
 @pytest.mark.parametrize(
-    ("columns", "rows", "says"), [(10, 7, (9, 6)), (7, 10, (6, 9)), (8, 5, (9, 6)), (9, 7, (9, 6))]
+    ("columns", "rows", "says"),
+    [(10, 7, (9, 6)), (7, 10, (6, 9)), (8, 5, (9, 6)), (9, 7, (9, 6)), (9, 5, (9, 6)), (8, 6, (9, 6)), (8, 7, (9, 6))],
 )
 def test_a_wrong_size_is_said_once_with_the_keys_to_change(tmp_path, columns, rows, says):
     with pytest.raises(SurveyError) as error:
@@ -134,3 +135,21 @@ def test_a_second_board_of_another_size_is_no_wrong_size(tmp_path):
     outcome = detect_job(lab, jobs=1, progress=False)
     assert outcome.wrong_sizes == {}
     assert outcome.summary()["image_points"] == 3 * 54
+
+
+def test_a_wrong_size_is_said_at_every_adjustment(tmp_path):
+    """Where another board was found, the images are not looked at again."""
+    lab = project(tmp_path / "lab", 9, 6)
+    held = 'station_from_camera = { treatment = "held" }\n[stations'
+    toml = (lab / "survey.toml").read_text().replace("[stations", held)
+    (lab / "survey.toml").write_text(toml)
+    with open(lab / "survey.toml", "a") as file:
+        file.write('[targets.small]\nkind = "checkerboard"\ncolumns = 7\nrows = 5\nsquare_mm = 20\nmotion = "epoch"\n')
+    for k in range(3):
+        view = placed(Checkerboard(7, 4, 0.02), (0.1, 0.2 * k, 0.1))
+        cv2.imwrite(str(lab / "images" / "c" / f"s{k}.png"), image_of(view, seed=k))
+    text = "survey.toml: [targets.small] says columns = 7, rows = 5, but the images show a board of 7 x 4 inner corners"
+    for _ in range(2):
+        said = [w for w in adjust_job(lab, progress=False).adjustment.warnings if w.startswith("detection")]
+        assert len(said) == 1
+        assert text in said[0]

@@ -140,7 +140,7 @@ def test_what_cannot_be_excluded_or_included_says_why(mine, capsys):
     before = table(mine)
     for command, name, message in (
         ("exclude", f"epoch:{epoch}", "exclusions.csv:2: "),
-        ("exclude", f"left/{epoch}", "is not used already"),
+        ("exclude", f"left/{epoch}", "is left out already"),
         ("include", f"left/{epoch}", f"is left out by epoch:{epoch}; take that back"),
         ("include", "r1c1", "point:board/r1c1 is not excluded"),
     ):
@@ -162,7 +162,7 @@ def _only_image(mine):
 def test_the_only_images_of_an_epoch_take_its_pose_with_them(mine):
     epoch = _only_image(mine)
     outcome = adjust_job(mine, progress=False)
-    assert any(f"every observation of it is left out: world_from_station head {epoch}" in w
+    assert any(f"every observation of it is left out, or too many are: world_from_station head {epoch}" in w
                or f"{epoch}" in w for w in outcome.adjustment.warnings)  # fmt: skip
     assert not any(n[0] == "world_from_station" and n[-1] == epoch for n in outcome.adjustment.estimates)
 

@@ -122,7 +122,7 @@ def test_a_project_that_was_not_adjusted_is_adjusted_without_comparison(tmp_path
     assert outcome.moved == ()
     assert "not adjusted yet" in outcome.why
     assert (tmp_path / "lab/results/solution.json").is_file()
-    with pytest.raises(SurveyError, match="is not used already"):
+    with pytest.raises(SurveyError, match="is left out already"):
         remove_job(tmp_path / "lab", ["p0-2"], progress=False)
 
 
