@@ -141,10 +141,13 @@ def render(
         _add_beacons(image, camera, beacons, facets, imaging.blur_px)
     rng = np.random.default_rng(seed)
     if imaging.noise_gray > 0.0:
-        image += imaging.noise_gray * rng.standard_normal(image.shape, dtype=np.float32)
+        noise = rng.standard_normal(image.shape, dtype=np.float32)
+        noise *= imaging.noise_gray
+        image += noise
     full = 2**imaging.bits - 1
-    digits = np.clip(np.rint(image * (full / 255.0)), 0, full)
-    return np.asarray(digits, np.uint8) if imaging.bits <= 8 else np.asarray(digits, np.uint16)
+    image *= full / 255.0
+    np.clip(np.rint(image, out=image), 0, full, out=image)
+    return np.asarray(image, np.uint8) if imaging.bits <= 8 else np.asarray(image, np.uint16)
 
 
 def _blurred_planes(camera: BrownCamera, facets: list[_Facet], imaging: Imaging) -> _Gray32:
@@ -156,6 +159,7 @@ def _blurred_planes(camera: BrownCamera, facets: list[_Facet], imaging: Imaging)
     return image
 
 
+@lru_cache(maxsize=4)
 def _illumination(image_size: tuple[int, int], gradient: tuple[float, float]) -> _Gray32:
     width, height = image_size
     u, v = np.arange(width) / width - 0.5, np.arange(height) / height - 0.5

@@ -36,5 +36,10 @@ inline double magnitude(double x) { return __builtin_fabs(x); }
 inline V magnitude(V v) { return v < 0.0 ? -v : v; }
 inline double where(bool mask, double a, double b) { return mask ? a : b; }
 template <class M> inline V where(M mask, V a, V b) { return mask ? a : b; }
+template <class M> inline bool any(M mask) {
+    bool found = false;
+    for (int i = 0; i < W; ++i) found |= mask[i] != 0;
+    return found;
+}
 
 }  // namespace
