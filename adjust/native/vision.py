@@ -128,19 +128,20 @@ def pixel_corner_rays(width: int, height: int, lens: FloatArray) -> FloatArray:
     return rays
 
 
-def draw_facets(rays: FloatArray, n: int, facets: Facets, background: float, samples: FloatArray) -> Gray:
-    """Grey values (n * height, n * width) of sub-pixels, each integrated over its area; rays: of the pixel corners.
+def draw_facets(
+    rays: FloatArray, n: int, facets: Facets, background: float, samples: FloatArray, image: Gray
+) -> None:
+    """Draw sub-pixels (n * height, n * width), each integrated over its area, into image; rays: of the pixel corners.
 
     samples: (S, 2) offsets in the unit square of a sub-pixel that sees an edge.
     """
-    height, width = rays.shape[0] - 1, rays.shape[1] - 1
-    image = np.empty((n * height, n * width), np.float32)
+    if image.shape != (n * (rays.shape[0] - 1), n * (rays.shape[1] - 1)):
+        raise ValueError(f"draw_facets: image is {image.shape}, {n} sub-pixels for each of {rays.shape} corners")
     s, t = samples.T
     weights = np.zeros((4, -(-len(samples) // _LANES) * _LANES))
     weights[:, : len(samples)] = (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
-    _draw_facets(0, height, rays, n, *facets, background, samples, weights, image,
+    _draw_facets(0, len(rays) - 1, rays, n, *facets, background, samples, weights, image,
                  np.empty(len(facets.from_ray), np.int64))  # fmt: skip
-    return image
 
 
 def spread_and_sum(image: Gray, n: int, sigma: float) -> Gray:
