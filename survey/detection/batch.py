@@ -50,7 +50,8 @@ def detect_images(
     cores = len(os.sched_getaffinity(0))
     if jobs is None and min(cores, len(tasks)) > 1:
         processes = min(cores, len(tasks) // _IMAGES_PER_PROCESS)
-        jobs, run = (processes, _in_processes) if processes > _MOST_THREADS else (min(cores, _MOST_THREADS), _in_threads)
+        many = processes > _MOST_THREADS
+        jobs, run = (processes, _in_processes) if many else (min(cores, _MOST_THREADS), _in_threads)
     else:
         jobs = jobs or 1
         run = _in_processes if jobs > 1 and len(tasks) > 1 else _here

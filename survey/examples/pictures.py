@@ -22,7 +22,10 @@ DAY = Imaging(blur_px=0.9, noise_gray=4.0, background_gray=105.0, gradient=(0.18
 NIGHT = Imaging(blur_px=0.9, noise_gray=2.0, background_gray=6.0)
 BEACON_DIAMETER_M = 0.006
 # noise does not repeat itself: a search for repetitions takes three times as long and makes no smaller file
-_PNG = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP)
+_PNG = (
+    *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
+    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP),
+)
 
 
 def write_images(draft: Draft, folder: Path, seed: int, jobs: int | None, progress: bool) -> None:

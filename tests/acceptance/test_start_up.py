@@ -11,7 +11,8 @@ from survey.cli import main
 
 NEEDLESS = (
     "cv2", "matplotlib", "pycolmap", "pandas", "pyarrow", "distributed", "scipy.stats", "scipy.optimize",
-    "scipy.linalg", "scipy.sparse.linalg", "scipy.sparse.csgraph", "scipy.spatial", "scipy.fft", "numpy.f2py.crackfortran",
+    "scipy.linalg", "scipy.sparse.linalg", "scipy.sparse.csgraph", "scipy.spatial", "scipy.fft",
+    "numpy.f2py.crackfortran",
     "adjust.pose_network", "adjust.relay", "adjust.table_checks", "survey.detection", "survey.simulate",
 )  # fmt: skip
 CODE = """
