@@ -86,7 +86,7 @@ struct Cross {
             const int64_t wide = lattice.weights.n[1], none = wide - lattice.n;  // no ray: zero, beyond both
             const double *w[4] = {&lattice.weights(0, 0), &lattice.weights(1, 0), &lattice.weights(2, 0), &lattice.weights(3, 0)};
             V count[3] = {};
-            for (int64_t k = 0; k < wide; k += W) {
+            for (int64_t k = 0; k + W <= wide; k += W) {
                 const V v[4] = {load(w[0] + k), load(w[1] + k), load(w[2] + k), load(w[3] + k)}, one = all<V>(1.0), zero = V{};
                 const V x = v[0] * beyond[0][0] + v[1] * beyond[0][1] + v[2] * beyond[0][2] + v[3] * beyond[0][3];
                 const V y = v[0] * beyond[1][0] + v[1] * beyond[1][1] + v[2] * beyond[1][2] + v[3] * beyond[1][3];
