@@ -39,7 +39,7 @@ from survey.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, s
 from survey.statistics import Statistics, statistics_of
 from survey.symmetric_boards import consistent_turns
 
-_PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-headless", "numba")
+_PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-headless")
 
 
 _OTHERS = ("table_readings", "pairs", "distances", "coordinates", "readings", "coordinate_differences", "levels",

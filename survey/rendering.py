@@ -8,6 +8,7 @@ Textures: the square of a checkerboard between r0c0, r0c1, r1c1 and r1c0 is dark
 have one row of squares outside the inner corners and a bright margin. Targets show a plain back.
 """
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -27,6 +28,7 @@ from survey.targets import Charuco, Checkerboard, DetectableTarget, MarkerBlock,
 
 GrayImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 _Gray32 = npt.NDArray[np.float32]
+_kept = threading.local()
 
 
 @dataclass(frozen=True)
@@ -141,21 +143,37 @@ def render(
         _add_beacons(image, camera, beacons, facets, imaging.blur_px)
     rng = np.random.default_rng(seed)
     if imaging.noise_gray > 0.0:
-        image += imaging.noise_gray * rng.standard_normal(image.shape, dtype=np.float32)
+        noise = rng.standard_normal(image.shape, dtype=np.float32)
+        noise *= imaging.noise_gray
+        image += noise
     full = 2**imaging.bits - 1
-    digits = np.clip(np.rint(image * (full / 255.0)), 0, full)
-    return np.asarray(digits, np.uint8) if imaging.bits <= 8 else np.asarray(digits, np.uint16)
+    image *= full / 255.0
+    np.clip(np.rint(image, out=image), 0, full, out=image)
+    return np.asarray(image, np.uint8) if imaging.bits <= 8 else np.asarray(image, np.uint16)
 
 
 def _blurred_planes(camera: BrownCamera, facets: list[_Facet], imaging: Imaging) -> _Gray32:
     """Grey values under the point spread, which acts on sub-pixels before they are summed to pixels."""
-    n = imaging.oversampling if imaging.blur_px > 0.0 else 1
-    image = _planes(camera, n, facets, imaging)
-    if imaging.blur_px > 0.0:
-        image = spread_and_sum(image, n, n * imaging.blur_px)
-    return image
+    width, height = camera.image_size
+    if not imaging.blur_px > 0.0:
+        image = np.empty((height, width), np.float32)
+        _draw_planes(camera, 1, facets, imaging, image)
+        return image
+    n = imaging.oversampling
+    image = _canvas((n * height, n * width))
+    _draw_planes(camera, n, facets, imaging, image)
+    return spread_and_sum(image, n, n * imaging.blur_px)
 
 
+def _canvas(shape: tuple[int, int]) -> _Gray32:
+    """Room for sub-pixels, this thread's own until the next image: so much fresh memory takes as long as drawing."""
+    kept = getattr(_kept, "canvas", None)
+    if kept is None or kept.shape != shape:
+        kept = _kept.canvas = np.empty(shape, np.float32)
+    return np.asarray(kept)
+
+
+@lru_cache(maxsize=4)
 def _illumination(image_size: tuple[int, int], gradient: tuple[float, float]) -> _Gray32:
     width, height = image_size
     u, v = np.arange(width) / width - 0.5, np.arange(height) / height - 0.5
@@ -181,11 +199,11 @@ def _lattice(n: int) -> FloatArray:
     return np.stack([(i + 0.5) / n, ((i * previous) % n + 0.5) / n], axis=1)
 
 
-def _planes(camera: BrownCamera, n: int, facets: list[_Facet], imaging: Imaging) -> _Gray32:
-    """Grey values of n x n sub-pixels in each pixel, before the point spread."""
-    width, height = camera.image_size
+def _draw_planes(camera: BrownCamera, n: int, facets: list[_Facet], imaging: Imaging, image: _Gray32) -> None:
+    """Grey values of n x n sub-pixels in each pixel, before the point spread, into image."""
     if not facets:
-        return np.full((n * height, n * width), imaging.background_gray, np.float32)
+        image.fill(imaging.background_gray)
+        return
     n_x, n_y = max(len(f.x_edges) for f in facets), max(len(f.y_edges) for f in facets)
     x_edges, y_edges = np.zeros((len(facets), n_x)), np.zeros((len(facets), n_y))
     cells, counts = np.zeros((len(facets), n_y - 1, n_x - 1)), np.zeros((len(facets), 2), np.int64)
@@ -196,7 +214,7 @@ def _planes(camera: BrownCamera, n: int, facets: list[_Facet], imaging: Imaging)
     inverse = np.stack([np.linalg.inv(f.camera_from_facet) for f in facets])
     bounds = np.stack([_bounds(f) for f in facets])
     planes = Facets(inverse, bounds, counts, x_edges, y_edges, cells)
-    return draw_facets(_rays(camera), n, planes, float(imaging.background_gray), _lattice(imaging.samples))
+    draw_facets(_rays(camera), n, planes, float(imaging.background_gray), _lattice(imaging.samples), image)
 
 
 def _bounds(facet: _Facet) -> FloatArray:

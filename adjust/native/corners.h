@@ -30,6 +30,18 @@ struct NormalTable {
         p = phi[i] + f * d * (1.0 + d * (second * d / 6.0 - 0.5 * a));
         g = f * (1.0 + d * (-a + d * (0.5 * second - d * a * (second - 2.0) / 6.0)));
     }
+    void at(V x, V &p, V &g) const {
+        const auto seen = magnitude(x) < UNSEEN;
+        const V inside = seen ? x : V{};
+        V a, f, base;
+        for (int e = 0; e < W; ++e) {
+            const int i = int(inside[e] * PER_SIGMA + (UNSEEN * PER_SIGMA + 0.5));
+            a[e] = double(i) / PER_SIGMA - UNSEEN, f[e] = density[i], base[e] = phi[i];
+        }
+        const V d = inside - a, second = a * a - 1.0;
+        p = seen ? base + f * d * (1.0 + d * (second * d / 6.0 - 0.5 * a)) : x > 0.0 ? all<V>(1.0) : V{};
+        g = seen ? f * (1.0 + d * (-a + d * (0.5 * second - d * a * (second - 2.0) / 6.0))) : V{};
+    }
 };
 
 // Nodes on (0, 1) and weights of Gauss and Legendre with 3, 4 and 6 nodes (Abramowitz and Stegun 1964, table 25.4).
@@ -66,21 +78,27 @@ struct Wedge {
         }
     }
 
-    // Grey value at (x, y) px from the window's centre, and its derivatives by the parameters. The bivariate distribution
-    // function and its derivatives by h, k, rho: Drezner and Wesolowsky 1990.
-    double operator()(double x, double y, double *d) const {
-        const double dx = x - p[0], dy = y - p[1], h = (c1 * dy - s1 * dx) * scale, k = (s2 * dx - c2 * dy) * scale, b = p[5];
-        double ph, gh, pk, gk, f, dh, dk, dr = 0.0;
+    // Grey value at (x, y) px from the window's centre, and its derivatives by the parameters; of one pixel or of several
+    // side by side. The bivariate distribution function and its derivatives by h, k, rho: Drezner and Wesolowsky 1990.
+    template <class S> S operator()(S x, S y, S *d) const {
+        const S dx = x - p[0], dy = y - p[1], h = (c1 * dy - s1 * dx) * scale, k = (s2 * dx - c2 * dy) * scale;
+        const double b = p[5];
+        S ph, gh, pk, gk, dr = all<S>(0.0);
         normal.at(h, ph, gh), normal.at(k, pk, gk);
-        if (magnitude(h) > FAR || magnitude(k) > FAR) {
-            f = ph * pk, dh = gh * pk, dk = gk * ph;
-        } else {
-            const double square = h * h + k * k, product = h * k;
-            double total = 0.0, by_h, by_k, density, unused;
-            for (int i = 0; i < nodes; ++i) total += weight[i] * std::exp((square - twice_sine[i] * product) * power[i]);
+        S f = ph * pk, dh = gh * pk, dk = gk * ph;
+        const S reach = where(magnitude(h) > magnitude(k), magnitude(h), magnitude(k));
+        const auto near = reach <= FAR;
+        if (any(near)) {
+            const S square = h * h + k * k, product = h * k;
+            S total = all<S>(0.0), by_h, by_k, density, unused;
+            for (int i = 0; i < nodes; ++i) {
+                const S power_of = (square - twice_sine[i] * product) * power[i];
+                total += weight[i] * exponential(where(power_of > -700.0, power_of, all<S>(-700.0)));
+            }
             normal.at((k - rho * h) * c, by_h, density), normal.at((h - rho * k) * c, by_k, unused);
             // the density of both is that of h times that of k where h is given
-            f = ph * pk + total, dh = gh * by_h, dk = gk * by_k, dr = gh * density * c;
+            f = where(near, f + total, f), dh = where(near, gh * by_h, dh), dk = where(near, gk * by_k, dk);
+            dr = where(near, gh * density * c, dr);
         }
         if (crossing) {
             f = 4.0 * f - 2.0 * ph - 2.0 * pk + 1.0;
@@ -90,7 +108,7 @@ struct Wedge {
         d[1] = b * scale * (dk * c2 - dh * c1);
         d[2] = b * (-dh * scale * (c1 * dx + s1 * dy) - dr * turn);
         d[3] = b * (dk * scale * (c2 * dx + s2 * dy) + dr * turn);
-        d[4] = 1.0, d[5] = f, d[6] = -b * (dh * h + dk * k), d[7] = x, d[8] = y;
+        d[4] = all<S>(1.0), d[5] = f, d[6] = -b * (dh * h + dk * k), d[7] = x, d[8] = y;
         return p[4] + b * f + p[7] * x + p[8] * y;
     }
 };

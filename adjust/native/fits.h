@@ -64,7 +64,13 @@ template <int N, class Row> inline void add_pixels(const Pixels &w, const Row &r
     for (int j = N + 1; j < ROOM; ++j) std::memset(A[j], 0, sizeof A[j]);
     for (int lo = 0; lo < w.n; lo += WINDOW) {
         const int m = w.n - lo < WINDOW ? w.n - lo : WINDOW, full = (m + W - 1) / W * W;
-        for (int i = 0; i < m; ++i) {
+        if constexpr (std::is_invocable_v<Row, V, V, V *>) {  // places are there up to whole vectors
+            for (int i = 0; i < full; i += W) {
+                V d[N];
+                store(A[N] + i, load(w.value + lo + i) - row(load(w.x + lo + i), load(w.y + lo + i), d));
+                for (int j = 0; j < N; ++j) store(A[j] + i, d[j]);
+            }
+        } else for (int i = 0; i < m; ++i) {
             double d[N];
             A[N][i] = w.value[lo + i] - row(w.x[lo + i], w.y[lo + i], d);
             for (int j = 0; j < N; ++j) A[j][i] = d[j];

@@ -36,5 +36,25 @@ inline double magnitude(double x) { return __builtin_fabs(x); }
 inline V magnitude(V v) { return v < 0.0 ? -v : v; }
 inline double where(bool mask, double a, double b) { return mask ? a : b; }
 template <class M> inline V where(M mask, V a, V b) { return mask ? a : b; }
+typedef int64_t Bits __attribute__((vector_size(8 * W)));
+
+inline double exponential(double x) { return std::exp(x); }
+// exp(x) to two units in the last place, for x from -700 to 700: 2^n times the series of what is left, at most log(2) / 2.
+inline V exponential(V x) {
+    constexpr double shift = 0x1.8p52;  // added, it leaves the nearest integer in the last bits
+    constexpr double c[] = {1.0 / 479001600, 1.0 / 39916800, 1.0 / 3628800, 1.0 / 362880, 1.0 / 40320, 1.0 / 5040, 1.0 / 720,
+                            1.0 / 120, 1.0 / 24, 1.0 / 6, 0.5, 1.0, 1.0};
+    const V shifted = x * 1.4426950408889634 + shift, n = shifted - shift;
+    const V r = (x - n * 0x1.62e42fefa3800p-1) - n * 0x1.ef35793c76730p-45;  // log(2) in two parts (Cody and Waite 1980)
+    V sum = all<V>(c[0]);
+    for (int i = 1; i < 13; ++i) sum = sum * r + c[i];
+    return sum * V((Bits(shifted) << 52) + (int64_t(1023) << 52));
+}
+inline bool any(bool mask) { return mask; }
+template <class M> inline bool any(M mask) {
+    bool found = false;
+    for (int i = 0; i < W; ++i) found |= mask[i] != 0;
+    return found;
+}
 
 }  // namespace

@@ -20,6 +20,7 @@ CORNER_PARAMETERS = 9
 ENOUGH_FOR_SLOPES = 45
 """Pixels of a corner from which the last two are free: fewer cannot tell them from the corner's own form."""
 GAUSSIAN, DISC = 0, 1
+_LANES, _BAND = 8, 8  # of the widest vectors; rows that spread_and_sum makes together
 
 _NODES = np.arange(-384, 385) / 64.0  # of the normal distribution, as corners.h expects them
 _TABLE = ndtr(_NODES), np.exp(-0.5 * _NODES**2) / np.sqrt(2.0 * np.pi)
@@ -39,7 +40,7 @@ _pixel_corner_rays = Function("pixel_corner_rays", "first last lens[14] rays[*,*
 _draw_facets = Function(
     "draw_facets",
     "first last rays[*,*,2] n from_ray[f,3,3] bounds[f,4] counts[f,2] x_edges[f,*] y_edges[f,*] cells[f,*,*] "
-    "background samples[*,2] image[*,*] candidates[f]",
+    "background samples[*,2] weights[4,*] image[*,*] candidates[f]",
 )
 
 _spread_and_sum = Function("spread_and_sum", "first last image[*,*] weights[t] reach n out[*,*] work[*,*]")
@@ -127,15 +128,20 @@ def pixel_corner_rays(width: int, height: int, lens: FloatArray) -> FloatArray:
     return rays
 
 
-def draw_facets(rays: FloatArray, n: int, facets: Facets, background: float, samples: FloatArray) -> Gray:
-    """Grey values (n * height, n * width) of sub-pixels, each integrated over its area; rays: of the pixel corners.
+def draw_facets(
+    rays: FloatArray, n: int, facets: Facets, background: float, samples: FloatArray, image: Gray
+) -> None:
+    """Draw sub-pixels (n * height, n * width), each integrated over its area, into image; rays: of the pixel corners.
 
     samples: (S, 2) offsets in the unit square of a sub-pixel that sees an edge.
     """
-    height, width = rays.shape[0] - 1, rays.shape[1] - 1
-    image = np.empty((n * height, n * width), np.float32)
-    _draw_facets(0, height, rays, n, *facets, background, samples, image, np.empty(len(facets.from_ray), np.int64))
-    return image
+    if image.shape != (n * (rays.shape[0] - 1), n * (rays.shape[1] - 1)):
+        raise ValueError(f"draw_facets: image is {image.shape}, {n} sub-pixels for each of {rays.shape} corners")
+    s, t = samples.T
+    weights = np.zeros((4, -(-len(samples) // _LANES) * _LANES))
+    weights[:, : len(samples)] = (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
+    _draw_facets(0, len(rays) - 1, rays, n, *facets, background, samples, weights, image,
+                 np.empty(len(facets.from_ray), np.int64))  # fmt: skip
 
 
 def spread_and_sum(image: Gray, n: int, sigma: float) -> Gray:
@@ -148,6 +154,6 @@ def spread_and_sum(image: Gray, n: int, sigma: float) -> Gray:
     weights = np.convolve(spread / spread.sum(), np.full(n, 1.0 / n)).astype(np.float32)
     height, width = image.shape[0] // n, image.shape[1] // n
     out = np.empty((height, width), np.float32)
-    work = np.empty((n, width + (2 * reach + n) // n + 1), np.float32)
+    work = np.empty((_BAND * n, width + (2 * reach + n) // n + 1), np.float32)
     _spread_and_sum(0, height, image, weights, reach, n, out, work)
     return out

@@ -76,7 +76,7 @@ def _images_are(folder: Path, recorded: Mapping[str, Mapping[str, Any]]) -> bool
 def fingerprint(folder: Path) -> str:
     """One hash of all that decides how a folder fails: definition, tables, names of images, versions; "" for none."""
     digest = hashlib.sha256(platform.python_version().encode())
-    for package in ("labsurvey", "gtsam", "numpy", "scipy", "numba"):
+    for package in ("labsurvey", "gtsam", "numpy", "scipy"):
         try:
             digest.update(f"{package} {version(package)}\n".encode())
         except PackageNotFoundError:

@@ -20,7 +20,7 @@ from typing import Any
 from survey.batch.record import Record, record_from
 
 _START = "import sys; sys.path[:] = sys.argv[1:]; from survey.batch.worker import main; main()"
-_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "NUMBA_NUM_THREADS")
+_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS")
 
 
 class WorkerDiedError(Exception):

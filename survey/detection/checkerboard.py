@@ -96,17 +96,24 @@ def _measured(gray: Gray32, gray8: Gray8, rough: FloatArray) -> tuple[Detection,
 
 
 def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
-    """Corners (n, 2) px to about a pixel: classic and sector finder on a reduced image, then the full one."""
+    """Corners (n, 2) px to about a pixel: classic and sector finder on a reduced image, then the full one.
+
+    On an image without a board the classic finder follows the noise at every threshold for half a second, unless a look
+    at the squares beforehand stops it, which now and then overlooks a board: without that look it has a smoothed image.
+    """
     coarse, factor = reduced(gray8, _COARSE_PX)
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    classic = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    looking = classic | cv2.CALIB_CB_FAST_CHECK
     pattern = (columns, rows)
-    ok, corners = cv2.findChessboardCorners(coarse, pattern, flags=flags)
+    ok, corners = cv2.findChessboardCorners(coarse, pattern, flags=looking)
     if not ok:
         ok, corners = cv2.findChessboardCornersSB(coarse, pattern, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not ok:
+        ok, corners = cv2.findChessboardCorners(cv2.GaussianBlur(coarse, (3, 3), 0.0), pattern, flags=classic)
     if ok:
         return np.asarray((np.reshape(corners, (-1, 2)).astype(float) + 0.5) * factor - 0.5)
     if coarse is not gray8:
-        ok, corners = cv2.findChessboardCorners(gray8, pattern, flags=flags | cv2.CALIB_CB_FAST_CHECK)
+        ok, corners = cv2.findChessboardCorners(gray8, pattern, flags=looking)
     return np.reshape(corners, (-1, 2)).astype(float) if ok else None
 
 

@@ -20,10 +20,31 @@ from survey.targets import Charuco, MarkerBlock, MarkerGrid
 _COARSE_PX = 1300  # longer side of the image in which markers are looked for first; the full one where some are missing
 
 
-def find_markers(gray: Gray32, gray8: Gray8, target: MarkerGrid | MarkerBlock) -> Detection:
+class SeenMarkers:
+    """The markers of an image, sought once for all targets of a dictionary."""
+
+    def __init__(self, gray8: Gray8) -> None:
+        self._full = gray8
+        self._coarse, self._factor = reduced(gray8, _COARSE_PX)
+        self._found: dict[tuple[str, bool], tuple[IntArray, FloatArray]] = {}
+
+    def of(self, dictionary: str, wanted: set[int]) -> tuple[IntArray, FloatArray]:
+        """Ids (n,) and corners (n, 4, 2) px in ascending id, those of the full image where some wanted ones lack."""
+        markers, quads = self._in(dictionary, False)
+        if self._coarse is not self._full and not wanted.issubset(markers.tolist()):
+            return self._in(dictionary, True)
+        return markers, (quads + 0.5) * self._factor - 0.5
+
+    def _in(self, dictionary: str, full: bool) -> tuple[IntArray, FloatArray]:
+        if (dictionary, full) not in self._found:
+            self._found[dictionary, full] = _markers_in(self._full if full else self._coarse, dictionary)
+        return self._found[dictionary, full]
+
+
+def find_markers(gray: Gray32, seen: SeenMarkers, target: MarkerGrid | MarkerBlock) -> Detection:
     """The corners of those of the target's markers that are in the image; a marker seen twice is left out."""
     wanted = _first_indices(target)
-    markers, quads = _seen_markers(gray8, target.dictionary, set(wanted))
+    markers, quads = seen.of(target.dictionary, set(wanted))
     notes: tuple[str, ...] = ()
     twice = sorted(m for m, count in Counter(markers.tolist()).items() if count > 1 and m in wanted)
     if twice:
@@ -82,20 +103,11 @@ def _gap_cells(target: MarkerGrid | MarkerBlock, cells: int) -> float:
     return 1.0
 
 
-def _seen_markers(gray8: Gray8, dictionary: str, wanted: set[int]) -> tuple[IntArray, FloatArray]:
+def _markers_in(gray8: Gray8, dictionary: str) -> tuple[IntArray, FloatArray]:
     """Ids (n,) and corners (n, 4, 2) px of all markers of a dictionary, in ascending id."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
-    detector = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters)
-    coarse, factor = reduced(gray8, _COARSE_PX)
-    markers, quads = _markers_in(detector, coarse)
-    if coarse is not gray8 and not wanted.issubset(markers.tolist()):
-        return _markers_in(detector, gray8)
-    return markers, (quads + 0.5) * factor - 0.5
-
-
-def _markers_in(detector: cv2.aruco.ArucoDetector, gray8: Gray8) -> tuple[IntArray, FloatArray]:
-    corners, ids, _ = detector.detectMarkers(gray8)
+    corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters).detectMarkers(gray8)
     if ids is None or len(np.ravel(ids)) == 0:
         return np.zeros(0, np.int64), np.zeros((0, 4, 2))
     markers = np.ravel(ids).astype(np.int64)

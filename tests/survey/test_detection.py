@@ -1,3 +1,5 @@
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -5,9 +7,10 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.errors import SurveyError
-from adjust.native.vision import corner_rows
-from survey.detection import detect_image
+from adjust.native.vision import corner_rows, fit_corners
+from survey.detection import detect_image, markers
 from survey.detection.corners import CROSSING_FLOOR_PX, MARKER_FLOOR_PX
+from survey.detection.detect import detect_targets
 from survey.detection.gray import gray_values, reduced, saturation_level
 from survey.rendering import BrownCamera, Imaging, PlacedTarget, render
 from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid
@@ -245,3 +248,42 @@ def test_large_images_are_searched_reduced_and_measured_in_full(target):
     found = detect_image(wide, target)
     assert found.point_idx.tolist() == alone.point_idx.tolist()
     assert np.abs(found.uv - alone.uv - [500, 1300]).max() < 1e-3
+
+
+def test_targets_of_one_dictionary_share_the_search_for_its_markers(monkeypatch):
+    view = PlacedTarget(ARUCO, Pose3(Rot3.Rx(0.2), np.array([-0.08, -0.06, 0.4])))
+    image = render(CAMERA, [view])
+    targets = {"grid": ARUCO, "other": dataclasses.replace(ARUCO, first_id=20), "board": BOARD}
+    alone = {name: detect_image(image, target) for name, target in targets.items()}
+    asked = []
+    search = markers._markers_in
+
+    def counted(gray8, dictionary):
+        asked.append(dictionary)
+        return search(gray8, dictionary)
+
+    monkeypatch.setattr(markers, "_markers_in", counted)
+    together = detect_targets(image, targets)
+    assert asked == [ARUCO.dictionary]
+    assert list(together) == list(targets)
+    assert len(together["grid"]) > 0 == len(together["other"])
+    for name, detection in together.items():
+        assert np.array_equal(detection.uv, alone[name].uv)
+        assert np.array_equal(detection.cov, alone[name].cov)
+        assert detection.reason == alone[name].reason
+
+
+@pytest.mark.parametrize("crossing", [True, False])
+@pytest.mark.parametrize("turn", [0.4, 1.3, 1.9])
+def test_a_fit_to_its_own_grey_values_gives_back_what_they_were_made_with(crossing, turn):
+    """The fit evaluates pixels side by side, ``corner_rows`` one after the other; both are the same function."""
+    p = np.array([20.3, 19.8, 0.3, 0.3 + turn, 60.0, 90.0, np.log(0.9), 0.2, -0.1])
+    v, u = np.mgrid[:41, :41]
+    value, _ = corner_rows(np.stack([u.ravel() - 20.0, v.ravel() - 20.0], axis=1), p - [20, 20, *[0] * 7], crossing)
+    image = value.reshape(41, 41).astype(np.float32)
+    start, angles = p[None, :2] + 0.2, p[None, 2:4] + 0.03
+    shapes = np.array([[8.0, 0.0, 0.0, 0.0]])
+    found, _, _, rms, status = fit_corners(image, start, angles, np.array([1.1]), shapes, crossing, 3.0, 1e-7)
+    assert status[0] == 0
+    assert rms[0] < 1e-4  # grey values of single precision
+    assert np.abs(found[0] - p).max() < 1e-4
