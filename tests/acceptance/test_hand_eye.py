@@ -95,7 +95,8 @@ def test_sigmas_too_small_throughout_are_said_and_estimated(tmp_path: Path) -> N
         stream.write("\n[adjustment]\nvariance_components = true\n")
     assert main(["adjust", str(folder), "--quiet"]) == 3  # the board is bent, and one image fits worse than the others
     estimated = json.loads((folder / "results" / "solution.json").read_text())
-    assert {(x["kind"], x["name"], x["what"]) for x in estimated["consistency"]["changes"]} == {("target", "board", "shape")}
+    changes = {(x["kind"], x["name"], x["what"]) for x in estimated["consistency"]["changes"]}
+    assert changes == {("target", "board", "shape")}
     assert not unused(estimated)
     assert estimated["summary"]["global_test"]["passed"]
     assert not [w for w in estimated["warnings"] if "contradicts the rest" in w]
