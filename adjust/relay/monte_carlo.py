@@ -14,7 +14,8 @@ import numpy as np
 from adjust.closed_forms import rotation_exp
 from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.relay.trials import adjust_trials
+from adjust.native.trials import adjust_trials
+from adjust.parallel import run_split, split_blocks
 from adjust.rotation_forms import euler_from_matrix, euler_jacobian, matrix_from_euler
 
 Noise = Literal["euler", "tangent"]
@@ -86,9 +87,14 @@ def adjust_batch(b_from_a: FloatArray, information: FloatArray, n_cameras: int) 
     """Adjust T complete networks: measured (T, E, 3, 3) in the order (0, 1), (0, 2), ..., (1, 2), ...
 
     information: inverse covariances (T, E, 3, 3), in the tangents on the right. The estimator is that of
-    :mod:`adjust.relay.parametric`, of all networks at once.
+    :mod:`adjust.relay.parametric`.
     """
-    return Batch(*adjust_trials(b_from_a, information, n_cameras, _LIMIT, _MOST))
+    measured, information = (np.ascontiguousarray(a, dtype=np.float64) for a in (b_from_a, information))
+    adjusted, omega = np.empty(measured.shape), np.empty(len(measured))
+    iterations = np.empty(len(measured), dtype=np.int64)
+    runs = split_blocks(np.arange(len(measured) + 1) * measured.shape[1])
+    run_split(adjust_trials, runs, measured, information, n_cameras, _LIMIT, _MOST, adjusted, omega, iterations)
+    return Batch(adjusted, omega, iterations)
 
 
 def simulate_complete(options: MonteCarloOptions = MonteCarloOptions()) -> MonteCarlo:
