@@ -88,7 +88,8 @@ class TreeCovariance:
         """Covariance (dim, dim) of one unknown."""
         n = self.number[key]
         along = np.arange(self._dims[n])
-        return self.arrays.cov[self._own[n] + self.arrays.width[self._home[n]] * along[:, None] + along]
+        cov: FloatArray = self.arrays.cov[self._own[n] + self.arrays.width[self._home[n]] * along[:, None] + along]
+        return cov
 
     @cached_property
     def _own(self) -> IntArray:

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from adjust.closed_forms import (
     inverse,
@@ -171,6 +170,8 @@ def _split(network: PoseNetwork, observation: ChainObservation) -> tuple[tuple[i
 
 def _connected(found: _RowsOfPoses) -> list[_RowsOfPoses]:
     """Its parts that share no row of poses, largest first."""
+    from scipy.sparse.csgraph import connected_components  # here: networks without moving rows start without it
+
     n = len(found.rows)
     joined = coo_array((np.ones(len(found.first)), (found.first, found.second)), shape=(n, n))
     label = connected_components(joined, directed=False)[1]

@@ -31,8 +31,9 @@ class ViewArrays(NamedTuple):
     def of_poses(x: FloatArray, rays: FloatArray, ptr: IntArray, of: IntArray | None) -> "ViewArrays":
         """As the core takes them; without ``of`` every view has one pose."""
         which = np.arange(len(ptr) - 1) if of is None else of
-        ints = (np.ascontiguousarray(a, dtype=np.int64) for a in (which, ptr))
-        return ViewArrays(*ints, *(np.ascontiguousarray(a, dtype=np.float64) for a in (x, rays)))
+        mine, ends = (np.ascontiguousarray(a, dtype=np.int64) for a in (which, ptr))
+        at, seen = (np.ascontiguousarray(a, dtype=np.float64) for a in (x, rays))
+        return ViewArrays(mine, ends, at, seen)
 
     @property
     def ends(self) -> IntArray:
