@@ -14,6 +14,7 @@ from adjust.errors import SurveyError
 from adjust.lens_radial import RadialProfile, invert_radius, radial_profile
 from adjust.model import BoolArray, Camera, FloatArray
 from adjust.native import lenses as kernels
+from adjust.parallel import run_split, split_blocks
 
 RAY_TOLERANCE = 1e-13
 """Newton's last step on a ray, in tangents of the angle to the axis."""
@@ -281,12 +282,13 @@ def _forward_rays(model: LensModel, values: FloatArray, constants: FloatArray, u
         s, centre_u, centre_v, _ = constants
         scale = values[0]
         distorted = np.column_stack([(uv[:, 0] - centre_u) * s - values[1], (uv[:, 1] - centre_v) * s + values[2]])
-    def equation(tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
-        ray = np.column_stack([tangents, np.ones(len(tangents))])
-        residuals, _, by_point = lens_derivatives(model, values, constants, ray, uv)
-        return residuals, by_point[:, :, :2]
-
-    tangents, solved = _newton(equation, _without_distortion(profile, distorted) / scale, 1.0)
+    tangents = np.ascontiguousarray(_without_distortion(profile, distorted) / scale)
+    solved = np.zeros(len(uv), dtype=np.bool_)
+    lens, constants, _, uv = _arrays(values, constants, np.zeros((0, 3)), uv)
+    run_split(
+        kernels.tangents_of, split_blocks(np.arange(len(uv) + 1)), model.kind, lens, constants, uv, MAX_ITERATIONS,
+        RAY_TOLERANCE, PIXEL_TOLERANCE, tangents, solved,
+    )  # fmt: skip
     found = solved & (np.hypot(tangents[:, 0], tangents[:, 1]) * scale <= profile.limit * BEYOND_LIMIT)
     _require_invertible(model, values, constants, uv, found)
     return tangents

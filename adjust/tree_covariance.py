@@ -7,6 +7,7 @@ lie together in one clique, so all redundancy numbers follow from it.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -85,10 +86,23 @@ class TreeCovariance:
 
     def marginal(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
-        block = self._block(self.number[key], self.number[key])
-        if block is None:
-            raise KeyError(key)
-        return block
+        n = self.number[key]
+        along = np.arange(self._dims[n])
+        cov: FloatArray = self.arrays.cov[self._own[n] + self.arrays.width[self._home[n]] * along[:, None] + along]
+        return cov
+
+    @cached_property
+    def _own(self) -> IntArray:
+        """Where the covariance of every key begins, in the rows of its home."""
+        tree = self.arrays
+        clique, dims = np.repeat(np.arange(len(tree.front)), np.diff(tree.key_ptr)), tree.dims[tree.keys]
+        before = np.cumsum(dims) - dims
+        at_home = tree.home[tree.keys] == clique
+        clique, key = clique[at_home], tree.keys[at_home]
+        column = before[at_home] - before[tree.key_ptr[clique]]
+        out = np.zeros(len(tree.dims), dtype=np.int64)
+        out[key] = tree.at[clique] + column * (tree.width[clique] + 1)
+        return out
 
     def joint(self, keys: Sequence[int]) -> FloatArray:
         """Joint covariance of any unknowns, stacked in this order; fast where they share a clique."""

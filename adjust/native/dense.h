@@ -51,25 +51,53 @@ inline double dot(const double *x, const double *y, int64_t n) {
     return total;
 }
 
-// N += A A', upper triangle, of A's first n rows, m long: three columns by four in
-// registers. Rows n .. n + 2 of A are read too; they and what they make in N mean nothing.
-template <int LENGTH, int WIDTH> inline void add_gram(const double (*A)[LENGTH], int n, int m, V (*N)[WIDTH]) {
-    for (int j = 0; j < n; j += 3)
-        for (int k = j; k < n; k += 4) {
-            V c[3][4] = {};
-            for (int p = 0; p < m; p += W) {
-                const V a0 = load(&A[j][p]), a1 = load(&A[j + 1][p]), a2 = load(&A[j + 2][p]);
+// N += A A', upper triangle and a little below the diagonal, of n rows, m long (whole vectors): tiles of sums in registers.
+template <int R, int C, int LENGTH, int WIDTH>
+[[gnu::always_inline]] inline void add_tile(const double (*A)[LENGTH], int j, int k, int m, double (*N)[WIDTH]) {
+    V c[R][C] = {};
+    for (int p = 0; p < m; p += W) {
+        V a[R];
 #pragma GCC unroll 4
-                for (int i = 0; i < 4; ++i) {
-                    const V b = load(&A[k + i][p]);
-                    c[0][i] += a0 * b, c[1][i] += a1 * b, c[2][i] += a2 * b;
-                }
-            }
-#pragma GCC unroll 3
-            for (int r = 0; r < 3; ++r)
+        for (int r = 0; r < R; ++r) a[r] = load(&A[j + r][p]);
+#pragma GCC unroll 6
+        for (int i = 0; i < C; ++i) {
+            const V b = load(&A[k + i][p]);
 #pragma GCC unroll 4
-                for (int i = 0; i < 4; ++i) N[j + r][k + i] += c[r][i];
+            for (int r = 0; r < R; ++r) c[r][i] += a[r] * b;
         }
+    }
+    V flat[(R * C + W - 1) / W * W] = {};
+#pragma GCC unroll 4
+    for (int r = 0; r < R; ++r)
+#pragma GCC unroll 6
+        for (int i = 0; i < C; ++i) flat[r * C + i] = c[r][i];
+    alignas(64) double found[(R * C + W - 1) / W * W];
+#pragma GCC unroll 12
+    for (int i = 0; i < R * C; i += W) store(found + i, sums(flat + i));
+#pragma GCC unroll 4
+    for (int r = 0; r < R; ++r)
+#pragma GCC unroll 6
+        for (int i = 0; i < C; ++i) N[j + r][k + i] += found[r * C + i];
+}
+// The columns k .. n - 1 of R rows from j on, in tiles about equally wide.
+template <int R, int LENGTH, int WIDTH> inline void add_rows(const double (*A)[LENGTH], int j, int n, int m, double (*N)[WIDTH]) {
+    constexpr int most = W == 8 ? 6 : 4;
+    for (int k = j; k < n;) {
+        const int left = n - k, width = left / ((left + most - 1) / most);
+        if (width == 1) add_tile<R, 1>(A, j, k, m, N);
+        else if (width == 2) add_tile<R, 2>(A, j, k, m, N);
+        else if (width == 3) add_tile<R, 3>(A, j, k, m, N);
+        else if (most == 4 || width == 4) add_tile<R, 4>(A, j, k, m, N);
+        else if (width == 5) add_tile<R, most - 1>(A, j, k, m, N);
+        else add_tile<R, most>(A, j, k, m, N);
+        k += width;
+    }
+}
+template <int LENGTH, int WIDTH> inline void add_gram(const double (*A)[LENGTH], int n, int m, double (*N)[WIDTH]) {
+    int j = 0;
+    for (; j + 3 <= n; j += 3) add_rows<3>(A, j, n, m, N);
+    if (n - j == 2) add_rows<2>(A, j, n, m, N);
+    if (n - j == 1) add_rows<1>(A, j, n, m, N);
 }
 
 // Lower Cholesky factor of A (n, n), rows of ld numbers, in place; false where there is none.

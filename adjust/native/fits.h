@@ -56,12 +56,8 @@ struct Pixels {
 
 // Normal equations of the window: row(x, y, derivatives) gives the predicted grey value.
 template <int N, class Row> inline void add_pixels(const Pixels &w, const Row &row, Normals<N> &out) {
-    constexpr int ROOM = N + 4;
-    alignas(64) double A[ROOM][WINDOW];
-    alignas(64) V sums[ROOM][ROOM];
-    for (auto &line : sums)
-        for (V &v : line) v = V{};
-    for (int j = N + 1; j < ROOM; ++j) std::memset(A[j], 0, sizeof A[j]);
+    alignas(64) double A[N + 1][WINDOW];
+    double sums[N + 1][N + 1] = {};
     for (int lo = 0; lo < w.n; lo += WINDOW) {
         const int m = w.n - lo < WINDOW ? w.n - lo : WINDOW, full = (m + W - 1) / W * W;
         if constexpr (std::is_invocable_v<Row, V, V, V *>) {  // places are there up to whole vectors
@@ -80,10 +76,10 @@ template <int N, class Row> inline void add_pixels(const Pixels &w, const Row &r
         add_gram(A, N + 1, full, sums);
     }
     for (int a = 0; a < N; ++a) {
-        for (int b = a; b < N; ++b) out.H[a][b] = out.H[b][a] = sum(sums[a][b]);
-        out.g[a] = sum(sums[a][N]);
+        for (int b = a; b < N; ++b) out.H[a][b] = out.H[b][a] = sums[a][b];
+        out.g[a] = sums[a][N];
     }
-    out.cost = sum(sums[N][N]);
+    out.cost = sums[N][N];
 }
 
 // The first n_free of N parameters p, in place, with the normal equations there; false without convergence. The first two

@@ -1,13 +1,16 @@
-// What Python calls of lenses, image points, trees and reduced poses.
+// What Python calls of lenses, image points, views, trees, reduced poses and simulated networks.
 #include "reduction.h"
+#include "views.h"
 
 extern "C" __attribute__((visibility("default"))) const Entry *images() {
     static constexpr Entry table[] = {
-        entry<lens_rows>("lens_rows"), entry<normal_equations>("normal_equations"), entry<errors>("errors"),
+        entry<lens_rows>("lens_rows"), entry<tangents_of>("tangents_of"), entry<normal_equations>("normal_equations"), entry<errors>("errors"),
         entry<block_rows>("block_rows"), entry<serve>("serve"), entry<local_by_keys>("local_by_keys"),
         entry<all_statistics>("all_statistics"), entry<reduce_poses>("reduce_poses"), entry<pose_steps>("pose_steps"),
         entry<leaf_rows>("leaf_rows"), entry<tree_block>("tree_block"), entry<invert_cliques>("invert_cliques"),
         entry<covariance_room>("covariance_room"), entry<covariance_rows>("covariance_rows"),
-        entry<joint_blocks>("joint_blocks"), entry<solve_cliques>("solve_cliques"), {nullptr, nullptr, nullptr}};
+        entry<joint_blocks>("joint_blocks"), entry<solve_cliques>("solve_cliques"),
+        entry<refine_views>("refine_views"), entry<errors_of_views>("errors_of_views"),
+        entry<offsets_of_views>("offsets_of_views"), entry<row_influences>("row_influences"), {nullptr, nullptr, nullptr}};
     return table;
 }

@@ -10,7 +10,6 @@ namespace {
 
 constexpr int CHUNK = 64;      // points evaluated together: their rows stay in the first two caches
 constexpr int MAX_LOCAL = 23;  // local unknowns and residual of a block: 14 + 6 + 2 + 1
-constexpr int COLUMNS = 28;    // room for them and what add_gram reads beside them
 enum Kind : int64_t { LENS, POSE, TABLE, WARP };
 
 struct Lenses {
@@ -51,9 +50,8 @@ struct Batch {
 };
 
 struct Room {
-    alignas(64) double A[COLUMNS][2 * CHUNK];  // whitened rows as columns: all of u, then all of v
+    alignas(64) double A[MAX_LOCAL][2 * CHUNK];  // whitened rows as columns: all of u, then all of v
     alignas(64) double in[10][CHUNK];
-    alignas(64) V N[COLUMNS][COLUMNS];
 };
 
 // What W points at p of the arrays in (of a row length) have: x in the target bent by its warp, in the camera, and more.
@@ -148,10 +146,6 @@ template <class Lens> inline void local_columns(const Batch &B, int64_t b, const
         }
     }
 }
-// The columns beyond the residual, which add_gram reads: zero.
-inline void clear_beyond(Room &room, int n) {
-    for (int j = n; j < COLUMNS; ++j) std::memset(room.A[j], 0, sizeof room.A[j]);
-}
 inline void clear_unused(const Batch &B, int64_t b, Room &room) {
     const int64_t c = B.blocks.camera[b];
     for (int j = 0; j < B.lenses.n_free[c]; ++j) std::memset(room.A[j], 0, sizeof room.A[j]);
@@ -165,19 +159,17 @@ inline void normal_equations(Ints which, const Batch &B, Out<double, 3> H, Out<d
         const int64_t b = which[i];
         const int n = int(B.n_local(b)) + 1;
         V least = all<V>(__builtin_inf());
-        for (int j = 0; j < COLUMNS; ++j)
-            for (int k = 0; k < COLUMNS; ++k) room.N[j][k] = V{};
-        clear_beyond(room, n);
+        double N[MAX_LOCAL][MAX_LOCAL] = {};
         clear_unused(B, b, room);
         with_lens(B.lenses.kind[B.blocks.camera[b]], [&]<class Lens>(Lens) {
             each_chunk(B, b, [&](int64_t lo, int size) {
                 const Chunk chunk(B, lo, size, room);
                 local_columns<Lens>(B, b, chunk, least, room);
-                add_gram(room.A, n, 2 * chunk.full, room.N);
+                add_gram(room.A, n, 2 * chunk.full, N);
             });
         });
         for (int j = 0; j < n; ++j)
-            for (int k = j; k < n; ++k) H(b, j, k) = H(b, k, j) = sum(room.N[j][k]);
+            for (int k = j; k < n; ++k) H(b, j, k) = H(b, k, j) = N[j][k];
         chi.data[b] = H(b, n - 1, n - 1);
         depth.data[b] = least_of(least);
     }

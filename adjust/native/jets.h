@@ -17,6 +17,11 @@ template <class S, unsigned M> struct Jet {
     template <unsigned B> S &at() { return d[count(M & ((1u << B) - 1))]; }
 };
 
+template <unsigned B, class S, unsigned M> [[gnu::always_inline]] inline S derivative(const Jet<S, M> &f) {
+    if constexpr (Jet<S, M>::template has<B>) return f.template at<B>();
+    else return S{};
+}
+
 template <class K> concept Plain = std::is_same_v<K, double> || std::is_same_v<K, V>;
 
 // f of every bit of M, as a constant.

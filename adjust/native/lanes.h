@@ -21,6 +21,19 @@ inline double sum(V v) {
     for (int i = 0; i < W; ++i) s += v[i];
     return s;
 }
+// Lane i, by its bit H: a or b there and H lanes away.
+template <int H, int... I> [[gnu::always_inline]] inline V folded(V a, V b, std::integer_sequence<int, I...>) {
+#if __has_builtin(__builtin_shufflevector)
+    return __builtin_shufflevector(a, b, (I & H ? W + I : I)...) + __builtin_shufflevector(a, b, (I & H ? W + (I ^ H) : I ^ H)...);
+#else
+    return V{(I & H ? b[I] + b[I ^ H] : a[I] + a[I ^ H])...};
+#endif
+}
+// The sums of the lanes of W vectors, one in each lane.
+template <int H = W / 2> [[gnu::always_inline]] inline V sums(const V *v) {
+    if constexpr (H == 0) return *v;
+    else return folded<H>(sums<H / 2>(v), sums<H / 2>(v + H), std::make_integer_sequence<int, W>{});
+}
 // x in every lane; a plain number has one.
 template <class S> inline S all(double x) {
     if constexpr (std::is_same_v<S, double>) return x;

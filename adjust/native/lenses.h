@@ -152,12 +152,7 @@ template <class Lens, class S, size_t... I>
     const auto &b = found.second;
     r[0] = a.v, r[1] = b.v;
     constexpr unsigned every = ((1u << Lens::n) - 1) | (7u << MAX_LENS);
-    each_bit<every>([&](auto bit) {
-        if constexpr (std::remove_cvref_t<decltype(a)>::template has<bit>) d[0][bit] = a.template at<bit>();
-        else d[0][bit] = all<S>(0);
-        if constexpr (std::remove_cvref_t<decltype(b)>::template has<bit>) d[1][bit] = b.template at<bit>();
-        else d[1][bit] = all<S>(0);
-    });
+    each_bit<every>([&](auto bit) { d[0][bit] = derivative<bit>(a), d[1][bit] = derivative<bit>(b); });
 }
 template <class Lens, class S>
 [[gnu::always_inline]] inline void lens_row(const double *l, const double *c, const S (&q)[3], S u, S v, S (&r)[2], S (&d)[2][N_COLUMNS]) {
@@ -179,6 +174,47 @@ inline void lens_rows(int64_t kind, Vector l, Vector c, In<double, 2> q, In<doub
             for (int s = 0; s < 2; ++s) {
                 residuals(i, s) = r[s];
                 std::memcpy(&rows(i, s, 0), d[s], sizeof d[s]);
+            }
+        }
+    });
+}
+
+inline V larger(V a, V b) { return a > b ? a : b; }
+
+// Tangents x/z, y/z of the rays of points first .. last - 1, by Newton on the projection from what is in `tangents`; solved:
+// those within `pixels` of their image point, where the image is not turned over. A step below `small` is the last one.
+inline void tangents_of(int64_t first, int64_t last, int64_t kind, Vector l, Vector c, In<double, 2> uv, int64_t iterations, double small,
+                        double pixels, Out<double, 2> tangents, Out<bool, 1> solved) {
+    with_lens(kind, [&]<class Lens>(Lens) {
+        const auto p = parameters<Lens>(l.data);
+        for (int64_t lo = first; lo < last; lo += W) {
+            const int m = int(smaller(last - lo, int64_t(W)));
+            V x, y, u, v;
+            for (int i = 0; i < W; ++i) {  // the last one again behind the end
+                const int64_t k = lo + smaller(int64_t(i), int64_t(m - 1));
+                x[i] = tangents(k, 0), y[i] = tangents(k, 1), u[i] = uv(k, 0), v[i] = uv(k, 1);
+            }
+            const auto newton = [&](V &r, V &dx, V &dy) {
+                const auto [a, b] = Lens::residual(p, c.data, Jet<V, 1u>{x, {all<V>(1)}}, Jet<V, 2u>{y, {all<V>(1)}}, all<V>(1), u, v);
+                const V ax = derivative<0>(a), ay = derivative<1>(a), bx = derivative<0>(b), by = derivative<1>(b);
+                const V determinant = ax * by - ay * bx;
+                dx = (by * a.v - ay * b.v) / determinant;
+                dy = (ax * b.v - bx * a.v) / determinant;
+                r = larger(magnitude(a.v), magnitude(b.v));
+                return determinant;
+            };
+            V r, dx, dy, going = all<V>(1);
+            for (int64_t n = 0; n < iterations; ++n) {  // a point that has arrived stays, whatever its neighbours do
+                newton(r, dx, dy);
+                x = going != 0.0 ? x - dx : x, y = going != 0.0 ? y - dy : y;
+                const V step = larger(magnitude(dx), magnitude(dy));
+                going = step > small * (1.0 + larger(magnitude(x), magnitude(y))) ? going : V{};
+                if (sum(going) == 0.0) break;
+            }
+            const V determinant = newton(r, dx, dy);
+            for (int i = 0; i < m; ++i) {
+                tangents(lo + i, 0) = x[i], tangents(lo + i, 1) = y[i];
+                solved.data[lo + i] = r[i] < pixels && determinant[i] > 0.0;
             }
         }
     });

@@ -8,7 +8,7 @@ without meaning; the caller tests the depth. The fisheye alone sees behind that 
 
 import numpy as np
 
-from adjust.model import FloatArray
+from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.native.library import Function
 
 BROWN = 0
@@ -22,6 +22,9 @@ MAX_LENS = 14
 N_COLUMNS = MAX_LENS + 3
 
 _lens_rows = Function("lens_rows", "kind lens[*] constants[4] q[n,3] uv[n,2] residuals[n,2] rows[*,2,17]")
+_tangents_of = Function(
+    "tangents_of", "first last kind lens[*] constants[4] uv[n,2] iterations small pixels tangents[n,2] solved[n]"
+)
 _NO_ROWS = np.zeros((0, 2, N_COLUMNS))
 
 
@@ -52,3 +55,15 @@ def _check(kind: int, lens: FloatArray) -> None:
         raise ValueError(f"no lens model has the number {kind}")
     if len(lens) < N_LENS[kind]:
         raise ValueError(f"lens model {kind} has {N_LENS[kind]} parameters, {len(lens)} were given")
+
+
+def tangents_of(
+    run: IntArray, kind: int, lens: FloatArray, constants: FloatArray, uv: FloatArray, iterations: int,
+    small: float, pixels: float, tangents: FloatArray, solved: BoolArray,
+) -> None:  # fmt: skip
+    """Tangents (n, 2) = x/z, y/z of the rays of image points (n, 2) px, by Newton from the given ones, in place.
+
+    run: the points to do, one after the other. small: relative size of the last step. solved (n,): those within
+    ``pixels`` of their image point, where the lens does not turn the image over.
+    """
+    _tangents_of(int(run[0]), int(run[-1]) + 1, kind, lens, constants, uv, iterations, small, pixels, tangents, solved)

@@ -36,6 +36,34 @@ struct Tree {
 
 inline int64_t tree_block(const Tree &tree, int64_t a, int64_t b, Out<double, 2> out) { return tree.block(a, b, out.data, out.n[1]); }
 
+// Diagonal of A Q A' of the rows of every chunk c: row_ptr[c] .. of found, over its keys key_ptr[c] .. of key. J: from
+// start[c] on the derivatives by one key after the other, each (rows, its dimension). lost: chunks of which two keys share
+// no clique. room: for the largest block of Q.
+inline void row_influences(Ints row_ptr, Ints key_ptr, Ints key, Ints start, Vector J, const Tree &tree, Out<double, 1> found, Out<bool, 1> lost,
+                           Out<double, 1> room) {
+    for (int64_t c = 0; c < start.n[0]; ++c) {
+        const int64_t first = row_ptr[c], rows = row_ptr[c + 1] - first;
+        const double *a = J.data + start[c];
+        for (int64_t x = key_ptr[c]; x < key_ptr[c + 1]; ++x) {
+            const int64_t n = tree.dims[key[x]];
+            const double *b = J.data + start[c];
+            for (int64_t y = key_ptr[c]; y <= x; ++y) {
+                const int64_t m = tree.dims[key[y]];
+                if (!tree.block(key[x], key[y], room.data, m)) lost.data[c] = true;
+                else
+                    for (int64_t r = 0; r < rows; ++r) {
+                        double sum = 0.0;
+                        for (int64_t i = 0; i < n; ++i)
+                            for (int64_t j = 0; j < m; ++j) sum += a[r * n + i] * room.data[i * m + j] * b[r * m + j];
+                        found.data[first + r] += x == y ? sum : 2.0 * sum;
+                    }
+                b += rows * m;
+            }
+            a += rows * n;
+        }
+    }
+}
+
 // [R S] to [R^-1, -R^-1 S] in place; the first singular clique or -1. row: scratch as wide as the widest clique.
 inline int64_t invert_cliques(Ints front, Ints width, Ints at, Out<double, 1> data, Out<double, 1> row) {
     for (int64_t c = 0; c < front.n[0]; ++c) {

@@ -9,11 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adjust.model import FloatArray, IntArray
+from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.native.library import Function
 
 TREE = "home[K] key_ptr[C+1] keys[*] dims[K] front[C] width[C] at[C] cov[*]"
 _tree_block = Function("tree_block", f"{TREE} a b out[*,*]")
+_row_influences = Function(
+    "row_influences",
+    f"row_ptr[c+1] key_ptr[c+1] key[k] start[c] J[*] {TREE} found[*] lost[c] room[*]",
+)
 _invert_cliques = Function("invert_cliques", "front[C] width[C] at[C] data[*] row[*]")
 _covariance_room = Function("covariance_room", "front[C] width[C]")
 _covariance_rows = Function("covariance_rows", f"{TREE} n_front[C] data[*] work[*]")
@@ -40,6 +44,19 @@ class TreeArrays(NamedTuple):
         """A tree without unknowns."""
         none = np.zeros(0, dtype=np.int64)
         return TreeArrays(none, np.zeros(1, dtype=np.int64), none, none, none, none, none, np.zeros(0))
+
+
+def row_influences(
+    row_ptr: IntArray, key_ptr: IntArray, key: IntArray, start: IntArray, J: FloatArray, tree: TreeArrays
+) -> tuple[FloatArray, BoolArray]:
+    """Diagonal of A Q A' (N,) of the rows of all chunks, and of which (c,) chunks two keys share no clique: nonsense.
+
+    Chunk c has rows ``row_ptr[c]`` to ``row_ptr[c + 1]`` over the keys ``key[key_ptr[c]:key_ptr[c + 1]]``; from
+    ``start[c]`` on J holds their derivatives by one key after the other, each (rows, its dimension).
+    """
+    found, lost = np.zeros(int(row_ptr[-1])), np.zeros(len(start), dtype=np.bool_)
+    _row_influences(row_ptr, key_ptr, key, start, J, *tree, found, lost, np.empty(int(tree.dims.max(initial=0)) ** 2))
+    return found, lost
 
 
 def invert_cliques(front: IntArray, width: IntArray, at: IntArray, data: FloatArray) -> int:

@@ -47,14 +47,8 @@ inline void retracted(const Pose &pose, const double *step, Pose &out) {
     }
     out[3][3] = 1.0;
 }
-// The step with retracted(a, step) = b; the turn through the quaternion, exact up to half a turn.
-inline void step_between(const Pose &a, const Pose &b, double *out) {
-    Mat r;
-    const Vec d = {b[0][3] - a[0][3], b[1][3] - a[1][3], b[2][3] - a[2][3]};
-    for (int i = 0; i < 3; ++i) {
-        out[3 + i] = a[0][i] * d[0] + a[1][i] * d[1] + a[2][i] * d[2];
-        for (int j = 0; j < 3; ++j) r[i][j] = a[0][i] * b[0][j] + a[1][i] * b[1][j] + a[2][i] * b[2][j];
-    }
+// Log(r), through the quaternion: exact up to half a turn.
+inline void turn_of(const Mat &r, double *out) {
     // four multiples of the quaternion (w, x, y, z): that with the largest square is the sharpest
     double w = 1 + r[0][0] + r[1][1] + r[2][2], x = 1 + r[0][0] - r[1][1] - r[2][2];
     double y = 1 - r[0][0] + r[1][1] - r[2][2], z = 1 - r[0][0] - r[1][1] + r[2][2];
@@ -70,19 +64,31 @@ inline void step_between(const Pose &a, const Pose &b, double *out) {
     const double sine = root(x * x + y * y + z * z), factor = sine < 1e-12 ? 2.0 : 2.0 * std::atan2(sine, w) / sine;
     out[0] = factor * x, out[1] = factor * y, out[2] = factor * z;
 }
-// Derivative of step_between(a, retracted(b, d)) by d at zero, where step = step_between(a, b): inverse of the right
-// Jacobian of SO(3) (Chirikjian 2012, eq. 10.86).
-inline void step_derivative(const double *step, double (&out)[6][6]) {
-    const double square = dot3(step, step), angle = root(square);
+// The step with retracted(a, step) = b.
+inline void step_between(const Pose &a, const Pose &b, double *out) {
+    Mat r;
+    const Vec d = {b[0][3] - a[0][3], b[1][3] - a[1][3], b[2][3] - a[2][3]};
+    for (int i = 0; i < 3; ++i) {
+        out[3 + i] = a[0][i] * d[0] + a[1][i] * d[1] + a[2][i] * d[2];
+        for (int j = 0; j < 3; ++j) r[i][j] = a[0][i] * b[0][j] + a[1][i] * b[1][j] + a[2][i] * b[2][j];
+    }
+    turn_of(r, out);
+}
+// Inverse of the right Jacobian of SO(3) (Chirikjian 2012, eq. 10.86): the derivative of Log(Exp(w) Exp(d)) by d at zero.
+inline void turn_derivative(const double *w, Mat &out) {
+    const double square = dot3(w, w), angle = root(square);
     const double beta = angle < 1e-4 ? 1.0 / 12.0 : 1.0 / square - (1.0 + std::cos(angle)) / (2.0 * angle * std::sin(angle));
-    Mat turn;
+    for (int i = 0; i < 3; ++i)  // beta [w]x [w]x = beta (w w' - w^2)
+        for (int j = 0; j < 3; ++j) out[i][j] = 0.5 * skew(w, i, j) + beta * w[i] * w[j] + (i == j ? 1.0 - beta * square : 0.0);
+}
+// Derivative of step_between(a, retracted(b, d)) by d at zero, where step = step_between(a, b).
+inline void step_derivative(const double *step, double (&out)[6][6]) {
+    Mat turn, by_turn;
     turn_by(step, turn);
+    turn_derivative(step, by_turn);
     std::memset(out, 0, sizeof out);
     for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) {  // beta [w]x [w]x = beta (w w' - w^2)
-            out[i][j] = 0.5 * skew(step, i, j) + beta * step[i] * step[j] + (i == j ? 1.0 - beta * square : 0.0);
-            out[3 + i][3 + j] = turn[i][j];
-        }
+        for (int j = 0; j < 3; ++j) out[i][j] = by_turn[i][j], out[3 + i][3 + j] = turn[i][j];
 }
 
 }  // namespace

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
 from adjust.model import IntArray
 from adjust.relay.graphs import loop_labels
@@ -90,6 +89,8 @@ def count(topology: Topology, loop_equations: int = 3) -> Counts:
 
 def parts(topology: Topology) -> IntArray:
     """The connected part (n,) of every station, numbered from 0 in the order of their first stations."""
+    from scipy.sparse.csgraph import connected_components  # here: what needs no counts starts without it
+
     n = topology.n_stations
     joined = sp.coo_array((np.ones(topology.n_pairs), (topology.a_idx, topology.b_idx)), shape=(n, n))
     return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)

@@ -59,12 +59,17 @@ def predict(r: Readings, u: Geometry, sign: float, curve: float) -> tuple[FloatA
 
     sign: of angles that count clockwise. curve: 1 / (2 radius), of refraction.
     """
-    value, A = np.empty(len(r.kind)), np.zeros((len(r.kind), N_COLUMNS))
-    level = np.flatnonzero(r.kind == HEIGHT)
-    value[level] = _heights(r, u, level, A)
-    rows = np.flatnonzero(r.kind != HEIGHT)
-    factor = np.where(r.kind[rows] == ANGLE, -1.0, 1.0)
-    value[rows], A[rows] = _sights(r, u, rows, r.to, 1, TO, factor, sign, curve)
+    level, rows = np.flatnonzero(r.kind == HEIGHT), np.flatnonzero(r.kind != HEIGHT)
+    distances = np.flatnonzero((r.kind == SLOPE) | (r.kind == HORIZONTAL))
+    offset, scale = u.instrument[r.instrument[distances], 0], 1.0 + u.instrument[r.instrument[distances], 1]
+    factor = np.where(r.kind == ANGLE, -1.0, 1.0)
+    factor[distances] = scale
+    value, A = _sights(r, u, rows, r.to, 1, TO, factor[rows], sign, curve)
+    if len(level):
+        sights, by = value, A
+        value, A = np.empty(len(r.kind)), np.zeros((len(r.kind), N_COLUMNS))
+        value[rows], A[rows] = sights, by
+        value[level] = _heights(r, u, level, A)
     rows = np.flatnonzero(r.kind == ANGLE)
     if len(rows):
         more, by = _sights(r, u, rows, r.second, 2, SECOND, np.ones(len(rows)), sign, curve)
@@ -75,11 +80,8 @@ def predict(r: Readings, u: Geometry, sign: float, curve: float) -> tuple[FloatA
     rows = np.flatnonzero(r.kind == ZENITH)
     value[rows] += u.instrument[r.instrument[rows], 3]
     A[rows, INSTRUMENT + 3] = 1.0
-    rows = np.flatnonzero((r.kind == SLOPE) | (r.kind == HORIZONTAL))
-    offset, scale = u.instrument[r.instrument[rows], 0], 1.0 + u.instrument[r.instrument[rows], 1]
-    A[rows] *= scale[:, None]
-    A[rows, INSTRUMENT], A[rows, INSTRUMENT + 1] = 1.0, value[rows]
-    value[rows] = offset + scale * value[rows]
+    A[distances, INSTRUMENT], A[distances, INSTRUMENT + 1] = 1.0, value[distances] / scale
+    value[distances] += offset
     return value, A
 
 
@@ -118,7 +120,8 @@ def _sights(
     target: column of the target's height.
     """
     a, b, kind, horizon, body = r.at[rows], to[rows], r.kind[rows], u.horizon, r.body[rows]
-    F = np.where((body >= 0)[:, None, None], u.body_axes[body], horizon.axes[a])
+    on_body, F = np.flatnonzero(body >= 0), horizon.axes[a]
+    F[on_body] = u.body_axes[body[on_body]]
     back, up_b, h_b = np.swapaxes(F, 1, 2), horizon.axes[b, 2], r.heights[rows, target, None]
     offset = r.heights[rows, 0, None] * F[:, 2] + _times(back, _centring(r, u, rows))
     d = u.X[b] + h_b * up_b - u.X[a] - offset
@@ -135,7 +138,7 @@ def _sights(
     w = _times(back, g)
     A[:, AT : AT + 3], A[:, to_column : to_column + 3], A[:, CENTRING : CENTRING + 3] = -w, w, -g
     turn = np.cross(w, d + offset)
-    on_body, levelled = np.flatnonzero(body >= 0), np.flatnonzero(body < 0)
+    levelled = np.flatnonzero(body < 0)
     A[on_body, BODY : BODY + 3] = _times(F[on_body], turn[on_body])
     _add_turn(horizon, a[levelled], turn[levelled], levelled, AT, A)
     raised = np.flatnonzero(h_b[:, 0])

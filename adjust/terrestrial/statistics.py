@@ -10,8 +10,8 @@ from typing import overload
 import gtsam
 import numpy as np
 
-from adjust.model import BoolArray, FloatArray, IntArray, Survey
-from adjust.native.trees import TreeArrays
+from adjust.model import FloatArray, IntArray, Survey
+from adjust.native.trees import row_influences
 from adjust.observation_factor import position_text
 from adjust.result import ObservationResidual, ReadingResiduals
 from adjust.terrestrial.batch import TerrestrialBatch
@@ -24,66 +24,16 @@ def influences(batch: TerrestrialBatch, tree: TreeCovariance) -> FloatArray:
     """Whitened a Q a' (N,) of all readings; the batch serves its rows unweighted. Order of ``Survey.readings``."""
     chunks = batch.layout.chunks
     rows, keys = np.array([(len(c.rows), len(c.keys)) for c in chunks], dtype=np.int64).reshape(-1, 2).T
-    of = np.repeat(np.arange(len(chunks)), keys)
+    row_ptr, key_ptr = (np.concatenate([[0], np.cumsum(n)]) for n in (rows, keys))
     key = np.array([tree.number[k] for chunk in chunks for k in chunk.keys], dtype=np.int64)
-    dim = np.array([d for chunk in chunks for d in chunk.dims], dtype=np.int64)
-    first, row_ptr = np.cumsum(keys) - keys, np.cumsum(rows) - rows
-    before = np.cumsum(dim) - dim
-    at = np.array([chunk.start for chunk in chunks], dtype=np.int64)[of] + rows[of] * (before - before[first[of]])
-    # every key of a chunk with itself and with those before it
-    number = np.arange(len(key)) - first[of] + 1
-    i = np.repeat(np.arange(len(key)), number)
-    j = first[of[i]] + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
-    found, lost, blocks = np.zeros(int(rows.sum())), np.zeros(len(chunks), dtype=np.bool_), _Blocks(tree.arrays)
-    most = int(dim.max(initial=0)) + 1
-    kinds, kind = np.unique((rows[of[i]] * most + dim[i]) * most + dim[j], return_inverse=True)
-    for n, shape in enumerate(kinds.tolist()):
-        e, (m, da), db = np.flatnonzero(kind == n), divmod(shape // most, most), shape % most
-        Q, there = blocks(key[i[e]], key[j[e]], da, db)
-        lost[of[i[e[~there]]]] = True
-        A, B = (batch.J[at[k[e], None] + np.arange(m * d)].reshape(-1, m, d) for k, d in ((i, da), (j, db)))
-        share = np.where(i[e] == j[e], 1.0, 2.0)[:, None] * ((A @ Q) * B).sum(axis=2)
-        np.add.at(found, row_ptr[of[i[e]], None] + np.arange(m), share)
+    start = np.array([chunk.start for chunk in chunks], dtype=np.int64)
+    found, lost = row_influences(row_ptr, key_ptr, key, start, batch.J, tree.arrays)
     for c in np.flatnonzero(lost):
         A = batch.jacobian(int(c))
-        found[row_ptr[c] : row_ptr[c] + rows[c]] = np.einsum("ip,pq,iq->i", A, tree.joint(chunks[c].keys), A)
+        found[row_ptr[c] : row_ptr[c + 1]] = np.einsum("ip,pq,iq->i", A, tree.joint(chunks[c].keys), A)
     out = np.empty(len(found))
     out[np.concatenate([chunk.rows for chunk in chunks])] = found
     return out
-
-
-class _Blocks:
-    """Covariances of many pairs of keys that share a clique of a tree, at once."""
-
-    def __init__(self, tree: TreeArrays) -> None:
-        self.tree = tree
-        clique, dims = np.repeat(np.arange(len(tree.front)), np.diff(tree.key_ptr)), tree.dims[tree.keys]
-        before = np.cumsum(dims) - dims
-        place = clique * len(tree.dims) + tree.keys
-        order = np.argsort(place)
-        self.place, self.column = place[order], (before - before[tree.key_ptr[clique]])[order]
-
-    def __call__(self, a: IntArray, b: IntArray, da: int, db: int) -> tuple[FloatArray, BoolArray]:
-        """Blocks (p, da, db) of keys a, b (p,) of these dimensions, and which (p,) there are.
-
-        The key whose home lies deeper was eliminated first, so that its clique holds the other one.
-        """
-        tree = self.tree
-        flip = tree.home[b] > tree.home[a]
-        clique = np.maximum(tree.home[a], tree.home[b])
-        row, column = self._columns(clique, np.where(flip, b, a)), self._columns(clique, np.where(flip, a, b))
-        start, width = tree.at[clique] + row * tree.width[clique] + column, tree.width[clique]
-        down, along = np.arange(da)[:, None], np.arange(db)
-        flipped, wide = flip[:, None, None], width[:, None, None]
-        places = start[:, None, None] + np.where(flipped, along * wide + down, down * wide + along)
-        there = column >= 0
-        return tree.cov[np.where(there[:, None, None], places, 0)], there
-
-    def _columns(self, clique: IntArray, key: IntArray) -> IntArray:
-        """Columns (p,) at which keys begin in cliques, -1 where they are not in them."""
-        wanted = clique * len(self.tree.dims) + key
-        found = np.minimum(np.searchsorted(self.place, wanted), len(self.place) - 1)
-        return np.where(self.place[found] == wanted, self.column[found], -1)
 
 
 def reading_residuals(batch: TerrestrialBatch, tree: TreeCovariance, values: gtsam.Values) -> ReadingResiduals:

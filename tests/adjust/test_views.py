@@ -15,6 +15,8 @@ from adjust.closed_forms import (
     view_offsets,
 )
 from adjust.initial.views import Sight, make_views, refine_views
+from adjust.native.library import SETS, Function, instruction_set
+from adjust.native.views import ViewArrays
 
 
 def board_views(n, seed=3, sigma=0.0):
@@ -131,6 +133,37 @@ def test_a_view_among_others_gives_what_it_gives_alone():
         assert abs(medians[i] - np.median(np.tan(angles))) < 1e-7
         assert abs(rms[i] - np.sqrt(np.mean(np.tan(angles) ** 2))) < 1e-7
         assert in_front[i]
+
+
+def test_views_are_the_same_on_any_number_of_threads(monkeypatch):
+    """Bit for bit: every view is worked on alone."""
+    x, rays, poses = zip(*list(views_of_many_sizes()) * 20, strict=True)
+    ptr = np.cumsum([0] + [len(part) for part in x])
+    all_x, all_rays, start = np.concatenate(x), np.concatenate(rays), np.array(poses)
+    assert ptr[-1] > 10_000
+    found = []
+    for threads in ("1", "3"):
+        monkeypatch.setenv("LABSURVEY_THREADS", threads)
+        refined = refine_poses(start, all_x, all_rays, ptr, 10, robust=True)
+        judged = *view_errors(refined, all_x, all_rays, ptr), *view_offsets(refined, all_x, all_rays, ptr)
+        found.append([refined, *judged])
+    for one, three in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, three)
+    assert np.abs(found[0][0] - start).max() > 1e-6
+
+
+def test_views_are_the_same_with_all_vector_instructions():
+    x, rays, poses = zip(*views_of_many_sizes(), strict=True)
+    views = ViewArrays.of_poses(np.concatenate(x), np.concatenate(rays), np.cumsum([0] + [len(p) for p in x]), None)
+    every, found = np.arange(len(poses)), []
+    for name in SETS[: SETS.index(instruction_set()) + 1]:
+        refined = np.array(poses)
+        declared = "which[*] of[K] ptr[B+1] x[N,3] rays[N,3] iterations robust poses[K,4,4] work[*]"
+        refine = Function("refine_views", declared, name)
+        refine(every, *views, 10, True, refined, np.empty(26 * 32))
+        found.append(refined)
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=1e-9)  # where a step of rounding's size stops a view
 
 
 def test_points_behind_are_told():

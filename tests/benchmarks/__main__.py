@@ -21,7 +21,7 @@ CASES: dict[str, Callable[[Session], None]] = {
     "trials": sections_networks.simulations, "targets": sections_other.targets, "start": sections_other.start_up,
     "stages": sections_other.stages, "script": sections_other.script,
 }  # fmt: skip
-PACKAGES = ("gtsam", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "pycolmap")
+PACKAGES = ("gtsam", "numpy", "scipy", "opencv-contrib-python-headless", "pycolmap")
 
 
 def main() -> int:

@@ -142,7 +142,7 @@ def cameras(sizes: Sequence[tuple[int, int, tuple[int, int]]]) -> str:
 
         spent = best_of(run, PARTS)
         if n_cameras * epochs <= 2000:
-            find_start(survey(calibration(n_cameras, 10, shape)))  # compiles
+            find_start(survey(calibration(n_cameras, 10, shape)))  # warms up
             clock = Clock()
             clock.timed("start values, where none are given", find_start)(given)
             spent |= clock.spent
