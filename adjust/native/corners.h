@@ -33,7 +33,7 @@ struct NormalTable {
     void at(V x, V &p, V &g) const {
         const auto seen = magnitude(x) < UNSEEN;
         const V inside = seen ? x : V{};
-        V a, f, base;
+        V a = {}, f = {}, base = {};
         for (int e = 0; e < W; ++e) {
             const int i = int(inside[e] * PER_SIGMA + (UNSEEN * PER_SIGMA + 0.5));
             a[e] = double(i) / PER_SIGMA - UNSEEN, f[e] = density[i], base[e] = phi[i];

@@ -14,7 +14,7 @@ inline void pixel_corner_rays(int64_t first, int64_t last, Vector lens, Out<doub
     const V nan = all<V>(__builtin_nan(""));
     for (int64_t j = first; j < last; ++j)
         for (int64_t i = 0; i < rays.n[1]; i += W) {
-            V u, v = all<V>(double(j) - 0.5), step = all<V>(1.0);
+            V u = {}, v = all<V>(double(j) - 0.5), step = all<V>(1.0);
             for (int e = 0; e < W; ++e) u[e] = double(i + e) - 0.5;
             V q[3] = {(u - l[3]) / l[0], (v - l[4]) / l[1], all<V>(1.0)};
             auto going = step > 0.0;  // a mask, -1 in lanes that are not there yet
