@@ -26,7 +26,8 @@ _LATE = frozenset((
 ))  # fmt: skip
 """What many observations share is eliminated last."""
 
-_HALVINGS = 3
+_SHORTEST = 0.125
+"""Share of an undamped step below which damping leads on better: the whole system bends."""
 _LEAST_GAIN = 0.1
 """Share of the promised decrease of chi-square that a step must bring."""
 _STATIONARY = 1e-2
@@ -189,11 +190,11 @@ class _Loop:
     ) -> tuple[gtsam.Values, float, float] | None:
         """Where the step leads: values, their chi-square and the share of the promised decrease; None if nowhere.
 
-        An undamped step is halved up to ``_HALVINGS`` times, until it keeps a part of its promise: the quadratic model
+        An undamped step is halved down to ``_SHORTEST``, until it keeps a part of its promise: the quadratic model
         falls by a (2 - a) of the whole at the length a. Source: Dennis and Schnabel 1996, section 6.3.
         """
         length = self.length
-        for _ in range(_HALVINGS + 1 if self.damping == 0.0 else 1):
+        while length >= (_SHORTEST if self.damping == 0.0 else 1.0):
             trial = self.values.retract(delta if length == 1.0 else delta.scale(length))
             new = self.evaluate(trial)
             behind = self._images_behind()

@@ -61,7 +61,7 @@ def test_commands(tmp_path, capsys):
         assert main(["remove", folder, "r11", "--quiet"]) in (0, 3)
         assert "removed: terrestrial:r11" in capsys.readouterr().out
         rows = (tmp_path / name / "observations" / "exclusions.csv").read_text().splitlines()
-        assert [row.split(",")[:3] for row in rows[1:]] == [["terrestrial", "r11", "excluded"]]
+        assert [row.split(",")[:3] for row in rows[1:]] == [["reading", "terrestrial:r11", "excluded"]]
 
 
 def test_report_shows_instruments_surfaces_and_beams_in_both_languages(tmp_path):

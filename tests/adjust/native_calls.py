@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
+from adjust.adjustment import adjust
+from adjust.initial import find_start
 from adjust.model import PoseParameter
-from adjust.native import bundles, images, lenses, navigation, reduction, trees, vision
+from adjust.native import bundles, images, lenses, navigation, reduction, trees, views, vision
 from adjust.native.library import Function
 from adjust.navigation import navigate
 from adjust.pose_network import solve_network
@@ -32,9 +34,10 @@ from tests.adjust.navigation import (
     turned,
     wide_head,
 )
+from tests.adjust.terrestrial_networks import measured, polar_network
 from tests.adjust.test_image_reduction import near, warped_stereo
 
-_MODULES = (lenses, images, trees, reduction, bundles, navigation, vision)
+_MODULES = (lenses, images, trees, reduction, bundles, navigation, views, vision)
 FUNCTIONS = {f.name: f for module in _MODULES for f in vars(module).values() if isinstance(f, Function)}
 """All functions of the core that have a face in Python."""
 _KEPT = 2
@@ -83,6 +86,7 @@ def calls() -> tuple[Call, ...]:
         _navigation()
         _pictures()
         _lenses()
+        _starts()
     return tuple(kept)
 
 
@@ -103,6 +107,12 @@ def _images() -> None:
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
     graph, done = h.solved(survey, near(truth))  # nothing to reduce: every block is condensed for itself
     graph.prepare(done.values, jacobians=False)
+
+
+def _starts() -> None:
+    survey, _ = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
+    find_start(survey)
+    adjust(measured(*polar_network(4), 1))
 
 
 def _bundles() -> None:
