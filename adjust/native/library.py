@@ -12,7 +12,7 @@ from collections.abc import Callable
 from functools import cache
 from operator import index
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -27,13 +27,6 @@ SETS = ("base", "avx2", "avx512")
 
 class _Entry(ctypes.Structure):
     _fields_ = (("name", ctypes.c_char_p), ("run", ctypes.c_void_p), ("describe", ctypes.c_void_p))
-
-
-class Compiled(Protocol):
-    """A function of the library: arrays and numbers in, one integer out."""
-
-    def __call__(self, *arguments: Any) -> int:
-        """Run it."""
 
 
 def _path(name: str) -> Path:

@@ -1,7 +1,6 @@
 """The batch: what need not be done again is taken over, the rest is adjusted side by side, everything is noted."""
 
 import contextlib
-import os
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,6 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from adjust.errors import SurveyError
+from adjust.parallel import cores
 from survey.batch.cache import fingerprint, unchanged_solution
 from survey.batch.causes import MAY_PASS
 from survey.batch.journal import Journal, entry_of, read_journal
@@ -105,11 +105,6 @@ def _counts(records: Any) -> str:
     states = [r.state for r in records]
     words = ((states.count(FAILED), "failed"), (states.count(TEST_FAILED), "test failed"))
     return ", ".join(f"{n} {word}" for n, word in words if n)
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def attempts(worker: Worker, task: Mapping[str, Any], retries: int) -> Record:
