@@ -16,23 +16,23 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from adjust.adjustment import AdjustOptions
     from adjust.adjustment import adjust as solve
-    from adjust.epochs import joint_survey
-    from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
-    from adjust.model import Datum, Survey
-    from adjust.other_datum import in_datum
-    from adjust.result import Adjustment, Estimate
+    from adjust.epochs.joint import joint_survey
+    from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
+    from adjust.model.result import Adjustment, Estimate
+    from adjust.model.survey import Datum, Survey
+    from adjust.precision.other_datum import in_datum
 
 _PLACES = {
     "AdjustOptions": ("adjust.adjustment", "AdjustOptions"),
-    "Adjustment": ("adjust.result", "Adjustment"),
-    "Datum": ("adjust.model", "Datum"),
-    "Estimate": ("adjust.result", "Estimate"),
-    "IndeterminateError": ("adjust.errors", "IndeterminateError"),
-    "NotConvergedError": ("adjust.errors", "NotConvergedError"),
-    "Survey": ("adjust.model", "Survey"),
-    "SurveyError": ("adjust.errors", "SurveyError"),
-    "in_datum": ("adjust.other_datum", "in_datum"),
-    "joint_survey": ("adjust.epochs", "joint_survey"),
+    "Adjustment": ("adjust.model.result", "Adjustment"),
+    "Datum": ("adjust.model.survey", "Datum"),
+    "Estimate": ("adjust.model.result", "Estimate"),
+    "IndeterminateError": ("adjust.model.errors", "IndeterminateError"),
+    "NotConvergedError": ("adjust.model.errors", "NotConvergedError"),
+    "Survey": ("adjust.model.survey", "Survey"),
+    "SurveyError": ("adjust.model.errors", "SurveyError"),
+    "in_datum": ("adjust.precision.other_datum", "in_datum"),
+    "joint_survey": ("adjust.epochs.joint", "joint_survey"),
     "solve": ("adjust.adjustment", "adjust"),
 }
 

@@ -6,20 +6,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
-from adjust.initial import Start, find_start
-from adjust.initial.given import GivenStarts, given_starts, moved_onto
-from adjust.lens import MODELS, camera_constants, monotone_radius_px, principal_point_px
-from adjust.model import BoolArray, FloatArray, Survey
-from adjust.observations import ImageBlock
-from adjust.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
-from adjust.result import Adjustment, Estimate, ParameterName
-from adjust.robust import limit, screen
-from adjust.solve import Solved, SolveOptions, solve
-from adjust.start_choice import Begun, adjusted_from_own_start
-from adjust.terrestrial.joint_start import find_all, needs_points
-from adjust.terrestrial.statistics import JoinedResiduals, reading_residuals
-from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
+from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
+from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.solver import Solved, SolveOptions, solve
+from adjust.lenses.models import MODELS, camera_constants, monotone_radius_px, principal_point_px
+from adjust.model.observations import ImageBlock
+from adjust.model.result import Adjustment, Estimate, ParameterName
+from adjust.model.survey import BoolArray, FloatArray, Survey
+from adjust.observations.terrestrial.statistics import JoinedResiduals, reading_residuals
+from adjust.precision.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
+from adjust.start import Start, find_start
+from adjust.start.choice import Begun, adjusted_from_own_start
+from adjust.start.given import GivenStarts, given_starts, moved_onto
+from adjust.start.readings.joint import find_all, needs_points
+from adjust.statistics.robust import limit, screen
 
 
 @dataclass(frozen=True)

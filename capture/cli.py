@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.commands.common import DONE, Version, is_set, print_json, run_as_program, run_command, say
 from survey.commands.completing import declare_completion_of
 from survey.commands.parser import Parser, name_commands, port, project_folder
 
 if TYPE_CHECKING:
-    from capture.camera import CameraInfo
+    from capture.devices.camera import CameraInfo
 
 _OPENING = "labcapture run plan.toml"
 _DESCRIPTION = """\
@@ -151,18 +151,18 @@ def _add_export(commands: Any, shaped: dict[str, Any]) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from capture.plan import read_plan
+    from capture.plan.plan import read_plan
 
     plan = read_plan(arguments.plan)
     if arguments.dry_run:
-        from capture.plan_report import plan_summary, plan_text
+        from capture.plan.report import plan_summary, plan_text
 
         if is_set(arguments, "json"):
             print_json(plan_summary(plan))
         else:
             print(f"{plan_text(plan)}\nNext: labcapture run {arguments.plan}")
         return DONE
-    from capture.session_run import run_plan
+    from capture.session.run import run_plan
 
     outcome = run_plan(plan, shown=not is_set(arguments, "quiet"))
     if is_set(arguments, "json"):
@@ -180,7 +180,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _cameras(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from capture.drivers.cameras import DRIVERS, describe_driver, discover
+    from capture.devices.cameras import DRIVERS, describe_driver, discover
 
     found: list[CameraInfo] = []
     for name in DRIVERS if arguments.driver == "all" else [describe_driver(arguments.driver).name]:
@@ -207,7 +207,7 @@ def _cameras(arguments: argparse.Namespace) -> int:
 
 
 def _table(arguments: argparse.Namespace) -> int:
-    from capture.table_jobs import driver_list, table_job
+    from capture.session.table_jobs import driver_list, table_job
 
     if arguments.plan is None:
         if arguments.jog or arguments.home or arguments.stop:
@@ -242,7 +242,7 @@ def _view(arguments: argparse.Namespace) -> int:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from capture.nexus import export
+    from capture.session.nexus import export
 
     summary = export(arguments.folder, arguments.file)
     if is_set(arguments, "json"):

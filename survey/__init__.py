@@ -16,25 +16,25 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from adjust.errors import SurveyError
+    from adjust.model.errors import SurveyError
     from survey.batch.python import Batch, adjust_many
     from survey.examples import write_example
-    from survey.files import Project, write_project
+    from survey.jobs.pairs import PairsOutcome, station_pairs
     from survey.notebook.covariance import Covariance
     from survey.notebook.plots import Plot
     from survey.notebook.solution import Solution
     from survey.notebook.steps import Problem, adjust, detect, exclude, include, problem, read, solve
-    from survey.pair_job import PairsOutcome, station_pairs
+    from survey.project import Project, write_project
 
 _PLACES = {
     "Batch": "survey.batch.python",
     "Covariance": "survey.notebook.covariance",
-    "PairsOutcome": "survey.pair_job",
+    "PairsOutcome": "survey.jobs.pairs",
     "Plot": "survey.notebook.plots",
     "Problem": "survey.notebook.steps",
-    "Project": "survey.files",
+    "Project": "survey.project",
     "Solution": "survey.notebook.solution",
-    "SurveyError": "adjust.errors",
+    "SurveyError": "adjust.model.errors",
     "adjust": "survey.notebook.steps",
     "adjust_many": "survey.batch.python",
     "detect": "survey.notebook.steps",
@@ -43,9 +43,9 @@ _PLACES = {
     "problem": "survey.notebook.steps",
     "read": "survey.notebook.steps",
     "solve": "survey.notebook.steps",
-    "station_pairs": "survey.pair_job",
+    "station_pairs": "survey.jobs.pairs",
     "write_example": "survey.examples",
-    "write_project": "survey.files",
+    "write_project": "survey.project",
 }
 
 __all__ = [

@@ -6,7 +6,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from survey.completion import commands_of, completion_script
+from survey.commands.completion import commands_of, completion_script
 
 
 def bash_completes(parser: argparse.ArgumentParser, folder: Path, words: list[str], expected: list[str]) -> None:

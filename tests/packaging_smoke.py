@@ -31,7 +31,7 @@ _COMMANDS = (
 )  # fmt: skip
 _SHIPPED = (
     *("adjust/py.typed", "survey/py.typed", "capture/py.typed", "survey/report/style.css", "survey/report/script.js"),
-    *("capture/web/page.html", "capture/drivers/turntables/dialects/two-axis.toml"),
+    *("capture/web/page.html", "capture/devices/turntables/dialects/two-axis.toml"),
 )
 _BUILT_FROM = (
     "LICENSE", "README.md", "setup.py", "build_tools/backend.py", "build_tools/native.py", "adjust/native/lenses.h",

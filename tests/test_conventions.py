@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.chains import table_motion
-from adjust.image_batch import square_root_information, warp_shape
-from adjust.lens import MODELS, lens_constants, project
-from adjust.model import (
+from adjust.frames.chains import table_motion
+from adjust.frames.state import State
+from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.lenses.models import MODELS, lens_constants, project
+from adjust.model.observations import FrameRef, ImageBlock, Pair, TableReading
+from adjust.model.result import Estimate
+from adjust.model.survey import (
     Camera,
     FloatArray,
     LensParameter,
@@ -20,11 +23,8 @@ from adjust.model import (
     Target,
     VectorParameter,
 )
-from adjust.observations import FrameRef, ImageBlock, Pair, TableReading
-from adjust.result import Estimate
-from adjust.state import State
-from adjust.unknowns import FrameTree, Unknowns
-from survey.quantities import Scale, pose_dict, pose_entry, sigmas_of
+from adjust.observations.images.batch import square_root_information, warp_shape
+from survey.solution.quantities import Scale, pose_dict, pose_entry, sigmas_of
 from tests.adjust import helpers as h
 
 RNG = np.random.default_rng(3)

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from survey.cli import build_parser, main
-from survey.completion import SHELLS, commands_of
+from survey.commands.completion import SHELLS, commands_of
 from tests.completion_checks import bash_completes, names_every_command_and_parses
 from tests.lower_bounds import pins, requirements
 

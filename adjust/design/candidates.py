@@ -9,10 +9,9 @@ from scipy.linalg import qr
 
 from adjust.design.exact import exact
 from adjust.design.rows import DesignMatrix, Rows, design_matrix
-from adjust.errors import SurveyError
-from adjust.graph import GraphBuilder, StartValues
-from adjust.model import BoolArray, FloatArray, IntArray, Point, Survey
-from adjust.observations import (
+from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.model.errors import SurveyError
+from adjust.model.observations import (
     Alignment,
     CoordinateDifferences,
     Coordinates,
@@ -25,7 +24,8 @@ from adjust.observations import (
     Reading,
     TableReading,
 )
-from adjust.result import ParameterName
+from adjust.model.result import ParameterName
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Point, Survey
 
 _RANK = 1e-10
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.error_analysis import (
+from adjust.design.error_analysis import (
     ERROR_KINDS,
     BeaconField,
     ErrorKind,
@@ -24,7 +24,7 @@ from adjust.error_analysis import (
     second_order,
     u_jacobian,
 )
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 
 # what the paper's figures span, m and rad
 SIZES: dict[ErrorKind, FloatArray] = {

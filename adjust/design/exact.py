@@ -8,9 +8,11 @@ from gtsam import Pose3
 
 from adjust.design.prediction import Predictor
 from adjust.design.readings import exact_readings
-from adjust.graph import StartValues
-from adjust.lens import MODELS, camera_constants, project
-from adjust.model import (
+from adjust.graph.assembly import StartValues
+from adjust.lenses.models import MODELS, camera_constants, project
+from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair
+from adjust.model.result import ParameterName
+from adjust.model.survey import (
     Camera,
     FloatArray,
     Point,
@@ -22,8 +24,6 @@ from adjust.model import (
     VectorParameter,
     VectorPrior,
 )
-from adjust.observations import Coordinates, Distance, ImageBlock, Pair
-from adjust.result import ParameterName
 
 
 def exact(survey: Survey, start: StartValues) -> Survey:

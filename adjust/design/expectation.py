@@ -6,11 +6,11 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, assemble
 from adjust.design.exact import exact
-from adjust.graph import GraphBuilder, StartValues
-from adjust.model import FloatArray, Survey
-from adjust.rank import readable
-from adjust.result import CAUTIOUS_SIGMAS, Adjustment, ParameterName
-from adjust.solve import SolveOptions, solve
+from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.rank import readable
+from adjust.graph.solver import SolveOptions, solve
+from adjust.model.result import CAUTIOUS_SIGMAS, Adjustment, ParameterName
+from adjust.model.survey import FloatArray, Survey
 
 _PART = 0.25  # of the largest share: what is named of a direction
 

@@ -7,8 +7,8 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.design.readings import disturbed_readings, draw
-from adjust.model import FloatArray, PoseParameter, Survey, VectorParameter, VectorPrior
-from adjust.observations import ImageBlock, Pair
+from adjust.model.observations import ImageBlock, Pair
+from adjust.model.survey import FloatArray, PoseParameter, Survey, VectorParameter, VectorPrior
 
 Rng = np.random.Generator
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3
 
-from adjust.errors import SurveyError
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.errors import SurveyError
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.navigation.model import Beacons, Head
 from adjust.navigation.system import System, evaluate, make_system, visible
 

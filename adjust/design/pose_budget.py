@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3
 
-from adjust.closed_forms import rotation_exp, rotation_log
-from adjust.errors import SurveyError
-from adjust.lens import MODELS, lens_derivatives
-from adjust.model import FloatArray, IntArray
+from adjust.lenses.models import MODELS, lens_derivatives
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray, IntArray
 from adjust.navigation.model import Beacons, Head
 from adjust.navigation.system import make_system, visible
+from adjust.spatial.rigid import rotation_exp, rotation_log
 
 SOURCES = ("spots", "beacons", "camera positions", "camera attitudes")
 UNITS = ("px", "m", "m", "rad")

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.errors import SurveyError
-from adjust.factors import ChainPose
-from adjust.graph import GraphBuilder, StartValues
-from adjust.image_batch import warp_shape
-from adjust.lens import MODELS, camera_constants, lens_residuals, project
-from adjust.model import BoolArray, Camera, FloatArray, Point, Survey, Target
+from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.lenses.models import MODELS, camera_constants, lens_residuals, project
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef, ImageBlock, PositionRef, TableReading
+from adjust.model.survey import BoolArray, Camera, FloatArray, Point, Survey, Target
 from adjust.native.lenses import FISHEYE
-from adjust.observations import FrameRef, ImageBlock, PositionRef, TableReading
+from adjust.observations.factors import ChainPose
+from adjust.observations.images.batch import warp_shape
 
 _STEPS = np.linspace(1.0 / 16.0, 1.0, 16)
 _NEAREST_M = 1e-3

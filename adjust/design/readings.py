@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from adjust.design.prediction import Predictor
-from adjust.errors import SurveyError
-from adjust.graph import StartValues
-from adjust.model import FloatArray, Survey, VectorParameter, VectorPrior
-from adjust.observation_factor import ObservationFactor
-from adjust.precision import noise_of
-from adjust.result import ParameterName
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import SurveyError
+from adjust.model.result import ParameterName
+from adjust.model.survey import FloatArray, Survey, VectorParameter, VectorPrior
+from adjust.observations.listed import ObservationFactor
+from adjust.precision.precision import noise_of
 
 Rng = np.random.Generator
 _NO_RESIDUAL_M = 1e-7

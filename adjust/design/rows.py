@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.design.prediction import Predictor
-from adjust.factors import ChainPose
-from adjust.graph import StartValues
-from adjust.image_batch import square_root_information, warp_shape
-from adjust.lens import MODELS, camera_constants, lens_derivatives
-from adjust.model import FloatArray, IntArray, Survey
-from adjust.observations import FrameRef, ImageBlock
-from adjust.result import ParameterName
+from adjust.graph.assembly import StartValues
+from adjust.lenses.models import MODELS, camera_constants, lens_derivatives
+from adjust.model.observations import FrameRef, ImageBlock
+from adjust.model.result import ParameterName
+from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.observations.factors import ChainPose
+from adjust.observations.images.batch import square_root_information, warp_shape
 
 
 @dataclass(frozen=True, eq=False)

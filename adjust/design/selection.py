@@ -21,10 +21,10 @@ from scipy.linalg import solve_triangular
 
 from adjust.design.candidates import Candidate, Informed, inform
 from adjust.design.expectation import expect
-from adjust.errors import SurveyError
-from adjust.graph import StartValues
-from adjust.model import FloatArray, IntArray, Survey
-from adjust.result import Adjustment, ParameterName
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import FloatArray, IntArray, Survey
 
 Criterion = Literal["D", "A"]
 

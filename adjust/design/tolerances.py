@@ -16,10 +16,10 @@ import numpy as np
 from adjust.design.exact import exact
 from adjust.design.rows import design_matrix
 from adjust.design.selection import Component
-from adjust.errors import SurveyError
-from adjust.graph import StartValues
-from adjust.model import FloatArray, Survey
-from adjust.result import Adjustment
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray, Survey
 
 
 @dataclass(frozen=True, eq=False)

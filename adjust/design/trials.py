@@ -17,13 +17,13 @@ from adjust.design.expectation import shared_names
 from adjust.design.noise import disturbed
 from adjust.design.readings import displaced, reading_sigmas
 from adjust.distributions import chi2
-from adjust.errors import SurveyError
-from adjust.graph import GraphBuilder, StartValues
-from adjust.model import FloatArray, Survey
-from adjust.parallel import workers
-from adjust.result import Adjustment, ParameterName
-from adjust.solve import SolveOptions, solve
-from adjust.unknowns import Unknown
+from adjust.frames.unknowns import Unknown
+from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.solver import SolveOptions, solve
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import FloatArray, Survey
+from adjust.native.parallel import workers
 
 _CHUNK = 8
 

@@ -1,4 +1,4 @@
-// Bundles with unknown points: rows, Schur complements, back-substitution, covariances; see adjust.bundle_batch.
+// Bundles with unknown points: rows, Schur complements, back-substitution, covariances; see adjust.observations.images.bundles.
 //
 // Local unknowns: the free lens parameters of every camera, six of camera_from_world per block (tangent on the right),
 // then the points that stay (tied to other observations). The other points are reduced one by one (Brown 1958; Triggs et

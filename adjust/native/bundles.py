@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import LENSES, LensArrays
 from adjust.native.library import Function
 

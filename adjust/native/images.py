@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.library import Function
 from adjust.native.trees import TREE, TreeArrays
 

@@ -1,7 +1,7 @@
 // The lens models, each written once: values alone or with derivatives, by the type of the numbers given.
 //
 // residual(p, c, X, Y, Z, u, v): predicted minus observed, px, of a point X, Y, Z in the camera (m; x right, y down,
-// z forward) seen at u, v. p: the parameters in the order of adjust.lens. c: pixel size (mm), image centre u and v (px),
+// z forward) seen at u, v. p: the parameters in the order of adjust.lenses.models. c: pixel size (mm), image centre u and v (px),
 // balance radius (mm). A new model is one such function and one line in with_lens below.
 #pragma once
 #include "jets.h"

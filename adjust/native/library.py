@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 
 _KINDS = {"f": np.float64, "i": np.int64, "s": np.float32, "u": np.uint8, "b": np.bool_}
 _FOLDER = Path(__file__).parent

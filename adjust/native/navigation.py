@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.library import Function
 
 DONE, OPEN, UNSETTLED = 0, 1, 2

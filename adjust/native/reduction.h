@@ -1,4 +1,4 @@
-// Poses that only image points of known targets touch, reduced by Schur complements; see adjust.image_reduction.
+// Poses that only image points of known targets touch, reduced by Schur complements; see adjust.observations.images.reduction.
 //
 // A pose's columns are its own six, then those of the keys its blocks share with others, then the residual.
 #pragma once

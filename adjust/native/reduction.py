@@ -1,4 +1,4 @@
-"""Reduction of poses that only image points of known targets touch; see :mod:`adjust.image_reduction`, ``reduction.h``.
+"""Reduction of poses that only image points of known targets touch; see :mod:`adjust.observations.images.reduction`, ``reduction.h``.
 
 A pose's columns are its own six, then those of the keys its blocks share with others, then the residual.
 """
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import BLOCKS, CHAINED, LENSES, MAX_LOCAL, SEGMENTS, BlockArrays, LensArrays, SegmentArrays
 from adjust.native.library import Function
 

@@ -1,4 +1,4 @@
-// Recursions over the cliques of a Bayes tree, flattened; see adjust.tree_covariance.
+// Recursions over the cliques of a Bayes tree, flattened; see adjust.precision.tree.
 //
 // Clique c has the keys keys[key_ptr[c]] .. keys[key_ptr[c + 1] - 1], the first n_front[c] of them frontal, parents
 // before children. Blocks of front x width numbers, row by row, begin at at[c]: in data first [R S], later

@@ -1,4 +1,4 @@
-"""Recursions over the cliques of a Bayes tree, flattened; see :mod:`adjust.tree_covariance` and ``trees.h``.
+"""Recursions over the cliques of a Bayes tree, flattened; see :mod:`adjust.precision.tree` and ``trees.h``.
 
 Clique c has the keys ``keys[key_ptr[c]:key_ptr[c + 1]]``, the first ``n_front[c]`` of them frontal, parents before
 children. Row-major blocks of front x width numbers begin at ``at[c]``: in ``data`` first [R S], later [R^-1, -R^-1 S];
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.library import Function
 
 TREE = "home[K] key_ptr[C+1] keys[*] dims[K] front[C] width[C] at[C] cov[*]"

@@ -1,4 +1,4 @@
-// Camera poses of single views, refined and judged by the angles between rays and points; see adjust.closed_forms.views.
+// Camera poses of single views, refined and judged by the angles between rays and points; see adjust.start.closed_forms.views.
 #pragma once
 #include "dense.h"
 #include "vectors.h"

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.library import Function
 
 _VIEWS = "which[*] of[K] ptr[B+1] x[N,3] rays[N,3]"

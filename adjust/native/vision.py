@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.library import Function
 
 Gray = npt.NDArray[np.float32]
@@ -121,7 +121,7 @@ def spot_rows(xy: FloatArray, p: FloatArray, profile: int) -> tuple[FloatArray, 
 def pixel_corner_rays(width: int, height: int, lens: FloatArray) -> FloatArray:
     """Undistorted x/z, y/z of all pixel corners, (height + 1, width + 1, 2); NaN where the lens cannot be inverted.
 
-    lens: Brown's parameters (13,), as :mod:`adjust.lens` orders them.
+    lens: Brown's parameters (13,), as :mod:`adjust.lenses.models` orders them.
     """
     rays = np.empty((height + 1, width + 1, 2))
     _pixel_corner_rays(0, height + 1, np.append(lens, 0.0), rays)

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.closed_forms.rigid import inverse, rigid, rotation_exp, rotation_log
 from adjust.distributions import chi2
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.navigation import DONE, SpotArrays, gauss_newton
 from adjust.navigation.system import Sightings, System
 from adjust.relay.motions import right_jacobian_inverse
+from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log
 from adjust.statistics.criteria import cautious
 
 _NO_B: FloatArray = np.zeros((0, 0))

@@ -5,12 +5,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from gtsam import Pose3
 
-from adjust.errors import SurveyError
-from adjust.lens import camera_constants
-from adjust.model import TABLE_GEOMETRY, FloatArray, PoseParameter, Survey
+from adjust.frames.unknowns import VectorMap
+from adjust.lenses.models import camera_constants
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import TABLE_GEOMETRY, FloatArray, PoseParameter, Survey
 from adjust.navigation.model import Beacons, Head, HeadCamera, HeadTable
-from adjust.result import Adjustment, ParameterName
-from adjust.unknowns import VectorMap
 
 
 def head_and_beacons(

@@ -12,14 +12,14 @@ from itertools import combinations
 
 import numpy as np
 
-from adjust.closed_forms.rigid import rigid
 from adjust.distributions import chi2
-from adjust.lens import MODELS, focal_length_px
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.lenses.models import MODELS, focal_length_px
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import FoundArrays, SkyArrays, search
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers, local, log_evidence
 from adjust.navigation.model import NavigateOptions
 from adjust.navigation.system import Sightings, System, evaluate, station_rays, visible
+from adjust.spatial.rigid import rigid
 
 _KEPT = 400
 _ADJUSTED = 60

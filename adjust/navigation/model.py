@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 
 Status = Literal["fixed", "bridged", "ambiguous", "undetermined", "none"]
 Bridge = Literal["", "prior", "table", "motion"]
@@ -18,7 +18,7 @@ Bridge = Literal["", "prior", "table", "motion"]
 
 @dataclass(frozen=True, eq=False)
 class HeadCamera:
-    """A calibrated camera of the head: ``lens`` (n,) and ``constants`` (4,) as ``adjust.lens`` has them."""
+    """A calibrated camera of the head: ``lens`` (n,) and ``constants`` (4,) as ``adjust.lenses.models`` has them."""
 
     camera_id: str
     image_size: tuple[int, int]

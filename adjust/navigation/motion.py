@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3
 
-from adjust.chains import table_motion
-from adjust.model import FloatArray
+from adjust.frames.chains import table_motion
+from adjust.model.survey import FloatArray
 from adjust.navigation.fit import PoseFit, Prior, local, local_derivative
 from adjust.navigation.model import Motion, NavigationEpoch, PosePrior
 from adjust.navigation.system import System

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3
 
-from adjust.lens import MODELS, project
-from adjust.model import FloatArray, IntArray
+from adjust.lenses.models import MODELS, project
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native import navigation as native
 from adjust.navigation.fit import PoseFit, Prior, fit_pose
 from adjust.navigation.model import Beacons, Head, Shares

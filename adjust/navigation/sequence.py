@@ -7,7 +7,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.distributions import chi2
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, local
 from adjust.navigation.identification import Candidate, with_prior, without_prior
 from adjust.navigation.model import (

@@ -6,9 +6,9 @@ from functools import cached_property
 
 import numpy as np
 
-from adjust.errors import SurveyError
-from adjust.lens import MODELS, unit_rays
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.lenses.models import MODELS, unit_rays
+from adjust.model.errors import SurveyError
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import FISHEYE, MAX_LENS
 from adjust.native.navigation import SpotArrays, SystemArrays, spot_rows
 from adjust.navigation.model import Beacons, Head, NavigationEpoch, Spots

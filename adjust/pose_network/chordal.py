@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from adjust.closed_forms.rigid import skew
-from adjust.errors import NotConvergedError, SurveyError
-from adjust.model import FloatArray
+from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.survey import FloatArray
 from adjust.pose_network.network import PoseNetwork, check_determined
 from adjust.pose_network.start import find_network_start
 from adjust.relay.motions import Motions
+from adjust.spatial.rigid import skew
 
 _GENERATORS = skew(np.eye(3))
 

@@ -3,17 +3,17 @@
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.errors import IndeterminateError, SurveyError
-from adjust.model import FloatArray, PoseParameter, Survey
-from adjust.named_precision import NamedPrecision
-from adjust.observations import FrameRef
+from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
+from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.observations import FrameRef
+from adjust.model.result import Adjustment, Estimate, GroupSummary, ImageResiduals, ObservationResidual, ParameterName
+from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.pose_network.network import PoseNetwork, pose_network
 from adjust.pose_network.precision import UNCONTROLLED
 from adjust.pose_network.solution import NetworkSolution
-from adjust.precision import adjusted_motion, global_test
+from adjust.precision.pose_networks import NamedPrecision
+from adjust.precision.precision import adjusted_motion, global_test
 from adjust.relay.motions import Motions, right_jacobian_inverse
-from adjust.result import Adjustment, Estimate, GroupSummary, ImageResiduals, ObservationResidual, ParameterName
-from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS
 
 
 def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.pose_network.network import PoseNetwork
 from adjust.relay.motions import Motions
 

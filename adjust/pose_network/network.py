@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array
 
-from adjust.closed_forms import nearest_rotation
-from adjust.errors import IndeterminateError, SurveyError
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.relay.graphs import loop_labels
+from adjust.spatial.rigid import nearest_rotation
 
 _FEW = 8
 

@@ -1,6 +1,6 @@
 """Covariances of all stations and the statistics of all pairs, from one pass over the Bayes tree.
 
-Redundancy numbers and tests as in :mod:`adjust.precision`: v' Q_vv^-1 v of a whole pair is chi-square with the rank of
+Redundancy numbers and tests as in :mod:`adjust.precision.precision`: v' Q_vv^-1 v of a whole pair is chi-square with the rank of
 Q_vv degrees of freedom (Baarda 1968; Koch 1999, section 4.2). A free network is solved against one station and then
 brought into its inner datum by an S-transformation (Baarda 1973), S = I - N (N_D' N_D)^-1 N_D'.
 """
@@ -13,11 +13,11 @@ import gtsam
 import numpy as np
 
 from adjust.distributions import chi2
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.solve import Minimum
+from adjust.precision.tree import TreeCovariance
 from adjust.relay.motions import Motions, right_jacobian_inverse
-from adjust.tree_covariance import TreeCovariance
 
 # share of a pair's direction that others must control for it to be tested; covariances of weak networks lose digits
 UNCONTROLLED = 1e-4

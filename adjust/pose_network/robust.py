@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.distributions import chi2
-from adjust.errors import IndeterminateError, NotConvergedError
-from adjust.model import BoolArray, FloatArray
+from adjust.model.errors import IndeterminateError, NotConvergedError
+from adjust.model.survey import BoolArray, FloatArray
 from adjust.pose_network.network import PoseNetwork, loop_marks
 from adjust.pose_network.precision import NetworkPrecision, PairStatistics
 from adjust.pose_network.solve import Minimum, NetworkOptions, Progress, minimize

@@ -13,9 +13,9 @@ import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
-from adjust.observations import Pair
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Pair
+from adjust.model.survey import FloatArray
 from adjust.pose_network.graph import NoiseCache, pair_factors, prior_factors
 from adjust.pose_network.growth import Batch, Growth, Tree, moved_over
 from adjust.pose_network.network import PoseNetwork, pose_network

@@ -6,15 +6,15 @@ from functools import cached_property
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.model import FloatArray
+from adjust.model.result import GlobalTest
+from adjust.model.survey import FloatArray
 from adjust.pose_network.graph import prior_whitening
 from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.precision import NetworkPrecision, pair_jacobians
 from adjust.pose_network.robust import RejectedPair, clean
 from adjust.pose_network.solve import DEFAULTS, Minimum, NetworkOptions, Progress, minimize
-from adjust.precision import global_test
+from adjust.precision.precision import global_test
 from adjust.relay.motions import Motions
-from adjust.result import GlobalTest
 
 
 @dataclass(frozen=True, eq=False)

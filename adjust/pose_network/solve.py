@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from adjust.errors import IndeterminateError, NotConvergedError
-from adjust.model import FloatArray
+from adjust.model.errors import IndeterminateError, NotConvergedError
+from adjust.model.survey import FloatArray
 from adjust.pose_network.graph import network_graph, network_ordering, network_values, values_arrays
 from adjust.pose_network.network import PoseNetwork, check_determined
 from adjust.pose_network.start import find_network_start

@@ -7,10 +7,10 @@ GTSAM's fastSyncRot3: the chordal problem with orthogonality relaxed, solved dir
 import gtsam
 import numpy as np
 
-from adjust.closed_forms import nearest_rotation, rotation_log
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.pose_network.graph import rotations_of
 from adjust.pose_network.network import PoseNetwork
+from adjust.spatial.rigid import nearest_rotation, rotation_log
 
 
 def find_network_start(network: PoseNetwork, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:

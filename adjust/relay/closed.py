@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray, PoseParameter, Station, Survey
-from adjust.named_precision import NamedPrecision
-from adjust.observations import Closure, FrameRef, Pair
-from adjust.precision import adjusted_motion, global_test
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Closure, FrameRef, Pair
+from adjust.model.result import Adjustment, ObservationResidual
+from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
+from adjust.precision.pose_networks import NamedPrecision
+from adjust.precision.precision import adjusted_motion, global_test
 from adjust.relay.conditions import adjust_loops
 from adjust.relay.network import network_from_pairs
 from adjust.relay.result import AdjustedPairs, whitening
-from adjust.result import Adjustment, ObservationResidual
 
 _OBSERVED = (
     "image_blocks", "distances", "coordinates", "readings", "coordinate_differences", "levels", "alignments",

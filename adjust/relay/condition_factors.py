@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from adjust.errors import NotConvergedError, SurveyError
-from adjust.model import FloatArray
+from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.survey import FloatArray
 from adjust.relay.loops import LoopBasis, evaluate_loops
 from adjust.relay.motions import Motions
 from adjust.relay.network import Network, gtsam_motion, motions_from_values, prior_factor, station_values

@@ -15,8 +15,8 @@ from typing import Literal
 
 import numpy as np
 
-from adjust.errors import NotConvergedError
-from adjust.model import FloatArray
+from adjust.model.errors import NotConvergedError
+from adjust.model.survey import FloatArray
 from adjust.relay.condition_factors import MAX_HARD_LOOPS, FactorSolution, solve_factors
 from adjust.relay.counts import parts
 from adjust.relay.loops import LoopBasis, evaluate_loops, loop_basis, loop_misclosures

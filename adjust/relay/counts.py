@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from adjust.model import IntArray
+from adjust.model.survey import IntArray
 from adjust.relay.graphs import loop_labels
 from adjust.relay.network import Topology
 

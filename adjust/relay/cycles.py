@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from adjust.model import IntArray
+from adjust.model.survey import IntArray
 from adjust.relay.graphs import Forest
 
 _Ways = Sequence[Sequence[tuple[int, int]]]  # of every station the neighbours, and the pairs that lead there

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.closed_forms.hand_eye import degenerate_direction
-from adjust.closed_forms.rigid import rotation_log
-from adjust.errors import SurveyError
-from adjust.model import FloatArray, IntArray
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray, IntArray
 from adjust.relay.eye_setup import EyeSetup
+from adjust.spatial.rigid import rotation_log
+from adjust.start.closed_forms.hand_eye import degenerate_direction
 
 
 @dataclass(frozen=True)

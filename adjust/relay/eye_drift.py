@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.distributions import norm
-from adjust.errors import NotConvergedError, SurveyError
-from adjust.model import FloatArray
+from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.survey import FloatArray
 from adjust.relay.eye_solver import EyeProblem, EyeSolution, linearise
 from adjust.relay.eye_trajectories import CommonMotions, Trajectory, common_motions
 from adjust.relay.eyes import EyeAdjustment, EyeOptions, MotionSequence, adjust_eye_motions

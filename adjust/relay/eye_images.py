@@ -9,13 +9,13 @@ from dataclasses import replace
 from gtsam import Pose3
 
 from adjust.adjustment import AdjustOptions, adjust
-from adjust.errors import SurveyError
-from adjust.model import Camera, PoseParameter, Station, Survey, Target
-from adjust.observations import FrameRef, ImageBlock
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef, ImageBlock
+from adjust.model.result import Adjustment
+from adjust.model.survey import Camera, PoseParameter, Station, Survey, Target
 from adjust.relay.eye_setup import from_matrix
 from adjust.relay.eye_solver import stacked
 from adjust.relay.eyes import PoseSequence, symmetric
-from adjust.result import Adjustment
 
 ROOM = "room"  # the world of targets that the survey holds
 _ADJUST = AdjustOptions()

@@ -7,9 +7,9 @@ from itertools import combinations
 import numpy as np
 import scipy.linalg
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
-from adjust.observations import Pair
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Pair
+from adjust.model.survey import FloatArray
 from adjust.relay.eyes import (
     EyeAdjustment,
     EyeOptions,

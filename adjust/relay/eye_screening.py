@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from adjust.distributions import chi2
-from adjust.errors import SurveyError
-from adjust.model import BoolArray, FloatArray
+from adjust.model.errors import SurveyError
+from adjust.model.survey import BoolArray, FloatArray
 from adjust.relay.eye_checks import OutlierEpoch
 from adjust.relay.eye_setup import EyeSetup
 from adjust.relay.eye_solver import EyeProblem, EyeSolution, linearise, solve_eyes

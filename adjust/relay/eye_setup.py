@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.linalg
 
-from adjust.closed_forms.hand_eye import relative_motions, solve_ax_xb
-from adjust.errors import SurveyError
-from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.observations import FrameRef
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.relay.eye_solver import EyeConditions, EyeProblem, KnownMotion, stacked
 from adjust.relay.graphs import adjacency
 from adjust.relay.motions import Motions, identities
+from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb
 
 if TYPE_CHECKING:  # the frozen values live with the functions that take them
     from adjust.relay.eyes import KnownWorlds, MotionSequence, PoseSequence

@@ -18,8 +18,8 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from adjust.errors import NotConvergedError
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.errors import NotConvergedError
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.relay.motions import Motions, exp, right_jacobian, right_jacobian_inverse
 
 

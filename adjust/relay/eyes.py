@@ -13,17 +13,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from gtsam import Pose3
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
-from adjust.observations import FrameRef, Pair
-from adjust.precision import global_test
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.result import GlobalTest
+from adjust.model.survey import FloatArray
+from adjust.precision.precision import global_test
 from adjust.relay.eye_checks import OutlierEpoch, refuse_undetermined
 from adjust.relay.eye_screening import solve_screened
 from adjust.relay.eye_setup import EyeSetup, motion_setup, pose_setup
 from adjust.relay.eye_solver import EyeSolution
 from adjust.relay.motions import Motions
 from adjust.relay.network import gtsam_motion
-from adjust.result import GlobalTest
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.model import IntArray
+from adjust.model.survey import IntArray
 
 
 def adjacency(n: int, a: IntArray, b: IntArray) -> tuple[IntArray, IntArray, IntArray]:

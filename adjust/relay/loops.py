@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from adjust.distributions import chi2
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.relay.cycles import bits_of, flat, forest_loops, shortest_loops
 from adjust.relay.graphs import adjacency, breadth_first
 from adjust.relay.motions import Motions, identities, right_jacobian_inverse

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.closed_forms.rigid import rotation_exp, rotation_log, skew
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.spatial.rigid import rotation_exp, rotation_log, skew
 
 _SMALL = 0.3  # rad; below it the series are exact to the last digit, above it the closed forms lose none
 

@@ -12,11 +12,11 @@ import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.errors import SurveyError
-from adjust.factors import gaussian
-from adjust.model import FloatArray, IntArray
-from adjust.observation_factor import frame_text
-from adjust.observations import Pair
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Pair
+from adjust.model.survey import FloatArray, IntArray
+from adjust.observations.factors import gaussian
+from adjust.observations.listed import frame_text
 from adjust.relay.motions import Motions
 
 

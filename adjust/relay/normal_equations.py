@@ -14,11 +14,11 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from adjust.factors import Jacobians, custom
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
+from adjust.observations.factors import Jacobians, custom
+from adjust.precision.tree import TreeCovariance
 from adjust.relay.loops import LoopBasis
 from adjust.relay.result import whitening
-from adjust.tree_covariance import TreeCovariance
 
 
 class NormalEquations(Protocol):

@@ -11,15 +11,15 @@ import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.errors import NotConvergedError, SurveyError
-from adjust.model import FloatArray, IntArray
+from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.survey import FloatArray, IntArray
+from adjust.precision.tree import TreeCovariance
 from adjust.relay.loops import loop_misclosures
 from adjust.relay.motions import Motions
 from adjust.relay.network import Network, between_factor, gtsam_motion, motions_from_values, prior_factor
 from adjust.relay.result import AdjustedPairs, adjusted_pairs
 from adjust.relay.start import refuse_parts, start_from_pairs
 from adjust.relay.station_datum import InnerStations, inner_stations
-from adjust.tree_covariance import TreeCovariance
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,8 @@ import scipy.sparse as sp
 from gtsam import Rot3
 from scipy.sparse.linalg import splu
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray
 from adjust.relay.counts import count
 from adjust.relay.motions import Motions, identities
 from adjust.relay.network import Network

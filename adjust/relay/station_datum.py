@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 from adjust.relay.motions import Motions, exp, right_jacobian_inverse
 from adjust.relay.network import Network
 from adjust.relay.result import whitening

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from adjust.distributions import norm, student
-from adjust.errors import SurveyError
-from adjust.model import FloatArray, IntArray
-from adjust.result import Adjustment, ParameterName
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.result import BudgetEntry, BudgetLine, VarianceComponents
 from adjust.statistics.system import LinearSystem, linear_system
 from adjust.statistics.weakness import covariance_columns

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from adjust.graph import AdjustmentGraph
-from adjust.model import BoolArray, Survey
-from adjust.observations import ReadingCovariance
+from adjust.graph.assembly import AdjustmentGraph
+from adjust.model.observations import ReadingCovariance
+from adjust.model.survey import BoolArray, Survey
 
 _FIELD = {
     "pair": "pairs", "distance": "distances", "coordinates": "coordinates", "level": "levels",

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from adjust.bundle_batch import BundleBatch
-from adjust.graph import AdjustmentGraph
-from adjust.image_batch import warp_shape
-from adjust.model import FloatArray, IntArray
+from adjust.graph.assembly import AdjustmentGraph
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import block_rows
 from adjust.native.lenses import MAX_LENS
-from adjust.precision import Precision
+from adjust.observations.images.batch import warp_shape
+from adjust.observations.images.bundles import BundleBatch
+from adjust.precision.precision import Precision
 from adjust.statistics.system import Entries, ImageRows, KeyColumns, LinearSystem, assembled, bundle_order, bundle_rows
 
 N_SHAPE = 4

@@ -1,7 +1,7 @@
 """All parts of a survey and all changes within it, tested together at one error probability."""
 
-from adjust.named_precision import NamedPrecision
-from adjust.result import Adjustment
+from adjust.model.result import Adjustment
+from adjust.precision.pose_networks import NamedPrecision
 from adjust.statistics.changes import ChangeSearch
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.criteria import sidak

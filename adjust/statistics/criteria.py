@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from adjust.distributions import chi2, ncx2
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.result import Criteria, LevelOptions
 
 CAUTIOUS = 0.5

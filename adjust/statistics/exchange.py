@@ -14,7 +14,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.statistics.single_tests import CONTROLLED
 from adjust.statistics.snooping import Snooping
 

@@ -19,7 +19,7 @@ import numpy as np
 import scipy
 from scipy import sparse
 
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.system import LinearSystem, Normal
 
 _SMALL = 500

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from adjust.datum import in_world
-from adjust.model import FloatArray
-from adjust.result import ParameterName
+from adjust.graph.datum import in_world
+from adjust.model.result import ParameterName
+from adjust.model.survey import FloatArray
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Influence
 from adjust.statistics.system import LinearSystem

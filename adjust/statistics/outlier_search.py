@@ -13,14 +13,14 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.distributions import chi2
-from adjust.errors import IndeterminateError, NotConvergedError
-from adjust.graph import StartValues
-from adjust.model import BoolArray, IntArray, Survey
-from adjust.pair_screen import values_of
-from adjust.result import Adjustment
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import IndeterminateError, NotConvergedError
+from adjust.model.result import Adjustment
+from adjust.model.survey import BoolArray, IntArray, Survey
 from adjust.statistics.candidates import Candidates, candidates, without
 from adjust.statistics.criteria import criteria, sidak
 from adjust.statistics.exchange import better_set, equal_sets
+from adjust.statistics.pair_screen import values_of
 from adjust.statistics.reliability import observation_name
 from adjust.statistics.result import Alternative, Decision, LevelOptions
 from adjust.statistics.snooping import Snooping, robust_squares

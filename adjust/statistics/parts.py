@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.distributions import chi2, fisher
-from adjust.image_batch import whitened_squares
-from adjust.model import FloatArray, IntArray
-from adjust.result import Adjustment
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray, IntArray
+from adjust.observations.images.batch import whitened_squares
 from adjust.statistics.quadratic_forms import upper_tail, upper_tail_bound
 from adjust.statistics.result import PartTest
 from adjust.statistics.system import LinearSystem

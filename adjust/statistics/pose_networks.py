@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.named_precision import NamedPrecision
-from adjust.result import Adjustment
-from adjust.unknowns import POSE_COMPONENTS
+from adjust.frames.unknowns import POSE_COMPONENTS
+from adjust.model.result import Adjustment
+from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.precision.pose_networks import NamedPrecision
 
 Whitening = tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray]
 """Numbers (n,) among the other residuals, whitened residuals (n, k) and A Q A' (n, k, k), W (n, k, k), used (n,)."""

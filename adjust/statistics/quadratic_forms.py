@@ -7,7 +7,7 @@ to its redundancy r, and their squares to half its variance.
 import numpy as np
 
 from adjust.distributions import chi2, norm
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 
 _STEPS = 100
 _NEAR = 1e-4

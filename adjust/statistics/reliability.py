@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.model import FloatArray, IntArray
-from adjust.named_precision import NamedPrecision
-from adjust.precision import Precision, noise_of
-from adjust.result import Adjustment
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray, IntArray
+from adjust.observations.terrestrial.statistics import influences as influences_of_readings
+from adjust.precision.pose_networks import NamedPrecision
+from adjust.precision.precision import Precision, noise_of
 from adjust.statistics.condensed import CondensedSystem, condensed_system
 from adjust.statistics.criteria import criteria
 from adjust.statistics.influence import influences
@@ -32,7 +33,6 @@ from adjust.statistics.single_tests import (
     whitened,
 )
 from adjust.statistics.system import precision_of
-from adjust.terrestrial.statistics import influences as influences_of_readings
 
 DEFAULT_LEVELS = LevelOptions()
 LARGEST_NETWORK = 3000

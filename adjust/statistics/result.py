@@ -5,8 +5,8 @@ from typing import Literal
 
 import numpy as np
 
-from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.result import ParameterName
+from adjust.model.result import ParameterName
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 
 Method = Literal["b", "sidak"]
 

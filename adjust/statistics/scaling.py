@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from adjust.model import FloatArray, Survey
+from adjust.model.survey import FloatArray, Survey
 
 _WITH_COVARIANCE = (
     "image_blocks", "table_readings", "pairs", "coordinates", "coordinate_differences", "alignments", "laser_spots",

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.distributions import chi2, fisher, norm, student
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 
 CONTROLLED = 1e-6
 """Share of an error that must show in the residuals to be told from rounding."""

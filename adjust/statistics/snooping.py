@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from adjust.distributions import chi2, fisher
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.statistics.single_tests import CONTROLLED, eigen2
 from adjust.statistics.system import LinearSystem
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.distributions import chi2
-from adjust.model import BoolArray, FloatArray
+from adjust.model.survey import BoolArray, FloatArray
 from adjust.statistics.criteria import MANY, cautious, cost_of_leaving_out, explanation_cost, widening
 from adjust.statistics.snooping import Snooping
 

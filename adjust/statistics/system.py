@@ -13,17 +13,17 @@ import scipy
 from gtsam import Pose3, Rot3, Values
 from scipy import sparse
 
-from adjust.bundle_batch import BundleBatch
-from adjust.datum import gauge
-from adjust.errors import SurveyError
-from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
-from adjust.model import BoolArray, FloatArray, IntArray, Survey
+from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.datum import gauge
+from adjust.graph.solver import solve
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.images import block_rows
 from adjust.native.lenses import MAX_LENS
-from adjust.pair_screen import values_of
-from adjust.precision import Precision, noise_of
-from adjust.result import Adjustment, ParameterName
-from adjust.solve import solve
+from adjust.observations.images.bundles import BundleBatch
+from adjust.precision.precision import Precision, noise_of
+from adjust.statistics.pair_screen import values_of
 
 DENSE = 3000
 """Unknowns up to which the normal matrix is factored as a full one."""

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adjust.model import FloatArray, IntArray
-from adjust.result import Adjustment, ParameterName
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.result import Correlation, PrincipalComponent, WeakDirection, WeakPart
 from adjust.statistics.system import DENSE, FEW, LinearSystem, linear_system
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 
 Angles = Callable[[], tuple[float, float]]
 """The true angles (axis1, axis2) of the table at this moment, rad."""

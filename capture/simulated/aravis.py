@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.errors import SurveyError
-from capture.camera import GrayImage, ImageSource
+from adjust.model.errors import SurveyError
+from capture.devices.camera import GrayImage, ImageSource
 
 _FILL = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32

@@ -22,7 +22,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from capture.drivers.turntables.simulated_axis import AxisPhysics, SimulatedAxis
+from capture.devices.turntables.simulated_axis import AxisPhysics, SimulatedAxis
 from survey.commands.common import not_negative, positive, run_command
 from survey.commands.parser import Parser, port, port_error
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from capture.simulated.angles import write_angles
 from capture.simulated.laboratory import (
     BEACON_EXPOSURE_US,
@@ -24,8 +24,8 @@ from capture.simulated.laboratory import (
     make_lab,
 )
 from survey.examples.truth import truth_json
+from survey.folder.whole import whole_folder
 from survey.simulate.parts import BOARD
-from survey.whole_folder import whole_folder
 
 LAB, ANGLES = "lab.json", "angles.json"
 _COORDINATES_SIGMA_MM = 0.4

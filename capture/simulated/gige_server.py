@@ -17,8 +17,8 @@ from typing import Self
 
 import numpy as np
 
-from adjust.errors import SurveyError
-from capture.camera import GrayImage, ImageSource
+from adjust.model.errors import SurveyError
+from capture.devices.camera import GrayImage, ImageSource
 from capture.simulated.angles import AnglesFile
 from capture.simulated.aravis import AravisCamera
 

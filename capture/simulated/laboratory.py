@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from gtsam import Pose3
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
-from survey.rendering import Beacons, BrownCamera, GrayImage, Imaging, PlacedTarget, render
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray
 from survey.simulate.draft import Draft
 from survey.simulate.parts import BOARD, add_beacons, add_head, add_table, shoot_board_from_table, turn_to_walls
+from survey.simulate.rendering import Beacons, BrownCamera, GrayImage, Imaging, PlacedTarget, render
 from survey.simulate.scene import BROWN, Scene, Truth, transform
 
 CAMERA_IDS = ("X", "Y", "Z")

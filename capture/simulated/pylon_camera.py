@@ -10,9 +10,9 @@ from pathlib import Path
 
 import cv2
 
-from adjust.errors import SurveyError
-from capture.camera import ImageSource
-from capture.drivers.cameras.pylon import PylonCamera
+from adjust.model.errors import SurveyError
+from capture.devices.camera import ImageSource
+from capture.devices.cameras.pylon import PylonCamera
 
 _FILES, _NEW = ("a.bmp", "b.bmp"), "new.bmp"
 

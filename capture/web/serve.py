@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from adjust.errors import SurveyError
-from capture.plan import read_plan
+from adjust.model.errors import SurveyError
+from capture.plan.plan import read_plan
 from capture.web.state import FolderView, LiveView, View, png_with_overlay
 from survey.commands.parser import port_error
 

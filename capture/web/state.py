@@ -11,23 +11,23 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
-from capture.camera import GrayImage
-from capture.drivers.turntables.moving import MovingTable
-from capture.plan import CapturePlan
-from capture.plan_table import make_table
-from capture.quality import Coverage, image_quality
-from capture.recorded import LOCATION, is_id
-from capture.session_cameras import PlannedCameras
-from capture.session_folder import lock_holder, session_lock
-from capture.session_progress import status_path
-from capture.session_quality import coverages, read_qualities, targets_by_camera
-from capture.session_resume import last_readback
-from capture.table_jobs import jog_target, table_status
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray
+from capture.devices.camera import GrayImage
+from capture.devices.turntables.moving import MovingTable
+from capture.plan.plan import CapturePlan
+from capture.plan.table import make_table
+from capture.session.cameras import PlannedCameras
+from capture.session.folder import lock_holder, session_lock
+from capture.session.progress import status_path
+from capture.session.quality import Coverage, image_quality
+from capture.session.quality_thread import coverages, read_qualities, targets_by_camera
+from capture.session.recorded import LOCATION, is_id
+from capture.session.resume import last_readback
+from capture.session.table_jobs import jog_target, table_status
 from survey.detection.gray import read_image
-from survey.files.project import IMAGES_FOLDER
-from survey.shapes import NUMBER, WHOLE, Each, misfit
+from survey.folder.shapes import NUMBER, WHOLE, Each, misfit
+from survey.project.project import IMAGES_FOLDER
 
 _LIVE_S = 0.3
 _STATUS = {

@@ -8,9 +8,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from adjust.errors import SurveyError
-from survey.files.detected import read_detected, same_file
-from survey.files.project import IMAGES_FOLDER
+from adjust.model.errors import SurveyError
+from survey.project.detected import read_detected, same_file
+from survey.project.project import IMAGES_FOLDER
 
 _BESIDE = ("covariance.npz", "residuals.csv", "residuals_other.csv", "report.html")
 

@@ -2,8 +2,8 @@
 
 import re
 
-from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
-from survey.files.locking import BusyError
+from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
+from survey.folder.locking import BusyError
 
 CAUSES = {
     "project": "no project",

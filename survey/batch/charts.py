@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 from survey.batch.control import WIDTH, Chart
 from survey.report import drawing as d
 from survey.report.language import localised, t

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.batch.record import FAILED, Record, record_from
 from survey.batch.worker import Worker
 

@@ -21,11 +21,11 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.distributions import chi2
-from adjust.epoch_states import differences_of, moved_value, origin, value_motions
-from adjust.model import FloatArray
+from adjust.epochs.states import differences_of, moved_value, origin, value_motions
+from adjust.model.survey import FloatArray
 from adjust.statistics.criteria import sidak
-from survey.quantities import ARCSEC_PER_RAD
-from survey.results import read_covariances
+from survey.report.results import read_covariances
+from survey.solution.quantities import ARCSEC_PER_RAD
 
 _TURNED = 1e-6
 _ROUNDS, _SETTLED = 20, 1e-13

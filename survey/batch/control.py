@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.distributions import chi2, norm, student
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 
 WIDTH = 3.0
 """Limits in sigmas."""

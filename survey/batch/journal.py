@@ -6,11 +6,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.batch.record import Record, record_from
-from survey.files.locking import FileLock
-from survey.files.text import atomic_write, read_bytes
-from survey.shapes import misfit
+from survey.folder.locking import FileLock
+from survey.folder.shapes import misfit
+from survey.folder.text import atomic_write, read_bytes
 
 _ENTRY = {"path": str, "fingerprint": str, "record": dict}
 JOURNAL, _LOCK = "journal.jsonl", ".journal.lock"

@@ -8,7 +8,7 @@ from survey.batch.page import overview_html
 from survey.batch.record import Record
 from survey.batch.tables import folders_csv, overview_json, trends_csv
 from survey.batch.trends import Trends
-from survey.replacing import write_set
+from survey.folder.replacing import write_set
 
 
 def write_overview(place: Path, records: Sequence[Record], trends: Trends, language: str = "en") -> dict[str, Path]:

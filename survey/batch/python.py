@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.batch.causes import CAUSES
 from survey.batch.charts import control_chart
 from survey.batch.overview import write_overview
@@ -14,7 +14,7 @@ from survey.batch.record import FAILED, Record
 from survey.batch.run import BatchOptions, counts, run_batch
 from survey.batch.tables import STATES, count_line, findings, short_names, summary_table
 from survey.batch.trends import Trends, trends_of
-from survey.files.text import suggestion
+from survey.folder.text import suggestion
 from survey.notebook.frames import frame
 from survey.notebook.html import heading, html_table
 from survey.notebook.plots import Plot, standalone

@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from adjust.unknowns import POSE_COMPONENTS
+from adjust.frames.unknowns import POSE_COMPONENTS
 from survey.batch.causes import CAUSES
 from survey.batch.common_datum import FreeDatum, Place, free_datum
-from survey.shapes import NUMBER, POSITIVE, REAL, WHOLE, Each, Either, misfit
-from survey.verdict import misfits
+from survey.folder.shapes import NUMBER, POSITIVE, REAL, WHOLE, Each, Either, misfit
+from survey.solution.verdict import misfits
 
 DONE, TEST_FAILED, FAILED = "done", "test_failed", "failed"
 ORIGINS, VERDICTS = ("adjusted", "unchanged", "resumed"), ("passed", "check", "failed")

@@ -11,8 +11,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from adjust.errors import SurveyError
-from adjust.parallel import cores
+from adjust.model.errors import SurveyError
+from adjust.native.parallel import cores
 from survey.batch.cache import fingerprint, unchanged_solution
 from survey.batch.causes import MAY_PASS
 from survey.batch.journal import Journal, entry_of, read_journal

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.batch.causes import cause_of
 from survey.batch.record import FAILED, Record, solved_record
 from survey.commands.common import message, require_project
@@ -20,7 +20,7 @@ def adjust_task(task: Mapping[str, Any]) -> Record:
     begin, folder = time.perf_counter(), Path(task["path"])
     try:
         require_project(folder)
-        from survey.jobs import adjust_job
+        from survey.jobs.adjusting.job import adjust_job
 
         outcome = adjust_job(folder, progress=False, redetect=task["redetect"])
         written = {name: str(path) for name, path in outcome.paths.items()}

@@ -67,7 +67,7 @@ def _adjust(arguments: argparse.Namespace) -> int:
 def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
     postpone()
     require_project(folder, arguments.out)
-    from survey.jobs import adjust_job
+    from survey.jobs.adjusting.job import adjust_job
 
     outcome = adjust_job(
         folder, out=arguments.out, progress=not is_set(arguments, "quiet"), redetect=arguments.redetect,

@@ -27,7 +27,7 @@ def declare_align(commands: Any, shaped: dict[str, Any]) -> None:
 
 def _align(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder, arguments.out)
-    from survey.aligning import align_job
+    from survey.jobs.aligning import align_job
 
     outcome = align_job(arguments.folder, out=arguments.out, progress=not is_set(arguments, "quiet"))
     if is_set(arguments, "json"):

@@ -15,7 +15,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, NoReturn, TextIO, cast
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 
 DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
 _OBJECTS = 100_000  # new ones before Python looks for cycles: loading modules makes many and no cycles
@@ -110,7 +110,7 @@ class Version(argparse.Action):
         """Print it and stop."""
         from importlib.metadata import PackageNotFoundError, version
 
-        from adjust.errors import SurveyError
+        from adjust.model.errors import SurveyError
         from adjust.native import instruction_set
 
         try:
@@ -180,7 +180,7 @@ def _holder(file: Path) -> str:
 
 def _nearest(folder: Path) -> str:
     """The project beside a folder that is not there whose name is the most like its own."""
-    from survey.files.text import suggestion
+    from survey.folder.text import suggestion
 
     by_name = {p.name: str(p) for p in _projects(folder.parent)}
     near = suggestion(folder.name, by_name)
@@ -199,7 +199,7 @@ def _projects(place: Path) -> list[Path]:
 def undo_killed(folder: Path) -> None:
     """A mixture of old and new must not be taken for a project."""
     if (folder / ".before").is_dir():
-        from survey.replacing import recover_killed
+        from survey.folder.replacing import recover_killed
 
         if recover_killed(folder):
             print(f"labsurvey: {folder}: a command that was killed while it replaced files has been undone",
@@ -208,6 +208,6 @@ def undo_killed(folder: Path) -> None:
 
 def tested(summary: Mapping[str, Any]) -> int:
     """Exit code by what the summary of a solution says: cautious sigmas mislead nobody, and are no failure."""
-    from survey.verdict import misfits
+    from survey.solution.verdict import misfits
 
     return TEST_FAILED if misfits(summary) else DONE

@@ -26,7 +26,7 @@ def declare_compare(commands: Any, shaped: dict[str, Any]) -> None:
 def _compare(arguments: argparse.Namespace) -> int:
     require_project(arguments.first)
     require_project(arguments.second)
-    from survey.comparison import compare_job
+    from survey.jobs.comparing import compare_job
 
     outcome = compare_job(arguments.first, arguments.second, progress=not is_set(arguments, "quiet"))
     if is_set(arguments, "json"):

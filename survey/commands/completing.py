@@ -39,7 +39,7 @@ def declare_completion_of(
 
 
 def _completion(build_parser: Callable[[], argparse.ArgumentParser], arguments: argparse.Namespace) -> int:
-    from survey.completion import completion_script
+    from survey.commands.completion import completion_script
 
     print(completion_script(build_parser(), arguments.shell), end="")
     return DONE

@@ -49,7 +49,7 @@ def declare_convert(commands: Any, shaped: dict[str, Any]) -> None:
 def _convert(arguments: argparse.Namespace) -> int:
     if arguments.source.is_dir() and ((arguments.source / "survey.toml").exists() or arguments.format is None):
         require_project(arguments.source)
-    from survey.converting import convert_job
+    from survey.jobs.converting import convert_job
 
     outcome = convert_job(
         arguments.source, arguments.target, format=arguments.format, information=arguments.information,

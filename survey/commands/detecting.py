@@ -28,7 +28,7 @@ def declare_detect(commands: Any, shaped: dict[str, Any]) -> None:
 
 def _detect(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder)
-    from survey.detecting import detect_job
+    from survey.jobs.detecting import detect_job
 
     outcome = detect_job(
         arguments.folder,

@@ -52,14 +52,14 @@ def declare_include(commands: Any, shaped: dict[str, Any]) -> None:
 
 def _exclude(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder)
-    from survey.excluding import exclude_job
+    from survey.jobs.excluding import exclude_job
 
     return _say(arguments, exclude_job(arguments.folder, arguments.names, arguments.reason, arguments.author))
 
 
 def _include(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder)
-    from survey.excluding import include_job
+    from survey.jobs.excluding import include_job
 
     return _say(arguments, include_job(arguments.folder, arguments.names, arguments.reason, arguments.author))
 

@@ -32,7 +32,7 @@ def declare_navigate(commands: Any, shaped: dict[str, Any]) -> None:
 
 def _navigate(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder, arguments.out)
-    from survey.navigation import NavigateRequest, navigate_job
+    from survey.jobs.navigating.job import NavigateRequest, navigate_job
 
     epochs = None if arguments.epochs is None else tuple(arguments.epochs)
     request = NavigateRequest(

@@ -62,7 +62,7 @@ def declare_trackers(commands: Any, shaped: dict[str, Any]) -> None:
 
 def _add(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder, arguments.out)
-    from survey.network import add_job
+    from survey.jobs.network import add_job
 
     outcome = add_job(arguments.folder, arguments.new, out=arguments.out, progress=not is_set(arguments, "quiet"))
     if is_set(arguments, "json"):
@@ -75,7 +75,7 @@ def _add(arguments: argparse.Namespace) -> int:
 
 def _remove(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder, arguments.out)
-    from survey.removing import remove_job
+    from survey.jobs.removing import remove_job
 
     progress = not is_set(arguments, "quiet")
     outcome = remove_job(
@@ -94,7 +94,7 @@ def _trackers(arguments: argparse.Namespace) -> int:
     files: dict[str, Path] = {path.stem: path for path in arguments.files}
     if len(files) < len(arguments.files):
         arguments.parser.error("two FILEs have the same name, but it names their trackers")
-    from survey.relay import read_trajectories, relay_trackers, tracker_pairs, trackers_text, write_relay_pairs
+    from survey.jobs.relay import read_trajectories, relay_trackers, tracker_pairs, trackers_text, write_relay_pairs
 
     found = relay_trackers(read_trajectories(files))
     written = None

@@ -34,7 +34,7 @@ def declare_pairs(commands: Any, shaped: dict[str, Any]) -> None:
 def _pairs(arguments: argparse.Namespace) -> int:
     if arguments.joint and arguments.out is None:
         arguments.parser.error("--joint says what is written; name --out DIR too")
-    from survey.pair_job import station_pairs
+    from survey.jobs.pairs import station_pairs
 
     outcome = station_pairs(arguments.folder, station=arguments.station, out=arguments.out, joint=arguments.joint)
     if is_set(arguments, "json"):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 
 _CHOICE = re.compile(
     r"argument (?P<what>.+?): invalid choice: '?(?P<found>.*?)'? \(choose from (?P<known>.*)\)", re.DOTALL
@@ -53,7 +53,7 @@ def _left_over(left: Sequence[str], command: argparse.ArgumentParser) -> str:
     word = left[0]
     if not word.startswith("-"):
         return f"{word!r} is one too many; see the usage above"
-    from survey.files.text import suggestion
+    from survey.folder.text import suggestion
 
     flags = _FLAG.findall(command.format_help())
     return f"unknown flag {word.split('=')[0]}; {suggestion(word.split('=')[0], flags)}"
@@ -63,7 +63,7 @@ def _mended(message: str, program: str) -> str:
     """A message of argparse in the words of the project: what was found, what to do."""
     choice, number = _CHOICE.fullmatch(message), _NUMBER.fullmatch(message)
     if choice:
-        from survey.files.text import choice_hint
+        from survey.folder.text import choice_hint
 
         known = [a or b for a, b in re.findall(r"'([^']*)'|([^',\s]+)", choice["known"])]
         what = "command" if choice["what"] == "COMMAND" else choice["what"]

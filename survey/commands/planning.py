@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say
 from survey.commands.parser import project_folder
 
@@ -83,7 +83,7 @@ def _error_analysis(arguments: argparse.Namespace) -> int:
 
 def _network(arguments: argparse.Namespace) -> int:
     """Without a plan.toml: the counts of a network of pairs."""
-    from survey.network import plan_job
+    from survey.jobs.network import plan_job
 
     outcome = plan_job(arguments.folder)
     if is_set(arguments, "json"):

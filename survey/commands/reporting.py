@@ -29,8 +29,8 @@ def declare_report(commands: Any, shaped: dict[str, Any]) -> None:
 
 def _report(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder, arguments.out)
-    from survey.jobs import adjust_job, command_line
-    from survey.results import ReportOptions
+    from survey.jobs.adjusting.job import adjust_job, command_line
+    from survey.report.results import ReportOptions
 
     language = arguments.language if arguments.language != "en" else None
     flags = {"language": language, "pdf": arguments.pdf, "check": arguments.check, "out": arguments.out}

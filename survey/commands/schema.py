@@ -27,17 +27,17 @@ def declare_schema(commands: Any, shaped: dict[str, Any]) -> None:
 
 def _schema(arguments: argparse.Namespace) -> int:
     if arguments.markdown:
-        from survey.reference import reference_page
+        from survey.project.reference import reference_page
 
         text = reference_page()
     else:
-        from survey.schema import survey_schema
+        from survey.project.schema import survey_schema
 
         text = json.dumps(survey_schema(), indent=1, ensure_ascii=False) + "\n"
     if arguments.out is None:
         print(text, end="")
     else:
-        from survey.files.text import atomic_write
+        from survey.folder.text import atomic_write
 
         atomic_write(arguments.out, text)
     return DONE

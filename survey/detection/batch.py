@@ -11,14 +11,14 @@ from pathlib import Path
 import cv2
 from tqdm import tqdm
 
-from adjust.errors import SurveyError
-from adjust.parallel import cores
+from adjust.model.errors import SurveyError
+from adjust.native.parallel import cores
 from survey.detection.detect import detect_targets
 from survey.detection.gray import read_image
 from survey.detection.pictures import write_picture
 from survey.detection.results import ImageReport, SpotOptions
 from survey.detection.spots import detect_spots, outside_targets
-from survey.targets import DetectableTarget
+from survey.project.targets import DetectableTarget
 
 _MOST_THREADS = 8  # so many keep busy beside Python's lock, which is free for nine tenths of the time
 _IMAGES_PER_PROCESS = 50  # a process takes some seconds to start, the time of that many images

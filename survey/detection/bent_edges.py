@@ -11,7 +11,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from adjust.model import BoolArray, FloatArray
+from adjust.model.survey import BoolArray, FloatArray
 from survey.detection.corners import CornerFit
 
 _PER_TERM = 2  # points for each coefficient of the cubic or the square

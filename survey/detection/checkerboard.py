@@ -3,13 +3,13 @@
 import cv2
 import numpy as np
 
-from adjust.model import BoolArray, FloatArray
+from adjust.model.survey import BoolArray, FloatArray
 from survey.detection.bent_edges import unbent
 from survey.detection.corners import CornerFit, refine_corners
 from survey.detection.extent import grown, is_of_neighbours
 from survey.detection.gray import Gray8, Gray32, reduced
 from survey.detection.results import Detection, nothing_found
-from survey.targets import Checkerboard
+from survey.project.targets import Checkerboard
 
 _COARSE_PX = 900  # longer side of the image in which the board is looked for first
 _MAX_DECOYS = 3

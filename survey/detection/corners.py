@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.vision import CORNER_PARAMETERS, ENOUGH_FOR_SLOPES, fit_corners
 
 # Edges are taken for straight lines. What bending by the lens does where it cannot be told from the other corners

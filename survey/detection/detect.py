@@ -8,7 +8,7 @@ from survey.detection.checkerboard import find_checkerboard
 from survey.detection.gray import AnyImage, Gray8, Gray32, for_finding, gray_values
 from survey.detection.markers import SeenMarkers, find_charuco, find_markers
 from survey.detection.results import Detection
-from survey.targets import Charuco, Checkerboard, DetectableTarget
+from survey.project.targets import Charuco, Checkerboard, DetectableTarget
 
 
 def detect_image(image: AnyImage, target: DetectableTarget) -> Detection:

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from adjust.model import BoolArray, FloatArray
+from adjust.model.survey import BoolArray, FloatArray
 from survey.detection.corners import refine_corners
 from survey.detection.gray import Gray32
 

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray
 from survey.detection.image_header import image_size
 
 Gray8 = npt.NDArray[np.uint8]

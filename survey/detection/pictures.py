@@ -6,10 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.detection.gray import AnyImage, Gray8, for_finding, gray_values
 from survey.detection.results import Detection, ImageReport, Spots
-from survey.targets import DetectableTarget
+from survey.project.targets import DetectableTarget
 
 _COLOURS = ((60, 200, 60), (60, 60, 255), (255, 140, 30), (200, 60, 200), (30, 190, 230))  # B G R
 _SPOT_COLOUR = (0, 200, 255)

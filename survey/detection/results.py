@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 from adjust.native.vision import GAUSSIAN, fit_spots
 from survey.detection.gray import AnyImage, Gray32, gray_values, saturation_level
 from survey.detection.results import Detection, SpotOptions, Spots

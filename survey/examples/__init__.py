@@ -5,7 +5,7 @@
 
 from pathlib import Path
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 
 EXAMPLES = {
     "full-lab": "three-camera head on a two-axis table, board, wall plates, beacons, relay station of four cameras",
@@ -33,7 +33,7 @@ def write_example(name: str, folder: Path, *, seed: int = 1, jobs: int | None = 
     from survey.examples.plain import WITHOUT_IMAGES
 
     draft, files = MAKERS[name](seed) if name in MAKERS else (None, WITHOUT_IMAGES[name](seed))
-    from survey.whole_folder import whole_folder  # here: the command line asks this module for its names alone
+    from survey.folder.whole import whole_folder  # here: the command line asks this module for its names alone
 
     with whole_folder(Path(folder)) as place:
         for path, text in files.items():

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 
-from adjust.model import FloatArray, Point, Setup, Survey
-from adjust.observations import PositionRef, Reading, ReadingKind
+from adjust.model.observations import PositionRef, Reading, ReadingKind
+from adjust.model.survey import FloatArray, Point, Setup, Survey
 from survey.simulate.readings import Instruments
 from survey.simulate.scene import Scene, Truth
 

@@ -4,8 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from adjust.model import FloatArray, Survey, Target
+from adjust.model.survey import FloatArray, Survey, Target
 from survey.examples.truth import truth_json
+from survey.project.targets import Charuco, Checkerboard, MarkerGrid, TargetKind
 from survey.simulate.draft import Draft
 from survey.simulate.labs import (
     BEACON_SIGMA_MM,
@@ -17,7 +18,6 @@ from survey.simulate.labs import (
     single_camera_draft,
     stereo_draft,
 )
-from survey.targets import Charuco, Checkerboard, MarkerGrid, TargetKind
 
 Files = dict[str, str]
 _LENS = """

@@ -10,12 +10,12 @@ import numpy as np
 from gtsam import Pose3
 from tqdm import tqdm
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
-from survey.rendering import Beacons, BrownCamera, GrayImage, Imaging, PlacedTarget, render
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray
+from survey.project.targets import PointList
 from survey.simulate.draft import Draft, Shot
+from survey.simulate.rendering import Beacons, BrownCamera, GrayImage, Imaging, PlacedTarget, render
 from survey.simulate.scene import BROWN, Scene, transform
-from survey.targets import PointList
 
 # a gray sensor with some gain in a room of ordinary light
 DAY = Imaging(blur_px=0.9, noise_gray=4.0, background_gray=105.0, gradient=(0.18, -0.12))

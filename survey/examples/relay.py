@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.model import FloatArray
-from adjust.result import ParameterName
+from adjust.model.result import ParameterName
+from adjust.model.survey import FloatArray
 from survey.examples.truth import truth_json
 
 Files = dict[str, str]

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.model import (
+from adjust.model.observations import ImageBlock, TableReading
+from adjust.model.survey import (
     TABLE_GEOMETRY,
     Camera,
     FloatArray,
@@ -20,9 +21,8 @@ from adjust.model import (
     Target,
     VectorParameter,
 )
-from adjust.observations import ImageBlock, TableReading
 from survey.examples.truth import truth_json
-from survey.files import write_project
+from survey.project import write_project
 from survey.simulate.scene import BROWN, Scene, Truth
 
 _ARCSEC = np.pi / 180.0 / 3600.0

@@ -6,8 +6,8 @@ import numpy as np
 from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
-from adjust.model import TABLE_GEOMETRY, FloatArray
-from adjust.result import ParameterName
+from adjust.model.result import ParameterName
+from adjust.model.survey import TABLE_GEOMETRY, FloatArray
 from survey.simulate.scene import BROWN, Truth
 
 _NOTE = "true values of the simulation; nothing reads this file"

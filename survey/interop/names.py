@@ -3,10 +3,10 @@
 from dataclasses import replace
 from typing import Any
 
-from adjust.model import Survey
-from adjust.observations import PositionRef
-from survey.files.text import _FORBIDDEN_IN_IDS as FORBIDDEN
-from survey.files.text import formula_problem, id_problem
+from adjust.model.observations import PositionRef
+from adjust.model.survey import Survey
+from survey.folder.text import _FORBIDDEN_IN_IDS as FORBIDDEN
+from survey.folder.text import formula_problem, id_problem
 
 
 def safe_ids(names: list[str], taken: set[str] | None = None) -> dict[str, str]:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from adjust.errors import SurveyError
-from survey.files.text import read_bytes, suggestion
-from survey.interop.foreign import LATIN_1, Where, is_utf8, number
+from adjust.model.errors import SurveyError
+from survey.folder.text import read_bytes, suggestion
+from survey.interop.networks.foreign import LATIN_1, Where, is_utf8, number
 
 _DEEPEST = 40
 _LITERAL = rb"(?:\"[^\"]*\"|'[^']*')"

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
-from survey.files.text import decode, read_bytes, suggestion
-from survey.interop.foreign import Where, number
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray
+from survey.folder.text import decode, read_bytes, suggestion
+from survey.interop.networks.foreign import Where, number
 
 MAX_BYTES = 32_000_000
 MAX_DEPTH = 32

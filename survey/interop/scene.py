@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3
 
-from adjust.errors import SurveyError
-from adjust.lens import MODELS, camera_constants, focal_length_px
-from adjust.model import Camera, FloatArray, IntArray
-from adjust.observations import FrameRef
-from survey.interop.camera_values import CameraValues
+from adjust.lenses.models import MODELS, camera_constants, focal_length_px
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef
+from adjust.model.survey import Camera, FloatArray, IntArray
+from survey.interop.cameras.values import CameraValues
 
 CHI2_95 = 7.814727903251179
 """The 95 % quantile of chi-square with 3 degrees of freedom: semi-axes are its root times sigma."""

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.errors import SurveyError
-from adjust.model import PoseParameter, Station, Survey
-from adjust.observations import FrameRef
-from survey.files.text import id_problem
-from survey.interop.camera_values import CameraValues
-from survey.interop.foreign import ForeignNetwork, Where, number, text_of
-from survey.interop.rig import pose_of, pose_of_quaternion, quaternion_xyzw
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef
+from adjust.model.survey import PoseParameter, Station, Survey
+from survey.folder.text import id_problem
+from survey.interop.cameras.rig import pose_of, pose_of_quaternion, quaternion_xyzw
+from survey.interop.cameras.values import CameraValues
+from survey.interop.networks.foreign import ForeignNetwork, Where, number, text_of
 
 _EPOCH = re.compile(r"#\s*epoch\s+(.*\S)\s*")
 _NUMBER = re.compile(r"\d+(\.\d+)?")

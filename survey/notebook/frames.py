@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3
 
-from adjust.result import Adjustment, Estimate, ParameterName
+from adjust.model.result import Adjustment, Estimate, ParameterName
 from survey.notebook.frames_library import pandas
-from survey.quantities import (
+from survey.solution.quantities import (
     ARCSEC_PER_RAD,
     Scale,
     ellipsoid,
@@ -21,8 +21,8 @@ from survey.quantities import (
     status_of,
     unit_for_people,
 )
-from survey.residual_tables import image_rows
-from survey.statistics import Statistics
+from survey.solution.residual_tables import image_rows
+from survey.solution.statistics import Statistics
 
 _POSES = ("station_from_camera", "mount_from_station", "world_from_station", "world_from_table", "carrier_from_target")
 

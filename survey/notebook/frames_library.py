@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 
 
 def pandas() -> Any:

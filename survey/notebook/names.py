@@ -5,9 +5,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from gtsam import Pose3
 
-from adjust.errors import SurveyError
-from adjust.result import Estimate, ParameterName
-from survey.files.text import suggestion
+from adjust.model.errors import SurveyError
+from adjust.model.result import Estimate, ParameterName
+from survey.folder.text import suggestion
 
 Component = tuple[ParameterName, str]
 Estimates = Mapping[ParameterName, Estimate]

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from adjust.errors import SurveyError
-from adjust.result import Adjustment
-from survey.files.text import atomic_write, choice_hint, suggestion
-from survey.quantities import Scale
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment
+from survey.folder.text import atomic_write, choice_hint, suggestion
 from survey.report import camera_plots, picture
 from survey.report.scene import scene_of
 from survey.report.statistics import heat_map, quantiles
-from survey.residual_tables import image_rows
-from survey.statistics import correlation_matrix
-from survey.verdict import suspects
+from survey.solution.quantities import Scale
+from survey.solution.residual_tables import image_rows
+from survey.solution.statistics import correlation_matrix
+from survey.solution.verdict import suspects
 
 if TYPE_CHECKING:
     from survey.report.camera_plots import CameraResiduals

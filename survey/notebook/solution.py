@@ -8,21 +8,21 @@ from typing import Any, Literal
 
 import numpy as np
 
-from adjust.errors import SurveyError
-from adjust.result import Adjustment
-from survey.files import Project
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment
+from survey.jobs.adjusting.published_methods import published_dict
 from survey.notebook import frames
 from survey.notebook.covariance import Covariance
 from survey.notebook.html import heading, html_table
 from survey.notebook.names import components, rows_in_joint
 from survey.notebook.plots import Plot
 from survey.notebook.plots import plot as plot_by_name
-from survey.published_methods import published_dict
-from survey.quantities import Scale, scale_of
-from survey.results import ReportOptions, RunInfo, summary_text, write_results
-from survey.solution import solution_dict
-from survey.statistics import Statistics, statistics_of
-from survey.verdict import MISFIT, UNTESTED, fit_of
+from survey.project import Project
+from survey.report.results import ReportOptions, RunInfo, summary_text, write_results
+from survey.solution.dictionary import solution_dict
+from survey.solution.quantities import Scale, scale_of
+from survey.solution.statistics import Statistics, statistics_of
+from survey.solution.verdict import MISFIT, UNTESTED, fit_of
 
 _VECTOR_KINDS = {"lenses": ("lens",), "tables": ("table_geometry",), "warps": ("warp",),
                  "instruments": ("instrument",), "surfaces": ("surface",)}  # fmt: skip

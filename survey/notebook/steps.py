@@ -5,16 +5,16 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from adjust.errors import SurveyError
-from adjust.model import Survey
-from survey.detecting import DetectOutcome, detect_job
-from survey.excluding import ExcludeOutcome, exclude_job, include_job
-from survey.files import AdjustmentOptions, Project
-from survey.files import read as read_project
-from survey.files.text import suggestion
-from survey.jobs import adjust_project, run_info
+from adjust.model.errors import SurveyError
+from adjust.model.survey import Survey
+from survey.folder.text import suggestion
+from survey.jobs.adjusting.job import adjust_project, run_info
+from survey.jobs.detecting import DetectOutcome, detect_job
+from survey.jobs.excluding import ExcludeOutcome, exclude_job, include_job
 from survey.notebook.html import heading, html_table
 from survey.notebook.solution import Solution
+from survey.project import AdjustmentOptions, Project
+from survey.project import read as read_project
 
 _SEVERAL = {"table_readings": "table readings", "reading_covariances": "covariances of readings",
             "coordinate_differences": "coordinate differences", "laser_spots": "laser spots",

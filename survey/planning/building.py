@@ -7,15 +7,15 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.design import Candidate, predict, with_candidates
-from adjust.errors import SurveyError
-from adjust.graph import StartValues
-from adjust.lens import MODELS, camera_constants, unit_rays
-from adjust.model import Camera, FloatArray, IntArray, Point, PointParameter, PoseParameter, Station, Survey
-from adjust.observations import Coordinates, Distance, ImageBlock, Pair, PositionRef, TableReading
-from adjust.result import Adjustment, ParameterName
-from survey.files import Project
+from adjust.graph.assembly import StartValues
+from adjust.lenses.models import MODELS, camera_constants, unit_rays
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair, PositionRef, TableReading
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import Camera, FloatArray, IntArray, Point, PointParameter, PoseParameter, Station, Survey
 from survey.planning.plan_file import ByHand, Measurements, Moment, Moments, Plan
 from survey.planning.plan_readings import Terrestrial, lengths_between, terrestrial_candidates, with_usual_sigmas
+from survey.project import Project
 
 
 @dataclass(frozen=True, eq=False)

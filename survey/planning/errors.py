@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from adjust.design.error_analysis import BeaconField, tolerance
 from adjust.design.error_figures import ErrorFigure, error_figures
-from adjust.error_analysis import BeaconField, tolerance
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
+from survey.folder.replacing import write_set
 from survey.planning.page import html_page
 from survey.planning.plots import Series, chart
 from survey.planning.summary import number
-from survey.replacing import write_set
 from survey.report import drawing as d
 from survey.report.markup import esc, fixed, general, section, table
 

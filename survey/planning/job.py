@@ -24,18 +24,18 @@ from adjust.design import (
     weak_directions,
 )
 from adjust.design.selection import Component, Criterion
-from adjust.errors import SurveyError
-from adjust.result import Adjustment
-from survey.files import Project, atomic_write, read
-from survey.files.project import RESULTS
-from survey.jobs import adjust_project
-from survey.network_summary import network_dict, pair_network
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment
+from survey.folder.replacing import changing, replace_parts
+from survey.jobs.adjusting.job import adjust_project
 from survey.planning.building import Planned, build_plan
 from survey.planning.navigation import NavigationOutcome, plan_navigation
 from survey.planning.plan_file import Plan, read_plan
 from survey.planning.summary import plan_summary, plan_text
 from survey.planning.wanted import required_sigmas, wanted_components
-from survey.replacing import changing, replace_parts
+from survey.project import Project, atomic_write, read
+from survey.project.project import RESULTS
+from survey.solution.loops import network_dict, pair_network
 
 
 @dataclass(frozen=True)

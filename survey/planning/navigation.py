@@ -8,13 +8,13 @@ from gtsam import Pose3
 
 from adjust.design.placement import Placement, PlacementOptions, place_beacons
 from adjust.design.pose_budget import PoseBudget, PoseTolerance, pose_budget, pose_tolerances, simulate_poses
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray
 from adjust.navigation import Beacons, Expected, Head, expected_precision, head_and_beacons
-from adjust.observations import FrameRef
-from adjust.result import Adjustment
-from survey.adjusted_frames import AdjustedFrames
 from survey.planning.plan_file import NavigationPlan, Plan
+from survey.solution.frames import AdjustedFrames
 
 _TRIALS = 1000
 

@@ -8,12 +8,12 @@ from gtsam import Pose3
 from adjust.design import group_redundancy
 from survey.planning.plots import Series, bars, chart, seen_map
 from survey.planning.summary import meets, people, pose_sigmas, tolerance_values
-from survey.quantities import scale_of
 from survey.report import drawing as d
 from survey.report.document import document
 from survey.report.markup import count, definition, esc, fixed, general, pill, section, sigma_text, table
 from survey.report.picture import pictures
 from survey.report.scene import Scene, Spot, scene_of
+from survey.solution.quantities import scale_of
 
 if TYPE_CHECKING:
     from survey.planning.job import PlanningOutcome

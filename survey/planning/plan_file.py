@@ -9,14 +9,14 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.design import Seeing
-from adjust.model import FloatArray, Survey
-from adjust.observations import FrameRef, PositionRef
-from survey.files.node import Node, read_toml
-from survey.files.poses import POSE_KEYS, read_pose, rotation_from_euler
-from survey.files.references import NameProblemError, Names, read_frame, read_position
-from survey.files.text import id_problem
-from survey.files.units import to_si
+from adjust.model.observations import FrameRef, PositionRef
+from adjust.model.survey import FloatArray, Survey
+from survey.folder.text import id_problem
+from survey.folder.units import to_si
 from survey.planning.plan_readings import TERRESTRIAL_KEYS, Terrestrial, read_terrestrial
+from survey.project.declared.node import Node, read_toml
+from survey.project.declared.poses import POSE_KEYS, read_pose, rotation_from_euler
+from survey.project.tables.references import NameProblemError, Names, read_frame, read_position
 
 PLAN_FILE = "plan.toml"
 _MOST = 100_000  # of whatever is counted in one place: more nobody measures, and memory ends

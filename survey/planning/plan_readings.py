@@ -7,10 +7,9 @@ from typing import Any, cast
 import numpy as np
 
 from adjust.design import Candidate
-from adjust.errors import SurveyError
-from adjust.graph import StartValues
-from adjust.model import FloatArray, Survey
-from adjust.observations import (
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import SurveyError
+from adjust.model.observations import (
     Alignment,
     CoordinateDifferences,
     FrameRef,
@@ -21,10 +20,12 @@ from adjust.observations import (
     Reading,
     ReadingKind,
 )
-from survey.files.instruments import setup_problem
-from survey.files.node import Node
-from survey.files.project import Accuracy, Project
-from survey.files.references import (
+from adjust.model.survey import FloatArray, Survey
+from survey.folder.units import to_si
+from survey.project.declared.instruments import setup_problem
+from survey.project.declared.node import Node
+from survey.project.project import Accuracy, Project
+from survey.project.tables.references import (
     NameProblemError,
     Names,
     check_epochs,
@@ -32,7 +33,6 @@ from survey.files.references import (
     read_frame,
     read_position,
 )
-from survey.files.units import to_si
 
 READING_KINDS = ("direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance",
                  "height_difference")  # fmt: skip

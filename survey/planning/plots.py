@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 from survey.report import drawing as d
 from survey.report.markup import esc
 

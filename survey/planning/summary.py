@@ -6,8 +6,8 @@ import numpy as np
 
 from adjust.design import Component, group_redundancy
 from adjust.design.pose_budget import PoseTolerance
-from adjust.model import FloatArray
-from survey.quantities import ARCSEC_PER_RAD, key_of, sigma_unit_for_people
+from adjust.model.survey import FloatArray
+from survey.solution.quantities import ARCSEC_PER_RAD, key_of, sigma_unit_for_people
 
 if TYPE_CHECKING:
     from survey.planning.job import PlanningOutcome

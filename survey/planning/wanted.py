@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from fnmatch import fnmatchcase
 
 from adjust.design import Component, components_of, shared_names
-from adjust.errors import SurveyError
-from adjust.model import Survey
-from adjust.result import Adjustment
-from survey.files.text import suggestion
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment
+from adjust.model.survey import Survey
+from survey.folder.text import suggestion
 from survey.planning.plan_file import Requirement
 
 EVERYTHING = "everything"

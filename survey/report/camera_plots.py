@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.model import BoolArray, FloatArray
+from adjust.model.survey import BoolArray, FloatArray
 from survey.report import drawing as d
 from survey.report.language import localised, t
 from survey.report.markup import MINUS, count

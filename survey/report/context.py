@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from typing import Any
 
-from adjust.model import BoolArray
-from adjust.result import Adjustment
-from survey.quantities import Scale
-from survey.residual_tables import ImageRows
-from survey.solution import RunInfo
-from survey.statistics import Statistics
+from adjust.model.result import Adjustment
+from adjust.model.survey import BoolArray
+from survey.solution.dictionary import RunInfo
+from survey.solution.quantities import Scale
+from survey.solution.residual_tables import ImageRows
+from survey.solution.statistics import Statistics
 
 
 @dataclass(frozen=True, eq=False)

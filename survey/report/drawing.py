@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 from survey.report.markup import esc
 
 # every colour of a picture has its counterpart on a dark page; a picture names no other one

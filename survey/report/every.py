@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from adjust.model import FloatArray, IntArray
-from survey.quantities import sigma_unit_for_people, unit_for_people
+from adjust.model.survey import FloatArray, IntArray
 from survey.report.context import Context
 from survey.report.embedding import json_script
 from survey.report.language import group_name, known, t
 from survey.report.markup import count, esc, fixed, section
+from survey.solution.quantities import sigma_unit_for_people, unit_for_people
 
 MOST = 20_000
 

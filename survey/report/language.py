@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.report.german import GERMAN, GERMAN_MESSAGES
 
 LANGUAGES = ("en", "de")

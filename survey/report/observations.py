@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from adjust.result import ObservationResidual
-from survey.quantities import sigma_unit_for_people, unit_for_people
+from adjust.model.result import ObservationResidual
 from survey.report.context import Context
 from survey.report.language import group_name, known, t
 from survey.report.markup import count, esc, fixed, general, pill, section, sigma_text, table, value_text
+from survey.solution.quantities import sigma_unit_for_people, unit_for_people
 
 _MOST_OTHER = 200
 _MOST_IMAGE = 30

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from survey.quantities import sigma_unit_for_people
 from survey.report import drawing as d
 from survey.report.context import Context
 from survey.report.language import group_name, known, message, t
@@ -10,7 +9,8 @@ from survey.report.markup import count, definition, esc, fixed, general, pill, s
 from survey.report.picture import pictures
 from survey.report.scene import scene_of
 from survey.report.space import space
-from survey.tolerances import Verdict, coverage
+from survey.solution.quantities import sigma_unit_for_people
+from survey.solution.tolerances import Verdict, coverage
 
 _WORDS = {"passed": "Passed", "check": "Needs a look", "failed": "Failed"}
 _MOST_WARNINGS = 25

@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from adjust.result import Adjustment
-from survey.quantities import scale_of
+from adjust.model.result import Adjustment
 from survey.report import every, instruments, left_out, loops, observations, overview, published, statistics, unknowns
 from survey.report.context import Context
 from survey.report.document import document
@@ -12,9 +11,10 @@ from survey.report.drawing import DARK
 from survey.report.embedding import json_script
 from survey.report.language import localised, speaking, t
 from survey.report.markup import esc
-from survey.residual_tables import image_rows
-from survey.solution import RunInfo, solution_dict
-from survey.statistics import Statistics
+from survey.solution.dictionary import RunInfo, solution_dict
+from survey.solution.quantities import scale_of
+from survey.solution.residual_tables import image_rows
+from survey.solution.statistics import Statistics
 
 _SECTIONS = (
     ("Identification", "identification", overview.identification),
@@ -54,7 +54,7 @@ def report_html(
     found: Statistics | None = None,
     in_language: str = "en",
 ) -> str:
-    """The page; ``solution`` is that of :func:`survey.solution.solution_dict`, made here where it is not given.
+    """The page; ``solution`` is that of :func:`survey.solution.dictionary.solution_dict`, made here where it is not given.
 
     found: the statistics, where they are to be shown. in_language: "en" or "de"; raises SurveyError for others.
     """

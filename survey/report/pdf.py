@@ -6,7 +6,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 _TIMEOUT_S = 180.0

@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model import FloatArray, Target
-from adjust.observations import FrameRef
-from adjust.result import Adjustment
-from survey.adjusted_frames import AdjustedFrames
-from survey.quantities import Scale
+from adjust.model.observations import FrameRef
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray, Target
+from survey.solution.frames import AdjustedFrames
+from survey.solution.quantities import Scale
 
 _MOST_EPOCHS = 24
 _MOST_POINTS = 500

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 from survey.report import drawing as d
 from survey.report.embedding import json_script
 from survey.report.language import t

@@ -3,10 +3,9 @@
 import numpy as np
 
 from adjust.distributions import beta, norm
-from adjust.model import FloatArray
-from adjust.result import ParameterName
+from adjust.model.result import ParameterName
+from adjust.model.survey import FloatArray
 from adjust.statistics.result import BudgetEntry, Component, Influence, RelativePrecision, WeakDirection
-from survey.quantities import sigma_unit_for_people
 from survey.report import drawing as d
 from survey.report.context import Context
 from survey.report.language import group_name, known, t
@@ -22,7 +21,8 @@ from survey.report.markup import (
     table,
     value_text,
 )
-from survey.statistics import CorrelationMatrix
+from survey.solution.quantities import sigma_unit_for_people
+from survey.solution.statistics import CorrelationMatrix
 
 _MOST_ROWS = 120
 _MOST_WEAK = 30

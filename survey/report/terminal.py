@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from adjust.result import Adjustment
+from adjust.model.result import Adjustment
 from survey.report.published import head_rows, worst_pairs
-from survey.solution import RunInfo, solution_dict
+from survey.solution.dictionary import RunInfo, solution_dict
 
 _WIDTH = 100
 _WORDS = {"passed": "PASSED", "check": "NEEDS A LOOK", "failed": "FAILED"}
@@ -19,7 +19,7 @@ _MOST_LOOPS, _MOST_EXCLUSIONS, _MOST_PAIRS = 3, 5, 5
 def summary_text(adjustment: Adjustment, run: RunInfo, solution: dict[str, Any] | None = None) -> str:
     """Verdict, warnings, key figures, groups, cameras, network, worst observations and points.
 
-    solution: that of :func:`survey.solution.solution_dict`, made here where it is not given.
+    solution: that of :func:`survey.solution.dictionary.solution_dict`, made here where it is not given.
     """
     solution = solution_dict(adjustment, run) if solution is None else solution
     lines: list[str] = []

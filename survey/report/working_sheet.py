@@ -3,10 +3,10 @@
 import math
 from collections.abc import Sequence
 
+from survey.jobs.working_sheet import ARCSEC, AxisState, FootMove, Sheet
 from survey.report import drawing as d
 from survey.report.document import document
 from survey.report.markup import esc
-from survey.working_sheet import ARCSEC, AxisState, FootMove, Sheet
 
 ROUND_COLUMNS = ("date", "task", "state", "x_arcsec", "y_arcsec", "z_arcsec", "sigma_x", "sigma_y", "sigma_z")
 _STATES = {

@@ -7,20 +7,10 @@ import cv2
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model import (
-    Camera,
-    FloatArray,
-    LensParameter,
-    Point,
-    PoseParameter,
-    Station,
-    Survey,
-    Table,
-    Target,
-)
-from adjust.observations import ImageBlock, TableReading
+from adjust.model.observations import ImageBlock, TableReading
+from adjust.model.survey import Camera, FloatArray, LensParameter, Point, PoseParameter, Station, Survey, Table, Target
+from survey.project.targets import TargetKind
 from survey.simulate.scene import BROWN, Scene, Truth, rotation_about, transform
-from survey.targets import TargetKind
 
 HELD = PoseParameter(Pose3(), "held")
 FREE_LENS = ("fx", "fy", "u0", "v0", "k1", "k2", "p1", "p2")

@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model import Station, Survey
-from adjust.observations import Coordinates, Distance, PositionRef
+from adjust.model.observations import Coordinates, Distance, PositionRef
+from adjust.model.survey import Station, Survey
+from survey.project.targets import Checkerboard, MarkerGrid
 from survey.simulate.draft import ARCSEC, HELD, Draft, Shot, image_blocks, outline, rotation_vector, table_readings
 from survey.simulate.noise import resample
 from survey.simulate.parts import (
@@ -23,7 +24,6 @@ from survey.simulate.parts import (
     wide_lens,
 )
 from survey.simulate.scene import Truth, rotation_about, shift_along
-from survey.targets import Checkerboard, MarkerGrid
 
 CORNER_SIGMA_PX = 0.115
 TABLE_SIGMA_ARCSEC = 8.0

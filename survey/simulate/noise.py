@@ -7,18 +7,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.model import (
-    Camera,
-    FloatArray,
-    Point,
-    PoseParameter,
-    Station,
-    Survey,
-    Table,
-    Target,
-    VectorPrior,
-)
-from adjust.observations import Pair
+from adjust.model.observations import Pair
+from adjust.model.survey import Camera, FloatArray, Point, PoseParameter, Station, Survey, Table, Target, VectorPrior
 from survey.simulate.readings import fresh_readings
 from survey.simulate.scene import BROWN, Scene, Truth
 

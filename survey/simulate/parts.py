@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model import FloatArray, Point, Station, Table
+from adjust.model.survey import FloatArray, Point, Station, Table
+from survey.project.targets import Charuco, Checkerboard, MarkerGrid, TargetKind
 from survey.simulate.draft import (
     ARCSEC,
     HELD,
@@ -28,7 +29,6 @@ from survey.simulate.draft import (
     table_angles,
 )
 from survey.simulate.scene import rotation_about, transform
-from survey.targets import Charuco, Checkerboard, MarkerGrid, TargetKind
 
 BOARD = Checkerboard(11, 8, 0.020)
 CHARUCO = Charuco(9, 6, 0.030, 0.022, "DICT_5X5_100")

@@ -1,7 +1,7 @@
 """Terrestrial and geometric observations of a simulated survey, by plain geometry and none of the code under test.
 
 Truth: ``("orientation", setup)`` (1,) rad, ``("instrument", id)`` (4,), ``("vertical",)`` (2,), ``("beam", id)`` (4,),
-``("surface", id)`` as in ``adjust.model.SURFACES``; what is missing is zero, and an orientation is needed.
+``("surface", id)`` as in ``adjust.model.survey.SURFACES``; what is missing is zero, and an orientation is needed.
 """
 
 from collections.abc import Mapping
@@ -12,8 +12,8 @@ import numpy as np
 from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
-from adjust.model import FloatArray, Survey, VectorParameter, tilt_axes
-from adjust.observations import Alignment, FrameRef, LaserSpot, Level, OnSurface, PositionRef, Reading
+from adjust.model.observations import Alignment, FrameRef, LaserSpot, Level, OnSurface, PositionRef, Reading
+from adjust.model.survey import FloatArray, Survey, VectorParameter, tilt_axes
 from survey.simulate.scene import Scene
 
 

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model import BoolArray, Camera, FloatArray, Station, Survey, Table, Target
-from adjust.observations import FrameRef, PositionRef
-from adjust.result import ParameterName
+from adjust.model.observations import FrameRef, PositionRef
+from adjust.model.result import ParameterName
+from adjust.model.survey import BoolArray, Camera, FloatArray, Station, Survey, Table, Target
 
 Truth = dict[ParameterName, Pose3 | FloatArray]
 BROWN = ("fx", "fy", "skew", "u0", "v0", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -45,7 +45,7 @@ def transform(matrix: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def _warped(target: Target, warp: FloatArray) -> FloatArray:
-    """Points of a sagging board, (n, 3) m, as ``adjust.model.Target`` defines the sag."""
+    """Points of a sagging board, (n, 3) m, as ``adjust.model.survey.Target`` defines the sag."""
     x = target.x_in_target.copy()
     span = np.ptp(x[:, :2], axis=0)
     u = (x[:, :2] - x[:, :2].min(axis=0)) / np.where(span > 0.0, span, 1.0)
@@ -86,7 +86,7 @@ class Scene:
         return value
 
     def table_from_mount(self, table_id: str, angles: FloatArray) -> FloatArray:
-        """(4, 4): outer axis, common perpendicular, inner axis, as ``adjust.model.Table`` writes the chain."""
+        """(4, 4): outer axis, common perpendicular, inner axis, as ``adjust.model.survey.Table`` writes the chain."""
         table = self._tables[table_id]
         if len(table.axes) == 1:
             return rotation_about(table.axes[0], angles[0] + self.vector("table_geometry", table_id)[0])

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
-from adjust.model import FloatArray, Survey
+from adjust.model.survey import FloatArray, Survey
 
 NULL_EIGENVALUE = 1e-11
 

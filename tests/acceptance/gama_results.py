@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 
 GON = np.pi / 200
 CC = GON * 1e-4

@@ -22,17 +22,17 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3, Rot3
 
-import survey.trading
-from adjust.model import PoseParameter, Station, Survey
-from adjust.observations import FrameRef, Pair
-from survey.aligning import align_job
+import survey.folder.exchange
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import PoseParameter, Station, Survey
 from survey.cli import main
-from survey.converting import convert_job
 from survey.examples.alignment import alignment_files
-from survey.files import read, write_project
-from survey.jobs import adjust_job
-from survey.previous import read_previous
-from survey.replacing import changing
+from survey.folder.replacing import changing
+from survey.jobs.adjusting.job import adjust_job
+from survey.jobs.aligning import align_job
+from survey.jobs.converting import convert_job
+from survey.project import read, write_project
+from survey.solution.previous import read_previous
 
 Files = Mapping[str, bytes]
 Happens = Callable[[int, str], None]
@@ -208,7 +208,7 @@ def _tell(home: Path, happens: Happens) -> None:
         if name in _STEPS and _changes(name, arguments) and _concerns(arguments, root):
             step(f"{name} {arguments[0]}")
 
-    real_sync, real_trade = os.fsync, survey.trading._renameat2
+    real_sync, real_trade = os.fsync, survey.folder.exchange._renameat2
 
     def fsync(handle: int) -> None:
         step("fsync")
@@ -218,7 +218,7 @@ def _tell(home: Path, happens: Happens) -> None:
         step(f"renameat2 {there}")
         return real_trade(new, there)
 
-    os.fsync, survey.trading._renameat2 = fsync, renameat2
+    os.fsync, survey.folder.exchange._renameat2 = fsync, renameat2
     sys.addaudithook(event)
 
 

@@ -13,10 +13,11 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.closed_forms import rotation_log
-from adjust.cpc import CpcInput, TableImages, body_on_main_axis, calibrate, single_camera_survey, table_images
-from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
-from adjust.model import (
+from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.solver import solve
+from adjust.model.observations import Distance, FrameRef, ImageBlock, PositionRef, TableReading
+from adjust.model.result import Adjustment
+from adjust.model.survey import (
     TABLE_GEOMETRY,
     Camera,
     LensParameter,
@@ -29,9 +30,8 @@ from adjust.model import (
     Target,
     VectorParameter,
 )
-from adjust.observations import Distance, FrameRef, ImageBlock, PositionRef, TableReading
-from adjust.result import Adjustment
-from adjust.solve import solve
+from adjust.published import CpcInput, TableImages, body_on_main_axis, calibrate, single_camera_survey, table_images
+from adjust.spatial.rigid import rotation_log
 from survey.simulate import BROWN, Scene, resample
 
 ARCSEC = np.pi / 180 / 3600

@@ -14,12 +14,12 @@ from scipy.stats import chi2
 from tqdm import tqdm
 
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.observations import ImageBlock
-from adjust.solve import solve
+from adjust.graph.solver import solve
+from adjust.model.observations import ImageBlock
 from survey.detection import detect_image
-from survey.rendering import BrownCamera, Imaging, PlacedTarget, render
+from survey.project.targets import Checkerboard
 from survey.simulate import BROWN, Scene
-from survey.targets import Checkerboard
+from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 from tests.acceptance.mfns_replica import (
     ANGLES_DEG,
     CAMERAS,

@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from adjust.model import FloatArray, Survey
+from adjust.model.survey import FloatArray, Survey
 from survey.cli import main
-from survey.interop.foreign import ForeignNetwork
-from survey.interop.gama import read_gama
-from survey.interop.krumm import read_adjusted, read_krumm
-from survey.interop.lgc import read_lgc
 from survey.interop.names import with_safe_ids
+from survey.interop.networks.foreign import ForeignNetwork
+from survey.interop.networks.gama import read_gama
+from survey.interop.networks.krumm import read_adjusted, read_krumm
+from survey.interop.networks.lgc import read_lgc
 from tests.acceptance.dense_network import DenseResult, dense_adjust, gradient_at, sparse_sigmas
 from tests.acceptance.gama_results import GamaResult, gama_result
 

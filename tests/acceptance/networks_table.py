@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Iterable
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from tests.acceptance.networks import (
     DEFAULTS,
     GAMA,

@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.lens import MODELS
-from adjust.model import (
+from adjust.lenses.models import MODELS
+from adjust.model.observations import ImageBlock
+from adjust.model.survey import (
     Camera,
     FloatArray,
     LensParameter,
@@ -26,7 +27,6 @@ from adjust.model import (
     VectorParameter,
     VectorPrior,
 )
-from adjust.observations import ImageBlock
 
 HELD = PoseParameter(Pose3(), "held")
 # photogrammetry's camera looks along -z with y up

@@ -12,12 +12,12 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.adjustment import AdjustOptions, adjust, assemble
-from adjust.closed_forms import rotation_log
-from adjust.errors import IndeterminateError
-from adjust.graph import GraphBuilder, StartValues
-from adjust.model import TILT, Beam, PoseParameter, Survey, VectorParameter, Vertical
-from adjust.observations import FrameRef, LaserSpot, Level, TableReading
-from adjust.solve import solve
+from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.solver import solve
+from adjust.model.errors import IndeterminateError
+from adjust.model.observations import FrameRef, LaserSpot, Level, TableReading
+from adjust.model.survey import TILT, Beam, PoseParameter, Survey, VectorParameter, Vertical
+from adjust.spatial.rigid import rotation_log
 from tests.acceptance.mfns_replica import ARCSEC, joint_graph, laboratory, noisy, replica, rotation, true_poses
 
 LEVEL_SIGMA, SPOT_SIGMA, TAPE_SIGMA = 15 * ARCSEC, 2e-4, 1e-3

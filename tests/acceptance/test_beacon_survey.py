@@ -9,11 +9,11 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.adjustment import adjust
-from adjust.lens import MODELS
-from adjust.model import Camera, LensParameter, Point, PoseParameter, Station, Survey
-from adjust.observations import Distance, FrameRef, ImageBlock, PositionRef
+from adjust.lenses.models import MODELS
+from adjust.model.observations import Distance, FrameRef, ImageBlock, PositionRef
+from adjust.model.survey import Camera, LensParameter, Point, PoseParameter, Station, Survey
 from survey.cli import FAILED, main
-from survey.files import write_project
+from survey.project import write_project
 from survey.simulate import beacons, resample
 
 SIGMA_PX = 0.1

@@ -12,7 +12,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from capture.cli import main as capture_main
 from survey.cli import build_parser, main
 
@@ -59,9 +59,9 @@ def jobs(monkeypatch):
             raise PermissionError(13, "Permission denied", str(folder / "results"))
         return _Outcome(folder, {"poor": "does_not_fit", "cautious": "cautious"}.get(folder.name, "fits"))
 
-    module = ModuleType("survey.jobs")
+    module = ModuleType("survey.jobs.adjusting.job")
     module.adjust_job = adjust_job
-    monkeypatch.setitem(sys.modules, "survey.jobs", module)
+    monkeypatch.setitem(sys.modules, "survey.jobs.adjusting.job", module)
     return calls
 
 

@@ -16,11 +16,11 @@ import pytest
 from gtsam import Pose3
 from scipy.stats import binom, chi2
 
-from adjust.graph import AdjustmentGraph, GraphBuilder
-from adjust.model import Datum, FloatArray, Survey
-from adjust.precision import Precision
-from adjust.result import ParameterName
-from adjust.solve import solve
+from adjust.graph.assembly import AdjustmentGraph, GraphBuilder
+from adjust.graph.solver import solve
+from adjust.model.result import ParameterName
+from adjust.model.survey import Datum, FloatArray, Survey
+from adjust.precision.precision import Precision
 from survey import simulate
 from survey.simulate.scene import Truth
 from tests.adjust import helpers as h

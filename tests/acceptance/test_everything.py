@@ -12,12 +12,23 @@ from gtsam import Pose3
 from scipy.stats import chi2
 
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.errors import IndeterminateError
-from adjust.graph import GraphBuilder, StartValues
-from adjust.model import TILT, Beam, Bearings, Instrument, Point, Setup, Survey, VectorParameter, VectorPrior, Vertical
-from adjust.observations import Distance, FrameRef, LaserSpot, Level, PositionRef, Reading
-from adjust.result import Adjustment
-from adjust.solve import SolveOptions, solve
+from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.solver import SolveOptions, solve
+from adjust.model.errors import IndeterminateError
+from adjust.model.observations import Distance, FrameRef, LaserSpot, Level, PositionRef, Reading
+from adjust.model.result import Adjustment
+from adjust.model.survey import (
+    TILT,
+    Beam,
+    Bearings,
+    Instrument,
+    Point,
+    Setup,
+    Survey,
+    VectorParameter,
+    VectorPrior,
+    Vertical,
+)
 from survey.simulate import beacons, resample
 
 ARCSEC = np.pi / 648000

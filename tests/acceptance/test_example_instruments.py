@@ -7,8 +7,8 @@ from scipy.stats import chi2
 
 from survey.cli import main
 from survey.examples.beacons import beacon_files
-from survey.files import read
-from survey.jobs import adjust_project
+from survey.jobs.adjusting.job import adjust_project
+from survey.project import read
 
 BEACONS = [f"B{i + 1:02d}" for i in range(12)]
 
@@ -65,7 +65,7 @@ def test_commands(tmp_path, capsys):
 
 
 def test_report_shows_instruments_surfaces_and_beams_in_both_languages(tmp_path):
-    from survey.jobs import run_info
+    from survey.jobs.adjusting.job import run_info
     from survey.report import report_html
 
     assert main(["example", "alignment", str(tmp_path / "a"), "--quiet"]) == 0

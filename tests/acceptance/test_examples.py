@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.cli import main
 from survey.examples import write_example
 from survey.examples.folders import MAKERS
 from survey.examples.pictures import picture
-from survey.files import read
+from survey.project import read
 from survey.simulate.draft import Shot
 
 

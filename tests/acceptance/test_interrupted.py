@@ -16,18 +16,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from capture.session_folder import session_lock
+from adjust.model.errors import SurveyError
+from capture.session.folder import session_lock
 from survey.batch.causes import MAY_PASS, cause_of
 from survey.cli import FAILED, main
-from survey.files import read, write_project
-from survey.files.locking import LOCK, BusyError, FileLock, holder_of
-from survey.files.text import atomic_write
-from survey.jobs import adjust_job
-from survey.previous import read_previous
-from survey.removing import remove_job
-from survey.replacing import changing, recover_killed, replace_parts, unfinished, write_set
-from survey.whole_folder import whole_folder
+from survey.folder.locking import LOCK, BusyError, FileLock, holder_of
+from survey.folder.replacing import changing, recover_killed, replace_parts, unfinished, write_set
+from survey.folder.text import atomic_write
+from survey.folder.whole import whole_folder
+from survey.jobs.adjusting.job import adjust_job
+from survey.jobs.removing import remove_job
+from survey.project import read, write_project
+from survey.solution.previous import read_previous
 from tests.acceptance.interruptions import (
     CASES,
     Ground,
@@ -238,7 +238,7 @@ def test_no_locks_on_this_file_system(
 @pytest.mark.parametrize("code", [errno.EINVAL, errno.ENOSYS, errno.EBUSY])
 def test_file_systems_that_cannot_trade_folders(lab: Path, code: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Network drives, folders that are mounted: files are replaced one by one instead."""
-    monkeypatch.setattr("survey.trading._renameat2", lambda *_: code)
+    monkeypatch.setattr("survey.folder.exchange._renameat2", lambda *_: code)
     before = content(lab)
     inode = (lab / "results").stat().st_ino
     assert main(["remove", str(lab), "p0-2", "--quiet"]) == 0
@@ -285,15 +285,15 @@ def test_files_of_others_stay(lab: Path) -> None:
 
 
 def test_what_comes_at_the_last_moment_stays(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import survey.trading
+    import survey.folder.exchange
 
-    real = survey.trading._renameat2
+    real = survey.folder.exchange._renameat2
 
     def late(new: Path, there: Path) -> int:
         (there / "late.txt").write_text("written by somebody else")
         return real(new, there)
 
-    monkeypatch.setattr(survey.trading, "_renameat2", late)
+    monkeypatch.setattr(survey.folder.exchange, "_renameat2", late)
     adjust_job(lab, progress=False)
     assert (lab / "results" / "late.txt").read_text() == "written by somebody else"
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from survey.cli import main
-from survey.results import read_covariances
+from survey.report.results import read_covariances
 from tests.data import data_folder
 
 # 0.657275451718 times the a priori variance of (0.5 micrometre)^2
@@ -109,8 +109,8 @@ def test_image_coordinates_with_all_their_digits_change_it_little(source, adjust
     from dataclasses import replace
 
     from adjust.adjustment import AdjustOptions, adjust
-    from adjust.model import Datum
-    from survey.interop.aicon import read_aicon
+    from adjust.model.survey import Datum
+    from survey.interop.cameras.aicon import read_aicon
 
     survey = read_aicon(source / "example.phc").survey
     datum = tuple(name for name, (_, chosen) in published.items() if chosen)

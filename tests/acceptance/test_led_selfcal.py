@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from gtsam import Pose3
 
-from adjust.lens import MODELS
-from adjust.model import Camera, LensParameter, Point, PoseParameter, Station, Survey, Tie
-from adjust.observations import Distance, FrameRef, ImageBlock, PositionRef
+from adjust.lenses.models import MODELS
+from adjust.model.observations import Distance, FrameRef, ImageBlock, PositionRef
+from adjust.model.survey import Camera, LensParameter, Point, PoseParameter, Station, Survey, Tie
 from survey.cli import FAILED, main
-from survey.files import AdjustmentOptions, write_project
+from survey.project import AdjustmentOptions, write_project
 from tests.data import data_folder
 
 NAMES = MODELS["brown"].names

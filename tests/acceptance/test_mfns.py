@@ -11,10 +11,10 @@ from gtsam import Pose3
 from scipy.stats import chi2
 
 from adjust.adjustment import AdjustOptions, adjust, assemble
-from adjust.cpc import body_on_main_axis, propagate
-from adjust.errors import IndeterminateError
-from adjust.rotation_forms import euler_cov_from_tangent
-from adjust.solve import solve
+from adjust.graph.solver import solve
+from adjust.model.errors import IndeterminateError
+from adjust.published import body_on_main_axis, propagate
+from adjust.spatial.rotation_forms import euler_cov_from_tangent
 from survey.simulate import BROWN, Scene
 from tests.acceptance.mfns_replica import (
     ANGLES_DEG,

@@ -12,10 +12,10 @@ from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from adjust.model import Camera, LensParameter, PoseParameter, Station, Target
-from adjust.observations import ImageBlock
+from adjust.model.observations import ImageBlock
+from adjust.model.survey import Camera, LensParameter, PoseParameter, Station, Target
 from survey.cli import main
-from survey.files import write_project
+from survey.project import write_project
 from tests.adjust.relay_station import EYES, LENS, SIZE, Station4, rigid
 from tests.survey.test_converting import tracker_files
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.model import PoseParameter
+from adjust.model.survey import PoseParameter
 from survey.cli import FAILED, main
-from survey.files import write_project
+from survey.project import write_project
 from survey.simulate import Scene, head_on_table, resample
 from tests.acceptance.mfns_replica import noisy, replica
 

@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from adjust.adjustment import adjust
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from tests.acceptance.positioner import (
     POSITIONER,
     PoseWeights,

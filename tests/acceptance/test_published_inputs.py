@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from adjust.lens import MODELS, lens_constants, lens_derivatives, lens_residuals, rays
+from adjust.lenses.models import MODELS, lens_constants, lens_derivatives, lens_residuals, rays
 from tests.acceptance import published
 from tests.data import data_folder
 

@@ -13,15 +13,15 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.closed_forms import rotation_log
-from adjust.cpc import compare_head
-from adjust.model import PoseParameter
-from adjust.observations import FrameRef, Pair
+from adjust.graph.solver import solve
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import PoseParameter
+from adjust.published import compare_head
+from adjust.published.relay import PaperOptions, adjusted_covariances, euler_covariances, paper_iteration
 from adjust.relay.network import network_from_pairs
-from adjust.relay.paper import PaperOptions, adjusted_covariances, euler_covariances, paper_iteration
-from adjust.solve import solve
+from adjust.spatial.rigid import rotation_log
 from survey.cli import main
-from survey.files import write_project
+from survey.project import write_project
 from tests.acceptance.mfns_replica import joint_graph, noisy, replica
 
 

@@ -6,8 +6,8 @@ import pytest
 from gtsam import Pose3
 
 from adjust.adjustment import adjust
-from adjust.graph import StartValues
-from adjust.lens import MODELS
+from adjust.graph.assembly import StartValues
+from adjust.lenses.models import MODELS
 from tests.acceptance import published
 from tests.data import data_folder
 

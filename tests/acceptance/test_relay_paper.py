@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
+from adjust.published.relay import paper_iteration
 from adjust.relay.condition_factors import MAX_HARD_LOOPS
 from adjust.relay.conditions import ConditionOptions, adjust_condition_factors, adjust_conditions
 from adjust.relay.counts import count
 from adjust.relay.loops import loop_misclosures
 from adjust.relay.motions import Motions
 from adjust.relay.network import Network, topology
-from adjust.relay.paper import paper_iteration
 from adjust.relay.parametric import adjust_parametric
 from tests.adjust.relay_monte_carlo import MonteCarloOptions, simulate_complete
 from tests.adjust.relay_networks import ARCMIN, chain_with_chords, complete, differences, grid, simulate

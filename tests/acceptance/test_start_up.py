@@ -13,7 +13,7 @@ NEEDLESS = (
     "cv2", "matplotlib", "pycolmap", "pandas", "pyarrow", "distributed", "scipy.stats", "scipy.optimize",
     "scipy.linalg", "scipy.sparse.linalg", "scipy.sparse.csgraph", "scipy.spatial", "scipy.fft",
     "numpy.f2py.crackfortran",
-    "adjust.pose_network", "adjust.relay", "adjust.table_checks", "survey.detection", "survey.simulate",
+    "adjust.pose_network", "adjust.relay", "adjust.diagnosis.table", "survey.detection", "survey.simulate",
 )  # fmt: skip
 CODE = """
 import sys

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.errors import NotConvergedError, SurveyError
-from survey.files import read
-from survey.jobs import adjust_project
-from survey.navigation import NavigateRequest, navigate_job
+from adjust.model.errors import NotConvergedError, SurveyError
+from survey.jobs.adjusting.job import adjust_project
+from survey.jobs.navigating.job import NavigateRequest, navigate_job
+from survey.project import read
 from tests.data import data_folder
 
 

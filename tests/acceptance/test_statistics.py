@@ -9,13 +9,13 @@ import pytest
 from scipy.stats import binom
 
 from adjust.adjustment import adjust
-from adjust.congruence import CongruenceOptions, congruence
-from adjust.model import Datum
-from adjust.result import Adjustment
+from adjust.epochs.congruence import CongruenceOptions, congruence
+from adjust.model.result import Adjustment
+from adjust.model.survey import Datum
 from adjust.statistics.reliability import reliability
 from survey.cli import main
-from survey.files import write_project
-from survey.interop.gama import read_gama
+from survey.interop.networks.gama import read_gama
+from survey.project import write_project
 from tests.adjust import statistics_networks as net
 from tests.data import data_folder
 

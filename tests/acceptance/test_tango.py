@@ -15,10 +15,10 @@ from gtsam import Pose3
 from scipy.stats import chi2
 
 from adjust.adjustment import adjust
-from adjust.errors import SurveyError
-from adjust.graph import StartValues
-from adjust.model import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey
-from adjust.observations import FrameRef, Pair
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey
 from adjust.relay.conditions import adjust_conditions
 from adjust.relay.eye_drift import fit_drift, rescaled, sequences
 from adjust.relay.eye_pairs import close_loops, pairs_of, triangle_misclosure
@@ -27,7 +27,7 @@ from adjust.relay.eyes import EyeOptions, PoseSequence, adjust_eye_motions, adju
 from adjust.relay.loops import loop_misclosures
 from adjust.relay.motions import Motions
 from adjust.relay.network import network_from_pairs
-from survey.relay import (
+from survey.jobs.relay import (
     RelayTrackers,
     one_metre,
     pair_text,

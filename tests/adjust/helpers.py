@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
-from adjust.lens import MODELS
-from adjust.model import (
+from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.solver import Solved, SolveOptions, solve
+from adjust.lenses.models import MODELS
+from adjust.model.observations import Coordinates, Distance, FrameRef, ImageBlock, PositionRef, TableReading
+from adjust.model.result import ParameterName
+from adjust.model.survey import (
     Camera,
     FloatArray,
     LensParameter,
@@ -26,10 +29,7 @@ from adjust.model import (
     Target,
     VectorParameter,
 )
-from adjust.observations import Coordinates, Distance, FrameRef, ImageBlock, PositionRef, TableReading
-from adjust.precision import Precision, image_residuals, other_residuals
-from adjust.result import ParameterName
-from adjust.solve import Solved, SolveOptions, solve
+from adjust.precision.precision import Precision, image_residuals, other_residuals
 from survey.simulate import resample
 from survey.simulate.scene import BROWN, Scene, Truth, rotation_about, transform
 

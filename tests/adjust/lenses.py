@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from adjust.lens import MODELS, LensModel, lens_constants
-from adjust.model import FloatArray
+from adjust.lenses.models import MODELS, LensModel, lens_constants
+from adjust.model.survey import FloatArray
 
 IMAGE_SIZE = (640, 480)
 PIXEL_SIZE_MM = 0.01

@@ -11,17 +11,17 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
-from adjust.initial import find_start
-from adjust.model import PoseParameter
+from adjust.model.survey import PoseParameter
 from adjust.native import bundles, images, lenses, navigation, reduction, trees, views, vision
 from adjust.native.library import Function
 from adjust.navigation import navigate
 from adjust.pose_network import solve_network
-from adjust.precision import Precision, image_residuals
+from adjust.precision.precision import Precision, image_residuals
+from adjust.start import find_start
 from survey.detection import SpotOptions, detect_image, detect_spots
-from survey.rendering import Beacons, BrownCamera, PlacedTarget, render
+from survey.project.targets import Checkerboard
 from survey.simulate import head_on_table
-from survey.targets import Checkerboard
+from survey.simulate.rendering import Beacons, BrownCamera, PlacedTarget, render
 from tests.adjust import helpers as h
 from tests.adjust import pose_networks
 from tests.adjust.lenses import IMAGE_SIZE, NAMES, lens, points_in_camera

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.lens import lens_constants
+from adjust.lenses.models import lens_constants
 from adjust.navigation import Beacons, Head, HeadCamera, HeadTable, NavigationEpoch, Spots
 
 SIZE = (1280, 1024)

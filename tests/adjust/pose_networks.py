@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 from adjust.pose_network import PoseNetwork, pose_network
 
 

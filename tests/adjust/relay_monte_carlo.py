@@ -11,10 +11,10 @@ from typing import Literal
 
 import numpy as np
 
-from adjust.closed_forms import rotation_exp
-from adjust.errors import SurveyError
-from adjust.model import BoolArray, FloatArray, IntArray
-from adjust.rotation_forms import euler_from_matrix, euler_jacobian, matrix_from_euler
+from adjust.model.errors import SurveyError
+from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.spatial.rigid import rotation_exp
+from adjust.spatial.rotation_forms import euler_from_matrix, euler_jacobian, matrix_from_euler
 from tests.adjust.relay_trials import adjust_trials
 
 Noise = Literal["euler", "tangent"]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.observations import FrameRef, Pair
+from adjust.model.observations import FrameRef, Pair
 from adjust.relay.motions import Motions
 from adjust.relay.network import Network, complete_topology, topology
 

@@ -5,8 +5,8 @@ import numpy as np
 from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 
-from adjust.model import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey, Target
-from adjust.observations import FrameRef, ImageBlock
+from adjust.model.observations import FrameRef, ImageBlock
+from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey, Target
 from adjust.relay.eyes import PoseSequence
 from adjust.relay.motions import Motions
 from survey.simulate.scene import BROWN

@@ -6,7 +6,7 @@ then arithmetic over all trials of a run, side by side, also the elimination.
 
 import numpy as np
 
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 
 _RUN = 512  # trials at a time: what they need stays in the processor's cache
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from adjust.adjustment import adjust
-from adjust.graph import StartValues
-from adjust.model import FloatArray, Point, PointParameter, Setup, Survey
-from adjust.observations import Distance, PositionRef, Reading
-from adjust.result import Adjustment
+from adjust.graph.assembly import StartValues
+from adjust.model.observations import Distance, PositionRef, Reading
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray, Point, PointParameter, Setup, Survey
 
 SIGMAS = {"direction": 5e-6, "zenith": 8e-6, "slope_distance": 3e-4, "tape": 2e-4}
 

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.graph import StartValues
-from adjust.model import (
+from adjust.graph.assembly import StartValues
+from adjust.model.observations import PositionRef, Reading
+from adjust.model.result import Adjustment
+from adjust.model.survey import (
     INSTRUMENT,
     Bearings,
     Datum,
@@ -22,8 +24,6 @@ from adjust.model import (
     Vertical,
     tilt_axes,
 )
-from adjust.observations import PositionRef, Reading
-from adjust.result import Adjustment
 
 ANGLES = ("direction", "angle", "azimuth")
 Truth = Mapping[tuple[str, ...], Any]

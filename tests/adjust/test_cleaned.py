@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from adjust.adjustment import AdjustOptions
-from adjust.pair_screen import PairOptions
 from adjust.statistics.cleaned import CleanOptions, adjust_cleaned
+from adjust.statistics.pair_screen import PairOptions
 from survey.simulate import beacons
 from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from adjust import closed_forms as cf
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
+from adjust.start import closed_forms as cf
 
 K = np.array([[1600.0, 0, 630.0], [0, 1590.0, 520.0], [0, 0, 1]])
 SIZE = (1280, 1024)

@@ -8,13 +8,13 @@ from gtsam import Pose3
 from scipy.stats import binom
 
 from adjust.adjustment import adjust
-from adjust.congruence import CongruenceOptions, compare, congruence, joint_congruence
-from adjust.epoch_states import EpochState, aligned, epoch_state, moved
-from adjust.epochs import joint_survey
-from adjust.errors import SurveyError
-from adjust.graph import StartValues
-from adjust.model import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
-from adjust.observations import FrameRef, Pair
+from adjust.epochs.congruence import CongruenceOptions, compare, congruence, joint_congruence
+from adjust.epochs.joint import joint_survey
+from adjust.epochs.states import EpochState, aligned, epoch_state, moved
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
 from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import chi2
 
 from adjust.adjustment import adjust
-from adjust.model import FloatArray, Survey
-from adjust.result import GlobalTest
+from adjust.model.result import GlobalTest
+from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.changes import ChangeSearch, natural
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.consistency import consistency

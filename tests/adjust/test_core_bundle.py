@@ -6,13 +6,13 @@ import gtsam
 import numpy as np
 import pytest
 
-from adjust.bundle_hidden import BundleHidden
-from adjust.errors import IndeterminateError
-from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
-from adjust.model import Datum, PoseParameter, Survey
-from adjust.observations import Coordinates, Distance, PositionRef
-from adjust.precision import Precision
-from adjust.solve import SolveOptions, solve
+from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.solver import SolveOptions, solve
+from adjust.model.errors import IndeterminateError
+from adjust.model.observations import Coordinates, Distance, PositionRef
+from adjust.model.survey import Datum, PoseParameter, Survey
+from adjust.observations.images.bundle_hidden import BundleHidden
+from adjust.precision.precision import Precision
 from survey.simulate import beacons
 from survey.simulate.scene import Truth
 from tests.adjust import helpers as h
@@ -179,7 +179,7 @@ def test_the_defects_of_a_larger_free_network_are_all_found(pivot: float, monkey
 
     Whatever pivots are then left out as rounding.
     """
-    monkeypatch.setattr("adjust.bundle_batch.ROUNDING_PIVOT", pivot)
+    monkeypatch.setattr("adjust.observations.images.bundles.ROUNDING_PIVOT", pivot)
     survey, truth = h.network(3, n_epochs=40, n_points=200, held=0, distances=0)
     survey = replace(survey, datum=Datum("inner", points=tuple(f"P{i}" for i in range(5))))
     _, done = h.solved(survey, h.shaken(h.start_at(truth), 1, 0.002, 0.002), tight=False)

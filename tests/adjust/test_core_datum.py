@@ -7,19 +7,11 @@ import pytest
 from gtsam import Pose3, Rot3
 from scipy.linalg import qr
 
-from adjust.datum import independent_rows
-from adjust.errors import IndeterminateError, SurveyError
-from adjust.model import (
-    Camera,
-    Datum,
-    Point,
-    PoseParameter,
-    Station,
-    Survey,
-    VectorParameter,
-)
-from adjust.observations import FrameRef, Pair
-from adjust.precision import Precision
+from adjust.graph.datum import independent_rows
+from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import Camera, Datum, Point, PoseParameter, Station, Survey, VectorParameter
+from adjust.precision.precision import Precision
 from survey.simulate import beacons, head_on_table, single_camera, stereo
 from survey.simulate.scene import Truth
 from tests.adjust import helpers as h

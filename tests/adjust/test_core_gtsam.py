@@ -11,11 +11,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from adjust.graph import AdjustmentGraph, StartValues
-from adjust.model import Survey, VectorPrior
-from adjust.observations import FrameRef, Pair
-from adjust.precision import Precision
-from adjust.solve import SolveOptions, solve
+from adjust.graph.assembly import AdjustmentGraph, StartValues
+from adjust.graph.solver import SolveOptions, solve
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import Survey, VectorPrior
+from adjust.precision.precision import Precision
 from survey.simulate import resample, stereo
 from tests.adjust import helpers as h
 from tests.adjust.terrestrial_networks import measured, polar_network, start_near

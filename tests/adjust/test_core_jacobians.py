@@ -7,18 +7,10 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.graph import AdjustmentGraph, StartValues
-from adjust.lens import MODELS
-from adjust.model import (
-    FloatArray,
-    Point,
-    PointParameter,
-    PoseParameter,
-    Survey,
-    Tie,
-    VectorPrior,
-)
-from adjust.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
+from adjust.graph.assembly import AdjustmentGraph, StartValues
+from adjust.lenses.models import MODELS
+from adjust.model.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
+from adjust.model.survey import FloatArray, Point, PointParameter, PoseParameter, Survey, Tie, VectorPrior
 from tests.adjust import helpers as h
 
 # of differences in the rational terms k4..k6: a step is too long for some blocks or too short for others

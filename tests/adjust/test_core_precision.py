@@ -8,11 +8,11 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.graph import StartValues
-from adjust.model import Datum, FloatArray, PoseParameter, Survey, Tie, VectorParameter, VectorPrior
-from adjust.observations import Distance, FrameRef, Pair, PositionRef
-from adjust.precision import Precision
-from adjust.result import Adjustment
+from adjust.graph.assembly import StartValues
+from adjust.model.observations import Distance, FrameRef, Pair, PositionRef
+from adjust.model.result import Adjustment
+from adjust.model.survey import Datum, FloatArray, PoseParameter, Survey, Tie, VectorParameter, VectorPrior
+from adjust.precision.precision import Precision
 from survey.simulate import beacons, head_on_table, relay, resample, single_camera, stereo
 from survey.simulate.scene import Truth
 from tests.adjust import helpers as h

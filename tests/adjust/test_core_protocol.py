@@ -9,8 +9,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from adjust.graph import AdjustmentGraph
-from adjust.solve import solve
+from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.solver import solve
 from survey.simulate import head_on_table
 from tests.adjust import helpers as h
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.errors import NotConvergedError, SurveyError
-from adjust.model import PoseParameter
-from adjust.observations import Distance, PositionRef
-from adjust.solve import SolveOptions, solve
+from adjust.graph.solver import SolveOptions, solve
+from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.observations import Distance, PositionRef
+from adjust.model.survey import PoseParameter
 from survey.simulate import head_on_table, single_camera, stereo
 from tests.adjust import helpers as h
 

@@ -7,19 +7,12 @@ import pytest
 from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 
-from adjust.cpc import (
-    CpcInput,
-    TableImages,
-    body_on_main_axis,
-    calibrate,
-    propagate,
-    single_camera_survey,
-)
-from adjust.cpc.method import difference
-from adjust.cpc.steps import lateral_offset, table_and_main_camera
-from adjust.errors import SurveyError
-from adjust.model import Camera, LensParameter, PoseParameter, Survey
-from adjust.rotation_forms import matrix_from_euler
+from adjust.model.errors import SurveyError
+from adjust.model.survey import Camera, LensParameter, PoseParameter, Survey
+from adjust.published import CpcInput, TableImages, body_on_main_axis, calibrate, propagate, single_camera_survey
+from adjust.published.method import difference
+from adjust.published.steps import lateral_offset, table_and_main_camera
+from adjust.spatial.rotation_forms import matrix_from_euler
 
 MAIN = np.radians([(0, 0), (0, -80), (0, -30), (0, 25), (0, 60), (-20, 0), (-11, 0), (9, 0), (18, 0)])
 X_ANGLES = np.radians([(80, 85), (95, 95), (-85, -90), (-95, -80)])

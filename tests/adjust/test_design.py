@@ -26,9 +26,9 @@ from adjust.design import (
 )
 from adjust.design.candidates import inform
 from adjust.design.rows import design_matrix
-from adjust.errors import IndeterminateError, SurveyError
-from adjust.model import Point, PointParameter
-from adjust.observations import Coordinates, Distance, ImageBlock, PositionRef
+from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.observations import Coordinates, Distance, ImageBlock, PositionRef
+from adjust.model.survey import Point, PointParameter
 from survey.simulate import LabSize, beacons, full_lab, single_camera
 from survey.simulate.labs import WITHOUT_COORDINATES
 from survey.simulate.scene import Scene

@@ -8,11 +8,11 @@ import pytest
 from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
+from adjust.design.error_analysis import ERROR_KINDS, BeaconField, error_curve, tolerance
 from adjust.design.error_figures import error_figure, error_figures
 from adjust.design.placement import PlacementOptions, place_beacons
 from adjust.design.pose_budget import pose_budget, pose_tolerances, simulate_poses
-from adjust.error_analysis import ERROR_KINDS, BeaconField, error_curve, tolerance
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from adjust.navigation import Beacons, expected_precision
 from tests.adjust.navigation import block_diagonal, mfns_head, scattered_beacons, turned, wide_head
 

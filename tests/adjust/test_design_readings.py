@@ -9,10 +9,10 @@ from adjust.adjustment import adjust
 from adjust.design import Candidate, components_of, exact, expect, run_trials, select, with_candidates
 from adjust.design.prediction import Predictor
 from adjust.design.rows import design_matrix
-from adjust.errors import SurveyError
-from adjust.graph import StartValues
-from adjust.model import INSTRUMENT, Datum, Setup, Surface, Survey, VectorParameter, VectorPrior
-from adjust.observations import CoordinateDifferences, OnSurface, PositionRef, Reading, ReadingCovariance
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import SurveyError
+from adjust.model.observations import CoordinateDifferences, OnSurface, PositionRef, Reading, ReadingCovariance
+from adjust.model.survey import INSTRUMENT, Datum, Setup, Surface, Survey, VectorParameter, VectorPrior
 from tests.adjust.terrestrial_networks import P, Truth, measured, polar_network, start_near, wrapped
 from tests.adjust.test_geometry import geometric
 

@@ -6,12 +6,12 @@ import gtsam
 import numpy as np
 import pytest
 
-from adjust.divergence import describe_divergence, misfits
-from adjust.errors import IndeterminateError, NotConvergedError
-from adjust.graph import AdjustmentGraph, StartValues
-from adjust.model import FloatArray, Point, PointParameter, Survey
-from adjust.observations import Distance, PositionRef
-from adjust.solve import SolveOptions, _Loop, solve
+from adjust.graph.assembly import AdjustmentGraph, StartValues
+from adjust.graph.divergence import describe_divergence, misfits
+from adjust.graph.solver import SolveOptions, _Loop, solve
+from adjust.model.errors import IndeterminateError, NotConvergedError
+from adjust.model.observations import Distance, PositionRef
+from adjust.model.survey import FloatArray, Point, PointParameter, Survey
 from survey.simulate import stereo
 from tests.adjust import helpers as h
 

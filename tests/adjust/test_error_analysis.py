@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from adjust.error_analysis import (
+from adjust.design.error_analysis import (
     ERROR_KINDS,
     BeaconField,
     error_curve,
@@ -14,8 +14,8 @@ from adjust.error_analysis import (
     tolerance,
     u_jacobian,
 )
-from adjust.errors import SurveyError
-from adjust.rotation_forms import matrix_from_euler
+from adjust.model.errors import SurveyError
+from adjust.spatial.rotation_forms import matrix_from_euler
 
 MM, DEG = 1e-3, np.pi / 180.0
 FAR = BeaconField(nearest_m=0.1)

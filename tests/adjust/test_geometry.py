@@ -8,12 +8,20 @@ from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 
 from adjust.adjustment import adjust
-from adjust.directions import tilted
-from adjust.errors import IndeterminateError, SurveyError
-from adjust.geometry.motions import direction_motions, surface_motions
-from adjust.geometry.residuals import line_distance, plane_distance, sphere_distance
-from adjust.graph import AdjustmentGraph, StartValues
-from adjust.model import (
+from adjust.graph.assembly import AdjustmentGraph, StartValues
+from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.observations import (
+    Alignment,
+    CoordinateDifferences,
+    Coordinates,
+    Distance,
+    FrameRef,
+    LaserSpot,
+    Level,
+    OnSurface,
+    PositionRef,
+)
+from adjust.model.survey import (
     BEAM,
     SURFACES,
     TILT,
@@ -32,18 +40,10 @@ from adjust.model import (
     Vertical,
     tilt_axes,
 )
-from adjust.motions import point_motions
-from adjust.observations import (
-    Alignment,
-    CoordinateDifferences,
-    Coordinates,
-    Distance,
-    FrameRef,
-    LaserSpot,
-    Level,
-    OnSurface,
-    PositionRef,
-)
+from adjust.observations.geometry.motions import direction_motions, surface_motions
+from adjust.observations.geometry.residuals import line_distance, plane_distance, sphere_distance
+from adjust.spatial.directions import tilted
+from adjust.spatial.motions import point_motions
 from tests.adjust import helpers as h
 
 UP = np.array([0.1, -0.2, 0.97]) / np.linalg.norm([0.1, -0.2, 0.97])
@@ -127,7 +127,7 @@ class Plainly:
         self.parameters = self.plain.parameters(values)
 
     def frame(self, ref: FrameRef) -> FloatArray:
-        from adjust.factors import ChainPose  # poses of chains have tests of their own
+        from adjust.observations.factors import ChainPose  # poses of chains have tests of their own
 
         chain = self.chains[ref]
         return np.asarray(ChainPose(self.graph.unknowns, self.graph.state, chain)(self.values)[0].matrix())
@@ -147,7 +147,7 @@ class Plainly:
     def __getattr__(self, name):
         if name != "chains":
             raise AttributeError(name)
-        from adjust.graph import GraphBuilder
+        from adjust.graph.assembly import GraphBuilder
 
         survey = self.survey
         frames = GraphBuilder(survey, {c.camera_id: c.lens.values for c in survey.cameras}).frames

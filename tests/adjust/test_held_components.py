@@ -7,10 +7,10 @@ import pytest
 from gtsam import Point3, Pose3, Rot3
 
 from adjust.adjustment import adjust
-from adjust.errors import SurveyError
-from adjust.graph import StartValues
-from adjust.model import Datum, Point, PointParameter, PoseParameter, Station, Survey
-from adjust.observations import Coordinates, Distance, FrameRef, PositionRef
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Coordinates, Distance, FrameRef, PositionRef
+from adjust.model.survey import Datum, Point, PointParameter, PoseParameter, Station, Survey
 
 SIGMA = 0.002
 PLANE = np.array([[0.0, 0.0, 1.5], [9.0, 1.0, 1.0], [8.0, 7.0, 2.0], [1.0, 6.0, 1.2], [4.0, 3.0, 1.8]])

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from gtsam import Pose3
 
-from adjust.errors import IndeterminateError
-from adjust.graph import AdjustmentGraph, StartValues
-from adjust.model import LensParameter, Survey, VectorParameter
-from adjust.observations import FrameRef, Pair
-from adjust.precision import Precision
-from adjust.solve import SolveOptions, solve
+from adjust.graph.assembly import AdjustmentGraph, StartValues
+from adjust.graph.solver import SolveOptions, solve
+from adjust.model.errors import IndeterminateError
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import LensParameter, Survey, VectorParameter
+from adjust.precision.precision import Precision
 from survey.simulate import Truth, resample, single_camera, stereo
 from tests.adjust import helpers as h
 

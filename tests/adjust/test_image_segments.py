@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from gtsam import Pose3
 
-from adjust.image_segments import first_seen, ranges
-from adjust.model import Camera, LensParameter, PoseParameter, Station, Survey, Table, Target
-from adjust.observations import FrameRef, ImageBlock, TableReading
-from adjust.unknowns import FrameTree, Unknowns
+from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.model.observations import FrameRef, ImageBlock, TableReading
+from adjust.model.survey import Camera, LensParameter, PoseParameter, Station, Survey, Table, Target
+from adjust.observations.images.segments import first_seen, ranges
 from tests.adjust import helpers as h
 
 POINTS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]])

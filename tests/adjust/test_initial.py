@@ -8,10 +8,9 @@ import pytest
 from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
-from adjust.errors import SurveyError
-from adjust.initial import find_start
-from adjust.initial.network import table_from_mount
-from adjust.model import (
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Coordinates, Distance, FrameRef, ImageBlock, Pair, PositionRef, TableReading
+from adjust.model.survey import (
     TABLE_GEOMETRY,
     Camera,
     LensParameter,
@@ -24,7 +23,8 @@ from adjust.model import (
     Target,
     VectorParameter,
 )
-from adjust.observations import Coordinates, Distance, FrameRef, ImageBlock, Pair, PositionRef, TableReading
+from adjust.start import find_start
+from adjust.start.network import table_from_mount
 
 SIZE = (1280, 1024)
 FREE = ("fx", "fy", "u0", "v0", "k1", "k2", "p1", "p2")

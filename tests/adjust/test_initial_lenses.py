@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from adjust.initial import find_start
-from adjust.initial.lenses import Sighting, start_lens
-from adjust.model import Camera, LensParameter, Point, PointParameter, PoseParameter, Station, Survey, Tie
-from adjust.observations import ImageBlock
+from adjust.model.errors import SurveyError
+from adjust.model.observations import ImageBlock
+from adjust.model.survey import Camera, LensParameter, Point, PointParameter, PoseParameter, Station, Survey, Tie
+from adjust.start import find_start
+from adjust.start.lenses import Sighting, start_lens
 from tests.adjust.test_initial import FREE, SIZE, TRUE, assert_near, board_views, grid, inv, looking_at, pixels
 from tests.data import data_folder
 

@@ -2,8 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from adjust.lens import (
+from adjust.lenses.models import (
     MODELS,
     camera_constants,
     default_start,
@@ -16,8 +15,9 @@ from adjust.lens import (
     rays,
     unit_rays,
 )
-from adjust.lens_radial import invert_radius, radial_profile
-from adjust.model import Camera, LensParameter
+from adjust.lenses.radial import invert_radius, radial_profile
+from adjust.model.errors import SurveyError
+from adjust.model.survey import Camera, LensParameter
 from tests.adjust.lenses import IMAGE_SIZE, NAMES, lens, points_in_camera
 
 

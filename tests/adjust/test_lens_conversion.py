@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from adjust.lens import MODELS, default_start, lens_constants, project, rays
-from adjust.lens_conversion import convert, rebalance_aicon
+from adjust.lenses.conversion import convert, rebalance_aicon
+from adjust.lenses.models import MODELS, default_start, lens_constants, project, rays
+from adjust.model.errors import SurveyError
 from tests.adjust.lenses import IMAGE_SIZE, NAMES, PIXEL_SIZE_MM, R0_MM, lens
 
 # an ordinary lens: 3 px of barrel in the corners, a little of everything else

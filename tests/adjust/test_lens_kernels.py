@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from adjust.lens import MODELS, lens_constants, lens_derivatives, lens_residuals, project
+from adjust.lenses.models import MODELS, lens_constants, lens_derivatives, lens_residuals, project
 from adjust.native.lenses import FISHEYE, MAX_LENS, N_COLUMNS, N_LENS, lens_rows
 from tests.adjust.lenses import IMAGE_SIZE, NAMES, PIXEL_SIZE_MM, R0_MM, lens, points_in_camera
 

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adjust import parallel
-from adjust.native import vision
+from adjust.native import parallel, vision
 from adjust.native.lenses import BROWN, N_LENS, lens_residuals, lens_rows
 from adjust.native.library import Function, instruction_set, instruction_sets, opened
-from adjust.precision import Precision, image_residuals
+from adjust.precision.precision import Precision, image_residuals
 from survey.simulate import beacons, head_on_table
 from tests.adjust import helpers as h
 from tests.adjust.native_calls import FUNCTIONS, Call, calls

@@ -7,13 +7,13 @@ import pytest
 from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
-from adjust.closed_forms.rigid import rigid, rotation_exp
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from adjust.native.navigation import real_roots, three_point_poses
 from adjust.navigation import Motion, NavigateOptions, NavigationEpoch, PosePrior, Spots, expected_precision, navigate
 from adjust.navigation.fit import local, local_derivative, retract
 from adjust.navigation.motion import MotionState, predicted, table_prior
 from adjust.navigation.system import evaluate, make_system, square_root
+from adjust.spatial.rigid import rigid, rotation_exp
 from tests.adjust.navigation import (
     Sight,
     drawn,

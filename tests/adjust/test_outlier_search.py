@@ -8,15 +8,15 @@ from gtsam import Pose3
 from scipy.stats import binom
 
 from adjust.adjustment import AdjustOptions, adjust
-from adjust.errors import NotConvergedError
-from adjust.graph import StartValues
-from adjust.model import FloatArray, Point, PointParameter, Survey
-from adjust.observations import Distance, FrameRef, Pair, PositionRef, Reading, ReadingCovariance
-from adjust.robust import limit
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import NotConvergedError
+from adjust.model.observations import Distance, FrameRef, Pair, PositionRef, Reading, ReadingCovariance
+from adjust.model.survey import FloatArray, Point, PointParameter, Survey
 from adjust.statistics.candidates import candidates, without
 from adjust.statistics.outlier_search import SearchOptions, search_outliers
 from adjust.statistics.reliability import reliability
 from adjust.statistics.result import LevelOptions
+from adjust.statistics.robust import limit
 from adjust.statistics.snooping import Snooping
 from adjust.statistics.system import LinearSystem, linear_system
 from survey.simulate import head_on_table, resample

@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from adjust.adjustment import adjust
-from adjust.errors import IndeterminateError, SurveyError
-from adjust.model import Datum, FloatArray, PoseParameter, Station, Survey
-from adjust.observations import FrameRef, Pair
+from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import Datum, FloatArray, PoseParameter, Station, Survey
 from adjust.pose_network import NetworkOptions, pose_network, solve_network
 from adjust.pose_network.chordal import chordal_cost, minimize_chordal
 from adjust.pose_network.from_survey import network_adjustment, network_from_survey

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.errors import SurveyError
-from adjust.observations import FrameRef, Pair
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef, Pair
 from adjust.pose_network import NetworkOptions, solve_network
 from adjust.pose_network.session import NetworkSession, SessionOptions
 from tests.adjust.pose_networks import Simulated, simulate

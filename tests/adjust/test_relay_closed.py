@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.errors import NotConvergedError, SurveyError
-from adjust.model import Camera, LensParameter, PoseParameter, Station, Survey, Target
-from adjust.observations import Closure, FrameRef, Pair
-from adjust.pair_screen import PairOptions, adjust_with_pairs
+from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.observations import Closure, FrameRef, Pair
+from adjust.model.result import Adjustment
+from adjust.model.survey import Camera, LensParameter, PoseParameter, Station, Survey, Target
 from adjust.relay.closed import closed, play
 from adjust.relay.condition_factors import MAX_HARD_LOOPS
 from adjust.relay.conditions import adjust_condition_factors, adjust_conditions, adjust_loops
-from adjust.result import Adjustment
+from adjust.statistics.pair_screen import PairOptions, adjust_with_pairs
 from survey.simulate import resample, stereo
 from tests.adjust import helpers as h
 from tests.adjust.relay_networks import grid, simulate

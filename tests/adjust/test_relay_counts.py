@@ -4,7 +4,7 @@ from math import comb
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from adjust.relay.counts import count
 from adjust.relay.loops import loop_basis
 from adjust.relay.network import topology

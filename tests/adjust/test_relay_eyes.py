@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from adjust.adjustment import adjust
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
-from adjust.observations import FrameRef
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef
+from adjust.model.survey import FloatArray
 from adjust.relay.eye_images import camera_sequence, eye_sequences, target_sequence
 from adjust.relay.eye_pairs import close_loops, pairs_of, triangle_misclosure
 from adjust.relay.eye_setup import motion_setup, pose_setup

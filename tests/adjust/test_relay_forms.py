@@ -6,10 +6,10 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.adjustment import adjust
-from adjust.errors import NotConvergedError, SurveyError
-from adjust.graph import StartValues
-from adjust.model import Datum, PoseParameter, Station, Survey
-from adjust.observations import FrameRef, Pair
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import Datum, PoseParameter, Station, Survey
 from adjust.relay.condition_factors import MAX_HARD_LOOPS
 from adjust.relay.conditions import ConditionOptions, adjust_condition_factors, adjust_conditions
 from adjust.relay.loops import evaluate_loops, loop_basis, loop_misclosures

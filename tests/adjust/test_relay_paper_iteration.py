@@ -5,14 +5,14 @@ import pytest
 from gtsam import Rot3
 from scipy.spatial.transform import Rotation
 
-from adjust.errors import NotConvergedError, SurveyError
+from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.published.relay import ARCSECOND, PaperOptions, loop_equations, paper_iteration
 from adjust.relay.conditions import adjust_conditions
 from adjust.relay.loops import loop_basis
 from adjust.relay.motions import Motions
 from adjust.relay.network import Network
-from adjust.relay.paper import ARCSECOND, PaperOptions, loop_equations, paper_iteration
 from adjust.relay.parametric import adjust_parametric
-from adjust.rotation_forms import euler_cov_from_tangent, euler_from_matrix
+from adjust.spatial.rotation_forms import euler_cov_from_tangent, euler_from_matrix
 from tests.adjust.relay_monte_carlo import MonteCarloOptions, adjust_batch, simulate_complete
 from tests.adjust.relay_networks import ARCMIN, complete, simulate
 

@@ -3,8 +3,8 @@ import pytest
 from gtsam import Rot3
 from scipy.spatial.transform import Rotation
 
-from adjust.errors import SurveyError
-from adjust.rotation_forms import (
+from adjust.model.errors import SurveyError
+from adjust.spatial.rotation_forms import (
     euler_cov_from_tangent,
     euler_from_matrix,
     euler_jacobian,

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from adjust.closed_forms import absolute_pose, best_poses, rigid, rotation_exp
-from adjust.closed_forms.rigid import skew
-from adjust.errors import SurveyError
-from adjust.initial.lens_refinement import lens_and_poses
+from adjust.model.errors import SurveyError
+from adjust.spatial.rigid import rigid, rotation_exp, skew
+from adjust.start.closed_forms.absolute_pose import absolute_pose, best_poses
+from adjust.start.lens_refinement import lens_and_poses
 
 
 def seen(x, pose, rng):

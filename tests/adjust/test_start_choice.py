@@ -7,13 +7,13 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
-from adjust.errors import NotConvergedError, SurveyError
-from adjust.graph import StartValues
-from adjust.initial.given import GivenStarts, given_starts, without_starts
-from adjust.model import Datum, FloatArray, Point, PointParameter, PoseParameter, Survey
-from adjust.observations import Distance, PositionRef
-from adjust.result import Adjustment
-from adjust.start_choice import Begun, adjusted_from_own_start
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.observations import Distance, PositionRef
+from adjust.model.result import Adjustment
+from adjust.model.survey import Datum, FloatArray, Point, PointParameter, PoseParameter, Survey
+from adjust.start.choice import Begun, adjusted_from_own_start
+from adjust.start.given import GivenStarts, given_starts, without_starts
 from survey.simulate import beacons, head_on_table
 from tests.adjust import helpers as h
 

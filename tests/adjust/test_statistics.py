@@ -11,15 +11,15 @@ from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 from adjust.adjustment import AdjustOptions, adjust, assemble
-from adjust.graph import StartValues
-from adjust.model import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
-from adjust.named_precision import NamedPrecision
-from adjust.observations import FrameRef, Pair
-from adjust.pair_screen import adjust_with_pairs
-from adjust.result import Adjustment
+from adjust.graph.assembly import StartValues
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.result import Adjustment
+from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
+from adjust.precision.pose_networks import NamedPrecision
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.criteria import criteria, noncentrality, sidak
 from adjust.statistics.influence import shifts
+from adjust.statistics.pair_screen import adjust_with_pairs
 from adjust.statistics.relative_precision import relative_precision
 from adjust.statistics.reliability import observation_name, reliability
 from adjust.statistics.result import LevelOptions

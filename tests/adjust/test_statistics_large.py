@@ -7,7 +7,7 @@ import pytest
 from scipy import sparse
 
 from adjust.adjustment import adjust
-from adjust.result import Adjustment
+from adjust.model.result import Adjustment
 from adjust.statistics import system as system_module
 from adjust.statistics import weakness
 from adjust.statistics.budget import uncertainty_budget

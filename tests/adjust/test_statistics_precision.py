@@ -10,10 +10,10 @@ from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 from adjust.adjustment import adjust
-from adjust.errors import SurveyError
-from adjust.model import FloatArray, PointParameter
-from adjust.observations import FrameRef
-from adjust.result import Adjustment
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray, PointParameter
 from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.relative_precision import ellipsoid, point_ellipsoid, relative_precision, relative_sigmas
 from adjust.statistics.scaling import scaled_survey

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from adjust.model import Survey
-from adjust.table_checks import probable_causes
+from adjust.diagnosis.table import probable_causes
+from adjust.model.survey import Survey
 from survey.simulate import head_on_table
 
 

@@ -8,9 +8,10 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
-from adjust.errors import SurveyError
-from adjust.graph import GraphBuilder, StartValues
-from adjust.model import (
+from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef, PositionRef, Reading, ReadingCovariance
+from adjust.model.survey import (
     INSTRUMENT,
     TILT,
     Bearings,
@@ -25,7 +26,6 @@ from adjust.model import (
     VectorPrior,
     Vertical,
 )
-from adjust.observations import FrameRef, PositionRef, Reading, ReadingCovariance
 from tests.adjust import helpers as h
 from tests.adjust.terrestrial_networks import P, dense, measured, polar_network, start_near, wrapped
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from adjust.adjustment import adjust
-from adjust.datum import gauge, inner_datum
-from adjust.errors import SurveyError
-from adjust.graph import GraphBuilder
-from adjust.model import INSTRUMENT, TILT, Bearings, Datum, FloatArray, Survey, VectorParameter, Vertical
-from adjust.other_datum import in_datum
-from adjust.precision import Precision
-from adjust.result import Adjustment
-from adjust.solve import solve
+from adjust.graph.assembly import GraphBuilder
+from adjust.graph.datum import gauge, inner_datum
+from adjust.graph.solver import solve
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment
+from adjust.model.survey import INSTRUMENT, TILT, Bearings, Datum, FloatArray, Survey, VectorParameter, Vertical
+from adjust.precision.other_datum import in_datum
+from adjust.precision.precision import Precision
 from tests.adjust import helpers as h
 from tests.adjust.terrestrial_networks import Truth, dense, measured, polar_network, start_near
 

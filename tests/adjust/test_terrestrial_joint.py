@@ -7,9 +7,12 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
-from adjust.errors import SurveyError
-from adjust.graph import StartValues
-from adjust.model import (
+from adjust.graph.assembly import StartValues
+from adjust.graph.solver import solve
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef, PositionRef, Reading, ReadingCovariance
+from adjust.model.result import Adjustment
+from adjust.model.survey import (
     INSTRUMENT,
     Datum,
     PoseParameter,
@@ -20,10 +23,7 @@ from adjust.model import (
     VectorPrior,
     Vertical,
 )
-from adjust.observations import FrameRef, PositionRef, Reading, ReadingCovariance
-from adjust.precision import Precision
-from adjust.result import Adjustment
-from adjust.solve import solve
+from adjust.precision.precision import Precision
 from survey.simulate import beacons
 from tests.adjust import helpers as h
 from tests.adjust.terrestrial_networks import P, Truth, measured, polar_network, start_near

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from adjust.adjustment import adjust
-from adjust.errors import SurveyError
-from adjust.model import Datum, Point, PointParameter, Setup, Survey
-from adjust.observations import Distance, PositionRef, Reading
-from adjust.terrestrial.start import find_points, given_points
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Distance, PositionRef, Reading
+from adjust.model.survey import Datum, Point, PointParameter, Setup, Survey
+from adjust.start.readings.start import find_points, given_points
 from tests.adjust.terrestrial_networks import P, Truth, measured, polar_network, start_near
 
 POLAR = (("direction", 1e-5), ("zenith", 1e-5), ("slope_distance", 5e-4))

@@ -8,9 +8,11 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
-from adjust.errors import SurveyError
-from adjust.lens import MODELS
-from adjust.model import (
+from adjust.lenses.models import MODELS
+from adjust.model.errors import SurveyError
+from adjust.model.observations import CoordinateDifferences, FrameRef, PositionRef, Reading
+from adjust.model.result import Adjustment
+from adjust.model.survey import (
     Bearings,
     Camera,
     Datum,
@@ -24,8 +26,6 @@ from adjust.model import (
     Survey,
     Target,
 )
-from adjust.observations import CoordinateDifferences, FrameRef, PositionRef, Reading
-from adjust.result import Adjustment
 
 ANGLE, LENGTH = 2e-5, 1e-4
 RAYS = ("direction", "zenith")
@@ -181,7 +181,7 @@ def test_a_body_tied_to_points_follows_them() -> None:
 
 def test_what_stands_on_the_station_tells_the_orientation() -> None:
     """A camera or a target in the station's frame makes the orientation a quantity of its own."""
-    from adjust.terrestrial.parameters import repeated_orientations
+    from adjust.observations.terrestrial.parameters import repeated_orientations
 
     x, pose = around(9), poses(1)[0]
     bearings = Bearings("x", False)

@@ -8,9 +8,9 @@ from scipy import sparse
 from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray, IntArray, Survey
-from adjust.observations import ReadingCovariance
+from adjust.model.errors import SurveyError
+from adjust.model.observations import ReadingCovariance
+from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.statistics.group_sums import GroupSums, MixedBlock, moments
 from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.system import linear_system

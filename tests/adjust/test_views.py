@@ -3,20 +3,12 @@
 import cv2
 import numpy as np
 
-from adjust.closed_forms import (
-    homographies,
-    plane_misfits,
-    plane_poses,
-    refine_poses,
-    rigid,
-    rotation_exp,
-    rotation_log,
-    view_errors,
-    view_offsets,
-)
-from adjust.initial.views import Sight, make_views, refine_views
 from adjust.native.library import SETS, Function, instruction_set
 from adjust.native.views import ViewArrays
+from adjust.spatial.rigid import rigid, rotation_exp, rotation_log
+from adjust.start.closed_forms.planes import homographies, plane_misfits, plane_poses
+from adjust.start.closed_forms.views import refine_poses, view_errors, view_offsets
+from adjust.start.views import Sight, make_views, refine_views
 
 
 def board_views(n, seed=3, sigma=0.0):

@@ -12,11 +12,21 @@ from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.graph import GraphBuilder, StartValues
-from adjust.model import Camera, Datum, FloatArray, IntArray, LensParameter, Point, PoseParameter, Station, Survey
-from adjust.observations import Distance, ImageBlock, PositionRef
-from adjust.result import ParameterName
-from adjust.solve import solve
+from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.solver import solve
+from adjust.model.observations import Distance, ImageBlock, PositionRef
+from adjust.model.result import ParameterName
+from adjust.model.survey import (
+    Camera,
+    Datum,
+    FloatArray,
+    IntArray,
+    LensParameter,
+    Point,
+    PoseParameter,
+    Station,
+    Survey,
+)
 from tests.acceptance import published
 from tests.benchmarks.data import FREE, SIZE, TRUE_LENS, free_lens, matrix, pixels
 from tests.benchmarks.outcome import Competitor, Outcome

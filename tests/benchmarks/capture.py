@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from capture.camera import Camera
-from capture.drivers.cameras import open_camera
-from capture.drivers.cameras.simulated import SimulatedCamera
+from capture.devices.camera import Camera
+from capture.devices.cameras import open_camera
+from capture.devices.cameras.simulated import SimulatedCamera
+from capture.session.trigger_set import TriggerSet
 from capture.simulated.gige_server import GigeServer
-from capture.trigger_set import TriggerSet
 from tests.capture.camera_helpers import gige_port
 
 WIDTH, HEIGHT = 640, 512

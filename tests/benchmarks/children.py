@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 from tests.benchmarks.kinds import Case, kind_of
 
 SYSTEM_PYTHON = "/usr/bin/python3"

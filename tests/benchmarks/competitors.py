@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust, assemble, start_values
-from adjust.graph import GraphBuilder
-from adjust.initial import find_start
-from adjust.model import FloatArray, Survey
-from adjust.solve import SolveOptions, solve
-from adjust.unknowns import Unknowns
+from adjust.frames.unknowns import Unknowns
+from adjust.graph.assembly import GraphBuilder
+from adjust.graph.solver import SolveOptions, solve
+from adjust.model.survey import FloatArray, Survey
+from adjust.start import find_start
 from tests.benchmarks import least_squares
 from tests.benchmarks.data import SIZE, Calibration, free_lens, matrix, rough_start, survey
 from tests.benchmarks.mrcal_tool import mrcal_tool

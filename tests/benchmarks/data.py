@@ -11,10 +11,10 @@ import numpy as np
 from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
-from adjust.graph import StartValues
-from adjust.model import Camera, FloatArray, IntArray, LensParameter, PoseParameter, Station, Survey, Target
-from adjust.observations import ImageBlock
-from adjust.result import ParameterName
+from adjust.graph.assembly import StartValues
+from adjust.model.observations import ImageBlock
+from adjust.model.result import ParameterName
+from adjust.model.survey import Camera, FloatArray, IntArray, LensParameter, PoseParameter, Station, Survey, Target
 
 SIZE = (1280, 1024)
 FREE = ("fx", "fy", "u0", "v0", "k1", "k2", "p1", "p2")

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from survey.detection import detect_image
-from survey.detection.dictionaries import charuco_board
-from survey.rendering import BrownCamera, Imaging, PlacedTarget, render
-from survey.targets import Charuco, Checkerboard
+from survey.project.dictionaries import charuco_board
+from survey.project.targets import Charuco, Checkerboard
+from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 from tests.benchmarks.cases import Arrays
 from tests.benchmarks.outcome import Competitor, Outcome
 

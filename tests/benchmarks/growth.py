@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from adjust.model import IntArray
+from adjust.model.survey import IntArray
 from tests.benchmarks import networks
 from tests.benchmarks.cases import Arrays
 from tests.benchmarks.outcome import Competitor, Outcome

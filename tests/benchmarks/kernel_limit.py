@@ -8,7 +8,7 @@ from time import perf_counter
 
 import numpy as np
 
-from adjust.graph import GraphBuilder
+from adjust.graph.assembly import GraphBuilder
 from tests.benchmarks import tables
 from tests.benchmarks.data import calibration, rough_start, survey
 

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 from tests.benchmarks.data import Calibration, matrix
 
 

@@ -11,7 +11,7 @@ from time import perf_counter
 
 import numpy as np
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 from tests.benchmarks.data import SIZE, Calibration
 from tests.benchmarks.outcome import Competitor, Outcome
 

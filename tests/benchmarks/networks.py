@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.model import FloatArray
-from adjust.observations import FrameRef, Pair
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import FloatArray
 from adjust.pose_network import NetworkOptions, NetworkSolution, PoseNetwork, pose_network, solve_network
 from adjust.pose_network.precision import pair_jacobians
 from adjust.pose_network.session import NetworkSession

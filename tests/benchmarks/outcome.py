@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 from survey.notebook.plots import standalone
 from survey.report import drawing as d
 

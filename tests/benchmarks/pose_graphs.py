@@ -9,10 +9,10 @@ import gtsam
 import numpy as np
 from gtsam import BetweenFactorPose3, Pose3, PriorFactorPose3, Rot3
 
-from adjust.model import FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.pose_network import NetworkOptions, PoseNetwork, pose_network, solve_network
 from adjust.pose_network.start import find_network_start
-from survey.interop.g2o import read_g2o
+from survey.interop.networks.g2o import read_g2o
 from tests.benchmarks.cases import Arrays
 from tests.benchmarks.outcome import Competitor, Outcome
 

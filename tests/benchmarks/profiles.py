@@ -9,18 +9,18 @@ import gtsam
 
 from adjust import adjustment
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
-from adjust.image_reduction import PoseReduction
-from adjust.initial import find_start
+from adjust.frames.state import State
+from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.solver import _Loop, solve
+from adjust.observations.images.reduction import PoseReduction
 from adjust.pose_network import NetworkOptions, solve_network
 from adjust.pose_network import precision as pose_precision
 from adjust.pose_network import solution as pose_solution
 from adjust.pose_network import solve as pose_solve
-from adjust.precision import Precision
-from adjust.solve import _Loop, solve
-from adjust.state import State
-from adjust.tree_covariance import TreeCovariance
-from survey.interop.g2o import read_g2o
+from adjust.precision.precision import Precision
+from adjust.precision.tree import TreeCovariance
+from adjust.start import find_start
+from survey.interop.networks.g2o import read_g2o
 from tests.benchmarks import tables, terrestrial
 from tests.benchmarks.data import calibration, rough_start, survey
 from tests.data import data_folder

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from adjust.model import FloatArray
+from adjust.model.survey import FloatArray
 from tests.benchmarks.children import Measured
 from tests.benchmarks.data import Calibration
 

@@ -13,11 +13,11 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import cKDTree
 
 from adjust.adjustment import AdjustOptions, assemble
-from adjust.graph import GraphBuilder, StartValues
-from adjust.model import BoolArray, Datum, FloatArray, IntArray, Point, PointParameter, Setup, Survey
-from adjust.observations import PositionRef, Reading
-from adjust.precision import Precision
-from adjust.solve import solve
+from adjust.graph.assembly import GraphBuilder, StartValues
+from adjust.graph.solver import solve
+from adjust.model.observations import PositionRef, Reading
+from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, Point, PointParameter, Setup, Survey
+from adjust.precision.precision import Precision
 from tests.acceptance.dense_network import _Model
 from tests.benchmarks.cases import Arrays
 from tests.benchmarks.outcome import Competitor, Outcome

@@ -7,8 +7,8 @@ from time import perf_counter
 import gtsam
 import numpy as np
 
-from adjust.closed_forms import rotation_exp
-from adjust.model import IntArray
+from adjust.model.survey import IntArray
+from adjust.spatial.rigid import rotation_exp
 from survey.planning.errors import error_analysis_job
 from tests.adjust.relay_monte_carlo import MonteCarloOptions, simulate_complete
 from tests.benchmarks.cases import Arrays

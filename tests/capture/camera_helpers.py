@@ -11,8 +11,8 @@ import genicam
 import numpy as np
 import pytest
 
-from capture.camera import Camera, FetchTimeoutError
-from capture.drivers.cameras import open_camera
+from capture.devices.camera import Camera, FetchTimeoutError
+from capture.devices.cameras import open_camera
 
 os.environ["PYLON_CAMEMU"] = "3"  # read once, when pylon is loaded
 GIGE = "gige:127.0.0.1"

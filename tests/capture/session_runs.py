@@ -54,7 +54,7 @@ def run_quietly(plan: str) -> None:
 def processes():
     """Processes that start in milliseconds, because what they import is imported once."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["capture.cli", "capture.session_run", "capture.plan"])
+    context.set_forkserver_preload(["capture.cli", "capture.session.run", "capture.plan.plan"])
     return context
 
 

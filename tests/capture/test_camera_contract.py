@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from capture.camera import (
+from capture.devices.camera import (
     Camera,
     CameraError,
     DisconnectedError,
@@ -16,7 +16,7 @@ from capture.camera import (
     OutOfRangeError,
     UnknownFeatureError,
 )
-from capture.drivers.cameras import open_camera
+from capture.devices.cameras import open_camera
 from capture.simulated.gige_server import GigeServer
 from tests.capture.camera_helpers import GIGE, PYLON, VIKY, gige_port, require_silence, set_up
 

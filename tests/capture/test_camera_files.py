@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.camera import (
+from capture.devices.camera import (
     CameraError,
     DisconnectedError,
     FetchTimeoutError,
@@ -14,8 +14,8 @@ from capture.camera import (
     OutOfRangeError,
     UnknownFeatureError,
 )
-from capture.drivers.cameras import discover, open_camera
-from capture.trigger_set import TriggerSet
+from capture.devices.cameras import discover, open_camera
+from capture.session.trigger_set import TriggerSet
 
 RNG = np.random.default_rng(8)
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from viva_genicam.testing import FakeGigeCamera, FakeU3vCamera
 
-from adjust.errors import SurveyError
-from capture.camera import Camera, DisconnectedError, FetchTimeoutError, IncompleteFrameError, InUseError
-from capture.drivers.cameras import discover
-from capture.drivers.cameras.u3v import U3vCamera
+from adjust.model.errors import SurveyError
+from capture.devices.camera import Camera, DisconnectedError, FetchTimeoutError, IncompleteFrameError, InUseError
+from capture.devices.cameras import discover
+from capture.devices.cameras.u3v import U3vCamera
+from capture.session.trigger_set import TriggerSet
 from capture.simulated.gige_server import GigeServer
-from capture.trigger_set import TriggerSet
 from tests.capture.camera_helpers import GIGE, gige_port, number_in, open_camera, set_up
 
 
@@ -129,7 +129,7 @@ def test_a_camera_whose_plug_is_pulled(port: None) -> None:
 
 HOLDER = """
 import sys
-from capture.drivers.cameras import open_camera
+from capture.devices.cameras import open_camera
 camera = open_camera("gige:127.0.0.1")
 print("held", flush=True)
 sys.stdin.read()

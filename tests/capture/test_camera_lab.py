@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
-from capture.camera import Camera
-from capture.drivers.cameras import open_camera
-from capture.quality import image_quality
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray
+from capture.devices.camera import Camera
+from capture.devices.cameras import open_camera
+from capture.session.quality import image_quality
+from capture.session.trigger_set import TriggerSet
 from capture.simulated.angles import AnglesFile, write_angles
 from capture.simulated.folder import ANGLES, read_lab, write_lab
 from capture.simulated.gige_server import GigeServer
 from capture.simulated.laboratory import CAMERA_IDS, LabPose, LabSize, SimulatedLab, make_lab
-from capture.trigger_set import TriggerSet
 from survey.detection.detect import detect_image
 from survey.detection.results import SpotOptions
 from survey.detection.spots import detect_spots
-from survey.files import read
+from survey.project import read
 from survey.simulate.parts import BOARD
 from survey.simulate.scene import Scene
 from tests.capture.camera_helpers import GIGE, gige_port

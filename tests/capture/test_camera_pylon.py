@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.camera import CameraError, DisconnectedError, IncompleteFrameError
-from capture.drivers.cameras.pylon import PylonCamera
+from capture.devices.camera import CameraError, DisconnectedError, IncompleteFrameError
+from capture.devices.cameras.pylon import PylonCamera
 from tests.capture.camera_helpers import PYLON, open_camera, require_silence, set_up
 
 RNG = np.random.default_rng(4)

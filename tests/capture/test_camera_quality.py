@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from capture.camera import Frame
-from capture.quality import Coverage, edge_blur_px, image_quality
-from survey.rendering import BrownCamera, Imaging, PlacedTarget, render
-from survey.targets import Checkerboard
+from capture.devices.camera import Frame
+from capture.session.quality import Coverage, edge_blur_px, image_quality
+from survey.project.targets import Checkerboard
+from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 
 BOARD = Checkerboard(11, 8, 0.02)
 POSE = Pose3(Rot3.RzRyRx(0.3, 0.2, 0.4), [-0.1, -0.08, 0.7])

@@ -3,9 +3,9 @@ import sys
 
 import pytest
 
-from adjust.errors import SurveyError
-from capture.camera import DriverMissingError
-from capture.drivers.cameras import DRIVERS, discover, open_camera
+from adjust.model.errors import SurveyError
+from capture.devices.camera import DriverMissingError
+from capture.devices.cameras import DRIVERS, discover, open_camera
 from tests.capture.camera_helpers import PYLON
 from tests.capture.camera_helpers import open_camera as opened
 
@@ -49,7 +49,7 @@ def test_an_address_that_was_discovered_opens() -> None:
 
 def test_no_software_is_loaded_before_its_driver_is_named() -> None:
     code = (
-        "import sys, capture.drivers.cameras as c, capture.trigger_set; c.discover('opencv');"
+        "import sys, capture.devices.cameras as c, capture.session.trigger_set; c.discover('opencv');"
         "print([m for m in ('pypylon', 'viva_genicam', 'harvesters', 'genicam') if m in sys.modules])"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -6,10 +6,10 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from capture.camera import Camera, DisconnectedError, FetchTimeoutError, IncompleteFrameError
-from capture.drivers.cameras.simulated import Fault, FaultKind, SimulatedCamera
-from capture.trigger_set import FrameOrderError, TriggerSet
+from adjust.model.errors import SurveyError
+from capture.devices.camera import Camera, DisconnectedError, FetchTimeoutError, IncompleteFrameError
+from capture.devices.cameras.simulated import Fault, FaultKind, SimulatedCamera
+from capture.session.trigger_set import FrameOrderError, TriggerSet
 from tests.capture.camera_helpers import PYLON, number_in, open_camera, set_up
 
 TIMEOUT_S = 0.02

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from capture.cli import build_parser, main
-from survey.completion import SHELLS, commands_of, completion_script
+from survey.commands.completion import SHELLS, commands_of, completion_script
 from tests.completion_checks import bash_completes, names_every_command_and_parses
 
 

@@ -5,8 +5,8 @@ import json
 
 import pytest
 
-from adjust.errors import SurveyError
-from capture.journal import Journal, read_journal
+from adjust.model.errors import SurveyError
+from capture.session.journal import Journal, read_journal
 
 
 def written(path, n=3):

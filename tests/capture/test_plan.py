@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from capture.cli import main
-from capture.drivers.turntables.dialect import read_dialect
-from capture.plan import check_plan_limits, estimate, read_plan
-from capture.turntable import LimitError
-from survey.files import write_project
+from capture.devices.turntable import LimitError
+from capture.devices.turntables.dialect import read_dialect
+from capture.plan.plan import check_plan_limits, estimate, read_plan
+from survey.project import write_project
+from survey.project.targets import Checkerboard
 from survey.simulate.labs import head_on_table
 from survey.simulate.scene import Scene
-from survey.targets import Checkerboard
 from tests.capture.session_runs import write_plan
 
 

@@ -11,13 +11,13 @@ import time
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from capture.journal import read_journal
-from capture.plan import read_plan
-from capture.session import SessionStoppedError
-from capture.session_folder import lock_holder, session_lock
-from capture.session_run import run_plan
-from capture.turntable import LimitError
+from adjust.model.errors import SurveyError
+from capture.devices.turntable import LimitError
+from capture.plan.plan import read_plan
+from capture.session.folder import lock_holder, session_lock
+from capture.session.journal import read_journal
+from capture.session.run import run_plan
+from capture.session.run_session import SessionStoppedError
 from tests.capture.session_runs import processes, require_complete, run_to_end, write_plan
 from tests.capture.table_server import table_server
 
@@ -196,7 +196,7 @@ def test_pause_and_go_on(tmp_path):
 
 def test_two_sessions_on_one_folder_are_refused(tmp_path):
     plan = write_plan(tmp_path)
-    holder = "import sys,time,pathlib; from capture.session_folder import session_lock as L\n"
+    holder = "import sys,time,pathlib; from capture.session.folder import session_lock as L\n"
     holder += f"lock = L(pathlib.Path({str(tmp_path / 'lab')!r})); lock.acquire()\n"
     holder += "print('held', flush=True); time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", holder], stdout=subprocess.PIPE, text=True) as other:
@@ -334,7 +334,7 @@ def test_changed_plan_is_refused(tmp_path):
 
 
 def test_table_that_drifts_is_not_trusted(tmp_path, monkeypatch):
-    from capture.session_cameras import PlannedCameras
+    from capture.session.cameras import PlannedCameras
 
     plan = write_plan(tmp_path)
     real, n = PlannedCameras.take, [0]
@@ -348,7 +348,7 @@ def test_table_that_drifts_is_not_trusted(tmp_path, monkeypatch):
             tables[0].simulated[0].pieces = []
         return frames
 
-    from capture.drivers.turntables.simulated import SimulatedController
+    from capture.devices.turntables.simulated import SimulatedController
 
     tables = []
     opened = SimulatedController.open

@@ -5,12 +5,12 @@ import h5py
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from capture.cli import main
-from capture.journal import read_journal
-from capture.nexus import export
-from capture.plan import read_plan
-from capture.session_run import run_plan
+from capture.plan.plan import read_plan
+from capture.session.journal import read_journal
+from capture.session.nexus import export
+from capture.session.run import run_plan
 from tests.capture.session_runs import write_plan
 
 

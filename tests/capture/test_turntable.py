@@ -6,10 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from capture.drivers.turntables.moving import MovingTable
-from capture.drivers.turntables.simulated import SimulatedController
-from capture.drivers.turntables.simulated_axis import AxisPhysics, SimulatedAxis
-from capture.turntable import (
+from capture.devices.turntable import (
     Axis,
     ControllerError,
     LimitError,
@@ -21,6 +18,9 @@ from capture.turntable import (
     TableDisconnectedError,
     TurntableError,
 )
+from capture.devices.turntables.moving import MovingTable
+from capture.devices.turntables.simulated import SimulatedController
+from capture.devices.turntables.simulated_axis import AxisPhysics, SimulatedAxis
 
 DEG = math.pi / 180
 FAST = AxisPhysics(speed=200 * DEG, acceleration=4000 * DEG)

@@ -10,12 +10,12 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from capture.drivers.turntables.ascii import AsciiController
-from capture.drivers.turntables.dialect import read_dialect, shipped_dialects
-from capture.drivers.turntables.moving import MovingTable
-from capture.drivers.turntables.standa import StandaController
-from capture.turntable import Axis, ControllerError, LimitError, Settle, StoppedError, TableDisconnectedError
+from adjust.model.errors import SurveyError
+from capture.devices.turntable import Axis, ControllerError, LimitError, Settle, StoppedError, TableDisconnectedError
+from capture.devices.turntables.ascii import AsciiController
+from capture.devices.turntables.dialect import read_dialect, shipped_dialects
+from capture.devices.turntables.moving import MovingTable
+from capture.devices.turntables.standa import StandaController
 from tests.capture.table_server import table_server
 
 DEG = math.pi / 180
@@ -212,9 +212,9 @@ run(Table(prefix="labsurvey:").pvdb, interfaces=["127.0.0.1"], log_pv_names=Fals
 _EPICS = """
 import math, sys, time
 import numpy as np
-from capture.drivers.turntables.epics import EpicsController
-from capture.drivers.turntables.moving import MovingTable
-from capture.turntable import Axis, ControllerError, LimitError, Settle, StoppedError, TableDisconnectedError
+from capture.devices.turntables.epics import EpicsController
+from capture.devices.turntables.moving import MovingTable
+from capture.devices.turntable import Axis, ControllerError, LimitError, Settle, StoppedError, TableDisconnectedError
 
 DEG = math.pi / 180
 axes = (Axis("axis1", -60 * DEG, 60 * DEG), Axis("axis2", -170 * DEG, 170 * DEG))

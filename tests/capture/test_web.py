@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from capture.cli import main
-from capture.plan import read_plan
-from capture.session_run import run_plan
+from capture.plan.plan import read_plan
+from capture.session.run import run_plan
 from capture.simulated import controller
 from capture.web.serve import PageServer, loopback_address
 from capture.web.state import FolderView, LiveView, Shown, png_with_overlay

@@ -22,7 +22,7 @@ from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from tests.fuzz.called import functions_called
 from tests.fuzz.mutate import Mutator
 from tests.fuzz.readers import READERS

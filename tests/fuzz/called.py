@@ -18,7 +18,7 @@ _PARSES = {("json", "loads"), ("json", "load"), ("tomllib", "loads"), ("tomllib"
 
 
 def functions_called(read: Callable[[bytes], object], inputs: Sequence[bytes]) -> list[str]:
-    """Functions of the packages that run while ``inputs`` are read, as ``survey/relay.py:read_trajectory``."""
+    """Functions of the packages that run while ``inputs`` are read, as ``survey/jobs/relay.py:read_trajectory``."""
     found = set()
 
     def note(frame: FrameType, event: str, _: Any) -> None:

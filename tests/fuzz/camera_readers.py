@@ -15,10 +15,10 @@ _POINTS = 4  # of each block: what a mutation costs grows with the file
 @cache
 def _samples() -> dict[str, dict[str, bytes]]:
     """The files of every format by name; a survey of two epochs and few points, projected by OpenCV."""
-    from survey.files import read
-    from survey.interop.camera_formats import COLMAP, FORMATS, READERS, write_cameras
-    from survey.interop.camera_values import camera_values
-    from survey.jobs import adjust_job
+    from survey.interop.cameras.formats import COLMAP, FORMATS, READERS, write_cameras
+    from survey.interop.cameras.values import camera_values
+    from survey.jobs.adjusting.job import adjust_job
+    from survey.project import read
     from tests.survey.camera_lab import write_lab
 
     out = {}
@@ -44,7 +44,7 @@ def _samples() -> dict[str, dict[str, bytes]]:
 
 
 def _network(format: str, path: Path) -> object:
-    from survey.interop.camera_formats import READERS
+    from survey.interop.cameras.formats import READERS
     from survey.interop.names import with_safe_ids
 
     return with_safe_ids(READERS[format.removesuffix("-json")](path).survey)

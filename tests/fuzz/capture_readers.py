@@ -55,7 +55,7 @@ square_mm = 30.0
 
 
 def _plan(path: Path) -> object:
-    from capture.plan import check_plan_limits, estimate, read_plan
+    from capture.plan.plan import check_plan_limits, estimate, read_plan
 
     plan = read_plan(path)
     check_plan_limits(plan)
@@ -63,20 +63,20 @@ def _plan(path: Path) -> object:
 
 
 def _dialect(path: Path) -> object:
-    from capture.drivers.turntables.dialect import read_dialect
+    from capture.devices.turntables.dialect import read_dialect
 
     return read_dialect(path.name, path.parent)
 
 
 def _dialects() -> list[bytes]:
-    from capture.drivers.turntables.dialect import FOLDER
+    from capture.devices.turntables.dialect import FOLDER
 
     return [p.read_bytes() for p in sorted(FOLDER.glob("*.toml"))]
 
 
 def _template(folder: Path) -> Read:
     """A survey.toml that a plan names: copied, and read in an empty folder."""
-    from capture.plan_poses import definition_of
+    from capture.plan.poses import definition_of
 
     tempfile.tempdir = str(folder)
     return in_file("lab/template.toml", definition_of)(folder)
@@ -85,8 +85,8 @@ def _template(folder: Path) -> Read:
 @cache
 def _run() -> dict[str, bytes]:
     """A plan and the folder of its finished session with simulated cameras and table."""
-    from capture.plan import read_plan
-    from capture.session_run import run_plan
+    from capture.plan.plan import read_plan
+    from capture.session.run import run_plan
     from tests.capture.session_runs import write_plan
 
     with tempfile.TemporaryDirectory() as name:
@@ -117,10 +117,10 @@ def _in_run(name: str, read) -> "Read":
 
 def _resumed(folder: Path) -> object:
     """What a session does with the journal before it moves anything."""
-    from capture.journal import Journal, read_journal, taken_sets
-    from capture.plan import read_plan
-    from capture.session_folder import write_table_angles
-    from capture.session_resume import last_readback, verified_sets
+    from capture.plan.plan import read_plan
+    from capture.session.folder import write_table_angles
+    from capture.session.journal import Journal, read_journal, taken_sets
+    from capture.session.resume import last_readback, verified_sets
 
     taken_sets(read_journal(folder / "lab" / "capture" / "journal.jsonl")[0])
     last_readback(folder / "lab")
@@ -133,7 +133,7 @@ def _resumed(folder: Path) -> object:
 
 
 def _exported(folder: Path) -> object:
-    from capture.nexus import export
+    from capture.session.nexus import export
 
     (folder / "out.nxs").unlink(missing_ok=True)
     return export(folder / "lab", folder / "out.nxs")
@@ -141,13 +141,13 @@ def _exported(folder: Path) -> object:
 
 def _angles_table(folder: Path) -> object:
     """Readings of other epochs that stand in the project already are kept."""
-    from capture.session_folder import write_table_angles
+    from capture.session.folder import write_table_angles
 
     return write_table_angles(folder / "lab", "turntable", {}, None)
 
 
 def _shown(folder: Path) -> object:
-    from capture.plan import read_plan
+    from capture.plan.plan import read_plan
     from capture.web.state import FolderView
 
     view = FolderView(read_plan(folder / "plan.toml"))
@@ -158,7 +158,7 @@ def _held(folder: Path) -> object:
     """Who holds the lock, as another process is told."""
     import fcntl
 
-    from capture.session_folder import lock_holder
+    from capture.session.folder import lock_holder
 
     with (folder / "lab" / "capture" / "lock").open("rb") as held:
         fcntl.flock(held, fcntl.LOCK_EX)

@@ -18,7 +18,7 @@ def main() -> None:
     """Run until libFuzzer's options say stop."""
     name, *options = sys.argv[1:]
     with atheris.instrument_imports(include=_PACKAGES):
-        from adjust.errors import SurveyError
+        from adjust.model.errors import SurveyError
         from tests.fuzz.readers import READERS
         from tests.fuzz.watch import Watch
 

@@ -67,7 +67,7 @@ def _calibrations() -> list[bytes]:
     from gtsam import Pose3
 
     from adjust.navigation import Beacons, Head, HeadCamera, HeadTable
-    from survey.navigation_calibration import Calibration, keep
+    from survey.jobs.navigating.calibration import Calibration, keep
 
     cameras = tuple(HeadCamera(c, (640, 480), "brown", np.arange(9.0), np.ones(2), Pose3()) for c in "XY")
     beacons = Beacons(("B1", "B2"), np.ones((2, 3)), np.eye(6), None)
@@ -81,13 +81,13 @@ def _calibrations() -> list[bytes]:
 
 
 def _calibration(path: Path) -> object:
-    from survey.navigation_calibration import kept
+    from survey.jobs.navigating.calibration import kept
 
     return kept(path, _KEY)
 
 
 def _times(path: Path) -> object:
-    from survey.navigation_task import NavigateRequest, chosen_times
+    from survey.jobs.navigating.task import NavigateRequest, chosen_times
 
     return chosen_times(["t1", "t2", "t3"], NavigateRequest(times=path))
 
@@ -96,7 +96,7 @@ def _adding(which: str):
     """One file of a folder of what is to be added to an adjusted project."""
 
     def prepare(folder: Path) -> Read:
-        from survey.merging import merge
+        from survey.project.merging import merge
 
         small_project(folder / "lab")
         for name, text in _NEW.items():

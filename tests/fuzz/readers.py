@@ -22,7 +22,7 @@ from tests.survey.interop_samples import AICON, CSV, DBAT, DBAT_FILES, GKF, KRUM
 @cache
 def _projects() -> tuple[dict[str, bytes], dict[str, bytes]]:
     """The files of two good projects that use most of the format; tables as CSV."""
-    from survey.files import write_project
+    from survey.project import write_project
     from tests.survey.test_files_terrestrial import everything
 
     with tempfile.TemporaryDirectory() as folder:
@@ -35,7 +35,7 @@ def _projects() -> tuple[dict[str, bytes], dict[str, bytes]]:
 
 @cache
 def _parquet() -> dict[str, bytes]:
-    from survey.files import write_project
+    from survey.project import write_project
     from tests.survey.test_files_terrestrial import everything
 
     with tempfile.TemporaryDirectory() as folder:
@@ -60,7 +60,7 @@ feet_mm = { a = [0, 0], b = [10, 0], c = [0, 10] }
 
 
 def _definition(folder: Path) -> Read:
-    from survey.files import read_definition
+    from survey.project import read_definition
 
     faults.write_good_project(folder)
     shutil.rmtree(folder / "images")
@@ -74,7 +74,7 @@ def _table(name: str, number: int) -> Callable[[Path], Read]:
     """One table of observations; what stands in survey.toml was read once."""
 
     def prepare(folder: Path) -> Read:
-        from survey.files import reading
+        from survey.project import reading
 
         beside = {reading._EXTRA.get(Path(name).stem)} | ({"table_angles"} if "laser_spots" in name else set())
         for other, data in _projects()[number].items():
@@ -97,7 +97,7 @@ def _table(name: str, number: int) -> Callable[[Path], Read]:
 
 def _in_pieces(folder: Path) -> Read:
     """A table of quoted words, taken three rows at a time instead of tens of thousands."""
-    from survey.files import csv_chunks
+    from survey.project.tables import csv_chunks
 
     csv_chunks.CHUNK = 3
     return _table("table_angles.csv", 0)(folder)
@@ -121,7 +121,7 @@ def _tables() -> dict[str, Reader]:
 
 
 def _points(folder: Path) -> Read:
-    from survey.files import read_definition
+    from survey.project import read_definition
 
     (folder / "survey.toml").write_text('format = 1\n[targets.sheet]\nkind = "points"\nfile = "sheet_points.csv"\n')
     return in_file("sheet_points.csv", lambda path: read_definition(path.parent))(folder)
@@ -144,8 +144,8 @@ def _image(folder: Path) -> Read:
 
 def _results(which: str) -> Callable[[Path], Read]:
     def prepare(folder: Path) -> Read:
-        from survey.files import read
-        from survey.previous import read_previous
+        from survey.project import read
+        from survey.solution.previous import read_previous
 
         put(folder, adjusted())
         project = read(folder)
@@ -173,8 +173,8 @@ def _npz() -> list[bytes]:
 
 
 def _planning(folder: Path) -> Read:
-    from survey.files import read
     from survey.planning.plan_file import read_plan
+    from survey.project import read
 
     put(folder / "lab", _planned_lab())
     survey = read(folder / "lab").survey
@@ -192,7 +192,7 @@ def _planned_lab() -> dict[str, bytes]:
 
 
 def _trajectory(path: Path) -> object:
-    from survey.relay import read_trajectories
+    from survey.jobs.relay import read_trajectories
 
     return read_trajectories({"a": path})
 
@@ -208,15 +208,15 @@ EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 4 0 0 4 0 4
 
 
 def _g2o(path: Path) -> object:
-    from survey.interop.g2o import read_g2o
+    from survey.interop.networks.g2o import read_g2o
 
     return read_g2o(path), read_g2o(path, "quaternion", True)
 
 
 def _foreign(name: str) -> Callable[[Path], object]:
     def read(path: Path) -> object:
-        from survey.converting import READERS as FOREIGN
         from survey.interop.names import with_safe_ids
+        from survey.jobs.converting import READERS as FOREIGN
 
         return with_safe_ids(FOREIGN[name](path).survey)
 
@@ -250,14 +250,14 @@ def _dbat(file: str) -> Callable[[Path], Read]:
 
 
 def _adjusted_krumm(path: Path) -> object:
-    from survey.interop.krumm import read_adjusted
+    from survey.interop.networks.krumm import read_adjusted
 
     return read_adjusted(path)
 
 
 def _recover(folder: Path) -> Read:
     """The list that a killed run leaves: what it names is restored or removed, inside the project only."""
-    from survey.replacing import recover
+    from survey.folder.replacing import recover
     from tests.fuzz.replaced import unfinished_project
 
     def run(data: bytes) -> object:
@@ -274,7 +274,7 @@ def _alignment_rounds() -> list[bytes]:
 
 
 def _rounds(path: Path) -> object:
-    from survey.aligning import _rounds as read
+    from survey.jobs.aligning import _rounds as read
 
     return read(path)
 

@@ -20,7 +20,7 @@ def small_project(folder: Path) -> None:
 @cache
 def adjusted() -> dict[str, bytes]:
     """Its files by name once it was adjusted, results/solution.json and results/covariance.npz among them."""
-    from survey.jobs import adjust_job
+    from survey.jobs.adjusting.job import adjust_job
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "small"

@@ -12,7 +12,17 @@ import numpy as np
 from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
-from adjust.model import (
+from adjust.model.observations import Distance, FrameRef, ImageBlock, Pair, PositionRef, TableReading
+from adjust.model.result import (
+    Adjustment,
+    Estimate,
+    GlobalTest,
+    GroupSummary,
+    ImageResiduals,
+    ObservationResidual,
+    ParameterName,
+)
+from adjust.model.survey import (
     TABLE_GEOMETRY,
     Camera,
     FloatArray,
@@ -26,17 +36,7 @@ from adjust.model import (
     Target,
     VectorParameter,
 )
-from adjust.observations import Distance, FrameRef, ImageBlock, Pair, PositionRef, TableReading
-from adjust.result import (
-    Adjustment,
-    Estimate,
-    GlobalTest,
-    GroupSummary,
-    ImageResiduals,
-    ObservationResidual,
-    ParameterName,
-)
-from survey.adjusted_frames import table_from_mount
+from survey.solution.frames import table_from_mount
 
 LENS_NAMES = ("fx", "fy", "skew", "u0", "v0", "k1", "k2", "p1", "p2", "k3")
 LENS_UNITS = ("px", "px", "px", "px", "px", "1", "1", "1", "1", "1")

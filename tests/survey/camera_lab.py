@@ -7,22 +7,13 @@ import numpy as np
 from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 
-from adjust.lens import MODELS, camera_constants, project
-from adjust.model import (
-    Camera,
-    LensParameter,
-    Point,
-    PointParameter,
-    PoseParameter,
-    Station,
-    Survey,
-    Target,
-)
-from adjust.observations import FrameRef, ImageBlock
-from survey.files import read, write_project
-from survey.interop.camera_values import camera_values
-from survey.jobs import adjust_job
-from survey.targets import Checkerboard
+from adjust.lenses.models import MODELS, camera_constants, project
+from adjust.model.observations import FrameRef, ImageBlock
+from adjust.model.survey import Camera, LensParameter, Point, PointParameter, PoseParameter, Station, Survey, Target
+from survey.interop.cameras.values import camera_values
+from survey.jobs.adjusting.job import adjust_job
+from survey.project import read, write_project
+from survey.project.targets import Checkerboard
 
 SIZE = (1280, 960)
 SIGMA_PX = 0.1

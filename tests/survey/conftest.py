@@ -3,9 +3,9 @@
 import pytest
 
 from survey.cli import main
-from survey.files import read
-from survey.interop.camera_formats import write_cameras
-from survey.interop.camera_values import camera_values
+from survey.interop.cameras.formats import write_cameras
+from survey.interop.cameras.values import camera_values
+from survey.project import read
 from tests.survey.camera_lab import adjusted_lab
 
 

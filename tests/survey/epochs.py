@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.model import Survey
-from survey.files import write_project
+from adjust.model.survey import Survey
+from survey.project import write_project
 from survey.simulate import resample, stereo
 
 

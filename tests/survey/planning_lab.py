@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model import PointParameter, PoseParameter
-from survey.files import Sigmas, write_project
+from adjust.model.survey import PointParameter, PoseParameter
+from survey.project import Sigmas, write_project
 from survey.simulate import beacons
 
 PLAN = """

@@ -60,7 +60,7 @@ def test_importing_the_packages_loads_nothing_heavy() -> None:
 def test_adjust_solve_stays_the_function_beside_its_submodule() -> None:
     module = importlib.import_module("adjust.solve")
     from adjust.adjustment import adjust as whole
-    from adjust.solve import solve as step
+    from adjust.graph.solver import solve as step
 
     assert adjust.solve is whole
     assert module.solve is step

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from adjust.errors import IndeterminateError, SurveyError
+from adjust.model.errors import IndeterminateError, SurveyError
 from survey import batch
 from survey.batch.cache import unchanged_solution
 from survey.batch.causes import CAUSES, cause_of
@@ -227,7 +227,7 @@ def test_a_bug_keeps_its_traceback_and_costs_one_folder(nights: list[Path], monk
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError("oops")
 
-    monkeypatch.setattr("survey.jobs.adjust_job", broken)
+    monkeypatch.setattr("survey.jobs.adjusting.job.adjust_job", broken)
     found = adjust_task({"folder": "n", "path": str(nights[0]), "redetect": False})
     assert (found.state, found.cause) == (FAILED, "internal")
     assert "ZeroDivisionError: oops" in found.error

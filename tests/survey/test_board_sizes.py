@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.detection import detect_image
 from survey.detection.extent import grown, is_of_neighbours
-from survey.jobs import adjust_job, detect_job
-from survey.rendering import BrownCamera, Imaging, PlacedTarget, render
-from survey.targets import Checkerboard
+from survey.jobs.adjusting.job import adjust_job, detect_job
+from survey.project.targets import Checkerboard
+from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 from tests.data import data_folder
 
 CAMERA = BrownCamera((640, 480), 800.0, 800.0, 319.5, 239.5, (-0.25, 0.06, 1e-3, -5e-4))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from gtsam import Pose3
 
-from adjust.observations import Closure
+from adjust.model.observations import Closure
 from survey.cli import main
-from survey.files import AdjustmentOptions, read, write_project
+from survey.project import AdjustmentOptions, read, write_project
 from tests.adjust.test_relay_closed import ARCSEC, eyes, rig
 
 MOUNT = Closure("plate", ("C1-C2", "C2-C3", "C1-C3"), 300.0 * ARCSEC, 1e-3)

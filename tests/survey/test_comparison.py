@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from survey.cli import main
-from survey.files import write_project
+from survey.project import write_project
 from tests.adjust.test_deformation import chain, measured, small
 
 

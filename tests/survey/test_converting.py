@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from survey.cli import main
-from survey.files import read
+from survey.project import read
 
 
 def _lines(n=5, seed=1, noise=1e-3):

@@ -10,11 +10,11 @@ import pytest
 
 from survey.batch.cache import unchanged_solution
 from survey.cli import main
-from survey.detecting import detect_job
-from survey.files import read
-from survey.files.detected import read_detected
-from survey.jobs import adjust_job
-from survey.network import add_job
+from survey.jobs.adjusting.job import adjust_job
+from survey.jobs.detecting import detect_job
+from survey.jobs.network import add_job
+from survey.project import read
+from survey.project.detected import read_detected
 
 TOML = """format = 1
 [cameras.C]

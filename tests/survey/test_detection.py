@@ -6,14 +6,14 @@ import pytest
 from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from adjust.native.vision import corner_rows, fit_corners
 from survey.detection import detect_image, markers
 from survey.detection.corners import CROSSING_FLOOR_PX, MARKER_FLOOR_PX
 from survey.detection.detect import detect_targets
 from survey.detection.gray import gray_values, reduced, saturation_level
-from survey.rendering import BrownCamera, Imaging, PlacedTarget, render
-from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid
+from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid
+from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 from tests.data import data_folder
 
 CAMERA = BrownCamera((960, 720), 1200.0, 1200.0, 479.5, 359.5, (-0.2, 0.05, 1e-3, -5e-4))

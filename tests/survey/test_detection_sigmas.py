@@ -9,8 +9,8 @@ from scipy.stats import chi2
 from survey.detection import SpotOptions, checkerboard, detect_image, detect_spots, markers
 from survey.detection.bent_edges import unbent
 from survey.detection.corners import CornerFit
-from survey.rendering import Beacons, BrownCamera, Imaging, PlacedTarget, render
-from survey.targets import Charuco, Checkerboard, MarkerGrid
+from survey.project.targets import Charuco, Checkerboard, MarkerGrid
+from survey.simulate.rendering import Beacons, BrownCamera, Imaging, PlacedTarget, render
 
 CAMERA = BrownCamera((640, 480), 800.0, 800.0, 319.5, 239.5, (-0.2, 0.05, 1e-3, -5e-4))
 BOARD = Checkerboard(8, 5, 0.02)

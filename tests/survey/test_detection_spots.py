@@ -4,7 +4,7 @@ import pytest
 
 from adjust.native.vision import DISC, GAUSSIAN, spot_rows
 from survey.detection import SpotOptions, detect_spots
-from survey.rendering import Beacons, BrownCamera, Imaging, render
+from survey.simulate.rendering import Beacons, BrownCamera, Imaging, render
 
 CAMERA = BrownCamera((800, 600), 1600.0, 1600.0, 399.5, 299.5, (-0.2, 0.05, 1e-3, -5e-4))
 GRID = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 9), np.linspace(-0.15, 0.15, 7), [1.0]), -1).reshape(-1, 3)

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from survey import files
-from survey.files.declarations import INSTRUMENT_UNITS, SURFACE_UNITS, keys_of
-from survey.files.reading import LAYOUTS
-from survey.files.vectors import vector_keys
+from survey import project as files
+from survey.project.declared.declarations import INSTRUMENT_UNITS, SURFACE_UNITS, keys_of
+from survey.project.declared.vectors import vector_keys
+from survey.project.reading import LAYOUTS
 
 PAGE = Path(__file__).parents[2] / "docs" / "observations.md"
 NEW = ("terrestrial", "terrestrial_covariance", "coordinate_differences", "coordinate_differences_covariance", "levels",

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 
 from adjust.adjustment import adjust
-from adjust.errors import SurveyError
-from survey.checked import checked
-from survey.epoch_names import separate_epochs
+from adjust.model.errors import SurveyError
+from survey.jobs.adjusting.explained import checked
+from survey.project.epoch_names import separate_epochs
 from survey.simulate import stereo
 
 

@@ -11,19 +11,19 @@ import pytest
 from gtsam import Pose3
 
 from adjust.adjustment import AdjustOptions
-from adjust.errors import SurveyError
-from adjust.solve import SolveOptions
+from adjust.graph.solver import SolveOptions
+from adjust.model.errors import SurveyError
 from survey.cli import main
-from survey.excluding import exclude_job, include_job
-from survey.files import read
-from survey.files.exclusions import Exclusion, Name
-from survey.files.observed import Observed
-from survey.files.reading import leaving_out, read_all
-from survey.jobs import adjust_job, adjust_project
-from survey.navigation_task import NavigateRequest, observed_epoch
-from survey.previous import read_previous
-from survey.removing import remove_job
-from survey.warm_start import WARM, survey_start, warm_adjustment
+from survey.jobs.adjusting.job import adjust_job, adjust_project
+from survey.jobs.adjusting.warm_start import WARM, survey_start, warm_adjustment
+from survey.jobs.excluding import exclude_job, include_job
+from survey.jobs.navigating.task import NavigateRequest, observed_epoch
+from survey.jobs.removing import remove_job
+from survey.project import read
+from survey.project.exclusions import Exclusion, Name
+from survey.project.observed import Observed
+from survey.project.reading import leaving_out, read_all
+from survey.solution.previous import read_previous
 
 
 @pytest.fixture
@@ -219,7 +219,7 @@ def test_warm_is_cold_with_spots_exclusions_and_rows_not_used(mine, monkeypatch)
     assert project.spots
     # until rounding ends it: to its usual limit, 1e-6 sigmas, each run stops somewhere else
     exact = partial(AdjustOptions, solve=SolveOptions(max_step=1e-9))
-    monkeypatch.setattr("survey.cleaning.AdjustOptions", exact)
+    monkeypatch.setattr("survey.jobs.adjusting.options.AdjustOptions", exact)
     cold = adjust_project(project, False)
     warm, how = warm_adjustment(project, previous, lambda _: pytest.fail("went cold"), False)
     assert how == WARM
@@ -236,8 +236,8 @@ def read_previous_of(folder):
 
 def _beacons_as_spots(project):
     """The beacons' image points without their names, and coordinates by which they are found again."""
-    from adjust.observations import Coordinates, PositionRef
-    from survey.files import SpotBlock
+    from adjust.model.observations import Coordinates, PositionRef
+    from survey.project import SpotBlock
     from tests.survey.camera_lab import BEACONS
 
     blocks = [b for b in project.survey.image_blocks if b.target_id is None]

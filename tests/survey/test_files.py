@@ -13,16 +13,26 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.errors import SurveyError
-from adjust.model import Camera, LensParameter, PointParameter, PoseParameter, Station, Survey, Target, VectorPrior
-from adjust.model import Point as WorldPoint
-from adjust.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef
-from survey import files
-from survey.files import csv_chunks, tables
-from survey.files.toml_lines import key_lines
-from survey.files.units import from_si, to_si
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef
+from adjust.model.survey import (
+    Camera,
+    LensParameter,
+    PointParameter,
+    PoseParameter,
+    Station,
+    Survey,
+    Target,
+    VectorPrior,
+)
+from adjust.model.survey import Point as WorldPoint
+from survey import project as files
+from survey.folder.units import from_si, to_si
+from survey.project.declared.toml_lines import key_lines
+from survey.project.tables import csv_chunks
+from survey.project.tables import reading as tables
+from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList
 from survey.simulate import full_lab
-from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList
 from tests.survey.faults import write_good_project
 
 COLUMNS = ("epoch_id", "camera_id", "target_id", "point_id", "u_px", "v_px", "sigma_u_px", "sigma_v_px", "rho_uv")

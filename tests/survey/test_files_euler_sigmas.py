@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from gtsam import Rot3
 
-from adjust.errors import SurveyError
-from survey import files
+from adjust.model.errors import SurveyError
+from survey import project as files
 
 TOML = """format = 1
 [stations.a]

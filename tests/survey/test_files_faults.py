@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from adjust.errors import SurveyError
-from survey import files
+from adjust.model.errors import SurveyError
+from survey import project as files
 from tests.survey.faults import DEFINITION_FAULTS, FAULTS, Fault, named_line, write_good_project
 
 NEEDS_TABLES = "unknown group"  # only the tables say which groups there are

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from adjust.model import (
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef, PositionRef, Reading, ReadingCovariance
+from adjust.model.survey import (
     Bearings,
     Instrument,
     Point,
@@ -20,9 +21,8 @@ from adjust.model import (
     VectorParameter,
     VectorPrior,
 )
-from adjust.observations import FrameRef, PositionRef, Reading, ReadingCovariance
-from survey import files
-from survey.files.project import Accuracy, Sigmas
+from survey import project as files
+from survey.project.project import Accuracy, Sigmas
 from tests.adjust.test_geometry import geometric
 from tests.survey.test_files import differences
 

@@ -14,20 +14,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from survey import files
+from adjust.model.errors import SurveyError
+from survey import project as files
 from survey.cli import FAILED, main
 from survey.commands.common import message
 from survey.detection.gray import read_image
 from survey.detection.image_header import image_size
-from survey.files.node import read_toml
-from survey.files.table_writing import write_table
-from survey.files.tables import Layout, group_names, read_table
-from survey.files.text import cell_text, id_problem, natural_key, read_bytes
-from survey.jobs import adjust_job
-from survey.previous import read_previous
-from survey.replacing import recover
-from survey.residual_tables import other_residuals_csv
+from survey.folder.replacing import recover
+from survey.folder.text import cell_text, id_problem, natural_key, read_bytes
+from survey.jobs.adjusting.job import adjust_job
+from survey.project.declared.node import read_toml
+from survey.project.tables.reading import Layout, group_names, read_table
+from survey.project.tables.writing import write_table
+from survey.solution.previous import read_previous
+from survey.solution.residual_tables import other_residuals_csv
 from tests.adjust.test_deformation import adjusted, chain, measured
 from tests.fuzz.replaced import unfinished_project
 from tests.fuzz.small import small_project
@@ -124,7 +124,7 @@ def test_numbers_too_large_to_be_meant(tmp_path: Path) -> None:
 
 
 def test_more_rows_than_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("survey.files.tables.LARGEST_ROWS", 2)
+    monkeypatch.setattr("survey.project.tables.reading.LARGEST_ROWS", 2)
     (tmp_path / "t.csv").write_text("a_id,x_mm\nA,1\nB,1\n")
     with pytest.raises(SurveyError, match="found 3 rows, at most 2 are read; split the survey"):
         read_table(tmp_path / "t.csv", LAYOUT)

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import HealthCheck, configuration, given, settings
 from hypothesis import strategies as st
 
-from survey.interop.camera_formats import COLMAP, KALIBR_TARGET, READERS, write_cameras
-from survey.interop.colmap import read_colmap
+from survey.interop.cameras.colmap import read_colmap
+from survey.interop.cameras.formats import COLMAP, KALIBR_TARGET, READERS, write_cameras
 from tests.survey.test_interop_fuzz import _damaged, _message
 
 configuration.set_hypothesis_home_dir(tempfile.gettempdir())

@@ -8,13 +8,13 @@ import pycolmap
 import pytest
 from gtsam import Pose3
 
-from adjust.errors import SurveyError
-from adjust.observations import FrameRef
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef
 from survey.cli import main
-from survey.files import read
-from survey.interop.camera_values import camera_values
-from survey.interop.colmap import pose3, reconstruction, rigid3d
-from survey.interop.colmap_model import read_model
+from survey.interop.cameras.colmap import pose3, reconstruction, rigid3d
+from survey.interop.cameras.colmap_model import read_model
+from survey.interop.cameras.values import camera_values
+from survey.project import read
 from tests.survey.camera_lab import SIGMA_PX, world_pixels
 
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import HealthCheck, configuration, given, settings
 from hypothesis import strategies as st
 
-from adjust.errors import SurveyError
-from survey.converting import READERS
-from survey.interop.krumm import read_adjusted
+from adjust.model.errors import SurveyError
+from survey.interop.networks.krumm import read_adjusted
+from survey.jobs.converting import READERS
 from tests.survey.interop_samples import AICON, CSV, DBAT, DBAT_FILES, GKF, KRUMM, LGC
 
 # no folder of its own among the sources

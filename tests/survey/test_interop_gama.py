@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from survey.interop.gama import read_gama
+from adjust.model.errors import SurveyError
+from survey.interop.networks.gama import read_gama
 from survey.interop.safe_xml import read_xml
 from tests.survey.interop_samples import GKF
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import yaml
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.cli import main
-from survey.files import read
-from survey.interop.camera_formats import write_cameras
-from survey.interop.kalibr import read_kalibr, target_text
-from survey.targets import Checkerboard, MarkerBlock, MarkerGrid, PointList
+from survey.interop.cameras.formats import write_cameras
+from survey.interop.cameras.kalibr import read_kalibr, target_text
+from survey.project import read
+from survey.project.targets import Checkerboard, MarkerBlock, MarkerGrid, PointList
 from tests.survey.camera_lab import BOARD, pixels, points_before, same_rig
 
 

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from survey.interop.mc_calib import read_mc_calib
+from adjust.model.errors import SurveyError
+from survey.interop.cameras.mc_calib import read_mc_calib
 from tests.survey.camera_lab import pixels, points_before, same_rig
 
 

@@ -12,14 +12,14 @@ import pytest
 from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
-from adjust.errors import SurveyError
-from adjust.lens import MODELS, camera_constants, project
-from adjust.model import Camera, LensParameter
+from adjust.lenses.models import MODELS, camera_constants, project
+from adjust.model.errors import SurveyError
+from adjust.model.survey import Camera, LensParameter
 from survey.cli import main
-from survey.files import read
-from survey.interop.camera_formats import write_cameras
-from survey.interop.lens_maps import BROWN_8, mapped_lens
-from survey.interop.mrcal import read_mrcal, rt_by_tangent, rt_of
+from survey.interop.cameras.formats import write_cameras
+from survey.interop.cameras.lens_maps import BROWN_8, mapped_lens
+from survey.interop.cameras.mrcal import read_mrcal, rt_by_tangent, rt_of
+from survey.project import read
 from tests.survey.camera_lab import LENSES, SIZE, pixels, points_before, same_rig
 
 _PYTHON = "/usr/bin/python3"  # where Debian's package puts mrcal

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from adjust.observations import FrameRef
-from survey.interop.nerf import read_nerf
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef
+from survey.interop.cameras.nerf import read_nerf
 from tests.survey.camera_lab import BEACONS, opencv_pixels
 from tests.survey.test_interop_trajectories import same_pose
 

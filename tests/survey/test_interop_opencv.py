@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from survey.interop.opencv_files import read_opencv
+from adjust.model.errors import SurveyError
+from survey.interop.cameras.opencv_files import read_opencv
 from tests.survey.camera_lab import pixels, points_before, same_rig
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from survey.files import read
-from survey.interop.aicon import SIGMA_MM, read_aicon
-from survey.interop.dbat import read_dbat
+from adjust.model.errors import SurveyError
+from survey.interop.cameras.aicon import SIGMA_MM, read_aicon
+from survey.interop.cameras.dbat import read_dbat
+from survey.project import read
 from tests.acceptance.published import dbat_survey
 from tests.data import data_folder
 from tests.survey.interop_samples import AICON, DBAT, DBAT_FILES

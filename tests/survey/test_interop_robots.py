@@ -6,10 +6,10 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from survey.files import read, write_project
-from survey.interop.camera_values import camera_values
-from survey.interop.robots import fixed_links, read_sdf, read_urdf, sdf_files, urdf_files
+from adjust.model.errors import SurveyError
+from survey.interop.cameras.robots import fixed_links, read_sdf, read_urdf, sdf_files, urdf_files
+from survey.interop.cameras.values import camera_values
+from survey.project import read, write_project
 from tests.survey.test_interop_trajectories import same_pose
 
 

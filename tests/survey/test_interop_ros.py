@@ -6,9 +6,9 @@ import yaml
 from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
-from adjust.errors import SurveyError
-from survey.interop.camera_formats import write_cameras
-from survey.interop.ros import read_industrial, read_ros
+from adjust.model.errors import SurveyError
+from survey.interop.cameras.formats import write_cameras
+from survey.interop.cameras.ros import read_industrial, read_ros
 from tests.survey.camera_lab import opencv_pixels, pixels, points_before, same_rig
 
 

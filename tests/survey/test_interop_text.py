@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.cli import main
-from survey.files import read
-from survey.interop.krumm import read_krumm
-from survey.interop.lgc import read_lgc
-from survey.interop.plain_csv import read_plain_csv
+from survey.interop.networks.krumm import read_krumm
+from survey.interop.networks.lgc import read_lgc
+from survey.interop.networks.plain_csv import read_plain_csv
+from survey.project import read
 from tests.survey.interop_samples import CSV, KRUMM, LGC
 
 GON, CC, ARCSEC = np.pi / 200, np.pi / 200 * 1e-4, np.pi / 648000

@@ -5,8 +5,8 @@ import pytest
 from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
-from adjust.errors import SurveyError
-from adjust.observations import FrameRef
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef
 from survey.interop.trajectories import read_kitti, read_tum
 
 

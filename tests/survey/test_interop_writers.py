@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from survey.cli import main
-from survey.files import read
-from survey.interop.gama import read_gama
-from survey.interop.plain_csv import read_plain_csv
+from survey.interop.networks.gama import read_gama
+from survey.interop.networks.plain_csv import read_plain_csv
+from survey.project import read
 from tests.acceptance.dense_network import dense_adjust
 from tests.survey.interop_samples import CSV, GKF
 

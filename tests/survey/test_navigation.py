@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.cli import main
-from survey.files import SpotBlock, write_project
-from survey.navigation import NavigateRequest, navigate_job
+from survey.jobs.navigating.job import NavigateRequest, navigate_job
+from survey.project import SpotBlock, write_project
 from survey.simulate import Scene, beacons
 
 

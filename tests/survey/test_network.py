@@ -10,17 +10,17 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.adjustment import AdjustOptions, adjust
-from adjust.errors import IndeterminateError, SurveyError
-from adjust.model import Datum, Point, PointParameter, PoseParameter, Station, Survey
-from adjust.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
-from adjust.pair_screen import PairOptions, adjust_with_pairs, is_pure
+from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
+from adjust.model.survey import Datum, Point, PointParameter, PoseParameter, Station, Survey
+from adjust.statistics.pair_screen import PairOptions, adjust_with_pairs, is_pure
 from survey import problem, solve
 from survey.cli import main
-from survey.files import read, write_project
-from survey.merging import merge
-from survey.network_summary import loops_dict, network_dict, pair_loops, pair_network
-from survey.quantities import ARCSEC_PER_RAD, scale_of
-from survey.solution import RunInfo, solution_dict
+from survey.project import read, write_project
+from survey.project.merging import merge
+from survey.solution.dictionary import RunInfo, solution_dict
+from survey.solution.loops import loops_dict, network_dict, pair_loops, pair_network
+from survey.solution.quantities import ARCSEC_PER_RAD, scale_of
 
 HELD = PoseParameter(Pose3(), "held")
 SIGMAS = np.array([1e-4] * 3 + [1e-3] * 3)
@@ -237,7 +237,7 @@ def test_a_pair_without_which_there_is_no_solution_stays(monkeypatch):
             raise IndeterminateError("2 directions are undetermined", ("S1",))
         return adjust(given, *arguments)
 
-    monkeypatch.setattr("adjust.pair_screen.adjust", fragile)
+    monkeypatch.setattr("adjust.statistics.pair_screen.adjust", fragile)
     result = adjust_with_pairs(survey)
     assert next(p for p in result.survey.pairs if p.pair_id == name).used
     assert [w for w in result.warnings if w.startswith(f"fails its test, but cannot be left out: pair {name}")]

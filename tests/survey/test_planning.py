@@ -9,14 +9,14 @@ import pytest
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.design import exact, expect, with_candidates
-from adjust.errors import IndeterminateError, SurveyError
-from survey.files import read, write_project
+from adjust.model.errors import IndeterminateError, SurveyError
 from survey.planning.building import build_plan
 from survey.planning.errors import error_analysis_job
 from survey.planning.job import PlanRequest, planning_job
 from survey.planning.plan_file import read_plan
 from survey.planning.plots import Series, chart, ticks
 from survey.planning.wanted import wanted_components
+from survey.project import read, write_project
 from survey.simulate import resample
 from survey.simulate.scene import Scene
 from tests.survey.planning_lab import PLAN, write_lab

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adjust.errors import SurveyError
-from adjust.lens import MODELS
+from adjust.lenses.models import MODELS
+from adjust.model.errors import SurveyError
 from survey.cli import main
 from survey.examples import EXAMPLES, write_example
-from survey.files.column_texts import COLUMN_TEXTS, column_text
-from survey.files.declarations import DECLARATIONS, declared
-from survey.files.declared import NOTHING, REQUIRED, Declared, Key
-from survey.files.exclusions import EXCLUSIONS
-from survey.files.reading import LAYOUTS, read_definition
-from survey.reference import reference_page
-from survey.schema import survey_schema
-from survey.tolerances import OWNERS
+from survey.project.declared.declarations import DECLARATIONS, declared
+from survey.project.declared.keys import NOTHING, REQUIRED, Declared, Key
+from survey.project.exclusions import EXCLUSIONS
+from survey.project.reading import LAYOUTS, read_definition
+from survey.project.reference import reference_page
+from survey.project.schema import survey_schema
+from survey.project.tables.column_texts import COLUMN_TEXTS, column_text
+from survey.solution.tolerances import OWNERS
 
 jsonschema = pytest.importorskip("jsonschema")
 ROOT = Path(__file__).parents[2]

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from gtsam import Pose3
 
-from adjust.errors import SurveyError
-from adjust.model import FloatArray
-from survey.files import write_project
-from survey.relay import read_trajectories, read_trajectory, relay_pairs, relay_text, write_relay_pairs
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray
+from survey.jobs.relay import read_trajectories, read_trajectory, relay_pairs, relay_text, write_relay_pairs
+from survey.project import write_project
 from tests.adjust.relay_station import Station4
 
 LINE = "{t}, 0.1, 0.2, 0.3, 0, 0, 0, 1\n"

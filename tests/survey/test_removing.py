@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.errors import IndeterminateError, SurveyError
-from adjust.model import Point, PoseParameter, Station, Survey
-from adjust.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
+from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
+from adjust.model.survey import Point, PoseParameter, Station, Survey
 from survey.cli import main
-from survey.excluding import include_job
-from survey.files import read, write_project
-from survey.jobs import adjust_job
-from survey.removing import remove_job
+from survey.jobs.adjusting.job import adjust_job
+from survey.jobs.excluding import include_job
+from survey.jobs.removing import remove_job
+from survey.project import read, write_project
 
 SIGMAS = np.array([1e-4] * 3 + [1e-3] * 3)
 ENDS = ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (3, 4))

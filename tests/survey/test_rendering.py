@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.errors import SurveyError
-from survey.rendering import Beacons, BrownCamera, Imaging, PlacedTarget, render
-from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid
+from adjust.model.errors import SurveyError
+from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid
+from survey.simulate.rendering import Beacons, BrownCamera, Imaging, PlacedTarget, render
 
 CAMERA = BrownCamera((320, 240), 400.0, 400.0, 159.5, 119.5)
 BOARD = Checkerboard(5, 4, 0.02)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.errors import SurveyError
-from adjust.model import Survey
-from adjust.result import Adjustment, ImageResiduals
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment, ImageResiduals
+from adjust.model.survey import Survey
 from survey import report as report_package
-from survey.quantities import scale_of
 from survey.report import drawing, every, markup, report_html, summary_text
 from survey.report.camera_plots import CameraResiduals, histogram, mean_field, vector_field
 from survey.report.german import GERMAN
 from survey.report.picture import enlargement, perspective, pictures, plan
 from survey.report.scene import Scene, Spot, scene_of
-from survey.solution import RunInfo
+from survey.solution.dictionary import RunInfo
+from survey.solution.quantities import scale_of
 from tests.survey.adjustments import Lab, correlate, lab_adjustment
 
 RUN = RunInfo(
@@ -403,8 +403,8 @@ def test_german_has_every_text_of_the_program() -> None:
 
 
 def test_groups_named_after_their_kind_are_said_in_the_language_and_others_as_they_are() -> None:
-    from adjust import observations
-    from survey.files.terrestrial import KINDS
+    from adjust.model import observations
+    from survey.project.tables.terrestrial import KINDS
     from survey.report.language import GROUPS_BY_KIND, group_name, speaking
 
     named = {

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from adjust.errors import SurveyError
+from adjust.model.errors import SurveyError
 from survey.report import every, pdf, report_html
 from survey.report.drawing import DARK
-from survey.solution import RunInfo
+from survey.solution.dictionary import RunInfo
 from tests.survey.adjustments import Lab, lab_adjustment
 
 RUN = RunInfo("lab", "Full lab", {"survey.toml": "12ab"}, {"alpha": 0.05}, {"labsurvey": "0.1.0"}, "2026-01-02")

@@ -8,29 +8,29 @@ from pathlib import Path
 
 import pytest
 
-import survey.aligning
+import survey.jobs.aligning
 import survey.planning.job
-from adjust.model import PointParameter, Survey
-from adjust.result import Adjustment
-from survey.aligning import align_job
+from adjust.model.result import Adjustment
+from adjust.model.survey import PointParameter, Survey
 from survey.batch.page import overview_html
 from survey.batch.record import FAILED, TEST_FAILED, Number, Record, Turn
 from survey.batch.trends import trends_of
 from survey.cli import main
 from survey.examples import write_example
 from survey.examples.alignment import alignment_files
-from survey.files import AdjustmentOptions, Project, Sigmas, read
-from survey.jobs import adjust_project, run_info
+from survey.jobs.adjusting.job import adjust_project, run_info
+from survey.jobs.aligning import align_job
 from survey.notebook.html import heading, html_table
 from survey.planning.job import PlanRequest, planning_job
 from survey.planning.page import plan_page
-from survey.quantities import scale_of
+from survey.project import AdjustmentOptions, Project, Sigmas, read
 from survey.report import report_html
 from survey.report.embedding import json_script
 from survey.report.markup import esc
 from survey.simulate import beacons
-from survey.solution import RunInfo
-from survey.statistics import statistics_of
+from survey.solution.dictionary import RunInfo
+from survey.solution.quantities import scale_of
+from survey.solution.statistics import statistics_of
 from tests.survey.adjustments import Lab, lab_adjustment
 from tests.survey.evil import PAYLOADS, evil_names, faults_of, names_in, renamed, tags_of
 from tests.survey.planning_lab import write_lab
@@ -95,7 +95,7 @@ def test_working_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     project = read(tmp_path)
     names = [*names_in(project.survey), *names_in(project.alignment_tasks), project.title]
     evil = renamed(project, evil_names(names))
-    monkeypatch.setattr(survey.aligning, "read", lambda _: evil)
+    monkeypatch.setattr(survey.jobs.aligning, "read", lambda _: evil)
     page = align_job(tmp_path, progress=False).page.read_text("utf-8")
     assert faults_of(page) == []
     assert page.count("&lt;script") + page.count("&gt;") > 5

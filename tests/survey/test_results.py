@@ -11,14 +11,14 @@ import pytest
 from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 
-from adjust.observations import FrameRef
-from adjust.result import Adjustment, Estimate, GlobalTest
-from survey.adjusted_frames import AdjustedFrames, table_from_mount
-from survey.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry
-from survey.residual_tables import _fixed, image_residuals_csv, other_residuals_csv
-from survey.results import covariance_npz, read_covariances, write_results
-from survey.solution import RunInfo, correlated, solution_dict, solution_json
-from survey.verdict import suspects, verdict
+from adjust.model.observations import FrameRef
+from adjust.model.result import Adjustment, Estimate, GlobalTest
+from survey.report.results import covariance_npz, read_covariances, write_results
+from survey.solution.dictionary import RunInfo, correlated, solution_dict, solution_json
+from survey.solution.frames import AdjustedFrames, table_from_mount
+from survey.solution.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry
+from survey.solution.residual_tables import _fixed, image_residuals_csv, other_residuals_csv
+from survey.solution.verdict import suspects, verdict
 from tests.survey.adjustments import POSE_COMPONENTS, POSE_UNITS, Lab, correlate, lab_adjustment
 
 RUN = RunInfo("lab", "A lab", {"survey.toml": "12ab"}, {"alpha": 0.05}, {"labsurvey": "0.1.0"}, "2026-01-02T03:04:05Z")

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import survey
-from adjust.errors import SurveyError
-from survey.aligning import align_job
+from adjust.model.errors import SurveyError
 from survey.cli import main
-from survey.files import AdjustmentOptions, read, write_project
-from survey.navigation import NavigateRequest, navigate_job
-from survey.results import read_covariances
+from survey.jobs.aligning import align_job
+from survey.jobs.navigating.job import NavigateRequest, navigate_job
+from survey.project import AdjustmentOptions, read, write_project
+from survey.report.results import read_covariances
 from survey.simulate import beacons
 from tests.adjust.test_deformation import chain, measured, small
 from tests.survey.test_working_sheet import definition, write

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.model import PoseParameter
-from adjust.observations import Distance, FrameRef, Pair, PositionRef
+from adjust.model.observations import Distance, FrameRef, Pair, PositionRef
+from adjust.model.survey import PoseParameter
 from survey.simulate import BROWN, Scene, full_lab, head_on_table, relay, resample, single_camera, stereo
 from survey.simulate.draft import table_angles
 from survey.simulate.scene import rotation_about

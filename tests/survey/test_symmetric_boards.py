@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adjust.adjustment import AdjustOptions, adjust
-from adjust.model import PoseParameter
-from survey.files import read
-from survey.jobs import adjust_job
-from survey.symmetric_boards import consistent_turns
-from survey.targets import Checkerboard
+from adjust.model.survey import PoseParameter
+from survey.jobs.adjusting.job import adjust_job
+from survey.jobs.adjusting.symmetric_boards import consistent_turns
+from survey.project import read
+from survey.project.targets import Checkerboard
 from tests.data import data_folder
 
 HELD = PoseParameter(treatment="held")

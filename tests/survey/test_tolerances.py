@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
-from adjust.errors import SurveyError
-from survey.files import read, write_project
-from survey.files.project import AdjustmentOptions
-from survey.quantities import scale_of
-from survey.tolerances import Tolerance, coverage, verdicts
+from adjust.model.errors import SurveyError
+from survey.project import read, write_project
+from survey.project.project import AdjustmentOptions
+from survey.solution.quantities import scale_of
+from survey.solution.tolerances import Tolerance, coverage, verdicts
 from tests.survey.adjustments import Lab, lab_adjustment
 
 TOML = """format = 1

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from gtsam import Rot3
 
-from adjust.errors import SurveyError
-from survey.aligning import align_job
+from adjust.model.errors import SurveyError
 from survey.cli import main
 from survey.examples.alignment import FEET_MM, OFF, alignment_files
+from survey.jobs.aligning import align_job
 from survey.report.working_sheet import steps
 
 ARCSEC = np.pi / 648000

@@ -1,0 +1,5 @@
+"""Table readings checked against images: swapped axes, signs, units, epochs, moved and mis-detected targets."""
+
+from adjust.diagnosis.table.check import probable_causes, sign_warnings
+
+__all__ = ["probable_causes", "sign_warnings"]

@@ -1,0 +1,138 @@
+"""Mistakes that all readings of a table share: axes exchanged, wrong units, epochs out of step."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.diagnosis.table.views import TableViews
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray, IntArray
+from adjust.spatial.rigid import inverse, rotation_log
+from adjust.start.closed_forms.hand_eye import solve_ax_zb
+
+_CLEAR_DEG = 0.2
+_BETTER = 5.0
+_UNITS = (  # factor from what stands there to what is meant, and how that comes about
+    (0.9, "are in gon, not degrees"),
+    (1.0 / 0.9, "were turned from gon into degrees although they were degrees"),
+    (180.0 / np.pi, "are in radians, not degrees"),
+    (np.pi / 180.0, "were turned from radians into degrees although they were degrees"),
+    (0.18 / np.pi, "are in milliradians, not degrees"),
+    (360.0, "are in whole turns, not degrees"),
+    (1.0 / 60.0, "are in arc minutes, not degrees"),
+    (1.0 / 3600.0, "are in arc seconds, not degrees"),
+    (0.5, "are twice the turn"),
+    (2.0, "are half the turn"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """What may have happened to the readings: ``meant`` turns those (e, k) rad that stand there into those meant."""
+
+    text: str
+    meant: Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The likeliest hypothesis and the typical disagreement (rad) of the turns, as it stands and under it."""
+
+    hypothesis: Hypothesis
+    as_given: float
+    corrected: float
+
+
+def hypotheses(n_axes: int) -> list[Hypothesis]:
+    """All mistakes, the simplest first."""
+    names = [f"axis{i + 1}" for i in range(n_axes)]
+    both = " and ".join(names)
+    out = [Hypothesis("", lambda a: a)]
+    if n_axes == 2:
+        out.append(Hypothesis("axis1 and axis2 are exchanged", lambda a: a[:, ::-1]))
+    for factor, what in _UNITS:
+        out.append(Hypothesis(f"the readings of {both} {what}", _scaled(np.full(n_axes, factor))))
+    if n_axes == 2:
+        for i, name in enumerate(names):
+            for factor, what in _UNITS:
+                single = np.where(np.arange(2) == i, factor, 1.0)
+                out.append(Hypothesis(f"the readings of {name} {what}", _scaled(single)))
+    for shift in (1, -1):
+        late = "following" if shift == 1 else "preceding"
+        out.append(Hypothesis(f"every epoch has the reading of the {late} one", _rolled(shift)))
+    out.append(Hypothesis("the readings are in the opposite order of the epochs", lambda a: a[::-1]))
+    if n_axes == 2:
+        for factor, what in _UNITS:
+            turned = _scaled(np.full(2, factor))
+            out.append(Hypothesis(f"axis1 and axis2 are exchanged, and the readings {what}", _exchanged(turned)))
+    return out
+
+
+def _scaled(factors: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    return lambda a: a * factors
+
+
+def _rolled(shift: int) -> Callable[[FloatArray], FloatArray]:
+    return lambda a: np.roll(a, shift, axis=0)
+
+
+def _exchanged(then: Callable[[FloatArray], FloatArray]) -> Callable[[FloatArray], FloatArray]:
+    return lambda a: then(a[:, ::-1])
+
+
+def shared_mistake(views: TableViews) -> tuple[Verdict | None, float]:
+    """The mistake of all readings that explains the images, or None; and the disagreement (rad) as it stands.
+
+    Turning angles sort out most mistakes; exchanged axes leave all of them as they are (the angle of ``R1(a) R2(b)`` is
+    that of ``R2(b) R1(a)``), and only show when base and mount have to be the same for all views.
+    """
+    pairs = _pairs(views)
+    if not len(pairs):
+        return None, 0.0
+    seen = _turns(views.poses[:, :3, :3].reshape(-1, 9), pairs)
+    known = hypotheses(views.angles.shape[1])
+    rough = []
+    for hypothesis in known:
+        R = views.motions(hypothesis.meant(views.angles))[views.epoch][:, :3, :3].reshape(-1, 9)
+        rough.append(float(np.median(np.abs(_turns(R, pairs) - seen))))
+    bound = 1.5 * min(rough) + np.radians(0.1)
+    scores = {i: max(s, _misfit(views, known[i])) for i, s in enumerate(rough) if i == 0 or s < bound}
+    # of explanations that are as good as each other the simplest, which comes first
+    least = min(scores.values())
+    best = next(i for i, s in scores.items() if s <= max(1.5 * least, least + np.radians(0.02)))
+    if best == 0 or scores[0] < np.radians(_CLEAR_DEG) or scores[0] < _BETTER * scores[best]:
+        return None, scores[0]
+    return Verdict(known[best], scores[0], scores[best]), scores[0]
+
+
+def _misfit(views: TableViews, hypothesis: Hypothesis) -> float:
+    """Typical angle (rad) by which views miss what one base and one mount would show; zero where that is open."""
+    M = views.motions(hypothesis.meant(views.angles))
+    medians = []
+    for i, o in sorted(set(zip(views.inner.tolist(), views.outer.tolist(), strict=True))):
+        rows = np.flatnonzero((views.inner == i) & (views.outer == o))
+        mount_from_table, seen = inverse(M)[views.epoch[rows]], views.poses[rows]
+        try:
+            Z, X, _ = solve_ax_zb(mount_from_table, seen)
+        except (SurveyError, np.linalg.LinAlgError):
+            continue
+        miss = rotation_log((X @ seen)[:, :3, :3].swapaxes(1, 2) @ (mount_from_table @ Z)[:, :3, :3])
+        medians.append(float(np.median(np.linalg.norm(miss, axis=1))))
+    return float(np.mean(medians)) if medians else 0.0
+
+
+def _pairs(views: TableViews) -> IntArray:
+    """Pairs (m, 2) of views of one inner and one outer thing at two epochs, at most some thousands."""
+    group = views.inner * (1 + views.outer.max()) + views.outer
+    i, j = np.triu_indices(len(group), 1)
+    keep = (group[i] == group[j]) & (views.epoch[i] != views.epoch[j])
+    pairs = np.column_stack([i[keep], j[keep]])
+    return pairs[:: max(1, len(pairs) // 5000)]
+
+
+def _turns(flat: FloatArray, pairs: IntArray) -> FloatArray:
+    """Angles (m,) rad between rotations (n, 9); exact near zero too."""
+    apart = np.linalg.norm(flat[pairs[:, 0]] - flat[pairs[:, 1]], axis=1)
+    # the Frobenius norm of R1 - R2 is 2 sqrt(2) sin(angle / 2)
+    return np.asarray(2.0 * np.arcsin(np.clip(apart / np.sqrt(8.0), 0.0, 1.0)))

@@ -1,0 +1,1 @@
+"""Several epochs: adjusted together, compared by congruence, and what moved between them."""

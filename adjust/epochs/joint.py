@@ -1,0 +1,80 @@
+"""Several epochs adjusted together: one survey in which stable points are shared, and all others are one per epoch."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from typing import Any
+
+from adjust.model.errors import SurveyError
+from adjust.model.observations import PositionRef
+from adjust.model.survey import Datum, Point, Survey
+
+_PARTS = ("cameras", "stations", "tables", "targets", "image_blocks", "table_readings", "pairs", "levels", "alignments",
+          "laser_spots", "on_surfaces", "surfaces", "beams")  # fmt: skip
+_IDS = ("distance_id", "reading_id")
+
+
+def epoch_name(name: str, epoch: str) -> str:
+    """A point, setup or reading of one epoch in the joint survey."""
+    return f"{name}@{epoch}"
+
+
+def joint_survey(epochs: Mapping[str, Survey], stable: Collection[str]) -> Survey:
+    """One survey of point networks at several epochs. stable: points that are the same in all epochs that have them.
+
+    Other points become one per epoch, named ``point@epoch``, and so do setups and ids of observations; instruments
+    with the same id are shared. The datum is inner over the stable points where any epoch's is. Raises SurveyError for
+    surveys with cameras, tables or stations (their poses have epochs of their own), and for unknown stable points.
+    """
+    if len(epochs) < 2:
+        raise SurveyError("a joint adjustment of epochs needs two surveys or more")
+    known = {p.point_id for s in epochs.values() for p in s.points}
+    lost = [p for p in stable if p not in known]
+    if lost:
+        raise SurveyError(f"stable point {lost[0]!r} is in none of the epochs")
+    for epoch, survey in epochs.items():
+        other = [part for part in _PARTS if getattr(survey, part)]
+        if other:
+            raise SurveyError(
+                f"epoch {epoch}: {other[0]} cannot be joined by renaming points; give their poses one per epoch in one "
+                "project instead"
+            )
+    points: dict[str, Point] = {}
+    parts: dict[str, list[Any]] = {name: [] for name in ("distances", "coordinates", "coordinate_differences", "setups",
+                                                         "readings", "reading_covariances")}  # fmt: skip
+    instruments: dict[str, Any] = {}
+    for epoch, survey in epochs.items():
+        for point in survey.points:
+            name = point.point_id if point.point_id in stable else epoch_name(point.point_id, epoch)
+            points.setdefault(name, replace(point, point_id=name))
+        instruments |= {i.instrument_id: i for i in survey.instruments if i.instrument_id not in instruments}
+        for part, found in parts.items():
+            found += [_renamed(x, epoch, stable) for x in getattr(survey, part)]
+    first = next(iter(epochs.values()))
+    inner = any(s.datum.kind == "inner" for s in epochs.values())
+    datum = Datum("inner", points=tuple(p for p in points if p in stable)) if inner else first.datum
+    whole = Survey(points=tuple(points.values()), datum=datum, vertical=first.vertical, bearings=first.bearings,
+                   instruments=tuple(instruments.values()))  # fmt: skip
+    observed: dict[str, Any] = {k: tuple(v) for k, v in parts.items()}
+    return replace(whole, **observed)
+
+
+def _renamed(item: Any, epoch: str, stable: Collection[str]) -> Any:
+    """An observation or setup of one epoch, with its own ids and points."""
+    changed: dict[str, Any] = {}
+    for name in item.__dataclass_fields__:
+        value = getattr(item, name)
+        if isinstance(value, PositionRef):
+            changed[name] = _position(value, epoch, stable)
+        elif isinstance(value, tuple) and value and isinstance(value[0], PositionRef):
+            changed[name] = tuple(_position(v, epoch, stable) for v in value)
+        elif (name == "setup_id" and value) or name in _IDS:
+            changed[name] = epoch_name(value, epoch)
+        elif name == "reading_ids":
+            changed[name] = tuple(epoch_name(v, epoch) for v in value)
+    return replace(item, **changed)
+
+
+def _position(ref: PositionRef, epoch: str, stable: Collection[str]) -> PositionRef:
+    if ref.frame is not None or ref.point_id is None or ref.point_id in stable:
+        return ref
+    return replace(ref, point_id=epoch_name(ref.point_id, epoch))

@@ -1,0 +1,167 @@
+"""The current values of all slots, lenses and warps as plain arrays, for the compiled kernels."""
+
+from collections.abc import Iterable
+
+import gtsam
+import numpy as np
+
+from adjust.frames.chains import table_motion
+from adjust.frames.unknowns import TableSlot, Unknowns, VectorMap, vector_map
+from adjust.lenses.models import MODELS, camera_constants
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray, IntArray, Survey, VectorParameter
+from adjust.native.images import LensArrays
+from adjust.native.lenses import MAX_LENS
+
+
+class State:
+    """Arrays that the kernels read. :meth:`load` fills them from GTSAM values; nothing else changes them.
+
+    slot_R (S, 3, 3), slot_t (S, 3): poses of all slots. D (table slots, 6, 6): derivative of a table's motion by its
+    free angles and free geometry, ``angles`` columns first. lenses: see LensArrays. warp (targets, 2) m.
+    """
+
+    def __init__(self, survey: Survey, unknowns: Unknowns) -> None:
+        self.unknowns = unknowns
+        self.cameras = {c.camera_id: i for i, c in enumerate(survey.cameras)}
+        self.targets = {t.target_id: i for i, t in enumerate(survey.targets)}
+        self.lens_maps = [unknowns.vectors[("lens", c.camera_id)] for c in survey.cameras]
+        self.warp_maps: list[VectorMap | None] = [unknowns.vectors.get(("warp", t.target_id)) for t in survey.targets]
+        self.lenses = self._lens_arrays(survey)
+        n = len(unknowns.slot_key)
+        self.slot_R, self.slot_t = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        for slot, pose in enumerate(unknowns.slot_pose):
+            self._set(slot, pose)
+        self.table_index: IntArray = np.full(n, -1, dtype=np.int64)
+        for i, table_slot in enumerate(unknowns.table_slots):
+            self.table_index[table_slot] = i
+        self.D = np.zeros((max(1, len(unknowns.table_slots)), 6, 6))
+        self.warp = np.zeros((max(1, len(survey.targets)), 2))
+        self._free_slots = [
+            (slot, key)
+            for slot, key in enumerate(unknowns.slot_key)
+            if key is not None and slot not in unknowns.table_slots
+        ]
+        self._pose_keys = {key for _, key in self._free_slots}
+        self.loaded: gtsam.Values | None = None
+        """The values that everything here is of; None while some of it is of others."""
+        self._slots_by_key = np.array([s for s, _ in sorted(self._free_slots, key=lambda x: x[1])], dtype=np.int64)
+
+    def _lens_arrays(self, survey: Survey) -> LensArrays:
+        n = len(survey.cameras)
+        integers = (np.zeros((n, MAX_LENS), dtype=np.int64), np.zeros((n, MAX_LENS), dtype=np.int64))
+        arrays = LensArrays(
+            np.array([MODELS[c.lens.model].kind for c in survey.cameras], dtype=np.int64),
+            np.zeros((n, MAX_LENS)),
+            np.zeros((n, 4)),
+            np.array([len(m.free) for m in self.lens_maps], dtype=np.int64),
+            np.zeros(n, dtype=np.int64),
+            *integers,
+            np.zeros((n, MAX_LENS)),
+        )
+        for i, camera in enumerate(survey.cameras):
+            arrays.constants[i] = camera_constants(camera)
+            sources, columns = np.nonzero(self.lens_maps[i].matrix)
+            k = arrays.n_map[i] = len(sources)
+            arrays.source[i, :k], arrays.column[i, :k] = sources, columns
+            arrays.factor[i, :k] = self.lens_maps[i].matrix[sources, columns]
+        return arrays
+
+    def _set(self, slot: int, pose: gtsam.Pose3) -> None:
+        matrix = pose.matrix()
+        self.slot_R[slot], self.slot_t[slot] = matrix[:3, :3], matrix[:3, 3]
+
+    def load(self, values: gtsam.Values, slots: Iterable[int] | None = None, lenses: bool = True) -> None:
+        """Read everything, or only these slots (and the lenses and warps unless told otherwise), from ``values``."""
+        if slots is None:
+            self._load_poses(values)
+            self._move_tables(values, self.unknowns.table_slots.values())
+            self.loaded = values if lenses else None
+        else:
+            self.loaded = self.loaded if values is self.loaded else None
+            asked = list(slots)
+            self._move_tables(values, [t for s, t in self.unknowns.table_slots.items() if s in asked])
+            for slot in asked:
+                if slot not in self.unknowns.table_slots and (found := self.unknowns.slot_key[slot]) is not None:
+                    self._set(slot, values.atPose3(found))
+        if lenses:
+            self._load_lenses(values)
+
+    def _load_poses(self, values: gtsam.Values) -> None:
+        """All free poses: in one call where ``values`` hold no others, which it gives in the order of their keys."""
+        rows = gtsam.utilities.extractPose3(values)  # (n, 12): rotation by rows, translation
+        if len(rows) == len(self._free_slots) and self._pose_keys.issubset(values.keys()):
+            self.slot_R[self._slots_by_key] = rows[:, :9].reshape(-1, 3, 3)
+            self.slot_t[self._slots_by_key] = rows[:, 9:]
+            return
+        for slot, key in self._free_slots:
+            self._set(slot, values.atPose3(key))
+
+    def _load_lenses(self, values: gtsam.Values) -> None:
+        for i, lens_map in enumerate(self.lens_maps):
+            full = lens_map.full(values)
+            self.lenses.values[i, : full.size] = full
+        for i, warp_map in enumerate(self.warp_maps):
+            if warp_map is not None:
+                self.warp[i] = warp_map.full(values)
+
+    def by_keys(self, slot: int, by_slot: FloatArray) -> list[tuple[int, FloatArray]]:
+        """From a derivative (n, 6) by a slot's pose to those by the unknowns behind it (none where it is held)."""
+        table = self.unknowns.table_slots.get(slot)
+        if table is None:
+            return [(key, by_slot) for key in self.unknowns.link_keys(slot)]
+        k, D = len(table.axes), self.D[self.table_index[slot]]
+        out = [(table.angles_key, by_slot @ D[:, :k])]
+        if table.geometry.key is not None:
+            out.append((table.geometry.key, by_slot @ D[:, k : k + len(table.geometry.free)]))
+        return out
+
+    def _move_tables(self, values: gtsam.Values, slots: Iterable[TableSlot]) -> None:
+        by_table: dict[str, list[TableSlot]] = {}
+        for slot in slots:
+            by_table.setdefault(slot.table_id, []).append(slot)
+        for tables in by_table.values():
+            self._move_table(values, tables)
+
+    def _move_table(self, values: gtsam.Values, slots: list[TableSlot]) -> None:
+        """Poses of one table's slots, and their derivatives into D."""
+        axes, geometry = slots[0].axes, slots[0].geometry
+        k, at = len(axes), [s.slot for s in slots]
+        angles = np.zeros((len(slots), 2))
+        angles[:, :k] = [values.atVector(s.angles_key) for s in slots]
+        given = dict.fromkeys(("zero_1", "zero_2", "non_orthogonality", "axis_offset"), 0.0)
+        given |= dict(zip(geometry.names, geometry.full(values).tolist(), strict=True))
+        zero_1, zero_2, tilt, offset = given.values()
+        one = np.ones(len(slots))
+        self.slot_R[at], self.slot_t[at], derivative = table_motion(
+            axes[0], axes[1] if k == 2 else -1, angles[:, 0] + zero_1, angles[:, 1] + zero_2, tilt * one, offset * one
+        )
+        columns = [list(given).index(name) for name in geometry.names]
+        by_geometry = derivative[:, :, columns] @ geometry.matrix
+        rows = self.table_index[at]
+        self.D[rows, :, :k] = derivative[:, :, :k]
+        self.D[rows, :, k : k + by_geometry.shape[2]] = by_geometry
+
+
+def collect_vectors(survey: Survey, unknowns: Unknowns, lenses: dict[str, FloatArray]) -> None:
+    """Register the lenses and board warps. ``lenses`` gives the full start vector of every camera.
+
+    Raises SurveyError where a target's warp or a lens names components its model does not have.
+    """
+    for camera in survey.cameras:
+        model = MODELS[camera.lens.model]
+        unknown_names = set(camera.lens.free) - set(model.names)
+        if unknown_names:
+            raise SurveyError(
+                f"camera {camera.camera_id!r}: lens model {model.name!r} has no parameter {sorted(unknown_names)}; "
+                f"it has {', '.join(model.names)}"
+            )
+        parameter = VectorParameter(
+            model.names, lenses[camera.camera_id], camera.lens.free, camera.lens.prior, camera.lens.ties
+        )
+        name = ("lens", camera.camera_id)
+        unknowns.vectors[name] = vector_map(parameter, model.units, unknowns, name)
+    for target in survey.targets:
+        if target.warp is not None:
+            name = ("warp", target.target_id)
+            unknowns.vectors[name] = vector_map(target.warp, ("m", "m"), unknowns, name)

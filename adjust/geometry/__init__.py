@@ -1,1 +1,0 @@
-"""Observations of geometry: levels, parallel axes, laser spots, surfaces, coordinate differences."""

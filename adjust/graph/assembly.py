@@ -1,0 +1,469 @@
+"""From a survey and its start values to one GTSAM factor graph."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TypeVar
+
+import gtsam
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.frames.state import State, collect_vectors
+from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef
+from adjust.model.result import ParameterName
+from adjust.model.survey import BoolArray, FloatArray, Survey, VectorPrior
+from adjust.observations.factors import (
+    ChainPose,
+    Position,
+    coordinates_factor,
+    distance_factor,
+    gaussian,
+    hold_factor,
+    pair_factor,
+    pose_prior_factor,
+    vector_prior_factor,
+)
+from adjust.observations.geometry.building import GeometryFactors, position_refs
+from adjust.observations.images.batch import ImageBatch, warp_shape
+from adjust.observations.images.bundle_points import add_point_factors
+from adjust.observations.images.bundles import BundleBatch
+from adjust.observations.images.reduction import PoseReduction, reduction
+from adjust.observations.listed import ObservationFactor, frame_text, position_text
+from adjust.observations.terrestrial.batch import TerrestrialBatch
+from adjust.observations.terrestrial.building import build_batch, reading_refs
+from adjust.observations.terrestrial.parameters import collect_terrestrial, full_start
+
+_Rows = TypeVar("_Rows", FloatArray, BoolArray)
+
+
+@dataclass(frozen=True, eq=False)
+class StartValues:
+    """Where the adjustment begins: full lens vectors, poses by parameter name, world points, table angles, vectors."""
+
+    lenses: Mapping[str, FloatArray]
+    poses: Mapping[ParameterName, Pose3]
+    points: Mapping[str, FloatArray]
+    vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
+
+
+@dataclass(eq=False)
+class AdjustmentGraph:
+    """The graph, its start and the batches that serve it. Held together with the survey only by the solver.
+
+    ``graph`` has every observation as a factor on its unknowns and nothing else; ``system`` is a view of it for the
+    solver, in which points and poses that nothing else touches are reduced.
+    reduction: of the poses that only image points touch, while ``system`` is without them; None where nothing is
+    reduced, or no longer.
+    """
+
+    survey: Survey
+    unknowns: Unknowns
+    state: State
+    start: gtsam.Values
+    images: ImageBatch
+    bundle: BundleBatch | None
+    image_order: list[tuple[int, bool]]
+    others: list[ObservationFactor]
+    others_graph: gtsam.NonlinearFactorGraph
+    terrestrial: TerrestrialBatch | None = None
+    reduction: PoseReduction | None = None
+
+    @cached_property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """All factors on all unknowns, right at any values and in any of GTSAM's algorithms."""
+        if self.bundle is None:
+            return self._unreduced
+        graph = self._factors(None)
+        add_point_factors(self.bundle, graph)
+        return graph
+
+    @cached_property
+    def _reduced(self) -> gtsam.NonlinearFactorGraph:
+        graph = self._factors(self.reduction)
+        if self.bundle is not None:
+            self.bundle.add_factor(graph)
+        if self.reduction is not None:
+            self.reduction.add_factor(graph)
+        return graph
+
+    @cached_property
+    def _unreduced(self) -> gtsam.NonlinearFactorGraph:
+        graph = self._factors(None)
+        if self.bundle is not None:
+            self.bundle.add_factor(graph)
+        return graph
+
+    @property
+    def system(self) -> gtsam.NonlinearFactorGraph:
+        """What the solver linearises, after :meth:`prepare` at the same values: a view of ``graph``.
+
+        Of the same chi-square, with what :attr:`reduction` and :attr:`bundle` reduce eliminated already.
+        """
+        return self._unreduced if self.reduction is None else self._reduced
+
+    def _factors(self, reduction: PoseReduction | None) -> gtsam.NonlinearFactorGraph:
+        """All factors but those of a bundle, and of the image blocks that ``reduction`` takes."""
+        graph = gtsam.NonlinearFactorGraph(self.others_graph)
+        self.images.add_factors(graph, None if reduction is None else reduction.others)
+        if self.terrestrial is not None:
+            self.terrestrial.add_factors(graph)
+        return graph
+
+    def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
+        """Evaluate all batches at ``values``. Where the reduction finds no inverse, it is given up: all is shown."""
+        self.state.load(values)
+        self.images.prepare(values, jacobians)
+        if jacobians:
+            if self.reduction is not None and not self.reduction.reduce(damping):
+                self.reduction = None
+            self.images.serve(None if self.reduction is None else self.reduction.others)
+        if self.terrestrial is not None:
+            self.terrestrial.prepare(values, jacobians)
+        if self.bundle is not None:
+            self.bundle.prepare(values, jacobians, damping)
+
+    def objective(self, values: gtsam.Values) -> float:
+        """Weighted square sum v'Pv at ``values``, at which everything is prepared."""
+        images = float(self.images.chi.sum()) + (self.bundle.chi_square if self.bundle is not None else 0.0)
+        readings = self.terrestrial.chi_square if self.terrestrial is not None else 0.0
+        return images + readings + 2.0 * float(self.others_graph.error(values))
+
+    def omega(self, values: gtsam.Values) -> float:
+        """Weighted square sum v'Pv at ``values``."""
+        self.prepare(values, jacobians=False)
+        return self.objective(values)
+
+    def _split(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rows (N, ...) in the order of ``Survey.image_blocks``, for the image batch and for the bundle."""
+        ptr = np.cumsum([0] + [len(b.uv) for b in self.survey.image_blocks])
+        parts: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+        for i, free in self.image_order:
+            parts[int(free)].append(rows[ptr[i] : ptr[i + 1]])
+        known, unknown = (np.concatenate(p) if p else rows[:0] for p in parts)
+        return known, unknown
+
+    def _joined(self, known: _Rows, unknown: _Rows) -> _Rows:
+        if self.bundle is None:
+            return known
+        out, at = [], [0, 0]
+        for i, free in self.image_order:
+            n = len(self.survey.image_blocks[i].uv)
+            source = unknown if free else known
+            out.append(source[at[int(free)] : at[int(free)] + n])
+            at[int(free)] += n
+        return np.concatenate(out) if out else known
+
+    def used(self) -> BoolArray:
+        """Which image points (N,) take part, in the order of ``Survey.image_blocks``."""
+        none: BoolArray = np.zeros(0, dtype=np.bool_)
+        return self._joined(self.images.used, none if self.bundle is None else self.bundle.unsorted(self.bundle.used))
+
+    def square_roots(self) -> FloatArray:
+        """Square root information (N, 3) of the image points: w00, w01, w11, as ``Survey.image_blocks`` are ordered."""
+        none = np.zeros((0, 3))
+        return self._joined(self.images.W_all, none if self.bundle is None else self.bundle.unsorted(self.bundle.W_all))
+
+    def set_weights(self, weights: FloatArray) -> None:
+        """Weights (N,) of the image points, on top of their covariance; zero leaves a point out."""
+        known, unknown = self._split(weights)
+        self.images.set_weights(known)
+        if self.bundle is not None:
+            self.bundle.set_weights(unknown)
+
+    def whitened_squares(self, values: gtsam.Values) -> FloatArray:
+        """Weighted squares v' inv(Q_ll) v (N,) of all image points at ``values``, whatever their weight."""
+        self.prepare(values, jacobians=False)
+        bundle = self.bundle.whitened_squares(values) if self.bundle is not None else np.zeros(0)
+        return self._joined(self.images.whitened_squares(), bundle)
+
+    def behind_camera(self) -> list[ImageBlock]:
+        """Blocks with a point behind their camera at the prepared values."""
+        found = [self.images.blocks[b] for b in np.flatnonzero(self.images.depth <= 0.0)]
+        if self.bundle is not None:
+            found += [b for b, z in zip(self.bundle.blocks, self.bundle.depth, strict=True) if z <= 0.0]
+        if not found:
+            return found
+        fisheye = {c.camera_id for c in self.survey.cameras if c.lens.model == "fisheye"}
+        return [b for b in found if b.camera_id not in fisheye]
+
+
+class GraphBuilder:
+    """Builds an :class:`AdjustmentGraph`; one use."""
+
+    def __init__(self, survey: Survey, lenses: Mapping[str, FloatArray]) -> None:
+        self.survey, self.unknowns = survey, Unknowns()
+        collect_vectors(survey, self.unknowns, dict(lenses))
+        self.terrestrial = collect_terrestrial(survey, self.unknowns)
+        self.frames = FrameTree(survey, self.unknowns)
+        self.point_ids = [p.point_id for p in survey.points]
+        self.known_ids = set(self.point_ids)
+        self.targets = {t.target_id: t for t in survey.targets}
+        self.others: list[ObservationFactor] = []
+        self.vector_starts: dict[ParameterName, FloatArray] = {}
+
+    def build(self, start: StartValues) -> AdjustmentGraph:
+        """The whole graph. Raises SurveyError naming what is missing or contradictory."""
+        self._register_points()
+        split = [self._block(i, block) for i, block in enumerate(self.survey.image_blocks)]
+        chains = {i: self.frames.of_image(block) for i, _, block in split}
+        positions, pair_chains = self._chains_of_others()
+        geometry = GeometryFactors(self.survey, self.unknowns, self.frames)
+        self.vector_starts |= geometry.starts
+        state = State(self.survey, self.unknowns)
+        at = {ref: self._position(state, ref, chain) for ref, chain in positions.items()}
+        values = self._values(start)
+        readings = build_batch(self.survey, self.unknowns, self.terrestrial, self.frames, state, at)
+        if readings is not None:
+            turned = {s: u.key for s, n in self.terrestrial.repeated.items() if (u := self.unknowns.by_name.get(n))}
+            readings.orient(values, {name[1] for name in start.vectors if name[0] == "orientation"}, turned)
+            readings.update_sigmas(values)
+        survey = geometry.find_starts(state, at, values, start.vectors)
+        self._other_factors(state, at, pair_chains)
+        self.others += geometry.factors(state, at, values)
+        self._priors()
+        others = gtsam.NonlinearFactorGraph()
+        for item in self.others:
+            if item.used:
+                others.add(item.factor)
+        for factor in self._holds():
+            others.add(factor)
+        known = [(i, b) for i, free, b in split if not free]
+        n_warp = {t: self._n_warp(t) for t in dict.fromkeys(b.target_id for _, b in known)}
+        x_in_world = self._world_points() if None in n_warp else np.zeros((0, 3))
+        images = ImageBatch(
+            self.survey, state, [b for _, b in known], [chains[i] for i, _ in known], x_in_world, n_warp
+        )
+        # unused observations too: they are predicted with the joint covariance of their unknowns
+        outside = {k for item in self.others for k in list(item.factor.keys())} | set(self.unknowns.held)
+        outside |= readings.keys if readings is not None else set()
+        of_images = set(images.of_blocks.key.tolist())
+        unknown = [(i, b) for i, free, b in split if free]
+        bundle = None
+        if unknown:
+            bundle = BundleBatch(
+                self.unknowns, state, [b for _, b in unknown], [chains[i] for i, _ in unknown], self.point_ids,
+                outside | of_images,
+            )  # fmt: skip
+            outside |= set(bundle.order) | set(bundle.point_key.values())
+        # a free datum is found and completed with all unknowns in sight
+        reduced = None if survey.datum.kind == "inner" else reduction(images, self.unknowns, outside)
+        order = [(i, free) for i, free, _ in split]
+        return AdjustmentGraph(
+            survey, self.unknowns, state, values, images, bundle, order, self.others, others, readings, reduced,
+        )  # fmt: skip
+
+    def _register_points(self) -> None:
+        for point in self.survey.points:
+            parameter = point.x_in_world
+            if parameter.treatment == "held":
+                if parameter.value is None:
+                    raise SurveyError(f"point {point.point_id!r} is held but has no coordinates; give x_mm")
+                self.unknowns.held_points[point.point_id] = np.asarray(parameter.value, dtype=float)
+            else:
+                unknown = self.unknowns.add(("point", point.point_id), "point", ("x", "y", "z"), ("m", "m", "m"))
+                self.unknowns.hold(unknown, parameter.held)
+
+    def _block(self, i: int, block: ImageBlock) -> tuple[int, bool, ImageBlock]:
+        free = block.target_id is None and any(
+            self.point_ids[int(p)] not in self.unknowns.held_points for p in block.point_idx
+        )
+        return i, free, block
+
+    def block_keys(self, block: ImageBlock) -> set[int]:
+        """Keys of the pose and table unknowns that an image block depends on."""
+        return {key for link in self.frames.of_image(block) for key in self.unknowns.link_keys(link.slot)}
+
+    def table_keys(self) -> set[int]:
+        """Keys of the table angles, which are always read."""
+        return {u.key for name, u in self.unknowns.by_name.items() if name[0] == "table_angles"}
+
+    def _world_points(self) -> FloatArray:
+        """Held world points (P, 3) m; NaN for those that are not held."""
+        held, unheld = self.unknowns.held_points, np.full(3, np.nan)
+        return np.array([held.get(p, unheld) for p in self.point_ids]).reshape(-1, 3)
+
+    def _n_warp(self, target_id: str | None) -> int:
+        vector = self.unknowns.vectors.get(("warp", target_id or ""))
+        if vector is None or vector.key is None:
+            return 0
+        if vector.free != vector.names:
+            raise SurveyError(f"target {target_id!r}: free both components of the warp or none")
+        return 2
+
+    def _position_chain(self, ref: PositionRef) -> Chain | None:
+        if ref.frame is None:
+            if ref.point_id not in self.known_ids:
+                raise SurveyError(f"point {ref.point_id!r} is observed but not part of the survey; add it under points")
+            return None
+        return self.frames.relative(ref.frame, FrameRef("world"))
+
+    def _chains_of_others(self) -> tuple[dict[PositionRef, Chain | None], list[Chain]]:
+        refs = [r for d in self.survey.distances for r in (d.a, d.b)]
+        refs += [r for c in self.survey.coordinates for r in c.positions]
+        refs += position_refs(self.survey) + reading_refs(self.survey)
+        positions = {ref: self._position_chain(ref) for ref in refs}
+        return positions, [self.frames.relative(p.a, p.b) for p in self.survey.pairs]
+
+    def _position(self, state: State, ref: PositionRef, chain: Chain | None) -> Position:
+        if chain is None:
+            unknown = self.unknowns.by_name.get(("point", ref.point_id or ""))
+            held = self.unknowns.held_points.get(ref.point_id or "", np.zeros(3))
+            return Position(None, held, unknown.key if unknown else None)
+        pose = ChainPose(self.unknowns, state, chain)
+        if ref.point_id is None or ref.frame is None:
+            return Position(pose, np.zeros(3))
+        target = self.targets[ref.frame.frame_id]
+        if ref.point_id not in target.point_ids:
+            raise SurveyError(f"target {target.target_id!r} has no point {ref.point_id!r}")
+        i = target.point_ids.index(ref.point_id)
+        sag = warp_shape(target.x_in_target)[i]
+        warp = self.unknowns.vectors.get(("warp", target.target_id))
+        return Position(pose, target.x_in_target[i], None, warp, (float(sag[0]), float(sag[1])))
+
+    def _other_factors(
+        self, state: State, at: Mapping[PositionRef, Position], pair_chains: list[Chain]
+    ) -> None:
+        for reading in self.survey.table_readings:
+            unknown = self.unknowns.by_name.get(("table_angles", reading.table_id, reading.epoch_id))
+            if unknown is not None:
+                factor = gtsam.PriorFactorVector(unknown.key, reading.angles, gaussian(reading.cov))
+                self._other(factor, "table", reading.group, (reading.table_id, reading.epoch_id), unknown.components,
+                            unknown.units, reading.angles, reading.used)  # fmt: skip
+        for pair, chain in zip(self.survey.pairs, pair_chains, strict=True):
+            self._pair(state, pair, chain)
+        for d in self.survey.distances:
+            if not at[d.a].keys and not at[d.b].keys:
+                raise SurveyError(f"distance {d.distance_id!r} joins two held positions; it can adjust nothing")
+            ids = (d.distance_id, position_text(d.a), position_text(d.b))
+            self._other(distance_factor(d, at[d.a], at[d.b]), "distance", d.group, ids, ("distance",), ("m",),
+                        np.array([d.value]), d.used)  # fmt: skip
+        for c in self.survey.coordinates:
+            known = np.isfinite(np.diag(c.cov))
+            names = tuple(f"{position_text(p)} {axis}" for p in c.positions for axis in "xyz")
+            names = tuple(np.array(names)[known].tolist())
+            owners = tuple(position_text(p) for p in c.positions)
+            self._other(coordinates_factor(c, [at[p] for p in c.positions]), "coordinates", c.group, owners, names,
+                        ("m",) * len(names), c.values.ravel()[known], c.used)  # fmt: skip
+
+    def _pair(self, state: State, pair: Pair, chain: Chain) -> None:
+        factor = pair_factor(pair, self.unknowns, state, chain)
+        measured = pair.b_from_a
+        observed = Pose3.Logmap(measured) if isinstance(measured, Pose3) else Rot3.Logmap(measured)
+        n = len(observed)
+        self._other(factor, "pair", pair.group, (pair.pair_id, frame_text(pair.a), frame_text(pair.b)),
+                    POSE_COMPONENTS[:n], POSE_UNITS[:n], observed, pair.used)  # fmt: skip
+
+    def _priors(self) -> None:
+        u = self.unknowns
+        for name, parameter in u.parameters.items():
+            if parameter.treatment == "prior":
+                if parameter.value is None or parameter.prior_cov is None:
+                    raise SurveyError(f"{' '.join(name)} has a prior without value or covariance; give both")
+                factor = pose_prior_factor(parameter, u.by_name[name].key)
+                known = np.isfinite(np.diag(parameter.prior_cov))
+                self._other(factor, "prior", "prior", name, tuple(np.array(POSE_COMPONENTS)[known]),
+                            tuple(np.array(POSE_UNITS)[known]), np.zeros(int(known.sum())))  # fmt: skip
+        for point in self.survey.points:
+            p = point.x_in_world
+            if p.treatment == "prior":
+                if p.value is None or p.prior_cov is None:
+                    raise SurveyError(f"point {point.point_id!r} has a prior without coordinates or sigma; give both")
+                name = ("point", point.point_id)
+                known = np.isfinite(np.diag(p.prior_cov))
+                mean = Coordinates((PositionRef(point.point_id),), np.asarray(p.value)[None], p.prior_cov)
+                factor = coordinates_factor(mean, [Position(None, np.zeros(3), u.by_name[name].key)])
+                self._other(factor, "prior", "prior", name, tuple(np.array(["x", "y", "z"])[known]),
+                            ("m",) * int(known.sum()), np.asarray(p.value)[known])  # fmt: skip
+        owners: list[tuple[ParameterName, VectorPrior | None]]
+        owners = [(("lens", c.camera_id), c.lens.prior) for c in self.survey.cameras]
+        owners += [(("table_geometry", t.table_id), t.geometry.prior) for t in self.survey.tables]
+        owners += [(("warp", t.target_id), t.warp.prior) for t in self.survey.targets if t.warp]
+        owners += [(("beam", b.beam_id), b.parameters.prior) for b in self.survey.beams]
+        owners += [(("surface", s.surface_id), s.parameters.prior) for s in self.survey.surfaces if s.parameters]
+        owners += [(("vertical",), self.survey.vertical.tilt.prior)]
+        owners += self.terrestrial.priors.items()
+        for name, prior in owners:
+            vector = u.vectors.get(name)
+            if prior is not None and vector is not None and vector.key is not None:
+                units = tuple(vector.units[vector.names.index(x)] for x in prior.names)
+                self._other(vector_prior_factor(prior, vector), "prior", "prior", name, prior.names, units, prior.mean)
+
+    def _holds(self) -> list[gtsam.NonlinearFactor]:
+        """What keeps single components of poses and points at their values. Raises SurveyError where there is none."""
+        u = self.unknowns
+        values = {name: parameter.value for name, parameter in u.parameters.items()}
+        points: dict[ParameterName, FloatArray | None] = {
+            ("point", p.point_id): p.x_in_world.value for p in self.survey.points
+        }
+        factors = []
+        for key, held in u.held.items():
+            unknown = u.by_key[key]
+            value = points[unknown.name] if unknown.kind == "point" else values[unknown.name]
+            if value is None:
+                names = ", ".join(unknown.components[i] for i in held)
+                raise SurveyError(f"{' '.join(unknown.name)}: {names} held without a value; give it one")
+            factors.append(hold_factor(unknown, held, value))
+        return factors
+
+    def _other(
+        self, factor: gtsam.NonlinearFactor, kind: str, group: str, ids: tuple[str, ...], components: tuple[str, ...],
+        units: tuple[str, ...], observed: FloatArray, used: bool = True,
+    ) -> None:  # fmt: skip
+        self.others.append(
+            ObservationFactor(factor, kind, group, ids, components, units, np.asarray(observed, dtype=float), used)
+        )
+
+    def _values(self, start: StartValues) -> gtsam.Values:
+        values = gtsam.Values()
+        missing = []
+        for name, unknown in self.unknowns.by_name.items():
+            if unknown.kind == "pose":
+                if name in start.poses:
+                    values.insert(unknown.key, start.poses[name])
+                else:
+                    missing.append(" ".join(name))
+            elif unknown.kind == "point":
+                if name[1] in start.points:
+                    values.insert(unknown.key, np.asarray(start.points[name[1]], dtype=float))
+                else:
+                    missing.append(" ".join(name))
+            else:
+                values.insert(unknown.key, self._start_vector(name, start))
+        if missing:
+            raise SurveyError("no start value for " + ", ".join(missing))
+        return values
+
+    def _start_vector(self, name: ParameterName, start: StartValues) -> FloatArray:
+        if name[0] == "table_angles":
+            for reading in self.survey.table_readings:
+                if (reading.table_id, reading.epoch_id) == name[1:]:
+                    return np.array(start.vectors.get(name, reading.angles), dtype=float)
+        vector = self.unknowns.vectors[name]
+        if name[0] == "lens":
+            full = start.lenses[name[1]]
+        elif name in start.vectors:
+            full = start.vectors[name]
+        elif name in self.vector_starts:
+            full = self.vector_starts[name]
+        elif name[0] in ("vertical", "instrument", "orientation", "centring"):
+            full = full_start(name, self.survey)
+        elif name[0] == "table_geometry":
+            full = next(t.geometry.values for t in self.survey.tables if t.table_id == name[1])
+        else:
+            full = next(t.warp.values for t in self.survey.targets if t.target_id == name[1] and t.warp)
+        return np.array([full[vector.names.index(x)] for x in vector.free], dtype=float)
+
+
+def inner_datum_keys(survey: Survey, unknowns: Unknowns) -> list[int]:
+    """The unknowns that the survey names (or all points, else all stations) for inner constraints."""
+    datum, by_name = survey.datum, unknowns.by_name
+    points = datum.points or (() if datum.stations else tuple(p.point_id for p in survey.points))
+    keys = [u.key for p in points if (u := by_name.get(("point", p)))]
+    stations = datum.stations
+    if not datum.points and not datum.stations and not keys:
+        stations = tuple(s.station_id for s in survey.stations)
+    keys += [u.key for name, u in by_name.items() if name[0] == "world_from_station" and name[1] in stations]
+    return keys

@@ -1,0 +1,254 @@
+"""The seven motions that images, pairs and readings cannot see, and inner constraints against them.
+
+The normal equations are solved with a minimal datum: as many single components as there are defects, held at no cost
+to the sparsity. Steps and covariances are then brought into the survey's datum, inner constraints ``R dx = 0`` over any
+number of unknowns, by an S-transformation (Baarda 1973; Koch 1999 section 3.3.6): ``S = I - G (R G)^-1 R`` with the
+motions G. The adjusted shape does not depend on either datum.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam import Pose3
+from scipy import sparse
+
+from adjust.frames.unknowns import Unknown
+from adjust.graph.assembly import AdjustmentGraph, inner_datum_keys
+from adjust.model.errors import SurveyError
+from adjust.model.result import ParameterName
+from adjust.model.survey import FloatArray, IntArray
+from adjust.observations.geometry.motions import MOVED, vector_motions
+from adjust.observations.terrestrial.motions import MOVED as READINGS_MOVED
+from adjust.observations.terrestrial.motions import reading_motions
+from adjust.spatial.motions import motions_of, points_motions, poses_at, poses_motions
+
+BLIND = 1e-8
+"""Length of the whitened Jacobian times a scaled direction that is not seen; rounding reaches 1e-13."""
+
+
+def gauge(graph: AdjustmentGraph, unknown: Unknown, values: gtsam.Values) -> FloatArray:
+    """How an unknown moves (dim, 7) with the whole survey: translations, rotations (about the world origin), scale."""
+    if unknown.name[0] in MOVED:
+        return vector_motions(graph.survey, graph.unknowns, unknown, values)
+    if unknown.name[0] in READINGS_MOVED:
+        return reading_motions(graph.survey, graph.unknowns, graph.terrestrial, unknown, values)
+    return motions_of(unknown, values, in_world(graph, unknown.name))
+
+
+def in_world(graph: AdjustmentGraph, name: ParameterName) -> bool:
+    """Whether a pose parameter is the pose of something in the world."""
+    if name[0] == "carrier_from_target":
+        return next(t.station_id for t in graph.survey.targets if t.target_id == name[1]) is None
+    return name[0] in ("world_from_station", "world_from_table")
+
+
+def visible_keys(graph: AdjustmentGraph) -> list[int]:
+    """The unknowns of the system that GTSAM solves, in a fixed order."""
+    seen = set(graph.system.keyVector())
+    return [u.key for u in graph.unknowns.by_name.values() if u.key in seen]
+
+
+@dataclass(frozen=True, eq=False)
+class Stacking:
+    """Where each key stands in a stacked vector of length ``n``."""
+
+    at: dict[int, slice]
+    n: int
+
+    def index(self, keys: Iterable[int]) -> IntArray:
+        """Positions of the components of ``keys``, one key after the other."""
+        places = [self.at[k] for k in keys]
+        start = np.array([p.start for p in places], dtype=np.int64)
+        dims = np.array([p.stop for p in places], dtype=np.int64) - start
+        first = np.cumsum(dims) - dims
+        return np.asarray(np.repeat(start - first, dims) + np.arange(int(dims.sum())))
+
+
+def stacking(graph: AdjustmentGraph, keys: Sequence[int]) -> Stacking:
+    """Stack ``keys`` in this order."""
+    at, n = {}, 0
+    for key in keys:
+        at[key] = slice(n, n + graph.unknowns.by_key[key].dim)
+        n = at[key].stop
+    return Stacking(at, n)
+
+
+def whitened_rows(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> sparse.csr_matrix:
+    """The whitened Jacobian (m, n), columns as stacked; ``stack`` has all keys of ``linear``."""
+    i, j, value = np.asarray(linear.sparseJacobian_())  # counted from 1; keys in ascending order, then the right side
+    place = np.append(stack.index(sorted(stack.at)), stack.n)
+    rows = int(i.max()) if len(i) else 0
+    full = sparse.csr_matrix((value, (i.astype(np.int64) - 1, place[j.astype(np.int64) - 1])), (rows, stack.n + 1))
+    return full[:, : stack.n]
+
+
+def times(linear: gtsam.GaussianFactorGraph, stack: Stacking, V: FloatArray) -> FloatArray:
+    """The whitened Jacobian times V (n, k), row after row."""
+    return np.asarray(whitened_rows(linear, stack) @ V)
+
+
+def normal_diagonal(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> FloatArray:
+    """Diagonal (n,) of the normal matrix."""
+    A = whitened_rows(linear, stack)
+    return np.asarray(A.multiply(A).sum(axis=0)).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class InnerDatum:
+    """Inner constraints: rows (k, dim) per key, relative to ``base``; ``directions`` (7, k) are the defects there.
+
+    minimal: per key the components that the normal equations hold, and their weights. sigma: of a datum component.
+    """
+
+    keys: list[int]
+    rows: dict[int, FloatArray]
+    base: gtsam.Values
+    kinds: dict[int, str]
+    directions: FloatArray
+    sigma: float
+    minimal: Mapping[int, tuple[IntArray, FloatArray]]
+
+    @property
+    def defect(self) -> int:
+        """Number of undetermined motions."""
+        return int(self.directions.shape[1])
+
+    def add_to(self, linear: gtsam.GaussianFactorGraph) -> None:
+        """Hold the minimal datum's components at their values."""
+        for key, (components, weights) in self.minimal.items():
+            dim = self.rows[key].shape[1] if key in self.rows else 3 if self.kinds[key] == "point" else 6
+            A = np.zeros((len(components), dim))
+            A[np.arange(len(components)), components] = weights
+            linear.add(key, A, np.zeros(len(components)), gtsam.noiseModel.Unit.Create(len(components)))
+
+    def completed(self, graph: AdjustmentGraph, values: gtsam.Values, delta: gtsam.VectorValues) -> gtsam.VectorValues:
+        """The step ``delta`` of all unknowns from ``values``, moved into this datum."""
+        motions = survey_motions(graph, values, self.directions)
+        offset, seen = np.zeros(self.defect), np.zeros((self.defect, self.defect))
+        for key, row in self.rows.items():
+            if self.kinds[key] == "point":
+                offset += row @ (np.asarray(values.atPoint3(key)) - np.asarray(self.base.atPoint3(key)) + delta.at(key))
+                seen += row @ motions[key]
+            else:
+                D = np.zeros((6, 6), order="F")
+                local = Pose3.Logmap(self.base.atPose3(key).between(values.atPose3(key)), D)
+                offset += row @ (local + D @ delta.at(key))
+                seen += row @ D @ motions[key]
+        shift = np.linalg.solve(seen, offset)
+        out = gtsam.VectorValues()
+        for key, moved in motions.items():
+            out.insert(key, delta.at(key) - moved @ shift)
+        return out
+
+
+def survey_motions(graph: AdjustmentGraph, values: gtsam.Values, directions: FloatArray) -> dict[int, FloatArray]:
+    """How every unknown moves (dim, k) with the motions ``directions`` (7, k) of the whole survey."""
+    unknowns = graph.unknowns.by_name.values()
+    points = [u.key for u in unknowns if u.kind == "point"]
+    x = np.array([values.atPoint3(key) for key in points]).reshape(-1, 3)
+    out = dict(zip(points, points_motions(x) @ directions, strict=True))
+    poses = [u for u in unknowns if u.kind == "pose"]
+    world = np.array([in_world(graph, u.name) for u in poses], dtype=np.bool_)
+    moved = poses_motions(*poses_at(values, [u.key for u in poses]), world) @ directions
+    out |= dict(zip([u.key for u in poses], moved, strict=True))
+    for u in unknowns:
+        if u.kind == "vector":
+            out[u.key] = gauge(graph, u, values) @ directions
+        for i in graph.unknowns.held.get(u.key, ()):
+            out[u.key][i] = 0.0
+    return out
+
+
+def defects(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> FloatArray:
+    """Directions (7, k) of the whole-survey motions that the observations do not see."""
+    keys = visible_keys(graph)
+    stack = stacking(graph, keys)
+    B = np.concatenate([gauge(graph, graph.unknowns.by_key[k], values) for k in keys])
+    d = np.sqrt(normal_diagonal(linear, stack))
+    lengths = np.linalg.norm(d[:, None] * B, axis=0)
+    usable = lengths > 0.0
+    scaled = times(linear, stack, B[:, usable] / lengths[usable])
+    _, s, Vt = np.linalg.svd(scaled, full_matrices=False)
+    null = Vt[s < BLIND].T
+    out = np.zeros((7, null.shape[1]))
+    out[usable] = null / lengths[usable, None]
+    return out
+
+
+def inner_datum(graph: AdjustmentGraph, base: gtsam.Values) -> InnerDatum | None:
+    """The inner constraints about ``base`` that the survey asks for, or None where its datum is given.
+
+    Raises SurveyError where nothing named can carry them.
+    """
+    if graph.survey.datum.kind != "inner":
+        return None
+    keys = inner_datum_keys(graph.survey, graph.unknowns)
+    if not keys:
+        raise SurveyError("datum kind 'inner' needs free points or free fixed stations; name some, or hold something")
+    graph.prepare(base, jacobians=True)
+    linear = graph.system.linearize(base)
+    stack = stacking(graph, visible_keys(graph))
+    weights = normal_diagonal(linear, stack)
+    directions = defects(graph, linear, base)
+    if directions.shape[1] == 0:
+        return None
+    by_key = graph.unknowns.by_key
+    motions = survey_motions(graph, base, directions)
+    rows = datum_rows(keys, motions)
+    minimal = minimal_datum(graph, stack, weights, motions)
+    kinds = {k: by_key[k].kind for k in [*keys, *minimal]}
+    sigma = float(1.0 / np.median(np.concatenate([w for _, w in minimal.values()])))
+    return InnerDatum(keys, rows, base, kinds, directions, sigma, minimal)
+
+
+def datum_rows(keys: Sequence[int], motions: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
+    """Orthonormal rows (k, dim per key) that forbid the motions (dim, k) of ``keys``; raises SurveyError."""
+    stacked = np.concatenate([motions[k] for k in keys])
+    Q, triangular = np.linalg.qr(stacked)
+    if len(stacked) < stacked.shape[1] or np.abs(np.diag(triangular)).min() < 1e-9 * np.abs(triangular).max():
+        raise SurveyError("the points and stations named for the inner datum cannot carry it; name three points")
+    rows, o = {}, 0
+    for key in keys:
+        dim = len(motions[key])
+        rows[key] = Q[o : o + dim].T.copy()
+        o += dim
+    return rows
+
+
+def independent_rows(B: FloatArray) -> IntArray:
+    """As many rows of B (n, k) as it has columns, each the one furthest from the span of those before it.
+
+    Source: QR factorisation with pivots, of the transpose (Golub and Van Loan, Matrix Computations, 5.4.2).
+    """
+    rest, chosen = B.copy(), []
+    for _ in range(B.shape[1]):
+        chosen.append(int(np.argmax(np.einsum("ij,ij->i", rest, rest))))
+        direction = rest[chosen[-1]] / max(float(np.linalg.norm(rest[chosen[-1]])), 1e-300)
+        rest -= np.outer(rest @ direction, direction)
+    return np.array(chosen, dtype=np.int64)
+
+
+def minimal_datum(
+    graph: AdjustmentGraph, stack: Stacking, diagonal: FloatArray, motions: Mapping[int, FloatArray]
+) -> dict[int, tuple[IntArray, FloatArray]]:
+    """As many components of points and poses as there are defects, those that tell the motions apart best.
+
+    diagonal: of the normal matrix, stacked. The components are independent rows of the motions in units of the
+    components' own sigmas.
+    """
+    root = np.sqrt(diagonal)
+    by_key = graph.unknowns.by_key
+    keys = [k for k in stack.at if by_key[k].kind in ("point", "pose") and np.abs(motions[k]).max() > 0.0]
+    if not keys:
+        raise SurveyError("an inner datum needs free points or poses of the world; free some, or set no inner datum")
+    index = stack.index(keys)
+    B = np.concatenate([motions[k] for k in keys]) * root[index][:, None]
+    chosen = independent_rows(np.linalg.qr(B)[0])
+    out: dict[int, tuple[IntArray, FloatArray]] = {}
+    owner = np.repeat(np.arange(len(keys)), [by_key[k].dim for k in keys])
+    for number in dict.fromkeys(owner[chosen].tolist()):
+        mine = np.sort(index[chosen][owner[chosen] == number])
+        out[keys[number]] = (mine - stack.at[keys[number]].start, root[mine])
+    return out

@@ -1,0 +1,141 @@
+"""What to say of an adjustment that did not arrive: what moved away, and which observations fit worst, by group."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from adjust.frames.unknowns import Unknown
+from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.rank import readable
+from adjust.model.errors import SurveyError
+from adjust.observations.listed import position_text
+
+_GROUPS, _OWNERS, _MOVED = 4, 3, 4
+_BY_FAR = 9.0
+"""Mean square over that of the next, from which an owner stands out."""
+_MISFIT = 16.0
+"""Mean squares over their variance from which a group or one of its owners is named: four sigmas."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """One observation: its group, whom it belongs to (a setup, a camera, itself), its name, and v'Pv per component."""
+
+    group: str
+    owner: str
+    text: str
+    square: float
+
+
+def describe_divergence(graph: AdjustmentGraph, values: gtsam.Values) -> list[str]:
+    """Lines for people: chi-square, what moved farthest from the start, the worst observations there and here.
+
+    The start is named first: a group that is wrong stands out there, before the adjustment has spread its error.
+    """
+    start = graph.start
+    before, after = misfits(graph, start), misfits(graph, values)
+    n = max(1, len(after))
+    first = _stands_out(before)
+    rms = [float(np.sqrt(np.mean([m.square for m in side]))) if side else 0.0 for side in (before, after)]
+    lines = [] if first is None else [first]
+    lines += [
+        f"the observations miss by {rms[0]:.3g} of their sigmas (root mean square of {n}) at the start values, "
+        f"by {rms[1]:.3g} where it stopped"
+    ]
+    moved = farthest(graph, start, values)
+    if moved:
+        lines.append(f"farthest from their start values: {', '.join(moved)}")
+    lines += [f"at the start values: {line}" for line in worst_by_group(before)]
+    lines += [f"where it stopped: {line}" for line in worst_by_group(after)]
+    return lines
+
+
+def _stands_out(found: list[Misfit]) -> str | None:
+    """The one owner whose observations fit far worse at the start than those of any other; None where none does."""
+    owners = [o for o in _owners(found) if np.isfinite(o[1])]
+    if len(owners) < 2 or owners[0][1] < _MISFIT or owners[0][1] < _BY_FAR * owners[1][1]:
+        return None
+    (owner, square), (_, after) = owners[:2]
+    return (
+        f"look first at {owner}: at the start values its observations miss by {np.sqrt(square):.3g} sigmas, those of "
+        f"any other by {np.sqrt(after):.3g} at most"
+    )
+
+
+def worst_by_group(found: list[Misfit]) -> list[str]:
+    """A line for each group that does not fit, the worst first: its misfit, its worst owners and observation."""
+    groups: dict[str, list[Misfit]] = {}
+    for m in found:
+        groups.setdefault(m.group, []).append(m)
+    mean = {group: float(np.mean([m.square for m in mine])) for group, mine in groups.items()}
+    lines = []
+    for group in sorted((g for g in groups if mean[g] > _MISFIT), key=lambda g: -mean[g])[:_GROUPS]:
+        worst = max(groups[group], key=lambda m: m.square)
+        owners = _owners(groups[group])
+        shown = ", ".join(f"{owner} ({np.sqrt(value):.3g})" for owner, value in owners[:_OWNERS])
+        lines.append(
+            f"group {group} misses by {np.sqrt(mean[group]):.3g} sigmas; worst: {shown}; "
+            f"of single observations {worst.text} ({np.sqrt(worst.square):.3g})"
+        )
+    return lines
+
+
+def _owners(found: list[Misfit]) -> list[tuple[str, float]]:
+    """Owners with the mean of their squares, the largest first."""
+    squares: dict[str, list[float]] = {}
+    for m in found:
+        squares.setdefault(m.owner, []).append(m.square)
+    mean = [(owner, float(np.mean(values))) for owner, values in squares.items()]
+    return sorted(mean, key=lambda item: (-item[1], item[0]))
+
+
+def misfits(graph: AdjustmentGraph, values: gtsam.Values) -> list[Misfit]:
+    """Every observation in use at ``values``; image points by image. Empty where the values cannot be evaluated."""
+    try:
+        squares = graph.whitened_squares(values)
+    except SurveyError:
+        return []
+    out, used, at = [], graph.used(), 0
+    for block in graph.survey.image_blocks:
+        rows = slice(at, at + len(block.uv))
+        at = rows.stop
+        mine = squares[rows][used[rows]]
+        if len(mine):
+            text = f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}"
+            out.append(Misfit(block.group, f"camera {block.camera_id}", text, float(mine.mean()) / 2.0))
+    for item in graph.others:
+        if item.used:
+            square = 2.0 * float(item.factor.error(values)) / max(1, len(item.components))
+            name = item.ids[0] if item.kind != "prior" else " ".join(item.ids)
+            out.append(Misfit(item.group, f"{item.kind} {name}", " ".join((item.kind, *item.ids)), square))
+    return [m for m in out + _reading_misfits(graph, values) if np.isfinite(m.square)]
+
+
+def _reading_misfits(graph: AdjustmentGraph, values: gtsam.Values) -> list[Misfit]:
+    batch, out = graph.terrestrial, []
+    if batch is None:
+        return []
+    e, used = batch.unweighted(values) ** 2, batch.used
+    for i, r in enumerate(graph.survey.readings):
+        if used[i]:
+            owner = f"setup {r.setup_id}" if r.setup_id else f"{r.kind} from {position_text(r.at)}"
+            text = f"{r.kind} {r.reading_id} {position_text(r.at)} {position_text(r.to)}"
+            out.append(Misfit(r.group, owner, text, float(e[i])))
+    return out
+
+
+def farthest(graph: AdjustmentGraph, start: gtsam.Values, values: gtsam.Values) -> list[str]:
+    """The points and poses that moved farthest, then those that turned farthest, with how far."""
+    rows: list[tuple[float, float, Unknown]] = []
+    for u in graph.unknowns.by_name.values():
+        if u.kind == "point":
+            rows.append((float(np.linalg.norm(values.atPoint3(u.key) - start.atPoint3(u.key))), 0.0, u))
+        elif u.kind == "pose":
+            a, b = start.atPose3(u.key), values.atPose3(u.key)
+            turn = float(np.linalg.norm(a.rotation().localCoordinates(b.rotation())))
+            rows.append((float(np.linalg.norm(b.translation() - a.translation())), turn, u))
+    shifts = sorted(rows, key=lambda row: -row[0])[:_MOVED]
+    turns = sorted((row for row in rows if row[1] > np.radians(1.0)), key=lambda row: -row[1])[:2]
+    out = [f"{readable(u)} by {1e3 * shift:.4g} mm" for shift, _, u in shifts if shift > 0.0]
+    return out + [f"{readable(u)} by {np.degrees(turn):.3g} deg" for _, turn, u in turns]

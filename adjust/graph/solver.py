@@ -1,0 +1,311 @@
+"""Gauss-Newton with a Levenberg-Marquardt fallback over an :class:`~adjust.graph.assembly.AdjustmentGraph`.
+
+Our own loop: GTSAM's optimisers copy all values for every Python callback, stop silently on constraints, and know
+nothing of the unknowns hidden in a batch.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.datum import InnerDatum, inner_datum, normal_diagonal, stacking, visible_keys
+from adjust.graph.divergence import describe_divergence
+from adjust.graph.rank import describe_null_space, unobserved_unknowns
+from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
+from adjust.precision.tree import Leaves
+
+_SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
+"""Sigmas that depend on distances (target centring) follow the solution until they change by no more than this."""
+
+_LATE = frozenset((
+    "lens", "station_from_camera", "mount_from_station", "world_from_table", "table_geometry", "warp", "instrument",
+    "vertical", "beam", "surface",
+))  # fmt: skip
+"""What many observations share is eliminated last."""
+
+_SHORTEST = 0.125
+"""Share of an undamped step below which damping leads on better: the whole system bends."""
+_LEAST_GAIN = 0.1
+"""Share of the promised decrease of chi-square that a step must bring."""
+_STATIONARY = 1e-2
+"""Sigmas that a step moves at most where the rank of the system is judged."""
+
+Progress = Callable[[int, float], None]
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """max_step: convergence, what is left to go for any unknown in its own sigmas. max_iterations: steps tried."""
+
+    max_step: float = 1e-6
+    max_iterations: int = 200
+    first_damping: float = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The minimum and how it was reached. linear: GTSAM's linearised graph there, eliminated in ``ordering``."""
+
+    values: gtsam.Values
+    linear: gtsam.GaussianFactorGraph
+    ordering: gtsam.Ordering
+    use_qr: bool
+    omega: float
+    iterations: int
+    max_step: float
+    datum: InnerDatum | None
+    leaves: Leaves | None = None
+    """The poses that were reduced before, as cliques of the Bayes tree of ``linear``."""
+
+
+class _Loop:
+    """Steps of Gauss-Newton, shortened where the whole one does not gain what it promises, else damped.
+
+    What observations leave undetermined is judged at the start and at stationary points. In between a system without a
+    solution is only damped: a state on the way out says nothing about the survey.
+    """
+
+    def __init__(self, graph: AdjustmentGraph, options: SolveOptions, progress: Progress | None) -> None:
+        self.graph, self.options, self.progress = graph, options, progress
+        self.values = graph.start
+        self._set_datum()
+        self.damping, self.length = 0.0, 1.0
+        self.use_qr = False
+        self.moved = self.before = np.inf
+        self.judging = True
+        self.behind: frozenset[tuple[str, str, str | None]] = frozenset()
+        self._ordering: tuple[gtsam.NonlinearFactorGraph, gtsam.Ordering] | None = None
+
+    def _set_datum(self) -> None:
+        self.datum = inner_datum(self.graph, self.values)
+
+    def linearize(self) -> None:
+        """``linear``: the system at the present values, with the minimal datum where the survey has an inner one."""
+        self.linear = self.graph.system.linearize(self.values)
+        if self.datum is not None:
+            self.datum.add_to(self.linear)
+
+    def completed(self, delta: gtsam.VectorValues) -> tuple[gtsam.VectorValues, float]:
+        """The step of all unknowns in the survey's datum, from that of the visible ones in the minimal datum.
+
+        Also by how much what was hidden lowers chi-square (to first order) beside what the visible step does.
+        """
+        decrease = 0.0
+        if self.graph.reduction is not None:
+            decrease += self.graph.reduction.complete(delta)
+        if self.graph.bundle is not None:
+            self.graph.bundle.complete(delta)
+            decrease += self.graph.bundle.hidden_decrease
+        if self.datum is not None:
+            delta = self.datum.completed(self.graph, self.values, delta)
+        return delta, decrease
+
+    def evaluate(self, values: gtsam.Values) -> float:
+        """Weighted square sum at ``values``; everything is ready to be linearised there, since most steps are good."""
+        try:
+            self.graph.prepare(values, True, self.damping)
+        except IndeterminateError:
+            if values is self.values:
+                raise
+            return np.inf  # a step that made a point undetermined is no step
+        return self.graph.objective(values)
+
+    @property
+    def ordering(self) -> gtsam.Ordering:
+        """In which GTSAM eliminates the system as it is now."""
+        system = self.graph.system
+        if self._ordering is None or self._ordering[0] is not system:
+            last = self._last_keys()
+            self._ordering = system, gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(system, last)
+        return self._ordering[1]
+
+    def step(self) -> gtsam.VectorValues:
+        """The (damped) step. Raises IndeterminateError where there is none, by name where that is judged."""
+        system = self.linear if self.damping == 0.0 else damped(self.graph, self.linear, self.damping)
+        try:
+            how = (self.ordering, gtsam.EliminateQR) if self.use_qr else (self.ordering,)
+            delta = system.optimize(*how)
+        except RuntimeError as error:
+            if "ndetermin" not in str(error):
+                raise
+            if self.use_qr or not self.judging:
+                raise IndeterminateError("the normal equations have no solution here") from None
+            if self.graph.reduction is not None:  # what is weak is judged, and named, with all unknowns in sight
+                self.graph.reduction = None
+                self.graph.prepare(self.values, True, self.damping)
+                self.linearize()
+                return self.step()
+            names = describe_null_space(self.graph, self.linear, self.values)
+            if names is not None:
+                raise names from None
+            self.use_qr = True  # weak, but determined: GTSAM's Cholesky refuses pivots that QR still resolves
+            return self.step()
+        if not np.isfinite(delta.norm()):
+            raise SurveyError("the normal equations have no finite solution; check the sigmas and start values")
+        return delta
+
+    def _last_keys(self) -> list[int]:
+        by_key, all_keys = self.graph.unknowns.by_key, list(self.graph.system.keyVector())
+        keys = [k for k in all_keys if k in by_key and by_key[k].name[0] in _LATE]
+        keys += [k for k in (self.datum.minimal if self.datum is not None else ()) if k not in keys]
+        return keys if len(keys) < len(all_keys) else []
+
+    def run(self) -> Solved:
+        omega = self.evaluate(self.values)
+        self.behind = self._images_behind()
+        self.linearize()
+        for iteration in range(1, self.options.max_iterations + 1):
+            try:
+                delta, promised = self._proposed()
+            except IndeterminateError:
+                if self.judging:
+                    raise
+                self._damp(iteration)
+                continue
+            self.before, self.moved = self.moved, np.sqrt(max(0.0, promised))
+            found = self._along(delta, omega, promised)
+            if found is None:
+                self._damp(iteration)
+                continue
+            self.values, omega, gain = found
+            if self.progress:
+                self.progress(iteration, omega)
+            if self._arrived():
+                return self._finish(omega, iteration)
+            self._relax(gain)
+        raise self._stuck(self.options.max_iterations)
+
+    def _proposed(self) -> tuple[gtsam.VectorValues, float]:
+        """The step of all unknowns from here, and by how much it lowers chi-square to first order, at least."""
+        delta = self.step()
+        decrease = -float(delta.dot(self.linear.gradientAtZero()))
+        delta, hidden = self.completed(delta)
+        return delta, decrease + hidden
+
+    def _along(
+        self, delta: gtsam.VectorValues, omega: float, promised: float
+    ) -> tuple[gtsam.Values, float, float] | None:
+        """Where the step leads: values, their chi-square and the share of the promised decrease; None if nowhere.
+
+        An undamped step is halved down to ``_SHORTEST``, until it keeps a part of its promise: the quadratic model
+        falls by a (2 - a) of the whole at the length a. Source: Dennis and Schnabel 1996, section 6.3.
+        """
+        length = self.length
+        while length >= (_SHORTEST if self.damping == 0.0 else 1.0):
+            trial = self.values.retract(delta if length == 1.0 else delta.scale(length))
+            new = self.evaluate(trial)
+            behind = self._images_behind()
+            if np.isfinite(new) and behind <= self.behind:
+                gain = (omega - new) / max(length * (2.0 - length) * promised, 1e-300)
+                if gain > _LEAST_GAIN or self._at_the_bottom(new, omega):
+                    self.length, self.behind = length, behind
+                    return trial, new, gain
+            length *= 0.5
+        return None
+
+    def _at_the_bottom(self, new: float, old: float) -> bool:
+        """Where rounding decides whether chi-square falls."""
+        return self.moved < 1e-4 or (self.moved**2 < 1e-11 * old and new <= old * (1.0 + 1e-11))
+
+    def _images_behind(self) -> frozenset[tuple[str, str, str | None]]:
+        """Images with a point behind their camera at the values that were prepared last."""
+        return frozenset((b.camera_id, b.epoch_id, b.target_id) for b in self.graph.behind_camera())
+
+    def _arrived(self) -> bool:
+        """Whether what is left to go is small: steps shrink at least linearly near the minimum."""
+        if self.damping > 0.0:
+            return False
+        ratio = min(1.0, self.moved / self.before) if np.isfinite(self.before) else 1.0
+        return self.moved * max(ratio, 1.0 - self.length) < self.options.max_step
+
+    def _relax(self, gain: float) -> None:
+        """The next step's length and damping, from what the last one gained; ready to be linearised."""
+        self.judging = self.moved < _STATIONARY
+        used = self.damping
+        if used == 0.0:
+            self.length = min(1.0, 2.0 * self.length) if gain > 0.75 else self.length
+        elif gain > 0.5:
+            self.damping = used / 10.0 if used > 1e-7 else 0.0
+        elif gain < 0.1:
+            self.damping = 4.0 * used
+        if self.damping == used:
+            self.linearize()
+        elif not self._prepared_here():
+            self.damping = used
+            self._prepared_here()
+
+    def _prepared_here(self) -> bool:
+        """Linearise at the present values with the damping of now; False where that has no solution, which is none."""
+        try:
+            self.graph.prepare(self.values, True, self.damping)
+        except IndeterminateError:
+            if self.judging and self.damping == 0.0:
+                raise
+            return False
+        self.linearize()
+        return True
+
+    def _damp(self, iteration: int) -> None:
+        """From the present values once more, with shorter steps."""
+        self.length = 1.0
+        while True:
+            self.damping = max(self.damping * 10.0, self.options.first_damping)
+            if self.damping > 1e8:
+                raise self._stuck(iteration)
+            if self._prepared_here():
+                return
+
+    def _stuck(self, iteration: int) -> NotConvergedError:
+        blocks = sorted({f"{camera} at {epoch}" for camera, epoch, _ in self.behind})
+        what = f"; points behind the camera in {', '.join(blocks[:5])}" if blocks else ""
+        head = (
+            f"the adjustment did not converge in {iteration} steps: the last step moved an unknown by "
+            f"{self.moved:.2g} sigma{what}; look for gross errors in the observations or a wrong start value"
+        )
+        return NotConvergedError("\n  - ".join([head, *describe_divergence(self.graph, self.values)]))
+
+    def _finish(self, omega: float, iteration: int) -> Solved:
+        if self.behind:
+            raise self._stuck(iteration)
+        self.judging = True
+        if self.datum is not None:
+            self._set_datum()  # about the solution, where the covariances belong; the solution stays
+            self.graph.prepare(self.values, True)
+        self.linearize()
+        # the covariances need this linearisation anyway: its step costs one elimination and brings the last digits
+        delta, _ = self.completed(self.step())
+        self.values = self.values.retract(delta)
+        leaves = None if self.graph.reduction is None else self.graph.reduction.leaves()
+        return Solved(
+            self.values, self.linear, self.ordering, self.use_qr, omega, iteration, self.moved, self.datum, leaves
+        )
+
+
+def damped(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.GaussianFactorGraph:
+    """The graph with Marquardt's damping: every unknown held with ``damping`` times its own diagonal."""
+    stack = stacking(graph, visible_keys(graph))
+    root = np.sqrt(damping * np.maximum(normal_diagonal(linear, stack), 1e-12))
+    out = linear.clone()
+    for key, place in stack.at.items():
+        n = place.stop - place.start
+        out.add(key, np.diag(root[place]), np.zeros(n), gtsam.noiseModel.Unit.Create(n))
+    return out
+
+
+def solve(graph: AdjustmentGraph, options: SolveOptions = SolveOptions(), progress: Progress | None = None) -> Solved:
+    """Adjust. Raises IndeterminateError (named), NotConvergedError, SurveyError."""
+    nothing = unobserved_unknowns(graph)
+    if nothing:
+        raise IndeterminateError(
+            "nothing observes " + ", ".join(nothing) + "; leave them out or hold them", tuple(nothing)
+        )
+    found = _Loop(graph, options, progress).run()
+    for _ in range(_SIGMA_ROUNDS):
+        if graph.terrestrial is None or graph.terrestrial.update_sigmas(found.values) < _SIGMA_CHANGE:
+            break
+        graph.start = found.values
+        found = _Loop(graph, options, progress).run()
+    return found

@@ -1,6 +1,0 @@
-"""Start values for a whole survey from its observations alone."""
-
-from adjust.initial.result import Start
-from adjust.initial.search import find_start, turns_of_views
-
-__all__ = ["Start", "find_start", "turns_of_views"]

@@ -1,0 +1,121 @@
+"""The radial part of the lens models: where it is one to one, and its inverse there.
+
+Every model maps a radius r (tangent of the angle to the axis, the angle itself for the fisheye, mm for the models in
+mm) to ``f(r) = r N(r^2) / D(r^2)``, N and D polynomials with ascending coefficients.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import polynomial
+
+from adjust.model.survey import BoolArray, FloatArray
+from adjust.native import lenses as kernels
+
+SMALLEST_ROOT = 1e-12
+"""Reciprocals of squared radii below this mean that the radius is out of any camera's sight."""
+MAX_ITERATIONS = 200
+
+
+@dataclass(frozen=True, eq=False)
+class RadialProfile:
+    """A radial function f(r) = r N(r^2) / D(r^2) that grows from 0 to ``limit`` (infinite where it always grows)."""
+
+    numerator: FloatArray
+    denominator: FloatArray
+    limit: float
+
+    def value(self, radius: FloatArray) -> FloatArray:
+        """f, element by element."""
+        w = np.asarray(radius) ** 2
+        f: FloatArray = radius * polynomial.polyval(w, self.numerator) / polynomial.polyval(w, self.denominator)
+        return f
+
+    def slope(self, radius: FloatArray) -> FloatArray:
+        """df/dr, element by element."""
+        w = np.asarray(radius) ** 2
+        growth = _growth(self.numerator, self.denominator)
+        df: FloatArray = polynomial.polyval(w, growth) / polynomial.polyval(w, self.denominator) ** 2
+        return df
+
+
+def radial_profile(kind: int, values: FloatArray, constants: FloatArray) -> RadialProfile:
+    """The radial function of a lens: undistorted to distorted radius, measured to corrected for backward models."""
+    v = [float(x) for x in values]
+    one = np.array([1.0])
+    if kind == kernels.BROWN:
+        return _profile(np.array([1.0, v[5], v[6], v[9]]), np.array([1.0, v[10], v[11], v[12]]))
+    if kind == kernels.FISHEYE:
+        return _profile(np.array([1.0, *v[5:9]]), one, largest=float(np.pi))
+    if kind == kernels.BROWN_BACKWARD:
+        return _profile(np.array([1.0, *v[3:6]]), one)
+    if kind == kernels.BROWN_BACKWARD_DBAT:
+        return _profile(np.array([1.0, *v[4:7]]), one)
+    w0 = float(constants[3]) ** 2
+    balance = w0 * (v[3] + w0 * (v[4] + w0 * v[5]))
+    return _profile(np.array([1.0 - balance, *v[3:6]]), one)
+
+
+def invert_radius(profile: RadialProfile, target: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Radii r with f(r) = target below the profile's limit, and which were found (the others are at the limit).
+
+    Newton kept inside a bracket that shrinks; f grows on it, so there is exactly one solution.
+    """
+    low = np.zeros_like(target)
+    with np.errstate(all="ignore"):
+        high = _upper_bracket(profile, target)
+        found = ~(profile.value(high) < target)
+        radius = np.where(found, np.minimum(target, high), high)
+        for _ in range(MAX_ITERATIONS):
+            error = profile.value(radius) - target
+            high = np.where(error > 0, radius, high)
+            low = np.where(error < 0, radius, low)
+            better = radius - error / profile.slope(radius)
+            outside = ~((better >= low) & (better <= high))
+            better = np.where(outside, (low + high) / 2, better)
+            step = np.abs(better - radius)
+            radius = np.where(found & (error != 0), better, radius)
+            if np.all((step <= 4e-16 * radius) | ~found | (error == 0)):
+                break
+    return radius, found
+
+
+def _profile(numerator: FloatArray, denominator: FloatArray, largest: float = float("inf")) -> RadialProfile:
+    """The profile with its limit: the first radius where f stops growing or its denominator vanishes."""
+    limit = min(_first_root(_growth(numerator, denominator)), _first_root(denominator), largest)
+    return RadialProfile(numerator, denominator, limit)
+
+
+def _growth(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
+    """Numerator of df/dr over D^2, a polynomial in w = r^2: (N + 2 w N') D - 2 w N D'."""
+    orders = 2 * np.arange(len(numerator))
+    first = polynomial.polymul(numerator * (1 + orders), denominator)
+    second = polynomial.polymul(numerator, denominator * 2 * np.arange(len(denominator)))
+    return np.asarray(polynomial.polysub(first, second), dtype=np.float64)
+
+
+def _first_root(coefficients: FloatArray) -> float:
+    """Radius at the smallest positive zero of a polynomial in r^2, infinite without one.
+
+    Solved for 1 / r^2, because then the leading coefficient is the one at r = 0, which is never small.
+    """
+    if coefficients[0] <= 0:
+        return 0.0
+    reciprocals = np.roots(coefficients)
+    real = reciprocals.real[np.abs(reciprocals.imag) <= 1e-9 * np.abs(reciprocals)]
+    largest = float(np.max(real, initial=0.0))
+    return float(largest**-0.5) if largest > SMALLEST_ROOT else float("inf")
+
+
+def _upper_bracket(profile: RadialProfile, target: FloatArray) -> FloatArray:
+    """Radii where f has passed the target, or the limit."""
+    if np.isfinite(profile.limit):
+        # a hair inside, where a vanishing denominator would be infinite
+        return np.full_like(target, profile.limit * (1 - 1e-13))
+    high = np.maximum(target, 1e-6)
+    for _ in range(MAX_ITERATIONS):
+        short = profile.value(high) < target
+        if not short.any() or high.max() > 1e12:
+            break
+        high = np.where(short, 2 * high, high)
+    return high

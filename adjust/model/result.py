@@ -1,0 +1,197 @@
+"""What an adjustment gives back. Every estimated quantity is one ``Estimate`` under its ``ParameterName``."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from gtsam import Pose3
+
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+
+# ("lens", camera) ("station_from_camera", camera) ("world_from_station", station[, epoch])
+# ("mount_from_station", station) ("world_from_table", table) ("table_geometry", table) ("table_angles", table, epoch)
+# ("carrier_from_target", target[, epoch]) ("warp", target) ("point", point) ("vertical",) ("instrument", instrument)
+# ("orientation", setup) ("centring", setup) ("beam", beam) ("surface", surface)
+ParameterName = tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The adjusted value of one parameter.
+
+    value: Pose3, or (n,) for lens, table, warp and point parameters.
+    components: names of the n (6 for a pose) components: rx ry rz tx ty tz, x y z, fx fy ...
+    units: unit inside, one per component (rad, m, px, mm, 1, ...).
+    cov: (n, n) in the tangent, zero rows for held components, *a priori* (not scaled by sigma0).
+    status: per component "free", "held", "prior" or "tied".
+    """
+
+    name: ParameterName
+    value: Pose3 | FloatArray
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    cov: FloatArray
+    status: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageResiduals:
+    """Residuals of all image points, block after block in the order of ``Survey.image_blocks``.
+
+    block_ptr: (B + 1,) row ranges. residuals: (N, 2) px, predicted minus observed. redundancy: (N, 2) of the whitened
+    components. standardized: (N, 2) px-direction residual over its own sigma. test: (N,) v' inv(Q_vv) v, chi-square
+    with 2 degrees of freedom. used: (N,).
+    """
+
+    block_ptr: IntArray
+    residuals: FloatArray
+    redundancy: FloatArray
+    standardized: FloatArray
+    test: FloatArray
+    used: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingResiduals:
+    """Residuals of all readings (N,), in the order of ``Survey.readings``; rad or m.
+
+    sigma: a priori, with the target's centring. residual: adjusted minus observed. residual_sigma: of the residual.
+    redundancy: diag(Q_vv P). test: w^2 with w = (P v)_i / sqrt((P Q_vv P)_ii), chi-square with one degree of freedom,
+    the square of ``standardized`` but for readings with a joint covariance. weighted_square: shares of v'Pv.
+    """
+
+    observed: FloatArray
+    adjusted: FloatArray
+    residual: FloatArray
+    sigma: FloatArray
+    residual_sigma: FloatArray
+    redundancy: FloatArray
+    standardized: FloatArray
+    test: FloatArray
+    weighted_square: FloatArray
+    used: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationResidual:
+    """One observation that is not an image point: (k,) components in SI units.
+
+    kind: table, pair, distance, coordinates, prior, a kind of reading, coordinate_difference, level, alignment, laser,
+    surface. ids: what it joins, for people.
+    """
+
+    kind: str
+    group: str
+    ids: tuple[str, ...]
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    observed: FloatArray
+    adjusted: FloatArray
+    residual: FloatArray
+    sigma: FloatArray
+    redundancy: FloatArray
+    standardized: FloatArray
+    test: float
+    used: bool
+
+
+@dataclass(frozen=True)
+class GroupSummary:
+    """Redundancy and weighted square sum of one group; ``factor`` is its variance component Omega / r."""
+
+    group: str
+    n_observations: int
+    redundancy: float
+    omega: float
+
+    @property
+    def factor(self) -> float:
+        """Estimated variance factor of the group, nan where the group has no redundancy."""
+        return self.omega / self.redundancy if self.redundancy > 1e-9 else float("nan")
+
+
+CAUTIOUS_SIGMAS = "cautious sigmas"
+"""How the warning begins that residuals are smaller than their sigmas: nobody is misled by these."""
+
+
+@dataclass(frozen=True)
+class GlobalTest:
+    """Chi-square test of sigma0 (two-sided): passed when ``lower <= omega <= upper``."""
+
+    omega: float
+    redundancy: int
+    alpha: float
+    lower: float
+    upper: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the weighted square sum agrees with the a priori sigmas."""
+        return self.lower <= self.omega <= self.upper
+
+    @property
+    def status(self) -> Literal["passed", "cautious", "failed"]:
+        """``cautious``: residuals are smaller than the sigmas say; ``failed``: larger, something does not fit."""
+        if self.omega > self.upper:
+            return "failed"
+        return "cautious" if self.omega < self.lower else "passed"
+
+    @property
+    def said(self) -> str:
+        """The status in words."""
+        return "passed with cautious sigmas" if self.status == "cautious" else self.status
+
+    def warning(self, sigma0: float) -> str:
+        """For people: what is not as the sigmas say; "" where all is."""
+        if self.passed:
+            return ""
+        larger = self.status == "failed"
+        what, side = ("global test failed", "larger") if larger else (CAUTIOUS_SIGMAS, "smaller")
+        return (
+            f"{what}: sigma0 = {sigma0:.3f}, the residuals are {side} than the a priori sigmas say "
+            f"(v'Pv = {self.omega:.1f}, expected {self.lower:.1f} to {self.upper:.1f})"
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Adjustment:
+    """A solved survey with its precision.
+
+    sigma0: a posteriori standard deviation of unit weight (a priori is 1). omega: v'Pv. iterations: steps taken.
+    max_step: the last step in sigmas of the unknowns. warnings: for people, worst first.
+    other_residuals: of all that are not image points, the readings last, also as arrays in ``reading_residuals``.
+    precision: gives joint covariances, ``precision.joint([name, ...])``.
+    variance_components: ``adjust.statistics.result.VarianceComponents``, where they were estimated. decisions: the log
+    of the search for gross errors, ``adjust.statistics.result.Decision``. n_screened: image points and other
+    observations that were in use and that this adjustment left out, where that was counted.
+    """
+
+    survey: Survey
+    estimates: Mapping[ParameterName, Estimate]
+    image_residuals: ImageResiduals
+    other_residuals: Sequence[ObservationResidual]
+    groups: tuple[GroupSummary, ...]
+    n_observations: int
+    n_unknowns: int
+    datum_defect: int
+    redundancy: int
+    omega: float
+    sigma0: float
+    global_test: GlobalTest | None
+    iterations: int
+    max_step: float
+    converged: bool
+    warnings: tuple[str, ...]
+    precision: Any = None
+    reading_residuals: ReadingResiduals | None = None
+    variance_components: Any = None
+    decisions: tuple[Any, ...] = ()
+    n_screened: int = 0
+
+    def __repr__(self) -> str:
+        """The key figures in one line."""
+        said = "" if self.global_test is None else f", global test {self.global_test.said}"
+        return (
+            f"Adjustment(sigma0 {self.sigma0:.4f}, {self.n_observations} observations, {self.n_unknowns} unknowns, "
+            f"redundancy {self.redundancy}{said})"
+        )

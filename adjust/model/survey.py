@@ -1,0 +1,337 @@
+"""What a survey consists of: the owners of the unknowns, as frozen values.
+
+Frames are a closed list: *world, station, camera, table, mount, target, image*. A transform ``a_from_b`` takes
+coordinates in b to coordinates in a. Lengths are metres, angles radians, image coordinates pixels; the centre of the
+first pixel is (0, 0). Tangents of poses are GTSAM's: rotation (rad) then translation (m), in the frame on the right.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from gtsam import Pose3
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+Treatment = Literal["free", "held", "prior"]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseParameter:
+    """A rigid motion ``a_from_b`` and how it is treated.
+
+    value: start value when free (None: found by the program), the constant when held, the mean when prior.
+    prior_cov: (6, 6), in the tangent at ``value``; ``np.inf`` on the diagonal means nothing is known of that component
+    (its row and column are then ignored).
+    held: components (rx ry rz tx ty tz, of the tangent at ``value``) of a free or prior pose that keep their value.
+    """
+
+    value: Pose3 | None = None
+    treatment: Treatment = "free"
+    prior_cov: FloatArray | None = None
+    held: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class PointParameter:
+    """Coordinates of a point in the world, (3,) m, and how they are treated; ``prior_cov`` is (3, 3).
+
+    held: axes (x y z) of a free or prior point that keep their value: z in a plane network, x and y in a levelling.
+    """
+
+    value: FloatArray | None = None
+    treatment: Treatment = "free"
+    prior_cov: FloatArray | None = None
+    held: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class VectorPrior:
+    """Prior knowledge of some components of a vector: ``mean`` (k,) and ``cov`` (k, k) in the order of ``names``."""
+
+    names: tuple[str, ...]
+    mean: FloatArray
+    cov: FloatArray
+
+
+@dataclass(frozen=True)
+class Tie:
+    """Component ``name`` follows ``to`` with a constant factor: fy = ratio * fx."""
+
+    name: str
+    to: str
+    factor: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class VectorParameter:
+    """Named scalars of one owner; those in ``free`` are unknowns, the others keep their value.
+
+    values: (n,) in the order of ``names``: start values of the free ones, constants of the others.
+    """
+
+    names: tuple[str, ...]
+    values: FloatArray
+    free: tuple[str, ...] = ()
+    prior: VectorPrior | None = None
+    ties: tuple[Tie, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class LensParameter:
+    """The lens of a camera and how it is treated.
+
+    model: a name of ``adjust.lenses.models.MODELS``.
+    values: (n,) in the order of the model's parameters, or None where the program must find a start.
+    free: the parameters to be estimated; the others are held at ``values`` (zero where those are None).
+    pixel_size_mm: needed by the models whose parameters are in millimetres.
+    balance_radius_mm: where the radial distortion of the model "aicon" is zero (its r0); no other model uses it.
+    """
+
+    model: str
+    free: tuple[str, ...]
+    values: FloatArray | None = None
+    prior: VectorPrior | None = None
+    ties: tuple[Tie, ...] = ()
+    pixel_size_mm: float | None = None
+    balance_radius_mm: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A camera, x right, y down, z forward, fixed on a station. ``image_size`` is (width, height) in pixels."""
+
+    camera_id: str
+    station_id: str
+    image_size: tuple[int, int]
+    lens: LensParameter
+    station_from_camera: PoseParameter = PoseParameter()
+
+
+@dataclass(frozen=True, eq=False)
+class Station:
+    """A rigid body that carries cameras and targets: the head, a relay station, a tripod.
+
+    motion: ``fixed`` (one pose for all epochs), ``epoch`` (one pose per epoch) or ``table`` (carried by ``table_id`` in
+    the epochs that have a reading of that table, with one pose per epoch in the others, as for images taken by hand).
+    world_from_station: the pose (fixed), or what holds for every epoch that is not listed in ``epochs``.
+    """
+
+    station_id: str
+    motion: Literal["fixed", "epoch", "table"] = "fixed"
+    world_from_station: PoseParameter = PoseParameter()
+    epochs: Mapping[str, PoseParameter] = field(default_factory=dict)
+    table_id: str | None = None
+    mount_from_station: PoseParameter = PoseParameter()
+
+
+TABLE_GEOMETRY = ("non_orthogonality", "axis_offset", "zero_1", "zero_2")
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A turntable of one or two axes, outermost (fixed to the base) first.
+
+    ``table_from_mount = R1(a1 + zero_1) * Trans3(axis_offset) * R3(non_orthogonality) * R2(a2 + zero_2)`` where R1, R2
+    turn about the named axes (right-handed) and 3 is the remaining axis, the common perpendicular of the two.
+    geometry: names as in ``TABLE_GEOMETRY`` (rad, m, rad, rad); a one-axis table has only ``zero_1``.
+    """
+
+    table_id: str
+    axes: tuple[str, ...] = ("x", "z")
+    world_from_table: PoseParameter = PoseParameter()
+    geometry: VectorParameter = field(
+        default_factory=lambda: VectorParameter(
+            TABLE_GEOMETRY, np.zeros(4), free=("non_orthogonality", "axis_offset")
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Known points on one rigid body: a board, a marker block. It stands in the world or on a station.
+
+    point_ids: n names; x_in_target: (n, 3) m.
+    motion: ``fixed`` or ``epoch`` (moved between epochs, as a board held by hand).
+    carrier_from_target: ``world_from_target``, or ``station_from_target`` where ``station_id`` is given; with motion
+    ``epoch`` what holds for every epoch that is not listed in ``epochs``.
+    warp: sag of a board, names ("warp_x", "warp_y") m: z = warp_x 4u(1-u) + warp_y 4v(1-v), with u, v from 0 to 1 over
+    the board.
+    """
+
+    target_id: str
+    point_ids: tuple[str, ...]
+    x_in_target: FloatArray
+    station_id: str | None = None
+    motion: Literal["fixed", "epoch"] = "fixed"
+    carrier_from_target: PoseParameter = PoseParameter()
+    epochs: Mapping[str, PoseParameter] = field(default_factory=dict)
+    warp: VectorParameter | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A beacon or tie point in the world."""
+
+    point_id: str
+    x_in_world: PointParameter = PointParameter()
+
+
+TILT = ("tilt_1", "tilt_2")
+
+
+def tilt_axes(direction: FloatArray) -> FloatArray:
+    """Two unit vectors (2, 3) that make a right-handed frame with a unit ``direction`` (3,): e1 x e2 = direction.
+
+    For z they are x and y; near any other axis the two next ones in cyclic order, made perpendicular.
+    """
+    first = np.roll(np.eye(3)[int(np.argmax(np.abs(direction)))], 1)
+    e1 = first - direction * (first @ direction)
+    e1 /= np.linalg.norm(e1)
+    return np.array([e1, np.cross(direction, e1)])
+
+
+@dataclass(frozen=True, eq=False)
+class Vertical:
+    """The direction of the plumb line in the world, for levels and for instruments that are set up level.
+
+    up_in_world: (3,) unit vector, upwards, before the tilt. tilt: names as in ``TILT`` (rad), small turns of it about
+    ``tilt_axes(up_in_world)``; held at zero unless freed. radius: of the level surfaces (m), whose plumb lines meet at
+    ``origin - radius * up``; None where the surfaces are planes.
+    """
+
+    up_in_world: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    tilt: VectorParameter = field(default_factory=lambda: VectorParameter(TILT, np.zeros(2)))
+    radius: float | None = None
+
+
+@dataclass(frozen=True)
+class Bearings:
+    """How horizontal angles are counted: from the world's axis ``zero``, and clockwise seen from above or not.
+
+    Geodesists in (east, north): zero "y", clockwise. Directions, angles, azimuths and orientations all follow it.
+    """
+
+    zero: Literal["x", "y"] = "y"
+    clockwise: bool = True
+
+
+INSTRUMENT = ("distance_offset", "distance_scale", "refraction", "vertical_index")
+
+
+@dataclass(frozen=True, eq=False)
+class Instrument:
+    """A total station, theodolite or level.
+
+    parameters: names as in ``INSTRUMENT`` (m, 1, 1, rad): an observed distance is ``offset + (1 + scale) * true``; the
+    coefficient of refraction bends zenith angles (with ``Vertical.radius``); the index is added to zenith angles.
+    """
+
+    instrument_id: str
+    parameters: VectorParameter = field(default_factory=lambda: VectorParameter(INSTRUMENT, np.zeros(4)))
+
+
+@dataclass(frozen=True)
+class Setup:
+    """An instrument set up once: its readings of kind "direction" share one orientation unknown.
+
+    levelled: its vertical axis is the plumb line; else readings are in the axes of the frame it stands on, which must
+    be a station (as of a tilted scanner or tracker). centring_sigma, height_sigma: m, of the offset of the instrument
+    from the point it stands on, one unknown with a prior for all its readings where positive.
+    """
+
+    setup_id: str
+    instrument_id: str | None = None
+    levelled: bool = True
+    centring_sigma: float = 0.0
+    height_sigma: float = 0.0
+
+
+BEAM = ("offset_1", "offset_2", "slope_1", "slope_2")
+
+
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """A laser beam fixed on a body (a mount, a station): the line ``offset + s * (e + slope)`` in that body's frame.
+
+    axis: the axis e ("x", "y", "z") of the body that it runs along; 1 and 2 are the next axes in cyclic order.
+    parameters: names as in ``BEAM`` (m, m, 1, 1).
+    """
+
+    beam_id: str
+    carrier_kind: Literal["mount", "station"]
+    carrier_id: str
+    axis: Literal["x", "y", "z"] = "z"
+    parameters: VectorParameter = field(default_factory=lambda: VectorParameter(BEAM, np.zeros(4), free=BEAM))
+
+
+SURFACES: Mapping[str, tuple[str, ...]] = {
+    "plane": ("normal_1", "normal_2", "distance"),
+    "line": ("direction_1", "direction_2", "offset_1", "offset_2"),
+    "sphere": ("x", "y", "z", "radius"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A plane, line or sphere in the world on which positions lie (see ``OnSurface``).
+
+    parameters: names as in ``SURFACES``. A plane is ``n . x = distance``, a line passes ``offset`` along ``n``: n is
+    ``reference`` (3,) turned by the small angles _1, _2 about ``tilt_axes(reference)``, and the two offsets are along
+    those axes. None in ``reference`` or ``parameters``: found by the program.
+    """
+
+    surface_id: str
+    kind: Literal["plane", "line", "sphere"]
+    reference: FloatArray | None = None
+    parameters: VectorParameter | None = None
+
+
+@dataclass(frozen=True)
+class Datum:
+    """Where origin, directions and scale come from.
+
+    ``given``: from what is held, has a prior or is observed. ``inner``: inner constraints (free network) over the
+    named points and stations (all of them where none is named).
+    """
+
+    kind: Literal["given", "inner"] = "given"
+    points: tuple[str, ...] = ()
+    stations: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """A whole survey: what there is, what was observed and what defines the datum. See ``adjust.model.observations``."""
+
+    cameras: tuple[Camera, ...] = ()
+    stations: tuple[Station, ...] = ()
+    tables: tuple[Table, ...] = ()
+    targets: tuple[Target, ...] = ()
+    points: tuple[Point, ...] = ()
+    image_blocks: tuple[Any, ...] = ()
+    table_readings: tuple[Any, ...] = ()
+    pairs: tuple[Any, ...] = ()
+    distances: tuple[Any, ...] = ()
+    coordinates: tuple[Any, ...] = ()
+    datum: Datum = Datum()
+    vertical: Vertical = field(default_factory=Vertical)
+    bearings: Bearings = Bearings()
+    instruments: tuple[Instrument, ...] = ()
+    setups: tuple[Setup, ...] = ()
+    beams: tuple[Beam, ...] = ()
+    surfaces: tuple[Surface, ...] = ()
+    readings: tuple[Any, ...] = ()
+    reading_covariances: tuple[Any, ...] = ()
+    coordinate_differences: tuple[Any, ...] = ()
+    levels: tuple[Any, ...] = ()
+    alignments: tuple[Any, ...] = ()
+    laser_spots: tuple[Any, ...] = ()
+    on_surfaces: tuple[Any, ...] = ()
+    pair_form: Literal["poses", "closed"] = "poses"
+    """Pairs by the poses of their frames, or every loop of them closed; set by :mod:`adjust.relay.closed`."""
+    closures: tuple[Any, ...] = ()
+    """Mounts (``adjust.model.observations.Closure``) whose play the covariances of their pairs already contain."""

@@ -1,0 +1,47 @@
+"""Compiled kernels on all cores: they hold no lock and write disjoint places, so threads need no copies."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+
+from adjust.model.survey import IntArray
+
+_WORTHWHILE = 5_000
+
+
+@cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers, thread_name_prefix="adjust")
+
+
+def workers() -> int:
+    """Threads used: ``LABSURVEY_THREADS``, or the cores this process may use."""
+    wanted = os.environ.get("LABSURVEY_THREADS", "")
+    return int(wanted) if wanted.isdigit() and int(wanted) > 0 else cores()
+
+
+def cores() -> int:
+    """Cores that this process may use; all of the machine where the system does not tell."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def split_blocks(ptr: IntArray) -> list[IntArray]:
+    """Block numbers in runs of about equal numbers of points: one run for small batches, else one per worker."""
+    n, total = len(ptr) - 1, int(ptr[-1])
+    count = 1 if total < _WORTHWHILE else min(n, workers())
+    edges = np.searchsorted(ptr, np.linspace(0, total, count + 1)[1:-1])
+    return [run.astype(np.int64) for run in np.split(np.arange(n), edges) if len(run)]
+
+
+def run_split(kernel: Callable[..., None], runs: list[IntArray], *arguments: object) -> None:
+    """Call ``kernel(run, *arguments)`` for every run, side by side."""
+    if len(runs) <= 1:
+        for run in runs:
+            kernel(run, *arguments)
+        return
+    pool = _pool(len(runs))
+    for future in [pool.submit(kernel, run, *arguments) for run in runs]:
+        future.result()

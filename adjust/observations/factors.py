@@ -1,0 +1,243 @@
+"""Factors of everything that is not an image point. GTSAM's own where it has them; the rest through one adapter.
+
+A residual is predicted minus observed, unwhitened; the noise model alone whitens.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.frames.state import State
+from adjust.frames.unknowns import Chain, Unknown, Unknowns, VectorMap
+from adjust.model.observations import Coordinates, Distance, Pair
+from adjust.model.survey import FloatArray, PoseParameter, VectorPrior
+from adjust.observations.images.batch import Chains
+
+Jacobians = list[tuple[int, FloatArray]]
+Residual = Callable[[gtsam.Values], tuple[FloatArray, Jacobians]]
+
+
+def gaussian(cov: FloatArray) -> gtsam.noiseModel.Gaussian:
+    """Noise of a full covariance; never turned into a constraint, however small (GTSAM's "smart" models are)."""
+    return gtsam.noiseModel.Gaussian.Covariance(np.atleast_2d(cov), False)
+
+
+def custom(keys: Sequence[int], cov: FloatArray, residual: Residual) -> gtsam.CustomFactor:
+    """The one place that knows GTSAM's callback: from ``values -> (residual, [(key, jacobian)])`` to a factor.
+
+    A key that comes more than once has its Jacobians added.
+    """
+    at = {key: i for i, key in enumerate(keys)}
+
+    def call(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
+        r, blocks = residual(values)
+        if jacobians is not None:
+            sums: dict[int, FloatArray] = {}
+            for key, block in blocks:
+                sums[key] = sums[key] + block if key in sums else block
+            for key, block in sums.items():
+                jacobians[at[key]] = np.ascontiguousarray(block)
+        return r
+
+    return gtsam.CustomFactor(gaussian(cov), list(keys), call)
+
+
+class ChainPose:
+    """The pose of a chain at given values, and its derivative (tangent on the right) by every unknown in it."""
+
+    def __init__(self, unknowns: Unknowns, state: State, chain: Chain) -> None:
+        self.state, self.chains = state, Chains([chain])
+        self.keys: list[int] = []
+        for link in chain:
+            self.keys += [k for k in unknowns.link_keys(link.slot) if k not in self.keys]
+
+    def __call__(self, values: gtsam.Values) -> tuple[Pose3, Jacobians]:
+        """Pose and Jacobians (6, dim)."""
+        c = self.chains
+        self.state.load(values, [int(s) for s in c.slot], lenses=False)
+        c.evaluate(self.state)
+        jacobians: Jacobians = []
+        for i, slot in enumerate(c.slot):
+            jacobians += self.state.by_keys(int(slot), c.C[i].copy())
+        return Pose3(Rot3(c.R[0]), c.t[0]), jacobians
+
+
+@dataclass(frozen=True, eq=False)
+class Position:
+    """A position in the world: a world point (key or held value), or a point fixed in the frame of a chain.
+
+    warp: of the target that the point is on, and the two unit sags at the point.
+    """
+
+    chain: ChainPose | None
+    x_in_frame: FloatArray
+    point_key: int | None = None
+    warp: VectorMap | None = None
+    sag: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def keys(self) -> list[int]:
+        """The unknowns it depends on."""
+        if self.point_key is not None:
+            return [self.point_key]
+        warp = [self.warp.key] if self.warp is not None and self.warp.key is not None else []
+        return (self.chain.keys if self.chain else []) + warp
+
+    def __call__(self, values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+        """Coordinates (3,) m in the world and Jacobians (3, dim)."""
+        if self.point_key is not None:
+            return np.asarray(values.atPoint3(self.point_key)), [(self.point_key, np.eye(3))]
+        if self.chain is None:
+            return self.x_in_frame, []
+        pose, jacobians = self.chain(values)
+        R = pose.rotation().matrix()
+        x = self.x_in_frame
+        if self.warp is not None:
+            x = x + np.array([0.0, 0.0, np.asarray(self.sag) @ self.warp.full(values)])
+        cross = np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
+        by_pose = np.hstack([-R @ cross, R])
+        out = [(key, by_pose @ J) for key, J in jacobians]
+        if self.warp is not None and self.warp.key is not None:
+            out.append((self.warp.key, np.outer(R[:, 2], np.asarray(self.sag) @ self.warp.matrix)))
+        return R @ x + pose.translation(), out
+
+
+def distance_residual(a: Position, b: Position, value: float) -> Residual:
+    """Distance between two positions minus the observed one; (1,) m."""
+
+    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+        (xa, ja), (xb, jb) = a(values), b(values)
+        d = xb - xa
+        length = float(np.linalg.norm(d))
+        u = (d / length)[None, :]
+        return np.array([length - value]), [(k, -u @ J) for k, J in ja] + [(k, u @ J) for k, J in jb]
+
+    return residual
+
+
+def distance_factor(observation: Distance, a: Position, b: Position) -> gtsam.NonlinearFactor:
+    """GTSAM's range between two points, or the general one."""
+    cov = np.array([[observation.sigma**2]])
+    if a.point_key is not None and b.point_key is not None:
+        return gtsam.RangeFactor3(a.point_key, b.point_key, observation.value, gaussian(cov))
+    keys = list(dict.fromkeys(a.keys + b.keys))
+    return custom(keys, cov, distance_residual(a, b, observation.value))
+
+
+def coordinates_factor(observation: Coordinates, positions: Sequence[Position]) -> gtsam.NonlinearFactor:
+    """GTSAM's prior for one world point, or coordinates of several positions with their joint covariance.
+
+    Coordinates with an infinite variance were not observed.
+    """
+    known = np.isfinite(np.diag(observation.cov))
+    if len(positions) == 1 and positions[0].point_key is not None and known.all():
+        return gtsam.PriorFactorPoint3(positions[0].point_key, observation.values[0], gaussian(observation.cov))
+
+    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+        out, blocks = np.zeros(3 * len(positions)), []
+        for i, position in enumerate(positions):
+            x, jacobians = position(values)
+            out[3 * i : 3 * i + 3] = x - observation.values[i]
+            for key, J in jacobians:
+                block = np.zeros((len(out), J.shape[1]))
+                block[3 * i : 3 * i + 3] = J
+                blocks.append((key, block[known]))
+        return out[known], blocks
+
+    keys = list(dict.fromkeys(k for p in positions for k in p.keys))
+    return custom(keys, observation.cov[np.ix_(known, known)], residual)
+
+
+def pair_factor(observation: Pair, unknowns: Unknowns, state: State, chain: Chain) -> gtsam.NonlinearFactor:
+    """A measured relative pose or rotation: GTSAM's between factor for two fixed bodies, else the general chain."""
+    simple = len(chain) == 2 and chain[0].inverse and not chain[1].inverse
+    keys = [unknowns.slot_key[link.slot] for link in chain]
+    measured = observation.b_from_a
+    predicted = ChainPose(unknowns, state, chain)
+    if isinstance(measured, Rot3):
+        residual = _rotation_residual(predicted, measured)
+        return custom(predicted.keys, observation.cov, residual)
+    if simple and not any(link.slot in unknowns.table_slots for link in chain):
+        b, a = keys
+        if a is not None and b is not None and a != b:
+            return gtsam.BetweenFactorPose3(b, a, measured, gaussian(observation.cov))
+    return custom(predicted.keys, observation.cov, _pose_residual(predicted, measured))
+
+
+def _pose_residual(predicted: ChainPose, measured: Pose3) -> Residual:
+    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+        pose, jacobians = predicted(values)
+        D = np.zeros((6, 6), order="F")
+        r = Pose3.Logmap(measured.between(pose), D)
+        return np.asarray(r), [(k, D @ J) for k, J in jacobians]
+
+    return residual
+
+
+def _rotation_residual(predicted: ChainPose, measured: Rot3) -> Residual:
+    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+        pose, jacobians = predicted(values)
+        D = np.zeros((3, 3), order="F")
+        r = Rot3.Logmap(measured.between(pose.rotation()), D)
+        return np.asarray(r), [(k, D @ J[:3]) for k, J in jacobians]
+
+    return residual
+
+
+def vector_prior_factor(prior: VectorPrior, vector: VectorMap) -> gtsam.NonlinearFactor:
+    """Prior on some components of a lens, table or warp; linear in the free components."""
+    index = [vector.names.index(name) for name in prior.names]
+    M, base, key = vector.matrix[index], vector.base[index], vector.key
+    if key is None:
+        raise ValueError("a prior on a vector without free components has no unknown")
+
+    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+        return base + M @ values.atVector(key) - prior.mean, [(key, M)]
+
+    return custom([key], prior.cov, residual)
+
+
+def pose_prior_factor(parameter: PoseParameter, key: int) -> gtsam.NonlinearFactor:
+    """Prior on a pose; components with an infinite variance carry none."""
+    if parameter.value is None or parameter.prior_cov is None:
+        raise ValueError("a pose prior needs a value and a covariance")
+    mean, cov = parameter.value, parameter.prior_cov
+    known = np.isfinite(np.diag(cov))
+    if known.all():
+        return gtsam.PriorFactorPose3(key, mean, gaussian(cov))
+
+    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+        D = np.zeros((6, 6), order="F")
+        r = Pose3.Logmap(mean.between(values.atPose3(key)), D)
+        return np.asarray(r)[known], [(key, D[known])]
+
+    return custom([key], cov[np.ix_(known, known)], residual)
+
+
+HOLD = 1e-9
+"""Standard deviation (m, rad) of a component that keeps its value. It is no observation: it is counted nowhere, and
+its variance is reported as zero. What the observations pull it by, about 1e-12 of this, is far below rounding."""
+
+
+def hold_factor(unknown: Unknown, held: Sequence[int], value: Pose3 | FloatArray) -> gtsam.NonlinearFactor:
+    """Keeps some components of a pose or a point at ``value``."""
+    rows = list(held)
+    cov = np.eye(len(rows)) * HOLD**2
+    key = unknown.key
+    if isinstance(value, Pose3):
+
+        def pose_residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+            D = np.zeros((6, 6), order="F")
+            r = Pose3.Logmap(value.between(values.atPose3(key)), D)
+            return np.asarray(r)[rows], [(key, D[rows])]
+
+        return custom([key], cov, pose_residual)
+    wanted, select = np.asarray(value, dtype=float)[rows], np.eye(unknown.dim)[rows]
+
+    def point_residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+        return np.asarray(values.atPoint3(key))[rows] - wanted, [(key, select)]
+
+    return custom([key], cov, point_residual)

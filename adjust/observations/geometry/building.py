@@ -1,0 +1,265 @@
+"""The geometric observations of a survey as factors."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from gtsam import Pose3
+
+from adjust.frames.state import State
+from adjust.frames.unknowns import Chain, FrameTree, Unknowns, VectorMap, vector_map
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Alignment, FrameRef, LaserSpot, Level, OnSurface, PositionRef
+from adjust.model.result import ParameterName
+from adjust.model.survey import SURFACES, Beam, BoolArray, FloatArray, Surface, Survey, VectorParameter
+from adjust.observations.factors import ChainPose, Position, custom
+from adjust.observations.geometry.fitting import fitted_beam, fitted_surface
+from adjust.observations.geometry.residuals import (
+    alignment_residual,
+    beam_axes,
+    differences_residual,
+    level_residual,
+    spot_residual,
+    surface_residual,
+)
+from adjust.observations.listed import ObservationFactor, frame_text, position_text
+from adjust.spatial.vertical import VerticalMap, collect_vertical, up_at
+
+BEAM_UNITS = ("m", "m", "1", "1")
+SURFACE_UNITS: Mapping[str, tuple[str, ...]] = {
+    "plane": ("rad", "rad", "m"),
+    "line": ("rad", "rad", "m", "m"),
+    "sphere": ("m", "m", "m", "m"),
+}
+
+
+def position_refs(survey: Survey) -> list[PositionRef]:
+    """The positions that geometric observations need."""
+    refs = [ref for d in survey.coordinate_differences for ref in (*d.at, *d.to)]
+    return refs + [o.position for o in survey.on_surfaces]
+
+
+def frame_refs(survey: Survey) -> list[FrameRef]:
+    """The frames that geometric observations need."""
+    carriers = {b.beam_id: b for b in survey.beams}
+    refs = [level.frame for level in survey.levels]
+    refs += [ref for a in survey.alignments for ref in (a.a, a.b)]
+    for spot in survey.laser_spots:
+        refs += [carrier_of(carriers, spot), FrameRef("target", spot.target_id, spot.epoch_id)]
+    return refs
+
+
+def carrier_of(beams: Mapping[str, Beam], spot: LaserSpot) -> FrameRef:
+    """The body that carries a spot's beam. Raises SurveyError for a beam that there is not."""
+    if spot.beam_id not in beams:
+        raise SurveyError(f"beam {spot.beam_id!r} is observed but not part of the survey; add it or correct the id")
+    beam = beams[spot.beam_id]
+    return FrameRef(beam.carrier_kind, beam.carrier_id, spot.epoch_id)
+
+
+class GeometryFactors:
+    """Makes the unknowns of beams and surfaces, their start values and the factors; one use, in this order."""
+
+    def __init__(self, survey: Survey, unknowns: Unknowns, frames: FrameTree) -> None:
+        self.survey, self.unknowns, self.frames = survey, unknowns, frames
+        self.beams = {b.beam_id: b for b in survey.beams}
+        self.surfaces = {s.surface_id: s for s in survey.surfaces}
+        self.starts: dict[ParameterName, FloatArray] = {}
+        for spot in survey.laser_spots:
+            carrier_of(self.beams, spot)
+            self._register(("beam", spot.beam_id), self.beams[spot.beam_id].parameters, BEAM_UNITS)
+        for observation in survey.on_surfaces:
+            surface = self._surface(observation)
+            names = SURFACES[surface.kind]
+            parameters = surface.parameters or VectorParameter(names, np.full(len(names), np.nan), free=names)
+            if np.isnan(parameters.values[[x not in parameters.free for x in names]]).any():
+                raise SurveyError(f"surface {surface.surface_id!r}: a parameter is held without a value; give it one")
+            self._register(("surface", surface.surface_id), parameters, SURFACE_UNITS[surface.kind])
+        self.vertical = collect_vertical(survey, unknowns) if survey.levels else None
+        self.level_chains = [frames.relative(level.frame, FrameRef("world")) for level in survey.levels]
+        self.alignment_chains = [frames.relative(a.a, a.b) for a in survey.alignments]
+        self.spot_chains = [self._spot_chain(spot) for spot in survey.laser_spots]
+
+    def _register(self, name: ParameterName, parameter: VectorParameter, units: tuple[str, ...]) -> None:
+        if name not in self.unknowns.vectors:
+            self.unknowns.vectors[name] = vector_map(parameter, units, self.unknowns, name)
+            self.starts[name] = np.nan_to_num(parameter.values)
+
+    def _surface(self, observation: OnSurface) -> Surface:
+        if observation.surface_id not in self.surfaces:
+            name = repr(observation.surface_id)
+            raise SurveyError(f"surface {name} is observed but not part of the survey; add it or correct the id")
+        return self.surfaces[observation.surface_id]
+
+    def _spot_chain(self, spot: LaserSpot) -> Chain:
+        return self.frames.relative(carrier_of(self.beams, spot), FrameRef("target", spot.target_id, spot.epoch_id))
+
+    def find_starts(
+        self,
+        state: State,
+        at: Mapping[PositionRef, Position],
+        values: gtsam.Values,
+        given: Mapping[ParameterName, FloatArray],
+    ) -> Survey:
+        """Put start values of surfaces and beams into ``values``; the survey with the surfaces complete.
+
+        given: starts that are known, as of an earlier adjustment. Raises SurveyError where nothing shows a surface.
+        """
+        for name in self.starts:
+            vector = self.unknowns.vectors[name]
+            if name[0] == "surface":
+                known = self.surfaces[name[1]]
+                surface = self.surfaces[name[1]] = self._fitted(known, at, values)
+                if surface.parameters is None:
+                    continue
+                self.unknowns.vectors[name] = vector = replace(vector, base=_base(vector, surface.parameters.values))
+                full = given.get(name, surface.parameters.values) if known is surface else surface.parameters.values
+            else:
+                full = given[name] if name in given else self._beam_start(state, self.beams[name[1]], vector, values)
+            if vector.key is not None:
+                values.update(vector.key, np.array([full[vector.names.index(x)] for x in vector.free]))
+        return replace(self.survey, surfaces=tuple(self.surfaces.values()))
+
+    def _fitted(self, surface: Surface, at: Mapping[PositionRef, Position], values: gtsam.Values) -> Surface:
+        mine = [o for o in self.survey.on_surfaces if o.surface_id == surface.surface_id]
+        ready = surface.kind == "sphere" or surface.reference is not None
+        if ready and surface.parameters is not None and not np.isnan(surface.parameters.values).any():
+            return surface
+        chosen = [o for o in mine if o.used] or mine
+        x = np.array([at[o.position](values)[0] for o in chosen])
+        return fitted_surface(surface, x, np.array([o.offset for o in chosen]))
+
+    def _beam_start(self, state: State, beam: Beam, vector: VectorMap, values: gtsam.Values) -> FloatArray:
+        poses, xy = [], []
+        for spot, chain in zip(self.survey.laser_spots, self.spot_chains, strict=True):
+            if spot.beam_id == beam.beam_id and spot.used:
+                poses.append(ChainPose(self.unknowns, state, chain)(values)[0])
+                xy.append(spot.xy)
+        start = np.asarray(beam.parameters.values, dtype=float)
+        free: BoolArray = np.array([x in vector.free for x in vector.names])
+        return fitted_beam(start, free, beam_axes(beam.axis), poses, np.array(xy)) if xy and free.any() else start
+
+    def factors(
+        self, state: State, at: Mapping[PositionRef, Position], values: gtsam.Values
+    ) -> list[ObservationFactor]:
+        """All geometric observations; ``values`` are the start, at which what cannot be linearised is refused."""
+        return [
+            *self._differences(at),
+            *self._levels(state, values),
+            *self._alignments(state, values),
+            *self._spots(state, values),
+            *self._on_surfaces(at),
+        ]
+
+    def _differences(self, at: Mapping[PositionRef, Position]) -> list[ObservationFactor]:
+        out = []
+        for d in self.survey.coordinate_differences:
+            ends = [(position_text(a), position_text(b)) for a, b in zip(d.at, d.to, strict=True)]
+            known = known_components(d.cov)
+            a, b = [at[ref] for ref in d.at], [at[ref] for ref in d.to]
+            keys = list(dict.fromkeys(k for p in (*a, *b) for k in p.keys))
+            _refuse_held(keys, f"the coordinate difference {ends[0][0]} to {ends[0][1]}")
+            factor = custom(keys, d.cov[np.ix_(known, known)], differences_residual(d, a, b, known))
+            names = tuple(f"{a} {b} {axis}" if len(ends) > 1 else axis for a, b in ends for axis in "xyz")
+            ids = tuple(dict.fromkeys(x for pair in ends for x in pair))
+            names, observed = tuple(np.array(names)[known]), d.values.ravel()[known]
+            out.append(ObservationFactor(factor, "coordinate_difference", d.group, ids, names, ("m",) * len(names),
+                                         observed, d.used))  # fmt: skip
+        return out
+
+    def _levels(self, state: State, values: gtsam.Values) -> list[ObservationFactor]:
+        out = []
+        for level, chain in zip(self.survey.levels, self.level_chains, strict=True):
+            if self.vertical is None:
+                break
+            pose, tilt = ChainPose(self.unknowns, state, chain), self.vertical.key
+            keys = pose.keys + ([tilt] if tilt is not None else [])
+            _refuse_held(keys, f"level {level.level_id!r}")
+            _check_level(level, pose(values)[0], self.vertical, values)
+            factor = custom(keys, np.array([[level.sigma**2]]), level_residual(level, pose, self.vertical))
+            ids = (level.level_id, frame_text(level.frame))
+            out.append(ObservationFactor(factor, "level", level.group, ids, ("inclination",), ("rad",),
+                                         np.array([level.value]), level.used))  # fmt: skip
+        return out
+
+    def _alignments(self, state: State, values: gtsam.Values) -> list[ObservationFactor]:
+        out = []
+        for a, chain in zip(self.survey.alignments, self.alignment_chains, strict=True):
+            pose, known = ChainPose(self.unknowns, state, chain), known_components(a.cov)
+            _refuse_held(pose.keys, f"alignment {a.alignment_id!r}")
+            _check_alignment(a, np.asarray(pose(values)[0].rotation().matrix()))
+            factor = custom(pose.keys, a.cov[np.ix_(known, known)], alignment_residual(a, pose, known))
+            names = tuple(np.array(["across_1", "across_2"])[known])
+            ids = (a.alignment_id, frame_text(a.a), frame_text(a.b))
+            out.append(ObservationFactor(factor, "alignment", a.group, ids, names, ("rad",) * len(names),
+                                         a.value[known], a.used))  # fmt: skip
+        return out
+
+    def _spots(self, state: State, values: gtsam.Values) -> list[ObservationFactor]:
+        out = []
+        for spot, chain in zip(self.survey.laser_spots, self.spot_chains, strict=True):
+            pose, beam = ChainPose(self.unknowns, state, chain), self.unknowns.vectors["beam", spot.beam_id]
+            axes = beam_axes(self.beams[spot.beam_id].axis)
+            along = pose(values)[0].rotation().matrix() @ axes @ np.array([*beam.full(values)[2:], 1.0])
+            if abs(along[2]) < 0.02 * np.linalg.norm(along):
+                raise SurveyError(
+                    f"laser spot {spot.spot_id!r}: beam {spot.beam_id!r} runs along target {spot.target_id!r} at epoch "
+                    f"{spot.epoch_id!r} instead of meeting it; correct its axis or the start of the target's pose"
+                )
+            keys = pose.keys + ([beam.key] if beam.key is not None else [])
+            _refuse_held(keys, f"laser spot {spot.spot_id!r}")
+            factor = custom(keys, spot.cov, spot_residual(spot, pose, beam, axes))
+            ids = (spot.spot_id, spot.beam_id, frame_text(FrameRef("target", spot.target_id, spot.epoch_id)))
+            out.append(ObservationFactor(factor, "laser", spot.group, ids, ("x", "y"), ("m", "m"), spot.xy, spot.used))
+        return out
+
+    def _on_surfaces(self, at: Mapping[PositionRef, Position]) -> list[ObservationFactor]:
+        out = []
+        for o in self.survey.on_surfaces:
+            surface, position = self.surfaces[o.surface_id], at[o.position]
+            vector = self.unknowns.vectors["surface", o.surface_id]
+            n = 2 if surface.kind == "line" and o.offset == 0.0 else 1
+            keys = position.keys + ([vector.key] if vector.key is not None else [])
+            _refuse_held(keys, f"{position_text(o.position)} on surface {o.surface_id!r}")
+            factor = custom(keys, np.eye(n) * o.sigma**2, surface_residual(o, position, surface, vector))
+            ids, names = (o.surface_id, position_text(o.position)), ("across_1", "across_2") if n == 2 else ("offset",)
+            out.append(ObservationFactor(factor, "surface", o.group, ids, names, ("m",) * n, np.full(n, o.offset),
+                                         o.used))  # fmt: skip
+        return out
+
+
+def known_components(cov: FloatArray) -> BoolArray:
+    """Which components of an observation were observed: those with a finite variance."""
+    return np.asarray(np.isfinite(np.diag(cov)))
+
+
+def _base(vector: VectorMap, values: FloatArray) -> FloatArray:
+    """Constants of a vector: the values of what is not free."""
+    return np.array([0.0 if s in ("free", "prior", "tied") else v for s, v in zip(vector.status, values, strict=True)])
+
+
+def _refuse_held(keys: list[int], what: str) -> None:
+    if not keys:
+        raise SurveyError(f"{what} joins what is held; it can adjust nothing: free something or remove it")
+
+
+def _check_level(level: Level, pose: Pose3, vertical: VerticalMap, values: gtsam.Values) -> None:
+    up = up_at(vertical.at(values), pose.translation())[0]
+    sine = abs(float(up @ pose.rotation().matrix() @ level.axis_in_frame))
+    if sine > 0.9:
+        angle = np.degrees(np.arcsin(min(1.0, sine)))
+        raise SurveyError(
+            f"level {level.level_id!r}: the axis of {frame_text(level.frame)} starts {angle:.0f} deg above or "
+            "below the horizontal, where a level tells nothing; name the axis along which it was laid"
+        )
+
+
+def _check_alignment(a: Alignment, R: FloatArray) -> None:
+    along = float(a.axis_in_b @ R @ a.axis_in_a)
+    if along < 0.5:
+        angle = np.degrees(np.arccos(np.clip(along, -1.0, 1.0)))
+        raise SurveyError(
+            f"alignment {a.alignment_id!r}: the axes of {frame_text(a.a)} and {frame_text(a.b)} start {angle:.0f} deg "
+            "apart; correct an axis (its sign) or the start of the poses"
+        )

@@ -1,0 +1,4 @@
+"""Image points.
+
+Of known targets in condensed blocks, and of unknown points with points and poses reduced in the batch.
+"""

@@ -1,0 +1,290 @@
+"""All image points of known targets: one compiled pass evaluates them, one condensed factor per block serves GTSAM.
+
+A block's rows are the upper triangular square root of its augmented normal matrix over [lens | camera_from_target |
+warp | residual]: the same linear system and chi-square as its 2n rows, for any n (Lawson and Hanson 1974, chapter 27).
+"""
+
+from collections.abc import Mapping, Sequence, Set
+from functools import cached_property
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+
+from adjust.frames.chains import evaluate_chains
+from adjust.frames.state import State
+from adjust.frames.unknowns import Chain
+from adjust.model.observations import ImageBlock
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.native.images import (
+    BlockArrays,
+    KeyArrays,
+    PointArrays,
+    all_statistics,
+    errors,
+    local_by_keys,
+    normal_equations,
+    serve,
+)
+from adjust.native.parallel import run_split, split_blocks
+from adjust.native.trees import TreeArrays
+from adjust.observations.images.segments import block_keys
+from adjust.precision.tree import TreeCovariance
+
+
+def square_root_information(cov: FloatArray) -> FloatArray:
+    """Upper triangular W (n, 3: w00, w01, w11) with W'W = inv(cov), for covariances (n, 2, 2)."""
+    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    w11 = 1.0 / np.sqrt(c)
+    w00 = 1.0 / np.sqrt(a - b * b / c)
+    return np.stack([w00, -w00 * b / c, w11], axis=1)
+
+
+def whitened_squares(v: FloatArray, W: FloatArray) -> FloatArray:
+    """|W v|^2 (n,) of residuals v (n, 2) with W (n, 3) upper triangular."""
+    return np.asarray((W[:, 0] * v[:, 0] + W[:, 1] * v[:, 1]) ** 2 + (W[:, 2] * v[:, 1]) ** 2)
+
+
+def warp_shape(x: FloatArray) -> FloatArray:
+    """The two unit sags 4u(1-u), 4v(1-v) at points (n, 3), u and v running from 0 to 1 over the target."""
+    low, high = x[:, :2].min(axis=0), x[:, :2].max(axis=0)
+    span = np.where(high > low, high - low, 1.0)
+    u = (x[:, :2] - low) / span
+    return np.asarray(4.0 * u * (1.0 - u))
+
+
+class Chains:
+    """Pose chains of many blocks in flat arrays, evaluated together."""
+
+    def __init__(self, chains: Sequence[Chain]) -> None:
+        links = [link for chain in chains for link in chain]
+        self.ptr: IntArray = np.cumsum([0] + [len(chain) for chain in chains])
+        self.slot = np.array([link.slot for link in links], dtype=np.int64)
+        self.inverse: BoolArray = np.array([link.inverse for link in links], dtype=np.bool_)
+        n = len(chains)
+        self.R, self.t, self.C = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((len(links), 6, 6))
+
+    def evaluate(self, state: State) -> None:
+        """Fill R (B, 3, 3), t (B, 3) and C (links, 6, 6)."""
+        self.R, self.t, self.C = evaluate_chains(state.slot_R, state.slot_t, self.ptr, self.slot, self.inverse)
+
+    def one(self, state: State, b: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """R (1, 3, 3), t (1, 3) and C (links, 6, 6) of chain ``b`` alone; fills nothing."""
+        links = slice(self.ptr[b], self.ptr[b + 1])
+        ptr: IntArray = np.array([0, self.ptr[b + 1] - self.ptr[b]])
+        return evaluate_chains(state.slot_R, state.slot_t, ptr, self.slot[links], self.inverse[links])
+
+    def slots(self, b: int) -> list[int]:
+        """The slots of chain ``b``."""
+        return [int(slot) for slot in self.slot[self.ptr[b] : self.ptr[b + 1]]]
+
+
+class ImageBatch:
+    """Image points of known targets (and of held world points), grouped per block.
+
+    ``prepare(values)`` evaluates everything; the factors serve what was prepared when they are asked at exactly these
+    values, and evaluate their own block otherwise, so the graph is correct in any GTSAM algorithm.
+    """
+
+    def __init__(
+        self, survey: Survey, state: State, blocks: Sequence[ImageBlock], chains: Sequence[Chain],
+        x_in_world: FloatArray, n_warp: Mapping[str | None, int],
+    ) -> None:  # fmt: skip
+        """x_in_world: points (P, 3) m of the world, for blocks without a target. n_warp: free components by target."""
+        self.blocks = tuple(blocks)
+        self.state = state
+        self.chains = Chains(chains)
+        self.ptr: IntArray = np.cumsum([0] + [len(b.uv) for b in blocks])
+        self.camera = np.array([state.cameras[b.camera_id] for b in blocks], dtype=np.int64)
+        warped: dict[str | None, int] = {t: i for t, i in state.targets.items() if state.warp_maps[i] is not None}
+        self.warp_id = np.array([warped.get(b.target_id, -1) for b in blocks], dtype=np.int64)
+        self.n_warp = np.array([n_warp[b.target_id] for b in blocks], dtype=np.int64)
+        self.n_points = int(self.ptr[-1])
+        self.W_all = square_root_information(np.concatenate([np.zeros((0, 2, 2)), *(b.cov for b in blocks)]))
+        self.used: BoolArray = used_points(blocks)
+        self.W_all_columns = np.ascontiguousarray(self.W_all.T)
+        self.W = self.W_all_columns * self.used
+        self.arrays = BlockArrays(self.ptr, self.camera, self.warp_id, self.n_warp)
+        self.points = _point_arrays(survey, blocks, x_in_world, warped.keys())
+        self._place_keys()
+
+    def _place_keys(self) -> None:
+        warp = np.where(self.n_warp > 0, self.warp_id, -1)
+        self.of_blocks = block_keys(self.state, self.camera, self.chains.ptr, self.chains.slot, warp)
+        self.n_rows: IntArray = self.state.lenses.n_free[self.camera] + 6 + self.n_warp + 1
+        most = int(self.n_rows.max(initial=1))
+        self.H = np.zeros((len(self.blocks), most, most))
+        self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
+        self._flat: FloatArray | None = None
+        self._served = np.zeros(len(self.blocks), dtype=np.bool_)
+        self._prepared: gtsam.Values | None = None
+        self._with_jacobians = False
+        self._all = split_blocks(self.ptr)
+
+    @cached_property
+    def keys(self) -> list[list[int]]:
+        """The keys of every block."""
+        ptr, key = self.of_blocks.ptr.tolist(), self.of_blocks.key.tolist()
+        return [key[a:b] for a, b in pairwise(ptr)]
+
+    def prepare(self, values: gtsam.Values, jacobians: bool) -> None:
+        """Evaluate all blocks at ``values``; ``state`` must have been loaded from the same values.
+
+        With ``jacobians`` the normal equations of every block, from which rows are served and poses are reduced.
+        """
+        if values is self._prepared and self._with_jacobians >= jacobians:
+            return
+        self.chains.evaluate(self.state)
+        self._evaluate(self._all, jacobians)
+        self._prepared, self._with_jacobians = values, jacobians
+
+    @property
+    def prepared(self) -> gtsam.Values | None:
+        """The values at which everything was evaluated last."""
+        return self._prepared
+
+    def forget(self) -> None:
+        """Evaluate again when next asked, whatever the values."""
+        self._prepared = None
+
+    def _evaluate(self, runs: list[IntArray], jacobians: bool) -> None:
+        s, c = self.state, self.chains
+        given = (self.arrays, self.points, self.W, s.lenses, c.R, c.t, s.warp)
+        if jacobians:
+            run_split(normal_equations, runs, *given, self.H, self.chi, self.depth)
+            self._served[:] = False
+        else:
+            run_split(errors, runs, *given, self.chi, self.depth)
+
+    def serve(self, which: IntArray | None = None) -> None:
+        """Condense these blocks, or all, for their factors, as last prepared with Jacobians."""
+        if which is not None and len(which) == 0:
+            return
+        if self._flat is None:
+            self._make_room()
+        runs = self._all if which is None else [which]
+        run_split(serve, runs, self.arrays, self.state.lenses, self.of_blocks.segments, self.chains.C,
+                  self.state.D, self.of_blocks.columns, self._at, self.H, self._flat, self.r)  # fmt: skip
+        for run in runs:
+            self._served[run] = True
+
+    def _make_room(self) -> None:
+        """Where the rows of all factors are written, and views of them for GTSAM."""
+        k = self.of_blocks
+        sizes = self.n_rows * k.columns
+        self._at = np.cumsum(np.append(0, sizes))[:-1].astype(np.int64)
+        self._flat, self.r = np.zeros(int(sizes.sum())), np.zeros((len(self.blocks), int(self.n_rows.max(initial=1))))
+        self._views: list[list[FloatArray]] = []
+        for b in range(len(self.blocks)):
+            rows, views = int(self.n_rows[b]), []
+            for i in range(k.ptr[b], k.ptr[b + 1]):
+                at, n = int(self._at[b] + rows * k.place[i]), int(k.width[i])
+                views.append(self._flat[at : at + rows * n].reshape(rows, n))
+            self._views.append(views)
+
+    def _evaluate_alone(self, b: int, values: gtsam.Values, jacobians: bool) -> None:
+        self.state.load(values, self.chains.slots(b))
+        c, links = self.chains, slice(self.chains.ptr[b], self.chains.ptr[b + 1])
+        c.R[b : b + 1], c.t[b : b + 1], c.C[links] = c.one(self.state, b)
+        self._prepared = None
+        self._evaluate([np.array([b], dtype=np.int64)], jacobians)
+
+    def residual(self, b: int, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        """What GTSAM's custom factor of block ``b`` returns: its condensed residual, and its rows by key."""
+        alone = values is not self._prepared or (jacobians is not None and not self._with_jacobians)
+        if alone:
+            self._evaluate_alone(b, values, jacobians is not None)
+        if jacobians is None:  # only the length of a residual is asked for: zeros, then the length
+            length = np.zeros(int(self.n_rows[b]))
+            length[-1] = np.sqrt(self.chi[b])
+            return length
+        if not self._served[b]:
+            if not alone and self.state.loaded is not values:  # another factor was asked at other values in between
+                self.state.load(values)
+            self.serve(np.array([b], dtype=np.int64))
+        for i, view in enumerate(self._views[b]):
+            jacobians[i] = view
+        return np.asarray(self.r[b, : self.n_rows[b]])
+
+    def set_weights(self, weights: FloatArray) -> None:
+        """Weights (N,) on top of the covariances; a point of weight zero is left out, the others are used."""
+        self.forget()
+        self.used = weights > 0.0
+        self.W = self.W_all_columns * np.sqrt(weights)
+
+    def whitened_squares(self) -> FloatArray:
+        """Weighted squares v' inv(Q_ll) v (N,) of all points where the chains were last evaluated."""
+        return whitened_squares(self.statistics(None)[0], self.W_all)
+
+    def add_factors(self, graph: gtsam.NonlinearFactorGraph, which: IntArray | None = None) -> None:
+        """One custom factor for each of these blocks, or of all, that has an unknown."""
+        noise = {int(n): gtsam.noiseModel.Unit.Create(int(n)) for n in np.unique(self.n_rows)}
+        for b in range(len(self.blocks)) if which is None else which.tolist():
+            keys = self.keys[b]
+            if keys:
+                graph.add(gtsam.CustomFactor(noise[int(self.n_rows[b])], keys, _callback(self, b)))
+
+    def local_from_keys(self, b: int) -> FloatArray:
+        """Derivative (n_lens + 6 + n_warp, sum of key dims) of the block's local unknowns by its keys."""
+        nl = int(self.state.lenses.n_free[self.camera[b]])
+        G = np.zeros((int(self.n_rows[b]) - 1, int(self.of_blocks.columns[b])))
+        local_by_keys(b, nl, self.of_blocks.segments, self.chains.C, self.state.D, G)
+        return G
+
+    def statistics(self, tree: TreeCovariance | None) -> tuple[FloatArray, FloatArray]:
+        """Residuals (N, 2) px and whitened A Q A' (N, 3) of all points, where the chains were last evaluated.
+
+        tree: covariances of the unknowns; without it, A Q A' is zero.
+        """
+        residual, influence = np.zeros((self.n_points, 2)), np.zeros((self.n_points, 3))
+        number = tree.number if tree is not None else {}
+        s, c, k = self.state, self.chains, self.of_blocks
+        keys = np.array([number.get(key, -1) for key in k.key.tolist()], dtype=np.int64)
+        lost = np.zeros(len(self.blocks), dtype=np.int64)
+        run_split(
+            all_statistics, self._all, self.arrays, self.points, self.W_all_columns, s.lenses, c.R, c.t, s.warp,
+            k.segments, c.C, s.D, k.columns, KeyArrays(k.ptr, keys, k.place),
+            tree.arrays if tree is not None else TreeArrays.nothing(), residual, influence, lost,
+        )  # fmt: skip
+        if lost.any() and tree is not None:
+            raise KeyError(f"unknowns of block {int(np.argmax(lost))} share no clique")
+        return residual, influence
+
+
+def used_points(blocks: Sequence[ImageBlock]) -> BoolArray:
+    """Which image points (N,) of these blocks take part."""
+    ptr = np.cumsum([0] + [len(b.uv) for b in blocks]).tolist()
+    used = np.ones(ptr[-1], dtype=np.bool_)
+    for i, block in enumerate(blocks):
+        if block.used is not None:
+            used[ptr[i] : ptr[i + 1]] = block.used
+    return used
+
+
+def _point_arrays(
+    survey: Survey, blocks: Sequence[ImageBlock], x_in_world: FloatArray, warped: Set[str | None]
+) -> PointArrays:
+    """All image points with what they show: taken from the points of all targets seen, one after the other."""
+    targets: dict[str | None, FloatArray] = {t.target_id: t.x_in_target for t in survey.targets}
+    targets[None] = x_in_world
+    seen = dict.fromkeys(b.target_id for b in blocks)
+    x = [np.zeros((0, 3)), *(targets[t] for t in seen)]
+    starts = np.cumsum([len(part) for part in x]).tolist()
+    start, sizes = dict(zip(seen, starts, strict=False)), [len(b.uv) for b in blocks]
+    index = np.concatenate([np.zeros(0, dtype=np.int64), *(b.point_idx for b in blocks)])
+    if np.any((index < 0) | (index >= np.repeat([len(targets[b.target_id]) for b in blocks], sizes))):
+        raise IndexError("an image block shows points that its target does not have")
+    rows = index + np.repeat(np.array([start[b.target_id] for b in blocks], dtype=np.int64), sizes)
+    uv = np.ascontiguousarray(np.concatenate([np.zeros((0, 2)), *(b.uv for b in blocks)]).T)
+    shape = np.zeros((2, len(rows)))
+    if not warped.isdisjoint(seen):
+        bent = [warp_shape(targets[t]) if t in warped else np.zeros((len(targets[t]), 2)) for t in seen]
+        shape = np.ascontiguousarray(np.concatenate(bent)[rows].T)
+    return PointArrays(np.ascontiguousarray(np.concatenate(x)[rows].T), shape, uv)
+
+
+def _callback(batch: ImageBatch, b: int):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
+    def residual(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # as above
+        return batch.residual(b, values, jacobians)
+
+    return residual

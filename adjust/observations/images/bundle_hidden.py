@@ -1,0 +1,194 @@
+"""What follows from the interface of a bundle: poses and points that its batch has reduced, and their covariances."""
+
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+import scipy
+from scipy import sparse
+
+from adjust.model.survey import FloatArray
+from adjust.native.bundles import (
+    between_poses,
+    direct_influence,
+    fill_upper,
+    of_points,
+    point_from_local,
+    reduced_influence,
+    with_lenses,
+    with_poses,
+)
+from adjust.native.lenses import MAX_LENS
+from adjust.native.parallel import run_split
+from adjust.observations.images.bundles import BundleBatch
+
+
+class BundleHidden:
+    """The hidden unknowns of a batch that is prepared with Jacobians, and stays so."""
+
+    def __init__(self, batch: BundleBatch) -> None:
+        self.batch = batch
+        self._given_interface: tuple[FloatArray, FloatArray] | None = None
+
+    def rows_along(self, V: FloatArray) -> FloatArray:
+        """Whitened Jacobian times directions V (n_interface, k) as rows (2K, k), what is hidden following best.
+
+        From the rows themselves: their normal equations would hide anything below the root of rounding.
+        """
+        b = self.batch
+        nh, k = b.n_hidden, V.shape[1]
+        d = np.vstack([np.zeros((nh, k)), V])
+        if nh:
+            right = np.asfortranarray(b.Y[:, :-1] @ (V * b.scale[nh:, None]))
+            d[:nh] = -scipy.linalg.lapack.dtrtrs(b.C, right, lower=0)[0] / b.scale[:nh, None]
+        local = np.asarray(b.G @ d)
+        points = np.zeros((len(b.point_ids), 3, k))
+        points[b.reduced] = b.points_following(local)
+        for i, at in b.tied_at.items():
+            points[i] = local[at : at + 3]
+        poses = local[b.first_pose : b.first_pose + 6 * len(b.blocks)].reshape(-1, 6, k)
+        by_pose, by_point = b.A[:, :, MAX_LENS : MAX_LENS + 6], b.A[:, :, MAX_LENS + 3 : MAX_LENS + 6]
+        out = by_pose @ poses[b.block] + by_point @ points[b.point]
+        for camera in sorted(set(b.camera_of.tolist())):
+            mine, free = b.camera_of == camera, int(b.state.lenses.n_free[camera])
+            out[mine] += b.A[mine, :, :free] @ local[b.lens_at[camera] : b.lens_at[camera] + free]
+        return np.asarray(out.reshape(-1, k))
+
+    def _hidden_poses_given_interface(self) -> tuple[FloatArray, FloatArray]:
+        """Hidden poses by the interface (n_hidden, n_interface), and their covariance when that is known."""
+        b = self.batch
+        if self._given_interface is None:
+            nh = b.n_hidden
+            scale = b.scale[:nh]
+            T = -scipy.linalg.lapack.dtrtrs(b.C, b.Y[:, :-1], lower=0)[0]
+            P = scipy.linalg.lapack.dpotri(b.C, lower=0)[0].T  # in C's order the lower triangle
+            fill_upper(P)
+            P /= scale
+            P /= scale[:, None]
+            self._given_interface = T / scale[:, None] * b.scale[nh:], P
+        return self._given_interface
+
+    def covariances(self, Q_interface: FloatArray, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Covariances of everything hidden, from the interface's joint covariance (order ``interface``).
+
+        Returns that of all poses and tied points (order ``order``), of the reduced points (P, 3, 3), and the whitened
+        A Q A' (K, 3) of every image point (sorted order). The batch must be prepared with Jacobians at ``values``.
+        """
+        b = self.batch
+        nh, n = b.n_hidden, b.n_keys
+        Q = np.empty((n, n))
+        Q[nh:, nh:] = Q_interface
+        if nh:
+            T, P = self._hidden_poses_given_interface()
+            Q[:nh, nh:] = T @ Q_interface
+            Q[nh:, :nh] = Q[:nh, nh:].T
+            np.matmul(Q[:nh, nh:], T.T, out=Q[:nh, :nh])
+            Q[:nh, :nh] += P
+        b.evaluate_rows(values, b.W_all)
+        return Q, *self._of_points_and_rows(self._local_covariance(Q))
+
+    def _local_covariance(self, Q: FloatArray) -> FloatArray:
+        """G Q G' (n_local, n_local)."""
+        b = self.batch
+        nh = b.n_hidden
+        if not b.alone:
+            return np.ascontiguousarray(b.G @ (b.G @ Q).T)
+        out = np.zeros((b.n_local, b.n_local))
+        between_poses(Q, b.own_at, b.chains.C[b.own_links], False, False, out)
+        to_interface = b.G[:, nh:]
+        mine = np.flatnonzero(np.diff(to_interface.indptr))
+        across = np.asarray(to_interface[mine] @ (b.G @ np.ascontiguousarray(Q[:, nh:])).T)
+        out[mine], out[:, mine] = across, across.T
+        return out
+
+    def _of_points_and_rows(self, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Covariances (P, 3, 3) of the reduced points, A Q A' (K, 3) of all image points. Q: of the local unknowns."""
+        b = self.batch
+        Y, YL = np.empty_like(b.W3), np.zeros_like(b.WL)
+        point_from_local(b.arrays, b.of_reduced, Y, YL)
+        B, BL, C = np.empty_like(b.W3), np.zeros_like(b.WL), np.zeros((len(b.reduced), 3, 3))
+        run_split(with_poses, b.runs, b.arrays, Q, Y, YL, B)
+        with_lenses(b.arrays, b.Vi, Q, Y, YL, B, BL, C)
+        influence = np.zeros((len(b.point), 3))
+        run_split(reduced_influence, b.runs, b.arrays, b.A, Q, B, BL, C, influence)
+        direct_influence(b.n_reduced, len(b.point), b.arrays, b.A, Q, influence)
+        return C, influence
+
+    def transposed(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
+        """Rows on hidden unknowns, transposed (dim, k) per key, as rows on the interface (n_interface, k)."""
+        nh, u = self.batch.n_hidden, self._by_keys(rows, k)
+        out = u[nh:]
+        return out + self._hidden_poses_given_interface()[0].T @ u[:nh] if nh else out
+
+    def products(self, interface: FloatArray, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
+        """Covariance times rows of every hidden unknown (dim, k), from that of the interface (n_interface, k).
+
+        rows: what the rows are on hidden unknowns, transposed (dim, k) per key. The batch must be prepared.
+        """
+        b = self.batch
+        nh, k = b.n_hidden, interface.shape[1]
+        d = np.zeros((b.n_keys, k))
+        d[nh:] = interface
+        if nh:
+            T, P = self._hidden_poses_given_interface()
+            d[:nh] = T @ interface + P @ self._by_keys(rows, k)[:nh]
+        dX = b.points_following(np.asarray(b.G @ d)) + b.Vi @ self._of_points(rows, k)
+        out = {key: d[b.key_at[key] : b.key_at[key] + 6] for key in b.hidden_poses}
+        return out | {b.point_key[i]: dX[j] for j, i in enumerate(b.reduced)}
+
+    def _of_points(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
+        b = self.batch
+        out = np.zeros((len(b.reduced), 3, k))
+        for j, i in enumerate(b.reduced):
+            if b.point_key[i] in rows:
+                out[j] = rows[b.point_key[i]]
+        return out
+
+    def _by_keys(self, rows: Mapping[int, FloatArray], k: int) -> FloatArray:
+        """Rows on hidden unknowns, transposed, as rows (n_keys, k) on the poses and the interface, points reduced."""
+        b = self.batch
+        g = b.Vi @ self._of_points(rows, k)
+        local = np.zeros((b.n_local, k))
+        of_points(b.arrays, b.of_reduced, g, local)
+        out = np.asarray(b.G.T @ local)
+        for key in b.hidden_poses:
+            if key in rows:
+                out[b.key_at[key] : b.key_at[key] + 6] += rows[key]
+        return out
+
+    def from_interface(self, keys: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """How hidden poses and points follow from the interface, stacked: M (n, n_interface), and their own scatter.
+
+        Their covariance is M Q_interface M' plus the second matrix (n, n); with any unknown b outside it is
+        M Cov(interface, b). The batch must be prepared with Jacobians.
+        """
+        b = self.batch
+        nh, n = b.n_hidden, b.n_keys
+        T, own = np.zeros((n, n - nh)), np.zeros((n, n))
+        T[nh:] = np.eye(n - nh)
+        if nh:
+            T[:nh], own[:nh, :nh] = self._hidden_poses_given_interface()
+        reduced = {b.point_key[i]: j for j, i in enumerate(b.reduced)}
+        rows, V = [], []
+        for key in keys:
+            if key in reduced:
+                rows.append(self._point_from_local(reduced[key]) @ b.G)
+                V.append(b.Vi[reduced[key]])
+            else:
+                at = b.key_at[key]
+                rows.append(sparse.csr_matrix((np.ones(6), (np.arange(6), at + np.arange(6))), shape=(6, n)))
+                V.append(np.zeros((6, 6)))
+        L = sparse.vstack(rows).tocsr()
+        scatter = np.asarray(L @ (L @ own).T) + scipy.linalg.block_diag(*V)
+        return np.asarray(L @ T), scatter
+
+    def _point_from_local(self, j: int) -> sparse.csr_matrix:
+        """Derivative (3, n_local) of reduced point ``j`` by the local unknowns: -V^-1 W."""
+        b = self.batch
+        Y = np.zeros((3, b.n_local))
+        for i in range(b.pc_ptr[j], b.pc_ptr[j + 1]):
+            at, n = b.lens_at[b.pc_camera[i]], b.state.lenses.n_free[b.pc_camera[i]]
+            Y[:, at : at + n] -= b.Vi[j] @ b.WL[i, :, :n]
+        for k in range(b.ptr[j], b.ptr[j + 1]):
+            Y[:, b.pose_at[k] : b.pose_at[k] + 6] -= b.Vi[j] @ b.W3[k]
+        return sparse.csr_matrix(Y)

@@ -1,0 +1,1 @@
+"""Readings of total stations, theodolites, levels and tapes: their equations, parameters and rows."""

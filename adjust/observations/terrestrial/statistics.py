@@ -1,0 +1,119 @@
+"""Redundancy numbers, standardized residuals and tests of all readings, from the covariances in a Bayes tree.
+
+Q_vv = Q_ll - A Q A'; r = diag(Q_vv P); the test of one reading is w^2 with w = (P v)_i / sqrt((P Q_vv P)_ii), which is
+the standardized residual where readings are not correlated (Baarda 1968; Foerstner 1979).
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import overload
+
+import gtsam
+import numpy as np
+
+from adjust.model.result import ObservationResidual, ReadingResiduals
+from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.native.trees import row_influences
+from adjust.observations.listed import position_text
+from adjust.observations.terrestrial.batch import TerrestrialBatch
+from adjust.precision.tree import TreeCovariance
+
+_ANGLES = ("direction", "angle", "zenith", "azimuth")
+
+
+def influences(batch: TerrestrialBatch, tree: TreeCovariance) -> FloatArray:
+    """Whitened a Q a' (N,) of all readings; the batch serves its rows unweighted. Order of ``Survey.readings``."""
+    chunks = batch.layout.chunks
+    rows, keys = np.array([(len(c.rows), len(c.keys)) for c in chunks], dtype=np.int64).reshape(-1, 2).T
+    row_ptr, key_ptr = (np.concatenate([[0], np.cumsum(n)]) for n in (rows, keys))
+    key = np.array([tree.number[k] for chunk in chunks for k in chunk.keys], dtype=np.int64)
+    start = np.array([chunk.start for chunk in chunks], dtype=np.int64)
+    found, lost = row_influences(row_ptr, key_ptr, key, start, batch.J, tree.arrays)
+    for c in np.flatnonzero(lost):
+        A = batch.jacobian(int(c))
+        found[row_ptr[c] : row_ptr[c + 1]] = np.einsum("ip,pq,iq->i", A, tree.joint(chunks[c].keys), A)
+    out = np.empty(len(found))
+    out[np.concatenate([chunk.rows for chunk in chunks])] = found
+    return out
+
+
+def reading_residuals(batch: TerrestrialBatch, tree: TreeCovariance, values: gtsam.Values) -> ReadingResiduals:
+    """Residuals and their statistics of all readings at ``values``."""
+    e = batch.unweighted(values)
+    used = batch.used
+    influence = influences(batch, tree)
+    sigma = batch.sigma.copy()
+    q = np.where(used, 1.0 - influence, 1.0 + influence)
+    redundancy = np.where(used, q, 0.0)
+    own = np.sqrt(np.maximum(q, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        standardized = np.where(own > 1e-6, e / own, np.nan)
+    test = standardized**2
+    for c in batch.correlated:
+        chunk = batch.layout.chunks[c]
+        if chunk.whitener is not None:
+            rows, W = chunk.rows, chunk.whitener
+            A = batch.jacobian(c)
+            M = A @ tree.joint(chunk.keys) @ A.T
+            Q = np.eye(len(rows)) - M if used[rows].all() else np.eye(len(rows)) + M
+            _correlated(W, Q, batch.residual[rows], e[rows], used[rows].all(),
+                        rows, redundancy, own, standardized, test)  # fmt: skip
+    observed = batch.layout.arrays.observed
+    return ReadingResiduals(
+        observed, observed + batch.residual, batch.residual.copy(), sigma, own * sigma, redundancy, standardized, test,
+        e**2, used,
+    )  # fmt: skip
+
+
+def _correlated(
+    W: FloatArray, Q: FloatArray, v: FloatArray, e: FloatArray, used: np.bool_, rows: IntArray, redundancy: FloatArray,
+    own: FloatArray, standardized: FloatArray, test: FloatArray,
+) -> None:  # fmt: skip
+    root = np.linalg.inv(W)
+    sigma = np.sqrt(np.diag(root @ root.T))
+    sigma_v = np.sqrt(np.maximum(0.0, np.diag(root @ Q @ root.T)))
+    scale = np.sqrt(np.maximum(0.0, np.diag(W.T @ Q @ W)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        standardized[rows] = np.where(sigma_v > 1e-6 * sigma, v / sigma_v, np.nan)
+        test[rows] = np.where(scale * sigma > 1e-6, (W.T @ e) / scale, np.nan) ** 2
+    own[rows] = sigma_v / sigma
+    redundancy[rows] = np.diag(root @ Q @ W) if used else 0.0
+
+
+class JoinedResiduals(Sequence[ObservationResidual]):
+    """Residuals of single observations, followed by those of all readings, each made when it is asked for."""
+
+    def __init__(self, first: tuple[ObservationResidual, ...], survey: Survey, readings: ReadingResiduals) -> None:
+        self.first, self.survey, self.readings = first, survey, readings
+
+    def __len__(self) -> int:
+        return len(self.first) + len(self.survey.readings)
+
+    @overload
+    def __getitem__(self, index: int) -> ObservationResidual: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[ObservationResidual, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> ObservationResidual | tuple[ObservationResidual, ...]:
+        if isinstance(index, slice):
+            return tuple(self[i] for i in range(*index.indices(len(self))))
+        i = index + len(self) if index < 0 else index
+        if not 0 <= i < len(self):
+            raise IndexError(index)
+        return self.first[i] if i < len(self.first) else self._reading(i - len(self.first))
+
+    def __iter__(self) -> Iterator[ObservationResidual]:
+        yield from self.first
+        for i in range(len(self.survey.readings)):
+            yield self._reading(i)
+
+    def _reading(self, i: int) -> ObservationResidual:
+        reading, a, one = self.survey.readings[i], self.readings, slice(i, i + 1)
+        ids: tuple[str, ...] = (reading.reading_id, position_text(reading.at), position_text(reading.to))
+        if reading.second is not None:
+            ids = (*ids, position_text(reading.second))
+        return ObservationResidual(
+            reading.kind, reading.group, ids, (reading.kind,), ("rad" if reading.kind in _ANGLES else "m",),
+            a.observed[one], a.adjusted[one], a.residual[one], a.sigma[one], a.redundancy[one], a.standardized[one],
+            float(a.test[i]), bool(a.used[i]),
+        )  # fmt: skip

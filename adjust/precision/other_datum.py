@@ -1,0 +1,211 @@
+"""A solution in another datum, without solving again: new coordinates and their covariances by an S-transformation.
+
+What was held becomes free: a held point has the covariance zero before and another one after. Only motions of the whole
+survey that no observation sees can be chosen anew.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from gtsam import Pose3, Rot3
+from scipy.linalg import block_diag
+
+from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.datum import InnerDatum, datum_rows, in_world, inner_datum, survey_motions
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment, Estimate, ParameterName
+from adjust.model.survey import Datum, FloatArray, Point, PoseParameter, Survey, Target
+from adjust.precision.precision import Precision
+from adjust.precision.s_transformation import STransformation, s_transformation
+
+_ROUNDS, _SETTLED = 20, 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class TransformedPrecision:
+    """Covariances in the new datum; names as in ``Adjustment.estimates``, stacked with all their free components.
+
+    blocks: per key, how its tangent (dim, dim) turned and grew with the finite motion to the new coordinates.
+    """
+
+    precision: Precision
+    keys: Mapping[ParameterName, int]
+    dims: Mapping[int, int]
+    transformation: STransformation
+    blocks: Mapping[int, FloatArray]
+    held: Mapping[int, tuple[int, ...]]
+
+    def joint(self, names: Sequence[ParameterName]) -> FloatArray:
+        """Joint covariance of several unknowns, stacked in this order."""
+        before = self.precision.graph.unknowns.by_name
+        old = [name for name in names if name in before]
+        keys = [self.keys[name] for name in names]
+        start = np.cumsum([0] + [self.dims[k] for k in keys])
+        at = [np.arange(start[i], start[i + 1]) for i, name in enumerate(names) if name in before]
+        Q = np.zeros((int(start[-1]),) * 2)
+        if old:
+            index = np.concatenate(at)
+            B = block_diag(*(self.blocks[self.keys[name]] for name in old))
+            Q[np.ix_(index, index)] = B @ self.precision.joint(old) @ B.T
+        return self.transformation.apply(keys, Q)
+
+    def cov(self, name: ParameterName) -> FloatArray:
+        """Covariance of one unknown, zero for components that are held."""
+        Q = np.array(self.joint([name]))
+        held = list(self.held.get(self.keys[name], ()))
+        Q[held], Q[:, held] = 0.0, 0.0
+        return Q
+
+
+def in_datum(result: Adjustment, datum: Datum, reference: Mapping[str, FloatArray] | None = None) -> Adjustment:
+    """The adjusted survey in an inner datum over other points or stations.
+
+    reference: coordinates (3,) m that the datum's points are fitted to; None keeps all coordinates where they are and
+    changes the covariances only. Residuals and their statistics stay. Raises SurveyError where the observations
+    themselves define the datum, and where what is named cannot carry it.
+    """
+    if datum.kind != "inner":
+        raise SurveyError("a solution can be moved to a datum of kind 'inner' only; to hold points, adjust again")
+    if not isinstance(result.precision, Precision):
+        raise SurveyError("only a solution with its covariances can be moved to another datum; adjust the survey again")
+    precision = result.precision
+    survey = replace(released(result.survey), datum=datum)
+    start = _values_of(result)
+    graph = GraphBuilder(survey, start.lenses).build(start)
+    inner = inner_datum(graph, graph.start)
+    if inner is None:
+        raise SurveyError("the observations define position, orientation and scale: no datum is left to choose")
+    values, blocks = graph.start, {u.key: np.eye(u.dim) for u in graph.unknowns.by_name.values()}
+    if reference is not None:
+        values, blocks = _fitted(graph, inner, reference)
+    motions = survey_motions(graph, values, inner.directions)
+    old_key = {graph.unknowns.by_name[n].key: u.key for n, u in precision.graph.unknowns.by_name.items()}
+
+    def products(rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
+        mine = {old_key[k]: row @ blocks[k] for k, row in rows.items() if k in old_key}
+        found = precision.datum_products(mine) if mine else {}
+        return {k: blocks[k] @ found[old_key[k]] if k in old_key and found else np.zeros(m.shape)
+                for k, m in motions.items()}  # fmt: skip
+
+    transformation = s_transformation(datum_rows(inner.keys, motions), motions, products)
+    by_name = graph.unknowns.by_name
+    new = TransformedPrecision(
+        precision, {n: u.key for n, u in by_name.items()}, {u.key: u.dim for u in by_name.values()}, transformation,
+        blocks, graph.unknowns.held,
+    )  # fmt: skip
+    estimates = {name: _moved(graph, estimate, values, new) for name, estimate in result.estimates.items()}
+    return replace(
+        result, survey=survey, estimates=estimates, precision=new, datum_defect=inner.defect,
+        n_unknowns=graph.unknowns.n_unknowns,
+    )  # fmt: skip
+
+
+def released(survey: Survey) -> Survey:
+    """The survey with held points and held poses of things in the world free."""
+    points = tuple(
+        Point(p.point_id, replace(p.x_in_world, treatment="free")) if p.x_in_world.treatment == "held" else p
+        for p in survey.points
+    )
+    stations = tuple(
+        replace(s, world_from_station=_free(s.world_from_station), epochs={e: _free(q) for e, q in s.epochs.items()})
+        for s in survey.stations
+    )
+    targets = tuple(_released_target(t) for t in survey.targets)
+    tables = tuple(replace(t, world_from_table=_free(t.world_from_table)) for t in survey.tables)
+    return replace(survey, points=points, stations=stations, targets=targets, tables=tables)
+
+
+def _free(parameter: PoseParameter) -> PoseParameter:
+    return replace(parameter, treatment="free") if parameter.treatment == "held" else parameter
+
+
+def _released_target(target: Target) -> Target:
+    if target.station_id is not None:
+        return target
+    epochs = {e: _free(q) for e, q in target.epochs.items()}
+    return replace(target, carrier_from_target=_free(target.carrier_from_target), epochs=epochs)
+
+
+def _values_of(result: Adjustment) -> StartValues:
+    lenses, poses, points, vectors = {}, {}, {}, {}
+    for name, estimate in result.estimates.items():
+        if isinstance(estimate.value, Pose3):
+            poses[name] = estimate.value
+        elif name[0] == "lens":
+            lenses[name[1]] = estimate.value
+        elif name[0] == "point":
+            points[name[1]] = estimate.value
+        else:
+            vectors[name] = estimate.value
+    return StartValues(lenses, poses, points, vectors)
+
+
+def _fitted(
+    graph: AdjustmentGraph, inner: InnerDatum, reference: Mapping[str, FloatArray]
+) -> tuple[gtsam.Values, dict[int, FloatArray]]:
+    """Values moved as a whole onto the reference by least squares, and how the tangents (dim, dim) change with it."""
+    names = {key: graph.unknowns.by_key[key].name for key in inner.keys}
+    lost = [name[1] for name in names.values() if name[0] != "point" or name[1] not in reference]
+    if lost:
+        raise SurveyError(f"no reference coordinates for {', '.join(lost[:5])}; give them for every point of the datum")
+    values, turn, scale = graph.start, np.eye(3), 1.0
+    for _ in range(_ROUNDS):
+        motions = survey_motions(graph, values, inner.directions)
+        rows = datum_rows(inner.keys, motions)
+        seen = np.sum([row @ motions[k] for k, row in rows.items()], axis=0)
+        away = {k: np.asarray(values.atPoint3(k)) - reference[names[k][1]] for k in rows}
+        shift = -np.linalg.solve(seen, np.sum([row @ away[k] for k, row in rows.items()], axis=0))
+        c = inner.directions @ shift
+        values = _move(graph, values, c, {k: m @ shift for k, m in motions.items()})
+        turn, scale = Rot3.Expmap(c[3:6]).matrix() @ turn, scale * float(np.exp(c[6]))
+        if np.abs(c).max() < _SETTLED:
+            break
+    blocks = {}
+    for unknown in graph.unknowns.by_name.values():
+        block = np.eye(unknown.dim)
+        if unknown.kind == "point":
+            block = scale * turn
+        elif unknown.kind == "pose":
+            block[3:, 3:] *= scale
+        blocks[unknown.key] = block
+    return values, blocks
+
+
+def _move(
+    graph: AdjustmentGraph, values: gtsam.Values, c: FloatArray, steps: Mapping[int, FloatArray]
+) -> gtsam.Values:
+    """Values after the finite motion c (7,): translation, rotation vector, logarithm of the scale; vectors by steps."""
+    scale, world = float(np.exp(c[6])), Pose3(Rot3.Expmap(c[3:6]), c[:3])
+    out = gtsam.Values(values)
+    for name, unknown in graph.unknowns.by_name.items():
+        if unknown.kind == "point":
+            out.update(unknown.key, np.asarray(world.transformFrom(scale * np.asarray(values.atPoint3(unknown.key)))))
+        elif unknown.kind == "pose":
+            pose = values.atPose3(unknown.key)
+            scaled = Pose3(pose.rotation(), scale * pose.translation())
+            out.update(unknown.key, world.compose(scaled) if in_world(graph, name) else scaled)
+        else:
+            out.update(unknown.key, np.asarray(values.atVector(unknown.key) + steps[unknown.key]))
+    return out
+
+
+def _moved(graph: AdjustmentGraph, estimate: Estimate, values: gtsam.Values, new: TransformedPrecision) -> Estimate:
+    unknown = graph.unknowns.by_name.get(estimate.name)
+    if unknown is None:
+        return estimate
+    status = tuple("free" if s == "held" and estimate.name[0] == "point" else s for s in estimate.status)
+    held = graph.unknowns.held.get(unknown.key, ())
+    status = tuple("held" if i in held else s for i, s in enumerate(status))
+    if unknown.kind == "pose":
+        free = tuple("free" if s == "held" and i not in held else s for i, s in enumerate(estimate.status))
+        return replace(estimate, value=values.atPose3(unknown.key), cov=new.cov(estimate.name), status=free)
+    if unknown.kind == "point":
+        x = np.asarray(values.atPoint3(unknown.key))
+        return replace(estimate, value=x, cov=new.cov(estimate.name), status=status)
+    vector = graph.unknowns.vectors.get(estimate.name)
+    if vector is None:
+        return replace(estimate, value=np.asarray(values.atVector(unknown.key)), cov=new.cov(estimate.name))
+    return replace(estimate, value=vector.full(values), cov=vector.matrix @ new.cov(estimate.name) @ vector.matrix.T)
+

@@ -1,0 +1,293 @@
+"""Covariances, redundancy numbers and standardized residuals of a solved survey.
+
+Redundancy numbers and residual covariances follow Baarda (1968) and Foerstner (1979): Q_vv = Q_ll - A Q A', r = diag of
+Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, chi-square with two degrees of freedom.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gtsam
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.distributions import chi2
+from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.datum import stacking, survey_motions
+from adjust.graph.solver import Solved
+from adjust.model.result import (
+    GlobalTest,
+    GroupSummary,
+    ImageResiduals,
+    ObservationResidual,
+    ParameterName,
+    ReadingResiduals,
+)
+from adjust.model.survey import BoolArray, FloatArray
+from adjust.observations.images.batch import whitened_squares
+from adjust.observations.images.bundle_hidden import BundleHidden
+from adjust.observations.listed import ObservationFactor
+from adjust.precision.s_transformation import STransformation, s_transformation
+from adjust.precision.tree import TreeCovariance
+
+_AT_A_TIME = 8192
+"""Image points tested together: what is computed on the way stays in the second cache."""
+
+
+class Precision:
+    """Covariances of the adjusted unknowns, a priori (sigma0 = 1), in the survey's datum."""
+
+    def __init__(self, graph: AdjustmentGraph, solved: Solved) -> None:
+        self.graph, self.solved = graph, solved
+        dims = {key: unknown.dim for key, unknown in graph.unknowns.by_key.items()}
+        if solved.use_qr:
+            tree = solved.linear.eliminateMultifrontal(solved.ordering, gtsam.EliminateQR)
+        else:
+            tree = solved.linear.eliminateMultifrontal(solved.ordering)
+        self.tree = TreeCovariance(tree, dims, solved.leaves)
+        self.hidden: dict[int, FloatArray] = {}
+        self.bundle_influence = np.zeros((0, 3))
+        self._hidden = None if graph.bundle is None else BundleHidden(graph.bundle)
+        if self._hidden is not None:
+            self._add_hidden(self._hidden)
+        self.transformation: STransformation | None = None
+        if solved.datum is not None:
+            motions = survey_motions(graph, solved.values, solved.datum.directions)
+            self.transformation = s_transformation(solved.datum.rows, motions, self.products)
+
+    def products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
+        """Covariance, as solved, times the transpose of ``rows`` (k, dim per key): (dim, k) for every unknown."""
+        tree, below = self.tree, self._hidden
+        k = next(iter(rows.values())).shape[0]
+        right = np.zeros((tree.n, k))
+        hidden = {}
+        for key, row in rows.items():
+            if key in self.hidden:
+                hidden[key] = row.T
+            else:
+                right[tree.rows([key])] += row.T
+        if below is not None:
+            right[tree.rows(below.batch.interface)] += below.transposed(hidden, k)
+        product = tree.times(right)
+        at = tree.places()
+        out = {key: product[place] for key, place in at.items()}
+        if below is not None:
+            out |= below.products(product[tree.rows(below.batch.interface)], hidden)
+        return out
+
+    def datum_products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
+        """The same as :meth:`products`, of the covariance in the survey's datum: S Q S' times rows."""
+        found, t = self.products(rows), self.transformation
+        if t is None:
+            return found
+        moved = np.sum([row @ t.motions[key] for key, row in rows.items()], axis=0)
+        spread = np.sum([row @ t.spread[key] for key, row in rows.items()], axis=0)
+        return {key: H - t.motions[key] @ spread.T - t.spread[key] @ moved.T + t.motions[key] @ t.core @ moved.T
+                for key, H in found.items()}  # fmt: skip
+
+    def _add_hidden(self, hidden: BundleHidden) -> None:
+        bundle = hidden.batch
+        Q, points, self.bundle_influence = hidden.covariances(self.tree.joint(bundle.interface), self.solved.values)
+        self.bundle_order_cov = Q
+        for key in bundle.hidden_poses:
+            at = bundle.key_at[key]
+            self.hidden[key] = Q[at : at + 6, at : at + 6]
+        for j, i in enumerate(bundle.reduced):
+            self.hidden[bundle.point_key[i]] = points[j]
+
+    def _in_datum(self, keys: Sequence[int], Q: FloatArray) -> FloatArray:
+        return Q if self.transformation is None else self.transformation.apply(keys, Q)
+
+    def cov(self, key: int) -> FloatArray:
+        """Covariance (dim, dim) of one unknown."""
+        Q = self.hidden[key].copy() if key in self.hidden else self.tree.marginal(key)
+        Q = self._in_datum([key], Q)
+        held = list(self.graph.unknowns.held.get(key, ()))
+        if held:
+            Q[held], Q[:, held] = 0.0, 0.0
+        return Q
+
+    def joint(self, names: Sequence[ParameterName]) -> FloatArray:
+        """Joint covariance of several unknowns, stacked in this order (of vectors their free components).
+
+        Raises KeyError for a name that is not an unknown.
+        """
+        keys = [self.graph.unknowns.by_name[name].key for name in names]
+        hidden = [k for k in keys if k in self.hidden]
+        if not hidden or self._hidden is None:
+            return self._in_datum(keys, self.tree.joint(keys))
+        bundle = self._hidden.batch
+        seen = [k for k in keys if k not in self.hidden]
+        outer = list(dict.fromkeys(bundle.interface + seen))
+        Q, at = self.tree.joint(outer), stacking(self.graph, outer)
+        M, own = self._hidden.from_interface(hidden)
+        interface, mine = at.index(bundle.interface), stacking(self.graph, hidden)
+        L = np.zeros((sum(self.tree.dims[k] for k in keys), at.n))
+        scatter, place = np.zeros((len(L), len(L))), stacking(self.graph, keys)
+        L[np.ix_(place.index(hidden), interface)] = M[mine.index(hidden)]
+        scatter[np.ix_(place.index(hidden), place.index(hidden))] = own
+        if seen:
+            L[place.index(seen), at.index(seen)] = 1.0
+        return self._in_datum(keys, L @ Q @ L.T + scatter)
+
+    def influence(self, item: ObservationFactor) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Whitened residual (k,), whitened A Q A' (k, k), and the square root information's inverse (k, k)."""
+        linear = item.factor.linearize(self.solved.values)
+        A, b = linear.jacobian()
+        Q = self._in_datum(list(linear.keys()), self.tree.joint(list(linear.keys())))
+        return -b, A @ Q @ A.T, np.asarray(np.linalg.inv(noise_of(item).R()))
+
+
+def noise_of(item: ObservationFactor) -> gtsam.noiseModel.Gaussian:
+    """The factor's noise; GTSAM's stubs give it only to some factors, the library to all that have one."""
+    noise: gtsam.noiseModel.Gaussian = item.factor.noiseModel()  # type: ignore[attr-defined]  # see above
+    return noise
+
+
+def image_residuals(precision: Precision) -> ImageResiduals:
+    """Residuals and their statistics of all image points, in the order of ``Survey.image_blocks``."""
+    graph = precision.graph
+    images, bundle = graph.images, graph.bundle
+    residual, influence = images.statistics(precision.tree)
+    parts = [_test(residual, influence, images.W_all, images.used)]
+    if bundle is not None:
+        stats = _test(bundle.residuals_px(), precision.bundle_influence, bundle.W_all, bundle.used)
+        back = np.empty(len(bundle.sorted), dtype=np.int64)
+        back[bundle.sorted] = np.arange(len(back))
+        parts.append(tuple(a[back] for a in stats))
+    return _merge(graph, parts)
+
+
+def _test(v: FloatArray, M: FloatArray, W: FloatArray, used: BoolArray) -> tuple[Any, ...]:
+    n = len(v)
+    redundancy, standardized, test = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for start in range(0, n, _AT_A_TIME):
+            part = slice(start, start + _AT_A_TIME)
+            _fill_test(v[part], M[part], W[part], used[part], redundancy[part], standardized[part], test[part])
+    return v, redundancy, standardized, test, used
+
+
+def _fill_test(
+    v: FloatArray, M: FloatArray, W: FloatArray, used: BoolArray, redundancy: FloatArray, standardized: FloatArray,
+    test: FloatArray,
+) -> None:  # fmt: skip
+    sign = np.where(used, -1.0, 1.0)
+    (v0, v1), (m00, m01, m11), (w00, w01, w11) = v.T, M.T, W.T
+    q00, q01, q11 = 1.0 + sign * m00, sign * m01, 1.0 + sign * m11
+    redundancy[:, 0], redundancy[:, 1] = q00, q11
+    redundancy[~used] = 0.0
+    e0, e1 = w00 * v0 + w01 * v1, w11 * v1
+    det = q00 * q11 - q01 * q01
+    test[:] = np.where(det > 1e-9, (q11 * e0 * e0 - 2 * q01 * e0 * e1 + q00 * e1 * e1) / det, np.nan)
+    # covariance of the residuals in pixels: W^-1 Q W^-T with W upper triangular
+    i00, i11 = 1.0 / w00, 1.0 / w11
+    i01 = -w01 * i00 * i11
+    su = np.sqrt(np.maximum(0.0, i00 * i00 * q00 + 2 * i00 * i01 * q01 + i01 * i01 * q11))
+    sv = np.sqrt(np.maximum(0.0, i11 * i11 * q11))
+    standardized[:, 0] = np.where(su > 1e-9 * i00, v0 / su, np.nan)
+    standardized[:, 1] = np.where(sv > 1e-9 * i11, v1 / sv, np.nan)
+
+
+def _merge(graph: AdjustmentGraph, parts: list[tuple[Any, ...]]) -> ImageResiduals:
+    if len(parts) == 1:
+        return ImageResiduals(graph.images.ptr, *(np.asarray(part) for part in parts[0]))
+    ptr = np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks])
+    n_points = int(ptr[-1])
+    out: list[Any] = [np.zeros((n_points, 2)) for _ in range(3)]
+    out += [np.zeros(n_points), np.zeros(n_points, dtype=np.bool_)]
+    at = [0, 0]
+    for i, (_, free) in enumerate(graph.image_order):
+        n = int(ptr[i + 1] - ptr[i])
+        source = slice(at[int(free)], at[int(free)] + n)
+        for a, part in zip(out, parts[int(free)], strict=True):
+            a[ptr[i] : ptr[i + 1]] = part[source]
+        at[int(free)] += n
+    return ImageResiduals(ptr, *out)
+
+
+def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
+    """The same for every observation that is neither an image point nor a reading."""
+    out = []
+    for item in precision.graph.others:
+        e, M, root = precision.influence(item)
+        n = len(e)
+        Q = np.eye(n) - M if item.used else np.eye(n) + M
+        v = root @ e
+        cov_v = root @ Q @ root.T
+        own = np.sqrt(np.maximum(0.0, np.diag(cov_v)))
+        sigma = np.sqrt(np.diag(root @ root.T))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            standardized = np.where(own > 1e-6 * sigma, v / own, np.nan)
+        test = float(e @ np.linalg.pinv(Q, rcond=1e-9) @ e)
+        redundancy = np.diag(Q) if item.used else np.zeros(n)
+        adjusted = adjusted_motion(item.observed, v) if item.kind == "pair" else np.asarray(item.observed + v)
+        out.append(
+            ObservationResidual(item.kind, item.group, item.ids, item.components, item.units, item.observed,
+                                adjusted, v, sigma, redundancy, standardized, test, item.used)
+        )  # fmt: skip
+    return tuple(out)
+
+
+def adjusted_motion(observed: FloatArray, v: FloatArray) -> FloatArray:
+    """Logarithm (3 or 6,) of an adjusted rotation or pose: that of ``observed`` times that of the residual."""
+    if len(v) == 3:
+        return np.asarray(Rot3.Logmap(Rot3.Expmap(observed) * Rot3.Expmap(v)))
+    return np.asarray(Pose3.Logmap(Pose3.Expmap(observed) * Pose3.Expmap(v)))
+
+
+def group_summaries(
+    graph: AdjustmentGraph,
+    images: ImageResiduals,
+    others: Sequence[ObservationResidual],
+    readings: ReadingResiduals | None = None,
+) -> tuple[GroupSummary, ...]:
+    """Observations, redundancy and weighted square sum of every group, in order of appearance."""
+    sums: dict[str, list[float]] = {}
+
+    def add(group: str, n: int, r: float, omega: float) -> None:
+        total = sums.setdefault(group, [0.0, 0.0, 0.0])
+        total[0], total[1], total[2] = total[0] + n, total[1] + r, total[2] + omega
+
+    names = list(dict.fromkeys(block.group for block in graph.survey.image_blocks))
+    for group, *sums_of_group in zip(names, *_image_sums(graph, images, names), strict=True):
+        add(group, *sums_of_group)
+    for item, factor in zip(others, graph.others, strict=True):
+        if item.used:
+            e = noise_of(factor).whiten(item.residual)
+            add(item.group, len(item.residual), float(item.redundancy.sum()), float(e @ e))
+    if readings is not None:
+        of_group: dict[str, list[int]] = {}
+        for i, reading in enumerate(graph.survey.readings):
+            of_group.setdefault(reading.group, []).append(i)
+        for group, mine in of_group.items():
+            taken = np.array(mine)[readings.used[mine]]
+            squares = float(readings.weighted_square[taken].sum())
+            add(group, len(taken), float(readings.redundancy[taken].sum()), squares)
+    return tuple(GroupSummary(g, int(n), r, omega) for g, (n, r, omega) in sums.items())
+
+
+def _image_sums(
+    graph: AdjustmentGraph, images: ImageResiduals, names: Sequence[str]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of each of these groups of image points: components used, redundancy, weighted square sum."""
+    blocks = graph.survey.image_blocks
+    if not blocks:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    number = {name: i for i, name in enumerate(names)}
+    which = slice(None) if images.used.all() else images.used
+    of_point = np.repeat([number[block.group] for block in blocks], np.diff(images.block_ptr))[which]
+
+    def total(of_points: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(of_point, of_points[which], len(names)), dtype=np.float64)
+
+    squares = whitened_squares(images.residuals, graph.square_roots())
+    return total(np.full(len(squares), 2.0)), total(images.redundancy.sum(axis=1)), total(squares)
+
+
+def global_test(omega: float, redundancy: int, alpha: float) -> GlobalTest | None:
+    """Two-sided chi-square test of the weighted square sum; None without redundancy."""
+    if redundancy <= 0:
+        return None
+    lower, upper = chi2.ppf([alpha / 2, 1 - alpha / 2], redundancy)
+    return GlobalTest(omega, redundancy, alpha, float(lower), float(upper))

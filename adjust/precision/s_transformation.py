@@ -1,0 +1,42 @@
+"""Covariances in another datum, S Q S' with ``S = I - G (R G)^-1 R`` (Baarda 1973; Koch 1999 section 3.3.6)."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.model.survey import FloatArray
+
+Products = Callable[[Mapping[int, FloatArray]], dict[int, FloatArray]]
+"""From rows (k, dim) of some keys, R, to Q R' (dim, k) of every key."""
+
+
+@dataclass(frozen=True, eq=False)
+class STransformation:
+    """What the covariances of a solution lack to be in a datum: per key G (dim, k) and Q R' (R G)^-T (dim, k).
+
+    core: (k, k), (R G)^-1 R Q R' (R G)^-T.
+    """
+
+    motions: Mapping[int, FloatArray]
+    spread: Mapping[int, FloatArray]
+    core: FloatArray
+
+    def apply(self, keys: Sequence[int], Q: FloatArray) -> FloatArray:
+        """The joint covariance of ``keys`` in the datum, from Q (n, n) in that of the solution."""
+        G = np.concatenate([self.motions[k] for k in keys])
+        W = np.concatenate([self.spread[k] for k in keys])
+        across = G @ W.T
+        return np.asarray(Q - across - across.T + G @ self.core @ G.T)
+
+
+def s_transformation(
+    rows: Mapping[int, FloatArray], motions: Mapping[int, FloatArray], products: Products
+) -> STransformation:
+    """The transformation to the datum ``rows`` (k, dim per key), of a solution with these ``motions`` (dim, k)."""
+    seen = np.sum([row @ motions[key] for key, row in rows.items()], axis=0)
+    inverse = np.linalg.inv(seen)
+    found = products(rows)
+    spread = {key: H @ inverse.T for key, H in found.items()}
+    core = inverse @ np.sum([row @ spread[key] for key, row in rows.items()], axis=0)
+    return STransformation(motions, spread, 0.5 * (core + core.T))

@@ -1,0 +1,228 @@
+"""Covariances of all cliques of a Bayes tree in one pass from the roots to the leaves.
+
+With a clique's conditional R x_f + S x_s: T = -R^-1 S, Q_fs = T Q_ss, Q_ff = R^-1 R^-T + T Q_ss T' (the sparse inverse
+subset of Takahashi, Fagan and Chen 1973; Golub and Plemmons 1980 for geodetic networks). The unknowns of every factor
+lie together in one clique, so all redundancy numbers follow from it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from adjust.model.survey import FloatArray, IntArray
+from adjust.native.trees import TreeArrays, covariance_rows, fill_block, invert_cliques, joint_blocks, solve_cliques
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """Cliques of one frontal key each, eliminated before a tree: those of S, the others, lie in one of its cliques.
+
+    width: columns of the blocks [R S], one after the other and row by row in ``data``.
+    """
+
+    keys: list[list[int]]
+    front: IntArray
+    width: IntArray
+    data: FloatArray
+
+
+class TreeCovariance:
+    """Marginal and joint covariances. ``dims`` gives the dimension of every key; keys are also counted 0, 1, ..."""
+
+    def __init__(self, tree: gtsam.GaussianBayesTree, dims: Mapping[int, int], leaves: Leaves | None = None) -> None:
+        self.dims = dims
+        blocks, clique_keys, fronts, parents = _collect(tree)
+        front, width = ([b.shape[i] for b in blocks] for i in (0, 1))
+        data = [b.ravel() for b in blocks]
+        if leaves is not None:
+            home: dict[int, int] = {}
+            for c, keys in enumerate(clique_keys):  # parents first: a key is frontal where it first appears
+                for k in keys:
+                    home.setdefault(k, c)
+            parents += [max(home[k] for k in keys[1:]) for keys in leaves.keys]
+            fronts += leaves.front.tolist()
+            front, width, data = front + leaves.front.tolist(), width + leaves.width.tolist(), [*data, leaves.data]
+            clique_keys = clique_keys + leaves.keys
+        order = list(dict.fromkeys(k for keys in clique_keys for k in keys))
+        self.number = {key: i for i, key in enumerate(order)}
+        self._dims = np.array([dims[k] for k in order], dtype=np.int64)
+        self._first = np.concatenate([[0], np.cumsum(self._dims)]).astype(np.int64)
+        self._keys = np.array([self.number[k] for keys in clique_keys for k in keys], dtype=np.int64)
+        self._key_ptr = np.cumsum([0] + [len(keys) for keys in clique_keys]).astype(np.int64)
+        self._front, self._width = np.array(front, dtype=np.int64), np.array(width, dtype=np.int64)
+        self._at = np.cumsum(np.append(0, self._front * self._width))[:-1].astype(np.int64)
+        self._data = np.concatenate(data) if data else np.zeros(0)
+        self._parents = np.array(parents, dtype=np.int64)
+        self._n_front = self._frontal_keys(fronts)
+        self._home = np.zeros(len(order), dtype=np.int64)
+        for c in range(len(front)):
+            start = self._key_ptr[c]
+            self._home[self._keys[start : start + self._n_front[c]]] = c
+        if invert_cliques(self._front, self._width, self._at, self._data) >= 0:
+            raise ZeroDivisionError("the Bayes tree is singular")
+        self.arrays = TreeArrays(self._home, self._key_ptr, self._keys, self._dims, self._front, self._width, self._at,
+                                 np.empty_like(self._data))  # fmt: skip
+        """What the compiled look-up of two keys' covariance needs."""
+        covariance_rows(self.arrays, self._n_front, self._data)
+
+    def _frontal_keys(self, fronts: list[int]) -> IntArray:
+        """Number of frontal keys of every clique, from the number of its frontal rows."""
+        out = np.empty(len(fronts), dtype=np.int64)
+        dims, ptr = self._dims[self._keys].tolist(), self._key_ptr.tolist()
+        for c, rows in enumerate(fronts):
+            n, total = 0, 0
+            while total < rows:
+                total += dims[ptr[c] + n]
+                n += 1
+            out[c] = n
+        return out
+
+    def _block(self, a: int, b: int) -> FloatArray | None:
+        out = np.empty((self._dims[a], self._dims[b]))
+        return out if fill_block(self.arrays, a, b, out) else None
+
+    def marginal(self, key: int) -> FloatArray:
+        """Covariance (dim, dim) of one unknown."""
+        n = self.number[key]
+        along = np.arange(self._dims[n])
+        cov: FloatArray = self.arrays.cov[self._own[n] + self.arrays.width[self._home[n]] * along[:, None] + along]
+        return cov
+
+    @cached_property
+    def _own(self) -> IntArray:
+        """Where the covariance of every key begins, in the rows of its home."""
+        tree = self.arrays
+        clique, dims = np.repeat(np.arange(len(tree.front)), np.diff(tree.key_ptr)), tree.dims[tree.keys]
+        before = np.cumsum(dims) - dims
+        at_home = tree.home[tree.keys] == clique
+        clique, key = clique[at_home], tree.keys[at_home]
+        column = before[at_home] - before[tree.key_ptr[clique]]
+        out = np.zeros(len(tree.dims), dtype=np.int64)
+        out[key] = tree.at[clique] + column * (tree.width[clique] + 1)
+        return out
+
+    def joint(self, keys: Sequence[int]) -> FloatArray:
+        """Joint covariance of any unknowns, stacked in this order; fast where they share a clique."""
+        numbers = [self.number[k] for k in keys]
+        deepest = numbers[int(np.argmax(self._home[numbers]))]
+        c = int(self._home[deepest])
+        inside = set(self._keys[self._key_ptr[c] : self._key_ptr[c + 1]].tolist())
+        if not inside.issuperset(numbers):
+            return self._apart(numbers)
+        at = np.concatenate([[0], np.cumsum(self._dims[numbers])])
+        out = np.empty((at[-1], at[-1]))
+        for i, a in enumerate(numbers):
+            for j, b in enumerate(numbers[: i + 1]):
+                block = self._block(a, b)
+                if block is None:
+                    return self._apart(numbers)
+                out[at[i] : at[i + 1], at[j] : at[j + 1]] = block
+                out[at[j] : at[j + 1], at[i] : at[i + 1]] = block.T
+        return out
+
+    def _apart(self, numbers: list[int]) -> FloatArray:
+        """Joint covariance of unknowns of different cliques: columns of the inverse, on their ways to the root only."""
+        rows = np.concatenate([np.arange(self._first[k], self._first[k + 1]) for k in numbers])
+        x = np.zeros((int(self._first[-1]), len(rows)))
+        x[rows, np.arange(len(rows))] = 1.0
+        cliques = self._ancestors(set(self._home[numbers].tolist()))
+        self._solve(cliques, x)
+        out = x[rows]
+        return np.asarray(0.5 * (out + out.T))
+
+    def _ancestors(self, cliques: set[int]) -> IntArray:
+        found: set[int] = set()
+        for start in cliques:
+            c = start
+            while c >= 0 and c not in found:
+                found.add(c)
+                c = int(self._parents[c])
+        return np.array(sorted(found), dtype=np.int64)
+
+    def _solve(self, cliques: IntArray, x: FloatArray) -> None:
+        solve_cliques(self.arrays, cliques, self._first, self._data, x)
+
+    def rows(self, keys: Sequence[int]) -> IntArray:
+        """Rows of these keys in a stacked vector of all unknowns, as :meth:`times` takes it."""
+        return np.concatenate([np.arange(self._first[k], self._first[k + 1]) for k in (self.number[q] for q in keys)])
+
+    def places(self) -> dict[int, slice]:
+        """Rows of every key in a stacked vector of all unknowns."""
+        first = self._first.tolist()
+        return {key: slice(first[i], first[i + 1]) for key, i in self.number.items()}
+
+    @property
+    def n(self) -> int:
+        """Length of a stacked vector of all unknowns."""
+        return int(self._first[-1])
+
+    def times(self, columns: FloatArray) -> FloatArray:
+        """The whole covariance matrix times columns (n, m), without forming it."""
+        x = np.array(columns, dtype=float)
+        self._solve(np.arange(len(self._front), dtype=np.int64), x)
+        return x
+
+    def full(self) -> FloatArray:
+        """The whole covariance matrix (n, n) of all unknowns, rows as :meth:`places` says, parents before children.
+
+        From the roots down: with Q of all that comes before, Q_f, = T Q_s, and Q_ff = R^-1 R^-T + T Q_sf. Costs the
+        size of the factor times n, by matrix products.
+        """
+        Q = np.zeros((self.n, self.n))
+        keys, ptr, first, dims = self._keys, self._key_ptr, self._first, self._dims
+        for c in range(len(self._front)):
+            nf, n = int(self._front[c]), int(self._width[c])
+            mine = keys[ptr[c] : ptr[c + 1]]
+            start = np.repeat(first[mine], dims[mine])
+            step = np.arange(n) - np.repeat(np.cumsum(dims[mine]) - dims[mine], dims[mine])
+            rows = start + step
+            done = int(rows[0])  # frontal keys are numbered where they first appear, cliques in their order
+            A = self._data[self._at[c] : self._at[c] + nf * n].reshape(nf, n)
+            own = slice(done, done + nf)
+            inverse = np.triu(A[:, :nf])
+            Q[own, own] = inverse @ inverse.T
+            if n > nf:
+                T = A[:, nf:]
+                across = T @ Q[rows[nf:], :done]
+                Q[own, :done] = across
+                Q[:done, own] = across.T
+                Q[own, own] += across[:, rows[nf:]] @ T.T
+        return Q
+
+    def pairs(self, first: IntArray, second: IntArray, dim: int) -> FloatArray:
+        """Joint covariances (p, 2 dim, 2 dim) of pairs of keys that share a factor; -1 stands for a constant.
+
+        Raises KeyError for a pair that shares none.
+        """
+        table = np.full(max(self.number, default=0) + 2, -1, dtype=np.int64)
+        table[np.array(list(self.number), dtype=np.int64)] = np.arange(len(self.number))
+        a, b = table[first], table[second]
+        out = np.empty((len(a), 2 * dim, 2 * dim))
+        lost = joint_blocks(self.arrays, a, b, out)
+        if lost >= 0:
+            raise KeyError((int(first[lost]), int(second[lost])))
+        return out
+
+
+def _collect(tree: gtsam.GaussianBayesTree) -> tuple[list[FloatArray], list[list[int]], list[int], list[int]]:
+    """Blocks [R S] (nf, n), keys, frontal rows and parent of every clique, parents first."""
+    blocks: list[FloatArray] = []
+    keys: list[list[int]] = []
+    parents: list[int] = []
+    stack: list[tuple[gtsam.GaussianBayesTreeClique, int]] = [(root, -1) for root in tree.roots()]
+    while stack:
+        clique, parent = stack.pop()
+        conditional = clique.conditional()
+        A = conditional.getA()
+        model = conditional.get_model()
+        if model is not None:
+            A = A / model.sigmas()[:, None]
+        me = len(blocks)
+        blocks.append(np.ascontiguousarray(A))
+        keys.append(list(conditional.keys()))
+        parents.append(parent)
+        stack += [(clique[j], me) for j in range(clique.nrChildren())]
+    return blocks, keys, [len(b) for b in blocks], parents

@@ -1,0 +1,60 @@
+"""The seven motions of a whole survey: three translations, three rotations about the world's origin, scale."""
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from adjust.frames.unknowns import Unknown
+from adjust.model.survey import BoolArray, FloatArray
+
+
+def skew(x: FloatArray) -> FloatArray:
+    """The matrix (3, 3) that multiplies a vector from the left to give ``x`` cross it."""
+    return np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
+
+
+def point_motions(x: FloatArray) -> FloatArray:
+    """How a point (3,) m of the world moves, (3, 7)."""
+    return np.column_stack([np.eye(3), -skew(x), x])
+
+
+def points_motions(x: FloatArray) -> FloatArray:
+    """How points (n, 3) m of the world move, (n, 3, 7)."""
+    B = np.zeros((len(x), 3, 7))
+    B[:, :, :3], B[:, :, 6] = np.eye(3), x
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # w x x, by w
+        B[:, i, 3 + j], B[:, j, 3 + i] = x[:, k], -x[:, k]
+    return B
+
+
+def poses_motions(R: FloatArray, t: FloatArray, in_world: BoolArray) -> FloatArray:
+    """How poses (R (n, 3, 3), t (n, 3) m) move, (n, 6, 7). in_world (n,): whether it is that of something there."""
+    out, transposed = np.zeros((len(t), 6, 7)), R.transpose(0, 2, 1)
+    out[:, 3:, 6] = np.einsum("nij,nj->ni", transposed, t)
+    turned = transposed[in_world]
+    out[in_world, 3:, :3] = out[in_world, :3, 3:6] = turned
+    out[in_world, 3:, 3:6] = turned @ points_motions(t[in_world])[:, :, 3:6]
+    return out
+
+
+def poses_at(values: gtsam.Values, keys: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    """Rotations (n, 3, 3) and translations (n, 3) m of poses."""
+    found = np.array([values.atPose3(key).matrix() for key in keys]).reshape(-1, 4, 4)
+    return found[:, :3, :3], found[:, :3, 3]
+
+
+def motions_of(unknown: Unknown, values: gtsam.Values, in_world: bool) -> FloatArray:
+    """How an unknown moves, (dim, 7). in_world: whether a pose is that of something in the world."""
+    out = np.zeros((unknown.dim, 7))
+    if unknown.kind == "point":
+        return point_motions(np.asarray(values.atPoint3(unknown.key)))
+    if unknown.kind == "pose":
+        R, t = poses_at(values, [unknown.key])
+        return np.asarray(poses_motions(R, t, np.array([in_world]))[0])
+    if "axis_offset" in unknown.components:
+        i = unknown.components.index("axis_offset")
+        out[i, 6] = values.atVector(unknown.key)[i]
+    elif unknown.name[0] == "warp":
+        out[:, 6] = values.atVector(unknown.key)
+    return out

@@ -1,0 +1,116 @@
+"""Rotations and rigid motions as plain arrays: (..., 3, 3) and (..., 4, 4), all vectorised over the leading axes."""
+
+import numpy as np
+
+from adjust.model.survey import FloatArray
+
+_TINY = 1e-12
+
+
+def skew(w: FloatArray) -> FloatArray:
+    """Cross-product matrix (..., 3, 3) of vectors (..., 3)."""
+    out = np.zeros((*w.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
+    return out - np.swapaxes(out, -1, -2)
+
+
+def rotation_exp(w: FloatArray) -> FloatArray:
+    """Rotations (..., 3, 3) of rotation vectors (..., 3) rad (Rodrigues)."""
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    small = angle < 1e-6
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0 - angle**2 / 6.0, np.sin(safe) / safe)
+    b = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    k = skew(w)
+    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+
+
+def rotation_log(r: FloatArray) -> FloatArray:
+    """Rotation vectors (..., 3) rad of rotations (..., 3, 3), through the quaternion: exact up to half a turn."""
+    r = np.asarray(r, dtype=float)
+    d0, d1, d2 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    squares = np.stack([1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], axis=-1)
+    ww = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
+    ss = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
+    rows = np.stack(
+        [
+            np.stack([squares[..., 0], *ww], axis=-1),
+            np.stack([ww[0], squares[..., 1], ss[0], ss[1]], axis=-1),
+            np.stack([ww[1], ss[0], squares[..., 2], ss[2]], axis=-1),
+            np.stack([ww[2], ss[1], ss[2], squares[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    largest = np.argmax(squares, axis=-1)
+    q = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    half = np.arctan2(sine, q[..., :1])
+    return np.asarray(np.where(sine < _TINY, 2.0, 2.0 * half / np.maximum(sine, _TINY)) * q[..., 1:])
+
+
+def nearest_rotation(m: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+    """Rotations (..., 3, 3) nearest to matrices in the Frobenius norm (orthogonal Procrustes, Schoenemann 1966).
+
+    weights: leading-axis weights; the matrices are then summed over the first axis beforehand.
+    """
+    if weights is not None:
+        m = np.tensordot(weights, m, axes=1)
+    u, _, vt = np.linalg.svd(m)
+    sign = np.sign(np.linalg.det(u @ vt))
+    u = u.copy()
+    u[..., :, 2] *= sign[..., None]
+    return np.asarray(u @ vt)
+
+
+def rigid(r: FloatArray, t: FloatArray) -> FloatArray:
+    """Rigid motions (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    out = np.zeros((*np.broadcast_shapes(r.shape[:-2], t.shape[:-1]), 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = r, t, 1.0
+    return out
+
+
+def inverse(m: FloatArray) -> FloatArray:
+    """Inverse rigid motions (..., 4, 4)."""
+    rt = np.swapaxes(m[..., :3, :3], -1, -2)
+    return rigid(rt, -(rt @ m[..., :3, 3, None])[..., 0])
+
+
+def transform(m: FloatArray, x: FloatArray) -> FloatArray:
+    """Points (..., 3) moved by rigid motions (..., 4, 4)."""
+    return np.asarray((m[..., :3, :3] @ x[..., None])[..., 0] + m[..., :3, 3])
+
+
+def rotation_to(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The smallest rotation (3, 3) that turns direction a (3,) into direction b (3,)."""
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    axis, cosine = np.cross(a, b), float(a @ b)
+    sine = float(np.linalg.norm(axis))
+    if sine < _TINY:
+        if cosine > 0:
+            return np.eye(3)
+        axis = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
+        return rotation_exp(np.pi * axis / np.linalg.norm(axis))
+    return rotation_exp(axis / sine * float(np.arctan2(sine, cosine)))
+
+
+def align(x_in_a: FloatArray, x_in_b: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+    """``a_from_b`` (4, 4) that best moves points (n, 3) of b onto those of a.
+
+    Source: Umeyama, PAMI 13(4), 1991, without scale. Two points leave the turn about their line at its smallest, one
+    point leaves the rotation at identity.
+    """
+    w = np.full(len(x_in_a), 1.0) if weights is None else weights
+    mean_a, mean_b = w @ x_in_a / w.sum(), w @ x_in_b / w.sum()
+    m = (x_in_a - mean_a).T @ (w[:, None] * (x_in_b - mean_b))
+    scale = np.linalg.svd(m, compute_uv=False)
+    if len(x_in_a) < 2 or scale[0] <= _TINY:
+        r = np.eye(3)
+    elif len(x_in_a) == 2 or scale[1] < 1e-9 * scale[0]:
+        u, _, vt = np.linalg.svd(m)
+        sign = 1.0 if u[:, 0] @ m @ vt[0] > 0 else -1.0
+        r = rotation_to(vt[0], sign * u[:, 0])
+    else:
+        r = nearest_rotation(m)
+    return rigid(r, mean_a - r @ mean_b)

@@ -1,0 +1,1 @@
+"""Solutions without a start: pure functions of arrays, each with the source of its formula."""

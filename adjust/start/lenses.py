@@ -1,0 +1,327 @@
+"""A start for the lens of one camera, from the targets it sees."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.lenses.models import (
+    LensModel,
+    camera_constants,
+    default_start,
+    focal_length_px,
+    lens_model,
+    principal_point_px,
+    unit_rays,
+)
+from adjust.model.errors import SurveyError
+from adjust.model.survey import Camera, FloatArray
+from adjust.start.closed_forms.absolute_pose import best_poses
+from adjust.start.closed_forms.planes import homographies, plane_misfits
+from adjust.start.closed_forms.zhang import pinhole_from_homographies
+from adjust.start.lens_refinement import LensFit, fit_lens
+
+_MOST_IMAGES = 30
+_SCAN_IMAGES = 8
+_MOST_SCREENED = 120
+_GOOD_START = 0.01  # of the image width: with less error a closed form needs no scan beside it
+_LEVELS = ("focal centre k1 k2", "focal centre k1", "focal k1", "focal")
+_SIMPLE_PX = 2.0
+_FOCAL = {"fx", "fy", "c", "ck"}
+_CENTRE = {"u0", "v0", "xp", "yp", "px", "py", "xh", "yh"}
+_RADIAL = {"k1": 1, "k2": 2, "K1": 1, "K2": 2, "A1": 1, "A2": 2}
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """Known points (n, 3) m of one rigid body and their image points (n, 2) px in one image."""
+
+    block_idx: int
+    x: FloatArray
+    uv: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class LensStart:
+    """values (n,) of the model, how they were found, and the blocks left out with the reason."""
+
+    values: FloatArray
+    note: str
+    excluded: dict[int, str]
+
+
+def start_lens(camera: Camera, sightings: Sequence[Sighting]) -> LensStart:
+    """Lens values from the given ones, or from the images of known points.
+
+    Planar targets: Zhang's closed form, or the best of a scan of focal lengths, then lens and poses together on at most
+    30 well-spread images. Raises SurveyError naming the camera where nothing determines its focal length.
+    """
+    model = lens_model(camera.lens.model)
+    if camera.lens.values is not None:
+        _check_given(camera, model)
+        return LensStart(np.array(camera.lens.values, dtype=float), "lens as given", {})
+    return _LensSearch(camera, model).run(sightings)
+
+
+def _check_given(camera: Camera, model: LensModel) -> None:
+    values = np.asarray(camera.lens.values)
+    if values.shape != (model.n,):
+        raise SurveyError(f"camera {camera.camera_id!r}: {values.size} lens values given, {model.name} has {model.n}")
+    for name, value in zip(model.names, values, strict=True):
+        if name in _FOCAL and not value > 0:
+            raise SurveyError(
+                f"camera {camera.camera_id!r}: the lens value {name} is {value:g}; give a positive start for it, or no"
+                " lens values at all, then they are found from the images"
+            )
+
+
+class _LensSearch:
+    """The search for one camera; keeps what does not change on the way."""
+
+    def __init__(self, camera: Camera, model: LensModel) -> None:
+        self.camera, self.model, self.size = camera, model, camera.image_size
+        self.constants = camera_constants(camera)
+        self._flat: dict[int, bool] = {}
+        self.prior = {}
+        if camera.lens.prior is not None:
+            self.prior = dict(zip(camera.lens.prior.names, camera.lens.prior.mean, strict=True))
+        self.tied = {tie.name: tie for tie in camera.lens.ties}
+        free = set(camera.lens.free) | {t.name for t in camera.lens.ties if t.to in camera.lens.free}
+        for name in model.names:
+            if name in (_FOCAL | {"u0", "v0", "px", "py"}) and name not in free and name not in self.prior:
+                raise SurveyError(
+                    f"camera {camera.camera_id!r}: {name} is held but has no value; give lens values or free it"
+                )
+
+    def run(self, sightings: Sequence[Sighting]) -> LensStart:
+        usable = [s for s in sightings if len(s.x) >= 4]
+        if any(name in self.prior for name in _FOCAL):
+            focal = self.prior.get("fx", self.prior.get("c", self.prior.get("ck", 0.0)))
+            return LensStart(self._values(focal / (self.constants[0] if self.model.in_mm else 1.0)), "lens prior", {})
+        if not usable:
+            raise SurveyError(
+                f"camera {self.camera.camera_id!r}: no lens values are given and no image shows 4 or more known points;"
+                " show it a target, or give lens values"
+            )
+        # the other images of a long series are screened by their poses
+        flat = _every([s for s in usable if self._is_flat(s)], _MOST_SCREENED)
+        good, excluded = self._screen(flat) if flat else ([], {})
+        chosen = spread_out(good) or [s for s in usable if s.block_idx not in excluded][:_MOST_IMAGES]
+        if not chosen:
+            raise SurveyError(
+                f"camera {self.camera.camera_id!r}: none of its {len(flat)} images fits a plane; the first: "
+                + next(iter(excluded.values()))
+            )
+        start, how = self._focal_length([s for s in chosen if self._is_flat(s)], chosen)
+        return self._refine(start, how, chosen, excluded)
+
+    def _is_flat(self, sighting: Sighting) -> bool:
+        """Whether the points are a plane; asked once for all images that show the same array of points."""
+        key = id(sighting.x)
+        if key not in self._flat:
+            self._flat[key] = _is_plane(sighting.x)
+        return self._flat[key]
+
+    def _screen(self, flat: Sequence[Sighting]) -> tuple[list[Sighting], dict[int, str]]:
+        """Images whose points lie as on a plane; a wrong point order misses by a good part of the image."""
+        ptr = np.cumsum([0] + [len(s.x) for s in flat])
+        misfit = plane_misfits(np.concatenate([s.x for s in flat]), np.concatenate([s.uv for s in flat]), ptr)
+        limit = max(0.02, 6.0 * float(np.median(misfit)))
+        good = [s for s, m in zip(flat, misfit, strict=True) if m <= limit]
+        excluded = {
+            s.block_idx: f"the points miss a plane by {100 * m:.0f} % of their extent (wrong order or mis-detected)"
+            for s, m in zip(flat, misfit, strict=True)
+            if m > limit
+        }
+        return good, excluded
+
+    def _focal_length(self, flat: Sequence[Sighting], chosen: Sequence[Sighting]) -> tuple[FloatArray, str]:
+        trials: list[tuple[FloatArray, str]] = []
+        if flat and self.model.name != "fisheye":
+            plane = {id(s.x): s.x for s in flat}  # one for all images that show the same array of points
+            on_plane = {key: _unit(_plane_coordinates(x)) for key, x in plane.items()}
+            xy, ptr = [on_plane[id(s.x)] for s in flat], np.cumsum([0] + [len(s.x) for s in flat])
+            h, _, good = homographies(np.concatenate(xy), np.concatenate([s.uv for s in flat]), ptr)
+            for variants in (("full",), ("centred", "square")) if good.any() else ():
+                try:
+                    found = pinhole_from_homographies(h[good], self.size, variants)
+                except SurveyError:
+                    continue
+                values = self._values(
+                    found.values[0], found.values[1], found.values[2:] if found.variant == "full" else None
+                )
+                trials.append((values, f"Zhang, {found.variant}"))
+        trial_images = _every(chosen, _SCAN_IMAGES)
+        errors = [self._error_px(values, trial_images) for values, _ in trials]
+        if errors and min(errors) < _GOOD_START * max(self.size):
+            return trials[int(np.argmin(errors))]
+        low, high = (0.15, 2.0) if self.model.name == "fisheye" else (0.35, 8.0)
+        for factor in np.geomspace(low, high, 16):
+            trials.append((self._values(factor * max(self.size)), "scan of focal lengths"))
+        errors += [self._error_px(values, trial_images) for values, _ in trials[len(errors) :]]
+        best = int(np.argmin(errors))
+        if not np.isfinite(errors[best]):
+            raise SurveyError(
+                f"camera {self.camera.camera_id!r}: no focal length from {low:g} to {high:g} image widths explains its"
+                " images of known points; check point order, coordinates and image size, or give lens values"
+            )
+        return trials[best]
+
+    def _values(self, fx: float, fy: float | None = None, centre: FloatArray | None = None) -> FloatArray:
+        """Values without distortion; prior means where there are any, ties respected."""
+        values = default_start(self.model, self.size, fx, self.camera.lens.pixel_size_mm)
+        index = {name: i for i, name in enumerate(self.model.names)}
+        if fy is not None and "fy" in index:
+            values[index["fy"]] = fy
+        if centre is not None and "u0" in index:
+            values[index["u0"]], values[index["v0"]] = centre
+        for name, mean in self.prior.items():
+            values[index[name]] = mean
+        for name, tie in self.tied.items():
+            values[index[name]] = tie.factor * values[index[tie.to]]
+        return values
+
+    def _error_px(self, values: FloatArray, images: Sequence[Sighting]) -> float:
+        """Median over the images of the best pose's error, relative to the extent of the points, in px."""
+        rays = self._rays(values, images)
+        some = [(s.x, r) for s, r in zip(images, rays, strict=True) if r is not None]
+        errors = np.full(len(images), np.inf)
+        errors[: len(some)] = best_poses([x for x, _ in some], [r for _, r in some], 2)[1]
+        return float(np.median(errors)) * focal_length_px(self.model, values, self.constants)
+
+    def _refine(self, start: FloatArray, how: str, chosen: Sequence[Sighting], excluded: dict[int, str]) -> LensStart:
+        """The richest lens that the images determine, refined together with the poses."""
+        images, poses = self._poses(start, chosen)
+        if not images:
+            raise SurveyError(
+                f"camera {self.camera.camera_id!r}: no image of known points gives a pose with the {how} lens"
+            )
+        x, uv = np.concatenate([s.x for s in images]), np.concatenate([s.uv for s in images])
+        ptr = np.concatenate([[0], np.cumsum([len(s.x) for s in images])])
+        for level in _LEVELS:
+            directions = self._directions(level)
+            if directions.shape[1] == 0 or ("centre" in level and len(images) < 3):
+                continue
+            fit = fit_lens(self.model, self.constants, start, directions, poses, x, uv, ptr)
+            if self._sane(fit, directions):
+                if level == _LEVELS[0] and _median(fit) > _SIMPLE_PX:  # a wide lens needs all its terms
+                    everything = self._directions("all")
+                    full = fit_lens(self.model, self.constants, fit.values, everything, fit.poses, x, uv, ptr, 60)
+                    if self._sane(full, everything) and _median(full) < 0.5 * _median(fit):
+                        fit, level = full, "all that is free"
+                median = _median(fit)
+                note = f"lens from {len(images)} images ({how}; refined: {level}), median error {median:.2f} px"
+                return LensStart(fit.values, note, excluded)
+        return LensStart(start, f"lens from {len(images)} images ({how}; too few to refine it)", excluded)
+
+    def _poses(self, values: FloatArray, chosen: Sequence[Sighting]) -> tuple[list[Sighting], FloatArray]:
+        some = [(s, r) for s, r in zip(chosen, self._rays(values, chosen), strict=True) if r is not None]
+        poses, error = best_poses([s.x for s, _ in some], [r for _, r in some], 3)
+        # images without a pose are left to the screening of all blocks, which reports them
+        good = np.isfinite(error)
+        return [s for (s, _), g in zip(some, good, strict=True) if g], poses[good]
+
+    def _rays(self, values: FloatArray, images: Sequence[Sighting]) -> list[FloatArray | None]:
+        """Unit rays of every image, None for one with pixels that the lens cannot have imaged."""
+        try:
+            rays = unit_rays(self.model, values, self.constants, np.concatenate([s.uv for s in images]))
+            return list(np.split(rays, np.cumsum([len(s.uv) for s in images])[:-1]))
+        except SurveyError:  # some pixel of some image: find out which
+            pass
+        found: list[FloatArray | None] = []
+        for s in images:
+            try:
+                found.append(unit_rays(self.model, values, self.constants, s.uv))
+            except SurveyError:
+                found.append(None)
+        return found
+
+    def _directions(self, level: str) -> FloatArray:
+        """Columns (n, p) of the lens components that this level frees, with ties; fx, fy apart only with the centre."""
+        wanted = set(_FOCAL)
+        wanted |= _CENTRE if "centre" in level else set()
+        wanted |= {name for name, order in _RADIAL.items() if f"k{order}" in level}
+        names, columns = self.model.names, []
+        wanted = set(names) if level == "all" else wanted
+        for i, name in enumerate(names):
+            if name not in wanted or name not in self.camera.lens.free or name in self.tied or name in self.prior:
+                continue
+            column = np.zeros(len(names))
+            column[i] = 1.0
+            for tie in self.tied.values():
+                if tie.to == name:
+                    column[names.index(tie.name)] = tie.factor
+            columns.append(column)
+        if level in _LEVELS[2:] and self.model.names[:2] == ("fx", "fy") and {"fx", "fy"} <= set(self.camera.lens.free):
+            # few or frontal images cannot tell fx from fy: one direction for both
+            both = [c for c in columns if c[0] or c[1]]
+            columns = [c for c in columns if not (c[0] or c[1])] + ([np.sum(both, axis=0)] if both else [])
+        return np.array(columns).reshape(-1, len(names)).T
+
+    def _sane(self, fit: LensFit, directions: FloatArray) -> bool:
+        """Whether the fit is determined (focal length to 10 %, centre to a tenth of the image) and possible."""
+        focal = focal_length_px(self.model, fit.values, self.constants)
+        width = max(self.size)
+        sigma = np.sqrt(np.einsum("ij,jk,ik->i", directions, fit.cov, directions))
+        pixel = 1.0 / self.constants[0] if self.model.in_mm else 1.0
+        limits = {**dict.fromkeys(_FOCAL, 0.1 * focal), **dict.fromkeys(_CENTRE, 0.1 * width)}
+        known = all(s * pixel <= limits[n] for n, s in zip(self.model.names, sigma, strict=True) if n in limits)
+        centre = principal_point_px(self.model, fit.values, self.constants)
+        inside = np.all(np.abs(centre - self.constants[1:3]) < 0.3 * width)
+        try:
+            corners = np.array([[0.0, 0.0], [self.size[0] - 1.0, 0.0], [0.0, self.size[1] - 1.0]])
+            unit_rays(self.model, fit.values, self.constants, 0.85 * corners + 0.15 * self.constants[1:3])
+        except SurveyError:
+            return False
+        return bool(known and inside and 0.05 * width < focal < 50 * width)
+
+
+def _median(fit: LensFit) -> float:
+    return float(np.median(np.linalg.norm(fit.residuals, axis=1)))
+
+
+def _is_plane(x: FloatArray) -> bool:
+    centred = x - x.mean(axis=0)
+    s = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred), 0.0))
+    return bool(s[1] > 1e-3 * s[2] and s[0] < 1e-2 * s[1])
+
+
+def _plane_coordinates(x: FloatArray) -> FloatArray:
+    centred = x - x.mean(axis=0)
+    _, vectors = np.linalg.eigh(centred.T @ centred)
+    return np.asarray(centred @ vectors[:, :0:-1])
+
+
+def _unit(xy: FloatArray) -> FloatArray:
+    return np.asarray(xy / np.max(np.linalg.norm(xy, axis=1)))
+
+
+def _every(images: Sequence[Sighting], n: int) -> list[Sighting]:
+    if len(images) <= n:
+        return list(images)
+    return [images[int(i)] for i in np.unique(np.linspace(0, len(images) - 1, n).round())]
+
+
+def spread_out(images: Sequence[Sighting], n: int = _MOST_IMAGES) -> list[Sighting]:
+    """At most n images that differ most in place, size and tilt of the target (farthest-point sampling)."""
+    if len(images) <= n:
+        return list(images)
+    features = _features(images)
+    features = (features - features.mean(axis=0)) / np.maximum(features.std(axis=0), 1e-9)
+    chosen = [int(np.argmax([len(s.x) for s in images]))]
+    distance = np.linalg.norm(features - features[chosen[0]], axis=1)
+    while len(chosen) < n:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
+    return [images[i] for i in sorted(chosen)]
+
+
+def _features(images: Sequence[Sighting]) -> FloatArray:
+    """Of every image centroid, logarithm of the size, and shape of the covariance of the image points, (B, 5)."""
+    counts = np.array([len(s.uv) for s in images])
+    first, uv = np.cumsum([0, *counts[:-1]]), np.concatenate([s.uv for s in images])
+    mean = np.add.reduceat(uv, first) / counts[:, None]
+    u, v = (uv - np.repeat(mean, counts, axis=0)).T
+    uu, uv_, vv = (np.add.reduceat(p, first) / (counts - 1) for p in (u * u, u * v, v * v))
+    size = np.sqrt(uu + vv)
+    return np.column_stack([mean / size[:, None], np.log(size), (uu - vv) / size**2, uv_ / size**2])

@@ -1,0 +1,214 @@
+"""Two unknown poses at once, from the known motion between them: the hand-eye and robot-world problems."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import coo_array
+
+from adjust.model.errors import SurveyError
+from adjust.model.result import ParameterName
+from adjust.model.survey import FloatArray, IntArray
+from adjust.spatial.averaging import pose_distance
+from adjust.spatial.rigid import inverse, rotation_log
+from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb, solve_ax_zb, solve_views
+from adjust.start.network import ChainObservation, PoseNetwork
+
+_CHOICES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Observations ``first * motions[i] * second = products[i]`` with both ends unknown; a link is (slot, inverse)."""
+
+    first: tuple[int, bool]
+    second: tuple[int, bool]
+    motions: FloatArray
+    products: FloatArray
+
+    def spread(self) -> float:
+        """Second singular value of the turns: how well two axes are given, rad."""
+        if len(self.motions) < 3:
+            return 0.0
+        turns = rotation_log(np.swapaxes(self.motions[:1, :3, :3], -1, -2) @ self.motions[1:, :3, :3])
+        return float(np.linalg.svd(turns, compute_uv=False)[1])
+
+    def swapped(self) -> "_Group":
+        """The same the other way round, so that each unknown comes second once."""
+        (a, a_inverse), (b, b_inverse) = self.first, self.second
+        return _Group((b, not b_inverse), (a, not a_inverse), inverse(self.motions), inverse(self.products))
+
+
+def solve_motion(network: PoseNetwork, degenerate: bool = True) -> str | None:
+    """Find what two unknowns and the motion between them determine; a note on what was done, or None.
+
+    Robot-world closed form where a group of observations turns about two axes; else hand-eye from the motions of all
+    groups that share an unknown; else all views together, where what a chain lacks on either side may be several poses
+    in a row; with all turns about one axis (where ``degenerate`` ones will do) the smallest of the consistent solutions
+    is taken, since a start need only be consistent.
+    """
+    groups = _groups(network)
+    for group in sorted(groups, key=lambda g: -g.spread()):
+        try:
+            second, first, _ = solve_ax_zb(group.motions, group.products)
+        except SurveyError:
+            continue
+        _set(network, group.second, second)
+        _set(network, group.first, inverse(first))
+        return f"{_text(network, group.first)} and {_text(network, group.second)} from {len(group.motions)} motions"
+    note = _shared(network, groups, False) or _together(network)
+    return note or (_shared(network, groups, True) if degenerate else None)
+
+
+def _shared(network: PoseNetwork, groups: list[_Group], minimum_norm: bool) -> str | None:
+    """Hand-eye over all groups with the same unknown; also from turns about one axis with ``minimum_norm``."""
+    by_second: dict[tuple[int, bool], list[_Group]] = {}
+    for group in groups + [g.swapped() for g in groups]:
+        if len(group.motions) >= 2:
+            by_second.setdefault(group.second, []).append(group)
+    for link, sharing in sorted(by_second.items(), key=lambda item: item[0]):
+        a, b = (
+            np.concatenate(m) for m in zip(*[relative_motions(g.motions, g.products) for g in sharing], strict=True)
+        )
+        try:
+            x, _ = solve_ax_xb(a, b, minimum_norm)
+        except SurveyError:
+            continue
+        _set(network, link, x)
+        how = "turns about one axis only: smallest consistent solution" if minimum_norm else f"{len(a)} motions"
+        return f"{_text(network, link)} from {how}"
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class _RowsOfPoses:
+    """Chains ``before * first * motion * second * after`` that lack a row of poses on either side of a motion.
+
+    first, second: (n,) positions in ``rows``, each the slots of such a row in order, with their direction. products:
+    per chain the alternatives (k, 4, 4) of ``first * motion * second``, likeliest first.
+    """
+
+    rows: list[tuple[tuple[int, bool], ...]]
+    first: list[int]
+    second: list[int]
+    motions: FloatArray
+    products: list[FloatArray]
+
+
+def _together(network: PoseNetwork) -> str | None:
+    """Everything on what moves and everything around it at once; a note, or None where that determines nothing."""
+    for found in _connected(_rows_of_poses(network)):
+        first, inside = np.unique(found.first, return_inverse=True)
+        second, outside = np.unique(found.second, return_inverse=True)
+        alone = [(i, 0) for i in first if len(found.rows[i]) == 1]
+        alone += [(i, 1) for i in second if len(found.rows[i]) == 1]
+        solved = _solved_views(found, inside, outside, network.lever) if alone else None
+        if solved is None:
+            continue
+        for i, side in alone:
+            pose = inverse(solved[0][list(first).index(i)]) if side == 0 else solved[1][list(second).index(i)]
+            _set(network, found.rows[i][0], pose)
+        names = " and ".join(_text(network, found.rows[i][0]) for i, _ in alone)
+        return f"{names} from {len(found.motions)} views of {len(second)} things by {len(first)} together"
+    return None
+
+
+def _solved_views(
+    found: _RowsOfPoses, inside: IntArray, outside: IntArray, lever: float
+) -> tuple[FloatArray, FloatArray] | None:
+    """The poses on the moving side and around it, from the alternatives that agree with all others."""
+    chosen = np.array([p[0] for p in found.products])
+    back = inverse(found.motions)
+    try:
+        for _ in range(_CHOICES):
+            x, z, _ = solve_views(back, chosen, inside, outside)
+            said = inverse(x)[inside] @ found.motions @ z[outside]
+            nearest = [int(np.argmin(pose_distance(p, s, lever))) for p, s in zip(found.products, said, strict=True)]
+            again = np.array([p[i] for p, i in zip(found.products, nearest, strict=True)])
+            if np.array_equal(again, chosen):
+                break
+            chosen = again
+    except SurveyError:
+        return None
+    return x, z
+
+
+def _rows_of_poses(network: PoseNetwork) -> _RowsOfPoses:
+    rows: dict[tuple[tuple[int, bool], ...], int] = {}
+    out = _RowsOfPoses([], [], [], np.zeros((0, 4, 4)), [])
+    motions = []
+    for observation in network.observations:
+        split = _split(network, observation)
+        if split is None:
+            continue
+        (a, b), (c, d) = split
+        chain = observation.chain
+        for side, (start, end) in ((out.first, (a, b)), (out.second, (c, d))):
+            row = tuple((link.slot, link.inverse) for link in chain[start:end])
+            side.append(rows.setdefault(row, len(rows)))
+        motions.append(network.product(chain[b:c]))
+        outer = inverse(network.product(chain[:a])), inverse(network.product(chain[d:]))
+        out.products.append(outer[0] @ observation.poses @ outer[1])
+    out.rows.extend(rows)
+    return replace(out, motions=np.array(motions).reshape(-1, 4, 4))
+
+
+def _split(network: PoseNetwork, observation: ChainObservation) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """Begin and end of the two rows of unknown poses in a chain, with something known between them; None if other."""
+    missing = network.unknown_links(observation.chain)
+    gaps = [i for i in range(1, len(missing)) if missing[i] > missing[i - 1] + 1]
+    if observation.rotation_only or len(gaps) != 1:
+        return None
+    at = gaps[0]
+    return (missing[0], missing[at - 1] + 1), (missing[at], missing[-1] + 1)
+
+
+def _connected(found: _RowsOfPoses) -> list[_RowsOfPoses]:
+    """Its parts that share no row of poses, largest first."""
+    if not found.first:
+        return []
+    from scipy.sparse.csgraph import connected_components  # here: a survey of readings starts without it
+
+    n = len(found.rows)
+    joined = coo_array((np.ones(len(found.first)), (found.first, found.second)), shape=(n, n))
+    label = connected_components(joined, directed=False)[1]
+    of_view = label[np.array(found.first, dtype=np.int64)]
+    parts = []
+    for part in sorted(set(of_view.tolist()), key=lambda p: -int((of_view == p).sum())):
+        mine = np.flatnonzero(of_view == part)
+        parts.append(_RowsOfPoses(
+            found.rows, [found.first[i] for i in mine], [found.second[i] for i in mine], found.motions[mine],
+            [found.products[i] for i in mine],
+        ))  # fmt: skip
+    return parts
+
+
+def _groups(network: PoseNetwork) -> list[_Group]:
+    found: dict[tuple[tuple[int, bool], tuple[int, bool]], list[tuple[FloatArray, FloatArray, bool]]] = {}
+    for observation in network.observations:
+        chain = observation.chain
+        missing = network.unknown_links(chain)
+        if len(missing) != 2 or observation.rotation_only:
+            continue
+        i, j = missing
+        motion = network.product(chain[i + 1 : j])
+        outer = inverse(network.product(chain[:i])), inverse(network.product(chain[j + 1 :]))
+        key = ((chain[i].slot, chain[i].inverse), (chain[j].slot, chain[j].inverse))
+        product = outer[0] @ observation.poses[0] @ outer[1]
+        found.setdefault(key, []).append((motion, product, len(observation.poses) == 1))
+    groups = []
+    for (first, second), rows in sorted(found.items()):
+        clear = [r for r in rows if r[2]]
+        # views with two near-equal poses only where the clear ones do not suffice
+        rows = clear if len(clear) >= max(4, len(rows) // 3) else rows
+        groups.append(_Group(first, second, np.array([r[0] for r in rows]), np.array([r[1] for r in rows])))
+    return groups
+
+
+def _set(network: PoseNetwork, link: tuple[int, bool], value: FloatArray) -> None:
+    slot, inverted = link
+    network.known[slot] = inverse(value) if inverted else value
+
+
+def _text(network: PoseNetwork, link: tuple[int, bool]) -> str:
+    name: ParameterName = network.names[link[0]]
+    return " ".join(name)

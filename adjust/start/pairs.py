@@ -1,0 +1,32 @@
+"""Start values of a survey that is nothing but a network of measured pairs."""
+
+from gtsam import Pose3, Rot3
+
+from adjust.model.kinds import is_pose_network
+from adjust.model.result import ParameterName
+from adjust.model.survey import Survey
+from adjust.start.result import Start
+
+
+def network_start(survey: Survey) -> Start | None:
+    """The network's own solution, without the pairs that contradict the rest; None where there is more than pairs.
+
+    Surveys of rotations alone, whose positions stay open, are left to the general search, too. Raises
+    IndeterminateError naming the stations that no pair ties to the others.
+    """
+    if not is_pose_network(survey) or not any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
+        return None
+    # here: a survey without pairs starts without it
+    from adjust.pose_network.from_survey import network_from_survey
+    from adjust.pose_network.robust import clean
+    from adjust.pose_network.solve import NetworkOptions
+
+    network = network_from_survey(survey, any_datum=True)
+    found = clean(network, NetworkOptions())
+    R, t = found.minimum.rotations, found.minimum.translations
+    notes = [f"{network.n_stations} stations from averaged rotations, linear positions and least squares"]
+    notes += [f"{rejected} (left out of the start)" for rejected in found.rejected]
+    poses: dict[ParameterName, Pose3] = {
+        ("world_from_station", s): Pose3(Rot3(R[i]), t[i]) for i, s in enumerate(network.station_ids)
+    }
+    return Start({}, poses, {}, notes=tuple(notes))

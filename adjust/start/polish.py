@@ -1,0 +1,158 @@
+"""All poses of the network together: a short least squares on the chains, each weighted by what its view can tell."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csc_array
+
+from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.spatial.averaging import pose_distance
+from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log, skew
+from adjust.start.closed_forms.views import tangent_axes
+from adjust.start.network import ChainObservation, PoseNetwork
+from adjust.start.views import View
+
+_DAMPING = 1e-7  # of the diagonal: what the observations leave open stays where it is
+_GROSS_PX = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Chains:
+    """n observations as arrays, chains padded to L links and alternatives to k.
+
+    rows: (n, L) positions in the array of poses, 0 the identity. inverted: (n, L). columns: (n, L) number of the
+    movable pose, -1 for none. measured: (n, k, 4, 4), the likeliest repeated as padding. roots: (n, 6, 6).
+    """
+
+    rows: IntArray
+    inverted: BoolArray
+    columns: IntArray
+    measured: FloatArray
+    roots: FloatArray
+
+
+def polish(network: PoseNetwork, movable: set[int], views: Mapping[int, View], iterations: int = 6) -> None:
+    """Move the movable poses to the minimum of the chains' misfit in px, robustly; nothing else changes.
+
+    Source: pose-graph least squares with each measured pose weighted by the normal matrix of its image points, which is
+    the bundle adjustment linearised at the measured poses. The caller's gauge poses are to be left out of ``movable``.
+    """
+    items = [
+        o
+        for o in network.observations
+        if not o.rotation_only and not network.unknown_links(o.chain) and any(k.slot in movable for k in o.chain)
+    ]
+    if not items:
+        return
+    slots = sorted({k.slot for o in items for k in o.chain})
+    moving = [slot for slot in slots if slot in movable]
+    chains = _arrays(network, items, slots, moving, views)
+    places = np.array([slots.index(slot) + 1 for slot in moving], dtype=np.int64)
+    poses = np.stack([np.eye(4)] + [network.known[slot] for slot in slots])
+    poses = _minimise(chains, poses, places, network.lever, iterations)
+    network.known.update({slot: poses[place] for slot, place in zip(moving, places, strict=True)})
+
+
+def _arrays(
+    network: PoseNetwork,
+    items: Sequence[ChainObservation],
+    slots: Sequence[int],
+    moving: Sequence[int],
+    views: Mapping[int, View],
+) -> _Chains:
+    n, longest = len(items), max(len(o.chain) for o in items)
+    rows, columns = np.zeros((n, longest), dtype=np.int64), np.full((n, longest), -1, dtype=np.int64)
+    inverted = np.zeros((n, longest), dtype=bool)
+    place, number = {s: i + 1 for i, s in enumerate(slots)}, {s: i for i, s in enumerate(moving)}
+    alternatives = max(len(o.poses) for o in items)
+    measured = np.empty((n, alternatives, 4, 4))
+    for i, o in enumerate(items):
+        for j, link in enumerate(o.chain):
+            rows[i, j], inverted[i, j], columns[i, j] = place[link.slot], link.inverse, number.get(link.slot, -1)
+        measured[i] = o.poses[0]
+        measured[i, : len(o.poses)] = o.poses
+    roots = np.array([_root_information(network.lever, o, views.get(o.block_idx)) for o in items])
+    return _Chains(rows, inverted, columns, measured, roots)
+
+
+def _root_information(lever: float, observation: ChainObservation, view: View | None) -> FloatArray:
+    """Square root (6, 6) of the information of the observed pose against a motion on its left, rms px."""
+    if view is None:
+        return np.diag([1.0] * 3 + [1.0 / lever] * 3) * 1000.0
+    pose = observation.poses[0]
+    p = view.x @ pose[:3, :3].T + pose[:3, 3]
+    depth = np.maximum(np.sum(p * view.rays, axis=1), 1e-9)
+    by_point = tangent_axes(view.rays) / depth[:, None, None]
+    j = np.concatenate([-by_point @ skew(p), by_point], axis=2).reshape(-1, 6) * view.focal_px
+    return np.asarray(np.linalg.qr(j / np.sqrt(len(p)), mode="r"))
+
+
+def _minimise(chains: _Chains, poses: FloatArray, places: IntArray, lever: float, iterations: int) -> FloatArray:
+    """Gauss-Newton with Cauchy weights on the poses at ``places``, as long as it lowers the misfit."""
+    best, best_cost, scale = poses, np.inf, np.inf
+    for _ in range(iterations + 1):
+        residuals, jacobians = _residuals(chains, poses, lever)
+        size = np.linalg.norm(residuals, axis=1)
+        # the scale may only shrink: far from the minimum everything counts, near it gross errors do not
+        scale = min(scale, max(3.0 * float(np.median(size)), _GROSS_PX))
+        cost = float(np.sum(np.log1p((size / scale) ** 2)) * scale**2)
+        if not cost < best_cost * (1 - 1e-6):
+            break
+        best, best_cost = poses, cost
+        step = _step(chains.columns, residuals, jacobians, 1.0 / (1.0 + (size / scale) ** 2), len(places))
+        poses = poses.copy()
+        poses[places] = poses[places] @ rigid(rotation_exp(step[:, :3]), step[:, 3:])
+    return best
+
+
+def _residuals(chains: _Chains, poses: FloatArray, lever: float) -> tuple[FloatArray, FloatArray]:
+    """Residuals (n, 6) and derivatives (n, L, 6, 6) by each link's pose, moved on its right."""
+    n, longest = chains.rows.shape
+    backwards = inverse(poses)
+    before = np.tile(np.eye(4), (n, 1, 1))
+    jacobians = np.empty((n, longest, 6, 6))
+    for j in range(longest):
+        turned = chains.inverted[:, j, None, None]
+        after = before @ np.where(turned, backwards[chains.rows[:, j]], poses[chains.rows[:, j]])
+        jacobians[:, j] = np.where(turned, -_adjoint(before), _adjoint(after))
+        before = after
+    nearest = np.argmin(pose_distance(chains.measured, before[:, None], lever), axis=1)
+    miss = before @ inverse(chains.measured[np.arange(n), nearest])
+    residuals = np.concatenate([rotation_log(miss[:, :3, :3]), miss[:, :3, 3]], axis=1)
+    return (chains.roots @ residuals[:, :, None])[..., 0], chains.roots[:, None] @ jacobians
+
+
+def _adjoint(pose: FloatArray) -> FloatArray:
+    """Maps (n, 6, 6) of motions (turn, shift) from right of poses (n, 4, 4) to left of them."""
+    out = np.zeros((len(pose), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = pose[:, :3, :3]
+    out[:, 3:, :3] = skew(pose[:, :3, 3]) @ pose[:, :3, :3]
+    return out
+
+
+def _step(
+    columns: IntArray, residuals: FloatArray, jacobians: FloatArray, weights: FloatArray, n_moving: int
+) -> FloatArray:
+    """One damped Gauss-Newton step (n_moving, 6)."""
+    size = 6 * n_moving
+    weighted = np.swapaxes(jacobians, 2, 3) * weights[:, None, None, None]
+    right = np.zeros((n_moving, 6))
+    inside = columns >= 0
+    np.add.at(right, columns[inside], (weighted @ residuals[:, None, :, None])[..., 0][inside])
+    blocks, row_idx, column_idx = [], [], []
+    for a in range(columns.shape[1]):
+        for b in range(columns.shape[1]):
+            both = inside[:, a] & inside[:, b]
+            blocks.append((weighted[both, a] @ jacobians[both, b]).ravel())
+            row, column = 6 * columns[both, a], 6 * columns[both, b]
+            row_idx.append((row[:, None, None] + np.arange(6)[:, None] + np.zeros(6, dtype=np.int64)).ravel())
+            column_idx.append((column[:, None, None] + np.zeros((6, 1), dtype=np.int64) + np.arange(6)).ravel())
+    entries = (np.concatenate(blocks), (np.concatenate(row_idx), np.concatenate(column_idx)))
+    normal = csc_array(entries, shape=(size, size))
+    diagonal = normal.diagonal()
+    damping = _DAMPING * diagonal + 1e-12 * float(diagonal.max())
+    damped = csc_array(normal + csc_array((damping, (np.arange(size), np.arange(size))), shape=(size, size)))
+    from scipy.sparse.linalg import splu  # here: a survey without images starts without it
+
+    return np.asarray(-splu(damped).solve(right.ravel()).reshape(-1, 6))

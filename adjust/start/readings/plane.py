@@ -1,0 +1,326 @@
+"""Approximate horizontal coordinates, as complex numbers, from directions and distances alone.
+
+Systems of coordinates grow point by point: polar points, intersections, resections and arcs, from what they know.
+Where the known system cannot grow, the sets of single stations are joined through two common points into systems of
+their own, and these moved into the known one: so traverses without any orientation close.
+"""
+
+import cmath
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from adjust.start.readings.sights import Node, Sights
+
+_SURE = 0.15
+"""Sine of the angle between two rays below which they do not intersect well."""
+_LOST = 1e-9
+
+
+@dataclass(eq=False)
+class System:
+    """Coordinates and, per set of directions, the turn to be added. absolute: in the world, so that azimuths hold."""
+
+    xy: dict[Node, complex]
+    turn: dict[str, float] = field(default_factory=dict)
+    absolute: bool = False
+
+    def copy(self) -> "System":
+        """An independent copy."""
+        return replace(self, xy=dict(self.xy), turn=dict(self.turn))
+
+
+@dataclass(eq=False)
+class PlaneStart:
+    """Searches plane coordinates; distance: horizontal ones of ordered pairs of nodes."""
+
+    sights: Sights
+    distance: Mapping[tuple[Node, Node], float]
+
+    def __post_init__(self) -> None:
+        self.around: dict[Node, set[Node]] = {}
+        for a, b in self.distance:
+            self.around.setdefault(a, set()).add(b)
+        self.sets_at: dict[Node, list[str]] = {}
+        self.sets_to: dict[Node, list[str]] = {}
+        self.azimuths_to: dict[Node, list[tuple[Node, float]]] = {}
+        for name, (a, targets) in self.sights.directions.items():
+            self.sets_at.setdefault(a, []).append(name)
+            for b in targets:
+                self.sets_to.setdefault(b, []).append(name)
+        for (a, b), values in self.sights.azimuths.items():
+            for value in values:
+                self.azimuths_to.setdefault(b, []).append((a, value))
+                self.azimuths_to.setdefault(a, []).append((b, value + np.pi))
+        self.nodes = set(self.sets_at) | set(self.sets_to) | set(self.around) | set(self.azimuths_to)
+
+    def find(self, known: Mapping[Node, complex]) -> System:
+        """The system of ``known`` points, or one of its own where nothing is known, with all points that it reaches."""
+        main = System(dict(known), absolute=bool(known))
+        pieces = self._stations()
+        if not known:
+            main = max(pieces, key=lambda p: len(p.xy), default=self._seed())
+            if len(main.xy) < 2:
+                main = self._seed()
+            main.absolute = True  # nothing else says where north is: azimuths turn it in the end
+            self._turn_by_azimuth(main)
+        while True:
+            self.grow(main)
+            if self._absorb(main, pieces) or self._pieces(pieces, main) or self._guess(main):
+                continue
+            return main
+
+    # -- systems -----------------------------------------------------------------------------------------------------
+
+    def _stations(self) -> list[System]:
+        """One system per set of directions, of its station and the targets whose distance is known."""
+        out = []
+        for name, (a, targets) in self.sights.directions.items():
+            xy = {a: 0j}
+            for b, angles in targets.items():
+                if (a, b) in self.distance:
+                    xy[b] = cmath.rect(self.distance[a, b], circular_median(angles))
+            if len(xy) > 1:
+                out.append(System(xy, {name: 0.0}))
+        return out
+
+    def _seed(self) -> System:
+        pairs = sorted(self.distance.items(), key=lambda item: (-len(self.around[item[0][0]]), item[0]))
+        if pairs:
+            (a, b), d = pairs[0]
+            return System({a: 0j, b: complex(d, 0.0)})
+        name = max(self.sights.directions, key=lambda s: len(self.sights.directions[s][1]), default=None)
+        if name is None:
+            return System({})
+        a, targets = self.sights.directions[name]
+        b = next(iter(targets))
+        return System({a: 0j, b: cmath.rect(1.0, circular_median(targets[b]))}, {name: 0.0})
+
+    def _turn_by_azimuth(self, system: System) -> None:
+        for (a, b), values in self.sights.azimuths.items():
+            if a in system.xy and b in system.xy and system.xy[a] != system.xy[b]:
+                turn = circular_median(values) - cmath.phase(system.xy[b] - system.xy[a])
+                move(system, cmath.rect(1.0, turn), 0j)
+                return
+
+    def _absorb(self, main: System, pieces: list[System]) -> bool:
+        """Move into ``main`` every piece that shares two points with it."""
+        grew = False
+        for piece in list(pieces):
+            common = [n for n in piece.xy if n in main.xy]
+            if len(common) == len(piece.xy):
+                pieces.remove(piece)
+            elif len(common) >= 2 and (motion := fit(piece.xy, main.xy, common)) is not None:
+                move(piece, *motion)
+                for n, z in piece.xy.items():
+                    main.xy.setdefault(n, z)
+                for name, turn in piece.turn.items():
+                    main.turn.setdefault(name, turn)
+                pieces.remove(piece)
+                grew = True
+        return grew
+
+    def _pieces(self, pieces: list[System], main: System) -> bool:
+        """Let the other systems grow and join each other; whether any did."""
+        for piece in sorted(pieces, key=lambda p: -len(p.xy)):
+            before = len(piece.xy)
+            self.grow(piece)
+            others = [p for p in pieces if p is not piece]
+            joined = self._absorb(piece, others)
+            if joined or len(piece.xy) > before:
+                pieces[:] = [piece, *others]
+                return True
+        return False
+
+    # -- growing -----------------------------------------------------------------------------------------------------
+
+    def grow(self, system: System) -> None:
+        """Add every point that is determined well by what the system knows."""
+        waiting = [n for n in self.nodes if n not in system.xy]
+        stuck = False
+        while waiting and not stuck:
+            self._orient(system)
+            stuck = True
+            for step in (self._polar, self._intersection, self._solved):
+                found = {n: z for n in waiting if (z := step(system, n)) is not None}
+                if found:
+                    system.xy.update(found)
+                    waiting = [n for n in waiting if n not in found]
+                    stuck = False
+                    break
+        self._orient(system)
+
+    def _orient(self, system: System) -> None:
+        for name, (a, targets) in self.sights.directions.items():
+            if name in system.turn or a not in system.xy:
+                continue
+            turns = [cmath.phase(system.xy[b] - system.xy[a]) - angle for b, angles in targets.items()
+                     if b in system.xy and system.xy[b] != system.xy[a] for angle in angles]  # fmt: skip
+            if turns:
+                system.turn[name] = circular_median(turns)
+
+    def _rays(self, system: System, node: Node) -> list[tuple[complex, float]]:
+        """Points and directions (rad) of the rays that reach a node."""
+        out = []
+        for name in self.sets_to.get(node, ()):
+            a, targets = self.sights.directions[name]
+            if name in system.turn and a in system.xy:
+                out.append((a, system.xy[a], circular_median(targets[node]) + system.turn[name]))
+        if system.absolute:
+            out += [(a, system.xy[a], angle) for a, angle in self.azimuths_to.get(node, ()) if a in system.xy]
+        return [(z, angle) for _, z, angle in out]
+
+    def _polar(self, system: System, node: Node) -> complex | None:
+        found = []
+        for name in self.sets_to.get(node, ()):
+            a, targets = self.sights.directions[name]
+            if name in system.turn and a in system.xy and (a, node) in self.distance:
+                angle = circular_median(targets[node]) + system.turn[name]
+                found.append(system.xy[a] + cmath.rect(self.distance[a, node], angle))
+        if system.absolute:
+            found += [system.xy[a] + cmath.rect(self.distance[a, node], angle)
+                      for a, angle in self.azimuths_to.get(node, ())
+                      if a in system.xy and (a, node) in self.distance]  # fmt: skip
+        return middle(found) if found else None
+
+    def _intersection(self, system: System, node: Node) -> complex | None:
+        rays = self._rays(system, node)
+        found = []
+        for i, (p, alpha) in enumerate(rays):
+            for q, beta in rays[:i]:
+                sine = np.sin(beta - alpha)
+                if abs(sine) > _SURE:
+                    s = ((q - p) * cmath.rect(1.0, -beta)).imag / -np.sin(beta - alpha)
+                    t = ((p - q) * cmath.rect(1.0, -alpha)).imag / -np.sin(alpha - beta)
+                    if s > 0.0 and t > 0.0:
+                        found.append(p + cmath.rect(s, alpha))
+        return middle(found) if found else None
+
+    def _solved(self, system: System, node: Node) -> complex | None:
+        found = self.candidates(system, node)
+        return found[0] if len(found) == 1 else None
+
+    def candidates(self, system: System, node: Node) -> list[complex]:
+        """Where a point can be: resection, arcs and their mixtures, by least squares from many sides."""
+        rays = self._rays(system, node)
+        circles = [(system.xy[b], self.distance[node, b]) for b in self.around.get(node, ()) if b in system.xy]
+        sets = []
+        for name in self.sets_at.get(node, ()):
+            _, targets = self.sights.directions[name]
+            seen = [(system.xy[b], circular_median(v)) for b, v in targets.items() if b in system.xy]
+            if len(seen) > 1:
+                sets.append(seen)
+        if len(rays) + len(circles) + sum(len(s) - 1 for s in sets) < 2:
+            return []
+        return positions(rays, circles, sets)
+
+    def _guess(self, main: System) -> bool:
+        """Take the better of two places where nothing is certain: the one from which the rest fits."""
+        for node in sorted(self.nodes - set(main.xy)):
+            found = self.candidates(main, node)
+            if len(found) < 2:
+                continue
+            trials: list[tuple[int, float, int, System]] = []
+            for z in found:
+                trial = main.copy()
+                trial.xy[node] = z
+                self.grow(trial)
+                trials.append((-len(trial.xy), self.misfit(trial), len(trials), trial))
+            best = min(trials, key=lambda t: (t[0], t[1], t[2]))[3]
+            main.xy, main.turn = best.xy, best.turn
+            return True
+        return False
+
+    def misfit(self, system: System) -> float:
+        """Robust sum of what distances (m) and directions (m across) miss."""
+        total = 0.0
+        for (a, b), d in self.distance.items():
+            if a < b and a in system.xy and b in system.xy:
+                total += min(abs(abs(system.xy[b] - system.xy[a]) - d), 0.1 * d)
+        for name, (a, targets) in self.sights.directions.items():
+            for b, angles in targets.items():
+                if name in system.turn and a in system.xy and b in system.xy:
+                    off = (system.xy[b] - system.xy[a]) * cmath.rect(1.0, -system.turn[name] - angles[0])
+                    total += min(abs(off) * abs(cmath.phase(off)), 0.1 * abs(off))
+        return total
+
+
+def positions(
+    rays: list[tuple[complex, float]], circles: list[tuple[complex, float]],
+    sets: list[list[tuple[complex, float]]],
+) -> list[complex]:  # fmt: skip
+    """Points that agree with rays to them, distances, and sets of directions from them; none where it is uncertain.
+
+    One: it is unique. Several: each fits as well. Found from starts all round, as few points are concerned.
+    """
+    from scipy.optimize import least_squares  # here: few surveys come this way, and it takes long to load
+
+    centres = np.array([z for z, _ in rays] + [z for z, _ in circles] + [z for s in sets for z, _ in s])
+    size = max(float(np.abs(centres - centres.mean()).max()), max((d for _, d in circles), default=0.0), 1e-3)
+
+    def misses(p: np.ndarray) -> np.ndarray:
+        z = complex(p[0], p[1])
+        out = [float(np.angle((z - o) * cmath.rect(1.0, -angle))) * size for o, angle in rays]
+        out += [abs(z - o) - d for o, d in circles]
+        for seen in sets:
+            turns = np.array([(o - z) * cmath.rect(1.0, -angle) for o, angle in seen])
+            turns /= np.maximum(np.abs(turns), _LOST * size)
+            mean = turns.sum()
+            out += (np.angle(turns * np.conj(mean)) * size).tolist()
+        return np.array(out)
+
+    around = [cmath.rect(r * size, 2.0 * np.pi * k / 8.0) for r in (0.3, 1.0, 2.5) for k in range(8)]
+    starts = [complex(centres.mean()) + z for z in around] if not circles else [
+        o + cmath.rect(d, 2.0 * np.pi * k / 12.0) for o, d in circles[:2] for k in range(12)
+    ]  # fmt: skip
+    found: list[tuple[float, complex, bool]] = []
+    for start in starts:
+        result = least_squares(misses, [start.real, start.imag], xtol=1e-10, ftol=1e-10, max_nfev=60)
+        z, cost = complex(*result.x), float(np.sqrt(2.0 * result.cost))
+        if not any(abs(z - other) < 1e-3 * size for _, other, _ in found):
+            s = np.linalg.svd(result.jac, compute_uv=False)
+            found.append((cost, z, bool(s[-1] > 0.02 * max(s[0], 1.0) and len(s) > 1)))
+    best = min(cost for cost, _, _ in found)
+    good = [(c, z, sure) for c, z, sure in found if c < 3.0 * best + 2e-3 * size]
+    return [z for _, z, sure in sorted(good, key=lambda g: g[0]) if sure] if all(g[2] for g in good) else []
+
+
+def fit(
+    source: Mapping[Node, complex], goal: Mapping[Node, complex], common: Iterable[Node]
+) -> tuple[complex, complex] | None:
+    """Turn (unit) and shift that move ``source`` onto ``goal``; None where the common points are too near together."""
+    names = list(common)
+    p, q = np.array([source[n] for n in names]), np.array([goal[n] for n in names])
+    a, b = p - p.mean(), q - q.mean()
+    size = np.abs(np.array(list(source.values())) - p.mean()).max()
+    if np.abs(a).max() < 0.02 * size or np.abs(b).max() < 1e-9:
+        return None
+    turn = complex(np.vdot(a, b))
+    turn /= abs(turn)
+    return turn, complex(q.mean() - turn * p.mean())
+
+
+def move(system: System, turn: complex, shift: complex) -> None:
+    """Turn and shift a system."""
+    for n in system.xy:
+        system.xy[n] = turn * system.xy[n] + shift
+    for name in system.turn:
+        system.turn[name] += cmath.phase(turn)
+
+
+def middle(points: list[complex]) -> complex:
+    """The point nearest to all others."""
+    if len(points) < 3:
+        return points[0]
+    z = np.array(points)
+    return points[int(np.argmin(np.abs(z[:, None] - z).sum(axis=1)))]
+
+
+def circular_median(angles: list[float]) -> float:
+    """The angle nearest to all others."""
+    if len(angles) < 3:
+        return angles[0]
+    z = np.array(angles)
+    turns = np.abs((z[:, None] - z + np.pi) % (2.0 * np.pi) - np.pi)
+    return angles[int(np.argmin(turns.sum(axis=1)))]

@@ -1,0 +1,140 @@
+"""Readings sorted by what they say of approximate coordinates: turned directions, distances, height differences.
+
+Coordinates are taken along the zero of bearings, counter-clockwise of it, and up; horizontal ones as complex numbers.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from adjust.model.observations import PositionRef, Reading
+from adjust.model.survey import FloatArray, Survey
+from adjust.observations.listed import position_text
+from adjust.spatial.vertical import plumb
+
+Node = str
+"""A world point's id, or the text of a position in a frame that is known."""
+
+
+@dataclass(eq=False)
+class Sights:
+    """directions: per set (a setup at one node, or angles that hang together) the node and angles to targets (rad).
+
+    azimuths: angle from a node to another. level: horizontal distances (m); slope: others, with the height of the
+    target's end above the instrument's end less that of the points. rise: height differences between points.
+    zenith: (angle, instrument minus target height). All per ordered pair of nodes (a, b), several values each.
+    """
+
+    directions: dict[str, tuple[Node, dict[Node, list[float]]]] = field(default_factory=dict)
+    azimuths: dict[tuple[Node, Node], list[float]] = field(default_factory=dict)
+    level: dict[tuple[Node, Node], list[float]] = field(default_factory=dict)
+    slope: dict[tuple[Node, Node], list[tuple[float, float]]] = field(default_factory=dict)
+    rise: dict[tuple[Node, Node], list[float]] = field(default_factory=dict)
+    zenith: dict[tuple[Node, Node], list[tuple[float, float]]] = field(default_factory=dict)
+    nodes: set[Node] = field(default_factory=set)
+
+    def distances(self, height: Mapping[Node, float]) -> dict[tuple[Node, Node], float]:
+        """Horizontal distances, the median of all, in both orders; slopes where both heights are known."""
+        found: dict[tuple[Node, Node], list[float]] = {}
+        for (a, b), values in self.level.items():
+            found.setdefault((min(a, b), max(a, b)), []).extend(values)
+        for (a, b), slopes in self.slope.items():
+            if a in height and b in height:
+                for s, above in slopes:
+                    across = s * s - (height[b] - height[a] + above) ** 2
+                    if across > 0.0:
+                        found.setdefault((min(a, b), max(a, b)), []).append(float(np.sqrt(across)))
+        median = {pair: float(np.median(v)) for pair, v in found.items()}
+        return median | {(b, a): d for (a, b), d in median.items()}
+
+
+def node_of(ref: PositionRef) -> Node:
+    """The node of a position."""
+    return position_text(ref)
+
+
+def horizon_axes(survey: Survey) -> FloatArray:
+    """Rows (3, 3): zero of bearings, counter-clockwise of it, up, at the origin and the given tilt."""
+    vertical = survey.vertical
+    line = plumb(vertical, survey.bearings.zero, np.asarray(vertical.tilt.values, dtype=float))
+    return np.array([line.zero, np.cross(line.up, line.zero), line.up])
+
+
+def collect_sights(survey: Survey) -> Sights:
+    """All used readings and distances of levelled setups."""
+    out = Sights()
+    sign = -1.0 if survey.bearings.clockwise else 1.0
+    tilted = {s.setup_id for s in survey.setups if not s.levelled}
+    polar: dict[tuple[str, Node, Node], dict[str, Reading]] = {}
+    angles: list[Reading] = []
+    for r in survey.readings:
+        if not r.used or r.setup_id in tilted:
+            continue
+        a, b = node_of(r.at), node_of(r.to)
+        out.nodes |= {a, b}
+        if r.kind == "direction":
+            _, targets = out.directions.setdefault(f"{r.setup_id}/{a}", (a, {}))
+            targets.setdefault(b, []).append(sign * r.value)
+        elif r.kind == "angle":
+            angles.append(r)
+        elif r.kind == "azimuth":
+            out.azimuths.setdefault((a, b), []).append(sign * r.value)
+        elif r.kind == "horizontal_distance":
+            out.level.setdefault((a, b), []).append(r.value)
+        elif r.kind == "height_difference":
+            out.rise.setdefault((a, b), []).append(r.value + r.instrument_height - r.target_height)
+        else:
+            polar.setdefault((r.setup_id, a, b), {})[r.kind] = r
+    for (_, a, b), found in polar.items():
+        _polar(out, a, b, found)
+    _angles(out, angles, sign)
+    for d in survey.distances:
+        if d.used:
+            a, b = node_of(d.a), node_of(d.b)
+            out.nodes |= {a, b}
+            out.slope.setdefault((a, b), []).append((d.value, 0.0))
+    return out
+
+
+def _polar(out: Sights, a: Node, b: Node, found: Mapping[str, Reading]) -> None:
+    slope, zenith = found.get("slope_distance"), found.get("zenith")
+    if slope is not None and zenith is not None:
+        out.level.setdefault((a, b), []).append(slope.value * abs(np.sin(zenith.value)))
+        rise = slope.value * np.cos(zenith.value) + zenith.instrument_height - zenith.target_height
+        out.rise.setdefault((a, b), []).append(float(rise))
+    elif slope is not None:
+        out.slope.setdefault((a, b), []).append((slope.value, slope.target_height - slope.instrument_height))
+    elif zenith is not None:
+        out.zenith.setdefault((a, b), []).append((zenith.value, zenith.instrument_height - zenith.target_height))
+
+
+def _angles(out: Sights, angles: list[Reading], sign: float) -> None:
+    """Angles at one node, hung together through their targets, are as good as directions."""
+    left = list(angles)
+    count = 0
+    while left:
+        first = left[0]
+        if first.second is None:
+            left.pop(0)
+            continue
+        a = node_of(first.at)
+        out.nodes |= {node_of(first.second)}
+        targets = {node_of(first.to): [0.0]}
+        grew = True
+        while grew:
+            grew, rest = False, []
+            for r in left:
+                to, second = node_of(r.to), node_of(r.second) if r.second is not None else ""
+                if node_of(r.at) != a or not (to in targets or second in targets):
+                    rest.append(r)
+                elif to in targets:
+                    targets.setdefault(second, []).append(targets[to][0] + sign * r.value)
+                    grew = True
+                else:
+                    targets.setdefault(to, []).append(targets[second][0] - sign * r.value)
+                    grew = True
+            left = rest
+        out.nodes |= set(targets)
+        out.directions[f"angles {count} at {a}"] = (a, targets)
+        count += 1

@@ -1,0 +1,198 @@
+"""Approximate coordinates of points from readings and distances, where none are given."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from adjust.model.errors import SurveyError
+from adjust.model.observations import PositionRef
+from adjust.model.survey import FloatArray, Point, Survey
+from adjust.observations.listed import position_text
+from adjust.start.readings.plane import PlaneStart
+from adjust.start.readings.sights import Node, Sights, collect_sights, horizon_axes
+from adjust.start.readings.space import spread_space
+from adjust.start.readings.tilted import tilted_sights
+
+
+def given_points(survey: Survey) -> dict[str, FloatArray]:
+    """Coordinates (3,) m that come with the survey, given or observed; nan where a component is not known."""
+    out = {}
+    for observed in survey.coordinates:
+        sigma = np.diag(observed.cov).reshape(-1, 3)
+        for ref, value, variance in zip(observed.positions, observed.values, sigma, strict=True):
+            if ref.frame is None and ref.point_id is not None and observed.used:
+                out[ref.point_id] = np.where(np.isfinite(variance), value, np.nan)
+    for point in survey.points:
+        if point.x_in_world.value is not None:
+            value = np.asarray(point.x_in_world.value, dtype=float)
+            before = out.get(point.point_id, np.full(3, np.nan))
+            out[point.point_id] = np.where(np.isfinite(value), value, before)
+    return out
+
+
+def find_points(
+    survey: Survey, known: Mapping[str, FloatArray], frames: Mapping[PositionRef, FloatArray] | None = None
+) -> dict[str, FloatArray]:
+    """Coordinates (3,) m of all points that known ones, readings, distances and baselines reach.
+
+    known: by point, nan for components not known. frames: of positions in frames that are known. Where nothing is
+    known, the first station is the origin and its circle's zero the direction of bearings.
+    """
+    E = horizon_axes(survey)
+    sights = collect_sights(survey)
+    nodes = {**known, **{position_text(ref): x for ref, x in (frames or {}).items()}}
+    upright = abs(E[2, 2]) > 0.999
+    xy, height = {}, {}
+    for n, x in nodes.items():
+        local = E @ np.nan_to_num(x)
+        whole = bool(np.isfinite(x).all())
+        if whole or (upright and np.isfinite(x[:2]).all()):
+            xy[n] = complex(local[0], local[1])
+        if whole or (upright and np.isfinite(x[2])):
+            height[n] = float(local[2])
+    _baselines(survey, E, xy, height)
+    xy, height = _spread(sights, xy, height)
+    out = {}
+    for point in survey.points:
+        n = point.point_id
+        if n in xy and n in height:
+            x = E.T @ np.array([xy[n].real, xy[n].imag, height[n]])
+            given = known.get(n, np.full(3, np.nan))
+            out[n] = np.where(np.isfinite(given), given, x)
+    return out
+
+
+def _spread(
+    sights: Sights, xy: dict[Node, complex], height: dict[Node, float]
+) -> tuple[dict[Node, complex], dict[Node, float]]:
+    """Plane coordinates and heights by turns, since slopes need heights and zenith angles need distances."""
+    spread_space(sights, xy, height)
+    heights_known = bool(height)
+    for rough in (False, True):
+        for _ in range(3):
+            before = len(xy) + len(height)
+            height = spread_heights(sights, xy, height, heights_known)
+            assumed = dict(height)
+            if rough:
+                mean = float(np.median(list(height.values()))) if height else 0.0
+                assumed = dict.fromkeys(sights.nodes, mean) | height
+            found = PlaneStart(sights, sights.distances(assumed)).find(xy)
+            xy = xy | found.xy
+            height = spread_heights(sights, xy, height, heights_known)
+            if len(xy) + len(height) == before:
+                break
+    return xy, height
+
+
+def spread_heights(
+    sights: Sights, xy: Mapping[Node, complex], known: Mapping[Node, float], seeded: bool
+) -> dict[Node, float]:
+    """Heights from height differences and zenith angles; the median of all ways of the same length.
+
+    seeded: whether any height was given; else the first one is zero.
+    """
+    edges: dict[Node, list[tuple[Node, float]]] = {}
+
+    def join(a: Node, b: Node, rise: float) -> None:
+        edges.setdefault(a, []).append((b, rise))
+        edges.setdefault(b, []).append((a, -rise))
+
+    for (a, b), rises in sights.rise.items():
+        join(a, b, float(np.median(rises)))
+    for (a, b), angles in sights.zenith.items():
+        if a in xy and b in xy and xy[a] != xy[b]:
+            d = abs(xy[b] - xy[a])
+            join(a, b, float(np.median([d / np.tan(z) + up for z, up in angles])))
+    out = dict(known)
+    if not out and not seeded and edges:
+        out[max(edges, key=lambda n: (len(edges[n]), n))] = 0.0
+    front = list(out)
+    while front:
+        ways: dict[Node, list[float]] = {}
+        for a in front:
+            for b, rise in edges.get(a, ()):
+                if b not in out:
+                    ways.setdefault(b, []).append(out[a] + rise)
+        out |= {b: float(np.median(values)) for b, values in ways.items()}
+        front = list(ways)
+    return out
+
+
+def _baselines(survey: Survey, E: FloatArray, xy: dict[Node, complex], height: dict[Node, float]) -> None:
+    """Points at the other end of observed coordinate differences."""
+    pairs = [(a.point_id, b.point_id, E @ v) for d in survey.coordinate_differences if d.used
+             and np.isfinite(np.diag(d.cov)).all()
+             for a, b, v in zip(d.at, d.to, d.values, strict=True)
+             if a.frame is None and b.frame is None]  # fmt: skip
+    if pairs and not xy:
+        xy[str(pairs[0][0])], height[str(pairs[0][0])] = 0j, 0.0
+    grew = True
+    while grew:
+        grew = False
+        for a, b, v in pairs:
+            for p, q, sign in ((str(a), str(b), 1.0), (str(b), str(a), -1.0)):
+                if p in xy and p in height and (q not in xy or q not in height):
+                    xy[q] = xy[p] + sign * complex(v[0], v[1])
+                    height[q] = height[p] + sign * float(v[2])
+                    grew = True
+
+
+def with_start(survey: Survey, found: Mapping[str, FloatArray]) -> Survey:
+    """The survey with the found coordinates as start values of the points that have none."""
+    points = []
+    for point in survey.points:
+        value = point.x_in_world.value
+        lacking = value is None or not np.isfinite(np.asarray(value, dtype=float)).all()
+        if lacking and point.point_id in found:
+            point = Point(point.point_id, replace(point.x_in_world, value=found[point.point_id]))
+        points.append(point)
+    return replace(survey, points=tuple(points))
+
+
+def lacking_points(survey: Survey, found: Mapping[str, FloatArray]) -> list[str]:
+    """Points without coordinates."""
+    return [p.point_id for p in survey.points if p.point_id not in found or not np.isfinite(found[p.point_id]).all()]
+
+
+def explain(survey: Survey, lacking: list[str]) -> SurveyError:
+    """Why these points have no approximate coordinates, by name."""
+    sights = collect_sights(survey)
+    lost = set(lacking)
+    tilted: dict[str, list[str]] = {}
+    for mine in tilted_sights(survey).values():
+        for s in mine:
+            tilted.setdefault(s.node, []).append(s.setup_id)
+    lines = []
+    for n in lacking[:12]:
+        directions = sorted({a for a, targets in sights.directions.values() if n in targets})
+        directions += sorted({a for a, b in sights.azimuths if b == n})
+        near = {b for a, b in (*sights.level, *sights.slope) if a == n} | {
+            a for a, b in (*sights.level, *sights.slope) if b == n}  # fmt: skip
+        seen = sorted({b for a, targets in sights.directions.values() if a == n for b in targets})
+        parts = []
+        if directions:
+            parts.append(f"{_count(len(directions), 'direction')} from {', '.join(directions[:4])}")
+        if near:
+            parts.append(f"{_count(len(near), 'distance')} ({', '.join(sorted(near)[:4])})")
+        if seen:
+            parts.append(f"its own directions to {', '.join(seen[:4])}")
+        if n in tilted and not parts:
+            from_setups = ", ".join(sorted(set(tilted[n]))[:4])
+            lines.append(
+                f"point {n!r} is seen from {from_setups}, which {'is' if len(set(tilted[n])) == 1 else 'are'} not "
+                "levelled: a second such sight, or a distance, and 3 known points for each station are needed"
+            )
+            continue
+        floating = [m for m in {*directions, *near, *seen} if m in lost]
+        also = f"; of these {', '.join(sorted(floating)[:4])} are not known either" if floating else ""
+        lines.append(f"point {n!r} is reached by {' and '.join(parts) + ' only' if parts else 'nothing'}{also}")
+    more = f"\n  ... and {len(lacking) - 12} more" if len(lacking) > 12 else ""
+    return SurveyError(
+        f"no start value can be found for {len(lacking)} point(s); measure a distance, a second direction or a height, "
+        "or give coordinates:\n  " + "\n  ".join(lines) + more
+    )
+
+
+def _count(n: int, what: str) -> str:
+    return f"one {what}" if n == 1 else f"{n} {what}s"

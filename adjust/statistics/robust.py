@@ -1,0 +1,87 @@
+"""Gross errors among the image points: found by reweighting, confirmed by test, left out of a clean least squares.
+
+Cauchy weights with a scale from the median (Huber 1981, section 7.8; Zhang 1997 for the constant) bring the solution to
+what most points agree on; there every point is tested with the error probability of the whole family (Sidak). Where
+the residuals are together far smaller than the sigmas say, nothing contradicts these and nothing is looked for.
+"""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.solver import Solved, SolveOptions, solve
+from adjust.model.survey import BoolArray, FloatArray
+from adjust.precision.precision import Precision, image_residuals
+from adjust.statistics.criteria import cautious
+
+_CAUCHY = 2.385**2
+_MEDIAN = 2.0 * np.log(2.0)  # of chi-square with two degrees of freedom
+_FAMILY = 0.001
+_ROUNDS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """A clean solution with its precision, and which image points (N,), in the order of the blocks, it uses."""
+
+    solved: Solved
+    precision: Precision
+    used: BoolArray
+
+
+def limit(n: int) -> float:
+    """Chi-square (2) that one of n good image points exceeds with probability 0.001."""
+    return float(-2.0 * np.log(-np.expm1(np.log1p(-_FAMILY) / max(1, n))))
+
+
+def scale(test: FloatArray) -> float:
+    """Variance factor of most points, not below the a priori 1."""
+    test = test[np.isfinite(test)]
+    return max(1.0, float(np.median(test)) / _MEDIAN) if test.size else 1.0
+
+
+def screen(graph: AdjustmentGraph, solved: Solved, options: SolveOptions) -> Screened:
+    """Look for gross errors; ends in a least squares of the points that are left. The graph keeps them."""
+    given = graph.used()
+    used = given.copy()
+    precision = Precision(graph, solved)
+    test = image_residuals(precision).test
+    if not cautious(test[used], np.full(int(used.sum()), 2)) and _suspects(test, used).any():
+        graph.start = _reweighted(graph, solved, used, options)
+        for _ in range(_ROUNDS):
+            solved = solve(graph, options)
+            precision = Precision(graph, solved)
+            now = given & ~_suspects(image_residuals(precision).test, given)
+            if (now == used).all():
+                break
+            used = now
+            graph.set_weights(used.astype(np.float64))
+            graph.start = solved.values
+        else:  # still changing its mind: what is returned is the least squares of what it says is used
+            solved = solve(graph, options)
+            precision = Precision(graph, solved)
+    return Screened(solved, precision, used)
+
+
+def _suspects(test: FloatArray, used: BoolArray) -> BoolArray:
+    factor = scale(test[used])
+    return np.asarray(used & (test > limit(int(used.sum())) * factor))
+
+
+def _reweighted(graph: AdjustmentGraph, solved: Solved, used: BoolArray, options: SolveOptions) -> gtsam.Values:
+    """Values near which Cauchy weights settle; leaves the points that agree there as the used ones."""
+    values = solved.values
+    e = graph.whitened_squares(values)
+    for _ in range(15):
+        factor = scale(e[used])
+        graph.set_weights(used / (1.0 + e / (_CAUCHY * factor)))
+        graph.start = values
+        values = solve(graph, SolveOptions(max_step=1e-2, max_iterations=options.max_iterations)).values
+        before, e = e, graph.whitened_squares(values)
+        if np.abs(np.sqrt(e[used]) - np.sqrt(before[used])).max() < 0.05 * np.sqrt(factor):
+            break
+    used &= e <= limit(int(used.sum())) * scale(e[used])
+    graph.set_weights(used.astype(np.float64))
+    return values

@@ -1,5 +1,0 @@
-"""Table readings checked against images: swapped axes, signs, units, epochs, moved and mis-detected targets."""
-
-from adjust.table_checks.check import probable_causes, sign_warnings
-
-__all__ = ["probable_causes", "sign_warnings"]

@@ -1,1 +1,0 @@
-"""Readings of total stations, theodolites and levels: observation equations, start values, statistics."""

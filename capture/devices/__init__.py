@@ -1,0 +1,1 @@
+"""Cameras and turntables: what they are to the session, and their drivers."""

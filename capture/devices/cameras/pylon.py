@@ -1,0 +1,218 @@
+"""Basler cameras through pypylon, its emulator (``PYLON_CAMEMU=3``) included."""
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from capture.devices.camera import (
+    CameraError,
+    CameraInfo,
+    DisconnectedError,
+    FeatureValue,
+    Frame,
+    InUseError,
+    OutOfRangeError,
+)
+from capture.devices.cameras.base import (
+    LOCKED_WHILE_ARMED,
+    OLDER_NAMES,
+    READY_S,
+    DriverCamera,
+    bits_of,
+    is_mosaic_or_gray,
+)
+
+with warnings.catch_warnings():
+    # SWIG's types have no __module__; where warnings are errors, that one ends the interpreter
+    warnings.filterwarnings("ignore", "builtin type .* has no __module__ attribute", DeprecationWarning)
+    from pypylon import genicam, pylon
+
+
+def discover() -> tuple[CameraInfo, ...]:
+    """All cameras that pylon's transport layers find."""
+    factory = pylon.TlFactory.GetInstance()
+    return tuple(_info(factory, device) for device in factory.EnumerateDevices())
+
+
+def camera(place: str) -> "PylonCamera":
+    """The camera of that serial number, user-defined name or IP address, not opened."""
+    return PylonCamera(place)
+
+
+def _info(factory: Any, device: Any) -> CameraInfo:
+    serial = device.GetSerialNumber()
+    in_use = not factory.IsDeviceAccessible(device)
+    return CameraInfo(f"pylon:{serial}", device.GetVendorName(), device.GetModelName(), serial, in_use)
+
+
+class PylonCamera(DriverCamera):
+    """A camera of pylon."""
+
+    def __init__(self, place: str) -> None:
+        super().__init__("pylon", place)
+        self._place = place
+        self._camera: Any = None
+        self._class = ""
+        self._bits, self._mono = 8, True
+
+    def open(self) -> None:
+        """See ``Camera``."""
+        factory = pylon.TlFactory.GetInstance()
+        device = self._find(factory)
+        if not factory.IsDeviceAccessible(device):
+            raise InUseError(self.address, "another program holds it", "close that program")
+        with self._translated("open"):
+            self._camera = pylon.InstantCamera(factory.CreateDevice(device))
+            self._camera.Open()
+        self._serial, self._class = device.GetSerialNumber(), device.GetDeviceClass()
+
+    def _find(self, factory: Any) -> Any:
+        devices = list(factory.EnumerateDevices())
+        for device in devices:
+            address = device.GetIpAddress() if device.IsIpAddressAvailable() else ""
+            if self._place in (device.GetSerialNumber(), device.GetUserDefinedName(), address):
+                return device
+        seen = ", ".join(d.GetSerialNumber() for d in devices) or "none"
+        found = f"pylon does not see it (serial numbers seen: {seen})"
+        raise DisconnectedError(self.address, found, "check the cable, its power and the address")
+
+    def close(self) -> None:
+        """See ``Camera``."""
+        if self._camera is not None:
+            with suppress(genicam.GenericException):  # where it is gone already nothing is left to let go of
+                self._camera.DestroyDevice()
+        self._camera, self._armed = None, False
+
+    @property
+    def last_block_id(self) -> int | None:
+        """65535 on GigE Vision without extended ids."""
+        if self._class != "BaslerGigE":
+            return None
+        node = self._camera.GetNodeMap().GetNode("GevGVSPExtendedIDMode")
+        return None if _readable(node) and node.Value == "On" else 65535
+
+    def get(self, name: str) -> FeatureValue:
+        """See ``Camera``."""
+        if name == "DeviceSerialNumber":
+            return self.serial
+        with self._translated(name):
+            node = self._node(name)
+            if not _readable(node):
+                raise self._unknown(name)
+            value: FeatureValue = node.Value
+        return value
+
+    def set(self, name: str, value: FeatureValue) -> None:
+        """See ``Camera``."""
+        if self._armed and name in LOCKED_WHILE_ARMED:
+            raise self._locked(name)
+        with self._translated(name):
+            node = self._node(name)
+            try:
+                node.Value = value
+            except (genicam.OutOfRangeException, genicam.InvalidArgumentException, TypeError) as error:
+                raise OutOfRangeError(self.address, f"{name} cannot be {value!r}", _range(node)) from error
+            except genicam.AccessException as error:
+                raise self._locked(name) from error
+
+    def _node(self, name: str) -> Any:
+        if self._camera is None:
+            raise CameraError(self.address, "it is not open", "open it first")
+        nodes = self._camera.GetNodeMap()
+        for candidate in (name, OLDER_NAMES.get(name, name)):
+            node = nodes.GetNode(candidate)
+            if node is not None and genicam.IsImplemented(node):
+                return node
+        raise self._unknown(name)
+
+    def arm(self) -> None:
+        """See ``Camera``."""
+        self.disarm()
+        self._note_trigger()
+        pixel_format = str(self.get("PixelFormat"))
+        self._bits, self._mono = bits_of(pixel_format), is_mosaic_or_gray(pixel_format)
+        with self._translated("arm"):
+            self._camera.StartGrabbing(pylon.GrabStrategy_OneByOne, pylon.GrabLoop_ProvidedByUser)
+            self._armed = True
+            if self._source_armed == "Software":
+                self._wait_until_ready()
+        self._drain()
+
+    def _wait_until_ready(self) -> None:
+        if self._camera.CanWaitForFrameTriggerReady():
+            wait_ms = int(1e3 * READY_S)
+            self._wait_for(lambda: self._camera.WaitForFrameTriggerReady(wait_ms, pylon.TimeoutHandling_Return))
+
+    def disarm(self) -> None:
+        """See ``Camera``."""
+        self._armed = False
+        if self._camera is not None and self._camera.IsGrabbing():
+            with self._translated("disarm"):
+                self._camera.StopGrabbing()
+
+    def _execute_trigger(self) -> None:
+        with self._translated("trigger"):
+            self._wait_until_ready()
+            self._camera.ExecuteSoftwareTrigger()
+
+    def _skip_pending(self) -> None:
+        with self._translated("trigger"):
+            while (result := self._camera.RetrieveResult(0, pylon.TimeoutHandling_Return)).IsValid():
+                result.Release()
+            self.fetch(READY_S)  # its exposure began before the call
+
+    def fetch(self, timeout_s: float) -> Frame:
+        """See ``Camera``."""
+        self._require_armed("fetch")
+        with self._translated("fetch"):
+            result = self._camera.RetrieveResult(round(1e3 * timeout_s), pylon.TimeoutHandling_Return)
+            if not result.IsValid():
+                raise self._no_image(timeout_s)
+            try:
+                return self._frame_of(result)
+            finally:
+                result.Release()
+
+    def _frame_of(self, result: Any) -> Frame:
+        complete = bool(result.GrabSucceeded())  # an incomplete buffer may well have error code 0
+        if complete and not self._mono:
+            found = f"it sends colour ({self.get('PixelFormat')})"
+            raise CameraError(self.address, found, "set PixelFormat to Mono8, Mono12 or Mono16")
+        # Array is a copy already
+        frame = self._frame(result.Array, int(result.BlockID), int(result.TimeStamp), self._bits, complete)
+        if complete:
+            return frame
+        raise self._incomplete(f"image {frame.block_id}", result.ErrorDescription or "no reason given", frame)
+
+    def _no_image(self, timeout_s: float) -> CameraError:
+        if timeout_s > 0.0 and self._camera.IsCameraDeviceRemoved():  # the question takes 2 ms
+            return self._gone()
+        return self._late(timeout_s)
+
+    @contextmanager
+    def _translated(self, what: str) -> Iterator[None]:
+        """GenICam's exceptions as ours."""
+        try:
+            yield
+        except genicam.GenericException as error:
+            if self._camera is not None and self._camera.IsCameraDeviceRemoved():
+                raise self._gone() from error
+            message = str(error).split(" : ")[0].strip()
+            if "controlled by another application" in message or "already opened" in message:
+                raise InUseError(self.address, "another program holds it", "close that program") from error
+            raise CameraError(self.address, f"{what}: {message}", "see the camera's manual") from error
+
+
+def _readable(node: Any) -> bool:
+    return node is not None and bool(genicam.IsReadable(node))
+
+
+def _range(node: Any) -> str:
+    """What the feature takes, in words."""
+    if hasattr(node, "Symbolics"):
+        return f"it takes {', '.join(node.Symbolics)}"
+    if hasattr(node, "Min"):
+        step = f" in steps of {node.Inc}" if hasattr(node, "Inc") else ""
+        return f"it takes {node.Min} to {node.Max}{step}"
+    return "give another type of value"

@@ -1,0 +1,285 @@
+"""A turntable from any controller: limits, chosen path, settling, stalls and stops are the same for all of them."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from adjust.model.survey import FloatArray
+from capture.devices.turntable import (
+    Axis,
+    AxisState,
+    Controller,
+    ControllerError,
+    Location,
+    MoveStatus,
+    NotSettledError,
+    Settle,
+    StalledError,
+    StoppedError,
+    TableDisconnectedError,
+    TurntableError,
+    degrees_text,
+)
+
+
+class MovingTable:
+    """A ``Turntable`` over a ``Controller``; a thread of its own watches each move.
+
+    near: (n,) rad, where the table was last, for controllers whose readback does not count turns.
+    """
+
+    def __init__(
+        self, name: str, axes: Sequence[Axis], controller: Controller, settle: Settle, near: FloatArray | None = None
+    ) -> None:
+        self._name, self._axes, self._controller, self._settle = name, tuple(axes), controller, settle
+        self._io = threading.Lock()
+        self._stopped = threading.Event()
+        self._locked_out = False
+        self._status: MoveStatus | None = None
+        self._setpoint = np.full(len(self._axes), np.nan)
+        self._last = None if near is None else np.array(near, float)
+        self.stop_sent_ns: int | None = None  # monotonic; when the last stop had been acknowledged
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return self._name
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """The axes, outermost first."""
+        return self._axes
+
+    @property
+    def address(self) -> str:
+        """How the controller is reached."""
+        return self._controller.address
+
+    @property
+    def limits(self) -> tuple[tuple[float, float], ...]:
+        """Lower and upper limit of every axis, rad."""
+        return tuple((axis.lower, axis.upper) for axis in self._axes)
+
+    @property
+    def position(self) -> FloatArray:
+        """The readback, (n,) rad."""
+        return np.array([state.angle for state in self.states()])
+
+    def open(self) -> None:
+        """Connect; nothing moves."""
+        with self._io:
+            self._controller.open()
+        try:
+            self.states()
+        except BaseException:
+            self._controller.close()
+            raise
+
+    def reopen(self) -> None:
+        """Connect anew; the count of turns goes on."""
+        with self._io:
+            self._controller.close()
+            self._controller.open()
+        self.states()
+
+    def close(self) -> None:
+        """Stop what still turns, and disconnect."""
+        try:
+            if self._status is not None and not self._status.done:
+                self.stop()
+        except TurntableError:
+            pass  # whoever closes has no use for a table that cannot be reached
+        self._controller.close()
+
+    def states(self) -> tuple[AxisState, ...]:
+        """What the controller says of all axes, turns counted."""
+        with self._io:
+            found = [self._controller.read(i) for i in range(len(self._axes))]
+            angles = self._unwrapped(np.array([state.angle for state in found]))
+        return tuple(
+            AxisState(float(angle), state.moving, state.fault) for angle, state in zip(angles, found, strict=True)
+        )
+
+    def _unwrapped(self, angles: FloatArray) -> FloatArray:
+        modulo = self._controller.modulo
+        if modulo is not None:
+            near = np.zeros(len(angles)) if self._last is None else self._last
+            angles = angles + modulo * np.round((near - angles) / modulo)
+        self._last = angles
+        return angles
+
+    def check(self, angles: Sequence[float] | FloatArray) -> None:
+        """Raise LimitError where a position cannot be reached from here or from anywhere; sends nothing."""
+        self._targets(angles, np.zeros(len(self._axes)) if self._last is None else self._last)
+
+    def _targets(self, angles: Sequence[float] | FloatArray, current: FloatArray) -> FloatArray:
+        if len(angles) != len(self._axes):
+            raise TurntableError(f"{self._name}: {len(angles)} angles for {len(self._axes)} axes; give one each")
+        rows = zip(self._axes, angles, current, strict=True)
+        return np.array([axis.target(float(angle), float(now)) for axis, angle, now in rows])
+
+    def set(self, angles: Sequence[float] | FloatArray) -> MoveStatus:
+        """Start to turn; all limits are checked before the first axis is told anything."""
+        self.check(angles)
+        if self._locked_out:
+            raise StoppedError(f"{self._name}: stopped in an emergency; it moves again after release")
+        current = self.position
+        targets = self._targets(angles, current)
+        self._begin()
+        self._setpoint = targets
+        status = MoveStatus()
+        self._status = status
+        try:
+            for i in range(len(self._axes)):
+                with self._io:
+                    self._require_released()
+                    self._controller.move(i, float(targets[i]), float(targets[i] - current[i]))
+        except BaseException as error:
+            self._fail(status, error)
+            raise
+        threading.Thread(target=self._watch, args=(status, targets), name=f"{self._name} moves", daemon=True).start()
+        return status
+
+    def home(self) -> MoveStatus:
+        """Look for the references; the readback afterwards is the setpoint."""
+        self._begin()
+        status = MoveStatus()
+        self._status = status
+        for i in range(len(self._axes)):
+            with self._io:
+                self._require_released()
+                self._controller.home(i)
+        threading.Thread(target=self._watch, args=(status, None), name=f"{self._name} homes", daemon=True).start()
+        return status
+
+    def _begin(self) -> None:
+        if self._status is not None and not self._status.done:
+            raise TurntableError(f"{self._name}: it is still moving; wait for the move before, or stop it")
+        self._stopped.clear()
+
+    def _require_released(self) -> None:
+        if self._locked_out or self._stopped.is_set():
+            raise StoppedError(f"{self._name}: stopped before all axes were sent off")
+
+    def stop(self) -> None:
+        """Stop all axes; over a cut connection it is tried once more with a new one."""
+        self._stopped.set()
+        with self._io:
+            try:
+                self._controller.stop()
+            except TableDisconnectedError:
+                self._controller.close()
+                self._controller.open()
+                self._controller.stop()
+        self.stop_sent_ns = time.monotonic_ns()
+
+    def emergency_stop(self) -> None:
+        """Stop, and refuse to move until ``release``."""
+        self._locked_out = True
+        self.stop()
+
+    def release(self) -> None:
+        """Allow moves again."""
+        self._locked_out = False
+
+    def locate(self) -> Location:
+        """Setpoint and readback."""
+        return Location(self._setpoint.copy(), self.position, time.monotonic_ns(), time.time_ns())
+
+    def _fail(self, status: MoveStatus, error: BaseException) -> None:
+        """Stop first, tell afterwards; a stop that fails too is part of the news."""
+        try:
+            self.stop()
+        except TurntableError as second:
+            error.add_note(f"the stop after it failed too: {second}")
+        status.finish(error)
+
+    def _watch(self, status: MoveStatus, targets: FloatArray | None) -> None:
+        try:
+            self._until_settled(targets)
+        except BaseException as error:  # told to whoever waits
+            self._fail(status, error)
+        else:
+            status.finish()
+
+    def _until_settled(self, targets: FloatArray | None) -> None:
+        settle, begin = self._settle, time.monotonic()
+        seen: deque[tuple[float, FloatArray]] = deque()
+        while True:
+            states, now = self.states(), time.monotonic()
+            if self._stopped.is_set():
+                raise StoppedError(f"{self._name}: the move was stopped at {self._where(states)}")
+            self._require_no_fault(states)
+            angles = np.array([state.angle for state in states])
+            seen.append((now, angles))
+            # one sample older than the window stays, so that the window is always spanned
+            while len(seen) > 1 and now - seen[1][0] >= max(settle.window_s, settle.stall_s):
+                seen.popleft()
+            moving = any(state.moving for state in states)
+            arrived = targets is None or bool(np.all(np.abs(angles - targets) <= settle.tolerance))
+            if not moving and arrived and self._still(seen, now, settle.window_s):
+                if targets is None:
+                    self._setpoint = self._at_turn_zero(angles)
+                return
+            self._require_progress(seen, now, states, targets, moving)
+            if now - begin > settle.timeout_s:
+                where = self._where(states)
+                raise NotSettledError(
+                    f"{self._name}: not at rest after {settle.timeout_s:g} s, at {where}; look for vibration, or give "
+                    "settle a larger tolerance_deg, still_deg or timeout_s"
+                )
+            time.sleep(settle.poll_s)
+
+    def _at_turn_zero(self, angles: FloatArray) -> FloatArray:
+        """A reference is found at turn zero, whichever way the search went."""
+        modulo = self._controller.modulo
+        with self._io:
+            self._last = angles if modulo is None else angles - modulo * np.round(angles / modulo)
+            return self._last
+
+    def _still(self, seen: deque[tuple[float, FloatArray]], now: float, span_s: float) -> bool:
+        return bool(np.all(self._spread(seen, now, span_s) <= self._settle.still))
+
+    def _spread(self, seen: deque[tuple[float, FloatArray]], now: float, span_s: float) -> FloatArray:
+        """Spread (n,) of the readback over the last ``span_s``; infinite until they have passed."""
+        if now - seen[0][0] < span_s:
+            return np.full(len(self._axes), np.inf)
+        inside = np.array([angles for at, angles in seen if now - at <= span_s] or [seen[-1][1]])
+        return np.asarray(np.ptp(inside, axis=0))
+
+    def _require_no_fault(self, states: Sequence[AxisState]) -> None:
+        for axis, state in zip(self._axes, states, strict=True):
+            if state.fault:
+                raise ControllerError(
+                    f"{self._name}: the controller reports {state.fault!r} of axis {axis.name!r} at "
+                    f"{np.degrees(state.angle):.4f} deg; clear it there, then go on"
+                )
+
+    def _require_progress(
+        self,
+        seen: deque[tuple[float, FloatArray]],
+        now: float,
+        states: Sequence[AxisState],
+        targets: FloatArray | None,
+        moving: bool,
+    ) -> None:
+        """Raise StalledError where an axis stands still although it should move, or has ended elsewhere."""
+        settle = self._settle
+        spread = self._spread(seen, now, settle.stall_s)
+        if targets is None:
+            return  # a reference search may wait at its switch; its end is the time-out
+        for i, axis in enumerate(self._axes):
+            away = abs(states[i].angle - targets[i])
+            if away > settle.tolerance and spread[i] <= settle.still:
+                what = "stands still while it should move" if moving else "has ended"
+                raise StalledError(
+                    f"{self._name}: axis {axis.name!r} {what} at {np.degrees(states[i].angle):.4f} deg, "
+                    f"{np.degrees(away):.4f} deg from its setpoint {np.degrees(targets[i]):.4f} deg, for "
+                    f"{settle.stall_s:g} s; the table was stopped; look for what blocks it"
+                )
+
+    def _where(self, states: Sequence[AxisState]) -> str:
+        return degrees_text(self._axes, [state.angle for state in states])

@@ -1,0 +1,1 @@
+"""The capture plan: which cameras and which table take which images."""

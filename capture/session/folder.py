@@ -1,0 +1,154 @@
+"""The project folder that a session fills, and the lock that keeps it for one session.
+
+images/<camera_id>/<epoch_id>.png; observations/table_angles.csv with the readbacks, from the journal; survey.toml,
+copied from the plan's template where there is none yet; capture/journal.jsonl, status.json, lock.
+"""
+
+import csv
+import hashlib
+import io
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray
+from capture.devices.camera import GrayImage
+from capture.session.journal import Record
+from survey.folder.locking import SESSION_LOCK, FileLock, holder_of
+from survey.folder.text import atomic_write, decode, read_bytes, sync_folder
+from survey.project.project import DEFINITION_FILE, IMAGES_FOLDER, OBSERVATIONS_FOLDER
+from survey.project.tables.writing import write_table
+
+CAPTURE_FOLDER = "capture"
+_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # lossless at any level; this one is fast
+
+
+def journal_path(folder: Path) -> Path:
+    """Where the journal of a project is."""
+    return folder / CAPTURE_FOLDER / "journal.jsonl"
+
+
+def session_lock(folder: Path) -> FileLock:
+    """What keeps a folder for one session; see :func:`survey.folder.locking.FileLock`."""
+    path = folder / SESSION_LOCK
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return FileLock(path, folder, "session")
+
+
+def lock_holder(folder: Path) -> str | None:
+    """Who works on a folder now; None where nobody does, whatever a dead process has left behind."""
+    return holder_of(folder / SESSION_LOCK)
+
+
+def write_image(folder: Path, camera_id: str, epoch_id: str, image: GrayImage) -> dict[str, Any]:
+    """Write an image losslessly; on return it is on disk. What the journal says of it. Raises OSError."""
+    is_encoded, png = cv2.imencode(".png", image, list(_PNG))
+    if not is_encoded:
+        raise ValueError(f"image of {camera_id} at {epoch_id}: {image.dtype} {image.shape} is no grey image")
+    data = png.tobytes()
+    path = folder / IMAGES_FOLDER / camera_id / f"{epoch_id}.png"
+    write_through(path, data)
+    return {
+        "path": path.relative_to(folder).as_posix(),
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "bytes": len(data),
+        "width": image.shape[1],
+        "height": image.shape[0],
+    }
+
+
+def write_through(path: Path, data: bytes) -> None:
+    """Temporary name, fsync, rename, fsync of the folder: after it even a cut of the power leaves all or nothing."""
+    if not path.parent.is_dir():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        sync_folder(path.parent.parent)
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        with temporary.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+        sync_folder(path.parent)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def damaged(folder: Path, record: Record) -> str | None:
+    """What is wrong with the images of a recorded set; None where every hash is right."""
+    for camera_id, image in record["images"].items():
+        path = folder / image["path"]
+        if not path.is_file():
+            return f"{camera_id}: {path} is missing"
+        if hashlib.sha256(path.read_bytes()).hexdigest() != image["sha256"]:
+            return f"{camera_id}: {path} has changed since it was recorded"
+    return None
+
+
+def remove_unrecorded(folder: Path, camera_ids: list[str], epoch_ids: set[str]) -> list[str]:
+    """Delete what a crash left: half-written files, and images of planned epochs that no journal line vouches for."""
+    removed = []
+    for camera_id in camera_ids:
+        images = folder / IMAGES_FOLDER / camera_id
+        if not images.is_dir():
+            continue
+        for path in images.iterdir():
+            is_half = path.name.startswith(".") and path.name.endswith(".png.tmp")
+            if is_half or (path.suffix == ".png" and path.stem in epoch_ids):
+                path.unlink()
+                removed.append(path.relative_to(folder).as_posix())
+    return sorted(removed)
+
+
+def prepare(folder: Path, template: Path | None) -> None:
+    """The folder, with the survey.toml of the plan where it has none yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    target = folder / DEFINITION_FILE
+    if template is not None and not target.exists():
+        atomic_write(target, template.read_bytes())
+
+
+def write_table_angles(folder: Path, table_id: str, sets: Mapping[str, Record], sigma: FloatArray | None) -> Path:
+    """``observations/table_angles.csv`` from the journal: the mean of the readbacks before and after each set.
+
+    sigma: (n,) rad of one reading, None where survey.toml gives it. Rows of epochs that the journal does not know are
+    kept: they were there before.
+    """
+    columns = ["epoch_id", "table_id", "axis1_deg", "axis2_deg"]
+    names = [] if sigma is None else [f"sigma_axis{i + 1}_arcsec" for i in range(len(sigma))]
+    rows = [row for row in _foreign_rows(folder) if row["epoch_id"] not in sets]
+    known = [*columns, *names]
+    known += [name for row in rows for name in row if name not in known]
+    for epoch_id, record in sets.items():
+        both = np.array([record["before"]["readback_deg"], record["after"]["readback_deg"]])
+        row = {"epoch_id": epoch_id, "table_id": table_id}
+        row |= {f"axis{i + 1}_deg": repr(round(float(angle), 9)) for i, angle in enumerate(both.mean(axis=0))}
+        if sigma is not None:
+            arcsec = np.degrees(sigma) * 3600
+            row |= {name: repr(round(float(value), 9)) for name, value in zip(names, arcsec, strict=True)}
+        rows.append(row)
+    if not any(row.get("axis2_deg") for row in rows):
+        known.remove("axis2_deg")
+    known = list(dict.fromkeys(known))
+    table = {name: [row.get(name) or "" for row in rows] for name in known}
+    return write_table(folder / OBSERVATIONS_FOLDER, "table_angles", table)
+
+
+def _foreign_rows(folder: Path) -> list[dict[str, str]]:
+    path = folder / OBSERVATIONS_FOLDER / "table_angles.csv"
+    if not path.is_file():
+        return []
+    try:
+        rows = list(csv.DictReader(io.StringIO(decode(path, read_bytes(path)[0]), newline=""), strict=True))
+    except csv.Error as error:
+        raise SurveyError(f"{path}: this is no table ({error}); correct it, or remove it") from error
+    for line, row in enumerate(rows, 2):
+        if None in row or None in row.values() or not row.get("epoch_id"):
+            raise SurveyError(f"{path}:{line}: not as long as its header, or without an epoch_id; correct the table")
+    return rows

@@ -1,0 +1,347 @@
+"""A capture session: turn the table, take the images of every camera as one set, put them on disk, write it down.
+
+Nothing is lost and nothing is twice: an epoch counts when its journal line is on disk, which comes after its images;
+whatever else a crash leaves behind is removed at the next start, and the epoch is taken again.
+"""
+
+import errno
+import platform
+import socket
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from adjust.model.errors import SurveyError
+from capture.devices.camera import CameraError, DisconnectedError, Frame
+from capture.devices.turntable import (
+    LimitError,
+    Location,
+    StoppedError,
+    TableDisconnectedError,
+    Turntable,
+    TurntableError,
+    degrees_text,
+    location_dict,
+)
+from capture.plan.plan import CapturePlan, Shot, check_plan_limits
+from capture.session.control import AbortedError, Control
+from capture.session.folder import journal_path, prepare, remove_unrecorded, write_image, write_table_angles
+from capture.session.journal import Journal, Record, clocks
+from capture.session.resume import verified_sets
+
+JOURNAL_FORMAT = 1
+
+
+class CameraSet(Protocol):
+    """The cameras of a session, taken together."""
+
+    def take(self, timeout_s: float) -> Mapping[str, Frame]:
+        """One image of every camera, by camera_id, exposed after this call. Raises CameraError, SetError."""
+        ...
+
+    def values(self, camera_id: str, names: Sequence[str]) -> Mapping[str, Any]:
+        """Features as they are now; those that a camera does not know are left out."""
+        ...
+
+    def recover(self, reopen: bool) -> None:
+        """Throw away what is under way and be ready again, with new connections where ``reopen``."""
+        ...
+
+    def describe(self) -> Mapping[str, Mapping[str, Any]]:
+        """Address and serial number of every camera."""
+        ...
+
+
+class SessionStoppedError(SurveyError):
+    """The session gave up, or was told to; table stopped, everything recorded so far is on disk."""
+
+    def __init__(self, message: str, interrupted: bool = False) -> None:
+        super().__init__(message)
+        self.interrupted = interrupted
+
+
+class DriftError(SurveyError):
+    """The table moved while the images were taken."""
+
+
+@dataclass(frozen=True)
+class Taken:
+    """An epoch that was just taken, for whoever shows the progress; frames by camera_id."""
+
+    record: Record
+    frames: Mapping[str, Frame]
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a session did: epochs planned, taken before and now, retries by kind of fault."""
+
+    folder: Path
+    planned: int
+    before: int
+    taken: int
+    retries: Mapping[str, int] = field(default_factory=dict)
+    seconds: float = 0.0
+
+    def summary(self) -> dict[str, Any]:
+        """As plain values."""
+        return {
+            "folder": str(self.folder),
+            "epochs_planned": self.planned,
+            "epochs_before": self.before,
+            "epochs_taken": self.taken,
+            "retries": dict(self.retries),
+            "seconds": round(self.seconds, 3),
+        }
+
+
+class Session:
+    """One run of a plan. ``listener`` is told of every epoch, ``note`` of everything else worth a line."""
+
+    def __init__(
+        self,
+        plan: CapturePlan,
+        table: Turntable | None,
+        cameras: CameraSet,
+        control: Control | None = None,
+        listener: Callable[[Taken], None] = lambda taken: None,
+        note: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self._plan, self._table, self._cameras = plan, table, cameras
+        self.control = control or Control()
+        self.control.on_stop = self._stop_table
+        self._listener, self._note = listener, note
+        self._retries: dict[str, int] = {}
+        self._journal: Journal | None = None
+        self._at: Shot | None = None
+
+    def run(self) -> Outcome:
+        """Take all epochs that are missing. Raises SessionStoppedError; the table is stopped before."""
+        begin = time.monotonic()
+        plan, folder = self._plan, self._plan.project
+        check_plan_limits(plan)
+        journal = Journal(journal_path(folder))
+        self._journal = journal
+        try:
+            missing, n_before = self._resume(journal)
+            self._home(missing)
+            for shot in missing:
+                self._pause(shot)
+                self._take_with_retries(shot)
+            self._finish(journal)
+        except BaseException as error:
+            safe = self._made_safe(error)
+            if safe is error:
+                raise
+            raise safe from error
+        finally:
+            with suppress(OSError):  # a full disk: the next start writes it from the journal
+                self._write_angles(journal)
+            journal.close()
+        return Outcome(
+            folder, len(plan.shots), n_before, len(missing), dict(self._retries), time.monotonic() - begin
+        )
+
+    def _resume(self, journal: Journal) -> tuple[list[Shot], int]:
+        plan = self._plan
+        prepare(plan.project, plan.survey)
+        valid = verified_sets(plan, journal, self._note)
+        wanted = {shot.epoch_id for shot in plan.shots}
+        removed = remove_unrecorded(plan.project, [c.camera_id for c in plan.cameras], wanted - set(valid))
+        for path in removed:
+            self._note(f"removed {path}: it was never acknowledged")
+        journal.append("session", **self._session_record(), removed=removed, torn=journal.torn)
+        self._write_angles(journal)
+        missing = [shot for shot in plan.shots if shot.epoch_id not in valid]
+        if valid and missing:
+            self._note(f"{len(valid)} epochs are there and whole, {len(missing)} to go")
+        return missing, len(wanted & set(valid))
+
+    def _home(self, missing: Sequence[Shot]) -> None:
+        """Look for the references, where the plan wants it and anything is to be taken."""
+        if missing and self._table is not None and self._plan.table is not None and self._plan.table.home:
+            self._note(f"{self._table.name}: looking for its references")
+            self._table.home().wait()
+
+    def _session_record(self) -> dict[str, Any]:
+        plan = self._plan
+        table = None
+        if plan.table is not None and self._table is not None:
+            axes = [axis.axis.name for axis in plan.table.axes]
+            table = {"table_id": plan.table.table_id, "driver": plan.table.driver, "axes": axes}
+        return {
+            "format": JOURNAL_FORMAT,
+            "plan": plan.file.name,
+            "plan_sha256": plan.digest,
+            "host": socket.gethostname(),
+            "python": platform.python_version(),
+            "table": table,
+            "cameras": {name: dict(values) for name, values in self._cameras.describe().items()},
+            **clocks(),
+        }
+
+    def _pause(self, shot: Shot) -> None:
+        if self.control.paused:
+            self._event("paused", f"before {shot.epoch_id}")
+            self._note(f"paused before {shot.epoch_id}")
+            self.control.wait_while_paused()
+            self._event("resumed", shot.epoch_id)
+        self.control.checkpoint()
+
+    def _take_with_retries(self, shot: Shot) -> None:
+        options = self._plan.options
+        for attempt in range(options.retries + 1):
+            self.control.checkpoint()
+            try:
+                return self._take(shot, attempt)
+            except (AbortedError, LimitError, StoppedError):
+                raise
+            except (CameraError, TurntableError, DriftError) as error:
+                self._stop_after_fault()
+                self._at = None  # whatever happened, the pose is approached anew
+                if attempt == options.retries:
+                    raise
+                kind = type(error).__name__.removesuffix("Error")
+                self._retries[kind] = self._retries.get(kind, 0) + 1
+                self._event("retry", f"{shot.epoch_id}: {error}")
+                self._note(f"{shot.epoch_id}: {error}\n  trying again ({attempt + 1} of {options.retries})")
+                self.control.sleep(options.retry_pause_s)
+                self._recover(error)
+        return None
+
+    def _stop_after_fault(self) -> None:
+        if self._table is not None:
+            with suppress(TurntableError):  # a cut connection: the next try connects anew, or says so
+                self._table.stop()
+
+    def _recover(self, error: SurveyError) -> None:
+        """Bring back what was lost; where that fails the next try says so."""
+        with suppress(CameraError, TurntableError):
+            if isinstance(error, TableDisconnectedError) and self._table is not None:
+                self._table.reopen()
+            self._cameras.recover(reopen=isinstance(error, DisconnectedError))
+
+    def _take(self, shot: Shot, attempt: int) -> None:
+        plan = self._plan
+        self._move(shot)
+        before = self._locate()
+        frames = self._cameras.take(plan.options.fetch_timeout_s)
+        after = self._locate()
+        self._require_rest(before, after)
+        self._require_sizes(frames)
+        self.control.checkpoint()
+        images = {camera_id: self._write(camera_id, shot, frame) for camera_id, frame in frames.items()}
+        journal = self._require_journal()
+        record = journal.append(
+            "set",
+            epoch_id=shot.epoch_id,
+            pose_id=shot.pose_id,
+            repeat=shot.repeat,
+            attempt=attempt,
+            planned_deg=np.degrees(shot.angles).tolist(),
+            before=location_dict(before),
+            after=location_dict(after),
+            images=images,
+            **clocks(),
+        )
+        done = len(set(journal.taken()) & {s.epoch_id for s in plan.shots})
+        self._listener(Taken(record, frames, done, len(plan.shots)))
+
+    def _move(self, shot: Shot) -> None:
+        if self._table is None or self._plan.table is None:
+            return
+        if self._at is None or self._at.pose_id != shot.pose_id:
+            self._table.set(shot.angles).wait()
+            self.control.sleep(self._plan.options.wait_s)
+        self._at = shot
+
+    def _locate(self) -> Location:
+        if self._table is None:
+            return Location(np.zeros(0), np.zeros(0), time.monotonic_ns(), time.time_ns())
+        return self._table.locate()
+
+    def _require_rest(self, before: Location, after: Location) -> None:
+        moved = np.abs(after.readback - before.readback)
+        if self._table is not None and (moved > self._plan.options.drift).any():
+            raise DriftError(
+                f"{self._table.name}: it moved while the images were taken, from "
+                f"{degrees_text(self._table.axes, before.readback)} to "
+                f"{degrees_text(self._table.axes, after.readback)}; brake it, or give drift_deg a larger value"
+            )
+
+    def _require_sizes(self, frames: Mapping[str, Frame]) -> None:
+        """An image that the survey cannot use is no image: better to hear of it at the first than after the last."""
+        for camera_id, frame in frames.items():
+            height, width = frame.image.shape
+            wanted = self._plan.image_sizes.get(camera_id, (width, height))
+            if (width, height) != wanted:
+                raise SurveyError(
+                    f"camera {camera_id!r} sends {width} x {height} px, but {self._plan.survey} says {wanted[0]} x "
+                    f"{wanted[1]}; set Width and Height (and OffsetX, OffsetY) in the plan, or correct image_size_px"
+                )
+
+    def _write(self, camera_id: str, shot: Shot, frame: Frame) -> dict[str, Any]:
+        values = self._cameras.values(camera_id, ("ExposureTime", "Gain", "PixelFormat"))
+        return {
+            **write_image(self._plan.project, camera_id, shot.epoch_id, frame.image),
+            "bits": frame.bits,
+            "serial": frame.serial,
+            "block_id": frame.block_id,
+            "device_time_ns": frame.device_time_ns,
+            "host_time_ns": frame.host_time_ns,
+            "host_monotonic_ns": frame.host_monotonic_ns,
+            "features": dict(values),
+        }
+
+    def _require_journal(self) -> Journal:
+        if self._journal is None:
+            raise ValueError("the session is not running")
+        return self._journal
+
+    def _event(self, what: str, message: str) -> None:
+        self._require_journal().append("event", what=what, message=message, **clocks())
+
+    def _finish(self, journal: Journal) -> None:
+        wanted = {shot.epoch_id for shot in self._plan.shots}
+        lost = wanted - set(journal.taken())
+        if lost:
+            raise ValueError(f"epochs without a record: {sorted(lost)}")
+        self._event("finished", f"{len(wanted)} epochs")
+
+    def _write_angles(self, journal: Journal) -> None:
+        table, sets = self._plan.table, journal.taken()
+        if table is not None and sets:
+            write_table_angles(self._plan.project, table.table_id, sets, table.sigma)
+
+    def _stop_table(self) -> None:
+        """At once, in the thread that asks for it; whatever moves ends with StoppedError."""
+        if self._table is not None:
+            with suppress(TurntableError):
+                self._table.emergency_stop()
+
+    def _made_safe(self, error: BaseException) -> BaseException:
+        """Stop the table, write down why, and say what to do next."""
+        safe = ""
+        if self._table is not None:
+            try:
+                self._table.stop()
+                safe = "the table is stopped, "
+            except TurntableError as second:
+                safe = f"THE TABLE COULD NOT BE STOPPED ({second}), "
+        with suppress(OSError):
+            self._event("stopped", str(error))
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            reason = f"{error.filename or self._plan.project}: the disk is full; make room"
+        elif isinstance(error, SurveyError):
+            reason = f"stopped: {self.control.reason}" if self.control.stopping else str(error)
+        else:
+            return error
+        again = f"the same command goes on with the rest: labcapture run {self._plan.file}"
+        return SessionStoppedError(f"{reason}\n  {safe}all recorded images are on disk; {again}", self.control.stopping)

@@ -1,0 +1,76 @@
+"""Two folders that trade places in one step: whoever opens the name finds the old one complete or the new one."""
+
+import ctypes
+import errno
+import os
+import shutil
+from pathlib import Path
+
+from survey.folder.locking import holder_of
+
+MARK = ".placed"
+_HERE, _EXCHANGE = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of <linux/fs.h>
+
+
+class CannotTradeError(Exception):
+    """The file system cannot do it; nothing was changed."""
+
+
+def trade(new: Path, there: Path) -> None:
+    """Let two folders trade places. ``new`` holds MARK, by which its later place is known. Raises CannotTradeError."""
+    code = _renameat2(new, there)
+    if code:
+        raise CannotTradeError(os.strerror(code))
+
+
+def _renameat2(new: Path, there: Path) -> int:
+    try:
+        call = ctypes.CDLL(None, use_errno=True).renameat2
+    except (AttributeError, OSError, TypeError):
+        return errno.ENOSYS
+    failed = call(_HERE, os.fsencode(new), _HERE, os.fsencode(there), _EXCHANGE)
+    return ctypes.get_errno() if failed else 0
+
+
+def complete_from(old: Path, new: Path) -> None:
+    """Give ``new`` what ``old`` holds besides, by second names, and MARK. Raises CannotTradeError."""
+    (old / MARK).unlink(missing_ok=True)
+    try:
+        _take(old, new)
+    except OSError as error:  # second names are not everywhere, and not of everybody's files
+        raise CannotTradeError(str(error)) from error
+    (new / MARK).touch()
+
+
+def _take(old: Path, new: Path) -> None:
+    with os.scandir(old) as entries:
+        found = [e for e in entries if not os.path.lexists(new / e.name) and not _is_leftover(e)]
+    for entry in found:
+        if entry.is_dir(follow_symlinks=False):
+            (new / entry.name).mkdir()
+            _take(Path(entry.path), new / entry.name)
+        else:
+            os.link(entry.path, new / entry.name, follow_symlinks=False)
+    _take_rights(old, new)
+
+
+def _take_rights(old: Path, new: Path) -> None:
+    status = old.stat()
+    if (status.st_uid, status.st_gid) != (new.stat().st_uid, new.stat().st_gid):
+        os.chown(new, status.st_uid, status.st_gid)
+    shutil.copymode(old, new)
+
+
+def _is_leftover(entry: "os.DirEntry[str]") -> bool:
+    """A temporary file that nobody writes any more."""
+    is_temporary = entry.name.startswith(".") and entry.name.endswith(".tmp") and entry.is_file(follow_symlinks=False)
+    return is_temporary and holder_of(Path(entry.path)) is None
+
+
+def carry_over(old: Path, new: Path) -> None:
+    """What somebody put into ``old`` at the last moment; then ``new`` is an ordinary folder."""
+    with os.scandir(old) as entries:
+        late = [e.name for e in entries if not os.path.lexists(new / e.name) and not _is_leftover(e)]
+    for name in late:
+        os.rename(old / name, new / name)
+    (new / MARK).unlink(missing_ok=True)

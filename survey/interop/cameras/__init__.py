@@ -1,0 +1,1 @@
+"""Files of programs that calibrate and locate cameras."""

@@ -1,0 +1,191 @@
+"""OpenCV's files of calibrations (YAML or JSON): lenses, and the stereo pair's or the whole rig's poses.
+
+One camera: the keys of OpenCV's calibration sample. Two: those of its stereo sample, M1 D1 M2 D2 R T, where
+x_2 = R x_1 + T. More: a list ``cameras`` with R and T from the first one. Pixels and lenses are OpenCV's own here; the
+unit of T is metres.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.model.survey import FloatArray
+from survey.interop.cameras.lens_maps import BROWN_8, FISHEYE_4, MappedLens
+from survey.interop.cameras.rig import Rig, RigCamera, opencv_lens, pose_of, rig_network
+from survey.interop.cameras.values import CameraValues, RigValues, rig_values
+from survey.interop.networks.foreign import ForeignNetwork
+from survey.interop.safe_yaml import Entry, quoted, read_yaml, yaml_number
+
+CHOICES = {"brown": ("skew", *BROWN_8), "fisheye": FISHEYE_4}
+_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_MATRIX = ("camera_matrix", "cameraMatrix", "K", "M", "intrinsic_matrix")
+_DISTORTION = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "distortion")
+
+
+def read_opencv(path: Path) -> ForeignNetwork:
+    """One camera, a stereo pair or a rig. Raises SurveyError with file and line for what cannot be read."""
+    root = read_yaml(path)
+    if "cameras" in root:
+        return rig_network(_listed(root.get("cameras")), path)
+    if "M1" in root or "cameraMatrix1" in root:
+        return rig_network(_stereo(root), path)
+    return rig_network(Rig("rig", (_camera(root, _label(root, "camera")),)), path)
+
+
+def _first(root: Entry, names: tuple[str, ...]) -> Entry:
+    return root.get(next((n for n in names if n in root), names[0]))
+
+
+def _camera(root: Entry, name: str, pose: Pose3 | None = None) -> RigCamera:
+    distortion = _first(root, _DISTORTION)
+    fisheye = any(k in root and root.get(k).text.lower() in ("1", "true", "fisheye") for k in ("fisheye_model",))
+    lens = opencv_lens(_first(root, _MATRIX).matrix(3, 3), distortion.matrix(-1), fisheye, distortion.where)
+    return RigCamera(name, _size(root, ""), lens, pose)
+
+
+def _label(root: Entry, default: str, key: str = "name") -> str:
+    return root.get(key).text if key in root else default
+
+
+def _size(root: Entry, suffix: str) -> tuple[int, int]:
+    for wide, high in ((f"image_width{suffix}", f"image_height{suffix}"), (f"width{suffix}", f"height{suffix}")):
+        if wide in root:
+            return root.get(wide).count(), root.get(high).count()
+    for key in (f"image_size{suffix}", "image_size", "imageSize"):
+        if key in root:
+            width, height = (item.count() for item in root.get(key).items[:2])
+            return width, height
+    if suffix and "image_width" in root:
+        return _size(root, "")
+    raise root.error(f"image_width{suffix} and image_height{suffix} are missing; add them")
+
+
+def _stereo(root: Entry) -> Rig:
+    cameras = []
+    fisheye = "fisheye_model" in root and root.get("fisheye_model").text.lower() in ("1", "true")
+    for i in ("1", "2"):
+        matrix = _first(root, (f"M{i}", f"cameraMatrix{i}"))
+        distortion = _first(root, (f"D{i}", f"distCoeffs{i}"))
+        lens = opencv_lens(matrix.matrix(3, 3), distortion.matrix(-1), fisheye, distortion.where)
+        pose = Pose3() if i == "1" else _pose(root) if "R" in root else None
+        cameras.append(RigCamera(_label(root, f"camera{i}", f"name{i}"), _size(root, i), lens, pose))
+    notes = () if "R" in root else ("the file has no R and T: the second camera's pose is found by an adjustment",)
+    return Rig(_label(root, "rig", "rig"), tuple(cameras), notes)
+
+
+def _pose(root: Entry) -> Pose3:
+    """First camera from this one."""
+    R, T = root.get("R"), root.get("T")
+    return pose_of(np.column_stack([R.matrix(3, 3), T.matrix(3)]), R.where).inverse()
+
+
+def _listed(entry: Entry) -> Rig:
+    cameras = []
+    for i, item in enumerate(entry.items):
+        pose = _pose(item) if "R" in item else Pose3() if i == 0 else None
+        cameras.append(_camera(item, _label(item, f"camera{i + 1}"), pose))
+    return Rig("rig", tuple(cameras))
+
+
+def opencv_files(
+    values: CameraValues, station: str | None, json: bool = False
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """The file of one station's cameras, and what was approximated."""
+    found = rig_values(values, station, "opencv", CHOICES)
+    return {"": opencv_text(found, json)}, found.notes
+
+
+def opencv_text(found: RigValues, json: bool = False) -> str:
+    """What cv2.FileStorage reads, as YAML or JSON."""
+    cameras, lenses = found.rig.cameras, found.lenses
+    base = cameras[0].rig_from_camera or Pose3()
+    poses = [(c.rig_from_camera or Pose3()).inverse() * base for c in cameras]
+    writer = _Json() if json else OpencvYaml()
+    if len(cameras) == 1:
+        return writer.document(_camera_values(cameras[0], lenses[0]))
+    if len(cameras) == 2 and lenses[0].model == lenses[1].model:
+        out: dict[str, Value] = {"fisheye_model": int(lenses[0].model == "fisheye")}
+        for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), 1):
+            own = _camera_values(camera, lens)
+            out |= {f"name{i}": camera.camera_id, f"image_width{i}": camera.image_size[0],
+                    f"image_height{i}": camera.image_size[1], f"M{i}": own["camera_matrix"],
+                    f"D{i}": own["distortion_coefficients"]}  # fmt: skip
+        return writer.document(out | _motion(poses[1]))
+    return writer.document({"cameras": [_camera_values(c, lens) | _motion(pose)
+                                        for c, lens, pose in zip(cameras, lenses, poses, strict=True)]})  # fmt: skip
+
+
+Value = str | int | FloatArray | list[dict[str, "Value"]]
+
+
+def _camera_values(camera: RigCamera, lens: MappedLens) -> dict[str, Value]:
+    names = ("k1", "k2", "k3", "k4") if lens.model == "fisheye" else _NAMES
+    k = lens.array(*names)
+    if lens.model == "brown" and not k[5:].any():
+        k = k[:5]
+    return {
+        "name": camera.camera_id, "image_width": camera.image_size[0], "image_height": camera.image_size[1],
+        "fisheye_model": int(lens.model == "fisheye"), "camera_matrix": camera_matrix(lens),
+        "distortion_coefficients": k.reshape(1, -1),
+    }  # fmt: skip
+
+
+def camera_matrix(lens: MappedLens) -> FloatArray:
+    """[fx skew u0; 0 fy v0; 0 0 1]."""
+    fx, fy, u0, v0 = lens.array("fx", "fy", "u0", "v0")
+    return np.array([[fx, lens.values.get("skew", 0.0), u0], [0.0, fy, v0], [0.0, 0.0, 1.0]])
+
+
+def _motion(pose: Pose3) -> dict[str, Value]:
+    return {"R": pose.rotation().matrix(), "T": np.asarray(pose.translation()).reshape(3, 1)}
+
+
+class OpencvYaml:
+    """Values in the YAML of cv2.FileStorage."""
+
+    def document(self, values: dict[str, Value]) -> str:
+        """A whole file."""
+        return "%YAML:1.0\n---\n" + "".join(self.lines(values, ""))
+
+    def lines(self, values: dict[str, Value], indent: str) -> list[str]:
+        """The lines of a mapping."""
+        out = []
+        for key, value in values.items():
+            if isinstance(value, list):
+                out.append(f"{indent}{key}:\n")
+                for item in value:
+                    out.append(f"{indent}   -\n")
+                    out += self.lines(item, f"{indent}      ")
+            elif isinstance(value, np.ndarray):
+                rows, cols = value.shape
+                out.append(f"{indent}{key}: !!opencv-matrix\n{indent}   rows: {rows}\n{indent}   cols: {cols}\n")
+                out.append(f"{indent}   dt: d\n{indent}   data: [ {_numbers(value)} ]\n")
+            else:
+                out.append(f"{indent}{key}: {value if isinstance(value, int) else quoted(value)}\n")
+        return out
+
+
+class _Json:
+    def document(self, values: dict[str, Value]) -> str:
+        return self._map(values, "") + "\n"
+
+    def _map(self, values: dict[str, Value], indent: str) -> str:
+        inner = indent + "    "
+        rows = [f'{inner}"{key}": {self._value(value, inner)}' for key, value in values.items()]
+        return "{\n" + ",\n".join(rows) + f"\n{indent}}}"
+
+    def _value(self, value: Value, indent: str) -> str:
+        if isinstance(value, list):
+            return "[ " + ", ".join(self._map(item, indent) for item in value) + " ]"
+        if isinstance(value, np.ndarray):
+            rows, cols = value.shape
+            data = f'"rows": {rows}, "cols": {cols}, "dt": "d", "data": [ {_numbers(value)} ]'
+            return f'{{ "type_id": "opencv-matrix", {data} }}'
+        return str(value) if isinstance(value, int) else quoted(value)
+
+
+def _numbers(matrix: FloatArray) -> str:
+    """Numbers with every bit; OpenCV wants a point in each."""
+    return ", ".join(re.sub(r"^(-?\d+)(e.*)?$", r"\1.0\2", yaml_number(v)) for v in matrix.ravel())

@@ -1,0 +1,143 @@
+"""Cameras that are fixed to each other, with their lenses: what most calibration files of other programs hold."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from gtsam import Pose3, Rot3
+from scipy.spatial.transform import Rotation
+
+from adjust.lenses.models import MODELS
+from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey, VectorPrior
+from adjust.spatial.rigid import nearest_rotation
+from survey.interop.names import safe_ids
+from survey.interop.networks.foreign import ForeignNetwork, Where
+from survey.project.targets import TargetKind
+
+_ROTATION_TOLERANCE = 1e-3
+"""What a written rotation matrix may miss orthonormality by: files round to four digits and fewer."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigCamera:
+    """One camera: ``lens.values`` are given; rig_from_camera is None where the file has lenses only.
+
+    lens_cov: (n, n) of the lens's parameters. pose_cov: (6, 6) in the tangent of rig_from_camera.
+    """
+
+    camera_id: str
+    image_size: tuple[int, int]
+    lens: LensParameter
+    rig_from_camera: Pose3 | None = None
+    lens_cov: FloatArray | None = None
+    pose_cov: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Cameras on one body. notes: what was changed on the way here, for people."""
+
+    rig_id: str
+    cameras: tuple[RigCamera, ...]
+    notes: tuple[str, ...] = ()
+    kinds: dict[str, TargetKind] = field(default_factory=dict)
+
+
+def lens_of(model: str, **values: float) -> LensParameter:
+    """A lens whose named parameters are given and free; the others are zero."""
+    names = MODELS[model].names
+    free = tuple(n for n in names if n in values and n != "skew")
+    return LensParameter(model, free, np.array([float(values.get(n, 0.0)) for n in names]))
+
+
+def opencv_lens(matrix: FloatArray, distortion: FloatArray, fisheye: bool, where: Where) -> LensParameter:
+    """The lens of a camera matrix (3, 3) and distortion coefficients in OpenCV's order (4, 5, 8; fisheye 4).
+
+    Raises SurveyError for what the models here do not have: thin prism and tilted sensors (more than 8 coefficients).
+    """
+    k = np.asarray(distortion, dtype=float).ravel()
+    if fisheye:
+        if len(k) not in (0, 4):
+            raise where.error(f"a fisheye lens has 4 coefficients, found {len(k)}; correct the file")
+        names: tuple[str, ...] = ("k1", "k2", "k3", "k4")
+    else:
+        if len(k) in (12, 14) and not k[8:].any():
+            k = k[:8]
+        if len(k) not in (0, 4, 5, 8):
+            raise where.error(
+                f"found {len(k)} distortion coefficients; 0, 4, 5 or 8 are read, thin prisms and tilted sensors are "
+                "no part of any lens model here: calibrate without them"
+            )
+        names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")[: len(k)]
+    matrix = np.asarray(matrix, dtype=float).reshape(3, 3)
+    lower = abs(matrix[1, 0]) + abs(matrix[2, 0]) + abs(matrix[2, 1])
+    if lower > 1e-12 or abs(matrix[2, 2] - 1.0) > 1e-12 or matrix[0, 0] <= 0.0 or matrix[1, 1] <= 0.0:
+        raise where.error("the camera matrix must be [fx skew cx; 0 fy cy; 0 0 1] with positive fx, fy; correct it")
+    values = dict(zip(names, k.tolist(), strict=False)) | {
+        "fx": matrix[0, 0], "fy": matrix[1, 1], "skew": matrix[0, 1], "u0": matrix[0, 2], "v0": matrix[1, 2]
+    }  # fmt: skip
+    return lens_of("fisheye" if fisheye else "brown", **values)
+
+
+def pose_of(matrix: FloatArray, where: Where) -> Pose3:
+    """A pose from a matrix (4, 4) or (3, 4); raises SurveyError where its rotation is none."""
+    matrix = np.asarray(matrix, dtype=float)
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise where.error(f"a matrix of {' x '.join(map(str, matrix.shape))} is no pose; expected 4 x 4 or 3 x 4")
+    R = nearest_rotation(matrix[:3, :3])
+    off = float(np.abs(R - matrix[:3, :3]).max())
+    if not off < _ROTATION_TOLERANCE or (len(matrix) == 4 and not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9)):
+        raise where.error(f"the matrix is no rigid motion (its rotation is {off:.2g} off); correct it")
+    return Pose3(Rot3(R), matrix[:3, 3])
+
+
+def pose_of_quaternion(xyzw: FloatArray, translation: FloatArray, where: Where) -> Pose3:
+    """A pose from a quaternion with the real part last; raises SurveyError where its length is far from 1."""
+    length = float(np.linalg.norm(xyzw))
+    if not abs(length - 1.0) < _ROTATION_TOLERANCE:
+        raise where.error(f"the quaternion has the length {length:.4g} instead of 1; correct it")
+    return Pose3(Rot3(Rotation.from_quat(xyzw).as_matrix()), translation)
+
+
+def quaternion_xyzw(pose: Pose3) -> FloatArray:
+    """The rotation as a unit quaternion, real part last and not negative."""
+    q = np.asarray(Rotation.from_matrix(pose.rotation().matrix()).as_quat())
+    return -q if q[3] < 0.0 else q
+
+
+def rig_network(rig: Rig, path: Path) -> ForeignNetwork:
+    """The rig as a survey without observations, ready for images of its own: lenses and poses are start values.
+
+    The first camera holds its pose and so the frame of the rig; covariances become priors.
+    """
+    names = [c.camera_id for c in rig.cameras]
+    if not names or len(set(names)) < len(names):
+        raise Where(path, 1).error("the file must name at least one camera, and every one differently; correct it")
+    safe = safe_ids(names)
+    cameras = [_camera(c, rig.rig_id, i == 0, safe) for i, c in enumerate(rig.cameras)]
+    survey = Survey(cameras=tuple(cameras), stations=(Station(rig.rig_id, motion="epoch"),))
+    renamed = tuple(f"camera {old!r} is called {new!r} here" for old, new in safe.items())
+    return ForeignNetwork(survey, path.stem, notes=(*rig.notes, *renamed))
+
+
+def _camera(c: RigCamera, rig_id: str, first: bool, safe: dict[str, str]) -> Camera:
+    lens = c.lens
+    if c.lens_cov is not None:
+        model = MODELS[lens.model]
+        known = [i for i, n in enumerate(model.names) if n in lens.free and c.lens_cov[i, i] > 0.0]
+        if known and lens.values is not None:
+            prior = VectorPrior(tuple(model.names[i] for i in known), lens.values[known],
+                                c.lens_cov[np.ix_(known, known)])  # fmt: skip
+            lens = replace(lens, free=prior.names, prior=prior)
+    pose = PoseParameter(c.rig_from_camera, "free")
+    if first:
+        pose = PoseParameter(c.rig_from_camera or Pose3(), "held")
+    elif c.pose_cov is not None and c.rig_from_camera is not None and (np.diagonal(c.pose_cov) > 0.0).all():
+        pose = PoseParameter(c.rig_from_camera, "prior", c.pose_cov)
+    return Camera(safe.get(c.camera_id, c.camera_id), rig_id, c.image_size, lens, pose)
+
+
+def relative_to(cameras: Sequence[RigCamera], base: Pose3) -> list[Pose3]:
+    """``base_from_camera`` of every camera, where ``base`` is rig_from_base."""
+    return [base.inverse() * (c.rig_from_camera or Pose3()) for c in cameras]

@@ -1,0 +1,1 @@
+"""Files of programs that adjust networks of readings and of poses."""

@@ -1,0 +1,90 @@
+"""A network as one JSON document: points, readings, baselines, coordinates, and the adjusted points with covariance."""
+
+import json
+from typing import Any
+
+import numpy as np
+
+from adjust.model.observations import PositionRef
+from adjust.model.survey import FloatArray
+from survey.interop.networks.values import NetworkValues, between_points, point_of
+
+FORMAT = "labsurvey-network-1"
+
+
+def network_json(network: NetworkValues) -> str:
+    """The document; SI and radians with units in the keys, None where nothing is known."""
+    survey = network.survey
+    document = {
+        "format": FORMAT,
+        "title": network.title,
+        "units": "metres and radians; directions are counted as under bearings",
+        "bearings": {"zero": survey.bearings.zero, "clockwise": survey.bearings.clockwise},
+        "datum": {"kind": survey.datum.kind, "points": list(survey.datum.points)},
+        "points": {p.point_id: _point(network, p) for p in survey.points},
+        "readings": [_reading(r) for r in survey.readings if between_points(r)],
+        "reading_covariances": [
+            {"ids": list(c.reading_ids), "covariance": _rows(c.cov)} for c in survey.reading_covariances
+        ],
+        "distances": [
+            {"id": d.distance_id, "from": point_of(d.a), "to": point_of(d.b), "value_m": d.value, "sigma_m": d.sigma,
+             "used": d.used}
+            for d in survey.distances if point_of(d.a) is not None and point_of(d.b) is not None
+        ],
+        "coordinate_differences": [
+            {"from": _ids(o.at), "to": _ids(o.to), "values_m": _rows(o.values), "covariance_m2": _rows(o.cov),
+             "used": o.used}
+            for o in survey.coordinate_differences
+        ],
+        "coordinates": [
+            {"points": _ids(o.positions), "values_m": _rows(o.values), "covariance_m2": _rows(o.cov), "used": o.used}
+            for o in survey.coordinates
+        ],
+        "adjusted": _adjusted(network),
+    }  # fmt: skip
+    return json.dumps(document, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _rows(matrix: FloatArray) -> list[list[float | None]]:
+    return [[_number(v) for v in row] for row in matrix.tolist()]
+
+
+def _ids(positions: tuple[PositionRef, ...]) -> list[str | None]:
+    return [point_of(p) for p in positions]
+
+
+def _point(network: NetworkValues, point: Any) -> dict[str, Any]:
+    x = network.x.get(point.point_id)
+    parameter = point.x_in_world
+    out = {"treatment": parameter.treatment, "held": list(parameter.held)}
+    if x is not None:
+        out["x_m"] = [_number(v) for v in x]
+    if parameter.prior_cov is not None:
+        out["prior_covariance_m2"] = _rows(parameter.prior_cov)
+    return out
+
+
+def _reading(r: Any) -> dict[str, Any]:
+    unit = "rad" if r.kind in ("direction", "angle", "zenith", "azimuth") else "m"
+    out = {"id": r.reading_id, "kind": r.kind, "from": r.at.point_id, "to": r.to.point_id}
+    out |= {"second": r.second.point_id} if r.second else {}
+    out |= {"setup": r.setup_id} if r.setup_id else {}
+    out |= {f"value_{unit}": r.value, f"sigma_{unit}": r.sigma, "group": r.group, "used": r.used}
+    heights = {"instrument_height_m": r.instrument_height, "target_height_m": r.target_height}
+    heights |= {"second_height_m": r.second_height}
+    return out | {k: v for k, v in heights.items() if v}
+
+
+def _adjusted(network: NetworkValues) -> dict[str, Any] | None:
+    if not network.adjusted:
+        return None
+    return {
+        "sigma_factor": network.factor,
+        "points": {
+            name: {"x_m": network.x[name].tolist(), "covariance_m2": _rows(cov)} for name, cov in network.covs.items()
+        },
+    }

@@ -1,0 +1,80 @@
+"""A terrestrial network on its way out of the program: the survey, where its points are, and how well that is known."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from adjust.model.errors import SurveyError
+from adjust.model.observations import PositionRef, Reading
+from adjust.model.survey import FloatArray, Survey
+from survey.solution.quantities import SigmaKind
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkValues:
+    """x: (3,) m by point, adjusted or start values; points without either are missing.
+
+    covs: (3, 3) m^2 by point, empty where not adjusted; multiplied by factor^2. joint: of ``names`` (point, axis).
+    sigmas, alpha: what the project asks for.
+    """
+
+    survey: Survey
+    title: str
+    x: Mapping[str, FloatArray]
+    adjusted: bool = False
+    covs: Mapping[str, FloatArray] = field(default_factory=dict)
+    factor: float = 1.0
+    names: tuple[tuple[str, str], ...] = ()
+    joint: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    n_observations: int = 0
+    n_unknowns: int = 0
+    redundancy: int = 0
+    omega: float = 0.0
+    sigmas: SigmaKind | None = None
+    alpha: float = 0.05
+
+
+def point_of(position: PositionRef) -> str | None:
+    """The world point that a position is, or None."""
+    return position.point_id if position.frame is None else None
+
+
+def between_points(reading: Reading) -> bool:
+    """Whether all ends of a reading are world points."""
+    ends = (reading.at, reading.to, *([reading.second] if reading.second else []))
+    return all(point_of(e) is not None for e in ends)
+
+
+def left_out(survey: Survey) -> tuple[str, ...]:
+    """What formats of networks cannot hold, for people."""
+    counts = {
+        "cameras": len(survey.cameras),
+        "stations": len(survey.stations),
+        "tables": len(survey.tables),
+        "targets": len(survey.targets),
+        "image points": sum(len(b.uv) for b in survey.image_blocks),
+        "table readings": len(survey.table_readings),
+        "pairs": len(survey.pairs),
+        "beams and spots": len(survey.beams) + len(survey.laser_spots),
+        "surfaces": len(survey.surfaces),
+        "levels": len(survey.levels),
+        "alignments": len(survey.alignments),
+        "free parameters of instruments": sum(len(i.parameters.free) for i in survey.instruments),
+        "readings on stations, cameras or targets": sum(not between_points(r) for r in survey.readings),
+        "observations not in use": sum(not o.used for o in (*survey.readings, *survey.coordinate_differences,
+                                                            *survey.coordinates, *survey.distances)),
+        "centring errors": sum(r.target_centring_sigma > 0.0 for r in survey.readings)
+        + sum(s.centring_sigma > 0.0 or s.height_sigma > 0.0 for s in survey.setups),
+        "tilts or curvature of the level surface": int(
+            survey.vertical.radius is not None or len(survey.vertical.tilt.free) > 0
+            or not np.array_equal(survey.vertical.up_in_world, [0.0, 0.0, 1.0])
+        ),
+    }  # fmt: skip
+    return tuple(f"left out, {what}: {n}" for what, n in counts.items() if n)
+
+
+def require_network(survey: Survey, where: str, what: str) -> None:
+    """Raise where nothing of the survey can be written as a network."""
+    if not survey.points:
+        raise SurveyError(f"{where}: the project has no points; {what} holds networks of points")

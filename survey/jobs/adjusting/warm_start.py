@@ -1,0 +1,195 @@
+"""Adjusting a project that has grown, from the values of its last solution.
+
+The result is that of adjusting everything at once: the minimum does not depend on where the search begins. Where it
+might (free networks, whose datum is that of the start; networks of pairs in which some were rejected), the search
+begins anew.
+"""
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+from gtsam import Pose3, Rot3
+from tqdm import tqdm
+
+from adjust.adjustment import AdjustOptions, start_values
+from adjust.graph.assembly import StartValues
+from adjust.lenses.models import MODELS
+from adjust.model.errors import NotConvergedError
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Survey
+from adjust.pose_network.from_survey import network_from_survey
+from adjust.start import find_start
+from adjust.statistics.pair_screen import PairOptions, adjusted_network, is_pure, network_solution
+from adjust.statistics.supported import lost_notes, supported
+from survey.jobs.adjusting.job import adjust_project, told
+from survey.project import Project
+from survey.solution.previous import Previous
+
+WARM, COLD = "from the previous solution", "from the beginning"
+
+
+def warm_adjustment(
+    project: Project, previous: Previous, cold: Callable[[Project], Adjustment], progress: bool
+) -> tuple[Adjustment, str]:
+    """Adjust a project that has grown or shrunk, and how that began. cold: adjusts a project from the beginning.
+
+    What people left out and what the tables leave out is obeyed as always; what the previous run screened out by
+    itself is tested anew, because what it contradicted may be gone.
+    """
+    survey = project.survey
+    if survey.datum.kind == "inner" or project.options.pairs == "closed" or (is_pure(survey) and not previous.clean):
+        return cold(project), COLD
+    if is_pure(survey):
+        return _warm_network(project, previous, progress) or (cold(project), COLD)
+    found: list[bool] = []
+
+    def begin(part: Survey) -> StartValues | None:
+        start = survey_start(part, previous)
+        found.append(start is not None)
+        return start
+
+    try:
+        adjustment = adjust_project(project, progress, begin)
+    except NotConvergedError:  # what is new may contradict what was there; the search from the beginning looks for that
+        return cold(project), COLD
+    return adjustment, WARM if all(found) else COLD
+
+
+def _warm_network(project: Project, previous: Previous, progress: bool) -> tuple[Adjustment, str] | None:
+    """A network of nothing but pairs; None where these do not reach all stations from those that are known."""
+    survey, lost = supported(project.survey)
+    begin = network_start(survey, previous.poses)
+    if begin is None:
+        return None
+    options = AdjustOptions(project.options.alpha, project.options.reject_blocks, project.options.reject_points)
+    pairs = PairOptions(project.options.reject_pairs, options)
+    with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
+
+        def step(_iteration: int, omega: float) -> None:
+            bar.set_postfix_str(f"v'Pv = {omega:.6g}")
+            bar.update()
+
+        result = adjusted_network(survey, network_solution(survey, pairs, step, begin), pairs)
+    return told(project, survey, replace(result, warnings=result.warnings + lost_notes(lost))), WARM
+
+
+def network_start(
+    survey: Survey, known: Mapping[ParameterName, Pose3]
+) -> tuple[FloatArray, FloatArray] | None:  # fmt: skip
+    """Rotations (N, 3, 3) and translations (N, 3) of a pure network: known ones, the others by the best pairs.
+
+    None where the pairs do not reach all stations.
+    """
+    ids = network_from_survey(survey).station_ids
+    poses = {s: known["world_from_station", s] for s in ids if ("world_from_station", s) in known}
+    given = {s.station_id: s.world_from_station for s in survey.stations}
+    poses |= {s: given[s].value or Pose3() for s in ids if given[s].treatment != "free"}
+    waiting = sorted((p for p in survey.pairs if p.used), key=lambda p: float(np.trace(p.cov)))
+    while len(poses) < len(ids):
+        usable = [p for p in waiting if (p.a.frame_id in poses) != (p.b.frame_id in poses)]
+        if not usable:
+            return None
+        for pair in usable:
+            a, b = pair.a.frame_id, pair.b.frame_id
+            motion = pair.b_from_a
+            b_from_a = Pose3(motion, np.zeros(3)) if isinstance(motion, Rot3) else motion
+            if a in poses and b not in poses:
+                poses[b] = poses[a].compose(b_from_a.inverse())
+            elif b in poses and a not in poses:
+                poses[a] = poses[b].compose(b_from_a)
+        waiting = [p for p in waiting if p.a.frame_id not in poses or p.b.frame_id not in poses]
+    return np.array([poses[s].rotation().matrix() for s in ids]), np.array([poses[s].translation() for s in ids])
+
+
+def survey_start(survey: Survey, previous: Previous) -> StartValues | None:
+    """Start values with what is known from before; None where images contradict it."""
+    found = find_start(_with_known(survey, previous))
+    if found.excluded_blocks:
+        return None
+    start = start_values(found)
+    return replace(start, vectors={**start.vectors, **_known_vectors(survey, previous, start)})
+
+
+def _known_vectors(survey: Survey, previous: Previous, start: StartValues) -> dict[ParameterName, FloatArray]:
+    """Angles, geometry of tables and warps from before, of those that ``start`` has; what is held keeps its value."""
+    out: dict[ParameterName, FloatArray] = {}
+    for table in survey.tables:
+        for name in start.vectors:
+            if name[0] == "table_angles" and name[1] == table.table_id:
+                axes = tuple(f"axis{i + 1}" for i in range(len(table.axes)))
+                _take(out, name, previous.vector(name, axes, ("rad",) * len(axes)))
+        geometry = table.geometry
+        units = tuple("m" if x == "axis_offset" else "rad" for x in geometry.names)
+        name = ("table_geometry", table.table_id)
+        if name in start.vectors:
+            _take(out, name, previous.vector(name, geometry.names, units), start.vectors[name],
+                  tuple(x in geometry.free for x in geometry.names))  # fmt: skip
+    return out
+
+
+def _take(
+    out: dict[ParameterName, FloatArray], name: ParameterName, value: FloatArray | None,
+    held: FloatArray | None = None, free: tuple[bool, ...] = (),
+) -> None:  # fmt: skip
+    if value is not None:
+        out[name] = value if held is None else np.where(free, value, held)
+
+
+def _with_known(survey: Survey, previous: Previous) -> Survey:
+    """The survey with previous values of free lenses, poses and points as their start."""
+
+    def pose(parameter: PoseParameter, *name: str) -> PoseParameter:
+        value = previous.poses.get(name)
+        known = value is not None and parameter.treatment == "free" and not parameter.held
+        return replace(parameter, value=value) if known else parameter
+
+    def epochs(given: Mapping[str, PoseParameter], usual: PoseParameter, *name: str) -> dict[str, PoseParameter]:
+        known = {n[2]: pose(given.get(n[2], usual), *n) for n in previous.poses if n[:2] == name and len(n) == 3}
+        return {**given, **known}
+
+    stations = tuple(
+        replace(
+            s,
+            world_from_station=pose(s.world_from_station, "world_from_station", s.station_id),
+            epochs=epochs(s.epochs, s.world_from_station, "world_from_station", s.station_id),
+            mount_from_station=pose(s.mount_from_station, "mount_from_station", s.station_id),
+        )
+        for s in survey.stations
+    )
+    targets = tuple(
+        replace(
+            t,
+            carrier_from_target=pose(t.carrier_from_target, "carrier_from_target", t.target_id),
+            epochs=epochs(t.epochs, t.carrier_from_target, "carrier_from_target", t.target_id),
+        )
+        for t in survey.targets
+    )
+    tables = tuple(
+        replace(t, world_from_table=pose(t.world_from_table, "world_from_table", t.table_id)) for t in survey.tables
+    )
+    cameras = tuple(
+        replace(
+            c, lens=_known_lens(c, previous),
+            station_from_camera=pose(c.station_from_camera, "station_from_camera", c.camera_id),
+        )
+        for c in survey.cameras
+    )  # fmt: skip
+    points = tuple(
+        replace(p, x_in_world=replace(p.x_in_world, value=previous.points[p.point_id]))
+        if p.x_in_world.treatment == "free" and not p.x_in_world.held and p.point_id in previous.points else p
+        for p in survey.points
+    )  # fmt: skip
+    return replace(survey, stations=stations, targets=targets, tables=tables, cameras=cameras, points=points)
+
+
+def _known_lens(camera: Camera, previous: Previous) -> LensParameter:
+    """The lens with its values of before; what is held, tied or has a prior needs nothing of it."""
+    lens, name = camera.lens, ("lens", camera.camera_id)
+    model = MODELS[lens.model]
+    found = previous.vector(name, model.names, model.units)
+    if found is None or previous.vectors[name].get("model") != lens.model or not lens.free:
+        return lens
+    held = np.zeros(len(model.names)) if lens.values is None else lens.values
+    return replace(lens, values=np.where([n in lens.free for n in model.names], found, held))

@@ -1,0 +1,160 @@
+"""The job ``compare``: two epochs of the same points and stations, adjusted each by itself, and what moved between."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adjust.epochs.congruence import CongruenceOptions, congruence
+from adjust.epochs.congruence_result import Congruence
+from adjust.epochs.deformation import Deformation, DeformationTest, station_deformations
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment
+from survey.jobs.adjusting.job import adjust_project
+from survey.jobs.congruence_text import congruence_dict, congruence_text
+from survey.project import Project, read
+from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind
+
+ALPHA = 0.05
+"""Error probability of the tests of all pairs of stations together."""
+
+
+@dataclass(frozen=True, eq=False)
+class CompareOutcome:
+    """Both folders with their adjustments, the deformation of neighbouring stations, and the congruence of all.
+
+    congruence: None where nothing common can be tested; ``why`` then says what is in the way. sigmas: what both
+    projects ask for; None: the pairs of stations are tested a priori, the congruence of all with the pooled sigma0.
+    """
+
+    folders: tuple[Path, Path]
+    adjustments: tuple[Adjustment, Adjustment]
+    deformations: tuple[Deformation, ...]
+    congruence: Congruence | None = None
+    why: str = ""
+    sigmas: SigmaKind | None = None
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What the adjustments warn of; wrong sigmas there make wrong tests here."""
+        pairs = zip(self.folders, self.adjustments, strict=True)
+        return tuple(f"{folder}: {warning}" for folder, adjustment in pairs for warning in adjustment.warnings)
+
+    def summary(self) -> dict[str, Any]:
+        """As plain values; None where something was not measured or cannot be tested."""
+        return {
+            "folders": [str(f) for f in self.folders],
+            "sigma0": [_number(a.sigma0) for a in self.adjustments],
+            "redundancy": [a.redundancy for a in self.adjustments],
+            "sigmas": self.sigmas or "a_priori",
+            "alpha": ALPHA,
+            "deformations": [_entry(d) for d in self.deformations],
+            "congruence": None if self.congruence is None else congruence_dict(self.congruence),
+            "warnings": list(self.problems),
+        }
+
+    def text(self) -> str:
+        """A table for people: rotation vectors and displacements with their sigmas; a star marks what is real."""
+        whole = self.why if self.congruence is None else congruence_text(self.congruence)
+        if not self.deformations:
+            problems = "".join(f"\n  ! {p}" for p in self.problems)
+            return f"{self.folders[0]} -> {self.folders[1]}{problems}\n{whole}"
+        moved = sum(d.significant for d in self.deformations)
+        width = max(7, *(len(f"{d.a} - {d.b}") for d in self.deformations))
+        head = f"  {'':<{width}}  {'rotation, arcsec':^42}  {'displacement, mm':^42}"
+        axes = "".join(f"{axis:>7}{'sigma':>7}" for axis in "xyz")
+        return "\n".join([
+            f"{self.folders[0]} -> {self.folders[1]}: {moved} of {len(self.deformations)} relations moved "
+            f"(error probability {ALPHA:g} for all together, {(self.sigmas or 'a_priori').replace('_', ' ')} sigmas)",
+            *(f"  ! {p}" for p in self.problems),
+            "", head.rstrip(), f"  {'a - b':<{width}}  {axes}  {axes}{'p':>9}",
+            *(_row(d, width) for d in self.deformations),
+            "", "  motion of a as seen from b, along the axes of a in the first epoch", "", whole,
+        ])  # fmt: skip
+
+
+def compare_job(folder_a: Path, folder_b: Path, *, progress: bool = True) -> CompareOutcome:
+    """Adjust two project folders and compare their stations; writes nothing. Raises SurveyError."""
+    folders = Path(folder_a), Path(folder_b)
+    projects = read(folders[0]), read(folders[1])
+    sigmas = _sigmas(projects)
+    first, second = (_adjusted(project, progress) for project in projects)
+    options = CongruenceOptions(ALPHA, sigmas != "a_priori", names=(folders[0].name, folders[1].name))
+    try:
+        found, why = congruence(first, second, options), ""
+    except SurveyError as error:
+        found, why = None, f"no congruence test: {error}"
+    stations = [{s.station_id for s in a.survey.stations if s.motion == "fixed"} for a in (first, second)]
+    if found is not None and len(stations[0] & stations[1]) < 2:
+        return CompareOutcome(folders, (first, second), (), found, sigmas=sigmas)
+    scaled = (sigmas == "a_posteriori",) * 2
+    moved = station_deformations(first, second, alpha=ALPHA, scale=(scaled[0], scaled[1]))
+    return CompareOutcome(folders, (first, second), moved, found, why, sigmas)
+
+
+def _sigmas(projects: tuple[Project, Project]) -> SigmaKind | None:
+    """What both ask for; what only one says holds for the other too."""
+    asked = {p.options.sigmas: p.folder for p in projects if p.options.sigmas is not None}
+    if len(asked) > 1:
+        said = ", ".join(f"{folder} {kind}" for kind, folder in asked.items())
+        raise SurveyError(f"[adjustment] sigmas differ ({said}), and a test has but one kind; make them the same")
+    return next(iter(asked), None)
+
+
+def _adjusted(project: Project, progress: bool) -> Adjustment:
+    folder = project.folder
+    if project.images and not (project.survey.image_blocks or project.spots):
+        raise SurveyError(
+            f"{folder}: nothing was detected in its images yet, and a comparison writes nothing; run 'labsurvey detect "
+            f"{folder}' first"
+        )
+    try:
+        return adjust_project(project, progress)
+    except SurveyError as error:
+        # of two folders the message must say which
+        raise error if str(folder) in str(error) else SurveyError(f"{folder}: {error}") from error
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _numbers(values: Any) -> list[float | None]:
+    return [_number(v) for v in np.asarray(values, dtype=float)]
+
+
+def _test(test: DeformationTest) -> dict[str, Any]:
+    return {"chi_square": _number(test.statistic), "freedom": test.freedom, "p": _number(test.p)}
+
+
+def _entry(d: Deformation) -> dict[str, Any]:
+    sigmas = d.sigmas
+    return {
+        "a": d.a,
+        "b": d.b,
+        "rotation_arcsec": _numbers(ARCSEC_PER_RAD * d.rotation),
+        "sigma_rotation_arcsec": _numbers(ARCSEC_PER_RAD * sigmas[:3]),
+        "rotation_euler_xyz_arcsec": _numbers(ARCSEC_PER_RAD * d.euler_zyx),
+        "sigma_rotation_euler_xyz_arcsec": _numbers(ARCSEC_PER_RAD * np.sqrt(np.diag(d.euler_cov))),
+        "displacement_mm": _numbers(1e3 * d.displacement),
+        "sigma_displacement_mm": _numbers(1e3 * sigmas[3:]),
+        "test_rotation": _test(d.rotation_test),
+        "test_displacement": _test(d.displacement_test),
+        "test": _test(d.test),
+        "significant": d.significant,
+    }
+
+
+def _row(d: Deformation, width: int) -> str:
+    s = d.sigmas
+    turn = "".join(_cell(ARCSEC_PER_RAD * x, 1) for k in range(3) for x in (d.rotation[k], s[k]))
+    shift = "".join(_cell(1e3 * x, 3) for k in range(3) for x in (d.displacement[k], s[3 + k]))
+    p = f"{d.test.p:9.2g}" if math.isfinite(d.test.p) else f"{'-':>9}"
+    return f"  {f'{d.a} - {d.b}':<{width}}  {turn}  {shift}{p}{' *' if d.significant else ''}"
+
+
+def _cell(value: float, digits: int) -> str:
+    # a space of its own: large values must not run together
+    return f" {value:>6.{digits}f}" if math.isfinite(value) else f"{'-':>7}"

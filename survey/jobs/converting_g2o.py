@@ -1,0 +1,103 @@
+"""Pose networks between g2o files and project folders."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import PoseParameter, Station, Survey
+from adjust.pose_network.from_survey import network_from_survey
+from adjust.statistics.pair_screen import is_pure
+from survey.folder.text import id_problem
+from survey.interop.networks.g2o import Information, read_g2o_file, write_g2o
+from survey.jobs.adjusting.warm_start import network_start
+from survey.project import AdjustmentOptions, read
+from survey.report.results import RESULTS
+from survey.solution.previous import read_previous
+
+AS_IN_THE_FILE = AdjustmentOptions(reject_pairs=False)
+"""A file's own minimum is that of all its pairs; its owner may let the program look for wrong ones."""
+
+
+def survey_from_g2o(
+    source: Path, information: Information, block_diagonal: bool = False
+) -> tuple[Survey, tuple[str, ...]]:
+    """The stations and pairs of a g2o file, and what of it was not taken as it stands, for people.
+
+    Raises SurveyError for what cannot be read, or named in a project.
+    """
+    found = read_g2o_file(source, information, use_vertices=True, block_diagonal=block_diagonal)
+    network = found.network
+    for station in network.station_ids:
+        if (problem := id_problem(station)) is not None:
+            raise SurveyError(f"{source}: vertex {station}: {problem}")
+    held = set(network.held.tolist())
+    stations = []
+    for i, station in enumerate(network.station_ids):
+        known = bool(np.isfinite(network.station_translations[i]).all())
+        value = _pose(network.station_rotations[i], network.station_translations[i]) if known else None
+        pose = PoseParameter(value, "held" if i in held else "free")
+        stations.append(Station(station, world_from_station=pose))
+    frames = [FrameRef("station", s) for s in network.station_ids]
+    pairs = tuple(
+        Pair(network.pair_ids[e], frames[int(network.a_idx[e])], frames[int(network.b_idx[e])],
+             _pose(network.rotations[e], network.translations[e]), network.cov[e])
+        for e in range(network.n_pairs)
+    )  # fmt: skip
+    return Survey(stations=tuple(stations), pairs=pairs), found.notes
+
+
+def _pose(rotation: Any, translation: Any) -> Pose3:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    return Pose3(matrix)
+
+
+def project_to_g2o(source: Path, target: Path, information: Information) -> tuple[int, int, str, tuple[str, ...]]:
+    """Write the pairs of a project; number of stations and pairs, which poses were written, what was left out."""
+    project = read(source)
+    survey = project.survey
+    if not is_pure(survey):
+        raise SurveyError(
+            f"{source}: g2o holds nothing but poses of fixed stations and pairs between them; this project has more, "
+            "or has no pairs"
+        )
+    network = network_from_survey(survey, any_datum=True)
+    adjusted = (source / RESULTS / "solution.json").is_file()
+    known = dict(read_previous(project).poses) if adjusted else _given(survey)
+    start = network_start(survey, known)
+    if start is None:
+        raise SurveyError(f"{source}: pairs leave stations without a pose; give them a start")
+    write_g2o(target, network, *start, information=information)
+    poses = "adjusted" if adjusted else "start values, not adjusted"
+    return network.n_stations, int(network.used.sum()), poses, _left_out(survey, network.station_ids)
+
+
+def _given(survey: Survey) -> dict[tuple[str, ...], Pose3]:
+    """Poses that survey.toml gives."""
+    return {
+        ("world_from_station", s.station_id): s.world_from_station.value
+        for s in survey.stations
+        if s.world_from_station.value is not None
+    }
+
+
+def _left_out(survey: Survey, ids: tuple[str, ...]) -> tuple[str, ...]:
+    """What the file does not say, for people."""
+    out = []
+    priors = [s.station_id for s in survey.stations if s.world_from_station.treatment == "prior"]
+    unused = [p.pair_id for p in survey.pairs if not p.used]
+    alone = [s.station_id for s in survey.stations if s.station_id not in ids]
+    for what, names in (("priors of stations", priors), ("pairs not in use", unused), ("stations without pair", alone)):
+        if names:
+            out.append(f"left out, {what}: {', '.join(names[:8])}{' and more' if len(names) > 8 else ''}")
+    if not all(s.isascii() and s.isdigit() for s in ids):
+        out.append(f"g2o knows only numbers: stations are written as 0 to {len(ids) - 1}, in the order {_order(ids)}")
+    return tuple(out)
+
+
+def _order(ids: tuple[str, ...]) -> str:
+    return ", ".join(ids[:12]) + (", ..." if len(ids) > 12 else "")

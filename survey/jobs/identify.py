@@ -1,0 +1,127 @@
+"""Which spot is which beacon: by predicting every beacon of roughly known position into every image.
+
+A spot and a beacon belong together when each is the other's nearest within the gate, and no second candidate comes
+half as near again; everything else is left unidentified and reported.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.lenses.models import MODELS, lens_constants, project
+from adjust.model.observations import FrameRef, ImageBlock
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray, Survey
+from survey.jobs.adjusting.less_observations import only_between
+from survey.project import SpotBlock
+from survey.solution.frames import AdjustedFrames
+
+_SECOND_BEST = 1.5
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Image blocks of identified beacons, and notes about what was not identified."""
+
+    blocks: tuple[ImageBlock, ...]
+    identified: int
+    unidentified: int
+    notes: tuple[str, ...]
+
+
+def without_points(survey: Survey) -> Survey:
+    """The survey without its world points: what can be adjusted before the spots have names."""
+    blocks = tuple(b for b in survey.image_blocks if b.target_id is not None)
+    return replace(only_between(survey, lambda ref: ref.frame is not None), points=(), image_blocks=blocks)
+
+
+def rough_positions(survey: Survey) -> dict[str, FloatArray]:
+    """World points whose coordinates are known or observed, (3,) m."""
+    known = {p.point_id: np.asarray(p.x_in_world.value) for p in survey.points if p.x_in_world.value is not None}
+    known = {point_id: x for point_id, x in known.items() if np.isfinite(x).all()}
+    for observation in survey.coordinates:
+        for ref, x in zip(observation.positions, observation.values, strict=True):
+            if ref.frame is None and ref.point_id is not None and np.isfinite(x).all():
+                known[ref.point_id] = x
+    return known
+
+
+def identify_spots(
+    survey: Survey, adjustment: Adjustment, spots: Sequence[SpotBlock], gate_px: float
+) -> Identification:
+    """Name the spots. ``adjustment`` gives cameras and frames, ``survey`` the beacons with rough positions."""
+    frames, positions = AdjustedFrames(adjustment), rough_positions(survey)
+    index = {p.point_id: i for i, p in enumerate(survey.points)}
+    blocks, notes, identified, total = [], [], 0, 0
+    for spot_block in spots:
+        total += len(spot_block.uv)
+        pose = frames.world_from(FrameRef("camera", spot_block.camera_id, spot_block.epoch_id))
+        where = f"camera {spot_block.camera_id} at epoch {spot_block.epoch_id}"
+        if pose is None:
+            notes.append(f"{where}: its pose is not known without the spots; name them in image_points")
+            continue
+        predicted = predict(survey, adjustment, spot_block.camera_id, pose, positions)
+        pairs, ambiguous = match(spot_block.uv, predicted, gate_px)
+        if ambiguous:
+            notes.append(f"{where}: {ambiguous} spots lie near more than one beacon and are left out")
+        identified += len(pairs)
+        if pairs:
+            rows = [i for i, _ in pairs]
+            blocks.append(
+                ImageBlock(spot_block.camera_id, spot_block.epoch_id, None, np.array([index[p] for _, p in pairs]),
+                           spot_block.uv[rows], spot_block.cov[rows])
+            )  # fmt: skip
+    seen = {survey.points[int(i)].point_id for b in blocks for i in b.point_idx}
+    missing = sorted(set(index) - seen)
+    if missing:
+        notes.append(f"beacons seen by no camera: {', '.join(missing)}")
+    return Identification(tuple(blocks), identified, total - identified, tuple(notes))
+
+
+def predict(
+    survey: Survey,
+    adjustment: Adjustment,
+    camera_id: str,
+    world_from_camera: Pose3,
+    positions: Mapping[str, FloatArray],
+) -> dict[str, FloatArray]:
+    """Image points (2,) px of the world points that are in front of a camera and inside its image."""
+    camera = next(c for c in survey.cameras if c.camera_id == camera_id)
+    estimate = adjustment.estimates[("lens", camera_id)].value
+    if isinstance(estimate, Pose3) or not positions:
+        return {}
+    model = MODELS[camera.lens.model]
+    constants = lens_constants(model, camera.image_size, camera.lens.pixel_size_mm)
+    names = list(positions)
+    R, t = world_from_camera.rotation().matrix(), world_from_camera.translation()
+    q = (np.array([positions[n] for n in names]) - t) @ R
+    # half the picture beyond 60 degrees off the axis says nothing about a lens that was calibrated inside its image
+    front = q[:, 2] > 0.3 * np.linalg.norm(q, axis=1)
+    if not front.any():
+        return {}
+    uv = project(model, estimate, constants, q[front])
+    width, height = camera.image_size
+    inside = np.all((uv > -0.5) & (uv < np.array([width, height]) - 0.5), axis=1)
+    seen = [n for n, ok in zip(names, front, strict=True) if ok]
+    return {n: x for n, x, ok in zip(seen, uv, np.atleast_1d(inside), strict=True) if ok}
+
+
+def match(uv: FloatArray, predicted: Mapping[str, FloatArray], gate_px: float) -> tuple[list[tuple[int, str]], int]:
+    """Pairs (spot, beacon) that choose each other, and how many spots had two candidates."""
+    if not predicted or not len(uv):
+        return [], 0
+    names = list(predicted)
+    distance = np.linalg.norm(uv[:, None, :] - np.array([predicted[n] for n in names])[None], axis=2)
+    pairs, ambiguous = [], 0
+    for i, row in enumerate(distance):
+        j = int(row.argmin())
+        if row[j] > gate_px:
+            continue
+        rivals = np.concatenate([np.delete(row, j), np.delete(distance[:, j], i)])
+        if rivals.size and rivals.min() < min(gate_px, _SECOND_BEST * row[j] + 1.0):
+            ambiguous += 1
+            continue
+        pairs.append((i, names[j]))
+    return pairs, ambiguous

@@ -1,0 +1,176 @@
+"""What of a project is navigated, and what it is calibrated from: station, epochs, their times, spots and readings."""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from adjust.model.errors import SurveyError
+from adjust.model.survey import Survey
+from adjust.navigation import NavigationEpoch, Spots
+from adjust.statistics.supported import supported
+from survey.folder.text import decode, natural_key, read_bytes
+from survey.jobs.adjusting.less_observations import in_use, only_between, points_read
+from survey.project import Project
+
+
+@dataclass(frozen=True)
+class NavigateRequest:
+    """What is navigated.
+
+    station: None for the only one with cameras, or the one a table carries. epochs: None for all in which its cameras
+    show beacons and no target. interval_s: time between epochs. times: instead, a table with columns epoch_id and
+    time_s; epochs then come in the order of time. Without either motion is not used. unnamed: forget the names that
+    spots have.
+    """
+
+    station: str | None = None
+    epochs: tuple[str, ...] | None = None
+    interval_s: float | None = None
+    use_table: bool = True
+    unnamed: bool = False
+    times: Path | None = None
+
+
+def chosen_station(project: Project) -> str:
+    """The station to navigate: the only one with cameras, or the only one on a table. Raises SurveyError."""
+    survey = project.survey
+    carrying = list(dict.fromkeys(c.station_id for c in survey.cameras))
+    turned = [s.station_id for s in survey.stations if s.station_id in carrying and s.motion == "table"]
+    for choice in (turned, carrying):
+        if len(choice) == 1:
+            return choice[0]
+    raise SurveyError(
+        f"{project.folder}/survey.toml: {len(carrying)} stations carry cameras ({', '.join(carrying)}); say which one "
+        "is to be navigated with --station"
+    )
+
+
+def chosen_epochs(project: Project, station: str, request: NavigateRequest) -> list[str]:
+    """Epochs to navigate, in natural order. Raises SurveyError."""
+    own = {c.camera_id for c in project.survey.cameras if c.station_id == station}
+    if not own:
+        raise SurveyError(f"{project.folder}/survey.toml: no camera is on station {station!r}")
+    lit, shown = _lit_and_shown(project, own)
+    if request.epochs is not None:
+        unknown = [e for e in request.epochs if e not in lit]
+        if unknown:
+            raise SurveyError(f"{project.folder}: no beacon was observed at epoch {', '.join(unknown)} from {station}")
+        return list(request.epochs)
+    found = sorted(lit - shown, key=natural_key)
+    if not found:
+        raise SurveyError(
+            f"{project.folder}/observations: no epoch to navigate: none shows beacons to station {station} without a "
+            "target; name epochs with --epochs, or detect spots first"
+        )
+    return found
+
+
+def _lit_and_shown(project: Project, own: set[str]) -> tuple[set[str], set[str]]:
+    """Epochs at which these cameras show beacons, and those at which they show a target."""
+    blocks = [b for b in in_use(project.survey).image_blocks if b.camera_id in own]
+    lit = {s.epoch_id for s in project.spots if s.camera_id in own}
+    lit |= {b.epoch_id for b in blocks if b.target_id is None}
+    return lit, {b.epoch_id for b in blocks if b.target_id is not None}
+
+
+def others_to_navigate(project: Project, station: str, epochs: Sequence[str]) -> list[str]:
+    """Epochs that could be navigated as well and were not asked for, in natural order.
+
+    They take no part in the calibration either, so that it is the same whichever epochs are asked for; none where no
+    epoch of the station shows a target, so that nothing else could calibrate it.
+    """
+    lit, shown = _lit_and_shown(project, {c.camera_id for c in project.survey.cameras if c.station_id == station})
+    return sorted(lit - shown - set(epochs), key=natural_key) if shown else []
+
+
+def chosen_times(epochs: Sequence[str], request: NavigateRequest) -> list[float] | None:
+    """Time (s) of every epoch, None where nothing tells. Raises SurveyError."""
+    if request.times is None:
+        step = request.interval_s
+        return None if step is None else [i * step for i in range(len(epochs))]
+    if request.interval_s is not None:
+        raise SurveyError("give either the interval between epochs or a table of their times, not both")
+    rows = list(csv.DictReader(decode(request.times, read_bytes(request.times)[0]).splitlines()))
+    if not rows or not {"epoch_id", "time_s"} <= set(rows[0]):
+        raise SurveyError(f"{request.times}:1: the columns epoch_id and time_s are needed")
+    found: dict[str, float] = {}
+    for line, row in enumerate(rows, 2):
+        try:
+            value = float(row["time_s"])
+        except (TypeError, ValueError):
+            value = float("nan")
+        if not np.isfinite(value) or row["epoch_id"] in found:
+            problem = "is there twice" if row["epoch_id"] in found else f"has the time {row['time_s']!r}, give seconds"
+            raise SurveyError(f"{request.times}:{line}: epoch {row['epoch_id']!r} {problem}")
+        found[row["epoch_id"]] = value
+    missing = [e for e in epochs if e not in found]
+    if missing:
+        raise SurveyError(f"{request.times}: no time for epoch {', '.join(missing[:5])}; add it, or leave it out")
+    times = [found[e] for e in epochs]
+    if len(set(times)) < len(times):
+        raise SurveyError(f"{request.times}: two of the epochs to navigate have the same time; times must differ")
+    return times
+
+
+def calibrating(project: Project, station: str, epochs: Sequence[str]) -> Survey:
+    """The survey that the navigated epochs have no part in, so that no spot is used twice."""
+    survey, out = project.survey, set(epochs)
+    own = {c.camera_id for c in survey.cameras if c.station_id == station}
+    blocks = tuple(b for b in survey.image_blocks if not (b.camera_id in own and b.epoch_id in out))
+    carried = next(s for s in survey.stations if s.station_id == station).table_id
+    readings = tuple(r for r in survey.table_readings if not (r.table_id == carried and r.epoch_id in out))
+    return supported(_with_known_points(replace(survey, image_blocks=blocks, table_readings=readings)))[0]
+
+
+def _with_known_points(survey: Survey) -> Survey:
+    """Without the points that the remaining observations do not determine: seen by fewer than two images, or given."""
+    seen: dict[int, set[tuple[str, str]]] = {}
+    for b in survey.image_blocks:
+        if b.target_id is None:
+            for i in (b.point_idx if b.used is None else b.point_idx[b.used]).tolist():
+                seen.setdefault(i, set()).add((b.camera_id, b.epoch_id))
+    given = {r.point_id for c in survey.coordinates if c.used for r in c.positions if r.frame is None}
+    given |= points_read(survey)
+    keep = [
+        i for i, p in enumerate(survey.points)
+        if len(seen.get(i, ())) >= 2 or p.point_id in given or p.x_in_world.treatment != "free"
+    ]  # fmt: skip
+    new = {old: k for k, old in enumerate(keep)}
+    ids = {survey.points[i].point_id for i in keep}
+    blocks = []
+    for b in survey.image_blocks:
+        if b.target_id is not None:
+            blocks.append(b)
+            continue
+        rows = np.isin(b.point_idx, keep)
+        if rows.any():
+            used = None if b.used is None else b.used[rows]
+            index = np.array([new[int(i)] for i in b.point_idx[rows]], dtype=np.int64)
+            blocks.append(replace(b, point_idx=index, uv=b.uv[rows], cov=b.cov[rows], used=used))
+    less = only_between(survey, lambda ref: ref.frame is not None or ref.point_id in ids)
+    return replace(less, points=tuple(survey.points[i] for i in keep), image_blocks=tuple(blocks))
+
+
+def observed_epoch(
+    project: Project, station: str, epoch_id: str, time_s: float | None, request: NavigateRequest, named: set[str]
+) -> NavigationEpoch:
+    """One epoch's spots, named or not, and its table reading; what is not used is not navigated from."""
+    survey = in_use(project.survey)
+    own = [c.camera_id for c in survey.cameras if c.station_id == station]
+    spots = [Spots(s.camera_id, s.uv, s.cov) for s in project.spots if s.camera_id in own and s.epoch_id == epoch_id]
+    for b in survey.image_blocks:
+        if b.target_id is None and b.camera_id in own and b.epoch_id == epoch_id:
+            ids = [survey.points[int(i)].point_id for i in b.point_idx]
+            if request.unnamed:
+                spots.append(Spots(b.camera_id, b.uv, b.cov))
+                continue
+            rows = [i for i, p in enumerate(ids) if p in named]
+            spots.append(Spots(b.camera_id, b.uv[rows], b.cov[rows], tuple(ids[i] for i in rows)))
+    carried = next(s for s in survey.stations if s.station_id == station).table_id
+    reading = next((r for r in survey.table_readings if (r.table_id, r.epoch_id) == (carried, epoch_id)), None)
+    if reading is None:
+        return NavigationEpoch(epoch_id, tuple(spots), time_s)
+    return NavigationEpoch(epoch_id, tuple(spots), time_s, reading.angles, reading.cov)

@@ -1,0 +1,219 @@
+"""The jobs ``plan`` (what a network of pairs will tell, before it is measured) and ``add`` (let one grow)."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Pair
+from survey.folder.replacing import complete, place_for, replace_parts
+from survey.jobs.adjusting.job import AdjustOutcome, Clock, adjust_project, command_line, made
+from survey.jobs.adjusting.warm_start import warm_adjustment
+from survey.project import Definition, Project, read, read_definition
+from survey.project.merging import Merged, merge, read_copy
+from survey.project.project import OBSERVATIONS_FOLDER
+from survey.project.tables.pairs import COVARIANCE_COLUMNS, EULER, PAIRS, QUATERNION, SIGMA_COLUMNS, TRANSLATION
+from survey.project.tables.reading import Table, read_table
+from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame
+from survey.report.results import RESULTS
+from survey.solution.loops import network_dict, pair_network
+from survey.solution.previous import Move, Previous, moves, read_previous
+
+_MOST_MOVES = 200
+_MOST_SHOWN = 8
+
+
+@dataclass(frozen=True)
+class PlanOutcome:
+    """What can be said before measuring, section by section; ``problems`` for people, worst first."""
+
+    folder: Path
+    title: str
+    sections: dict[str, dict[str, Any]]
+    problems: tuple[str, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """As plain values."""
+        return {"folder": str(self.folder), "title": self.title, **self.sections, "problems": list(self.problems)}
+
+    def text(self) -> str:
+        """For people."""
+        n = self.sections["network"]
+        what = "poses" if n["equations_per_condition"] == 6 else "rotations"
+        through = n["conditions_through_given_stations"]
+        lines = [
+            f"{self.title or self.folder}: {n['n_stations']} stations, {n['measured_pairs']} of "
+            f"{n['measurable_pairs']} measurable pairs",
+            *(f"  ! {problem}" for problem in self.problems),
+            "",
+            f"  independent unknown {what:<10}{n['independent_unknown_poses']:>8}",
+            f"  triangle conditions           {n['triangle_conditions']:>8}",
+            f"  independent conditions        {n['independent_conditions']:>8}"
+            + (f"   ({through} of them through given stations)" if through else ""),
+            f"  redundancy                    {n['redundancy']:>8}   equations",
+            f"  conditions per pair           {n['conditions_per_pair']:>8.2f}",
+        ]
+        groups = n["inseparable_pairs"]
+        lines += [f"  errors seen but not told apart: {_named(group)}" for group in groups[:_MOST_SHOWN]]
+        lines += [f"  and {len(groups) - _MOST_SHOWN} more such groups"] if len(groups) > _MOST_SHOWN else []
+        return "\n".join(lines)
+
+
+def plan_job(folder: Path) -> PlanOutcome:
+    """Count what the pairs of a project will tell; they need no values yet. Raises SurveyError."""
+    definition = read_definition(Path(folder))
+    path = next((p for ending in ("csv", "parquet")
+                 if (p := definition.folder / OBSERVATIONS_FOLDER / f"pairs.{ending}").is_file()), None)  # fmt: skip
+    if path is None:
+        raise SurveyError(
+            f"{definition.folder / OBSERVATIONS_FOLDER}/pairs.csv: there is no such file; list the pairs to be "
+            "measured in it: pair_id,a_id,b_id (values may follow later). What images will tell is planned by "
+            f"{definition.folder / 'plan.toml'}, which is not there either"
+        )
+    survey = replace(definition.survey, pairs=_planned(read_table(path, PAIRS), Names.of(definition.survey)))
+    network = network_dict(pair_network(survey))
+    return PlanOutcome(definition.folder, definition.title, {"network": network}, _problems(definition, network))
+
+
+def _planned(table: Table, names: Names) -> tuple[Pair, ...]:
+    """Pairs by their ends; rotations where the table has values, but none of a translation."""
+    ids, used = table.unique_ids("pair_id"), table.flags("used").tolist()
+    shifts = (*TRANSLATION, *(c for cs in SIGMA_COLUMNS["translation"] for c in cs), COVARIANCE_COLUMNS[-1])
+    turns = (*QUATERNION, *EULER, *(c for cs in SIGMA_COLUMNS["rotation"] for c in cs), COVARIANCE_COLUMNS[0])
+    shift, turn = _filled(table, shifts), _filled(table, turns)
+    out = []
+    for row, (a_text, b_text) in enumerate(zip(table.text("a_id").values(), table.text("b_id").values(), strict=True)):
+        try:
+            a, b = read_frame(a_text, names), read_frame(b_text, names)
+            check_epochs(a, b, names)
+        except NameProblemError as problem:
+            raise table.error(row, f"a_id, b_id: {problem}") from problem
+        if a == b:
+            raise table.error(row, f"a_id, b_id: both are {a_text!r}; a pair joins two different frames")
+        rotation_only = bool(turn[row] and not shift[row])
+        motion = Rot3() if rotation_only else Pose3()
+        out.append(Pair(ids[row], a, b, motion, np.eye(3 if rotation_only else 6), used=used[row]))
+    return tuple(out)
+
+
+def _filled(table: Table, columns: Sequence[str]) -> list[bool]:
+    """Rows in which any of the columns has a value."""
+    missing = np.isnan(np.stack([table.numbers(c) for c in columns], axis=1))
+    return [not all(row) for row in missing.tolist()]
+
+
+def _problems(definition: Definition, network: dict[str, Any]) -> tuple[str, ...]:
+    out = []
+    parts = network["parts"]
+    if parts:
+        named = " | ".join(_named(part) for part in parts[:6]) + (" | ..." if len(parts) > 6 else "")
+        beside = ", unless images join them" if definition.survey.cameras else ""
+        out.append(f"the pairs leave {len(parts)} parts that hang together by nothing{beside}: {named}")
+    if definition.survey.datum.kind == "given" and not network["given_stations"] and not definition.survey.cameras:
+        out.append('no station is held or has a prior; hold one, or write [datum] kind = "inner"')
+    if network["uncontrolled_pairs"]:
+        out.append(
+            f"close no loop, so that nobody would notice an error in them: {_named(network['uncontrolled_pairs'])}; "
+            "measure a second way to what they lead to"
+        )
+    return tuple(out)
+
+
+def _named(ids: Sequence[str], most: int = 12) -> str:
+    return ", ".join(ids[:most]) + (f" and {len(ids) - most} more" if len(ids) > most else "")
+
+
+@dataclass(frozen=True, eq=False)
+class AddOutcome:
+    """A network that has grown. start: how the adjustment began, for people."""
+
+    outcome: AdjustOutcome
+    added: dict[str, Any]
+    moved: tuple[Move, ...]
+    before: Previous
+    start: str
+    seconds: float
+    paths: dict[str, Path] = field(default_factory=dict)
+
+    def summary(self) -> dict[str, Any]:
+        """As plain values."""
+        after = self.outcome.solution["summary"]
+        return {
+            **self.outcome.summary(),
+            "added": self.added,
+            "redundancy_before": self.before.summary["redundancy"],
+            "redundancy_after": after["redundancy"],
+            "sigma0_before": self.before.summary["sigma0"],
+            "sigma0_after": after["sigma0"],
+            "start": self.start,
+            "n_moved_over_one_sigma": sum(m.sigmas > 1.0 for m in self.moved),
+            "moved": [
+                {"name": m.name, "moved_mm": m.mm, "moved_arcsec": m.arcsec, "moved_sigmas": m.sigmas}
+                for m in self.moved[:_MOST_MOVES]
+            ],
+            "seconds": self.seconds,
+        }
+
+    def text(self) -> str:
+        """For people."""
+        before, after = self.before.summary, self.outcome.solution["summary"]
+        lines = ["added: " + "; ".join(f"{kind} {_added(what)}" for kind, what in self.added.items())]
+        lines.append(
+            f"redundancy {before['redundancy']} -> {after['redundancy']}, sigma0 {_sigma0(before)} -> {_sigma0(after)}"
+            f", {self.start}, {self.seconds:.2f} s"
+        )
+        far = [m for m in self.moved if m.sigmas > 1.0]
+        lines.append(
+            f"{len(far)} of {len(self.moved)} old stations and points moved by more than one of their sigmas"
+            + ("; the most" if self.moved and not far else "")
+        )
+        for m in (far or self.moved)[:_MOST_SHOWN]:
+            lines.append(f"  {m.name:<20}{m.mm:>10.3f} mm{m.arcsec:>9.1f} arcsec{m.sigmas:>8.2f} sigmas")
+        return "\n".join([*lines, "", self.outcome.text()])
+
+
+def _added(what: Any) -> str:
+    return _named(what) if isinstance(what, list) else str(what)
+
+
+def _sigma0(summary: Any) -> str:
+    return "-" if summary["sigma0"] is None else f"{summary['sigma0']:.3f}"
+
+
+def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool = True) -> AddOutcome:
+    """Add what is in ``new`` to the adjusted project ``folder``, or to a copy of it at ``out``. Raises SurveyError.
+
+    The project is as before whatever goes wrong.
+    """
+    begin = time.perf_counter()
+    folder, new = Path(folder), Path(new)
+    with place_for(folder, out) as place:
+        project = read(folder)
+        before = read_previous(project)
+        merged = merge(folder, new, place)
+        grown = _read_merged(merged, project, out or folder)
+        adjustment, start = warm_adjustment(grown, before, lambda p: adjust_project(p, progress), progress)
+        said = command_line("add", folder, new, out=out)
+        outcome = made(grown, adjustment, place, Clock({"adjust": time.perf_counter() - begin}), command=said)
+        if out is None:
+            replace_parts(folder, [*merged.entries, RESULTS])
+        else:
+            complete(folder, place)
+    outcome = outcome.at(out or folder)
+    added = {**merged.new_ids, **merged.rows}
+    moved = moves(before, adjustment, grown.options.sigmas)
+    return AddOutcome(outcome, added, moved, before, start, time.perf_counter() - begin)
+
+
+def _read_merged(merged: Merged, project: Project, folder: Path) -> Project:
+    try:
+        return read_copy(merged.place, project, folder)
+    except SurveyError as error:
+        raise merged.translated(error) from error
+
+

@@ -1,0 +1,30 @@
+"""The project folder: ``read`` gives a ``Project``, ``write_project`` writes one."""
+
+from survey.folder.text import atomic_write
+from survey.project.project import (
+    AdjustmentOptions,
+    Definition,
+    ImagePointsWhere,
+    Project,
+    Sigmas,
+    SpotBlock,
+    SpotsRequest,
+)
+from survey.project.reading import read, read_definition
+from survey.project.writing import write_image_points, write_project, write_spots
+
+__all__ = [
+    "AdjustmentOptions",
+    "Definition",
+    "ImagePointsWhere",
+    "Project",
+    "Sigmas",
+    "SpotBlock",
+    "SpotsRequest",
+    "atomic_write",
+    "read",
+    "read_definition",
+    "write_image_points",
+    "write_project",
+    "write_spots",
+]

@@ -1,0 +1,1 @@
+"""``survey.toml``: its tables as they are declared, read and written, key by key."""

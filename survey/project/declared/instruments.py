@@ -1,0 +1,132 @@
+"""The vertical, the counting of bearings, instruments and their setups in ``survey.toml``, read and written."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+
+import numpy as np
+
+from adjust.model.survey import Bearings, Instrument, Setup, Vertical
+from survey.folder.text import suggestion
+from survey.folder.units import from_si
+from survey.project.declared.declarations import INSTRUMENT_UNITS, TILT_UNITS, keys_of
+from survey.project.declared.node import Node
+from survey.project.declared.toml_text import Section
+from survey.project.declared.vectors import read_vector, vector_to_toml
+from survey.project.project import Accuracy
+
+_ANGLE = ("arcsec", "mgon", "cc", "deg")
+_LENGTH = ("mm",)
+_ACCURACY: dict[str, tuple[str, tuple[str, ...]]] = {
+    "direction": ("sigma_direction", _ANGLE),
+    "angle": ("sigma_angle", _ANGLE),
+    "zenith": ("sigma_zenith", _ANGLE),
+    "azimuth": ("sigma_azimuth", _ANGLE),
+    "distance": ("sigma_distance", _LENGTH),
+    "distance_slope": ("sigma_distance", ("ppm",)),
+    "height_difference": ("sigma_height_difference", _LENGTH),
+    "levelling": ("sigma_levelling", ("mm",)),
+    "target_centring": ("sigma_target_centring", _LENGTH),
+    "centring": ("sigma_centring", _LENGTH),
+    "height": ("sigma_height", _LENGTH),
+}
+
+
+def read_vertical(node: Node) -> Vertical:
+    """The table [vertical]."""
+    node.allow(*keys_of("vertical"))
+    up = node.numbers("up_in_world", (3,), [0.0, 0.0, 1.0])
+    length = float(np.linalg.norm(up))
+    if abs(length - 1.0) > 1e-3:
+        raise node.error(f"the direction has length {length:g}, not 1; correct it", "up_in_world")
+    radius = node.number("radius_m", positive=True) if node.has("radius_m") else None
+    if abs(length - 1.0) > 1e-12:  # else the same bits come back
+        up = up / length
+    return Vertical(up, read_vector(node, TILT_UNITS, ()), radius)
+
+
+def read_bearings(node: Node) -> Bearings:
+    """The table [bearings]."""
+    node.allow(*keys_of("bearings"))
+    zero = node.choice("zero", ("x", "y"), "y")
+    return Bearings("x" if zero == "x" else "y", node.flag("clockwise", True))
+
+
+def read_instruments(root: Node) -> tuple[tuple[Instrument, ...], dict[str, Accuracy]]:
+    """The tables [instruments.*], and what their readings are worth."""
+    instruments, accuracies = [], {}
+    for instrument_id, node in root.tables("instruments"):
+        node.allow(*keys_of("instrument"))
+        instruments.append(Instrument(instrument_id, read_vector(node, INSTRUMENT_UNITS, ())))
+        given: dict[str, float] = {}
+        for name, (key, units) in _ACCURACY.items():
+            sigma = node.sigmas(key, units, 1)
+            if sigma is not None:
+                given[name] = float(sigma[0])
+        if "distance_slope" in given and "distance" not in given:
+            raise node.error("sigma_distance_mm is missing; the sigma of a distance is mm + ppm", "sigma_distance_ppm")
+        if given:
+            accuracies[instrument_id] = Accuracy(**given)
+    return tuple(instruments), accuracies
+
+
+def read_setups(root: Node, instruments: tuple[str, ...], accuracies: Mapping[str, Accuracy]) -> tuple[Setup, ...]:
+    """The tables [setups.*]; centring is the instrument's where they do not say."""
+    setups = []
+    for setup_id, node in root.tables("setups"):
+        node.allow(*keys_of("setup"))
+        instrument_id = None
+        if node.has("instrument"):
+            instrument_id = node.reference("instrument", instruments, "instrument")
+        usual = accuracies.get(instrument_id or "", Accuracy())
+        sigmas = []
+        for key, value in (("sigma_centring_mm", usual.centring), ("sigma_height_mm", usual.height)):
+            sigma = node.number(key, float(from_si(value, "mm")))
+            if sigma < 0:
+                raise node.error(f"found {sigma:g}; a sigma is positive, or 0 for none", key)
+            sigmas.append(sigma / 1000.0)
+        setups.append(Setup(setup_id, instrument_id, node.flag("levelled", True), *sigmas))
+    return tuple(setups)
+
+
+def vertical_sections(vertical: Vertical, bearings: Bearings) -> list[Section]:
+    """[vertical] and [bearings], where they are not as usual."""
+    sections: list[Section] = []
+    tilt = vector_to_toml(vertical.tilt, TILT_UNITS, "vertical")
+    usual = Vertical()
+    plain = not vertical.tilt.free and not np.any(vertical.tilt.values) and vertical.radius is None
+    if not plain or not np.array_equal(vertical.up_in_world, usual.up_in_world):
+        radius = {} if vertical.radius is None else {"radius_m": vertical.radius}
+        sections.append((("vertical",), {"up_in_world": vertical.up_in_world.tolist(), **radius, **tilt}))
+    if bearings != Bearings():
+        sections.append((("bearings",), {"zero": bearings.zero, "clockwise": bearings.clockwise}))
+    return sections
+
+
+def instrument_sections(
+    instruments: tuple[Instrument, ...], setups: tuple[Setup, ...], accuracies: Mapping[str, Accuracy]
+) -> list[Section]:
+    """[instruments.*] and [setups.*]."""
+    sections: list[Section] = []
+    for instrument in instruments:
+        path = ("instruments", instrument.instrument_id)
+        values = vector_to_toml(instrument.parameters, INSTRUMENT_UNITS, ".".join(path))
+        given = asdict(accuracies[instrument.instrument_id]) if instrument.instrument_id in accuracies else {}
+        for name, sigma in given.items():
+            if sigma:
+                key, units = _ACCURACY[name]
+                values[f"{key}_{units[0]}"] = float(from_si(sigma, units[0]))
+        sections.append((path, values))
+    for setup in setups:
+        values = {} if setup.instrument_id is None else {"instrument": setup.instrument_id}
+        values |= {"levelled": setup.levelled, "sigma_centring_mm": float(from_si(setup.centring_sigma, "mm"))}
+        values["sigma_height_mm"] = float(from_si(setup.height_sigma, "mm"))
+        sections.append((("setups", setup.setup_id), values))
+    return sections
+
+
+def setup_problem(setup_id: str, setups: tuple[Setup, ...]) -> str | None:
+    """Why ``setup_id`` names no setup, or None."""
+    known = [setup.setup_id for setup in setups]
+    if setup_id in known:
+        return None
+    return f"unknown setup {setup_id!r}; {suggestion(setup_id, known)}; setups are listed as [setups.{setup_id}]"

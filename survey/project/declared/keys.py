@@ -1,0 +1,73 @@
+"""How a table of ``survey.toml`` is declared: its keys with their kind, unit, default and meaning.
+
+Readers allow the keys that a declaration names and no others; the reference and the schema for editors are made from
+the same declarations (``survey.project.reference``, ``survey.schema``). What there is stands in ``survey.project.declared.declarations``.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+ValueKind = Literal[
+    "text", "choice", "flag", "whole", "number", "numbers", "matrix", "names", "sigma", "table"
+]  # fmt: skip
+REQUIRED = object()
+"""The default of a key that must be there."""
+NOTHING = None
+"""The default of a key that may be absent and then says nothing."""
+_UNITS = ("mm2", "mm", "m", "arcsec", "mgon", "cc", "deg", "px", "ppm")
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key. size: numbers in a list, rows of a square matrix, components of a sigma (one number for all, or a list).
+
+    choices: words allowed, of names too; refers: the table whose ids are allowed; least: of a number;
+    positive: above zero; table: name of the declaration of what stands below it.
+    """
+
+    name: str
+    kind: ValueKind
+    what: str
+    default: Any = NOTHING
+    size: tuple[int, ...] = ()
+    choices: tuple[str, ...] = ()
+    refers: str = ""
+    least: int | None = None
+    positive: bool = False
+    table: str = ""
+
+    @property
+    def unit(self) -> str:
+        """The unit that the name ends with, empty where it has none."""
+        return next((unit.replace("mm2", "mm²") for unit in _UNITS if self.name.endswith(f"_{unit}")), "")
+
+
+@dataclass(frozen=True)
+class Declared:
+    """A table. path: where it stands in the file, ``ID`` for an id of the user's; several may share one path by ``of``.
+
+    of: key and word that choose this declaration among those of one path. free_keys: what keys of the user's own hold.
+    """
+
+    name: str
+    path: str
+    what: str
+    keys: tuple[Key, ...] = field(default=())
+    of: tuple[str, str] | None = None
+    free_keys: Key | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the keys."""
+        return tuple(key.name for key in self.keys)
+
+
+def vector_keys_declared(units: dict[str, str], said: dict[str, str], free: tuple[str, ...]) -> tuple[Key, ...]:
+    """The keys of named scalars with units (``survey.project.declared.vectors``): which are free, values, sigmas of priors."""
+    names = tuple(units)
+    keys = [Key("free", "names", f"which of {', '.join(names)} are unknown", default=list(free), choices=names)]
+    keys.append(Key("sigma", "table", "a prior: sigmas of the values given, under the same keys", table="vector_sigma"))
+    for name in names:
+        full = name if units[name] == "1" else f"{name}_{units[name]}"
+        keys.append(Key(full, "number", said[name]))
+    return tuple(keys)

@@ -1,0 +1,131 @@
+"""The lens of a camera in ``survey.toml``."""
+
+from typing import Any
+
+import numpy as np
+
+from adjust.lenses.models import MODELS
+from adjust.model.survey import FloatArray, LensParameter, Tie, VectorPrior
+from survey.folder.text import suggestion
+from survey.project.declared.declarations import keys_of
+from survey.project.declared.node import Node
+from survey.project.tables.covariance import covariance_problem
+
+# Without these a lens images nothing: they are never zero by silence.
+_ESSENTIAL = {
+    "brown": ("fx", "fy", "u0", "v0"),
+    "fisheye": ("fx", "fy", "u0", "v0"),
+    "brown_backward": ("c",),
+    "brown_backward_dbat": ("c", "px", "py"),
+    "aicon": ("ck",),
+}
+
+
+def read_lens(node: Node) -> LensParameter:
+    """The table [cameras.*.lens]."""
+    node.allow(*keys_of("lens"))
+    model = node.choice("model", MODELS)
+    names = MODELS[model].names
+    free = node.references("free", names, f"parameter of the model {model}")
+    ties = _ties(node, names, free)
+    values = _values(node, model, names, free, ties)
+    pixel_size_mm = node.number("pixel_size_mm", positive=True) if node.has("pixel_size_mm") else None
+    if MODELS[model].in_mm and pixel_size_mm is None:
+        raise node.error(f"pixel_size_mm is missing; the model {model} is in millimetres", "pixel_size_mm")
+    return LensParameter(model, free, values, _prior(node, names, free), ties, pixel_size_mm, _balance(node, model))
+
+
+def _balance(node: Node, model: str) -> float:
+    """The radius where AICON's radial distortion is zero, mm."""
+    if node.has("balance_radius_mm") and model != "aicon":
+        raise node.error('only the model "aicon" has a balance radius; remove it', "balance_radius_mm")
+    return node.number("balance_radius_mm", 0.0)
+
+
+def _known(node: Node, names: tuple[str, ...]) -> None:
+    for name in node.values:
+        if name not in names:
+            raise node.error(f"unknown lens parameter; {suggestion(name, names)}", name)
+
+
+def _values(
+    node: Node, model: str, names: tuple[str, ...], free: tuple[str, ...], ties: tuple[Tie, ...]
+) -> FloatArray | None:
+    table = node.table("values")
+    _known(table, names)
+    tied = {tie.name for tie in ties}
+    for name in _ESSENTIAL[model]:
+        if name in table.values or name in tied or (not table.values and name in free):
+            continue
+        raise table.error(f"{name!r} has no value; give it here" + ("" if table.values else " or make it free"), name)
+    if not table.values:
+        return None
+    return np.array([table.number(name, 0.0) for name in names])
+
+
+def _prior(node: Node, names: tuple[str, ...], free: tuple[str, ...]) -> VectorPrior | None:
+    table = node.table("prior")
+    _known(table, names)
+    if not table.values:
+        return None
+    has_matrix = node.has("prior_covariance")
+    means, sigmas = [], []
+    for name in table.values:
+        if name not in free:
+            raise table.error("has a prior but is not free; add it to 'free' or remove the prior", name)
+        entry = table.table(name)
+        entry.allow(*keys_of("lens_prior"))
+        means.append(entry.number("value"))
+        if has_matrix and entry.has("sigma"):
+            raise entry.error("prior_covariance is given too; keep one of the two", "sigma")
+        if not has_matrix:
+            if not entry.has("sigma"):
+                raise entry.error("a prior needs its sigma; add it")
+            sigmas.append(entry.number("sigma", positive=True))
+    k = len(means)
+    cov = node.numbers("prior_covariance", (k, k)) if has_matrix else np.diag(np.array(sigmas) ** 2)
+    problem = covariance_problem(cov[None])
+    if problem:
+        raise node.error(f"{problem[1]}; correct the matrix", "prior_covariance")
+    return VectorPrior(tuple(table.values), np.array(means), cov)
+
+
+def _ties(node: Node, names: tuple[str, ...], free: tuple[str, ...]) -> tuple[Tie, ...]:
+    table = node.table("tie")
+    _known(table, names)
+    ties = []
+    for name in table.values:
+        entry = table.table(name)
+        entry.allow(*keys_of("lens_tie"))
+        to = entry.reference("to", names, "lens parameter")
+        if to == name or to in table.values:
+            raise entry.error(f"{to!r} is tied itself; tie to a parameter that is not", "to")
+        if name in free:
+            raise table.error("is tied and free; remove it from 'free' or remove the tie", name)
+        ties.append(Tie(name, to, entry.number("factor", 1.0)))
+    return tuple(ties)
+
+
+def lens_to_toml(lens: LensParameter) -> dict[str, Any]:
+    """The table that ``read_lens`` reads."""
+    names = MODELS[lens.model].names
+    table: dict[str, Any] = {"model": lens.model, "free": list(lens.free)}
+    if lens.values is not None:
+        table["values"] = dict(zip(names, lens.values.tolist(), strict=True))
+    if lens.prior is not None:
+        is_diagonal = not (lens.prior.cov - np.diag(np.diagonal(lens.prior.cov))).any()
+        sigmas = np.sqrt(np.diagonal(lens.prior.cov)).tolist()
+        means = lens.prior.mean.tolist()
+        table["prior"] = {
+            name: {"value": mean, "sigma": sigma} if is_diagonal else {"value": mean}
+            for name, mean, sigma in zip(lens.prior.names, means, sigmas, strict=True)
+        }
+        if not is_diagonal:
+            table["prior_covariance"] = lens.prior.cov.tolist()
+    if lens.ties:
+        table["tie"] = {tie.name: {"to": tie.to, "factor": tie.factor} for tie in lens.ties}
+    if lens.pixel_size_mm is not None:
+        table["pixel_size_mm"] = lens.pixel_size_mm
+    if lens.balance_radius_mm:
+        table["balance_radius_mm"] = lens.balance_radius_mm
+    return table

@@ -1,0 +1,229 @@
+"""A survey as the sections of ``survey.toml``, the inverse of ``owners``, ``kinds``, ``lenses`` and ``poses``."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from adjust.model.errors import SurveyError
+from adjust.model.survey import (
+    Camera,
+    FloatArray,
+    PointParameter,
+    PoseParameter,
+    Station,
+    Survey,
+    Table,
+    Target,
+    VectorParameter,
+)
+from survey.folder.units import from_si
+from survey.project.declared.bodies import body_sections
+from survey.project.declared.closures import closure_sections
+from survey.project.declared.instruments import instrument_sections, vertical_sections
+from survey.project.declared.lenses import lens_to_toml
+from survey.project.declared.owners import GEOMETRY_UNITS, geometry_key
+from survey.project.declared.poses import quaternion_wxyz
+from survey.project.declared.targets import WARP
+from survey.project.declared.tolerances import tolerance_sections
+from survey.project.declared.toml_text import Section
+from survey.project.declared.vectors import check_vector
+from survey.project.project import FORMAT, AdjustmentOptions, Sigmas, SpotsRequest
+from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind
+
+
+def survey_sections(survey: Survey, kinds: Mapping[str, TargetKind], sigmas: Sigmas) -> list[Section]:
+    """The sections of what there is and of the datum."""
+    sections: list[Section] = []
+    for camera in survey.cameras:
+        sections += _camera(camera)
+    for station in survey.stations:
+        sections += _station(station)
+    for table in survey.tables:
+        sections.append((("tables", table.table_id), _table(table, sigmas.tables.get(table.table_id))))
+    for target in survey.targets:
+        sections += _target(target, kinds[target.target_id])
+    if survey.points:
+        sections.append((("points",), {point.point_id: _point(point.x_in_world) for point in survey.points}))
+    sections += vertical_sections(survey.vertical, survey.bearings)
+    sections += instrument_sections(survey.instruments, survey.setups, sigmas.instruments)
+    sections += body_sections(survey.beams, survey.surfaces)
+    datum: dict[str, Any] = {"kind": survey.datum.kind}
+    datum |= {"points": survey.datum.points} if survey.datum.points else {}
+    datum |= {"stations": survey.datum.stations} if survey.datum.stations else {}
+    return [*sections, (("datum",), datum)]
+
+
+def head_section(title: str, tie_points: bool) -> Section:
+    """The keys before the first table."""
+    return (), {"format": FORMAT, "title": title, "tie_points": tie_points}
+
+
+def option_sections(options: AdjustmentOptions, request: SpotsRequest | None, sigmas: Sigmas) -> list[Section]:
+    """The sections [spots], [sigmas], [adjustment], [closures] and [tolerances]."""
+    sections: list[Section] = []
+    if request is not None:
+        spots: dict[str, Any] = {"cameras": request.cameras, "diameter_px": request.diameter_px}
+        spots["gate_px"] = request.gate_px
+        if request.epochs is not None:
+            spots["epochs"] = request.epochs
+        sections.append((("spots",), spots))
+    if sigmas.image_px is not None:
+        sections.append((("sigmas",), {"image_px": sigmas.image_px}))
+    flags: dict[str, Any] = {"reject_blocks": options.reject_blocks, "reject_points": options.reject_points}
+    flags["reject_pairs"] = options.reject_pairs
+    if options.variance_components:
+        flags["variance_components"] = True
+    if options.sigmas is not None:
+        flags["sigmas"] = options.sigmas
+    if options.pairs != "poses":
+        flags["pairs"] = options.pairs
+    sections.append((("adjustment",), {"alpha": options.alpha, **flags}))
+    sections += closure_sections(options.closures)
+    if options.identification:
+        sections.append((("identification",), dict(options.identification)))
+    return sections + tolerance_sections(options.tolerances)
+
+
+def pose_to_toml(pose: PoseParameter, where: str) -> dict[str, Any]:
+    """The table that ``read_pose`` reads; empty for a free pose without start."""
+    result: dict[str, Any] = {} if pose.treatment == "free" else {"treatment": pose.treatment}
+    if pose.held:
+        result["held"] = pose.held
+    if pose.value is not None:
+        result["translation_mm"] = from_si(pose.value.translation(), "mm").tolist()
+        result["rotation_quaternion_wxyz"] = quaternion_wxyz(pose.value.rotation())
+    if pose.treatment != "prior":
+        return result
+    if pose.prior_cov is None:
+        raise SurveyError(f"{where}: a prior without covariance cannot be written; give it one")
+    cov = _without_vague_rows(pose.prior_cov)
+    if np.count_nonzero(cov) > 6:
+        return {**result, "covariance_rad_m": cov.tolist()}
+    sigma = np.sqrt(np.diagonal(cov))
+    result["sigma_rotation_arcsec"] = from_si(sigma[:3], "arcsec").tolist()
+    result["sigma_translation_mm"] = from_si(sigma[3:], "mm").tolist()
+    return result
+
+
+def _without_vague_rows(cov: FloatArray) -> FloatArray:
+    """``cov`` with zeros beside every infinite variance: what stands there has no meaning."""
+    result = cov.copy()
+    for i in np.flatnonzero(np.isinf(np.diagonal(cov))).tolist():
+        result[i, :] = result[:, i] = 0.0
+        result[i, i] = np.inf
+    return result
+
+
+def _poses(poses: Mapping[str, PoseParameter], where: str) -> dict[str, Any]:
+    """Poses by key, those that say nothing left out."""
+    tables = {key: pose_to_toml(pose, f"{where}.{key}") for key, pose in poses.items()}
+    return {key: table for key, table in tables.items() if table}
+
+
+def _epochs(path: tuple[str, ...], poses: Mapping[str, PoseParameter]) -> list[Section]:
+    if not poses:
+        return []
+    where = ".".join((*path, "epochs"))
+    return [((*path, "epochs"), {key: pose_to_toml(pose, f"{where}.{key}") for key, pose in poses.items()})]
+
+
+def _camera(camera: Camera) -> list[Section]:
+    path = ("cameras", camera.camera_id)
+    values = {"station": camera.station_id, "image_size_px": camera.image_size}
+    poses = _poses({"station_from_camera": camera.station_from_camera}, ".".join(path))
+    return [(path, values | poses), ((*path, "lens"), lens_to_toml(camera.lens))]
+
+
+def _station(station: Station) -> list[Section]:
+    path = ("stations", station.station_id)
+    values: dict[str, Any] = {"motion": station.motion}
+    poses = {"world_from_station": station.world_from_station}
+    if station.motion == "table":
+        values["table"] = station.table_id
+        poses["mount_from_station"] = station.mount_from_station
+    return [(path, values | _poses(poses, ".".join(path))), *_epochs(path, station.epochs)]
+
+
+def _table(table: Table, sigma: FloatArray | None) -> dict[str, Any]:
+    values: dict[str, Any] = {"axes": table.axes}
+    if sigma is not None:
+        values["sigma_arcsec"] = from_si(sigma, "arcsec").tolist()
+    values |= _poses({"world_from_table": table.world_from_table}, f"tables.{table.table_id}")
+    geometry, where = table.geometry, f"tables.{table.table_id}.geometry"
+    check_vector(geometry, where)
+    numbers = {
+        geometry_key(name): float(from_si(value, GEOMETRY_UNITS[name]))
+        for name, value in zip(geometry.names, geometry.values, strict=True)
+    }
+    values["geometry"] = {"free": geometry.free, **numbers}
+    if geometry.prior is not None:
+        sigmas = zip(geometry.prior.names, np.sqrt(np.diagonal(geometry.prior.cov)), strict=True)
+        values["geometry_sigma"] = {geometry_key(n): float(from_si(s, GEOMETRY_UNITS[n])) for n, s in sigmas}
+    return values
+
+
+def _target(target: Target, kind: TargetKind) -> list[Section]:
+    path = ("targets", target.target_id)
+    values = {**_kind(target.target_id, kind), "motion": target.motion}
+    if target.station_id is not None:
+        values["station"] = target.station_id
+    values |= _poses({"pose": target.carrier_from_target}, ".".join(path))
+    if target.warp is not None:
+        values["warp"] = _warp(target.warp, f"targets.{target.target_id}.warp")
+    return [(path, values), *_epochs(path, target.epochs)]
+
+
+def _warp(warp: VectorParameter, where: str) -> dict[str, Any]:
+    check_vector(warp, where)
+    if warp.names != WARP or warp.free not in ((), WARP) or (warp.prior and warp.prior.names != WARP):
+        raise SurveyError(f"{where}: the two components are free, held or known together, else they cannot be written")
+    numbers = {f"{name}_mm": float(from_si(value, "mm")) for name, value in zip(WARP, warp.values, strict=True)}
+    sigma = np.sqrt(np.diagonal(warp.prior.cov)) if warp.prior else None
+    return {
+        "free": bool(warp.free),
+        **numbers,
+        **({"sigma_mm": from_si(sigma, "mm").tolist()} if sigma is not None else {}),
+    }
+
+
+def points_file(target_id: str) -> str:
+    """The file of a point list."""
+    return f"{target_id}_points.csv"
+
+
+def _kind(target_id: str, kind: TargetKind) -> dict[str, Any]:
+    def mm(x: float) -> float:
+        return float(from_si(x, "mm"))
+
+    match kind:
+        case Checkerboard():
+            values = {"columns": kind.columns, "rows": kind.rows, "square_mm": mm(kind.square_m)}
+            return {"kind": "checkerboard", **values}
+        case Charuco():
+            values = {"squares_x": kind.squares_x, "squares_y": kind.squares_y, "square_mm": mm(kind.square_m)}
+            values["marker_mm"] = mm(kind.marker_m)
+            return {"kind": "charuco", **values, "dictionary": kind.dictionary, "legacy": kind.legacy}
+        case MarkerGrid():
+            values = {"columns": kind.columns, "rows": kind.rows, "marker_mm": mm(kind.marker_m)}
+            values |= {"gap_mm": mm(kind.gap_m), "first_id": kind.first_id}
+            return {"kind": "marker_grid", **values, "dictionary": kind.dictionary}
+        case MarkerBlock():
+            markers = {str(marker): from_si(kind.corners[marker], "mm").tolist() for marker in sorted(kind.corners)}
+            return {"kind": "marker_block", "dictionary": kind.dictionary, "markers": markers}
+        case PointList():
+            return {"kind": "points", "file": points_file(target_id)}
+
+
+def _point(point: PointParameter) -> dict[str, Any]:
+    result: dict[str, Any] = {} if point.treatment == "free" else {"treatment": point.treatment}
+    if point.held:
+        result["held"] = point.held
+    if point.value is not None:
+        result["x_mm"] = from_si(point.value, "mm").tolist()
+    if point.treatment == "prior" and point.prior_cov is not None:
+        cov = _without_vague_rows(point.prior_cov)
+        if np.count_nonzero(cov) > 3:
+            return {**result, "covariance_mm2": from_si(cov, "mm2").tolist()}
+        result["sigma_mm"] = from_si(np.sqrt(np.diagonal(cov)), "mm").tolist()
+    return result

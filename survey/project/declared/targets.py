@@ -1,0 +1,148 @@
+"""Targets of ``survey.toml``, and what of them a program can find."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+
+from adjust.model.survey import FloatArray, Target, VectorParameter, VectorPrior
+from survey.folder.text import suggestion
+from survey.folder.units import to_si
+from survey.project.declared.declarations import DECLARATIONS, keys_of
+from survey.project.declared.node import Node
+from survey.project.declared.owners import read_epochs
+from survey.project.declared.poses import read_pose
+from survey.project.tables.reading import Layout, read_table
+from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind
+
+_KINDS = tuple(d.of[1] for d in DECLARATIONS if d.path == "targets.ID" and d.of is not None)
+_MOST_ON_BOARD = 250_000  # squares or markers
+WARP = ("warp_x", "warp_y")
+POINTS_LAYOUT = Layout("points of a target", ("point_id",), ("x_mm", "y_mm", "z_mm"))
+
+
+def read_targets(
+    root: Node, station_ids: tuple[str, ...], camera_ids: tuple[str, ...], inputs: dict[str, str]
+) -> tuple[tuple[Target, ...], dict[str, TargetKind], dict[str, tuple[str, ...]]]:
+    """The targets under [targets.*], their kinds, and the cameras that may see those that name some.
+
+    The hashes of the files of point lists are added to ``inputs``.
+    """
+    targets, kinds, seen_by = [], {}, {}
+    for target_id, node in root.tables("targets"):
+        kind_name = node.choice("kind", _KINDS)
+        node.allow(*keys_of(f"target_{kind_name}"))
+        name = node.choice("motion", ("fixed", "epoch"), "fixed")
+        motion: Literal["fixed", "epoch"] = "epoch" if name == "epoch" else "fixed"
+        kind = _points(node, inputs) if kind_name == "points" else _READERS[kind_name](node)
+        point_ids, x_in_target = kind.points()
+        targets.append(
+            Target(
+                target_id,
+                point_ids,
+                x_in_target,
+                node.reference("station", station_ids, "station") if node.has("station") else None,
+                motion,
+                read_pose(node.table("pose")),
+                read_epochs(node, motion == "fixed"),
+                _warp(node.table("warp"), kind_name) if node.has("warp") else None,
+            )
+        )
+        kinds[target_id] = kind
+        if node.has("cameras"):
+            seen_by[target_id] = node.references("cameras", camera_ids, "camera")
+    return tuple(targets), kinds, seen_by
+
+
+def _metres(node: Node, key: str) -> float:
+    return float(to_si(node.number(key, positive=True), "mm"))
+
+
+def _counts(node: Node, keys: tuple[str, str], smallest: int) -> tuple[int, int]:
+    """How many there are across and down; refused where no board can have so many."""
+    across, down = (node.integer(key, smallest) for key in keys)
+    if across * down > _MOST_ON_BOARD:
+        raise node.error(f"found {across} x {down}; a board has at most {_MOST_ON_BOARD}", keys[0])
+    return across, down
+
+
+def _checkerboard(node: Node) -> TargetKind:
+    return Checkerboard(*_counts(node, ("columns", "rows"), 2), _metres(node, "square_mm"))
+
+
+def _dictionary(node: Node) -> str:
+    from survey.project.dictionaries import dictionary_names  # brings in OpenCV, which few projects need here
+
+    name, known = node.text("dictionary"), dictionary_names()
+    if name.upper().removeprefix("DICT_") not in known:
+        raise node.error(f"unknown dictionary {name!r}; {suggestion(name.upper(), known)}", "dictionary")
+    return name
+
+
+def _charuco(node: Node) -> TargetKind:
+    square, marker = _metres(node, "square_mm"), _metres(node, "marker_mm")
+    if marker >= square:
+        raise node.error("the marker is not smaller than the square; correct marker_mm or square_mm", "marker_mm")
+    columns, rows = _counts(node, ("squares_x", "squares_y"), 2)
+    return Charuco(columns, rows, square, marker, _dictionary(node), node.flag("legacy", False))
+
+
+def _marker_grid(node: Node) -> TargetKind:
+    return MarkerGrid(
+        *_counts(node, ("columns", "rows"), 1),
+        _metres(node, "marker_mm"),
+        _metres(node, "gap_mm"),
+        _dictionary(node),
+        node.integer("first_id", 0, 0),
+    )
+
+
+def _marker_block(node: Node) -> TargetKind:
+    markers = node.table("markers")
+    corners: dict[int, FloatArray] = {}
+    for key in markers.values:
+        if not (key.isascii() and key.isdecimal() and len(key) < 10) or int(key) in corners:
+            raise markers.error("expected the number of a marker, each once", key)
+        corners[int(key)] = to_si(markers.numbers(key, (4, 3)), "mm")
+    if not corners:
+        raise node.error("no markers; write markers = { 7 = [[x, y, z], ... four corners in mm] }", "markers")
+    return MarkerBlock(corners, _dictionary(node))
+
+
+_READERS: dict[str, Callable[[Node], TargetKind]] = {
+    "checkerboard": _checkerboard,
+    "charuco": _charuco,
+    "marker_grid": _marker_grid,
+    "marker_block": _marker_block,
+}
+
+
+def _points(node: Node, inputs: dict[str, str]) -> TargetKind:
+    name = node.text("file")
+    folder = node.file.parent
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise node.error(f"found {name!r}; the file must lie inside the project folder", "file")
+    if not path.is_file():
+        raise node.error(f"the file {name!r} does not exist in {folder}; create it or correct the name", "file")
+    table = read_table(path, POINTS_LAYOUT)
+    inputs[path.relative_to(folder).as_posix()] = table.digest
+    ids = table.unique_ids("point_id")
+    if not ids:
+        raise table.error(0, "the table has no points; a target needs at least one")
+    x_mm = np.stack([table.numbers(column) for column in POINTS_LAYOUT.numbers], axis=1)
+    return PointList(ids, to_si(x_mm, "mm"))
+
+
+def _warp(node: Node, kind_name: str) -> VectorParameter:
+    if kind_name == "marker_block":
+        raise node.error(f"a target of kind {kind_name!r} is no flat board and has no warp; remove it")
+    node.allow(*keys_of("warp"))
+    free = WARP if node.flag("free", True) else ()
+    values = np.array([to_si(node.number(f"{name}_mm", 0.0), "mm") for name in WARP])
+    sigma = node.sigmas("sigma", ("mm",), 2)
+    if sigma is None:
+        return VectorParameter(WARP, values, free)
+    if not free:
+        raise node.error("the warp has a sigma but is not free; write free = true or remove the sigma", "sigma_mm")
+    return VectorParameter(WARP, values, free, VectorPrior(WARP, values, np.diag(sigma**2)))

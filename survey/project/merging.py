@@ -1,0 +1,239 @@
+"""Two project folders as one: what is new is put behind what is there, and every line remembers where it came from."""
+
+import csv
+import io
+import re
+import shutil
+import tomllib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from adjust.model.errors import SurveyError
+from survey.folder.replacing import copy_folder
+from survey.folder.text import atomic_write, decode, read_bytes, suggestion
+from survey.project.declared.node import read_toml
+from survey.project.declared.toml_lines import KeyPath, key_lines
+from survey.project.declared.toml_text import toml_text
+from survey.project.detected import ImageKey, file_of
+from survey.project.exclusions import EXCLUSIONS_FILE, appended, read_exclusions
+from survey.project.project import DEFINITION_FILE, FORMAT, IMAGES_FOLDER, OBSERVATIONS_FOLDER, Project
+from survey.project.reading import LAYOUTS, read
+from survey.project.tables.reading import read_table
+
+_KINDS = ("cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces")
+Origin = tuple[Path, int]
+
+
+@dataclass(eq=False)
+class Merged:
+    """A merged project under construction in ``place``.
+
+    origins: of every line of a merged file, by its path in the project. entries: paths that differ from the old ones.
+    new_ids: what NEW defines, by kind. rows: number of new rows by table.
+    """
+
+    folder: Path
+    new: Path
+    place: Path
+    origins: dict[str, list[Origin]] = field(default_factory=dict)
+    entries: list[str] = field(default_factory=list)
+    new_ids: dict[str, list[str]] = field(default_factory=dict)
+    rows: dict[str, int] = field(default_factory=dict)
+
+    def translated(self, error: SurveyError) -> SurveyError:
+        """The error with the files and lines that the user knows instead of those of the merged project."""
+        message = str(error)
+        for name, lines in self.origins.items():
+            where = re.escape(str(self.place / name))
+            if re.search(where, message):
+                message = _renumbered(r"(already in )line (\d+)", message, lines)
+            message = _renumbered(rf"(){where}:(\d+)", message, lines)
+        return type(error)(message.replace(str(self.place), str(self.folder)))
+
+
+def _renumbered(pattern: str, message: str, lines: Sequence[Origin]) -> str:
+    def found(match: re.Match[str]) -> str:
+        return match[1] + _where(lines, int(match[2]))
+
+    return re.sub(pattern, found, message)
+
+
+def _where(lines: Sequence[Origin], line: int) -> str:
+    path, number = lines[min(line, len(lines)) - 1]
+    return f"{path}:{number}"
+
+
+def merge(folder: Path, new: Path, place: Path) -> Merged:
+    """Write the merged survey.toml and observations into ``place``; raises SurveyError for what cannot be added."""
+    merged = Merged(folder, new, place)
+    if not new.is_dir():
+        raise SurveyError(f"{new}: no such folder; give a folder with observations/ and, for new stations, survey.toml")
+    if new.resolve() == folder.resolve():
+        raise SurveyError(f"{new}: is the project itself; give the folder that holds what is new")
+    _merge_definition(merged)
+    _merge_tables(merged)
+    _take_images(merged)
+    if not merged.rows and not any(merged.new_ids.values()):
+        raise SurveyError(f"{new}: nothing to add; put tables into {new}/{OBSERVATIONS_FOLDER}, such as pairs.csv")
+    return merged
+
+
+def _merge_definition(merged: Merged) -> None:
+    old_path, new_path = merged.folder / DEFINITION_FILE, merged.new / DEFINITION_FILE
+    text = decode(old_path, read_bytes(old_path)[0])
+    text += "" if text.endswith("\n") else "\n"
+    origins: list[Origin] = [(old_path, i + 1) for i in range(text.count("\n"))]
+    if new_path.is_file():
+        added, lines = _new_sections(merged, new_path, key_lines(text), tomllib.loads(text))
+        text, origins = text + added, origins + lines
+        merged.entries.append(DEFINITION_FILE)
+        try:
+            tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise SurveyError(
+                f"{old_path}: nothing can be added below its tables ({error}); write them as [stations.ID], not as one "
+                "line in braces"
+            ) from error
+    merged.origins[DEFINITION_FILE] = origins
+    atomic_write(merged.place / DEFINITION_FILE, text)
+
+
+def _new_sections(
+    merged: Merged, path: Path, old_lines: Mapping[KeyPath, int], old: Mapping[str, Any]
+) -> tuple[str, list[Origin]]:
+    """What NEW's survey.toml adds, as text, with the line in NEW of every line."""
+    root, _ = read_toml(path)
+    out, lines = f"\n# added from {merged.new.name}\n", [(path, 1), (path, 1)]
+    for key in root.values:
+        if key == "format" and root.values[key] != FORMAT:
+            raise root.error(f"found {root.values[key]}; this program reads format {FORMAT}", key)
+        if key in ("format", "title"):
+            continue
+        if key not in _KINDS:
+            raise root.error("cannot be added, it belongs to the project as a whole; change it there", key)
+        for name, node in root.tables(key):
+            if name in old.get(key, {}):
+                before = f"{merged.folder / DEFINITION_FILE}:{old_lines.get((key, name), 1)}"
+                raise node.error(f"stands already in {before}; give what is new a name of its own, or leave it out")
+            _take_point_list(merged, node.values)
+            try:
+                out += toml_text([((key, name), node.values)]) + "\n"
+            except (TypeError, ValueError) as error:
+                raise node.error(f"holds a value that no project knows ({error})") from error
+            line = root.lines.get((key, name), 1)
+            lines += [(path, line), *((path, root.lines.get((key, name, k), line)) for k in node.values), (path, line)]
+            merged.new_ids.setdefault(key, []).append(name)
+    return out, lines
+
+
+def _take_point_list(merged: Merged, entry: Mapping[str, Any]) -> None:
+    """The file that a target of points names."""
+    name = entry.get("file")
+    if not isinstance(name, str) or not (merged.new / name).is_file():
+        return
+    if (merged.folder / name).exists():
+        raise SurveyError(f"{merged.new / name}: {merged.folder / name} is there already; give it another name")
+    (merged.place / name).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy2(merged.new / name, merged.place / name)
+    merged.entries.append(name)
+
+
+def _merge_tables(merged: Merged) -> None:
+    old, target = merged.folder / OBSERVATIONS_FOLDER, merged.place / OBSERVATIONS_FOLDER
+    if old.is_dir():
+        copy_folder(old, target)
+    target.mkdir(exist_ok=True)
+    for path in sorted((merged.folder / name for name in point_files(merged.folder)), key=str):
+        _link_into(path, merged)
+    source = merged.new / OBSERVATIONS_FOLDER
+    for path in sorted(source.iterdir()) if source.is_dir() else []:
+        if path.suffix not in (".csv", ".parquet") or path.name.startswith("."):
+            continue
+        if path.name == EXCLUSIONS_FILE:
+            atomic_write(target / path.name, appended(old / path.name, read_exclusions(source)[0]))
+            merged.entries.append(f"{OBSERVATIONS_FOLDER}/{path.name}")
+            continue
+        if path.stem not in LAYOUTS:
+            raise SurveyError(f"{path}: unknown table {path.stem!r}; {suggestion(path.stem, LAYOUTS)}")
+        read_table(path, LAYOUTS[path.stem])  # its own faults, with its own lines
+        if path.suffix == ".parquet" or (old / f"{path.stem}.parquet").exists():
+            raise SurveyError(f"{path}: Parquet tables cannot be added to; write both tables as CSV")
+        _merge_table(merged, old / path.name, path, target / path.name)
+        merged.entries.append(f"{OBSERVATIONS_FOLDER}/{path.name}")
+
+
+def read_copy(place: Path, project: Project, folder: Path) -> Project:
+    """Read what was made of ``project`` in ``place``, as it will be at ``folder``; images that are not copied count."""
+    copy = read(place)
+    points = Counter[ImageKey]()
+    for block in copy.survey.image_blocks:
+        points[block.camera_id, block.epoch_id] += len(block.uv)
+    new = {
+        key: replace(file_of(path, path.relative_to(place).as_posix()), status="given", n_image_points=points[key])
+        for key, path in copy.images.items()
+        if key not in project.images
+    }
+    return replace(
+        copy, folder=folder, title=project.title, images={**copy.images, **project.images},
+        detected={**project.detected, **new}, image_notes=project.image_notes,
+        notes=tuple(note.replace(str(place), str(folder)) for note in copy.notes),
+    )  # fmt: skip
+
+
+def point_files(folder: Path) -> list[str]:
+    """Point lists that the old survey.toml names; the merged project is read with them."""
+    definition = tomllib.loads(decode(folder / DEFINITION_FILE, read_bytes(folder / DEFINITION_FILE)[0]))
+    targets = definition.get("targets", {})
+    return [t["file"] for t in targets.values() if isinstance(t, dict) and isinstance(t.get("file"), str)]
+
+
+def _link_into(path: Path, merged: Merged) -> None:
+    copy = merged.place / path.relative_to(merged.folder)
+    if path.is_file() and not copy.exists():
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, copy)
+
+
+def _merge_table(merged: Merged, old: Path, new: Path, target: Path) -> None:
+    new_header, new_rows = table_rows(new)
+    old_header, old_rows = table_rows(old) if old.is_file() else (new_header, [])
+    header = [*old_header, *(name for name in new_header if name not in old_header)]
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    origins: list[Origin] = [(old if old.is_file() else new, 1)]
+    for path, names, rows in ((old, old_header, old_rows), (new, new_header, new_rows)):
+        place = {name: i for i, name in enumerate(names)}
+        order = [place.get(name) for name in header]
+        for line, row in rows:
+            writer.writerow(["" if i is None else row[i] for i in order])
+            origins.append((path, line))
+    merged.origins[f"{OBSERVATIONS_FOLDER}/{new.name}"] = origins
+    merged.rows[new.stem] = len(new_rows)
+    atomic_write(target, stream.getvalue())
+
+
+def table_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Header, and the rows with their lines; what is there was read as a table before."""
+    reader = csv.reader(io.StringIO(decode(path, read_bytes(path)[0]), newline=""), strict=True)
+    header = next(reader)
+    return header, [(reader.line_num, row) for row in reader if row]
+
+
+def _take_images(merged: Merged) -> None:
+    source = merged.new / IMAGES_FOLDER
+    paths = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else []
+    if paths and "image_points" not in merged.rows:
+        raise SurveyError(
+            f"{source}: images without {merged.new / OBSERVATIONS_FOLDER}/image_points.csv; detect their targets first"
+        )
+    for path in paths:
+        name = path.relative_to(merged.new)
+        if (merged.folder / name).exists():
+            raise SurveyError(f"{path}: {merged.folder / name} is there already; give the epoch another name")
+        (merged.place / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, merged.place / name)
+        merged.entries.append(name.as_posix())

@@ -1,0 +1,207 @@
+"""What a project folder holds, as frozen values."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from gtsam import Rot3
+
+from adjust.model.observations import Closure, FrameRef
+from adjust.model.survey import FloatArray, IntArray, Survey
+from survey.project.detected import DetectedImage
+from survey.project.exclusions import Exclusion
+from survey.project.targets import TargetKind
+from survey.solution.quantities import SigmaKind
+from survey.solution.tolerances import Tolerance
+
+FORMAT = 1
+DEFINITION_FILE = "survey.toml"
+OBSERVATIONS_FOLDER = "observations"
+IMAGES_FOLDER = "images"
+RESULTS = "results"
+
+
+@dataclass(frozen=True)
+class SpotsRequest:
+    """Light spots that ``detect`` looks for in ``cameras``.
+
+    epochs: None for every image of these cameras in which no target is expected. diameter_px: smallest and largest.
+    gate_px: how far from its prediction a spot may lie to be taken for a beacon.
+    """
+
+    cameras: tuple[str, ...]
+    epochs: tuple[str, ...] | None = None
+    diameter_px: tuple[float, float] = (2.0, 12.0)
+    gate_px: float = 15.0
+
+
+@dataclass(frozen=True, eq=False)
+class SpotBlock:
+    """Spots that one camera saw at one epoch, not yet identified: ``spot_ids`` n, uv (n, 2) px, cov (n, 2, 2) px^2."""
+
+    camera_id: str
+    epoch_id: str
+    spot_ids: tuple[str, ...]
+    uv: FloatArray
+    cov: FloatArray
+
+
+@dataclass(frozen=True)
+class AdjustmentOptions:
+    """How the project is adjusted and reported: the tables [adjustment], [tolerances.NAME] and [identification].
+
+    alpha: error probability of the tests. reject_blocks: leave mis-detected images out of the start, then test them.
+    reject_points: leave gross errors among the image points out, and list them. reject_pairs: the same for measured
+    pairs and single observations of all other kinds. variance_components: estimate the variance of every group.
+    sigmas: of all that is estimated, as the observations' own sigmas say (a_priori) or times sigma0 (a_posteriori);
+    None where the project does not say: every job then has its usual ones, ``adjust`` a posteriori.
+    tolerances: what is demanded of the results. identification: who measured what, where and with
+    what, printed in the report as it is. pairs: by the poses of their frames, or with all their loops closed, through
+    the mounts of ``closures``.
+    """
+
+    alpha: float = 0.05
+    reject_blocks: bool = True
+    reject_points: bool = True
+    reject_pairs: bool = True
+    variance_components: bool = False
+    sigmas: SigmaKind | None = None
+    pairs: Literal["poses", "closed"] = "poses"
+    closures: tuple[Closure, ...] = ()
+    tolerances: tuple[Tolerance, ...] = ()
+    identification: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Foot:
+    """A screw or edge that carries a body, at (x, y) m in the body's plane."""
+
+    name: str
+    x: float
+    y: float
+
+
+@dataclass(frozen=True, eq=False)
+class AlignmentTask:
+    """A body that is to be turned until its axes are those of ``onto`` (the table [align.ID]).
+
+    onto_from_body: the rotation wanted. pitch: m per turn of the feet's screws. tolerance: rad, about each axis.
+    """
+
+    task_id: str
+    body: FrameRef
+    onto: FrameRef
+    onto_from_body: Rot3 = field(default_factory=Rot3)
+    feet: tuple[Foot, ...] = ()
+    pitch: float | None = None
+    tolerance: float | None = None
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """What an instrument's readings are worth where the table gives no sigma, in SI; None where not given.
+
+    angle: of an angle between two directions; sqrt(2) that of a direction where it is not given. distance, slope: the
+    sigma of a distance d is ``distance + slope * d``. levelling: m per square root of a kilometre of levelled line.
+    target_centring: of targets set up over points. centring, height: of the instrument, for its setups.
+    """
+
+    direction: float | None = None
+    angle: float | None = None
+    zenith: float | None = None
+    azimuth: float | None = None
+    distance: float | None = None
+    distance_slope: float = 0.0
+    height_difference: float | None = None
+    levelling: float | None = None
+    target_centring: float = 0.0
+    centring: float = 0.0
+    height: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Sigmas:
+    """A priori sigmas where the tables give none, in SI.
+
+    image_px: of image points, None where not given. scale: factor on all sigmas of a group.
+    tables: (axes,) rad by table id. instruments: by instrument id.
+    """
+
+    image_px: float | None = None
+    scale: Mapping[str, float] = field(default_factory=dict)
+    tables: Mapping[str, FloatArray] = field(default_factory=dict)
+    instruments: Mapping[str, Accuracy] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePointsWhere:
+    """Where the image points of ``Survey.image_blocks`` stand: one array of lines (rows of Parquet) per block."""
+
+    file: Path | None = None
+    lines: tuple[IntArray, ...] = ()
+
+    def where(self, block: int, point: int) -> str:
+        """``file:line`` of a point of a block, for messages."""
+        return f"{self.file}:{self.lines[block][point]}"
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """An exclusion in force, and how many images, image points, spots without a name and readings it meets."""
+
+    exclusion: Exclusion
+    n_images: int = 0
+    n_image_points: int = 0
+    n_spots: int = 0
+    n_readings: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Definition:
+    """What survey.toml says, and the images that are there; ``survey`` has no observations.
+
+    images: by (camera_id, epoch_id), in natural order. inputs: sha256 of every file read, by its path in the folder.
+    target_cameras: the cameras in whose images a target is looked for, where not in all.
+    """
+
+    folder: Path
+    title: str
+    tie_points: bool
+    survey: Survey
+    target_kinds: Mapping[str, TargetKind]
+    images: Mapping[tuple[str, str], Path]
+    spots_request: SpotsRequest | None
+    options: AdjustmentOptions
+    sigmas: Sigmas
+    inputs: Mapping[str, str]
+    target_cameras: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    alignment_tasks: tuple[AlignmentTask, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Project(Definition):
+    """A definition whose ``survey`` holds the observations too; ``spots`` are image points without identity.
+
+    The covariances of the observations contain ``sigmas.scale`` already. left_out: what people excluded; it is not used
+    in ``survey``, nor among the ``spots``. n_left_out: how many observations that are, each once. n_unused_in_files:
+    those that only a table marks ``used = false``. detected: what is known of every image and its points. to_detect:
+    images whose points are to be found anew. notes: exclusions that name nothing. image_notes: images that are new,
+    have changed or are gone.
+    """
+
+    spots: tuple[SpotBlock, ...] = ()
+    image_points_where: ImagePointsWhere = ImagePointsWhere()
+    left_out: tuple[LeftOut, ...] = ()
+    n_left_out: int = 0
+    n_unused_in_files: int = 0
+    detected: Mapping[tuple[str, str], DetectedImage] = field(default_factory=dict)
+    to_detect: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+    image_notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        """What is in the folder, in a few lines: a notebook prints it."""
+        from survey.notebook.steps import project_text  # the adjustment is not needed to read a folder
+
+        return project_text(self)

@@ -1,0 +1,374 @@
+"""Reading a project folder."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adjust.model.errors import SurveyError
+from adjust.model.survey import Datum, FloatArray, Point, PointParameter, Survey
+from survey.folder.locking import settled
+from survey.folder.text import id_problem, natural_key, suggestion
+from survey.project.declared.alignment_tasks import read_alignment_tasks
+from survey.project.declared.bodies import read_beams, read_surfaces
+from survey.project.declared.closures import read_closures
+from survey.project.declared.declarations import keys_of
+from survey.project.declared.instruments import read_bearings, read_instruments, read_setups, read_vertical
+from survey.project.declared.node import Node, read_toml
+from survey.project.declared.owners import read_cameras, read_stations, read_tables
+from survey.project.declared.poses import flat_point, read_point
+from survey.project.declared.targets import read_targets
+from survey.project.declared.tolerances import read_tolerances
+from survey.project.detected import DetectedImage, ImageKey, ImageNews, image_news, read_detected
+from survey.project.exclusions import EXCLUSIONS, EXCLUSIONS_FILE, Exclusion, in_force, read_exclusions
+from survey.project.images import find_images
+from survey.project.observed import Observed, union, without
+from survey.project.project import (
+    DEFINITION_FILE,
+    FORMAT,
+    IMAGES_FOLDER,
+    OBSERVATIONS_FOLDER,
+    AdjustmentOptions,
+    Definition,
+    ImagePointsWhere,
+    LeftOut,
+    Project,
+    Sigmas,
+    SpotsRequest,
+)
+from survey.project.sought import sought_in
+from survey.project.tables.differences import DIFFERENCES, DIFFERENCES_COVARIANCE, read_differences
+from survey.project.tables.geometric import (
+    ALIGNMENTS,
+    LASER_SPOTS,
+    LEVELS,
+    ON_SURFACES,
+    read_alignments,
+    read_laser_spots,
+    read_levels,
+    read_on_surfaces,
+)
+from survey.project.tables.image_points import IMAGE_POINTS, SPOTS, read_image_blocks, read_spots, world_names
+from survey.project.tables.measurements import (
+    ANGLES,
+    COORDINATES,
+    COORDINATES_COVARIANCE,
+    DISTANCES,
+    read_angles,
+    read_coordinates,
+    read_distances,
+)
+from survey.project.tables.pairs import PAIRS, read_pairs
+from survey.project.tables.reading import Layout, Table, read_table
+from survey.project.tables.references import Names
+from survey.project.tables.terrestrial import (
+    KINDS,
+    TERRESTRIAL,
+    TERRESTRIAL_COVARIANCE,
+    read_reading_covariances,
+    read_readings,
+)
+from survey.solution.quantities import SIGMA_KINDS
+
+LAYOUTS = {
+    layout.name: layout
+    for layout in (
+        IMAGE_POINTS, SPOTS, ANGLES, PAIRS, DISTANCES, COORDINATES, COORDINATES_COVARIANCE, TERRESTRIAL,
+        TERRESTRIAL_COVARIANCE, DIFFERENCES, DIFFERENCES_COVARIANCE, LEVELS, ALIGNMENTS, LASER_SPOTS, ON_SURFACES,
+    )
+}  # fmt: skip
+_GROUPS = (
+    "image", "table", "pair", "distance", "coordinates", *KINDS, "coordinate_difference", "level", "alignment",
+    "laser", "surface",
+)  # fmt: skip
+_EXTRA = {  # tables that only make sense beside another
+    "coordinates_covariance": "coordinates",
+    "terrestrial_covariance": "terrestrial",
+    "coordinate_differences_covariance": "coordinate_differences",
+}
+
+
+def read_definition(folder: Path) -> Definition:
+    """Read survey.toml and list the images; raises SurveyError."""
+    with settled(Path(folder)):
+        return _read_definition(Path(folder))[0]
+
+
+def read(folder: Path) -> Project:
+    """Read a whole project folder; tables of observations that are not there yet are empty. Raises SurveyError.
+
+    What ``exclusions.csv`` leaves out is not used. ``notes`` say which of its rows name nothing, ``image_notes``
+    which images are not those any more that the points come from.
+    """
+    project = read_all(folder)
+    return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
+
+
+def read_all(folder: Path) -> Project:
+    """:func:`read`, with what is excluded as if it were not."""
+    with settled(Path(folder)):
+        definition, root = _read_definition(Path(folder))
+        place = definition.folder / OBSERVATIONS_FOLDER
+        tables = _read_tables(place)
+        _, digest = read_exclusions(place)
+        known = read_detected(place)
+        images = _image_news(definition, tables, known)
+    project = _observed(definition, root, tables)
+    hashes = dict(sorted({**project.inputs, f"{OBSERVATIONS_FOLDER}/{EXCLUSIONS_FILE}": digest}.items()))
+    if digest:
+        project = dataclasses.replace(project, inputs=hashes)
+    notes = images.notes(definition.folder)
+    detected = {**known, **(images.same or {})}
+    return dataclasses.replace(project, detected=detected, to_detect=images.to_detect, image_notes=notes)
+
+
+def leaving_out(project: Project, exclusions: Iterable[Exclusion]) -> Project:
+    """A project without what is excluded; what names nothing is said in its notes."""
+    exclusions = tuple(exclusions)
+    if not exclusions:
+        return dataclasses.replace(project, n_unused_in_files=_n_unused(project.survey))
+    observed = Observed(project.survey, project.spots)
+    path = project.folder / OBSERVATIONS_FOLDER / EXCLUSIONS_FILE
+    found, hits, notes = [], [], []
+    for one in exclusions:
+        hit = observed.hits(one.name, one.at)
+        if hit:
+            hits.append(hit)
+        else:
+            notes.append(f"{path}:{one.line}: {one.name} is left out, but nothing has that name; "
+                         f"{observed.near(one.name)}")  # fmt: skip
+        found.append(LeftOut(one, len(hit.images), hit.n_image_points, hit.n_spots, hit.n_readings))
+    survey, spots = without(project.survey, project.spots, hits)
+    every = union(hits)
+    in_files = _n_unused(survey) - (every.n - every.n_spots)
+    return dataclasses.replace(
+        project, survey=survey, spots=spots, left_out=tuple(found), n_left_out=every.n, n_unused_in_files=in_files,
+        notes=(*project.notes, *notes),
+    )  # fmt: skip
+
+
+def _n_unused(survey: Survey) -> int:
+    kinds = (survey.table_readings, survey.pairs, survey.distances, survey.coordinates, survey.readings, survey.levels,
+             survey.coordinate_differences, survey.alignments, survey.laser_spots, survey.on_surfaces)  # fmt: skip
+    images = sum(int((~b.used).sum()) for b in survey.image_blocks if b.used is not None)
+    return images + sum(not o.used for kind in kinds for o in kind)
+
+
+def _image_news(
+    definition: Definition, tables: Mapping[str, Table], known: Mapping[ImageKey, DetectedImage]
+) -> ImageNews:
+    if not definition.images and not known:
+        return ImageNews()
+    pointed: set[ImageKey] = set()
+    for name in ("image_points", "spots"):
+        if name in tables:
+            camera, epoch = (tables[name].text(c) for c in ("camera_id", "epoch_id"))
+            pairs = np.unique(camera.codes * len(epoch.names) + epoch.codes).tolist()
+            pointed |= {(camera.names[i // len(epoch.names)], epoch.names[i % len(epoch.names)]) for i in pairs}
+    if not known and not pointed:
+        return ImageNews()  # nothing was looked at yet
+    sought = {key: one.digest() for key, one in sought_in(definition).items()}
+    return image_news(definition.images, known, pointed, sought)
+
+
+def _observed(definition: Definition, root: Node, tables: dict[str, Table]) -> Project:
+    """All that the tables hold."""
+    _check_scales(root, definition.sigmas, tables)
+    survey = _with_tie_points(definition, tables, flat_point(root.integer("dimensions", 1, 3)))
+    _check_datum_points(root, survey)
+    names, sigmas = Names.of(survey), definition.sigmas
+    points = tables.get("image_points")
+    blocks, where = read_image_blocks(points, names, sigmas) if points is not None else ((), ImagePointsWhere())
+    for extra_name, main in _EXTRA.items():
+        if extra_name in tables and main not in tables:
+            problem = f"there is no table of {main} beside it; add {main}.csv or remove this file"
+            raise tables[extra_name].error(0, problem)
+    extra, coordinates = tables.get("coordinates_covariance"), tables.get("coordinates")
+    survey = dataclasses.replace(
+        survey,
+        image_blocks=blocks,
+        table_readings=read_angles(tables["table_angles"], names, sigmas) if "table_angles" in tables else (),
+        pairs=read_pairs(tables["pairs"], names, sigmas) if "pairs" in tables else (),
+        distances=read_distances(tables["distances"], names, sigmas) if "distances" in tables else (),
+        coordinates=read_coordinates(coordinates, extra, names, sigmas) if coordinates is not None else (),
+    )
+    survey = dataclasses.replace(survey, **_terrestrial_and_geometric(tables, Names.of(survey), sigmas))
+    fields = {field.name: getattr(definition, field.name) for field in dataclasses.fields(Definition)}
+    hashes = {table.path.relative_to(definition.folder).as_posix(): table.digest for table in tables.values()}
+    fields |= {"survey": survey, "inputs": dict(sorted(({**definition.inputs, **hashes}).items()))}
+    spots = read_spots(tables["spots"], names, sigmas) if "spots" in tables else ()
+    return Project(**fields, spots=spots, image_points_where=where)
+
+
+def _terrestrial_and_geometric(tables: dict[str, Table], names: Names, sigmas: Sigmas) -> dict[str, Any]:
+    """The fields of the survey that these tables fill; ``names`` know the readings of the turntables already."""
+    found: dict[str, Any] = {}
+    if "terrestrial" in tables:
+        found["readings"] = read_readings(tables["terrestrial"], names, sigmas)
+    if "terrestrial_covariance" in tables:
+        found["reading_covariances"] = read_reading_covariances(
+            tables["terrestrial_covariance"], found["readings"]
+        )
+    if "coordinate_differences" in tables:
+        extra = tables.get("coordinate_differences_covariance")
+        found["coordinate_differences"] = read_differences(tables["coordinate_differences"], extra, names, sigmas)
+    for name, read_one in (("levels", read_levels), ("alignments", read_alignments), ("laser_spots", read_laser_spots),
+                           ("on_surfaces", read_on_surfaces)):  # fmt: skip
+        if name in tables:
+            found[name] = read_one(tables[name], names, sigmas)
+    return found
+
+
+def _read_definition(folder: Path) -> tuple[Definition, Node]:
+    path = folder / DEFINITION_FILE
+    if not path.is_file():
+        raise SurveyError(f"{path}: there is no such file; a project folder holds a {DEFINITION_FILE}")
+    root, digest = read_toml(path)
+    _check_format(root)
+    root.allow(*keys_of("root"))
+    inputs = {DEFINITION_FILE: digest}
+    tables, table_sigmas = read_tables(root)
+    stations = read_stations(root, tuple(table.table_id for table in tables))
+    station_ids = tuple(station.station_id for station in stations)
+    cameras = read_cameras(root, station_ids)
+    camera_ids = tuple(camera.camera_id for camera in cameras)
+    targets, kinds, seen_by = read_targets(root, station_ids, camera_ids, inputs)
+    dimensions = root.integer("dimensions", 1, 3)
+    if dimensions > 3:
+        raise root.error(f"found {dimensions}; a network has 1 (levelling), 2 (plane) or 3 dimensions", "dimensions")
+    points = tuple(Point(point_id, read_point(node, dimensions)) for point_id, node in root.tables("points"))
+    datum = _read_datum(root.table("datum"), station_ids)
+    instruments, accuracies = read_instruments(root)
+    table_ids = tuple(table.table_id for table in tables)
+    survey = Survey(
+        cameras, stations, tables, targets, points, datum=datum, vertical=read_vertical(root.table("vertical")),
+        bearings=read_bearings(root.table("bearings")), instruments=instruments,
+        setups=read_setups(root, tuple(i.instrument_id for i in instruments), accuracies),
+        beams=read_beams(root, station_ids, table_ids), surfaces=read_surfaces(root),
+    )  # fmt: skip
+    tie_points = root.flag("tie_points", False)
+    if not tie_points:
+        _check_datum_points(root, survey)
+    definition = Definition(
+        folder=folder,
+        title=root.text("title", ""),
+        tie_points=tie_points,
+        survey=survey,
+        target_kinds=kinds,
+        images=find_images(folder / IMAGES_FOLDER, camera_ids),
+        spots_request=_read_spots_request(root.table("spots"), camera_ids) if root.has("spots") else None,
+        options=_read_options(root),
+        sigmas=dataclasses.replace(_read_sigmas(root.table("sigmas"), table_sigmas), instruments=accuracies),
+        inputs=inputs,
+        target_cameras=seen_by,
+        alignment_tasks=read_alignment_tasks(root, survey),
+    )
+    return definition, root
+
+
+def _check_format(root: Node) -> None:
+    if not root.has("format"):
+        raise root.error(f"the key 'format' is missing; the first line is 'format = {FORMAT}'", "format")
+    if root.integer("format", 0) != FORMAT:
+        raise root.error(f"found {root.values['format']}; this program reads format {FORMAT}", "format")
+
+
+def _read_datum(node: Node, station_ids: tuple[str, ...]) -> Datum:
+    node.allow(*keys_of("datum"))
+    kind = node.choice("kind", ("given", "inner"), "given")
+    for key in ("points", "stations"):
+        if kind == "given" and node.has(key):
+            raise node.error('only the datum of kind "inner" names points and stations; remove this', key)
+    stations = node.references("stations", station_ids, "station", ())
+    return Datum("inner" if kind == "inner" else "given", node.names("points", ()), stations)
+
+
+def _check_datum_points(root: Node, survey: Survey) -> None:
+    node = root.table("datum")
+    node.references("points", (point.point_id for point in survey.points), "point", ())
+
+
+def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest:
+    node.allow(*keys_of("spots"))
+    cameras = node.references("cameras", camera_ids, "camera")
+    epochs = node.names("epochs") if node.has("epochs") else None
+    for i, epoch_id in enumerate(epochs or ()):
+        problem = id_problem(epoch_id)
+        if problem:
+            raise node.error(problem, "epochs", i)
+    smallest, largest = node.numbers("diameter_px", (2,), [2.0, 12.0]).tolist()
+    if not 0 < smallest <= largest:
+        raise node.error(f"found [{smallest:g}, {largest:g}]; expected [smallest, largest]", "diameter_px")
+    return SpotsRequest(cameras, epochs, (smallest, largest), node.number("gate_px", 15.0, positive=True))
+
+
+def _read_options(root: Node) -> AdjustmentOptions:
+    """The tables [adjustment], [closures], [tolerances] and [identification]."""
+    node, said = root.table("adjustment"), root.table("identification")
+    node.allow(*keys_of("adjustment"))
+    alpha = node.number("alpha", 0.05, positive=True)
+    if alpha >= 1:
+        raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
+    flags = {name: node.flag(name, True) for name in ("reject_blocks", "reject_points", "reject_pairs")}
+    identification = tuple((key, said.text(key)) for key in said.values)
+    flags["variance_components"] = node.flag("variance_components", False)
+    asked = node.choice("sigmas", SIGMA_KINDS) if node.has("sigmas") else ""
+    sigmas = next((kind for kind in SIGMA_KINDS if kind == asked), None)
+    form, closures = read_closures(root)
+    return AdjustmentOptions(
+        alpha, **flags, sigmas=sigmas, pairs=form, closures=closures, tolerances=read_tolerances(root),
+        identification=identification,
+    )  # fmt: skip
+
+
+def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:
+    node.allow(*keys_of("sigmas"))
+    scale = node.table("scale")
+    image_px = node.number("image_px", positive=True) if node.has("image_px") else None
+    return Sigmas(image_px, {group: scale.number(group, positive=True) for group in scale.values}, tables)
+
+
+def _check_scales(root: Node, sigmas: Sigmas, tables: dict[str, Table]) -> None:
+    found = {name for table in tables.values() for name in table.text("group").names if name}
+    for group in sigmas.scale:
+        if group not in (*_GROUPS, *found):
+            problem = f"unknown group; {suggestion(group, (*_GROUPS, *sorted(found)))}"
+            raise root.table("sigmas").table("scale").error(problem, group)
+
+
+def _read_tables(folder: Path) -> dict[str, Table]:
+    """All tables in the folder by name; raises where a file is no known table or one is there twice."""
+    tables: dict[str, Table] = {}
+    paths = sorted(folder.iterdir()) if folder.is_dir() else []
+    for path in paths:
+        if path.suffix not in (".csv", ".parquet") or path.name.startswith("."):
+            continue
+        if path.stem == EXCLUSIONS.name:
+            continue
+        layout: Layout | None = LAYOUTS.get(path.stem)
+        if layout is None:
+            near = suggestion(path.stem, (*LAYOUTS, EXCLUSIONS.name))
+            raise SurveyError(f"{path}: unknown table {path.stem!r}; {near}")
+        if path.stem in tables:
+            raise SurveyError(f"{path}: {tables[path.stem].path.name} is there too; keep one of the two")
+        tables[path.stem] = read_table(path, layout)
+    return tables
+
+
+def _with_tie_points(definition: Definition, tables: dict[str, Table], unknown: PointParameter) -> Survey:
+    """The survey with the world points that only the observations name, where the project allows that."""
+    survey = definition.survey
+    if not definition.tie_points:
+        return survey
+    found = world_names(tables["image_points"]) if "image_points" in tables else set()
+    for table, columns in (
+        ("distances", ("from_id", "to_id")), ("coordinates", ("point_id",)), ("on_surfaces", ("point_id",)),
+        ("terrestrial", ("from_id", "to_id", "second_id")), ("coordinate_differences", ("from_id", "to_id")),
+    ):  # fmt: skip
+        for column in columns if table in tables else ():
+            found |= {name for name in tables[table].text(column).names if name and not set(name) & set(":@/")}
+    new = found - {point.point_id for point in survey.points} - {"world"}
+    ordered = sorted((name for name in new if not id_problem(name)), key=natural_key)
+    return dataclasses.replace(survey, points=(*survey.points, *(Point(name, unknown) for name in ordered)))

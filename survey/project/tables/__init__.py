@@ -1,0 +1,1 @@
+"""The tables in ``observations/``: their columns, readers and writers."""

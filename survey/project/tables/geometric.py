@@ -1,0 +1,200 @@
+"""Tables of levels, alignments, laser spots and positions on surfaces."""
+
+import numpy as np
+
+from adjust.model.observations import Alignment, FrameRef, LaserSpot, Level, OnSurface
+from adjust.model.survey import FloatArray
+from survey.folder.text import LARGEST_NUMBER, natural_key, suggestion
+from survey.folder.units import to_si
+from survey.project.project import Sigmas
+from survey.project.tables.covariance import covariance_from_sigmas
+from survey.project.tables.quantity_columns import needed, one_of, quantity
+from survey.project.tables.reading import FLAGS, Layout, Table, first_row, group_names
+from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame, read_position
+
+_TILTS = ("arcsec", "mgon", "deg", "mm_per_m")
+LEVELS = Layout(
+    "levels",
+    ("level_id", "frame_id", "axis"),
+    (),
+    FLAGS,
+    (*(f"value_{unit}" for unit in (*_TILTS, "g")), *(f"sigma_{unit}" for unit in (*_TILTS, "g"))),
+)
+ALIGNMENTS = Layout(
+    "alignments",
+    ("alignment_id", "a_id", "axis_a", "b_id", "axis_b"),
+    (),
+    FLAGS,
+    (
+        *(f"value_{i}_{unit}" for i in (1, 2) for unit in ("arcsec", "deg")),
+        *(f"sigma_{i}_{unit}" for i in (1, 2) for unit in ("arcsec", "deg")),
+        "rho_12",
+    ),
+)
+LASER_SPOTS = Layout(
+    "laser_spots",
+    ("spot_id", "beam_id", "epoch_id", "target_id"),
+    ("x_mm", "y_mm"),
+    FLAGS,
+    ("sigma_mm", "sigma_x_mm", "sigma_y_mm", "rho_xy"),
+)
+ON_SURFACES = Layout("on_surfaces", ("surface_id", "point_id"), ("sigma_mm",), FLAGS, ("offset_mm",))
+
+
+def read_axis(table: Table, row: int, column: str, text: str) -> FloatArray:
+    """A unit vector: ``x``, ``-y`` or three numbers with blanks between them."""
+    name, sign = (text[1:], -1.0) if text.startswith("-") else (text, 1.0)
+    if name in ("x", "y", "z"):
+        return np.asarray(sign * np.eye(3)["xyz".index(name)])
+    try:
+        axis = np.array([float(part) for part in text.split()])
+    except ValueError:
+        axis = np.zeros(0)
+    fits = axis.shape == (3,) and bool((np.abs(axis) <= LARGEST_NUMBER).all())
+    length = float(np.linalg.norm(axis)) if fits else 0.0
+    if not length > 0:
+        raise table.error(row, f"{column}: found {text!r}; write x, y, z, -x, -y, -z or three numbers with blanks")
+    return axis if abs(length - 1.0) < 1e-12 else axis / length
+
+
+def axis_text(axis: FloatArray) -> str:
+    """What ``read_axis`` reads."""
+    for sign, prefix in ((1.0, ""), (-1.0, "-")):
+        for i, name in enumerate("xyz"):
+            if np.array_equal(axis, sign * np.eye(3)[i]):
+                return prefix + name
+    return " ".join(repr(float(part)) for part in axis)
+
+
+def read_levels(table: Table, names: Names, sigmas: Sigmas) -> tuple[Level, ...]:
+    """Levels sorted by id; an accelerometer gives the component of gravity along its axis, in g, upwards positive."""
+    ids, axes = table.unique_ids("level_id"), table.text("axis").values()
+    force, force_sigma = table.numbers("value_g"), table.positive("sigma_g")
+    wrong = np.abs(force) >= 1
+    if wrong.any():
+        row = first_row(wrong)
+        raise table.error(row, f"value_g: found {force[row]:g}; along a level axis it lies between -1 and 1")
+    angle = np.arcsin(force)
+    values = one_of(table, {"value": quantity(table, "value", _TILTS), "value_g": angle})
+    with np.errstate(invalid="ignore"):
+        # of asin(f / g): sigma / cos
+        own = {"sigma": quantity(table, "sigma", _TILTS, True), "sigma_g": force_sigma / np.cos(np.nan_to_num(values))}
+    sigma = one_of(table, own)
+    every = np.ones(len(table), dtype=bool)
+    needed(table, values, every, "value: is blank; fill in value_arcsec, value_mm_per_m, value_g or the like")
+    needed(table, sigma, every, "sigma: is blank; fill in sigma_arcsec, sigma_mm_per_m, sigma_g or the like")
+    groups, used = group_names(table, "level"), table.flags("used").tolist()
+    levels = []
+    for row, text in enumerate(table.text("frame_id").values()):
+        frame = _frame(table, row, "frame_id", text, names)
+        axis = read_axis(table, row, "axis", axes[row])
+        scaled = float(sigma[row]) * sigmas.scale.get(groups[row], 1.0)
+        levels.append(Level(ids[row], frame, axis, float(values[row]), scaled, groups[row], used[row]))
+    return tuple(sorted(levels, key=lambda level: natural_key(level.level_id)))
+
+
+def _frame(table: Table, row: int, column: str, text: str, names: Names) -> FrameRef:
+    try:
+        frame = read_frame(text, names)
+        check_epochs(frame, None, names)
+    except NameProblemError as problem:
+        raise table.error(row, f"{column}: {problem}") from problem
+    return frame
+
+
+def read_alignments(table: Table, names: Names, sigmas: Sigmas) -> tuple[Alignment, ...]:
+    """Alignments sorted by id; a component without sigma was not observed, one without value is zero."""
+    ids = table.unique_ids("alignment_id")
+    units = ("arcsec", "deg")
+    values = np.stack([quantity(table, f"value_{i}", units) for i in (1, 2)], axis=1)
+    sigma = np.stack([quantity(table, f"sigma_{i}", units, True) for i in (1, 2)], axis=1)
+    idle = np.isnan(sigma).all(axis=1)
+    if idle.any():
+        raise table.error(first_row(idle), "sigma: the row has none; give sigma_1_arcsec, sigma_2_arcsec or both")
+    lost = np.isnan(sigma) & ~np.isnan(values)
+    if lost.any():
+        row, i = (int(x[0]) for x in np.nonzero(lost))
+        raise table.error(row, f"value_{i + 1}: has no sigma_{i + 1}; add it, or remove the value")
+    rho = _correlation(table, "rho_12")
+    groups, used = group_names(table, "alignment"), table.flags("used").tolist()
+    ends, axes = ([table.text(f"{what}{x}").values() for x in suffixes]
+                  for what, suffixes in (("", ("a_id", "b_id")), ("axis_", ("a", "b"))))  # fmt: skip
+    result = []
+    for row, alignment_id in enumerate(ids):
+        a, b = (_frame(table, row, column, ends[k][row], names) for k, column in enumerate(("a_id", "b_id")))
+        if a == b:
+            raise table.error(row, f"a_id, b_id: both are {ends[0][row]!r}; an alignment joins two different frames")
+        known = ~np.isnan(sigma[row])
+        cov = np.diag(np.where(known, 1.0, np.inf))
+        if known.all():
+            cov = covariance_from_sigmas(sigma[row][None], rho[row : row + 1, None])[0]
+        else:
+            cov[known, known] = sigma[row][known] ** 2
+        cov[np.isfinite(cov)] *= sigmas.scale.get(groups[row], 1.0) ** 2
+        axis_a, axis_b = (read_axis(table, row, f"axis_{x}", axes[k][row]) for k, x in enumerate("ab"))
+        result.append(Alignment(alignment_id, a, axis_a, b, axis_b, np.nan_to_num(values[row]), cov, groups[row],
+                                used[row]))  # fmt: skip
+    return tuple(sorted(result, key=lambda alignment: natural_key(alignment.alignment_id)))
+
+
+def _correlation(table: Table, column: str) -> FloatArray:
+    rho = np.nan_to_num(table.numbers(column))
+    wrong = np.abs(rho) >= 1
+    if wrong.any():
+        row = first_row(wrong)
+        raise table.error(row, f"{column}: found {rho[row]:g}; a correlation lies between -1 and 1")
+    return rho
+
+
+def read_laser_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[LaserSpot, ...]:
+    """Laser spots sorted by id."""
+    ids, epochs = table.unique_ids("spot_id"), table.ids("epoch_id").values()
+    beams, targets = table.text("beam_id").values(), table.text("target_id").values()
+    both = table.positive("sigma_mm")
+    each = np.stack([table.positive("sigma_x_mm"), table.positive("sigma_y_mm")], axis=1)
+    twice = ~np.isnan(both) & ~np.isnan(each).all(axis=1)
+    if twice.any():
+        raise table.error(first_row(twice), "sigma_mm and sigma_x_mm are both given; keep one of the two")
+    sigma = to_si(np.where(np.isnan(each), both[:, None], each), "mm")
+    needed(table, sigma.sum(axis=1), np.ones(len(table), dtype=bool), "sigma: is blank; fill in sigma_mm")
+    cov = covariance_from_sigmas(sigma, _correlation(table, "rho_xy")[:, None])
+    xy = to_si(np.stack([table.numbers("x_mm"), table.numbers("y_mm")], axis=1), "mm")
+    groups, used = group_names(table, "laser"), table.flags("used").tolist()
+    known = {beam.beam_id: beam for beam in names.survey.beams}
+    on_table = {(r.table_id, r.epoch_id) for r in names.survey.table_readings}
+    spots = []
+    for row, spot_id in enumerate(ids):
+        if beams[row] not in known:
+            raise table.error(row, f"beam_id: unknown beam {beams[row]!r}; {suggestion(beams[row], known)}")
+        if targets[row] not in names.target_points:
+            found = suggestion(targets[row], names.target_points)
+            raise table.error(row, f"target_id: unknown target {targets[row]!r}; {found}")
+        beam = known[beams[row]]
+        if beam.carrier_kind == "mount" and (beam.carrier_id, epochs[row]) not in on_table:
+            found = f"table {beam.carrier_id!r} has no reading at epoch {epochs[row]!r}"
+            raise table.error(row, f"epoch_id: {found}; add it to table_angles, or correct the epoch")
+        scaled = cov[row] * sigmas.scale.get(groups[row], 1.0) ** 2
+        spots.append(LaserSpot(spot_id, beams[row], epochs[row], targets[row], xy[row], scaled, groups[row], used[row]))
+    return tuple(sorted(spots, key=lambda spot: natural_key(spot.spot_id)))
+
+
+def read_on_surfaces(table: Table, names: Names, sigmas: Sigmas) -> tuple[OnSurface, ...]:
+    """Positions on surfaces, sorted by surface and position."""
+    surfaces, texts = table.text("surface_id").values(), table.text("point_id").values()
+    offset = to_si(np.nan_to_num(table.numbers("offset_mm")), "mm")
+    sigma = to_si(table.positive("sigma_mm"), "mm")
+    groups, used = group_names(table, "surface"), table.flags("used").tolist()
+    known = {surface.surface_id for surface in names.survey.surfaces}
+    result = []
+    for row, (surface_id, text) in enumerate(zip(surfaces, texts, strict=True)):
+        if surface_id not in known:
+            raise table.error(row, f"surface_id: unknown surface {surface_id!r}; {suggestion(surface_id, known)}")
+        try:
+            position = read_position(text, names)
+            check_epochs(position.frame, None, names)
+        except NameProblemError as problem:
+            raise table.error(row, f"point_id: {problem}") from problem
+        scaled = float(sigma[row]) * sigmas.scale.get(groups[row], 1.0)
+        item = OnSurface(surface_id, position, scaled, float(offset[row]), groups[row], used[row])
+        result.append(((natural_key(surface_id), natural_key(text)), item))
+    return tuple(item for _, item in sorted(result, key=lambda pair: pair[0]))

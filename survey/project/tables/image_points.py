@@ -1,0 +1,188 @@
+"""Tables of image points into one block per camera, epoch and target, without a step per row."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.model.observations import ImageBlock
+from adjust.model.survey import FloatArray, IntArray
+from survey.folder.text import natural_key, suggestion
+from survey.project.project import ImagePointsWhere, Sigmas, SpotBlock
+from survey.project.tables.covariance import covariance_from_sigmas
+from survey.project.tables.reading import Layout, Table, TextColumn, checked_groups, first_row
+from survey.project.tables.references import Names
+
+_SIGMAS = ("sigma_u_px", "sigma_v_px", "rho_uv")
+IMAGE_POINTS = Layout(
+    "image_points",
+    ("epoch_id", "camera_id", "point_id"),
+    ("u_px", "v_px"),
+    ("target_id", "group", "used"),
+    _SIGMAS,
+)
+SPOTS = Layout("spots", ("epoch_id", "camera_id", "spot_id"), ("u_px", "v_px"), (), _SIGMAS)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """The rows of a table as numbers: codes in natural order of names, positions of points, measured values."""
+
+    camera: IntArray
+    epoch: IntArray
+    uv: FloatArray
+    cov: FloatArray
+
+
+def world_names(table: Table) -> set[str]:
+    """Ids of the points without target."""
+    target, point = table.text("target_id"), table.text("point_id")
+    if "" not in target.names:
+        return set()
+    in_world = target.codes == target.names.index("")
+    return {point.names[code] for code in np.unique(point.codes[in_world]).tolist()}
+
+
+def read_image_blocks(table: Table, names: Names, sigmas: Sigmas) -> tuple[tuple[ImageBlock, ...], ImagePointsWhere]:
+    """Blocks by camera, epoch, target (the world's points last) and group; their points in the target's order."""
+    cameras, epochs = table.ids("camera_id"), table.ids("epoch_id")
+    targets, groups = table.text("target_id"), _groups(table)
+    rows = _measured(table, cameras, epochs, names, sigmas, groups)
+    point_idx = _point_positions(table, targets, names)
+    target = _ranks(targets, blank_last=True)
+    group = _ranks(groups)
+    _refuse_duplicates(table, "point_id", rows, target, point_idx)
+    order = np.lexsort((point_idx, group, target, rows.epoch, rows.camera))
+    keys = np.stack([rows.camera, rows.epoch, target, group])[:, order]
+    used = table.flags("used")
+    blocks, lines = [], []
+    for part in _runs(order, keys):
+        row = part[0]
+        blocks.append(
+            ImageBlock(
+                cameras.names[cameras.codes[row]],
+                epochs.names[epochs.codes[row]],
+                targets.names[targets.codes[row]] or None,
+                point_idx[part],
+                rows.uv[part],
+                rows.cov[part],
+                None if used[part].all() else used[part],
+                groups.names[groups.codes[row]],
+            )
+        )
+        lines.append(table.lines[part])
+    return tuple(blocks), ImagePointsWhere(table.path, tuple(lines))
+
+
+def read_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[SpotBlock, ...]:
+    """Unidentified spots in blocks by camera and epoch, sorted by id."""
+    cameras, epochs, spots = table.ids("camera_id"), table.ids("epoch_id"), table.ids("spot_id")
+    image = TextColumn(("image",), np.zeros(len(table), dtype=np.int64))
+    rows = _measured(table, cameras, epochs, names, sigmas, image)
+    spot = _ranks(spots)
+    _refuse_duplicates(table, "spot_id", rows, np.zeros(len(table), dtype=np.int64), spot)
+    order = np.lexsort((spot, rows.epoch, rows.camera))
+    keys = np.stack([rows.camera, rows.epoch])[:, order]
+    blocks = []
+    for part in _runs(order, keys):
+        camera_id, epoch_id = (column.names[column.codes[part[0]]] for column in (cameras, epochs))
+        spot_ids = tuple(spots.names[code] for code in spots.codes[part].tolist())
+        blocks.append(SpotBlock(camera_id, epoch_id, spot_ids, rows.uv[part], rows.cov[part]))
+    return tuple(blocks)
+
+
+def _runs(order: IntArray, keys: IntArray) -> list[IntArray]:
+    """The pieces of ``order`` (n,) over which the columns of ``keys`` (k, n) stay the same."""
+    if not len(order):
+        return []
+    return np.split(order, np.flatnonzero((np.diff(keys, axis=1) != 0).any(axis=0)) + 1)
+
+
+def _groups(table: Table) -> TextColumn:
+    groups = checked_groups(table)
+    return TextColumn(tuple(name or "image" for name in groups.names), groups.codes)
+
+
+def _ranks(column: TextColumn, blank_last: bool = False) -> IntArray:
+    """Codes (n,) that sort as the names do, whatever the order of the rows."""
+    order = sorted(set(column.names), key=lambda name: (blank_last and not name, natural_key(name)))
+    rank = {name: i for i, name in enumerate(order)}
+    return np.array([rank[name] for name in column.names], dtype=np.int64)[column.codes]
+
+
+def _measured(
+    table: Table, cameras: TextColumn, epochs: TextColumn, names: Names, sigmas: Sigmas, groups: TextColumn
+) -> _Rows:
+    sizes = {camera.camera_id: camera.image_size for camera in names.survey.cameras}
+    for code, name in enumerate(cameras.names):
+        if name not in sizes:
+            row = first_row(cameras.codes == code)
+            raise table.error(row, f"camera_id: unknown camera {name!r}; {suggestion(name, sizes)}")
+    uv = np.stack([table.numbers("u_px"), table.numbers("v_px")], axis=1)
+    size = np.array([sizes[name] for name in cameras.names], dtype=float).reshape(-1, 2)[cameras.codes]
+    outside = ((uv < -0.5) | (uv > size - 0.5)).any(axis=1)
+    if outside.any():
+        row = first_row(outside)
+        width, height = size[row].astype(int)
+        problem = f"the point ({uv[row, 0]:g}, {uv[row, 1]:g}) px is outside the image of {width} x {height} px"
+        raise table.error(row, f"{problem}; correct the table or image_size_px")
+    scale = np.array([sigmas.scale.get(name, 1.0) for name in groups.names])[groups.codes]
+    return _Rows(_ranks(cameras), _ranks(epochs), uv, _covariances(table, sigmas.image_px, scale))
+
+
+def _covariances(table: Table, default_px: float | None, scale: FloatArray) -> FloatArray:
+    """Covariances (n, 2, 2) px^2, from the sigma columns or, where a row has none, from ``default_px``."""
+    sigma = np.stack([table.positive("sigma_u_px"), table.positive("sigma_v_px")], axis=1)
+    rho = table.numbers("rho_uv")
+    blank = np.isnan(sigma)
+    half = blank.any(axis=1) & (~blank.all(axis=1) | ~np.isnan(rho))
+    if half.any():
+        raise table.error(first_row(half), "sigma_u_px, sigma_v_px: one is missing; give both or leave all blank")
+    wrong = np.abs(rho) >= 1
+    if wrong.any():
+        row = first_row(wrong)
+        raise table.error(row, f"rho_uv: found {rho[row]:g}; a correlation lies between -1 and 1")
+    if blank.any():
+        if default_px is None:
+            problem = "the row has no sigma; fill in sigma_u_px, sigma_v_px, or give [sigmas] image_px in survey.toml"
+            raise table.error(first_row(blank.any(axis=1)), problem)
+        sigma[blank] = default_px
+    return covariance_from_sigmas(sigma * scale[:, None], np.nan_to_num(rho)[:, None])
+
+
+def _point_positions(table: Table, targets: TextColumn, names: Names) -> IntArray:
+    """Position (n,) of every row's point in its target, or among the world's points."""
+    points = table.ids("point_id")
+    pairs, first, inverse = np.unique(
+        targets.codes * len(points.names) + points.codes, return_index=True, return_inverse=True
+    )
+    found = np.empty(len(pairs), dtype=np.int64)
+    for i in np.argsort(first).tolist():
+        target_code, point_code = divmod(int(pairs[i]), len(points.names))
+        target_id, point_id = targets.names[target_code], points.names[point_code]
+        row = int(first[i])
+        if target_id and target_id not in names.target_points:
+            near = suggestion(target_id, names.target_points)
+            raise table.error(row, f"target_id: unknown target {target_id!r}; {near}")
+        known = names.target_points[target_id] if target_id else names.points
+        if point_id not in known:
+            owner = f"target {target_id!r} has no point {point_id!r}" if target_id else f"unknown point {point_id!r}"
+            hint = "" if target_id else f"; list it as [points.{point_id}], or set tie_points = true"
+            raise table.error(row, f"point_id: {owner}; {suggestion(point_id, known)}{hint}")
+        found[i] = known[point_id]
+    return np.asarray(found[inverse.reshape(-1)])
+
+
+def _refuse_duplicates(table: Table, column: str, rows: _Rows, target: IntArray, point: IntArray) -> None:
+    if not len(point):
+        return
+    keys = rows.camera
+    for part in (rows.epoch, target, point):
+        keys = keys * (int(part.max()) + 1) + part
+    order = np.argsort(keys, kind="stable")
+    same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    if len(same):
+        i = same[np.argmin(order[same + 1])]
+        name = table.text(column).values()[order[i]]
+        line = table.lines[order[i]]
+        problem = f"{name!r} stands already in line {line} for this camera, epoch and target; remove one"
+        raise table.error(int(order[i + 1]), f"{column}: {problem}")

@@ -1,0 +1,158 @@
+"""Observations as the columns of their tables, the inverse of ``image_points`` and ``measurements``."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair, TableReading
+from adjust.model.survey import FloatArray, Survey
+from survey.folder.units import from_si
+from survey.project.declared.poses import quaternion_wxyz
+from survey.project.project import SpotBlock
+from survey.project.tables.covariance import sigmas_and_correlations
+from survey.project.tables.measurements import XYZ_RHO, XYZ_SIGMAS
+from survey.project.tables.pairs import COVARIANCE_COLUMNS, QUATERNION, SIGMA_COLUMNS, TRANSLATION
+from survey.project.tables.references import frame_text, position_text
+from survey.project.tables.terrestrial_columns import triple_rows
+from survey.project.tables.writing import Columns
+
+
+def image_point_columns(blocks: Sequence[ImageBlock], survey: Survey) -> Columns:
+    """One row per image point; ``group`` and ``used`` only where they are not as usual."""
+    names: dict[str | None, tuple[str, ...]] = {target.target_id: target.point_ids for target in survey.targets}
+    names[None] = tuple(point.point_id for point in survey.points)
+    sizes = [len(block.uv) for block in blocks]
+    point_ids = [names[block.target_id][i] for block in blocks for i in block.point_idx.tolist()]
+    used = [flag for b in blocks for flag in (b.used.tolist() if b.used is not None else [True] * len(b.uv))]
+    return {
+        "epoch_id": _repeat([block.epoch_id for block in blocks], sizes),
+        "camera_id": _repeat([block.camera_id for block in blocks], sizes),
+        "target_id": _repeat([block.target_id or "" for block in blocks], sizes),
+        "point_id": point_ids,
+        **_measured(blocks),
+        **_group_columns(_repeat([block.group for block in blocks], sizes), used, "image"),
+    }
+
+
+def spot_columns(spots: Sequence[SpotBlock]) -> Columns:
+    """One row per unidentified spot."""
+    sizes = [len(block.uv) for block in spots]
+    return {
+        "epoch_id": _repeat([block.epoch_id for block in spots], sizes),
+        "camera_id": _repeat([block.camera_id for block in spots], sizes),
+        "spot_id": [spot_id for block in spots for spot_id in block.spot_ids],
+        **_measured(spots),
+    }
+
+
+def _measured(blocks: Sequence[ImageBlock] | Sequence[SpotBlock]) -> dict[str, FloatArray]:
+    uv = np.concatenate([np.zeros((0, 2)), *(block.uv for block in blocks)])
+    sigma, rho = sigmas_and_correlations(np.concatenate([np.zeros((0, 2, 2)), *(block.cov for block in blocks)]))
+    columns = np.column_stack([uv, sigma, rho])
+    return dict(zip(("u_px", "v_px", "sigma_u_px", "sigma_v_px", "rho_uv"), columns.T, strict=True))
+
+
+def angle_columns(readings: Sequence[TableReading]) -> Columns:
+    """One row per reading; the second axis blank for a table that has one."""
+    rows = np.full((len(readings), 5), np.nan)
+    for row, reading in zip(rows, readings, strict=True):
+        k = len(reading.angles)
+        sigma, rho = sigmas_and_correlations(reading.cov[None])
+        row[:k] = from_si(reading.angles, "deg")
+        row[2 : 2 + k] = from_si(sigma[0], "arcsec")
+        row[4] = rho[0, 0] if k == 2 else np.nan
+    names = ("axis1_deg", "axis2_deg", "sigma_axis1_arcsec", "sigma_axis2_arcsec", "rho_12")
+    return {
+        "epoch_id": [reading.epoch_id for reading in readings],
+        "table_id": [reading.table_id for reading in readings],
+        **dict(zip(names, rows.T, strict=True)),
+        **_group_columns([reading.group for reading in readings], [True] * len(readings), "table"),
+    }
+
+
+def pair_columns(pairs: Sequence[Pair]) -> Columns:
+    """One row per pair: quaternion, translation of poses, sigmas where they are independent, else the covariance."""
+    sigma_names = (*SIGMA_COLUMNS["rotation"][3], *SIGMA_COLUMNS["translation"][1])
+    names = (*QUATERNION, *TRANSLATION, *sigma_names, *COVARIANCE_COLUMNS)
+    rows = np.full((len(pairs), len(names)), np.nan)
+    for row, pair in zip(rows, pairs, strict=True):
+        is_pose = isinstance(pair.b_from_a, Pose3)
+        rotation = pair.b_from_a.rotation() if isinstance(pair.b_from_a, Pose3) else pair.b_from_a
+        row[:4] = quaternion_wxyz(rotation)
+        if isinstance(pair.b_from_a, Pose3):
+            row[4:7] = from_si(pair.b_from_a.translation(), "mm")
+        k = 6 if is_pose else 3
+        if np.count_nonzero(pair.cov) == k:
+            sigma = np.sqrt(np.diagonal(pair.cov))
+            row[7:10] = from_si(sigma[:3], "arcsec")
+            row[10 : 7 + k] = from_si(sigma[3:], "mm")
+        else:
+            full = np.full((6, 6), np.nan)
+            upper = np.triu_indices(k)
+            full[upper] = pair.cov[upper]
+            row[13:] = full.ravel()
+    columns = {name: column for name, column in zip(names, rows.T, strict=True) if not np.isnan(column).all()}
+    return {
+        "pair_id": [pair.pair_id for pair in pairs],
+        "a_id": [frame_text(pair.a) for pair in pairs],
+        "b_id": [frame_text(pair.b) for pair in pairs],
+        **columns,
+        **_group_columns([pair.group for pair in pairs], [pair.used for pair in pairs], "pair"),
+    }
+
+
+def distance_columns(distances: Sequence[Distance]) -> Columns:
+    """One row per distance."""
+    return {
+        "distance_id": [distance.distance_id for distance in distances],
+        "from_id": [position_text(distance.a) for distance in distances],
+        "to_id": [position_text(distance.b) for distance in distances],
+        "value_m": np.array([distance.value for distance in distances]),
+        "sigma_mm": from_si([distance.sigma for distance in distances], "mm"),
+        **_group_columns([d.group for d in distances], [d.used for d in distances], "distance"),
+    }
+
+
+def coordinate_columns(coordinates: Sequence[Coordinates]) -> tuple[Columns, Columns]:
+    """One row per position, and one row per covariance between positions of the same observation."""
+    rows, set_ids, groups, used = [], [], [], []
+    between: list[tuple[str, str, str, str, str]] = []
+    covariances: list[float] = []
+    alone: set[str] = set()
+    for number, observation in enumerate(coordinates, 1):
+        names = [position_text(position) for position in observation.positions]
+        set_id = observation.set_id or (f"set{number}" if len(names) > 1 or names[0] in alone else "")
+        alone.update(names if not set_id else ())
+        for i, values in enumerate(observation.values):
+            rows.append(triple_rows(values, observation.cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]))
+            set_ids.append(set_id)
+            groups.append(observation.group)
+            used.append(observation.used)
+        for i, j in zip(*np.nonzero(np.triu(observation.cov)), strict=True):
+            if i // 3 != j // 3:
+                between.append((set_id, names[i // 3], "xyz"[i % 3], names[j // 3], "xyz"[j % 3]))
+                covariances.append(float(from_si(observation.cov[i, j], "mm2")))
+    columns = ("x_mm", "y_mm", "z_mm", *XYZ_SIGMAS, *XYZ_RHO)
+    table: dict[str, Sequence[str] | FloatArray] = {
+        "point_id": [position_text(position) for observation in coordinates for position in observation.positions],
+        **dict(zip(columns, np.array(rows).reshape(-1, 9).T, strict=True)),
+        **({"set_id": set_ids} if any(set_ids) else {}),
+        **_group_columns(groups, used, "coordinates"),
+    }
+    ids = ("set_id", "a_id", "a_axis", "b_id", "b_axis")
+    extra: dict[str, Sequence[str] | FloatArray] = {name: [row[i] for row in between] for i, name in enumerate(ids)}
+    return table, {**extra, "covariance_mm2": np.array(covariances)}
+
+
+def _repeat(values: Sequence[str], sizes: Sequence[int]) -> list[str]:
+    return [value for value, size in zip(values, sizes, strict=True) for _ in range(size)]
+
+
+def _group_columns(groups: Sequence[str], used: Sequence[bool], usual: str) -> dict[str, list[str]]:
+    columns = {}
+    if any(group != usual for group in groups):
+        columns["group"] = list(groups)
+    if not all(used):
+        columns["used"] = ["true" if flag else "false" for flag in used]
+    return columns

@@ -1,0 +1,168 @@
+"""The table of measured pairs: relative rotations and poses, with sigmas or covariances."""
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Pair
+from adjust.model.survey import BoolArray, FloatArray
+from adjust.spatial.rotation_forms import euler_from_matrix, tangent_cov_from_euler
+from survey.folder.text import natural_key
+from survey.folder.units import to_si
+from survey.project.declared.poses import rotation_from_euler, rotation_from_quaternion
+from survey.project.project import Sigmas
+from survey.project.tables.covariance import covariance_from_sigmas, covariance_problem
+from survey.project.tables.reading import FLAGS, Layout, Table, first_row, group_names
+from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame
+
+QUATERNION = ("qw", "qx", "qy", "qz")
+EULER = ("euler_x_deg", "euler_y_deg", "euler_z_deg")
+TRANSLATION = ("tx_mm", "ty_mm", "tz_mm")
+_TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
+
+
+def covariance_column(i: int, j: int) -> str:
+    """Column of one element of a pair's covariance, in rad and m."""
+    unit = {0: "rad2", 1: "rad_m", 2: "m2"}[(i >= 3) + (j >= 3)]
+    return f"cov_{_TANGENT[i]}_{_TANGENT[j]}_{unit}"
+
+
+EULER_SIGMAS = [tuple(f"sigma_euler_{a}_{unit}" for a in "xyz") for unit in ("deg", "arcsec")]
+SIGMA_COLUMNS = {
+    "rotation": [("sigma_rotation_deg",) * 3, ("sigma_rotation_arcsec",) * 3]
+    + [tuple(f"sigma_{a}_{unit}" for a in _TANGENT[:3]) for unit in ("deg", "arcsec")]
+    + EULER_SIGMAS,
+    "translation": [("sigma_translation_mm",) * 3, tuple(f"sigma_{a}_mm" for a in _TANGENT[3:])],
+}
+COVARIANCE_COLUMNS = tuple(covariance_column(i, j) for i in range(6) for j in range(6))
+PAIRS = Layout(
+    "pairs",
+    ("pair_id", "a_id", "b_id"),
+    (),
+    FLAGS,
+    QUATERNION
+    + EULER
+    + TRANSLATION
+    + tuple(dict.fromkeys(name for columns in SIGMA_COLUMNS.values() for names in columns for name in names))
+    + COVARIANCE_COLUMNS,
+)
+
+
+def read_pairs(table: Table, names: Names, sigmas: Sigmas) -> tuple[Pair, ...]:
+    """Measured pairs sorted by id: poses where there is a translation, else rotations."""
+    pair_ids = table.unique_ids("pair_id")
+    is_pose = _all_or_none(table, TRANSLATION)
+    rotations = _pair_rotations(table)
+    cov = _pair_covariances(table, is_pose, rotations)
+    groups, used = group_names(table, "pair"), table.flags("used").tolist()
+    translation = to_si(np.stack([table.numbers(name) for name in TRANSLATION], axis=1), "mm")
+    ends = list(zip(table.text("a_id").values(), table.text("b_id").values(), strict=True))
+    pairs = []
+    for row, (a_text, b_text) in enumerate(ends):
+        try:
+            a, b = read_frame(a_text, names), read_frame(b_text, names)
+            check_epochs(a, b, names)
+        except NameProblemError as problem:
+            raise table.error(row, f"a_id, b_id: {problem}") from problem
+        if a == b:
+            raise table.error(row, f"a_id, b_id: both are {a_text!r}; a pair joins two different frames")
+        k = 6 if is_pose[row] else 3
+        b_from_a = Pose3(rotations[row], translation[row]) if is_pose[row] else rotations[row]
+        scaled = cov[row, :k, :k] * sigmas.scale.get(groups[row], 1.0) ** 2
+        pairs.append(Pair(pair_ids[row], a, b, b_from_a, scaled, groups[row], used[row]))
+    return tuple(sorted(pairs, key=lambda pair: natural_key(pair.pair_id)))
+
+
+def _pair_rotations(table: Table) -> list[Rot3]:
+    by_quaternion, by_euler = _all_or_none(table, QUATERNION), _all_or_none(table, EULER)
+    wrong = by_quaternion == by_euler
+    if wrong.any():
+        row = first_row(wrong)
+        found = "twice; keep one" if by_euler[row] else "nowhere; fill in"
+        raise table.error(row, f"the rotation is given {found} of {','.join(QUATERNION)} and {','.join(EULER)}")
+    wxyz = np.stack([table.numbers(name) for name in QUATERNION], axis=1)
+    euler = to_si(np.stack([table.numbers(name) for name in EULER], axis=1), "deg")
+    rotations = []
+    for row in range(len(table)):
+        rotation = rotation_from_quaternion(wxyz[row]) if by_quaternion[row] else rotation_from_euler(euler[row])
+        if rotation is None:
+            length = np.linalg.norm(wxyz[row])
+            raise table.error(row, f"the quaternion qw,qx,qy,qz has length {length:g}, not 1; correct it")
+        rotations.append(rotation)
+    return rotations
+
+
+def _pair_covariances(table: Table, is_pose: BoolArray, rotations: list[Rot3]) -> FloatArray:
+    """Covariances (n, 6, 6) in rad and m, of rotations only in the upper left (3, 3)."""
+    cov = np.zeros((len(table), 6, 6))
+    full = np.stack([table.numbers(name) for name in COVARIANCE_COLUMNS], axis=1)
+    given: BoolArray = np.asarray((~np.isnan(full)).any(axis=1))
+    if given.any():
+        cov[given] = _full_covariances(table, given, is_pose)
+    if not given.all():
+        sigma = np.concatenate([_sigmas(table, "rotation"), _sigmas(table, "translation")], axis=1)
+        sigma[~is_pose, 3:] = np.where(np.isnan(sigma[~is_pose, 3:]), 1.0, np.inf)
+        for name, part in (("rotation", sigma[:, :3]), ("translation", sigma[:, 3:])):
+            bad = ~given & (~np.isfinite(part)).any(axis=1)
+            if bad.any():
+                row = first_row(bad)
+                surplus = "the pair has a sigma of the translation but no translation; remove it"
+                missing = f"the pair has no sigma of the {name}; fill in {SIGMA_COLUMNS[name][1][0]} or the like"
+                raise table.error(row, surplus if np.isinf(part[row]).any() else missing)
+        cov[~given] = covariance_from_sigmas(sigma[~given])
+        _turn_euler_covariances(table, rotations, cov)
+    cov[~is_pose, 3:, :] = 0.0
+    cov[~is_pose, :, 3:] = 0.0
+    for mask, k in ((is_pose, 6), (~is_pose, 3)):
+        problem = covariance_problem(cov[mask][:, :k, :k])
+        if problem:
+            raise table.error(int(np.flatnonzero(mask)[problem[0]]), f"{problem[1]}; correct the cov columns")
+    return cov
+
+
+def _turn_euler_covariances(table: Table, rotations: list[Rot3], cov: FloatArray) -> None:
+    """Where the sigmas are those of Euler angles (R = Rz Ry Rx), turn their covariance into the tangent, in place."""
+    sigmas = np.stack([table.numbers(name) for columns in EULER_SIGMAS for name in columns], axis=1)
+    for row in np.flatnonzero((~np.isnan(sigmas)).any(axis=1)):
+        try:
+            angles = euler_from_matrix(rotations[row].matrix())
+        except SurveyError as error:
+            raise table.error(int(row), f"sigma_euler: {error}; give sigma_rx_arcsec and the like instead") from error
+        cov[row, :3, :3] = tangent_cov_from_euler(angles, cov[row, :3, :3])
+
+
+def _full_covariances(table: Table, given: BoolArray, is_pose: BoolArray) -> FloatArray:
+    """Matrices (n, 6, 6) of the rows ``given``: the upper triangle is needed, the lower one filled in where blank."""
+    full = np.stack([table.numbers(name) for name in COVARIANCE_COLUMNS], axis=1).reshape(-1, 6, 6)
+    upper = np.triu(np.ones((6, 6), dtype=bool))
+    needed = upper & ~(~is_pose[:, None, None] & (np.arange(6) >= 3))
+    missing = given[:, None, None] & needed & np.isnan(full)
+    if missing.any():
+        row, i, j = (int(x[0]) for x in np.nonzero(missing))
+        raise table.error(row, f"{covariance_column(i, j)}: is blank; fill in the whole upper triangle")
+    doubled = given & ~np.isnan(np.concatenate([_sigmas(table, "rotation"), _sigmas(table, "translation")], 1)).all(1)
+    if doubled.any():
+        raise table.error(first_row(doubled), "the covariance and sigmas are both given; keep one of the two")
+    full = np.nan_to_num(np.where(np.isnan(full), full.transpose(0, 2, 1), full))
+    return np.asarray(full[given])
+
+
+def _sigmas(table: Table, part: str) -> FloatArray:
+    """Sigmas (n, 3) rad or m from whichever columns give them; nan where none does."""
+    result = np.full((len(table), 3), np.nan)
+    for columns in SIGMA_COLUMNS[part]:
+        values = to_si(np.stack([table.positive(name) for name in columns], axis=1), columns[0].rpartition("_")[2])
+        twice = ~np.isnan(values).all(axis=1) & ~np.isnan(result).all(axis=1)
+        if twice.any():
+            raise table.error(first_row(twice), f"{columns[0]}: the sigma of the {part} is given twice; keep one")
+        result = np.where(np.isnan(values), result, values)
+    return result
+
+
+def _all_or_none(table: Table, columns: tuple[str, ...]) -> BoolArray:
+    """Rows (n,) in which all ``columns`` are filled; raises where only some are."""
+    filled = np.stack([~np.isnan(table.numbers(name)) for name in columns], axis=1)
+    some = filled.any(axis=1) & ~filled.all(axis=1)
+    if some.any():
+        raise table.error(first_row(some), f"{','.join(columns)}: only some are filled in; give all or none")
+    return np.asarray(filled.all(axis=1))

@@ -1,0 +1,244 @@
+"""The table of readings of total stations, theodolites and levels, and that of their correlations."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from adjust.model.observations import PositionRef, Reading, ReadingCovariance, ReadingKind
+from adjust.model.survey import FloatArray
+from survey.folder.text import choice_hint, natural_key, suggestion
+from survey.folder.units import to_si
+from survey.project.declared.instruments import setup_problem
+from survey.project.project import Accuracy, Sigmas
+from survey.project.tables.covariance import covariance_problem
+from survey.project.tables.quantity_columns import ANGLE_UNITS, dms_angles, one_of, quantity
+from survey.project.tables.reading import FLAGS, Layout, Table, first_row
+from survey.project.tables.references import NameProblemError, Names, check_epochs, read_position
+
+KINDS: tuple[ReadingKind, ...] = (
+    "direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance", "height_difference",
+)  # fmt: skip
+ANGLES = KINDS[:4]
+HEIGHTS = ("instrument_height", "target_height", "second_height")
+TERRESTRIAL = Layout(
+    "terrestrial",
+    ("kind", "from_id", "to_id"),
+    (),
+    ("reading_id", "setup_id", "second_id", "value_dms", *FLAGS),
+    (
+        *(f"value_{unit}" for unit in ("deg", "gon", "m", "mm")),
+        *(f"sigma_{unit}" for unit in (*ANGLE_UNITS, "mm")),
+        *(f"{name}_{unit}" for name in HEIGHTS for unit in ("mm", "m")),
+        "sigma_target_centring_mm",
+        "length_m",
+    ),
+)
+TERRESTRIAL_COVARIANCE = Layout("terrestrial_covariance", ("a_id", "b_id"), ("rho",))
+
+
+def read_readings(table: Table, names: Names, sigmas: Sigmas) -> tuple[Reading, ...]:
+    """Readings sorted by id; a reading without one gets r1, r2 ... by its row."""
+    kinds, reading_ids = _kinds(table), _reading_ids(table)
+    values = _values(table, kinds)
+    heights = [np.nan_to_num(quantity(table, name, ("mm", "m"))) for name in HEIGHTS]
+    setup_ids, groups = table.text("setup_id").values(), table.text("group").values()
+    ends = zip(table.text("from_id").values(), table.text("to_id").values(), strict=True)
+    seconds, used = table.text("second_id").values(), table.flags("used").tolist()
+    own = _own_sigmas(table, kinds)
+    centring = to_si(table.numbers("sigma_target_centring_mm"), "mm")
+    lengths = table.positive("length_m")
+    setups = {setup.setup_id: setup for setup in names.survey.setups}
+    readings = []
+    for row, (from_text, to_text) in enumerate(ends):
+        kind, setup_id = kinds[row], setup_ids[row]
+        _check_setup(table, row, kind, setup_id, names)
+        at, to, second = _positions(table, row, (from_text, to_text, seconds[row]), kind, names)
+        instrument_id = setups[setup_id].instrument_id if setup_id else None
+        accuracy = sigmas.instruments.get(instrument_id or "", Accuracy())
+        sigma = own[row]
+        if np.isnan(sigma):
+            sigma = _usual_sigma(table, row, kind, values[row], lengths[row], accuracy, instrument_id)
+        group = groups[row] or kind
+        plumbing = centring[row] if not np.isnan(centring[row]) else accuracy.target_centring
+        if plumbing < 0:
+            raise table.error(row, "sigma_target_centring_mm: it is negative; write 0 for none")
+        readings.append(
+            Reading(reading_ids[row], kind, at, to, float(values[row]), float(sigma) * sigmas.scale.get(group, 1.0),
+                    setup_id, second, float(heights[0][row]), float(heights[1][row]), float(heights[2][row]),
+                    float(plumbing), group, used[row])
+        )  # fmt: skip
+    return tuple(sorted(readings, key=lambda reading: natural_key(reading.reading_id)))
+
+
+def _kinds(table: Table) -> list[ReadingKind]:
+    column = table.text("kind")
+    for code, name in enumerate(column.names):
+        if name not in KINDS and (column.codes == code).any():
+            found = f"kind: found {name!r}; {choice_hint(name, KINDS)}"
+            raise table.error(first_row(column.codes == code), found)
+    known = {name: name for name in KINDS}
+    return [known[name] for name in column.values()]  # type: ignore[index]  # all are known, see above
+
+
+def _reading_ids(table: Table) -> list[str]:
+    given = table.text("reading_id").values()
+    seen: dict[str, int] = {}
+    for row, name in enumerate(given):
+        if name and name in seen:
+            raise table.error(row, f"reading_id: {name!r} stands already in line {table.lines[seen[name]]}")
+        seen[name] = row
+    ids = [name or f"r{row + 1}" for row, name in enumerate(given)]
+    for row, name in enumerate(given):
+        if not name and ids[row] in seen:
+            raise table.error(row, f"reading_id: {ids[row]!r}, which this row would get, is another one's; give it one")
+    return ids
+
+
+def _values(table: Table, kinds: Sequence[ReadingKind]) -> FloatArray:
+    angle = np.array([kind in ANGLES for kind in kinds], dtype=bool)
+    parts = {f"value_{unit}": quantity(table, "value", (unit,)) for unit in ("deg", "gon")}
+    angles = one_of(table, parts | {"value_dms": dms_angles(table, "value_dms")})
+    length = quantity(table, "value", ("m", "mm"))
+    for mask, good, bad, needs in (
+        (angle, angles, length, "an angle: value_deg, value_gon or value_dms"),
+        (~angle, length, angles, "a length: value_m or value_mm"),
+    ):
+        wrong = mask & (np.isnan(good) | ~np.isnan(bad))
+        if wrong.any():
+            row = first_row(wrong)
+            found = "has a value of the wrong kind" if not np.isnan(bad[row]) else "has no value"
+            raise table.error(row, f"value: the {kinds[row]} {found}; give it {needs}")
+    values = np.where(angle, angles, length)
+    for row, kind in enumerate(kinds):
+        if kind == "zenith" and not 0.0 < values[row] < np.pi:
+            found = f"found {np.degrees(values[row]):.6g} deg"
+            raise table.error(row, f"value: {found}; a zenith angle lies between 0 and 180 deg (reduce it to face I)")
+        if kind in ("slope_distance", "horizontal_distance") and values[row] <= 0:
+            raise table.error(row, f"value: found {values[row]:g} m; a distance is positive")
+    return values
+
+
+def _own_sigmas(table: Table, kinds: Sequence[ReadingKind]) -> FloatArray:
+    """Sigmas (n,) that the rows give, nan where they give none."""
+    angle = np.array([kind in ANGLES for kind in kinds], dtype=bool)
+    angles, lengths = quantity(table, "sigma", ANGLE_UNITS, True), quantity(table, "sigma", ("mm",), True)
+    wrong = (angle & ~np.isnan(lengths)) | (~angle & ~np.isnan(angles))
+    if wrong.any():
+        row = first_row(wrong)
+        unit = "sigma_arcsec, sigma_cc or sigma_mgon" if angle[row] else "sigma_mm"
+        raise table.error(row, f"sigma: that of a reading of kind {kinds[row]} stands in {unit}; move it there")
+    return np.where(angle, angles, lengths)
+
+
+def _usual_sigma(
+    table: Table,
+    row: int,
+    kind: ReadingKind,
+    value: float,
+    length: float,
+    accuracy: Accuracy,
+    instrument_id: str | None,
+) -> float:
+    """The sigma that the instrument gives; distances a + b d, height differences also by the root of the length."""
+    sigma: float | None
+    key = f"sigma_{kind}_arcsec"
+    match kind:
+        case "direction":
+            sigma = accuracy.direction
+        case "angle":
+            sigma = accuracy.angle
+            if sigma is None and accuracy.direction is not None:
+                sigma = accuracy.direction * 2.0**0.5  # the difference of two directions
+        case "zenith":
+            sigma = accuracy.zenith
+        case "azimuth":
+            sigma = accuracy.azimuth
+        case "height_difference":
+            sigma, key = accuracy.height_difference, "sigma_height_difference_mm"
+            if accuracy.levelling is not None and not np.isnan(length):
+                sigma = float(np.hypot(sigma or 0.0, accuracy.levelling * (length / 1000.0) ** 0.5))
+        case _:
+            sigma, key = accuracy.distance, "sigma_distance_mm"
+            if sigma is not None:
+                sigma += accuracy.distance_slope * value
+    if sigma is None:
+        where = f"[instruments.{instrument_id}]" if instrument_id else "the instrument of its setup"
+        raise table.error(row, f"the {kind} has no sigma; add it to the row, or {key} to {where}")
+    return sigma
+
+
+def _check_setup(table: Table, row: int, kind: ReadingKind, setup_id: str, names: Names) -> None:
+    if not setup_id:
+        if kind == "direction":
+            raise table.error(row, "setup_id: is blank; directions of one set-up share an orientation: name it")
+        return
+    problem = setup_problem(setup_id, names.survey.setups)
+    if problem:
+        raise table.error(row, f"setup_id: {problem}")
+
+
+def _positions(
+    table: Table, row: int, texts: tuple[str, str, str], kind: ReadingKind, names: Names
+) -> tuple[PositionRef, PositionRef, PositionRef | None]:
+    columns = ("from_id", "to_id", "second_id")
+    if (kind == "angle") != bool(texts[2]):
+        if kind == "angle":
+            raise table.error(row, "second_id: an angle needs its right-hand target; fill it in")
+        raise table.error(row, f"second_id: readings of kind {kind} have no second target; remove it")
+    refs: list[PositionRef] = []
+    for column, text in zip(columns, texts, strict=True):
+        if not text:
+            continue
+        try:
+            refs.append(read_position(text, names))
+            check_epochs(refs[0].frame, refs[-1].frame, names)
+        except NameProblemError as problem:
+            raise table.error(row, f"{column}: {problem}") from problem
+        if refs[-1] in refs[:-1]:
+            raise table.error(row, f"{column}: {text!r} stands in this row twice; its positions must differ")
+    return refs[0], refs[1], refs[2] if len(refs) > 2 else None
+
+
+def read_reading_covariances(extra: Table, readings: Sequence[Reading]) -> tuple[ReadingCovariance, ...]:
+    """Correlated readings, one covariance for those that hang together."""
+    by_id = {reading.reading_id: reading for reading in readings}
+    rho: dict[tuple[str, str], float] = {}
+    lines: dict[str, int] = {}
+    pairs = zip(extra.text("a_id").values(), extra.text("b_id").values(), extra.numbers("rho").tolist(), strict=True)
+    for row, (a, b, value) in enumerate(pairs):
+        for column, name in (("a_id", a), ("b_id", b)):
+            if name not in by_id:
+                raise extra.error(row, f"{column}: unknown reading {name!r}; {suggestion(name, by_id)}")
+            lines.setdefault(name, row)
+        if a == b or not -1.0 < value < 1.0:
+            found = f"rho: found {value:g}; a correlation lies between -1 and 1"
+            raise extra.error(row, found if a != b else "a_id, b_id: a correlation joins two different readings")
+        if rho.get((b, a), rho.get((a, b), value)) != value or (a, b) in rho:
+            raise extra.error(row, f"the correlation of {a!r} and {b!r} is given twice; keep one")
+        rho[a, b] = value
+    result = []
+    for members in _components(list(lines), list(rho)):
+        ordered = tuple(sorted(members, key=natural_key))
+        cov = np.diag([by_id[name].sigma ** 2 for name in ordered])
+        for (a, b), value in rho.items():
+            if a in members:
+                i, j = ordered.index(a), ordered.index(b)
+                cov[i, j] = cov[j, i] = value * by_id[a].sigma * by_id[b].sigma
+        row = min(lines[name] for name in ordered)
+        problem = covariance_problem(cov[None])
+        if problem:
+            raise extra.error(row, f"the correlations of {', '.join(ordered[:6])}: {problem[1]}; correct them")
+        if len({by_id[name].used for name in ordered}) > 1:
+            raise extra.error(row, f"{', '.join(ordered[:6])} are correlated: use all of them or none")
+        result.append(ReadingCovariance(ordered, cov))
+    return tuple(sorted(result, key=lambda c: natural_key(c.reading_ids[0])))
+
+
+def _components(names: list[str], edges: list[tuple[str, str]]) -> list[set[str]]:
+    of = {name: {name} for name in names}
+    for a, b in edges:
+        if of[a] is not of[b]:
+            of[a] |= of[b]
+            for name in of[b]:
+                of[name] = of[a]
+    return list({id(members): members for members in of.values()}.values())

@@ -1,0 +1,354 @@
+"""The solution of a survey as one dictionary of plain values: what ``solution.json`` holds and reports print."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from adjust.distributions import norm
+from adjust.epochs.states import datum_carriers, open_directions
+from adjust.model.result import Adjustment, Estimate, GroupSummary
+from adjust.model.survey import FloatArray
+from adjust.precision.pose_networks import in_conditions
+from survey.project.detected import DetectedImage
+from survey.project.project import LeftOut
+from survey.solution.instruments import instrument_entries
+from survey.solution.left_out import left_out_dict
+from survey.solution.quantities import Scale, SigmaKind, point_entry, pose_entry, scale_of, vector_entry
+from survey.solution.statistics import Statistics
+from survey.solution.statistics_dict import statistics_dict
+from survey.solution.verdict import findings, fit_of, suspects, verdict
+
+CORRELATION_LIMIT = 0.95
+# parameters for which "zero" is no sensible hypothesis
+_NEVER_ZERO = {"fx", "fy", "u0", "v0", "c", "xp", "yp"}
+_JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
+CONVENTIONS = {
+    "poses": "a_from_b takes coordinates in b to coordinates in a; camera x right, y down, z forward",
+    "translation_mm": "origin of b in a; sigma_translation_mm along the axes of a",
+    "rotation_euler_xyz_deg": "R = Rz(z) Ry(y) Rx(x); sigma_rotation_arcsec: small rotations about the axes of b",
+    "residuals": "adjusted (predicted) minus observed",
+    "image": "the centre of the first pixel is (0, 0)",
+}
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """What was run: everything in a result file that the adjustment itself does not know.
+
+    date: time stamp, ISO 8601. seconds: duration per step; printed, but in no file, so that equal input gives equal
+    files. sigmas: how sigmas of unknowns are given. identification: what the project says of itself (who, where, with
+    what), in its order. command: as it can be given again. images: by camera/epoch, with their hashes. left_out,
+    n_left_out, n_unused_in_files: as of :class:`survey.project.Project`.
+    """
+
+    folder: str
+    title: str
+    input_hashes: Mapping[str, str] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    date: str = ""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    sigmas: SigmaKind = "a_posteriori"
+    identification: tuple[tuple[str, str], ...] = ()
+    command: str = ""
+    images: Mapping[str, DetectedImage] = field(default_factory=dict)
+    left_out: tuple[LeftOut, ...] = ()
+    n_left_out: int = 0
+    n_unused_in_files: int = 0
+
+
+def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None = None) -> dict[str, Any]:
+    """The whole solution as plain values, floats in full, None where there is no number; ``found``: its statistics."""
+    scale = scale_of(adjustment, run.sigmas)
+    solution: dict[str, Any] = plain(
+        {
+            "format": 1,
+            "summary": _summary(adjustment, run, scale, found),
+            "conventions": CONVENTIONS,
+            "cameras": _cameras(adjustment, scale),
+            "stations": _stations(adjustment, scale),
+            "points": _points(adjustment, scale),
+            "tables": _tables(adjustment, scale),
+            "targets": _targets(adjustment, scale),
+            "pairs": _pairs(adjustment, scale),
+            **instrument_entries(adjustment, scale),
+            **_network(adjustment),
+            **_free_datum(adjustment),
+            "groups": {g.group: _group(g) for g in adjustment.groups},
+            **left_out_dict(adjustment, run.left_out, run.n_left_out, run.n_unused_in_files),
+            "warnings": [*findings(found.consistency if found else None), *adjustment.warnings],
+            **(statistics_dict(adjustment, found, scale) if found is not None else {}),
+            "inputs": {
+                "folder": run.folder,
+                "identification": dict(run.identification),
+                "command": run.command,
+                "hashes": dict(run.input_hashes),
+                "images": {
+                    name: {"file": i.file, "sha256": i.sha256, "points": i.status, "n_image_points": i.n_image_points,
+                           "n_spots": i.n_spots}
+                    for name, i in run.images.items()
+                },
+                "options": dict(run.options),
+                "versions": dict(run.versions),
+                "date": run.date,
+            },
+        }
+    )
+    return solution
+
+
+def _free_datum(adjustment: Adjustment) -> dict[str, Any]:
+    """Motions of the whole (t, rotation vector, ln scale) that the observations leave open, and what carries them."""
+    directions = open_directions(adjustment)
+    if not directions.shape[1]:
+        return {}
+    carriers = ["/".join(name) for name in datum_carriers(adjustment)]
+    return {"free_datum": {"open_motions": directions.T.tolist(), "carried_by": carriers}}
+
+
+def plain(value: Any) -> Any:
+    """Only what JSON knows: mappings and sequences kept, numbers as Python's, None for what is not finite."""
+    kind = type(value)
+    if kind is str or kind is int or kind is bool or value is None:
+        return value
+    if kind is float:
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(v) for v in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, int | np.integer):
+        return int(value)
+    return str(value)
+
+
+def _summary(adjustment: Adjustment, run: RunInfo, scale: Scale, statistics: Statistics | None) -> dict[str, Any]:
+    found, test = suspects(adjustment), adjustment.global_test
+    n_unmet = sum(not v.met for v in statistics.verdicts) if statistics is not None else 0
+    tested = statistics.consistency if statistics is not None else None
+    level, reason = verdict(adjustment, found, n_unmet, tested)
+    return {
+        "title": run.title,
+        "verdict": level,
+        "reason": reason,
+        "fit": fit_of(adjustment, tested),
+        "sigma0": adjustment.sigma0 if adjustment.redundancy > 0 else None,
+        "redundancy": adjustment.redundancy,
+        "n_observations": adjustment.n_observations,
+        "n_unknowns": adjustment.n_unknowns,
+        "datum": adjustment.survey.datum.kind,
+        "datum_defect": adjustment.datum_defect,
+        "n_tolerances_not_met": n_unmet,
+        "converged": adjustment.converged,
+        "iterations": adjustment.iterations,
+        "last_step_sigmas": adjustment.max_step,
+        "sigmas": scale.sigmas,
+        "sigma_factor": scale.factor,
+        "omega": adjustment.omega,
+        "global_test": test
+        and {
+            "omega": test.omega,
+            "redundancy": test.redundancy,
+            "alpha": test.alpha,
+            "lower": test.lower,
+            "upper": test.upper,
+            "passed": test.passed,
+            "status": test.status,
+        },
+        "suspects": {
+            "alpha": found.alpha,
+            "image_test_limit": found.image_limit,
+            "standardized_limit": found.w_limit,
+            "n_image_points": found.n_image,
+            "n_other": found.n_other,
+            "n_not_used": found.n_not_used,
+        },
+    }
+
+
+def _group(group: GroupSummary) -> dict[str, Any]:
+    """``deviation``: of omega from its expectation r, in units of its own sigma sqrt(2 r), as chi-square has it."""
+    factor, r = group.factor, group.redundancy
+    return {
+        "n_observations": group.n_observations,
+        "redundancy": group.redundancy,
+        "omega": group.omega,
+        "variance_factor": factor,
+        "sigma_scale": float(np.sqrt(factor)) if factor >= 0.0 else float("nan"),
+        "deviation": (group.omega - r) / float(np.sqrt(2.0 * r)) if factor >= 0.0 else float("nan"),
+    }
+
+
+def correlated(estimate: Estimate) -> list[dict[str, Any]]:
+    """Pairs of components of one parameter with |correlation| above 95 %, strongest first."""
+    sigmas = np.sqrt(np.clip(np.diag(estimate.cov), 0.0, None))
+    safe = np.where(sigmas > 0.0, sigmas, np.inf)
+    rho = estimate.cov / np.outer(safe, safe)
+    pairs = [
+        (float(rho[i, j]), i, j)
+        for i in range(len(sigmas))
+        for j in range(i)
+        if abs(rho[i, j]) > CORRELATION_LIMIT and "tied" not in (estimate.status[i], estimate.status[j])
+    ]
+    names = estimate.components
+    return [
+        {"a": names[j], "b": names[i], "correlation": value} for value, i, j in sorted(pairs, key=lambda x: -abs(x[0]))
+    ]
+
+
+def _lens(estimate: Estimate, model: str, scale: Scale) -> dict[str, Any]:
+    entry = {"model": model} | vector_entry(estimate, scale)
+    sigmas = scale.factor * np.sqrt(np.clip(np.diag(estimate.cov), 0.0, None))
+    values = np.asarray(estimate.value, dtype=float)
+    ratios = {
+        name: float(abs(value) / sigma)
+        for name, value, sigma in zip(estimate.components, values, sigmas, strict=True)
+        if sigma > 0.0 and name not in _NEVER_ZERO
+    }
+    limit = float(norm.isf(0.025))
+    entry["value_over_sigma"] = ratios
+    entry["not_significant"] = [name for name, ratio in ratios.items() if ratio < limit]
+    entry["correlations_over_95_percent"] = correlated(estimate)
+    return entry
+
+
+def _cameras(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for camera in adjustment.survey.cameras:
+        entry: dict[str, Any] = {"station": camera.station_id, "image_size_px": list(camera.image_size)}
+        lens = adjustment.estimates.get(("lens", camera.camera_id))
+        if lens is not None:
+            entry["lens"] = _lens(lens, camera.lens.model, scale)
+        entry |= _pose(adjustment, ("station_from_camera", camera.camera_id), "station_from_camera", scale)
+        out[camera.camera_id] = entry | _images(adjustment, camera.camera_id)
+    return out
+
+
+def _images(adjustment: Adjustment, camera_id: str) -> dict[str, Any]:
+    """Number of used image points and RMS residual, of the camera and of each of its images."""
+    found = adjustment.image_residuals
+    squares: dict[str, list[FloatArray]] = {}
+    for block, first, last in zip(
+        adjustment.survey.image_blocks, found.block_ptr[:-1], found.block_ptr[1:], strict=True
+    ):
+        if block.camera_id == camera_id:
+            used = found.used[first:last]
+            squares.setdefault(block.epoch_id, []).append(found.residuals[first:last][used] ** 2)
+    per_image = {epoch: np.concatenate(parts) for epoch, parts in squares.items()}
+    every = np.concatenate([*per_image.values(), np.empty((0, 2))])
+    return {
+        "n_images": len(per_image),
+        "n_image_points": len(every),
+        "rms_residual_px": _rms(every),
+        "images": {e: {"n_image_points": len(x), "rms_residual_px": _rms(x)} for e, x in per_image.items()},
+    }
+
+
+def _rms(squares: FloatArray) -> float:
+    """Root mean square over both coordinates."""
+    return float(np.sqrt(squares.mean())) if squares.size else float("nan")
+
+
+def _pose(adjustment: Adjustment, name: tuple[str, ...], key: str, scale: Scale) -> dict[str, Any]:
+    """The pose under ``key`` and, where it moves, under ``epochs``; empty where it is no unknown."""
+    epochs = {
+        n[2]: {key: pose_entry(estimate, scale)}
+        for n, estimate in adjustment.estimates.items()
+        if len(n) == 3 and n[:2] == name
+    }
+    single = adjustment.estimates.get(name)
+    entry: dict[str, Any] = {} if single is None else {key: pose_entry(single, scale)}
+    return entry | ({"epochs": epochs} if epochs else {})
+
+
+def _stations(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+    out = {}
+    for station in adjustment.survey.stations:
+        name = station.station_id
+        entry = {"motion": station.motion} | ({"table": station.table_id} if station.table_id else {})
+        entry |= _pose(adjustment, ("mount_from_station", name), "mount_from_station", scale)
+        out[name] = entry | _pose(adjustment, ("world_from_station", name), "world_from_station", scale)
+    return out
+
+
+def _points(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+    return {n[1]: point_entry(e, scale) for n, e in adjustment.estimates.items() if n[0] == "point"}
+
+
+def _tables(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+    out = {}
+    for table in adjustment.survey.tables:
+        name = table.table_id
+        entry = {"axes": list(table.axes)} | _pose(adjustment, ("world_from_table", name), "world_from_table", scale)
+        geometry = adjustment.estimates.get(("table_geometry", name))
+        if geometry is not None:
+            entry["geometry"] = vector_entry(geometry, scale)
+        angles = {n[2]: e for n, e in adjustment.estimates.items() if n[:2] == ("table_angles", name)}
+        out[name] = entry | {"epochs": {epoch: vector_entry(e, scale) for epoch, e in angles.items()}}
+    return out
+
+
+def _targets(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+    out = {}
+    for target in adjustment.survey.targets:
+        name = target.target_id
+        key = "station_from_target" if target.station_id else "world_from_target"
+        entry: dict[str, Any] = {"n_points": len(target.point_ids), "motion": target.motion}
+        entry |= {"station": target.station_id} if target.station_id else {}
+        entry |= _pose(adjustment, ("carrier_from_target", name), key, scale)
+        warp = adjustment.estimates.get(("warp", name))
+        out[name] = entry | ({"warp": vector_entry(warp, scale)} if warp is not None else {})
+    return out
+
+
+def _pairs(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+    if not adjustment.survey.pairs:
+        return {}
+    from survey.solution.pairs import pairs_dict  # here: as above
+
+    return pairs_dict(adjustment, scale)
+
+
+def _network(adjustment: Adjustment) -> dict[str, Any]:
+    """What the pairs can tell, and how well their loops close; nothing where there are no pairs."""
+    survey = adjustment.survey
+    if not survey.pairs:
+        return {}
+    # here: a survey without pairs is reported without it
+    from survey.solution.loops import closures_dict, loops_after, loops_dict, network_dict, pair_loops, pair_network
+
+    loops = pair_loops(survey)
+    if loops is None:
+        return {}
+    left_out = [p.pair_id for p in survey.pairs if not p.used]
+    how = "conditions" if in_conditions(adjustment) else "poses"
+    listed = loops_dict(loops, left_out, loops_after(adjustment, loops), survey.pair_form, how)
+    closures = {"closures": closures_dict(adjustment)} if survey.closures else {}
+    return {"network": network_dict(pair_network(survey)), "loops": listed, **closures}
+
+
+def solution_json(solution: Mapping[str, Any]) -> str:
+    """JSON with one line per entry of a mapping and lists of numbers kept on one line; floats by repr."""
+    return _lines(solution, 0) + "\n"
+
+
+def _lines(value: Any, depth: int) -> str:
+    if isinstance(value, Mapping) and value:
+        inner = ",\n".join(f"{' ' * (depth + 1)}{_one(k)}: {_lines(v, depth + 1)}" for k, v in value.items())
+        return f"{{\n{inner}\n{' ' * depth}}}"
+    if isinstance(value, list) and any(isinstance(v, Mapping | str) for v in value):
+        inner = ",\n".join(" " * (depth + 1) + _lines(v, depth + 1) for v in value)
+        return f"[\n{inner}\n{' ' * depth}]"
+    return _one(value)
+
+
+def _one(value: Any) -> str:
+    return _JSON.encode(value)

@@ -1,0 +1,113 @@
+"""Where everything is after an adjustment: any frame of the survey in the world, from the adjusted values."""
+
+from functools import reduce
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.model.observations import FrameRef
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import FloatArray, PoseParameter, Station, Table, Target
+
+
+def _turn(axis: int, angle: float) -> Pose3:
+    rotation = (Rot3.Rx, Rot3.Ry, Rot3.Rz)[axis](angle)
+    return Pose3(rotation, np.zeros(3))
+
+
+def table_from_mount(axes: tuple[str, ...], geometry: dict[str, float], angles: FloatArray) -> Pose3:
+    """The motion of a table, the formula of ``adjust.model.survey.Table``; ``geometry`` by name, missing names are zero."""
+    first = "xyz".index(axes[0])
+    motion = _turn(first, float(angles[0]) + geometry.get("zero_1", 0.0))
+    if len(axes) == 1:
+        return motion
+    second = "xyz".index(axes[1])
+    third = 3 - first - second
+    offset = np.zeros(3)
+    offset[third] = geometry.get("axis_offset", 0.0)
+    parts = (
+        Pose3(Rot3(), offset),
+        _turn(third, geometry.get("non_orthogonality", 0.0)),
+        _turn(second, float(angles[1]) + geometry.get("zero_2", 0.0)),
+    )
+    return reduce(lambda a, b: a * b, parts, motion)
+
+
+class AdjustedFrames:
+    """Frames of an adjusted survey; what neither was estimated nor has a value is None."""
+
+    def __init__(self, adjustment: Adjustment) -> None:
+        survey = adjustment.survey
+        self.estimates = adjustment.estimates
+        self.cameras = {c.camera_id: c for c in survey.cameras}
+        self.stations = {s.station_id: s for s in survey.stations}
+        self.tables = {t.table_id: t for t in survey.tables}
+        self.targets = {t.target_id: t for t in survey.targets}
+        self.readings = {(r.table_id, r.epoch_id): r for r in survey.table_readings}
+
+    def pose(self, name: ParameterName, parameter: PoseParameter) -> Pose3 | None:
+        """The adjusted pose of a parameter; where it was held, its constant."""
+        if name in self.estimates:
+            value = self.estimates[name].value
+            return value if isinstance(value, Pose3) else None
+        if parameter.value is None and parameter.treatment == "held":
+            return Pose3()
+        return parameter.value
+
+    def world_from(self, frame: FrameRef) -> Pose3 | None:
+        """``world_from_<frame>``, None where the survey does not tell (or the frame does not exist)."""
+        if frame.kind == "world":
+            return Pose3()
+        if frame.kind == "camera" and frame.frame_id in self.cameras:
+            camera = self.cameras[frame.frame_id]
+            mount = self.pose(("station_from_camera", camera.camera_id), camera.station_from_camera)
+            return _product(self.world_from(FrameRef("station", camera.station_id, frame.epoch_id)), mount)
+        if frame.kind == "station" and frame.frame_id in self.stations:
+            return self._station(self.stations[frame.frame_id], frame.epoch_id)
+        if frame.kind == "target" and frame.frame_id in self.targets:
+            return self._target(self.targets[frame.frame_id], frame.epoch_id)
+        if frame.kind == "table" and frame.frame_id in self.tables:
+            return self._table(self.tables[frame.frame_id])
+        return None
+
+    def _table(self, table: Table) -> Pose3 | None:
+        return self.pose(("world_from_table", table.table_id), table.world_from_table)
+
+    def _station(self, station: Station, epoch_id: str | None) -> Pose3 | None:
+        if station.motion == "fixed":
+            return self.pose(("world_from_station", station.station_id), station.world_from_station)
+        if epoch_id is None:
+            return None
+        if station.motion == "table" and (station.table_id, epoch_id) in self.readings:
+            table = self.tables[station.table_id or ""]
+            mount = self.pose(("mount_from_station", station.station_id), station.mount_from_station)
+            return _product(_product(self._table(table), self._motion(table, epoch_id)), mount)
+        parameter = station.epochs.get(epoch_id, station.world_from_station)
+        return self.pose(("world_from_station", station.station_id, epoch_id), parameter)
+
+    def _motion(self, table: Table, epoch_id: str) -> Pose3:
+        geometry = dict(zip(table.geometry.names, map(float, table.geometry.values), strict=True))
+        estimate = self.estimates.get(("table_geometry", table.table_id))
+        if estimate is not None and not isinstance(estimate.value, Pose3):
+            geometry |= dict(zip(estimate.components, map(float, estimate.value), strict=True))
+        reading = self.estimates.get(("table_angles", table.table_id, epoch_id))
+        angles = self.readings[table.table_id, epoch_id].angles
+        if reading is not None and not isinstance(reading.value, Pose3):
+            angles = reading.value
+        return table_from_mount(table.axes, geometry, angles)
+
+    def _target(self, target: Target, epoch_id: str | None) -> Pose3 | None:
+        name: ParameterName = ("carrier_from_target", target.target_id)
+        parameter = target.carrier_from_target
+        if target.motion == "epoch":
+            if epoch_id is None:
+                return None
+            name, parameter = (*name, epoch_id), target.epochs.get(epoch_id, parameter)
+        pose = self.pose(name, parameter)
+        if target.station_id is None:
+            return pose
+        return _product(self.world_from(FrameRef("station", target.station_id, epoch_id)), pose)
+
+
+def _product(a: Pose3 | None, b: Pose3 | None) -> Pose3 | None:
+    return None if a is None or b is None else a * b

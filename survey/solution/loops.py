@@ -1,0 +1,286 @@
+"""The measured pairs of a survey as a network: counts after theorem 1 of the relay paper, and its loops one by one.
+
+Frames are the eyes: stations, cameras, targets. What the datum gives (held stations, stations with a full prior, the
+world) closes loops too, where there is more than one of it: each is then joined to the world.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray, PoseParameter, Survey
+from adjust.relay.closed import play
+from adjust.relay.counts import Counts, count
+from adjust.relay.loops import LoopMisclosures, evaluate_loops, loop_misclosures
+from adjust.relay.motions import Motions
+from adjust.relay.network import Network, Topology, topology
+from survey.folder.text import natural_key
+from survey.solution.quantities import ARCSEC_PER_RAD
+
+ALPHA = 0.001
+"""Error probability of the test of all loops together."""
+_MOST_LOOPS = 1000
+_GIVEN = "given:"  # no id holds a colon
+_WORLD = "world"
+
+
+@dataclass(frozen=True, eq=False)
+class PairNetwork:
+    """counts: of the pairs in use. shifts: the same of those with a translation, where not all have one.
+
+    given: frames whose pose is known without pairs. uncontrolled: pairs in use that close no loop, not even through
+    given frames. conditions: independent ones, those through given frames included. redundancy: their equations.
+    """
+
+    counts: Counts
+    shifts: Counts | None
+    given: tuple[str, ...]
+    uncontrolled: tuple[str, ...]
+    inseparable: tuple[tuple[str, ...], ...]
+    parts: tuple[tuple[str, ...], ...]
+    conditions: int
+    redundancy: int
+
+
+def frame_name(frame: FrameRef) -> str:
+    """As in tables; a station goes without its kind."""
+    if frame.kind == "world":
+        return _WORLD
+    text = frame.frame_id if frame.kind == "station" else f"{frame.kind}:{frame.frame_id}"
+    return f"{text}@{frame.epoch_id}" if frame.epoch_id else text
+
+
+def pair_network(survey: Survey) -> PairNetwork:
+    """Count what the pairs in use can tell."""
+    used = [p for p in survey.pairs if p.used]
+    bare = _bare_stations(survey)
+    poses = [p for p in used if isinstance(p.b_from_a, Pose3)]
+    dim = 6 if len(poses) == len(used) and used else 3
+    whole = topology(_ends(used), bare)
+    counts = count(whole, dim)
+    tied = _tied(survey, used, bare, 6 if poses else 3)
+    closed = count(tied, dim)
+    conditions, redundancy, shifts = closed.independent_conditions, closed.redundancy, None
+    if dim == 3 and poses:
+        shifts = count(topology(_ends(poses), bare), 3)
+        redundancy += count(_tied(survey, poses, bare, 6), 3).redundancy
+    return PairNetwork(
+        counts, shifts, _given(survey, used, 6 if poses else 3),
+        _ordered(_real(closed.uncontrolled_pairs)), _groups(_real(g) for g in closed.inseparable_pairs),
+        tuple(real for part in closed.parts if (real := _ordered(s for s in part if s != _WORLD))),
+        conditions, redundancy,
+    )  # fmt: skip
+
+
+def _ordered(ids: Iterable[str]) -> tuple[str, ...]:
+    """In natural order, whatever the order of the rows."""
+    return tuple(sorted(ids, key=natural_key))
+
+
+def _groups(groups: Iterable[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
+    found = [_ordered(g) for g in groups if len(g) > 1]
+    return tuple(sorted(found, key=lambda g: natural_key(g[0])))
+
+
+def _real(ids: Sequence[str]) -> tuple[str, ...]:
+    return tuple(i for i in ids if not i.startswith(_GIVEN))
+
+
+def _ends(pairs: Sequence[Pair]) -> list[tuple[str, str, str]]:
+    return [(p.pair_id, frame_name(p.a), frame_name(p.b)) for p in pairs]
+
+
+def _bare_stations(survey: Survey) -> tuple[str, ...]:
+    """Fixed stations that only pairs can determine: they carry neither cameras nor targets."""
+    carriers = {c.station_id for c in survey.cameras} | {t.station_id for t in survey.targets}
+    return tuple(s.station_id for s in survey.stations if s.motion == "fixed" and s.station_id not in carriers)
+
+
+def _is_given(parameter: PoseParameter, dim: int) -> bool:
+    if parameter.treatment == "held":
+        return True
+    cov = parameter.prior_cov
+    return parameter.treatment == "prior" and cov is not None and bool(np.isfinite(np.diag(cov)[:dim]).all())
+
+
+def _given(survey: Survey, pairs: Sequence[Pair], dim: int) -> tuple[str, ...]:
+    ends = {frame_name(r) for p in pairs for r in (p.a, p.b)}
+    fixed = (s for s in survey.stations if s.motion == "fixed" and s.station_id in ends)
+    given = tuple(s.station_id for s in fixed if _is_given(s.world_from_station, dim))
+    return ((_WORLD,) if _WORLD in ends else ()) + given
+
+
+def _tied(survey: Survey, pairs: Sequence[Pair], bare: tuple[str, ...], dim: int) -> Topology:
+    """The pairs, and what is given joined to the world where that closes loops."""
+    return topology(_ends(pairs) + [(_GIVEN + s, s, _WORLD) for s in _joined(survey, pairs, dim)], bare)
+
+
+def _joined(survey: Survey, pairs: Sequence[Pair], dim: int) -> tuple[str, ...]:
+    given = _given(survey, pairs, dim)
+    return tuple(s for s in given if s != _WORLD) if len(given) > 1 else ()
+
+
+def pair_loops(survey: Survey) -> LoopMisclosures | None:
+    """How well every independent loop of all measured pairs closes, used or not; None where there is no pair.
+
+    Of pairs with and without translation the rotations alone.
+    """
+    pairs = list(survey.pairs)
+    if not pairs:
+        return None
+    dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3
+    joined = _joined(survey, pairs, dim)
+    motions = [p.b_from_a for p in pairs]
+    covs = [np.asarray(p.cov)[:dim, :dim] for p in pairs]
+    stations = {s.station_id: s.world_from_station for s in survey.stations}
+    for station in joined:
+        given = stations[station]
+        motions.append(given.value or Pose3())
+        held = given.treatment == "held" or given.prior_cov is None
+        covs.append(np.zeros((dim, dim)) if held else np.asarray(given.prior_cov)[:dim, :dim])
+    network = Network(_tied(survey, pairs, (), dim), _motions(motions, dim), np.array(covs))
+    return loop_misclosures(network)
+
+
+def loops_after(adjustment: Adjustment, loops: LoopMisclosures) -> FloatArray:
+    """Misclosures (L, dim) of the same loops by the adjusted pairs, predicted where not used; a mount keeps its play.
+
+    From the residuals: each pair as measured, moved by its own. Nan where a pair has none.
+    """
+    basis, survey = loops.basis, adjustment.survey
+    top, dim = basis.topology, loops.vector.shape[1]
+    by_id = {p.pair_id: p for p in survey.pairs}
+    found = {o.ids[0]: np.asarray(o.residual) for o in adjustment.other_residuals if o.kind == "pair"}
+    stations = {s.station_id: s.world_from_station for s in survey.stations}
+    motions: list[Pose3 | Rot3] = []
+    moved, lost = np.zeros((top.n_pairs, dim)), np.zeros(top.n_pairs, dtype=np.bool_)
+    for e, pair_id in enumerate(top.pair_ids):
+        pair = by_id.get(pair_id)
+        if pair is None:  # what is given: its adjusted pose, where it is known no better than that
+            given = stations[pair_id.removeprefix(_GIVEN)]
+            estimate = adjustment.estimates.get(("world_from_station", pair_id.removeprefix(_GIVEN)))
+            now = None if estimate is None else estimate.value
+            motions.append(now if isinstance(now, Pose3) else given.value or Pose3())
+            continue
+        motions.append(pair.b_from_a)
+        v = found.get(pair_id)
+        lost[e] = v is None
+        if v is not None:
+            moved[e] = (v - play(survey.closures, pair, v))[:dim]
+    w = evaluate_loops(basis, _motions(motions, dim).retract(moved))[0]
+    w[np.logical_or.reduceat(lost[basis.pair_idx], basis.ptr[:-1])] = np.nan
+    return w
+
+
+def _motions(motions: Sequence[Pose3 | Rot3], dim: int) -> Motions:
+    rotation = np.array([(m.rotation() if isinstance(m, Pose3) else m).matrix() for m in motions])
+    if dim == 3:
+        return Motions(rotation)
+    return Motions(rotation, np.array([m.translation() for m in motions if isinstance(m, Pose3)]))
+
+
+def network_dict(network: PairNetwork) -> dict[str, Any]:
+    """The counts as plain values."""
+    c = network.counts
+    return {
+        "n_stations": c.n_stations,
+        "n_parts": len(network.parts),
+        "parts": [list(part) for part in network.parts] if len(network.parts) > 1 else [],
+        "independent_unknown_poses": c.independent_unknowns,
+        "measured_pairs": c.n_pairs,
+        "measurable_pairs": c.measurable_pairs,
+        "triangle_conditions": c.triangle_conditions,
+        "independent_conditions": network.conditions,
+        "conditions_through_given_stations": network.conditions - c.independent_conditions,
+        "equations_per_condition": c.loop_equations,
+        "redundancy": network.redundancy,
+        "conditions_per_pair": network.conditions / c.n_pairs if c.n_pairs else 0.0,
+        "given_stations": list(network.given),
+        "uncontrolled_pairs": list(network.uncontrolled),
+        "inseparable_pairs": [list(group) for group in network.inseparable],
+        "isolated_stations": list(c.isolated_stations),
+    }
+
+
+def loops_dict(
+    loops: LoopMisclosures, left_out: Sequence[str] = (), after: FloatArray | None = None, form: str = "poses",
+    solved_by: str = "poses",
+) -> dict[str, Any]:
+    """The loops, worst first, as plain values; left_out: pairs that are not used, named beside the loops they are in.
+
+    sigma_misclosure: along the direction of the misclosure. after: misclosures (L, dim) by the adjusted pairs. form:
+    "poses" or "closed", as asked for. solved_by: "poses" or "conditions", how the pairs were adjusted.
+    """
+    failed = set(loops.failed(ALPHA).tolist())
+    order = np.argsort(loops.p_value, kind="stable")[:_MOST_LOOPS].tolist()
+    return {
+        "n_loops": len(loops.test),
+        "n_failed": len(failed),
+        "n_listed": len(order),
+        "minimal": loops.basis.minimal,
+        "note": loops.basis.note,
+        "alpha": ALPHA,
+        "form": form,
+        "solved_by": solved_by,
+        "worst_first": [
+            _loop(loops, k, k in failed, set(left_out)) | ({} if after is None else _after(after[k])) for k in order
+        ],
+    }
+
+
+def _after(w: FloatArray) -> dict[str, Any]:
+    out = {"misclosure_after_arcsec": float(ARCSEC_PER_RAD * np.linalg.norm(w[:3]))}
+    return out if len(w) == 3 else out | {"misclosure_after_mm": float(1e3 * np.linalg.norm(w[3:]))}
+
+
+def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
+    """Every loop through a mount: its misclosure as measured, and the play of the mount that the adjustment leaves.
+
+    sigma: of the mount, as given. play_over_sigma: length of the play over its sigmas, of dim components.
+    """
+    survey, out = adjustment.survey, {}
+    by_id = {p.pair_id: p for p in survey.pairs}
+    found = {o.ids[0]: np.asarray(o.residual) for o in adjustment.other_residuals if o.kind == "pair"}
+    for closure in survey.closures:
+        pairs = [by_id[i] for i in closure.pair_ids]
+        dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3
+        covs = np.array([np.asarray(p.cov)[:dim, :dim] for p in pairs])
+        loop = loop_misclosures(Network(topology(_ends(pairs)), _motions([p.b_from_a for p in pairs], dim), covs))
+        w, cov = loop.vector[0], loop.cov[0]
+        entry: dict[str, Any] = {"pairs": list(closure.pair_ids), "used": pairs[-1].used}
+        entry |= {"sigma_arcsec": ARCSEC_PER_RAD * closure.rotation_sigma, "sigma_mm": 1e3 * closure.translation_sigma}
+        entry["misclosure_arcsec"], entry["sigma_misclosure_arcsec"] = _along(w[:3], cov[:3, :3], ARCSEC_PER_RAD)
+        if dim == 6:
+            entry["misclosure_mm"], entry["sigma_misclosure_mm"] = _along(w[3:], cov[3:, 3:], 1e3)
+        entry |= {"test": loop.test[0], "freedom": dim, "p_value": loop.p_value[0]}
+        v = found.get(closure.pair_ids[-1])
+        if v is not None:
+            d = play(survey.closures, pairs[-1], v)
+            entry["play_arcsec"] = float(ARCSEC_PER_RAD * np.linalg.norm(d[:3]))
+            entry |= {"play_mm": float(1e3 * np.linalg.norm(d[3:]))} if len(d) == 6 else {}
+            sigma = np.sqrt(np.diag(closure.cov(len(d))))
+            entry["play_over_sigma"] = float(np.linalg.norm(d[sigma > 0.0] / sigma[sigma > 0.0]))
+        out[closure.closure_id] = entry
+    return out
+
+
+def _loop(loops: LoopMisclosures, k: int, failed: bool, left_out: set[str]) -> dict[str, Any]:
+    w, cov = loops.vector[k], loops.cov[k]
+    pairs = _real(loops.basis.pairs(k))
+    entry: dict[str, Any] = {"stations": list(loops.basis.stations(k)), "pairs": list(pairs)}
+    entry["misclosure_arcsec"], entry["sigma_misclosure_arcsec"] = _along(w[:3], cov[:3, :3], ARCSEC_PER_RAD)
+    if len(w) == 6:
+        entry["misclosure_mm"], entry["sigma_misclosure_mm"] = _along(w[3:], cov[3:, 3:], 1e3)
+    entry |= {"test": loops.test[k], "freedom": len(w), "p_value": loops.p_value[k], "closes": not failed}
+    return entry | {"pairs_not_used": [p for p in pairs if p in left_out]}
+
+
+def _along(w: FloatArray, cov: FloatArray, factor: float) -> tuple[float, float]:
+    size = float(np.linalg.norm(w))
+    sigma = float(np.sqrt(w @ cov @ w)) / size if size > 0.0 else float(np.sqrt(np.trace(cov) / 3.0))
+    return factor * size, factor * sigma

@@ -1,0 +1,200 @@
+"""What the statistics of an adjustment say, gathered for reports and result files."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.model.result import Adjustment, Estimate, ParameterName
+from adjust.model.survey import FloatArray, IntArray
+from adjust.precision.pose_networks import NamedPrecision
+from adjust.statistics.budget import uncertainty_budget
+from adjust.statistics.condensed import condensed_system
+from adjust.statistics.consistency import consistency
+from adjust.statistics.relative_precision import relative_precision
+from adjust.statistics.reliability import LARGEST_NETWORK, reliability
+from adjust.statistics.result import (
+    BudgetEntry,
+    Consistency,
+    Correlation,
+    Decision,
+    RelativePrecision,
+    Reliability,
+    VarianceComponents,
+    WeakDirection,
+)
+from adjust.statistics.system import LinearSystem, precision_of
+from adjust.statistics.weakness import compared_columns, correlations, weak_directions
+from survey.solution.quantities import PROBABILITY, Scale
+from survey.solution.tolerances import Tolerance, Verdict, verdicts
+
+
+@dataclass(frozen=True, eq=False)
+class CorrelationMatrix:
+    """Correlations (n, n) between components; ``labels`` n, ``starts`` of the parameters they belong to, by name."""
+
+    labels: tuple[str, ...]
+    starts: tuple[int, ...]
+    names: tuple[ParameterName, ...]
+    matrix: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """Tests and reliability, variance components where they were asked for, and what else a report shows.
+
+    correlated: pairs of components above 95 %. weak: directions that the survey determines badly. relative: between
+    neighbouring points and stations. budget: of points, stations and lenses. decisions: the log of the outlier search.
+    verdicts: on the tolerances of the project. consistency: of every part with the rest, and of cameras and targets
+    with themselves through time. left_out: for people, what is not all there, and why.
+    """
+
+    reliability: Reliability
+    components: VarianceComponents | None
+    correlated: tuple[Correlation, ...]
+    weak: tuple[WeakDirection, ...]
+    relative: tuple[RelativePrecision, ...]
+    budget: tuple[BudgetEntry, ...]
+    correlations: CorrelationMatrix | None
+    decisions: tuple[Decision, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()
+    consistency: Consistency | None = None
+    left_out: tuple[str, ...] = ()
+
+
+MOST_CORRELATED = 110
+"""Components that the picture of correlations shows: what there is once before what there is at every epoch."""
+MOST_BUDGETS = 60
+"""Parameters with a budget: cameras, tables and stations first, then points."""
+_FEW_PLACES = 300
+"""Places whose neighbours are found without a tree."""
+MOST_NEIGHBOURS = 150
+def statistics_of(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], scale: Scale) -> Statistics:
+    """All of them, at every size. Raises SurveyError for a tolerance that is about nothing."""
+    judged = verdicts(adjustment, tolerances, scale)
+    alpha = adjustment.global_test.alpha if adjustment.global_test is not None else 0.05
+    drawn, near = correlation_matrix(adjustment), neighbours(adjustment, scale)
+    if _is_large_network(adjustment):
+        tested = consistency(adjustment, None, alpha)
+        return Statistics(reliability(adjustment), adjustment.variance_components, (), (), near, (), drawn,
+                          adjustment.decisions, judged, tested, (*tested.left_out, _LARGE_NETWORK))  # fmt: skip
+    condensed = condensed_system(precision_of(adjustment))
+    system, components = condensed.system, adjustment.variance_components
+    names = _budgeted(adjustment)
+    budget = uncertainty_budget(adjustment, names[:MOST_BUDGETS], PROBABILITY, components, system) if names else ()
+    tested = consistency(adjustment, condensed, alpha)
+    return Statistics(
+        reliability(adjustment, system=condensed), components, correlations(adjustment, system=system),
+        weak_directions(adjustment, system=system), near,
+        tuple(_scaled_budget(x, scale.factor) for x in budget), drawn, adjustment.decisions, judged, tested,
+        (*tested.left_out, *_left_out(adjustment, system, len(names))),
+    )  # fmt: skip
+
+
+_LARGE_NETWORK = (
+    f"correlations, weak directions, uncertainty budgets and influences: not computed for a network of more than "
+    f"{LARGEST_NETWORK} pairs; the covariance of any stations is there (Solution.covariance)"
+)
+
+
+def _is_large_network(adjustment: Adjustment) -> bool:
+    return isinstance(adjustment.precision, NamedPrecision) and len(adjustment.other_residuals) > LARGEST_NETWORK
+
+
+def _left_out(adjustment: Adjustment, system: LinearSystem, n_budgets: int) -> tuple[str, ...]:
+    """For people: what the statistics show a part of, and which."""
+    out, n = [], len(system.columns)
+    compared = len(compared_columns(system))
+    if compared < n:
+        out.append(
+            f"correlations: {compared} of {n} components were compared with all others, points and then those of "
+            "single epochs last; the rest only within their own unknown"
+        )
+    if n_budgets > MOST_BUDGETS:
+        out.append(f"uncertainty budgets: of {MOST_BUDGETS} of {n_budgets} parameters, points last")
+    places = sum(1 for name in adjustment.estimates if len(name) == 2 and name[0] in ("point", "world_from_station"))
+    if places > MOST_NEIGHBOURS:
+        out.append(f"relative precision: of {MOST_NEIGHBOURS} pairs of neighbours among {places} points and stations")
+    return tuple(out)
+
+
+def _budgeted(adjustment: Adjustment) -> tuple[ParameterName, ...]:
+    """What gets a budget: what there is once, points last."""
+    rank = {"lens": 0, "station_from_camera": 1, "mount_from_station": 2, "world_from_table": 3, "table_geometry": 4,
+            "world_from_station": 5, "point": 6}  # fmt: skip
+    names = [n for n, e in adjustment.estimates.items() if n[0] in rank and len(n) == 2 and _unknown_components(e)]
+    return tuple(sorted(names, key=lambda n: rank[n[0]]))
+
+
+def _scaled_budget(entry: BudgetEntry, factor: float) -> BudgetEntry:
+    lines = tuple(replace(line, u=factor * line.u) for line in entry.lines)
+    return replace(entry, u=factor * entry.u, expanded=factor * entry.expanded, lines=lines)
+
+
+def _nearest(x: FloatArray, k: int) -> IntArray:
+    """Of each of n places (n, 3) the k nearest ones (n, k), itself first."""
+    if len(x) <= _FEW_PLACES:
+        squares = np.sum((x[:, None] - x) ** 2, axis=2)
+        squares[np.arange(len(x)), np.arange(len(x))] = -1.0
+        return np.argsort(squares, axis=1, kind="stable")[:, :k]
+    from scipy.spatial import cKDTree  # here: it takes longer to load than a small survey to adjust
+
+    return np.asarray(cKDTree(x).query(x, k=k)[1])
+
+
+
+def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision, ...]:
+    """Relative precision of every point and fixed station to its two nearest; sigmas scaled as the others are."""
+    names, places = [], []
+    for name, e in adjustment.estimates.items():
+        if len(name) == 2 and name[0] in ("point", "world_from_station"):
+            x = np.asarray(e.value.translation() if isinstance(e.value, Pose3) else e.value, dtype=float)
+            if np.isfinite(x).all():
+                names.append(name)
+                places.append(x)
+    if len(names) < 2:
+        return ()
+    near = _nearest(np.array(places), min(3, len(names)))
+    pairs = dict.fromkeys((min(i, int(k)), max(i, int(k))) for i, row in enumerate(near) for k in row if int(k) != i)
+    free = [(names[i], names[k]) for i, k in pairs if _is_free(adjustment, names[i]) or _is_free(adjustment, names[k])]
+    posterior = scale.sigmas == "a_posteriori"
+    f = scale.factor
+    return tuple(
+        replace(r, cov=f**2 * r.cov, sigma_distance=f * r.sigma_distance,
+                rotation_cov=None if r.rotation_cov is None else f**2 * r.rotation_cov)
+        for r in relative_precision(adjustment, free[:MOST_NEIGHBOURS], PROBABILITY, posterior)
+        if r.ellipsoid.dimension  # rotations alone say nothing of positions
+    )  # fmt: skip
+
+
+def _is_free(adjustment: Adjustment, name: ParameterName) -> bool:
+    return bool(_unknown_components(adjustment.estimates[name]))
+
+
+def correlation_matrix(adjustment: Adjustment) -> CorrelationMatrix | None:
+    """Correlations between the components of parameters that are there once; None where fewer than two are free."""
+    names: list[ParameterName] = []
+    components: list[tuple[str, ...]] = []
+    for name, estimate in adjustment.estimates.items():
+        free = _unknown_components(estimate)
+        if free and len(name) < 3 and name[0] != "table_angles":
+            if sum(map(len, components)) + len(free) > MOST_CORRELATED:
+                break
+            names.append(name)
+            components.append(free)
+    sizes = [len(free) for free in components]
+    if sum(sizes) < 2:
+        return None
+    cov = adjustment.precision.joint(names)
+    sigma = np.sqrt(np.clip(np.diag(cov), 0.0, None))
+    safe = np.where(sigma > 0.0, sigma, np.inf)
+    labels = tuple(f"{'/'.join(name)}/{c}" for name, free in zip(names, components, strict=True) for c in free)
+    starts = tuple(int(x) for x in np.concatenate([[0], np.cumsum(sizes)[:-1]]))
+    return CorrelationMatrix(labels, starts, tuple(names), cov / np.outer(safe, safe))
+
+
+def _unknown_components(estimate: Estimate) -> tuple[str, ...]:
+    """The components that stand in a joint covariance: all of a pose or point, the free ones of a vector."""
+    free = tuple(c for c, s in zip(estimate.components, estimate.status, strict=True) if s in ("free", "prior"))
+    whole = isinstance(estimate.value, Pose3) or estimate.name[0] == "point"
+    return estimate.components if whole and free else free
