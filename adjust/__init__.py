@@ -4,13 +4,10 @@
     adjustment.estimates["point", "B3"]   value, covariance, status
     adjustment.precision.joint([...])     joint covariances
 
-The names in ``__all__`` stay; everything is loaded when it is first used. :func:`adjust.solve` takes a whole survey;
-the submodule of the same name holds one of its steps, the least squares on a graph.
+The names in ``__all__`` stay; everything is loaded when it is first used.
 """
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -64,14 +61,3 @@ def __getattr__(name: str) -> Any:
 def __dir__() -> list[str]:
     """Public names first."""
     return sorted(__all__)
-
-
-class _Package(ModuleType):
-    """Keeps ``adjust.solve`` the function: importing a submodule would put the module under that name."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _PLACES and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

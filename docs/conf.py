@@ -33,9 +33,20 @@ suppress_warnings = ["myst.xref_missing", "misc.highlighting_failure"]
 PACKAGES = ("survey", "adjust", "capture")
 # what a package without a list of its own shows
 MODULES = {
-    "adjust": ("adjust.model.survey", "adjust.model.observations", "adjust.adjustment", "adjust.model.result", "adjust.model.errors"),
+    "adjust": (
+        "adjust.model.survey",
+        "adjust.model.observations",
+        "adjust.adjustment",
+        "adjust.model.result",
+        "adjust.model.errors",
+    ),
     "survey": ("survey.jobs.adjusting.job", "survey.project.project", "survey.simulate", "survey.report.results"),
-    "capture": ("capture.devices.camera", "capture.devices.turntable", "capture.plan.plan", "capture.session.run_session"),
+    "capture": (
+        "capture.devices.camera",
+        "capture.devices.turntable",
+        "capture.plan.plan",
+        "capture.session.run_session",
+    ),
 }
 
 

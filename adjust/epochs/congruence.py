@@ -339,7 +339,7 @@ def _warnings(pooled: tuple[float, float, float], last: CongruenceTest, options:
 def joint_congruence(
     adjustment: Adjustment, epochs: tuple[str, str], options: CongruenceOptions = DEFAULT_CONGRUENCE
 ) -> Congruence:
-    """Two epochs of one joint adjustment (:func:`adjust.epochs.joint.joint_survey`): the points that each has for itself.
+    """Two epochs of one joint adjustment (:func:`~adjust.epochs.joint.joint_survey`): points that each has for itself.
 
     Their covariance with each other counts; the shared points are the datum. Raises SurveyError where none is common.
     """

@@ -305,7 +305,7 @@ class Datum:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """A whole survey: what there is, what was observed and what defines the datum. See ``adjust.model.observations``."""
+    """A whole survey: what there is, what was observed (``adjust.model.observations``) and what defines the datum."""
 
     cameras: tuple[Camera, ...] = ()
     stations: tuple[Station, ...] = ()

@@ -1,9 +1,9 @@
 """Lens models in the core: their numbers, and points of one camera at once.
 
 Every model has a number (its kind), a parameter vector in a fixed order and a vector of constants ``[pixel_size_mm,
-centre_u, centre_v, r0_mm]`` of which it uses what it needs; ``adjust.lenses.models`` names them all. The formulas, each written
-once for values and derivatives, are in ``lenses.h``. A point on or behind the camera's plane gives finite numbers
-without meaning; the caller tests the depth. The fisheye alone sees behind that plane, and means it.
+centre_u, centre_v, r0_mm]`` of which it uses what it needs; ``adjust.lenses.models`` names them all. The formulas,
+each written once for values and derivatives, are in ``lenses.h``. A point on or behind the camera's plane gives
+finite numbers without meaning; the caller tests the depth. The fisheye alone sees behind that plane, and means it.
 """
 
 import numpy as np

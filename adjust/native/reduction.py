@@ -1,6 +1,7 @@
-"""Reduction of poses that only image points of known targets touch; see :mod:`adjust.observations.images.reduction`, ``reduction.h``.
+"""Reduction of poses that only image points of known targets touch (``reduction.h``).
 
-A pose's columns are its own six, then those of the keys its blocks share with others, then the residual.
+See :mod:`adjust.observations.images.reduction`. A pose's columns are its own six, then those of the keys its blocks
+share with others, then the residual.
 """
 
 from typing import NamedTuple

@@ -1,7 +1,7 @@
 """Covariances of all stations and the statistics of all pairs, from one pass over the Bayes tree.
 
-Redundancy numbers and tests as in :mod:`adjust.precision.precision`: v' Q_vv^-1 v of a whole pair is chi-square with the rank of
-Q_vv degrees of freedom (Baarda 1968; Koch 1999, section 4.2). A free network is solved against one station and then
+Redundancy numbers and tests as in :mod:`adjust.precision.precision`: v' Q_vv^-1 v of a whole pair is chi-square with the
+rank of Q_vv degrees of freedom (Baarda 1968; Koch 1999, section 4.2). A free network is solved against one station and then
 brought into its inner datum by an S-transformation (Baarda 1973), S = I - N (N_D' N_D)^-1 N_D'.
 """
 

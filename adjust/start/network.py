@@ -220,7 +220,7 @@ def partial_pose(parameter: PoseParameter | None) -> FloatArray | None:
 
 
 def table_from_mount(table: Table, angles: FloatArray) -> FloatArray:
-    """Motion (4, 4) of a table at angles (k,) rad with its given geometry; formula in :class:`adjust.model.survey.Table`."""
+    """Motion (4, 4) of a table at angles (k,) rad with its given geometry (:class:`adjust.model.survey.Table`)."""
     geometry = dict(zip(table.geometry.names, table.geometry.values, strict=True))
     axes = ["xyz".index(a) for a in table.axes]
     if len(angles) != len(axes):

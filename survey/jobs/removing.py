@@ -102,7 +102,7 @@ def remove_job(
 ) -> RemoveOutcome:  # fmt: skip
     """Adjust a project, or a copy of it at ``out``, without some observations, which are excluded from then on.
 
-    names: as of :func:`survey.jobs.excluding.exclude_job`. Raises SurveyError for a name that is unknown, and where the rest
+    names: as of :func:`survey.jobs.excluding.exclude_job`. Raises SurveyError for an unknown name, and where the rest
     does not determine everything but what was named; the project is as before whatever goes wrong.
     """
     begin, folder = time.perf_counter(), Path(folder)

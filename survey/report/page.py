@@ -54,7 +54,7 @@ def report_html(
     found: Statistics | None = None,
     in_language: str = "en",
 ) -> str:
-    """The page; ``solution`` is that of :func:`survey.solution.dictionary.solution_dict`, made here where it is not given.
+    """The page; ``solution`` is that of ``solution_dict``, made here where it is not given.
 
     found: the statistics, where they are to be shown. in_language: "en" or "de"; raises SurveyError for others.
     """

@@ -16,7 +16,7 @@ def _turn(axis: int, angle: float) -> Pose3:
 
 
 def table_from_mount(axes: tuple[str, ...], geometry: dict[str, float], angles: FloatArray) -> Pose3:
-    """The motion of a table, the formula of ``adjust.model.survey.Table``; ``geometry`` by name, missing names are zero."""
+    """The motion of a table, the formula of ``adjust.model.survey.Table``; ``geometry``: by name, missing is zero."""
     first = "xyz".index(axes[0])
     motion = _turn(first, float(angles[0]) + geometry.get("zero_1", 0.0))
     if len(axes) == 1:

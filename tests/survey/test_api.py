@@ -1,7 +1,6 @@
 """The Python interface: public names, the five steps, data frames, covariances and plots by name, the notebook."""
 
 import doctest
-import importlib
 import json
 import subprocess
 import sys
@@ -55,16 +54,6 @@ def test_importing_the_packages_loads_nothing_heavy() -> None:
     )
     found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert found.stdout.strip() == "[]"
-
-
-def test_adjust_solve_stays_the_function_beside_its_submodule() -> None:
-    module = importlib.import_module("adjust.solve")
-    from adjust.adjustment import adjust as whole
-    from adjust.graph.solver import solve as step
-
-    assert adjust.solve is whole
-    assert module.solve is step
-    assert adjust.solve is not step
 
 
 def test_the_api_gives_what_the_command_line_writes(solution: survey.Solution, folder: Path, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """The image points of a bundle one by one: two rows each on its lens, its poses and its point, nothing hidden.
 
-What :class:`~adjust.observations.images.bundles.BundleBatch` condenses into one factor, as GTSAM's own algorithms can take it: the
-same chi-square and, with hidden poses and points eliminated, the same normal equations.
+What :class:`~adjust.observations.images.bundles.BundleBatch` condenses into one factor, as GTSAM's own algorithms
+can take it: the same chi-square and, with hidden poses and points eliminated, the same normal equations.
 """
 
 import gtsam

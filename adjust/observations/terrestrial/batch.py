@@ -20,8 +20,8 @@ class TerrestrialBatch:
     """Readings with their predicted values and derivatives at the values last prepared.
 
     residual (N,): predicted minus observed, horizontal angles in (-pi, pi]. A (N, 22): derivatives by what
-    :mod:`adjust.observations.terrestrial.equations` lists. e (N,): residuals over their sigmas (not decorrelated). Arrays are in the
-    order of ``Survey.readings``.
+    :mod:`adjust.observations.terrestrial.equations` lists. e (N,): residuals over their sigmas (not decorrelated).
+    Arrays are in the order of ``Survey.readings``.
     """
 
     def __init__(self, survey: Survey, parameters: TerrestrialParameters, layout: Layout) -> None:

@@ -17,7 +17,8 @@ class DriverDescription:
     """A driver: what it reaches, the form of its addresses, and where its software comes from.
 
     Its module has ``discover() -> tuple[CameraInfo, ...]`` and ``camera(place, **options) -> Camera`` (not opened).
-    packages: what it imports. extra: the extra of this package that installs them; None: always there.
+    packages: what it imports. extra: the extra of this package that installs them; None: always there. room: where its
+    module is.
     """
 
     name: str
@@ -25,6 +26,7 @@ class DriverDescription:
     address: str
     packages: tuple[str, ...] = ()
     extra: str | None = None
+    room: str = "capture.devices.cameras"
 
 
 DRIVERS = {
@@ -47,6 +49,7 @@ DRIVERS = {
             "lab",
             "a camera of the simulated laboratory, in this process or through pylon's emulator",
             "lab:FOLDER/CAMERA or lab:FOLDER/CAMERA?via=pylon:SERIAL",
+            room="capture.simulated",
         ),
     )
 }
@@ -95,7 +98,7 @@ def load_driver(name: str) -> ModuleType:
     with needed_software(driver):
         for package in driver.packages:
             importlib.import_module(package)
-    return importlib.import_module(f"capture.devices.cameras.{name}")
+    return importlib.import_module(f"{driver.room}.{name}")
 
 
 @contextmanager

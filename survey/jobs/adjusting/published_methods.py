@@ -1,7 +1,7 @@
 """The published step-by-step methods on a project, beside its joint adjustment, number by number with both sigmas.
 
-Two methods: the calibration of a camera head on a two-axis table (``adjust.published``), and the iteration of corrections of
-Euler angles over the loops of measured pairs (``adjust.published.relay``). Those that a project has the observations for
+Two methods: the calibration of a camera head on a two-axis table, and the iteration of corrections of Euler angles over
+the loops of measured pairs (``adjust.published``). Those that a project has the observations for
 are run; of the others it is said what is missing.
 """
 

@@ -1,7 +1,8 @@
 """How a table of ``survey.toml`` is declared: its keys with their kind, unit, default and meaning.
 
 Readers allow the keys that a declaration names and no others; the reference and the schema for editors are made from
-the same declarations (``survey.project.reference``, ``survey.schema``). What there is stands in ``survey.project.declared.declarations``.
+the same declarations (``survey.project.reference``, ``survey.project.schema``).
+What there is stands in ``survey.project.declared.declarations``.
 """
 
 from dataclasses import dataclass, field
@@ -63,7 +64,7 @@ class Declared:
 
 
 def vector_keys_declared(units: dict[str, str], said: dict[str, str], free: tuple[str, ...]) -> tuple[Key, ...]:
-    """The keys of named scalars with units (``survey.project.declared.vectors``): which are free, values, sigmas of priors."""
+    """The keys of named scalars with units (``declared.vectors``): which are free, values, sigmas of priors."""
     names = tuple(units)
     keys = [Key("free", "names", f"which of {', '.join(names)} are unknown", default=list(free), choices=names)]
     keys.append(Key("sigma", "table", "a prior: sigmas of the values given, under the same keys", table="vector_sigma"))
