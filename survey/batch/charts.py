@@ -3,18 +3,19 @@
 from collections.abc import Sequence
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.model import FloatArray
 from survey.batch.control import WIDTH, Chart
 from survey.report import drawing as d
-from survey.report.language import localised, t
-from survey.report.markup import MINUS, esc, value_text
+from survey.report.language import esc, localised, t
+from survey.report.markup import MINUS, value_text
 
 _WIDE, _HIGH = 540.0, 178.0
 _LEFT, _RIGHT, _TOP, _BASE = 58.0, 8.0, 22.0, 26.0
 
 
-def control_chart(c: Chart, names: Sequence[str], failed: Sequence[int], title: str) -> str:
+def control_chart(c: Chart, names: Sequence[str], failed: Sequence[int], title: str) -> Markup:
     """Values as deviations from the mean, limits from sigmas (band) and from the scatter (dashed), alarms in red.
 
     names: of all epochs of the batch. failed: positions of epochs that have no result, crossed at the bottom.

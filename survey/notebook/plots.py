@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.errors import SurveyError
 from adjust.result import Adjustment
 from survey.files.text import atomic_write, choice_hint, suggestion
 from survey.quantities import Scale
 from survey.report import camera_plots, picture
+from survey.report.drawing import ON_WHITE, standalone
 from survey.report.scene import scene_of
 from survey.report.statistics import heat_map, quantiles
 from survey.residual_tables import image_rows
@@ -21,7 +23,6 @@ from survey.verdict import suspects
 if TYPE_CHECKING:
     from survey.report.camera_plots import CameraResiduals
 
-_FONT = '"Inter", "Segoe UI", "Helvetica Neue", "Liberation Sans", Arial, sans-serif'
 
 
 @dataclass(frozen=True)
@@ -47,12 +48,6 @@ class Plot:
         return f"Plot({self.name!r}, {len(self.svg)} bytes of SVG)"
 
 
-def standalone(svg: str) -> str:
-    """As a file of its own: a name space, a font and a white ground, also in a dark notebook."""
-    look = f"background:#fff;font-family:{_FONT}".replace('"', "'")
-    return svg.replace("<svg ", f'<svg xmlns="http://www.w3.org/2000/svg" style="{look}" ', 1)
-
-
 def _camera(adjustment: Adjustment, camera: str | None) -> "CameraResiduals":
     ids = [c.camera_id for c in adjustment.survey.cameras]
     if camera is None and len(ids) == 1:
@@ -72,19 +67,19 @@ def _camera(adjustment: Adjustment, camera: str | None) -> "CameraResiduals":
     )  # fmt: skip
 
 
-def _residuals(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> str:
+def _residuals(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> Markup:
     return camera_plots.vector_field(_camera(adjustment, camera))
 
 
-def _mean_residuals(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> str:
+def _mean_residuals(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> Markup:
     return camera_plots.mean_field(_camera(adjustment, camera))
 
 
-def _histogram(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> str:
+def _histogram(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> Markup:
     return camera_plots.histogram(_camera(adjustment, camera))
 
 
-def _view(adjustment: Adjustment, scale: Scale, make: Callable[[Any], picture.View]) -> str:
+def _view(adjustment: Adjustment, scale: Scale, make: Callable[[Any], picture.View]) -> Markup:
     scene = scene_of(adjustment, scale)
     everything = scene.positions()
     if not len(everything):
@@ -93,22 +88,22 @@ def _view(adjustment: Adjustment, scale: Scale, make: Callable[[Any], picture.Vi
     return picture.draw(scene, make(everything), everything, enlarged, scale.ellipsoid)
 
 
-def _map(adjustment: Adjustment, scale: Scale) -> str:
+def _map(adjustment: Adjustment, scale: Scale) -> Markup:
     return _view(adjustment, scale, picture.plan)
 
 
-def _perspective(adjustment: Adjustment, scale: Scale) -> str:
+def _perspective(adjustment: Adjustment, scale: Scale) -> Markup:
     return _view(adjustment, scale, picture.perspective)
 
 
-def _correlations(adjustment: Adjustment, _scale: Scale) -> str:
+def _correlations(adjustment: Adjustment, _scale: Scale) -> Markup:
     found = correlation_matrix(adjustment)
     if found is None:
         raise SurveyError("there are not two unknowns whose correlation could be shown")
     return heat_map(found)
 
 
-def _quantiles(adjustment: Adjustment, _scale: Scale, group: str | None = None) -> str:
+def _quantiles(adjustment: Adjustment, _scale: Scale, group: str | None = None) -> Markup:
     names = [g.group for g in adjustment.groups]
     group = names[0] if group is None and len(names) == 1 else group
     if group not in names:
@@ -127,7 +122,7 @@ def _quantiles(adjustment: Adjustment, _scale: Scale, group: str | None = None) 
     return quantiles(group, w)
 
 
-PLOTS: Mapping[str, Callable[..., str]] = {
+PLOTS: Mapping[str, Callable[..., Markup]] = {
     "residuals": _residuals,
     "mean_residuals": _mean_residuals,
     "histogram": _histogram,
@@ -148,4 +143,4 @@ def plot(name: str, adjustment: Adjustment, scale: Scale, **chosen: str) -> Plot
         if key != allowed.get(name):
             takes = f"it takes {allowed[name]}=" if name in allowed else "it takes nothing more"
             raise SurveyError(f"plot {name!r} knows no {key}=; {takes}")
-    return Plot(name, standalone(PLOTS[name](adjustment, scale, **chosen)))
+    return Plot(name, standalone(PLOTS[name](adjustment, scale, **chosen), ON_WHITE))

@@ -4,10 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.model import FloatArray
 from survey.report import drawing as d
-from survey.report.markup import esc
+from survey.report.language import esc
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 58.0, 14.0, 26.0, 42.0
 
@@ -37,7 +38,7 @@ def ticks(low: float, high: float, most: int = 5) -> FloatArray:
 def chart(
     series: Sequence[Series], title: str, x_label: str, y_label: str, width: float = 350.0, height: float = 260.0,
     least: float | None = 0.0,
-) -> str:  # fmt: skip
+) -> Markup:  # fmt: skip
     """A plot with linear axes. ``least``: where the y axis begins, None: at the data."""
     xs = np.concatenate([s.x for s in series])
     tops = np.concatenate([s.y + (0 if s.error is None else s.error) for s in series])
@@ -90,7 +91,7 @@ def _drawn(s: Series, place: Callable[[FloatArray, FloatArray], FloatArray]) -> 
     return parts + [d.dot(x, y, 2.6, s.colour) for x, y in xy]
 
 
-def bars(names: Sequence[str], values: FloatArray, title: str, colours: Sequence[str], width: float = 560.0) -> str:
+def bars(names: Sequence[str], values: FloatArray, title: str, colours: Sequence[str], width: float = 560.0) -> Markup:
     """Horizontal bars, one a line, with their values."""
     high, left = max(float(np.max(values, initial=0.0)), 1e-300), 230.0
     parts = [d.text(0, 12, title, colour=d.INK, size=11.5)]
@@ -102,7 +103,7 @@ def bars(names: Sequence[str], values: FloatArray, title: str, colours: Sequence
     return d.svg(width, 30 + 17 * len(names), parts, title)
 
 
-def seen_map(rows: Sequence[str], columns: Sequence[str], counts: FloatArray, title: str) -> str:
+def seen_map(rows: Sequence[str], columns: Sequence[str], counts: FloatArray, title: str) -> Markup:
     """Which row (camera and target) shows how many points at which epoch (column); (r, c), zero is left blank."""
     left, cell, top = 150.0, max(6.0, min(16.0, 760.0 / max(len(columns), 1))), 22.0
     high = max(float(counts.max(initial=0.0)), 1.0)

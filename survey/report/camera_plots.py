@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.model import BoolArray, FloatArray
 from survey.report import drawing as d
@@ -54,7 +55,7 @@ def _bar(y: float, scale: float) -> str:
     return d.scale_bar(1, y, step * scale, localised(f"{step:g} px"))
 
 
-def vector_field(c: CameraResiduals) -> str:
+def vector_field(c: CameraResiduals) -> Markup:
     """Residual vectors at the observed points; suspects red and all drawn, not used ones orange."""
     scale, height, parts = _frame(c.size, t("Residuals"))
     rank = np.random.default_rng(0).permutation(len(c.uv))
@@ -79,7 +80,7 @@ def vector_field(c: CameraResiduals) -> str:
     return d.svg(WIDTH, _TOP + height + _BOTTOM, parts, t("Residual vectors of camera {name}", name=c.camera_id))
 
 
-def mean_field(c: CameraResiduals) -> str:
+def mean_field(c: CameraResiduals) -> Markup:
     """Mean residual per cell over the number of points per cell: what the lens model leaves over shows here."""
     scale, height, parts = _frame(c.size, t("Mean per cell, over the coverage"))
     nx = _CELLS_ACROSS
@@ -106,7 +107,7 @@ def mean_field(c: CameraResiduals) -> str:
     return d.svg(WIDTH, _TOP + height + _BOTTOM, parts, title)
 
 
-def histogram(c: CameraResiduals) -> str:
+def histogram(c: CameraResiduals) -> Markup:
     """Standardized residuals (u and v together) against the normal distribution they should have."""
     reach, n_bins, height = 5.0, 50, 118.0
     w = c.standardized[c.used].ravel()

@@ -3,9 +3,10 @@
 from collections.abc import Iterable
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.model import FloatArray
-from survey.report.markup import esc
+from survey.report.language import esc
 
 # every colour of a picture has its counterpart on a dark page; a picture names no other one
 INK, GREY, FAINT, PAPER, FRAME = "#1c2733", "#66727f", "#d5dbe1", "#ffffff", "#fbfcfd"
@@ -22,24 +23,25 @@ DARK = {
     X_AXIS: "#f08080", Z_AXIS: "#8ea8f5",
     "#b2560d": "#f0985a", "#a8324a": "#ee7f97", "#00798c": "#4fc3d6", "#6b6b00": "#c9c95a", "#4a4a8a": "#a5a5ee",
 }  # fmt: skip
-"""What each colour becomes where the reader's screen is dark."""
+"""What each colour becomes where the reader's screen is dark: attributes of pictures stay those of paper."""
 
 
-def dark_rules() -> str:
-    """Rules of a style sheet that bring pictures to a dark page: their attributes stay those of paper."""
-    return "".join(
-        f'svg [{attribute}="{light}"]{{{attribute}:{dark}}}'
-        for light, dark in DARK.items()
-        for attribute in ("fill", "stroke")
-    )
-
-
-def svg(width: float, height: float, parts: Iterable[str], title: str) -> str:
+def svg(width: float, height: float, parts: Iterable[str], title: str) -> Markup:
     """A picture with its accessible title."""
-    return (
+    return Markup(
         f'<svg viewBox="0 0 {width:g} {height:g}" width="{width:g}" height="{height:g}" role="img" '
         f'aria-label="{esc(title)}">{"".join(parts)}</svg>'
     )
+
+
+ON_WHITE = "background:#fff;font-family:'Inter', 'Segoe UI', 'Helvetica Neue', 'Liberation Sans', Arial, sans-serif"
+"""A font and a white ground for a picture by itself, also in a dark notebook."""
+
+
+def standalone(picture: Markup, style: str = "") -> str:
+    """A picture as a file of its own."""
+    look = f' style="{style}"' if style else ""
+    return str(picture).replace("<svg ", f'<svg xmlns="http://www.w3.org/2000/svg"{look} ', 1)
 
 
 def text(

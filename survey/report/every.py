@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.model import FloatArray, IntArray
 from survey.quantities import sigma_unit_for_people, unit_for_people
 from survey.report.context import Context
-from survey.report.embedding import json_script
 from survey.report.language import group_name, known, t
-from survey.report.markup import count, esc, fixed, section
+from survey.report.markup import count, fixed, heads, json_script, part, section
 
 MOST = 20_000
 
@@ -38,16 +38,15 @@ COLUMNS = (
 _NAMES = ("Kind", "Group", "Where", "Point", "Component", "Unit", "Unit of σ")
 _NUMBERS = tuple(name for name in COLUMNS if name not in _NAMES)
 _SORTED_BY = COLUMNS.index("w")
-_SORTED = ' aria-sort="descending"'
 _BY_SIZE = {"Residual", "w", "Gross error"}
 
 
-def every_observation(c: Context) -> str:
+def every_observation(c: Context) -> Markup:
     """The section; nothing where there is no observation."""
     rows = _all_rows(c)
     n = len(rows.flags)
     if not n:
-        return ""
+        return Markup()
     worst = np.argsort(-np.nan_to_num(np.abs(rows.numbers["w"]), nan=-1.0), kind="stable")
     kept = worst[:MOST]
     columns = [
@@ -69,28 +68,12 @@ def every_observation(c: Context) -> str:
     )
     if power is not None:
         said += " " + t("Power {power} %.", power=fixed(100 * power.power, 0))
-    return section("all-observations", "All observations", _controls() + json_script("all-data", data), said + more)
+    shown = part("all_observations", heads(_left(x) for x in COLUMNS), _SORTED_BY, of="report.html")
+    return section("all-observations", "All observations", shown + json_script("all-data", data), said + more)
 
 
-def _controls() -> str:
-    heads = "".join(
-        f'<th class="{"l" if x in _NAMES else "r"}"{_SORTED if i == _SORTED_BY else ""}>{known(x)}</th>'
-        for i, x in enumerate(COLUMNS)
-    )
-    buttons = "".join(
-        f'<button type="button" id="all-{name}" aria-label="{esc(t(label))}">{sign}</button>'
-        for name, sign, label in (
-            ("first", "«", "first page"), ("back", "‹", "page before"), ("next", "›", "next page"),
-            ("last", "»", "last page"),
-        )
-    )  # fmt: skip
-    return (
-        f'<div class="screen"><p class="controls"><input type="search" class="filter" id="all-filter" '
-        f'placeholder="{esc(t("filter"))}" aria-label="{esc(t("filter"))}"> <label><input type="checkbox" '
-        f'id="all-only"> {t("only suspect or not used")}</label> {buttons} <span id="all-where"></span></p>'
-        f'<div class="t"><table id="all"><thead><tr>{heads}<th class="l"></th></tr></thead><tbody></tbody></table>'
-        f'</div></div><p class="note paper">{t("On the screen this table can be searched and sorted.")}</p>'
-    )
+def _left(column: str) -> str:
+    return f"<{column}" if column in _NAMES else column
 
 
 def _coded(name: str, values: Sequence[str]) -> dict[str, Any]:

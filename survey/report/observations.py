@@ -1,12 +1,28 @@
-"""Sections on what was observed: residuals and tests, the worst first."""
+"""Sections on what was observed: residuals and tests, the worst first; what people left out, and why."""
+
+from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.result import ObservationResidual
 from survey.quantities import sigma_unit_for_people, unit_for_people
 from survey.report.context import Context
 from survey.report.language import group_name, known, t
-from survey.report.markup import count, esc, fixed, general, pill, section, sigma_text, table, value_text
+from survey.report.markup import (
+    MISSING,
+    code,
+    count,
+    element,
+    fixed,
+    general,
+    joined,
+    pill,
+    section,
+    sigma_text,
+    table,
+    value_text,
+)
 
 _MOST_OTHER = 200
 _MOST_IMAGE = 30
@@ -23,7 +39,7 @@ def _row_class(used: bool, suspect: bool) -> str:
     return "off" if not used else "suspect" if suspect else ""
 
 
-def others(c: Context) -> str:
+def others(c: Context) -> Markup:
     """Everything but image points, one row per component, sorted by |standardized residual|."""
     limit = c.solution["summary"]["suspects"]["standardized_limit"]
     every = [(o, i) for o in c.adjustment.other_residuals for i in range(len(o.components))]
@@ -51,18 +67,19 @@ def _other_row(o: ObservationResidual, i: int, suspect: bool) -> list[str]:
     shown_sigma = float(o.sigma[i] * factor)
     residual, sigma = float(o.residual[i] * sigma_factor), float(o.sigma[i] * sigma_factor)
     # an r of zero means that nothing controls the observation: its residual says nothing
-    redundancy = fixed(o.redundancy[i], 2) + ("" if o.redundancy[i] > 0.05 else " " + pill("warn", t("uncontrolled")))
-    word = esc(known(o.kind.replace("_", " ")))
-    kind = word if o.group == o.kind else f"{word} <small>{esc(group_name(o.group))}</small>"
+    flag = [] if o.redundancy[i] > 0.05 else [pill("warn", t("uncontrolled"))]
+    redundancy = joined((fixed(o.redundancy[i], 2), *flag), " ")
+    word = known(o.kind.replace("_", " "))
+    kind = word if o.group == o.kind else joined((word, element("small", group_name(o.group))), " ")
     return [
-        kind, esc(" · ".join(o.ids)), f"<code>{esc(o.components[i])}</code>",
+        kind, " · ".join(o.ids), code(o.components[i]),
         value_text(float(o.observed[i] * factor), shown_sigma), value_text(float(o.adjusted[i] * factor), shown_sigma),
-        esc(unit), value_text(residual, sigma), sigma_text(sigma), esc(sigma_unit), redundancy,
+        unit, value_text(residual, sigma), sigma_text(sigma), sigma_unit, redundancy,
         fixed(o.standardized[i], 2), _flag(o.used, suspect),
     ]  # fmt: skip
 
 
-def image_points(c: Context) -> str:
+def image_points(c: Context) -> Markup:
     """The image points with the largest test, and the images with the largest residuals."""
     found, blocks = c.adjustment.image_residuals, c.adjustment.survey.image_blocks
     test = np.nan_to_num(found.test, nan=-1.0)
@@ -75,7 +92,7 @@ def image_points(c: Context) -> str:
         numbers = [fixed(v, n) for v, n in zip(values, (2, 2, 3, 3, 2, 2), strict=True)]
         names = (block.camera_id, block.epoch_id, block.target_id or "world", c.rows.point_ids[c.rows.point[k]])
         redundancy = [fixed(r, 2) for r in found.redundancy[k]]
-        rows.append([*(esc(n) for n in names), *numbers, *redundancy, fixed(found.test[k], 2), _flag(used, suspect)])
+        rows.append([*names, *numbers, *redundancy, fixed(found.test[k], 2), _flag(used, suspect)])
         classes.append(_row_class(used, suspect))
     columns = (
         "<Camera", "<Epoch", "<Target", "<Point", "u [px]", "v [px]", "res. u [px]", "res. v [px]", "std. u", "std. v",
@@ -91,7 +108,7 @@ def image_points(c: Context) -> str:
     return section("image-points", "Image points", body, note)
 
 
-def _images(c: Context) -> str:
+def _images(c: Context) -> Markup:
     every = [
         (camera_id, epoch, image["rms_residual_px"], image["n_image_points"])
         for camera_id, camera in c.solution["cameras"].items()
@@ -99,6 +116,36 @@ def _images(c: Context) -> str:
         if image["rms_residual_px"] is not None
     ]
     worst = sorted(every, key=lambda x: -x[2])[:_MOST_IMAGES]
-    rows = [[esc(camera), esc(epoch), count(n), fixed(rms, 3)] for camera, epoch, rms, n in worst]
+    rows = [[camera, epoch, count(n), fixed(rms, 3)] for camera, epoch, rms, n in worst]
     columns = ("<Camera", "<Epoch", "Points", "RMS residual [px]")
-    return f"<h3>{t('Images with the largest residuals')}</h3>{table(columns, rows)}" if rows else ""
+    return element("h3", t("Images with the largest residuals")) + table(columns, rows) if rows else Markup()
+
+
+def excluded(c: Context) -> Markup:
+    """Rows of exclusions.csv in force, as they stand there; empty where nothing was left out by anybody."""
+    found, out = c.solution["exclusions"], c.solution["left_out"]
+    if not found and not any(out.values()):
+        return Markup()
+    limit = c.solution["summary"]["suspects"]["standardized_limit"]
+    columns = ("<What", "<Reason", "<Who", "<When", "Images", "Image points", "Readings", "Largest |w| now", "<")
+    rows = table(columns, [_excluded_row(e, limit) for e in found]) if found else Markup()
+    note = t(
+        "{people} observations are left out by people (observations/exclusions.csv), {files} only by used = false in "
+        "their table, {run} by this adjustment. What is left out is predicted and tested as long as the others "
+        "determine it: a small residual says that it would fit now.",
+        people=count(out["by_people"]), files=count(out["in_files"]), run=count(out["in_this_run"]),
+    )  # fmt: skip
+    return section("excluded", "Excluded by people", rows or element("p", t("Nothing is excluded by people.")), note)
+
+
+def _excluded_row(e: dict[str, Any], limit: float) -> tuple[str, ...]:
+    w = e["largest_standardized_residual"]
+    reason = e["reason"] if e["reason"] else pill("soft", t("no reason given"))
+    meets = e["n_image_points"] + e["n_spots"] + e["n_readings"]
+    flag = pill("soft", t("names nothing")) if not meets else "" if w is None else (
+        pill("quiet", t("fits now")) if w <= limit else pill("soft", t("does not fit"))
+    )  # fmt: skip
+    return (
+        code(e["name"]), reason, e["author"], e["time"], count(e["n_images"]),
+        count(e["n_image_points"] + e["n_spots"]), count(e["n_readings"]), MISSING if w is None else fixed(w, 1), flag,
+    )  # fmt: skip

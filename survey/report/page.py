@@ -3,15 +3,15 @@
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from adjust.result import Adjustment
 from survey.quantities import scale_of
-from survey.report import every, instruments, left_out, loops, observations, overview, published, statistics, unknowns
+from survey.report import every, loops, observations, overview, published, statistics, unknowns
 from survey.report.context import Context
-from survey.report.document import document
 from survey.report.drawing import DARK
-from survey.report.embedding import json_script
 from survey.report.language import localised, speaking, t
-from survey.report.markup import esc
+from survey.report.markup import document, element, joined, json_script, part
 from survey.residual_tables import image_rows
 from survey.solution import RunInfo, solution_dict
 from survey.statistics import Statistics
@@ -29,12 +29,12 @@ _SECTIONS = (
     ("Turntables", "tables", unknowns.tables),
     ("Targets", "targets", unknowns.targets),
     ("Points", "points", unknowns.points),
-    ("Instruments and surfaces", "instruments", instruments.instruments),
+    ("Instruments and surfaces", "instruments", unknowns.instruments),
     ("Network", "network", loops.network),
     ("Loops", "loops", loops.loops),
     ("Pairs", "pairs", loops.pairs),
     ("Published methods", "published", published.published),
-    ("Excluded by people", "excluded", left_out.excluded),
+    ("Excluded by people", "excluded", observations.excluded),
     ("Observations", "observations", observations.others),
     ("Image points", "image-points", observations.image_points),
     ("All observations", "all-observations", every.every_observation),
@@ -71,11 +71,11 @@ def report_html(
 
 def _page(c: Context) -> str:
     made = [(name, anchor, make(c)) for name, anchor, make in _SECTIONS]
-    nav = "".join(f'<a href="#{anchor}">{esc(t(name))}</a>' for name, anchor, body in made if body)
+    nav = part("nav", [(anchor, t(name)) for name, anchor, body in made if body])
     script = Path(__file__).with_name("script.js").read_text(encoding="utf-8")
     title = f"{c.solution['summary']['title'] or c.run.folder} – {t('Adjustment report')}"
-    shown = f"{overview.header(c)}<nav>{nav}</nav>" + "\n".join(body for _, _, body in made)
-    return document(title, shown, f"{json_script('words', _words())}<script>{script}</script>")
+    shown = overview.header(c) + nav + joined((body for _, _, body in made), "\n")
+    return document(title, shown, json_script("words", _words()) + element("script", Markup(script)))
 
 
 def _words() -> dict[str, Any]:

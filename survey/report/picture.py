@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.model import FloatArray
 from survey.report import drawing as d
@@ -164,7 +165,7 @@ def _world_axes(view: View, reach: float) -> list[str]:
     return parts
 
 
-def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, ellipsoid: float) -> str:
+def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, ellipsoid: float) -> Markup:
     """One view of the scene as SVG."""
     extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
     parts = [
@@ -215,12 +216,12 @@ def _labels(view: View, scene: Scene, ahead: float) -> list[str]:
     return parts
 
 
-def pictures(scene: Scene, ellipsoid: float) -> tuple[str, float]:
-    """Both views side by side, and the factor by which ellipsoids are enlarged; nothing for an empty scene."""
+def pictures(scene: Scene, ellipsoid: float) -> tuple[tuple[Markup, ...], float]:
+    """Both views, and the factor by which ellipsoids are enlarged; nothing for an empty scene."""
     everything = scene.positions()
     if not len(everything):
-        return "", 1.0
+        return (), 1.0
     extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
     enlarged = enlargement(scene, ellipsoid, extent)
     views = (plan(everything), perspective(everything))
-    return "".join(f"<figure>{draw(scene, v, everything, enlarged, ellipsoid)}</figure>" for v in views), enlarged
+    return tuple(draw(scene, v, everything, enlarged, ellipsoid) for v in views), enlarged

@@ -3,23 +3,22 @@
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.model import FloatArray
 from survey.report import drawing as d
-from survey.report.embedding import json_script
-from survey.report.language import t
-from survey.report.markup import esc
+from survey.report.markup import json_script, part
 from survey.report.picture import enlargement
 from survey.report.scene import Scene, Shot
 
 _MOST_LABELS = 80
 
 
-def space(scene: Scene, ellipsoid: float) -> str:
+def space(scene: Scene, ellipsoid: float) -> Markup:
     """Canvas, slider and data; nothing for an empty scene. ``ellipsoid``: semi-axes of the region, in sigmas."""
     everything = scene.positions()
     if not len(everything):
-        return ""
+        return Markup()
     low, high = everything.min(axis=0), everything.max(axis=0)
     reach = max(float(np.linalg.norm(high - low)) / 2.0, 1e-3)
     data = {
@@ -30,19 +29,7 @@ def space(scene: Scene, ellipsoid: float) -> str:
         "spots": [_spot(s.x, s.cov, ellipsoid, s.kind) for s in scene.spots],
         "labels": _labels(scene),
     }
-    hint = t("Drag to turn, Ctrl and wheel to zoom; arrow keys, + and − do the same.")
-    enlarged, times = t("Ellipsoids enlarged"), t("times")
-    buttons = "".join(
-        f'<button type="button" id="space-{name}" aria-label="{esc(t(label))}">{sign}</button>'
-        for name, sign, label in (("in", "+", "nearer"), ("out", "−", "further away"))
-    )
-    return (
-        '<div class="screen"><canvas id="space" tabindex="0" role="img" '
-        f'aria-label="{esc(t("The survey in space"))}"></canvas>'
-        f'<p class="controls">{buttons} <span>{hint}</span> <label>{enlarged} <b id="space-factor"></b> {times} '
-        '<input id="space-enlarge" type="range" min="-2" max="1" step="0.05" value="0"></label></p></div>'
-        f"{json_script('space-data', data)}"
-    )
+    return part("space", of="report.html") + json_script("space-data", data)
 
 
 def rounded(x: FloatArray) -> Any:

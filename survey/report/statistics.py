@@ -1,21 +1,28 @@
 """Sections on the statistics: variance components, reliability, relative precision, budget, correlations."""
 
+from collections.abc import Sequence
+
 import numpy as np
+from markupsafe import Markup
 
 from adjust.distributions import beta, norm
 from adjust.model import FloatArray
 from adjust.result import ParameterName
-from adjust.statistics.result import BudgetEntry, Component, Influence, RelativePrecision, WeakDirection
+from adjust.statistics.result import BudgetEntry, Component, Correlation, Influence, RelativePrecision, WeakDirection
 from survey.quantities import sigma_unit_for_people
 from survey.report import drawing as d
 from survey.report.context import Context
-from survey.report.language import group_name, known, t
+from survey.report.language import esc, group_name, known, t
 from survey.report.markup import (
     MISSING,
+    code,
     count,
-    esc,
+    element,
+    figures,
     fixed,
     general,
+    joined,
+    listed,
     pill,
     section,
     sigma_text,
@@ -32,50 +39,45 @@ _MOST_PARTS = 6
 def name_text(name: ParameterName) -> str:
     """A parameter as people write it: kind in words, then ids."""
     kind = known(name[0].replace("_", " "))
-    return esc(" ".join((kind, *name[1:])))
+    return " ".join((kind, *name[1:]))
 
 
-def components(c: Context) -> str:
+def components(c: Context) -> Markup:
     """Variance components with their own sigma and test; nothing where they were not estimated."""
     found = c.statistics and c.statistics.components
     if not found:
-        return ""
+        return Markup()
     rows = [_component_row(x) for x in found.components]
     columns = ("<Group", "Factor of variance", "σ of it", "Factor of σ", "n", "Redundancy", "p of 1", "<")
     said = t(
         "Estimated variance factor of every group, on top of the sigmas given ({method}, {n} solutions of the survey). "
         "p of 1: probability of a factor as far from 1 where the given sigmas are right. All sigmas and tests in this "
         "report use these factors.",
-        method=esc(found.method), n=found.iterations,
+        method=found.method, n=found.iterations,
     )  # fmt: skip
     if not found.converged:
         said += " " + pill("bad", t("not converged"))
-    mixed = "".join(
-        f"<li>{t('Not separable, only their mixture is known: {names}', names=esc(', '.join(group)))}</li>"
-        for group in found.unseparable
-    )
-    listed = f'<ul class="problems">{mixed}</ul>' if mixed else ""
-    return section("components", "Variance components", table(columns, rows) + listed, said)
+    mixed = [
+        t("Not separable, only their mixture is known: {names}", names=", ".join(group)) for group in found.unseparable
+    ]
+    return section("components", "Variance components", table(columns, rows) + listed(mixed), said)
 
 
 def _component_row(x: Component) -> tuple[str, ...]:
     kind = "warn" if x.status == "estimated" and x.p < 0.01 else "quiet" if x.status == "estimated" else "soft"
     return (
-        esc(group_name(x.group)), value_text(x.factor, x.sigma), sigma_text(x.sigma),
+        group_name(x.group), value_text(x.factor, x.sigma), sigma_text(x.sigma),
         fixed(float(np.sqrt(max(x.factor, 0.0))), 3),
         count(x.n), fixed(x.redundancy, 1), general(x.p, 2), pill(kind, known(x.status)),
     )  # fmt: skip
 
 
-def reliability(c: Context) -> str:
+def reliability(c: Context) -> Markup:
     """What a gross error that no test finds could do, worst first, and what is not controlled at all."""
     if c.statistics is None:
-        return ""
+        return Markup()
     r = c.statistics.reliability
-    free = "".join(f"<li>{esc(x)}</li>" for x in r.uncontrolled[:_MOST_WEAK])
-    if len(r.uncontrolled) > _MOST_WEAK:
-        free += f"<li>{t('{n} more in solution.json.', n=count(len(r.uncontrolled) - _MOST_WEAK))}</li>"
-    uncontrolled = f"<h3>{t('Not controlled')}</h3><ul>{free}</ul>" if free else ""
+    uncontrolled = _titled("Not controlled", _most(r.uncontrolled))
     rows = [_influence_row(c, x) for x in r.influences[:_MOST_WEAK]]
     columns = ("<Observation", "MDB [σ]", "λ̄", "<Moves most", "by", "<Unit", "in its σ", "<Position", "by [mm]")
     o = r.criteria.options
@@ -85,7 +87,7 @@ def reliability(c: Context) -> str:
         "{level}) of an observation would do to the unknowns if it stayed undetected. Worst first.",
         power=fixed(100 * o.power, 0), method=method, level=general(float(r.criteria.alpha[0]), 2),
     )  # fmt: skip
-    return section("reliability", "Reliability", uncontrolled + (table(columns, rows) if rows else ""), said)
+    return section("reliability", "Reliability", uncontrolled + (table(columns, rows) if rows else Markup()), said)
 
 
 def _influence_row(c: Context, x: Influence) -> tuple[str, ...]:
@@ -96,8 +98,8 @@ def _influence_row(c: Context, x: Influence) -> tuple[str, ...]:
     external = float(tests.external[x.row]) if tests is not None else float("nan")
     place = name_text(x.position) if x.position else MISSING
     return (
-        esc(row), fixed(detectable, 1), fixed(external, 2), f"{name_text(x.name)} <code>{esc(x.component)}</code>",
-        general(x.shift * factor, 2), esc(unit), fixed(x.ratio, 2), place,
+        row, fixed(detectable, 1), fixed(external, 2), joined((name_text(x.name), code(x.component)), " "),
+        general(x.shift * factor, 2), unit, fixed(x.ratio, 2), place,
         general(1e3 * x.position_shift, 2) if x.position else MISSING,
     )  # fmt: skip
 
@@ -112,10 +114,10 @@ def observation_text(c: Context, row: int) -> str:
     return f"{known(o.kind.replace('_', ' '))} {' · '.join(o.ids)}"
 
 
-def relative(c: Context) -> str:
+def relative(c: Context) -> Markup:
     """Precision of neighbours relative to each other, least precise first."""
     if c.statistics is None or not c.statistics.relative:
-        return ""
+        return Markup()
     found = sorted(c.statistics.relative, key=lambda r: -float(r.ellipsoid.semi_axes[0]))
     rows = [_relative_row(r) for r in found[:_MOST_ROWS]]
     columns = ("<From", "<To", "Distance [mm]", "σ [mm]", "a [mm]", "b [mm]", "c [mm]", "Rotation σ [″]")
@@ -137,18 +139,18 @@ def _relative_row(r: RelativePrecision) -> list[str]:
     return [name_text(r.a), name_text(r.b), value_text(distance, sigma), sigma_text(sigma), *axes, turn]
 
 
-def budget(c: Context) -> str:
+def budget(c: Context) -> Markup:
     """Uncertainty budget of the results: standard uncertainty, its sources, expanded uncertainty."""
     if c.statistics is None or not c.statistics.budget:
-        return ""
+        return Markup()
     entries = c.statistics.budget
     sources = list(dict.fromkeys(line.source for e in entries for line in e.lines))
     kinds = {line.source: line.kind for e in entries for line in e.lines}
     rows = [_budget_row(e, sources) for e in entries[:_MOST_ROWS]]
-    heads = [f"{esc(s)} ({kinds[s]}) [%]" for s in sources]
+    heads = [esc(f"{s} ({kinds[s]}) [%]") for s in sources]
     columns = ["<Result", "<", "u", "<Unit", *heads, "ν", "k", "U"]
     left_out = len(entries) - _MOST_ROWS
-    more = " " + t("{n} more in solution.json.", n=count(left_out)) if left_out > 0 else ""
+    more = " " + t("{n} more in solution.json.", n=count(left_out)) if left_out > 0 else Markup()
     said = t(
         "Standard uncertainty u of every result and the share of each source in its variance (GUM, JCGM 100:2008). "
         "Type A: from the scatter of this survey's own residuals; type B: given. ν: effective degrees of freedom; "
@@ -164,43 +166,50 @@ def _budget_row(e: BudgetEntry, sources: list[str]) -> list[str]:
     shares = [fixed(100 * share[s], 1) if s in share else MISSING for s in sources]
     freedom = "∞" if not np.isfinite(e.freedom) else fixed(e.freedom, 0)
     return [
-        name_text(e.name), f"<code>{esc(e.component)}</code>", sigma_text(e.u * factor), esc(unit), *shares, freedom,
+        name_text(e.name), code(e.component), sigma_text(e.u * factor), unit, *shares, freedom,
         fixed(e.coverage, 2), sigma_text(e.expanded * factor),
     ]  # fmt: skip
 
 
-def correlations(c: Context) -> str:
+def correlations(c: Context) -> Markup:
     """The correlation matrix as a picture, pairs above 95 % and weak directions by name."""
     if c.statistics is None:
-        return ""
+        return Markup()
     s = c.statistics
-    drawn = f"<figure>{heat_map(s.correlations)}</figure>" if s.correlations is not None else ""
-    pairs = "".join(
-        f"<li>{name_text(x.a)} <code>{esc(x.a_component)}</code> {t('with')} {name_text(x.b)} "
-        f"<code>{esc(x.b_component)}</code>: {fixed(100 * x.coefficient, 1)} %</li>"
-        for x in s.correlated[:_MOST_WEAK]
-    )
-    if len(s.correlated) > _MOST_WEAK:
-        pairs += f"<li>{t('{n} more in solution.json.', n=count(len(s.correlated) - _MOST_WEAK))}</li>"
-    strong = f"<h3>{t('Correlated above 95 %')}</h3><ul>{pairs}</ul>" if pairs else ""
-    weak = "".join(f"<li>{_weak_text(x)}</li>" for x in s.weak[:10])
-    weakly = f"<h3>{t('Weak directions')}</h3><ul>{weak}</ul>" if weak else ""
+    drawn = element("figure", heat_map(s.correlations)) if s.correlations is not None else Markup()
+    strong = _titled("Correlated above 95 %", _most([_correlated(x) for x in s.correlated]))
+    weak = _titled("Weak directions", [_weak_text(x) for x in s.weak[:10]])
     note = t("Blue: positive, red: negative; empty: none. Lines separate the parameters.")
-    return section("correlations", "Correlations", drawn + strong + weakly, note)
+    return section("correlations", "Correlations", drawn + strong + weak, note)
 
 
-def _weak_text(x: WeakDirection) -> str:
+def _titled(title: str, items: Sequence[str]) -> Markup:
+    return element("h3", t(title)) + listed(items, "") if items else Markup()
+
+
+def _most(items: Sequence[str]) -> list[str]:
+    """The first of them, and how many more there are."""
+    more = len(items) - _MOST_WEAK
+    return [*items[:_MOST_WEAK], *([t("{n} more in solution.json.", n=count(more))] if more > 0 else [])]
+
+
+def _correlated(x: Correlation) -> Markup:
+    first, second = (name_text(x.a), code(x.a_component)), (name_text(x.b), code(x.b_component))
+    return joined((*first, t("with"), *second), " ") + f": {fixed(100 * x.coefficient, 1)} %"
+
+
+def _weak_text(x: WeakDirection) -> Markup:
     parts = []
     for part in x.parts[:_MOST_PARTS]:
         unit, factor = sigma_unit_for_people(part.unit)
         amount = general(part.amount * factor, 2)
-        parts.append(f"{name_text(part.name)} <code>{esc(part.component)}</code> {amount} {esc(unit)}")
+        parts.append(joined((name_text(part.name), code(part.component), amount, unit), " "))
     left_out = len(x.parts) - _MOST_PARTS
-    more = t(" and {n} more", n=left_out) if left_out > 0 else ""
-    return t("{n} times weaker together than alone: ", n=general(x.inflation, 3)) + ", ".join(parts) + more
+    more = t(" and {n} more", n=left_out) if left_out > 0 else Markup()
+    return t("{n} times weaker together than alone: ", n=general(x.inflation, 3)) + joined(parts, ", ") + more
 
 
-def heat_map(m: CorrelationMatrix) -> str:
+def heat_map(m: CorrelationMatrix) -> Markup:
     """The matrix as cells; labels where there is room for them."""
     n, left = len(m.labels), 150.0
     cell = min(18.0, 620.0 / max(n, 1))
@@ -226,7 +235,7 @@ def heat_map(m: CorrelationMatrix) -> str:
     return d.svg(left + size + 4, size + 8, parts, t("Correlations"))
 
 
-def normality(c: Context) -> str:
+def normality(c: Context) -> Markup:
     """Quantiles of the standardized residuals of every group against those of the normal distribution."""
     groups: dict[str, list[FloatArray]] = {}
     found = c.adjustment.image_residuals
@@ -241,16 +250,15 @@ def normality(c: Context) -> str:
         w = np.concatenate(parts)
         w = np.sort(w[np.isfinite(w)])
         if len(w) >= 8:
-            drawn.append(f"<figure>{quantiles(group_name(name), w)}</figure>")
+            drawn.append(quantiles(group_name(name), w))
     note = t(
         "Standardized residuals of each group in order, against the quantiles that as many normally distributed ones "
         "would have. The band holds 95 % of such points one by one."
     )
-    body = f'<div class="figures">{"".join(drawn[:12])}</div>' if drawn else ""
-    return section("normality", "Distribution of residuals", body, note)
+    return section("normality", "Distribution of residuals", figures(drawn[:12]), note)
 
 
-def quantiles(name: str, w: FloatArray) -> str:
+def quantiles(name: str, w: FloatArray) -> Markup:
     """A Q-Q plot of sorted values; the band is that of order statistics (beta distribution)."""
     n, side, pad = len(w), 240.0, 26.0
     keep = np.unique(np.concatenate([np.arange(min(n, 40)), np.linspace(0, n - 1, 160).astype(int),

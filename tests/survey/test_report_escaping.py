@@ -26,8 +26,8 @@ from survey.planning.job import PlanRequest, planning_job
 from survey.planning.page import plan_page
 from survey.quantities import scale_of
 from survey.report import report_html
-from survey.report.embedding import json_script
-from survey.report.markup import esc
+from survey.report.language import esc
+from survey.report.markup import json_script
 from survey.simulate import beacons
 from survey.solution import RunInfo
 from survey.statistics import statistics_of
