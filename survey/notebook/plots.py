@@ -15,7 +15,7 @@ from survey.quantities import Scale
 from survey.report import camera_plots, picture
 from survey.report.drawing import ON_WHITE, standalone
 from survey.report.scene import scene_of
-from survey.report.statistics import heat_map, quantiles
+from survey.report.statistics import heat_map, quantiles, standardized_by_group
 from survey.residual_tables import image_rows
 from survey.statistics import correlation_matrix
 from survey.verdict import suspects
@@ -109,14 +109,7 @@ def _quantiles(adjustment: Adjustment, _scale: Scale, group: str | None = None) 
     if group not in names:
         hint = suggestion(group, names) if group else f"groups are {', '.join(names)}"
         raise SurveyError(f"{'no group is named' if group is None else f'there is no group {group!r}'}; {hint}")
-    found, parts = adjustment.image_residuals, []
-    for i, block in enumerate(adjustment.survey.image_blocks):
-        rows = slice(found.block_ptr[i], found.block_ptr[i + 1])
-        if block.group == group:
-            parts.append(found.standardized[rows][found.used[rows]].ravel())
-    parts += [o.standardized for o in adjustment.other_residuals if o.used and o.group == group]
-    w = np.concatenate([*parts, np.empty(0)])
-    w = np.sort(w[np.isfinite(w)])
+    w = standardized_by_group(adjustment).get(group, np.empty(0))
     if len(w) < 8:
         raise SurveyError(f"group {group!r} has {len(w)} residuals that can be tested; quantiles need 8 or more")
     return quantiles(group, w)

@@ -2,12 +2,11 @@
 
 from typing import Any
 
-import numpy as np
 from markupsafe import Markup
 
 from adjust.result import ObservationResidual
 from survey.quantities import sigma_unit_for_people, unit_for_people
-from survey.report.context import Context
+from survey.report.context import Context, other_components, worst
 from survey.report.language import group_name, known, t
 from survey.report.markup import (
     MISSING,
@@ -42,21 +41,20 @@ def _row_class(used: bool, suspect: bool) -> str:
 def others(c: Context) -> Markup:
     """Everything but image points, one row per component, sorted by |standardized residual|."""
     limit = c.solution["summary"]["suspects"]["standardized_limit"]
-    every = [(o, i) for o in c.adjustment.other_residuals for i in range(len(o.components))]
-    # what cannot be tested (no redundancy, no number) comes last
-    size = [abs(o.standardized[i]) if np.isfinite(o.standardized[i]) else -1.0 for o, i in every]
-    order = sorted(range(len(every)), key=lambda k: -size[k])[:_MOST_OTHER]
-    rows = [_other_row(*every[k], size[k] > limit) for k in order]
-    classes = [_row_class(every[k][0].used, size[k] > limit) for k in order]
+    observation, component, w = other_components(c.adjustment)
+    order = worst(w, _MOST_OTHER)  # what cannot be tested (no redundancy, no number) comes last
+    shown_rows = [(c.adjustment.other_residuals[observation[k]], int(component[k]), abs(w[k]) > limit) for k in order]
+    rows = [_other_row(*row) for row in shown_rows]
+    classes = [_row_class(o.used, suspect) for o, _, suspect in shown_rows]
     columns = (
         "<Kind", "<Between", "<Component", "Observed", "Adjusted", "<Unit", "Residual", "σ", "<Unit", "Redundancy",
         "Standardized", "<",
     )  # fmt: skip
-    shown = {"shown": count(len(rows)), "n": count(len(every))}
+    shown = {"shown": count(len(rows)), "n": count(len(w))}
     note = t(
         "Suspect: |standardized residual| above {limit}. Sigmas are those given to the program.", limit=fixed(limit, 2)
     )
-    if len(every) > len(rows):
+    if len(w) > len(rows):
         note += " " + t("The worst {shown} of {n} rows; all in residuals_other.csv.", **shown)
     return section("observations", "Other observations", table(columns, rows, "", classes) if rows else "", note)
 
@@ -82,10 +80,8 @@ def _other_row(o: ObservationResidual, i: int, suspect: bool) -> list[str]:
 def image_points(c: Context) -> Markup:
     """The image points with the largest test, and the images with the largest residuals."""
     found, blocks = c.adjustment.image_residuals, c.adjustment.survey.image_blocks
-    test = np.nan_to_num(found.test, nan=-1.0)
-    worst = np.argsort(-test, kind="stable")[:_MOST_IMAGE]
     rows, classes = [], []
-    for k in worst:
+    for k in worst(found.test, _MOST_IMAGE):
         block = blocks[c.rows.block[k]]
         used, suspect = bool(found.used[k]), bool(c.suspect[k])
         values = (*c.rows.uv[k], *found.residuals[k], *found.standardized[k])
@@ -98,11 +94,11 @@ def image_points(c: Context) -> Markup:
         "<Camera", "<Epoch", "<Target", "<Point", "u [px]", "v [px]", "res. u [px]", "res. v [px]", "std. u", "std. v",
         "red. u", "red. v", "Test", "<",
     )  # fmt: skip
-    s = c.solution["summary"]["suspects"]
+    s, n = c.solution["summary"]["suspects"], count(len(found.test))
     note = t(
         "The {shown} largest of {n}. Test: chi-square with 2 degrees of freedom, suspect above {limit} ({alpha} % "
         "together). The others are in residuals.csv.",
-        shown=len(rows), n=count(len(test)), limit=fixed(s["image_test_limit"], 1), alpha=general(100 * s["alpha"]),
+        shown=len(rows), n=n, limit=fixed(s["image_test_limit"], 1), alpha=general(100 * s["alpha"]),
     )  # fmt: skip
     body = table(columns, rows, "", classes) + _images(c) if rows else ""
     return section("image-points", "Image points", body, note)
@@ -115,8 +111,8 @@ def _images(c: Context) -> Markup:
         for epoch, image in camera["images"].items()
         if image["rms_residual_px"] is not None
     ]
-    worst = sorted(every, key=lambda x: -x[2])[:_MOST_IMAGES]
-    rows = [[camera, epoch, count(n), fixed(rms, 3)] for camera, epoch, rms, n in worst]
+    largest = sorted(every, key=lambda x: -x[2])[:_MOST_IMAGES]
+    rows = [[camera, epoch, count(n), fixed(rms, 3)] for camera, epoch, rms, n in largest]
     columns = ("<Camera", "<Epoch", "Points", "RMS residual [px]")
     return element("h3", t("Images with the largest residuals")) + table(columns, rows) if rows else Markup()
 
@@ -128,13 +124,15 @@ def excluded(c: Context) -> Markup:
         return Markup()
     limit = c.solution["summary"]["suspects"]["standardized_limit"]
     columns = ("<What", "<Reason", "<Who", "<When", "Images", "Image points", "Readings", "Largest |w| now", "<")
-    rows = table(columns, [_excluded_row(e, limit) for e in found]) if found else Markup()
+    rows = table(columns, [_excluded_row(e, limit) for e in found[:_MOST_OTHER]]) if found else Markup()
     note = t(
         "{people} observations are left out by people (observations/exclusions.csv), {files} only by used = false in "
         "their table, {run} by this adjustment. What is left out is predicted and tested as long as the others "
         "determine it: a small residual says that it would fit now.",
         people=count(out["by_people"]), files=count(out["in_files"]), run=count(out["in_this_run"]),
     )  # fmt: skip
+    if len(found) > _MOST_OTHER:
+        note += " " + t("{n} more in solution.json.", n=count(len(found) - _MOST_OTHER))
     return section("excluded", "Excluded by people", rows or element("p", t("Nothing is excluded by people.")), note)
 
 

@@ -33,6 +33,7 @@ _WORDS = {"passed": "Passed", "check": "Needs a look", "failed": "Failed"}
 _MOST_WARNINGS = 25
 _MOST_VERDICTS = 200
 _MOST_PARTS = 20
+_MOST_IMAGES = 500
 _KINDS = {"group": "Group", "camera": "Camera", "epoch": "Epoch", "target": "Target", "table": "Table",
           "set-up": "Set-up", "instrument": "Instrument"}  # fmt: skip
 _CLEAR = 3.0  # deviations of a group beyond this many sigmas are marked
@@ -232,9 +233,11 @@ def inputs(c: Context) -> Markup:
     parts = [definition([(t("Command"), code(i["command"]))])] if i["command"] else []
     parts += [files] if i["hashes"] else []
     if i["images"]:
-        rows = [(e["file"], code(e["sha256"]), count(e["n_image_points"] + e["n_spots"])) for e in i["images"].values()]
-        images = table(("<Image", "<Hash", "Points"), rows)
-        said = t("{n} images, each with the hash of the file that its points come from", n=count(len(rows)))
+        shown = list(i["images"].values())[:_MOST_IMAGES]
+        rows = [(e["file"], code(e["sha256"]), count(e["n_image_points"] + e["n_spots"])) for e in shown]
+        images, left_out = table(("<Image", "<Hash", "Points"), rows), len(i["images"]) - len(rows)
+        images += note(t("{n} more in solution.json.", n=count(left_out))) if left_out else Markup()
+        said = t("{n} images, each with the hash of the file that its points come from", n=count(len(i["images"])))
         parts.append(part("details", said, images, False))
     for title, entries in (("Options", i["options"]), ("Versions", i["versions"])):
         if entries:

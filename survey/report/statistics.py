@@ -7,7 +7,7 @@ from markupsafe import Markup
 
 from adjust.distributions import beta, norm
 from adjust.model import FloatArray
-from adjust.result import ParameterName
+from adjust.result import Adjustment, ParameterName
 from adjust.statistics.result import BudgetEntry, Component, Correlation, Influence, RelativePrecision, WeakDirection
 from survey.quantities import sigma_unit_for_people
 from survey.report import drawing as d
@@ -237,25 +237,25 @@ def heat_map(m: CorrelationMatrix) -> Markup:
 
 def normality(c: Context) -> Markup:
     """Quantiles of the standardized residuals of every group against those of the normal distribution."""
-    groups: dict[str, list[FloatArray]] = {}
-    found = c.adjustment.image_residuals
-    for i, block in enumerate(c.adjustment.survey.image_blocks):
-        rows = slice(found.block_ptr[i], found.block_ptr[i + 1])
-        groups.setdefault(block.group, []).append(found.standardized[rows][found.used[rows]].ravel())
-    for o in c.adjustment.other_residuals:
-        if o.used:
-            groups.setdefault(o.group, []).append(o.standardized)
-    drawn = []
-    for name, parts in groups.items():
-        w = np.concatenate(parts)
-        w = np.sort(w[np.isfinite(w)])
-        if len(w) >= 8:
-            drawn.append(quantiles(group_name(name), w))
+    drawn = [quantiles(group_name(name), w) for name, w in standardized_by_group(c.adjustment).items() if len(w) >= 8]
     note = t(
         "Standardized residuals of each group in order, against the quantiles that as many normally distributed ones "
         "would have. The band holds 95 % of such points one by one."
     )
     return section("normality", "Distribution of residuals", figures(drawn[:12]), note)
+
+
+def standardized_by_group(adjustment: Adjustment) -> dict[str, FloatArray]:
+    """Standardized residuals of every group's used observations in ascending order; none that is no number."""
+    found, groups = adjustment.image_residuals, [b.group for b in adjustment.survey.image_blocks]
+    at = {name: i for i, name in enumerate(dict.fromkeys(groups))}
+    row_group = np.repeat(np.array([at[name] for name in groups], dtype=np.int64), np.diff(found.block_ptr))
+    out = {name: [found.standardized[found.used & (row_group == i)].ravel()] for name, i in at.items()}
+    for o in adjustment.other_residuals:
+        if o.used:
+            out.setdefault(o.group, []).append(o.standardized)
+    joint = {name: np.concatenate(parts) for name, parts in out.items()}
+    return {name: np.sort(w[np.isfinite(w)]) for name, w in joint.items()}
 
 
 def quantiles(name: str, w: FloatArray) -> Markup:

@@ -1,7 +1,7 @@
 """Sections on what was estimated: cameras, stations, tables, targets, points, instruments and surfaces."""
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from markupsafe import Markup
@@ -26,8 +26,11 @@ from survey.report.markup import (
     with_sigma,
 )
 
-_MOST_ROWS = 250
+_MOST_ROWS, _MOST_CAMERAS, _MOST_BLOCKS = 250, 40, 100
 _MANY_EPOCHS = 12
+T = TypeVar("T")
+_Pose = tuple[str, str, str, dict[str, Any]]
+"""Thing, name of its pose, epoch or nothing, entry."""
 _POSE_COLUMNS = ("<Pose", "<Epoch", "x [mm]", "y [mm]", "z [mm]", "rx [°]", "ry [°]", "rz [°]", "<Status")
 _POSE_NOTE = (
     "A pose a_from_b is the origin of b in a and R = Rz Ry Rx. Below each coordinate its sigma along the axes of a in "
@@ -77,8 +80,9 @@ def vector_table(entry: dict[str, Any], ratios: dict[str, float] | None = None) 
     return (table(columns, rows) if rows else Markup()) + at_zero
 
 
-def _pose_row(name: Markup, epoch: str, entry: dict[str, Any]) -> list[str]:
+def _pose_row(pose: _Pose) -> list[str]:
     """A row of the table of poses."""
+    thing_id, name, epoch, entry = pose
     smallest = min((s for s in entry["sigma_translation_mm"] if s), default=None)
     cells = [
         with_sigma(v, s, smallest) for v, s in zip(entry["translation_mm"], entry["sigma_translation_mm"], strict=True)
@@ -87,28 +91,30 @@ def _pose_row(name: Markup, epoch: str, entry: dict[str, Any]) -> list[str]:
     for angle, sigma in zip(entry["rotation_euler_xyz_deg"], entry["sigma_rotation_arcsec"], strict=True):
         below = f"± {sigma_text(sigma)}″" if sigma else t("held")
         cells.append(part("below", _value_in("deg", angle, least, "arcsec"), below))
-    return [name, epoch, *cells, status_pill(entry["status"])]
+    return [joined((element("b", thing_id), code(name)), " "), epoch, *cells, status_pill(entry["status"])]
 
 
-def _pose_rows(thing_id: str, entry: dict[str, Any]) -> Iterator[list[str]]:
+def _poses(thing_id: str, entry: dict[str, Any]) -> Iterator[_Pose]:
     """All poses of a thing, also those per epoch."""
-    thing = element("b", thing_id)
     for key, value in entry.items():
         if key == "epochs":
             for epoch, poses in value.items():
                 for name, pose in poses.items():
                     if "_from_" in name and isinstance(pose, dict):
-                        yield _pose_row(joined((thing, code(name)), " "), epoch, pose)
+                        yield thing_id, name, epoch, pose
         elif "_from_" in key:
-            yield _pose_row(joined((thing, code(key)), " "), "", value)
+            yield thing_id, key, "", value
 
 
-def _limited(columns: tuple[str, ...], rows: list[list[str]]) -> Markup:
-    if not rows:
+def _limited(columns: Sequence[str], things: Sequence[T], row: Callable[[T], list[str]]) -> Markup:
+    """A table with a row for each of the first things, and how many more there are."""
+    if not things:
         return Markup()
-    n = count(len(rows) - _MOST_ROWS)
-    more = note(t("{n} more in solution.json.", n=n)) if len(rows) > _MOST_ROWS else Markup()
-    return table(columns, rows[:_MOST_ROWS]) + more
+    return table(columns, map(row, things[:_MOST_ROWS])) + _more(len(things) - _MOST_ROWS)
+
+
+def _more(n: int) -> Markup:
+    return note(t("{n} more in solution.json.", n=count(n))) if n > 0 else Markup()
 
 
 def cameras(c: Context) -> Markup:
@@ -116,20 +122,34 @@ def cameras(c: Context) -> Markup:
     found = c.adjustment.image_residuals
     blocks = c.adjustment.survey.image_blocks
     camera_of_block = np.array([b.camera_id for b in blocks], dtype=object)
-    parts = []
+    entries, parts = c.solution["cameras"], []
+    # of very many cameras those with the largest residuals are shown whole
+    by_size = sorted(entries, key=lambda k: -(entries[k]["rms_residual_px"] or 0.0))
+    shown, others = set(by_size[:_MOST_CAMERAS]), by_size[_MOST_CAMERAS:]
     for camera in c.adjustment.survey.cameras:
-        entry = c.solution["cameras"][camera.camera_id]
+        if camera.camera_id not in shown:
+            continue
         mine = (camera_of_block == camera.camera_id)[c.rows.block] if len(blocks) else np.zeros(0, dtype=bool)
         residuals = camera_plots.CameraResiduals(
             camera.camera_id, camera.image_size, c.rows.uv[mine], found.residuals[mine], found.standardized[mine],
             found.used[mine], c.suspect[mine],
         )  # fmt: skip
-        parts.append(_camera(camera.camera_id, entry, residuals))
+        parts.append(_camera(camera.camera_id, entries[camera.camera_id], residuals))
+    if others:
+        n = count(len(others))
+        title = t("{n} more cameras, with smaller residuals; their lenses and poses in solution.json", n=n)
+        columns = ("<Camera", "Images", "Points", "RMS residual [px]")
+        parts.append(part("details", title, _limited(columns, others, lambda k: _camera_row(k, entries[k])), True))
     said = t(
         "Residual vectors point from the observed to the adjusted position. Red: suspect, orange: not used. "
         "A pattern in the mean per cell is what the lens model leaves over; empty cells hold no points."
     )
     return section("cameras", "Cameras", joined(parts), said)
+
+
+def _camera_row(camera_id: str, entry: dict[str, Any]) -> list[str]:
+    numbers = (count(entry["n_images"]), count(entry["n_image_points"]), fixed(entry["rms_residual_px"], 3))
+    return [camera_id, *numbers]
 
 
 def _camera(camera_id: str, entry: dict[str, Any], residuals: camera_plots.CameraResiduals) -> Markup:
@@ -144,7 +164,7 @@ def _camera(camera_id: str, entry: dict[str, Any], residuals: camera_plots.Camer
     shown = Markup() if lens is None else vector_table(lens, lens["value_over_sigma"]) + _remarks(lens)
     makers = (camera_plots.vector_field, camera_plots.mean_field, camera_plots.histogram)
     drawn = [make(residuals) for make in makers] if len(residuals.uv) else []
-    rows = [row[:1] + row[2:] for row in _pose_rows(camera_id, entry)]
+    rows = [row[:1] + row[2:] for row in map(_pose_row, _poses(camera_id, entry))]
     poses = table(_POSE_COLUMNS[:1] + _POSE_COLUMNS[2:], rows) if rows else ""
     return part("camera", camera_id, facts, shown, drawn, poses, of="report.html")
 
@@ -171,18 +191,14 @@ def _remarks(lens: dict[str, Any]) -> Markup:
 
 def stations(c: Context) -> Markup:
     """Poses of stations, of their mounts, of tables and targets."""
-    rows = [
-        row
-        for kind in ("stations", "tables", "targets")
-        for i, e in c.solution[kind].items()
-        for row in _pose_rows(i, e)
-    ]
-    by_epoch = [row for row in rows if row[1]]
-    body = _limited(_POSE_COLUMNS, rows)
-    if len(by_epoch) > _MANY_EPOCHS:
-        body = _limited(_POSE_COLUMNS, [row for row in rows if not row[1]])
+    kinds = (c.solution[kind] for kind in ("stations", "tables", "targets"))
+    poses = [pose for entries in kinds for i, e in entries.items() for pose in _poses(i, e)]
+    by_epoch = [pose for pose in poses if pose[2]]
+    many = len(by_epoch) > _MANY_EPOCHS
+    body = _limited(_POSE_COLUMNS, [pose for pose in poses if not pose[2]] if many else poses, _pose_row)
+    if many:
         title = t("{n} poses by epoch", n=count(len(by_epoch)))
-        body += part("details", title, _limited(_POSE_COLUMNS, by_epoch), False)
+        body += part("details", title, _limited(_POSE_COLUMNS, by_epoch, _pose_row), False)
     return section("poses", "Poses of stations, tables and targets", body, t(_POSE_NOTE))
 
 
@@ -197,50 +213,56 @@ def tables(c: Context) -> Markup:
         if entry["epochs"]:
             names = list(next(iter(entry["epochs"].values()))["status"])
             columns = ("<Epoch", *(x for n in names for x in (f"{n} [°]", "σ [″]")))
-            rows = [
-                [epoch]
-                + [x for _, v, u, s, su, _ in _components(angles) for x in (_value_in(u, v, s, su), sigma_text(s))]
-                for epoch, angles in entry["epochs"].items()
-            ]
-            title = t("{n} epochs: adjusted angles", n=count(len(rows)))
-            body += part("details", title, _limited(columns, rows), len(rows) <= _MANY_EPOCHS)
+            epochs = list(entry["epochs"].items())
+            title = t("{n} epochs: adjusted angles", n=count(len(epochs)))
+            body += part("details", title, _limited(columns, epochs, _angles_row), len(epochs) <= _MANY_EPOCHS)
         parts.append(body)
     return section("tables", "Turntables", joined(parts))
 
 
+def _angles_row(epoch: tuple[str, dict[str, Any]]) -> list[str]:
+    name, angles = epoch
+    parts = ((_value_in(unit, v, s, s_unit), sigma_text(s)) for _, v, unit, s, s_unit, _ in _components(angles))
+    return [name, *(x for both in parts for x in both)]
+
+
 def targets(c: Context) -> Markup:
     """What the targets are; their poses are listed with those of the stations."""
-    rows, warps = [], Markup()
-    for target_id, entry in c.solution["targets"].items():
-        carrier = t("station {name}", name=entry["station"]) if "station" in entry else t("the world")
-        n_epochs = count(len(entry.get("epochs", {})))
-        rows.append([target_id, count(entry["n_points"]), carrier, known(entry["motion"]), n_epochs])
-        if "warp" in entry:
-            warps += element("h3", t("Warp of {name}", name=target_id)) + vector_table(entry["warp"])
+    entries = list(c.solution["targets"].items())
     columns = ("<Target", "Points", "<Stands on", "<Motion", "Poses per epoch")
-    return section("targets", "Targets", table(columns, rows) + warps if rows else "")
+    bent = [(k, e["warp"]) for k, e in entries if "warp" in e]
+    warps = [element("h3", t("Warp of {name}", name=k)) + vector_table(warp) for k, warp in bent[:_MOST_BLOCKS]]
+    body = joined((_limited(columns, entries, _target_row), *warps, _more(len(bent) - _MOST_BLOCKS)))
+    return section("targets", "Targets", body)
+
+
+def _target_row(target: tuple[str, dict[str, Any]]) -> list[str]:
+    target_id, entry = target
+    carrier = t("station {name}", name=entry["station"]) if "station" in entry else t("the world")
+    return [target_id, count(entry["n_points"]), carrier, known(entry["motion"]), count(len(entry.get("epochs", {})))]
 
 
 def points(c: Context) -> Markup:
     """Coordinates of points, least precise first."""
     entries = sorted(c.solution["points"].items(), key=lambda x: -x[1]["ellipsoid_95_semi_axes_mm"][0])
     worst = entries[0][1]["ellipsoid_95_semi_axes_mm"][0] if entries else 0.0
-    rows = []
     every = [p[f"sigma_{a}_mm"] for _, p in entries for a in "xyz" if p[f"sigma_{a}_mm"]]
     typical = float(np.median(every)) if every else None
-    for point_id, p in entries:
+
+    def row(point: tuple[str, dict[str, Any]]) -> list[str]:
+        point_id, p = point
         axes = p["ellipsoid_95_semi_axes_mm"]
-        length = 100.0 * axes[0] / worst if worst else 0.0
-        bar = part("bar", f"{length:.0f}")
-        row = [element("b", point_id), *(with_sigma(p[f"{a}_mm"], p[f"sigma_{a}_mm"], typical) for a in "xyz")]
-        rows.append([*row, *(sigma_text(a) for a in axes), bar, status_pill(p["status"])])
+        bar = part("bar", f"{100.0 * axes[0] / worst if worst else 0.0:.0f}")
+        cells = [element("b", point_id), *(with_sigma(p[f"{a}_mm"], p[f"sigma_{a}_mm"], typical) for a in "xyz")]
+        return [*cells, *(sigma_text(a) for a in axes), bar, status_pill(p["status"])]
+
     columns = ("<Point", "x [mm]", "y [mm]", "z [mm]", "a [mm]", "b [mm]", "c [mm]", "<", "<Status")
     said = t(
         "World coordinates with sigmas below; a, b, c: semi-axes of the 95 % confidence ellipsoid ({k} sigmas). "
         "Least precise first.",
         k=general(c.scale.ellipsoid, 4),
     )
-    return section("points", "Points", _limited(columns, rows), said)
+    return section("points", "Points", _limited(columns, entries, row), said)
 
 
 def instruments(c: Context) -> Markup:
@@ -252,10 +274,12 @@ def instruments(c: Context) -> Markup:
         parts += [vector_table(vertical["tilt"])] if "tilt" in vertical else []
     for instrument_id, entry in c.solution.get("instruments", {}).items():
         parts += [element("h3", joined((t("Instrument"), instrument_id), " ")), vector_table(entry)]
-    for setup_id, entry in c.solution.get("setups", {}).items():
+    setups = list(c.solution.get("setups", {}).items())
+    for setup_id, entry in setups[:_MOST_BLOCKS]:
         of = f" ({entry['instrument']})" if "instrument" in entry else ""
         parts += [element("h3", joined((t("Setup"), f"{setup_id}{of}"), " "))]
         parts += [vector_table(entry[kind]) for kind in ("orientation", "centring") if kind in entry]
+    parts += [_more(len(setups) - _MOST_BLOCKS)]
     for beam_id, entry in c.solution.get("beams", {}).items():
         carrier = next(f"{kind} {entry[kind]}" for kind in ("mount", "station") if kind in entry)
         head = f"{t('Laser beam')} {beam_id} ({carrier}, {t('along')} {entry['axis']})"
