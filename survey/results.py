@@ -14,7 +14,7 @@ from survey.files.project import RESULTS
 from survey.quantities import SigmaKind, scale_of
 from survey.replacing import changing, replace_parts
 from survey.report import report_html, summary_text
-from survey.report.pdf import report_pdf
+from survey.report.page import report_pdf
 from survey.residual_tables import image_residuals_csv, other_residuals_csv
 from survey.safe_npz import read_arrays
 from survey.solution import RunInfo, solution_dict, solution_json

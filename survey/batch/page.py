@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import quote
 
@@ -13,8 +14,9 @@ from survey.batch.charts import control_chart
 from survey.batch.control import ONE_SIDE, TREND, Chart
 from survey.batch.record import FAILED, TEST_FAILED, Record
 from survey.batch.run import counts
-from survey.batch.tables import short_names
+from survey.batch.tables import folders_csv, overview_json, short_names, trends_csv
 from survey.batch.trends import LEVEL, Trends
+from survey.replacing import write_set
 from survey.report.language import group_name, known, message, speaking, t
 from survey.report.markup import (
     MISSING,
@@ -233,3 +235,16 @@ def _folders(records: Sequence[Record], place: Path) -> Markup:
     columns = ("<Survey", "<", "<Reason", "sigma0", "n", "u", "Redundancy", "Not used", "<", "s")
     note = t("n observations, u unknowns. A name leads to the survey's own report.")
     return section("folders", "Folders", table(columns, rows, "", classes), note)
+
+
+def write_overview(place: Path, records: Sequence[Record], trends: Trends, language: str = "en") -> dict[str, Path]:
+    """Write overview.html, overview.json, folders.csv and trends.csv into ``place``; the paths by name."""
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    place = Path(place).absolute()
+    texts = {
+        "folders.csv": folders_csv(records),
+        "trends.csv": trends_csv(records, trends),
+        "overview.html": overview_html(records, trends, place, date, language),
+        "overview.json": overview_json(records, trends),
+    }
+    return write_set(place, texts)

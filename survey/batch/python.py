@@ -9,7 +9,7 @@ from typing import Any
 from adjust.errors import SurveyError
 from survey.batch.causes import CAUSES
 from survey.batch.charts import control_chart
-from survey.batch.overview import write_overview
+from survey.batch.page import write_overview
 from survey.batch.record import FAILED, Record
 from survey.batch.run import BatchOptions, counts, run_batch
 from survey.batch.tables import STATES, count_line, findings, short_names, summary_table

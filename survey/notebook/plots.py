@@ -12,16 +12,16 @@ from adjust.errors import SurveyError
 from adjust.result import Adjustment
 from survey.files.text import atomic_write, choice_hint, suggestion
 from survey.quantities import Scale
-from survey.report import camera_plots, picture
+from survey.report import charts, picture
 from survey.report.drawing import ON_WHITE, standalone
-from survey.report.scene import scene_of
-from survey.report.statistics import heat_map, quantiles, standardized_by_group
+from survey.report.scene import enlargement, scene_of
+from survey.report.statistics import standardized_by_group
 from survey.residual_tables import image_rows
 from survey.statistics import correlation_matrix
 from survey.verdict import suspects
 
 if TYPE_CHECKING:
-    from survey.report.camera_plots import CameraResiduals
+    from survey.report.charts import CameraResiduals
 
 
 
@@ -60,7 +60,7 @@ def _camera(adjustment: Adjustment, camera: str | None) -> "CameraResiduals":
     of_block = np.array([b.camera_id == camera for b in adjustment.survey.image_blocks], dtype=bool)
     mine = of_block[rows.block] if len(of_block) else np.zeros(0, dtype=bool)
     suspect = found_residuals.used & (found_residuals.test > suspects(adjustment).image_limit)
-    return camera_plots.CameraResiduals(
+    return charts.CameraResiduals(
         camera, adjustment.survey.cameras[ids.index(camera)].image_size, rows.uv[mine],
         found_residuals.residuals[mine], found_residuals.standardized[mine], found_residuals.used[mine],
         suspect[mine],
@@ -68,15 +68,15 @@ def _camera(adjustment: Adjustment, camera: str | None) -> "CameraResiduals":
 
 
 def _residuals(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> Markup:
-    return camera_plots.vector_field(_camera(adjustment, camera))
+    return charts.vector_field(_camera(adjustment, camera))
 
 
 def _mean_residuals(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> Markup:
-    return camera_plots.mean_field(_camera(adjustment, camera))
+    return charts.mean_field(_camera(adjustment, camera))
 
 
 def _histogram(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> Markup:
-    return camera_plots.histogram(_camera(adjustment, camera))
+    return charts.histogram(_camera(adjustment, camera))
 
 
 def _view(adjustment: Adjustment, scale: Scale, make: Callable[[Any], picture.View]) -> Markup:
@@ -84,7 +84,7 @@ def _view(adjustment: Adjustment, scale: Scale, make: Callable[[Any], picture.Vi
     everything = scene.positions()
     if not len(everything):
         raise SurveyError("there is nothing with a place in this survey to draw a map of")
-    enlarged = picture.enlargement(scene, scale.ellipsoid, float(np.linalg.norm(np.ptp(everything, axis=0))))
+    enlarged = enlargement(scene, scale.ellipsoid, float(np.linalg.norm(np.ptp(everything, axis=0))))
     return picture.draw(scene, make(everything), everything, enlarged, scale.ellipsoid)
 
 
@@ -100,7 +100,7 @@ def _correlations(adjustment: Adjustment, _scale: Scale) -> Markup:
     found = correlation_matrix(adjustment)
     if found is None:
         raise SurveyError("there are not two unknowns whose correlation could be shown")
-    return heat_map(found)
+    return charts.heat_map(found)
 
 
 def _quantiles(adjustment: Adjustment, _scale: Scale, group: str | None = None) -> Markup:
@@ -112,7 +112,7 @@ def _quantiles(adjustment: Adjustment, _scale: Scale, group: str | None = None) 
     w = standardized_by_group(adjustment).get(group, np.empty(0))
     if len(w) < 8:
         raise SurveyError(f"group {group!r} has {len(w)} residuals that can be tested; quantiles need 8 or more")
-    return quantiles(group, w)
+    return charts.quantiles(group, w)
 
 
 PLOTS: Mapping[str, Callable[..., Markup]] = {

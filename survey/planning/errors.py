@@ -12,10 +12,10 @@ from adjust.design.error_figures import ErrorFigure, error_figures
 from adjust.error_analysis import BeaconField, tolerance
 from adjust.errors import SurveyError
 from survey.planning.page import html_page
-from survey.planning.plots import Series, chart
 from survey.planning.summary import number
 from survey.replacing import write_set
 from survey.report import drawing as d
+from survey.report.charts import Series, chart
 from survey.report.markup import figures, fixed, general, section, table
 
 PAPER = BeaconField()

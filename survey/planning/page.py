@@ -7,10 +7,10 @@ from gtsam import Pose3
 from markupsafe import Markup
 
 from adjust.design import group_redundancy
-from survey.planning.plots import Series, bars, chart, seen_map
 from survey.planning.summary import meets, people, pose_sigmas, tolerance_values
 from survey.quantities import scale_of
 from survey.report import drawing as d
+from survey.report.charts import Series, bars, chart, seen_map
 from survey.report.language import esc
 from survey.report.markup import (
     count,

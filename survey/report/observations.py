@@ -1,9 +1,18 @@
-"""Sections on what was observed: residuals and tests, the worst first; what people left out, and why."""
+"""Sections on what was observed: residuals and tests, the worst first; what people left out, and why; every row.
 
+The table of all observations has a row for each component, with what auditors of adjustments ask for: the value, its
+sigma a priori, the adjusted value and its sigma, residual, redundancy number, Baarda's w, estimated gross error,
+minimal detectable bias and what that would do to the unknowns. Of more than ``MOST`` rows the page has the worst, the
+tables beside it all.
+"""
+
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from markupsafe import Markup
 
+from adjust.model import FloatArray, IntArray
 from adjust.result import ObservationResidual
 from survey.quantities import sigma_unit_for_people, unit_for_people
 from survey.report.context import Context, other_components, worst
@@ -15,7 +24,10 @@ from survey.report.markup import (
     element,
     fixed,
     general,
+    heads,
     joined,
+    json_script,
+    part,
     pill,
     section,
     sigma_text,
@@ -26,6 +38,19 @@ from survey.report.markup import (
 _MOST_OTHER = 200
 _MOST_IMAGE = 30
 _MOST_IMAGES = 10
+MOST = 20_000
+
+# what the rows are sorted by stands beside what they are of: the rest may be off a small screen
+COLUMNS = (
+    "Where", "Point", "Component", "w", "Residual", "σ", "Unit of σ", "Redundancy", "Gross error", "MDB", "λ̄",
+    "Observed", "Adjusted", "Unit", "σ adj.", "Kind", "Group",
+)  # fmt: skip
+_NAMES = ("Kind", "Group", "Where", "Point", "Component", "Unit", "Unit of σ")
+_SORTED_BY = COLUMNS.index("w")
+_BY_SIZE = {"Residual", "w", "Gross error"}
+_Row = tuple[tuple[str, ...], tuple[float, ...]]
+"""Names in the order of ``_NAMES``; observed, adjusted, sigma, residual, redundancy, w, whether used, the factors to
+the units of values and of sigmas, 0 ordinary, 1 suspect or 2 not used, observation and component in the tests."""
 
 
 def _flag(used: bool, suspect: bool) -> str:
@@ -147,3 +172,118 @@ def _excluded_row(e: dict[str, Any], limit: float) -> tuple[str, ...]:
         code(e["name"]), reason, e["author"], e["time"], count(e["n_images"]),
         count(e["n_image_points"] + e["n_spots"]), count(e["n_readings"]), MISSING if w is None else fixed(w, 1), flag,
     )  # fmt: skip
+
+
+def every_observation(c: Context) -> Markup:
+    """The section; nothing where there is no observation."""
+    n_image = c.adjustment.image_residuals.standardized.size
+    observation, component, others_w = other_components(c.adjustment)
+    w = np.concatenate([c.adjustment.image_residuals.standardized.ravel(), others_w])
+    if not len(w):
+        return Markup()
+    rows = [
+        _every_image(c, *divmod(k, 2)) if k < n_image
+        else _every_other(c, int(observation[k - n_image]), int(component[k - n_image]))
+        for k in worst(w, MOST).tolist()
+    ]  # fmt: skip
+    names = dict(zip(_NAMES, zip(*(row[0] for row in rows), strict=True), strict=True))
+    values = np.array([row[1] for row in rows], dtype=float).T
+    numbers = _numbers(values) | _reliability(c, values)
+    columns = [
+        _coded(names[x]) if x in _NAMES else _numeric(x, numbers[x], _digits(x, numbers, values)) for x in COLUMNS
+    ]
+    data = {"rows": len(rows), "columns": columns, "flags": values[9].astype(int).tolist()}
+    said = t(
+        "Every observation, one row per component, largest |w| first. w: Baarda's standardized residual. Gross error: "
+        "estimated. MDB: the bias of this component alone that its test finds with the stated power; λ̄: how many of "
+        "its sigmas an undetected bias can at most move any function of the unknowns. Click a heading to sort."
+    )
+    if c.statistics is not None:
+        power = c.statistics.reliability.criteria.options.power
+        said += " " + t("Power {power} %.", power=fixed(100 * power, 0))
+    if len(w) > len(rows):
+        shown = {"shown": count(len(rows)), "n": count(len(w))}
+        said += " " + t("The worst {shown} of {n}; all in residuals.csv and residuals_other.csv.", **shown)
+    table = part("all_observations", heads(_left(x) for x in COLUMNS), _SORTED_BY, of="report.html")
+    return section("all-observations", "All observations", table + json_script("all-data", data), said)
+
+
+def _left(column: str) -> str:
+    return f"<{column}" if column in _NAMES else column
+
+
+def _coded(values: Sequence[str]) -> dict[str, Any]:
+    names = list(dict.fromkeys(values))
+    at = {v: i for i, v in enumerate(names)}
+    return {"names": names, "codes": [at[v] for v in values]}
+
+
+def _numeric(name: str, values: FloatArray, digits: IntArray) -> dict[str, Any]:
+    out: list[Any] = []
+    for value, places in zip(values.tolist(), digits.tolist(), strict=True):
+        if not np.isfinite(value):
+            out.append(None)
+        elif places > 0:
+            out.append(round(value, places))
+        else:
+            out.append(round(value))
+    return {"values": out, "size": name in _BY_SIZE}
+
+
+def _digits(name: str, numbers: dict[str, FloatArray], values: FloatArray) -> IntArray:
+    """Decimals: two digits of the sigma, three for its fractions; fixed ones for numbers without unit."""
+    sigma = numbers["σ"]
+    if name in ("Redundancy", "w", "λ̄"):
+        return np.full(len(sigma), 2, dtype=np.int64)
+    if name in ("Observed", "Adjusted"):
+        sigma = sigma * values[7] / values[8]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = 2 - np.floor(np.log10(np.where(sigma > 0, sigma, np.nan)))
+    return np.asarray(np.clip(np.nan_to_num(places, nan=4.0), 0, 9).astype(np.int64))
+
+
+def _every_image(c: Context, k: int, i: int) -> _Row:
+    found, block = c.adjustment.image_residuals, c.adjustment.survey.image_blocks[c.rows.block[k]]
+    where = f"{block.camera_id} · {block.epoch_id} · {block.target_id or 'points'}"
+    point = c.rows.point_ids[c.rows.point[k]]
+    observed, residual, used = c.rows.uv[k, i], found.residuals[k, i], bool(found.used[k])
+    return (t("image point"), group_name(block.group), where, point, "uv"[i], "px", "px"), (
+        observed, observed + residual, c.rows.sigmas[k, i], residual, found.redundancy[k, i], found.standardized[k, i],
+        used, 1.0, 1.0, 2 if not used else int(c.suspect[k]), k, i,
+    )  # fmt: skip
+
+
+def _every_other(c: Context, k: int, i: int) -> _Row:
+    o = c.adjustment.other_residuals[k]
+    unit, factor = unit_for_people(o.components[i], o.units[i])
+    sigma_unit, sigma_factor = sigma_unit_for_people(o.units[i])
+    suspect = abs(o.standardized[i]) > c.solution["summary"]["suspects"]["standardized_limit"]
+    kind, where = known(o.kind.replace("_", " ")), " · ".join(o.ids)
+    return (kind, group_name(o.group), where, "", o.components[i], unit, sigma_unit), (
+        o.observed[i], o.adjusted[i], o.sigma[i], o.residual[i], o.redundancy[i], o.standardized[i], o.used,
+        factor, sigma_factor, 2 if not o.used else int(suspect), len(c.adjustment.image_residuals.test) + k, i,
+    )  # fmt: skip
+
+
+def _numbers(values: FloatArray) -> dict[str, FloatArray]:
+    """The sigma of an adjusted observation: of the observation less that of its residual; of a prediction plus it."""
+    observed, adjusted, sigma, residual, redundancy, w, used, factor, small = values[:9]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = np.where(np.abs(w) > 1e-6, np.abs(residual / w), sigma * np.sqrt(np.maximum(redundancy, 0.0)))
+    left = np.sqrt(np.maximum(0.0, np.where(used > 0, sigma**2 - own**2, own**2 - sigma**2)))
+    return {
+        "Observed": observed * factor, "Adjusted": adjusted * factor, "σ": sigma * small, "σ adj.": left * small,
+        "Residual": residual * small, "Redundancy": redundancy, "w": w,
+    }  # fmt: skip
+
+
+def _reliability(c: Context, values: FloatArray) -> dict[str, FloatArray]:
+    """Gross error, minimal detectable bias and external reliability; nothing where there are no statistics."""
+    if c.statistics is None:
+        return dict.fromkeys(("Gross error", "MDB", "λ̄"), np.full(values.shape[1], np.nan))
+    tests, (observation, component) = c.statistics.reliability.tests, values[10:].astype(np.int64)
+    rows = tests.ptr[observation] + component
+    return {
+        "Gross error": tests.error[rows] * values[8], "MDB": tests.detectable_component[rows] * values[8],
+        "λ̄": tests.external[observation],
+    }  # fmt: skip

@@ -25,8 +25,7 @@ from survey.report.markup import (
     table,
 )
 from survey.report.picture import pictures
-from survey.report.scene import scene_of
-from survey.report.space import space
+from survey.report.scene import scene_of, space
 from survey.tolerances import Verdict, coverage
 
 _WORDS = {"passed": "Passed", "check": "Needs a look", "failed": "Failed"}

@@ -5,12 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from markupsafe import Markup
 
-from adjust.distributions import beta, norm
 from adjust.model import FloatArray
 from adjust.result import Adjustment, ParameterName
 from adjust.statistics.result import BudgetEntry, Component, Correlation, Influence, RelativePrecision, WeakDirection
 from survey.quantities import sigma_unit_for_people
-from survey.report import drawing as d
+from survey.report.charts import heat_map, quantiles
 from survey.report.context import Context
 from survey.report.language import esc, group_name, known, t
 from survey.report.markup import (
@@ -29,7 +28,6 @@ from survey.report.markup import (
     table,
     value_text,
 )
-from survey.statistics import CorrelationMatrix
 
 _MOST_ROWS = 120
 _MOST_WEAK = 30
@@ -209,32 +207,6 @@ def _weak_text(x: WeakDirection) -> Markup:
     return t("{n} times weaker together than alone: ", n=general(x.inflation, 3)) + joined(parts, ", ") + more
 
 
-def heat_map(m: CorrelationMatrix) -> Markup:
-    """The matrix as cells; labels where there is room for them."""
-    n, left = len(m.labels), 150.0
-    cell = min(18.0, 620.0 / max(n, 1))
-    size = n * cell
-    parts = [d.rect(left, 4, size, size, d.PAPER, f' stroke="{d.FAINT}"')]
-    # one path per shade keeps a matrix of a hundred rows small
-    shade = np.clip(np.round(20.0 * m.matrix), -20, 20).astype(int)
-    for value in np.unique(shade[shade != 0]).tolist():
-        cells = "".join(
-            f"M{left + j * cell:.1f} {4 + i * cell:.1f}h{cell:.1f}v{cell:.1f}h-{cell:.1f}z"
-            for i, j in np.argwhere(shade == value).tolist()
-        )
-        colour = d.BLUE if value > 0 else d.RED
-        parts.append(f'<path d="{cells}" fill="{colour}" fill-opacity="{abs(value) / 20.0:.2f}"/>')
-    for at in (*m.starts, n):
-        parts.append(d.line(left + at * cell, 4, left + at * cell, 4 + size, d.GREY, 0.6))
-        parts.append(d.line(left, 4 + at * cell, left + size, 4 + at * cell, d.GREY, 0.6))
-    ends = (*m.starts[1:], n)
-    for name, start, end in zip(m.names, m.starts, ends, strict=True):
-        if (end - start) * cell >= 9.0:
-            y = 4 + 0.5 * (start + end) * cell + 3.5
-            parts.append(d.text(left - 6, y, " ".join((known(name[0].replace("_", " ")), *name[1:])), "end", 9.5))
-    return d.svg(left + size + 4, size + 8, parts, t("Correlations"))
-
-
 def normality(c: Context) -> Markup:
     """Quantiles of the standardized residuals of every group against those of the normal distribution."""
     drawn = [quantiles(group_name(name), w) for name, w in standardized_by_group(c.adjustment).items() if len(w) >= 8]
@@ -256,30 +228,3 @@ def standardized_by_group(adjustment: Adjustment) -> dict[str, FloatArray]:
             out.setdefault(o.group, []).append(o.standardized)
     joint = {name: np.concatenate(parts) for name, parts in out.items()}
     return {name: np.sort(w[np.isfinite(w)]) for name, w in joint.items()}
-
-
-def quantiles(name: str, w: FloatArray) -> Markup:
-    """A Q-Q plot of sorted values; the band is that of order statistics (beta distribution)."""
-    n, side, pad = len(w), 240.0, 26.0
-    keep = np.unique(np.concatenate([np.arange(min(n, 40)), np.linspace(0, n - 1, 160).astype(int),
-                                     np.arange(max(0, n - 40), n)]))  # fmt: skip
-    rank = keep + 1.0
-    x = norm.ppf((rank - 0.375) / (n + 0.25))
-    low, high = norm.ppf(beta.ppf([[0.025], [0.975]], rank, n + 1 - rank))
-    reach = max(3.0, float(np.ceil(max(abs(x[0]), min(6.0, float(np.abs(w).max()))))))
-    unit, middle = (side - 2 * pad) / (2 * reach), 0.5 * side
-
-    def at(a: FloatArray, b: FloatArray) -> FloatArray:
-        return np.column_stack([middle + unit * a, middle + 8 - unit * np.clip(b, -reach, reach)])
-
-    band = np.concatenate([at(x, low), at(x, high)[::-1]])
-    parts = [
-        d.text(0, 11, name, colour=d.INK, size=11.5),
-        d.polygon(band, d.BAND, "none"),
-        d.polyline(at(np.array([-reach, reach]), np.array([-reach, reach])), d.GREY, 0.9),
-    ]
-    parts += [d.dot(a, b, 1.7, d.BLUE) for a, b in at(x, w[keep])]
-    for tick in range(-int(reach) + 1, int(reach), 2 if reach > 4 else 1):
-        parts.append(d.text(middle + unit * tick, side - 4, f"{tick}".replace("-", "−"), "middle", 9))
-        parts.append(d.text(4, middle + 11 - unit * tick, f"{tick}".replace("-", "−"), "start", 9))
-    return d.svg(side, side, parts, t("Quantiles of group {name}", name=name))

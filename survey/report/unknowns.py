@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 import numpy as np
 from markupsafe import Markup
 
-from survey.report import camera_plots
+from survey.report import charts
 from survey.report.context import Context
 from survey.report.language import known, t
 from survey.report.markup import (
@@ -130,7 +130,7 @@ def cameras(c: Context) -> Markup:
         if camera.camera_id not in shown:
             continue
         mine = (camera_of_block == camera.camera_id)[c.rows.block] if len(blocks) else np.zeros(0, dtype=bool)
-        residuals = camera_plots.CameraResiduals(
+        residuals = charts.CameraResiduals(
             camera.camera_id, camera.image_size, c.rows.uv[mine], found.residuals[mine], found.standardized[mine],
             found.used[mine], c.suspect[mine],
         )  # fmt: skip
@@ -152,7 +152,7 @@ def _camera_row(camera_id: str, entry: dict[str, Any]) -> list[str]:
     return [camera_id, *numbers]
 
 
-def _camera(camera_id: str, entry: dict[str, Any], residuals: camera_plots.CameraResiduals) -> Markup:
+def _camera(camera_id: str, entry: dict[str, Any], residuals: charts.CameraResiduals) -> Markup:
     width, height = entry["image_size_px"]
     facts = t(
         "{width} × {height} px on station {station} · {images} images, {points} points", width=width, height=height,
@@ -162,7 +162,7 @@ def _camera(camera_id: str, entry: dict[str, Any], residuals: camera_plots.Camer
     facts += " · " + t("RMS residual {rms} px", rms=fixed(entry["rms_residual_px"], 3))
     lens = entry.get("lens")
     shown = Markup() if lens is None else vector_table(lens, lens["value_over_sigma"]) + _remarks(lens)
-    makers = (camera_plots.vector_field, camera_plots.mean_field, camera_plots.histogram)
+    makers = (charts.vector_field, charts.mean_field, charts.histogram)
     drawn = [make(residuals) for make in makers] if len(residuals.uv) else []
     rows = [row[:1] + row[2:] for row in map(_pose_row, _poses(camera_id, entry))]
     poses = table(_POSE_COLUMNS[:1] + _POSE_COLUMNS[2:], rows) if rows else ""

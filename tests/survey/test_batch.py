@@ -21,8 +21,7 @@ from survey.batch.cache import unchanged_solution
 from survey.batch.causes import CAUSES, cause_of
 from survey.batch.control import Series, chart, runs
 from survey.batch.journal import Journal, read_journal
-from survey.batch.overview import write_overview
-from survey.batch.page import overview_html
+from survey.batch.page import overview_html, write_overview
 from survey.batch.record import FAILED, Record, record_from
 from survey.batch.run import BatchOptions, attempts, run_batch
 from survey.batch.tables import folders_csv, overview_json, short_names, summary_table, trends_csv

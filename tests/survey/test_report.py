@@ -12,11 +12,11 @@ from adjust.errors import SurveyError
 from adjust.model import Survey
 from adjust.result import Adjustment, ImageResiduals
 from survey.quantities import scale_of
-from survey.report import drawing, every, markup, report_html, summary_text
-from survey.report.camera_plots import CameraResiduals, histogram, mean_field, vector_field
+from survey.report import drawing, markup, observations, report_html, summary_text
+from survey.report.charts import CameraResiduals, histogram, mean_field, vector_field
 from survey.report.language import esc
-from survey.report.picture import enlargement, perspective, pictures, plan
-from survey.report.scene import Scene, Spot, scene_of
+from survey.report.picture import perspective, pictures, plan
+from survey.report.scene import Scene, Spot, enlargement, scene_of
 from survey.solution import RunInfo
 from tests.survey.adjustments import Lab, correlate, lab_adjustment
 
@@ -353,7 +353,7 @@ def test_all_observations_are_in_the_page_with_what_was_observed(page: str, adju
     assert data["rows"] == n
     columns = [c["values"] if "values" in c else [c["names"][k] for k in c["codes"]] for c in data["columns"]]
     assert {len(c) for c in columns} == {n}
-    by_name = dict(zip(every.COLUMNS, columns, strict=True))
+    by_name = dict(zip(observations.COLUMNS, columns, strict=True))
     kind, where, point, component = (by_name[name] for name in ("Kind", "Where", "Point", "Component"))
     observed, sigma, adjusted, residual = (by_name[name] for name in ("Observed", "σ", "Adjusted", "Residual"))
     block = adjustment.survey.image_blocks[5]
