@@ -11,13 +11,15 @@ from gtsam import Pose3, Rot3
 from adjust.errors import SurveyError
 from adjust.model import Survey
 from adjust.result import Adjustment, ImageResiduals
+from survey.files.detected import DetectedImage
 from survey.quantities import scale_of
-from survey.report import drawing, markup, observations, report_html, summary_text
+from survey.report import drawing, markup, observations, report_html, summary_text, unknowns
 from survey.report.charts import CameraResiduals, histogram, mean_field, vector_field
+from survey.report.context import worst
 from survey.report.language import esc
 from survey.report.picture import perspective, pictures, plan
 from survey.report.scene import Scene, Spot, enlargement, scene_of
-from survey.solution import RunInfo
+from survey.solution import RunInfo, solution_dict
 from tests.survey.adjustments import Lab, correlate, lab_adjustment
 
 RUN = RunInfo(
@@ -382,3 +384,56 @@ def test_german_page_says_the_same_numbers(adjustment: Adjustment, page: str) ->
     assert [x.replace(",", ".") for x in comma] == figures
     with pytest.raises(SurveyError, match="language 'fr'"):
         report_html(adjustment, RUN, in_language="fr")
+
+
+def test_the_largest_are_those_of_a_whole_sorting() -> None:
+    """Equal values in their order, what is no number last, whatever the number that is wanted."""
+    values = np.random.default_rng(3).integers(-9, 10, 500).astype(float)
+    values[[7, 80, 200]] = np.nan
+    order = sorted(range(len(values)), key=lambda k: -abs(values[k]) if np.isfinite(values[k]) else 1.0)
+    for most in (1, 20, 250, 499, 500, 900):
+        assert worst(values, most).tolist() == order[:most]
+    assert worst(np.empty(0), 5).tolist() == []
+
+
+def test_the_page_grows_no_further_with_the_observations() -> None:
+    small, large = (lab_adjustment(Lab(n_epochs=n, n_beacons=60)) for n in (150, 600))
+    assert 2 * len(small.image_residuals.test) > observations.MOST
+    pages = [report_html(made, RUN) for made in (small, large)]
+    assert len(pages[1]) < 1.1 * len(pages[0]) < 3e6
+    n = markup.count(2 * len(large.image_residuals.test) + sum(len(o.components) for o in large.other_residuals))
+    assert f"The worst 20\u2009000 of {n}; all in residuals.csv and residuals_other.csv." in pages[1]
+
+
+def test_rows_shown_are_the_same_with_and_without_the_others(adjustment: Adjustment, page: str) -> None:
+    """The worst rows of a page that is cut are the first of the one that is not."""
+    whole = json.loads(re.search(r'id="all-data">(.*?)</script>', page, re.S)[1])  # type: ignore[index]  # it is there
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(observations, "MOST", 40)
+        cut = report_html(adjustment, RUN)
+    part = json.loads(re.search(r'id="all-data">(.*?)</script>', cut, re.S)[1])  # type: ignore[index]  # it is there
+    assert part["rows"] == 40
+    assert part["flags"] == whole["flags"][:40]
+    for a, b in zip(part["columns"], whole["columns"], strict=True):
+        if "codes" in a:
+            assert [a["names"][k] for k in a["codes"]] == [b["names"][k] for k in b["codes"][:40]]
+        else:
+            assert a["values"] == b["values"][:40]
+
+
+def test_of_very_many_cameras_and_images_the_page_says_what_it_leaves_out(
+    adjustment: Adjustment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = {f"X/e{i}": DetectedImage(f"images/X/e{i}.png", "ab", 1, 1, 1, n_image_points=3) for i in range(510)}
+    monkeypatch.setattr(unknowns, "_MOST_CAMERAS", 1)
+    page = report_html(adjustment, replace(RUN, images=images))
+    rms = {k: e["rms_residual_px"] for k, e in solution_dict(adjustment, RUN)["cameras"].items()}
+    largest = max(rms, key=lambda k: rms[k])
+    assert re.findall("<h3>Camera (.)</h3>", page) == [largest]
+    words = " ".join(parsed(page).words)
+    assert "2 more cameras, with smaller residuals; their lenses and poses in solution.json" in words
+    assert all(f"{value:.3f}" in words for value in rms.values())
+    assert "510 images" in words
+    assert "images/X/e499.png" in words
+    assert "images/X/e500.png" not in words
+    assert "10 more in solution.json." in words
