@@ -75,7 +75,7 @@ def reliability(c: Context) -> Markup:
     if c.statistics is None:
         return Markup()
     r = c.statistics.reliability
-    uncontrolled = _titled("Not controlled", _most(r.uncontrolled))
+    uncontrolled = _titled("Not controlled", _most(r.uncontrolled[:_MOST_WEAK], len(r.uncontrolled)))
     rows = [_influence_row(c, x) for x in r.influences[:_MOST_WEAK]]
     columns = ("<Observation", "MDB [σ]", "λ̄", "<Moves most", "by", "<Unit", "in its σ", "<Position", "by [mm]")
     o = r.criteria.options
@@ -175,7 +175,8 @@ def correlations(c: Context) -> Markup:
         return Markup()
     s = c.statistics
     drawn = element("figure", heat_map(s.correlations)) if s.correlations is not None else Markup()
-    strong = _titled("Correlated above 95 %", _most([_correlated(x) for x in s.correlated]))
+    pairs = _most([_correlated(x) for x in s.correlated[:_MOST_WEAK]], len(s.correlated))
+    strong = _titled("Correlated above 95 %", pairs)
     weak = _titled("Weak directions", [_weak_text(x) for x in s.weak[:10]])
     note = t("Blue: positive, red: negative; empty: none. Lines separate the parameters.")
     return section("correlations", "Correlations", drawn + strong + weak, note)
@@ -185,10 +186,10 @@ def _titled(title: str, items: Sequence[str]) -> Markup:
     return element("h3", t(title)) + listed(items, "") if items else Markup()
 
 
-def _most(items: Sequence[str]) -> list[str]:
-    """The first of them, and how many more there are."""
-    more = len(items) - _MOST_WEAK
-    return [*items[:_MOST_WEAK], *([t("{n} more in solution.json.", n=count(more))] if more > 0 else [])]
+def _most(first: Sequence[str], n: int) -> list[str]:
+    """The first of ``n``, and how many more there are."""
+    more = n - len(first)
+    return [*first, *([t("{n} more in solution.json.", n=count(more))] if more else [])]
 
 
 def _correlated(x: Correlation) -> Markup:
