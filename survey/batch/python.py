@@ -9,7 +9,7 @@ from typing import Any
 from adjust.model.errors import SurveyError
 from survey.batch.causes import CAUSES
 from survey.batch.charts import control_chart
-from survey.batch.overview import write_overview
+from survey.batch.page import write_overview
 from survey.batch.record import FAILED, Record
 from survey.batch.run import BatchOptions, counts, run_batch
 from survey.batch.tables import STATES, count_line, findings, short_names, summary_table
@@ -17,7 +17,8 @@ from survey.batch.trends import Trends, trends_of
 from survey.folder.text import suggestion
 from survey.notebook.frames import frame
 from survey.notebook.html import heading, html_table
-from survey.notebook.plots import Plot, standalone
+from survey.notebook.plots import Plot
+from survey.report.drawing import ON_WHITE, standalone
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,8 @@ class Batch:
         for c in self.trends.charts:
             if c.series.name == name:
                 failed = [i for i, r in enumerate(self.records) if r.state == FAILED]
-                return Plot(name, standalone(control_chart(c, short_names(self.records), failed, name)))
+                drawn = control_chart(c, short_names(self.records), failed, name)
+                return Plot(name, standalone(drawn, ON_WHITE))
         known = [c.series.name for c in self.trends.charts]
         raise SurveyError(f"there is no number {name!r} in two epochs or more; {suggestion(name, known)}")
 

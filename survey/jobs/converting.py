@@ -22,7 +22,7 @@ from survey.interop.cameras import formats as camera_formats
 from survey.interop.cameras.aicon import ENDINGS as AICON_ENDINGS
 from survey.interop.cameras.aicon import read_aicon
 from survey.interop.cameras.dbat import read_dbat
-from survey.interop.cameras.values import camera_values
+from survey.interop.cameras.values import CameraValues, camera_values
 from survey.interop.names import with_safe_ids
 from survey.interop.networks.foreign import ForeignNetwork, is_utf8
 from survey.interop.networks.g2o import Information
@@ -190,6 +190,12 @@ def _encoding(source: Path, format: str) -> tuple[str, ...]:
     return ("the text is not UTF-8; unless the file names its encoding it was read as Latin-1",)
 
 
+def values_of_cameras(project: Project) -> CameraValues:
+    """The values of a project. One with results is adjusted again, because its files do not hold every covariance."""
+    solved = (project.folder / RESULTS / "solution.json").is_file()
+    return camera_values(project, adjust_project(project, progress=False) if solved else None)
+
+
 def _to_file(
     source: Path, target: Path, format: str, information: Information, station: str | None
 ) -> ConvertOutcome:
@@ -200,7 +206,7 @@ def _to_file(
         return ConvertOutcome(source, target, "g2o", {"stations": n_stations, "pairs": n_pairs}, poses, rest)
     project = read(source)
     if format in camera_formats.WRITERS:
-        values = camera_values(project)
+        values = values_of_cameras(project)
         counts, notes = camera_formats.write_cameras(values, target, format, station)
         said = "adjusted" if values.adjusted else "start values, not adjusted"
         return ConvertOutcome(source, target, format, counts, said, notes)

@@ -14,9 +14,10 @@ from survey.planning.building import build_plan
 from survey.planning.errors import error_analysis_job
 from survey.planning.job import PlanRequest, planning_job
 from survey.planning.plan_file import read_plan
-from survey.planning.plots import Series, chart, ticks
 from survey.planning.wanted import wanted_components
 from survey.project import read, write_project
+from survey.report.charts import Series, chart
+from survey.report.drawing import ticks
 from survey.simulate import resample
 from survey.simulate.scene import Scene
 from tests.survey.planning_lab import PLAN, write_lab

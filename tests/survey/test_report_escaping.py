@@ -25,8 +25,8 @@ from survey.planning.job import PlanRequest, planning_job
 from survey.planning.page import plan_page
 from survey.project import AdjustmentOptions, Project, Sigmas, read
 from survey.report import report_html
-from survey.report.embedding import json_script
-from survey.report.markup import esc
+from survey.report.language import esc
+from survey.report.markup import json_script
 from survey.simulate import beacons
 from survey.solution.dictionary import RunInfo
 from survey.solution.quantities import scale_of

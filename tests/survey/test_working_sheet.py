@@ -11,7 +11,7 @@ from adjust.model.errors import SurveyError
 from survey.cli import main
 from survey.examples.alignment import FEET_MM, OFF, alignment_files
 from survey.jobs.aligning import align_job
-from survey.report.working_sheet import steps
+from survey.jobs.working_sheet import steps
 
 ARCSEC = np.pi / 648000
 
