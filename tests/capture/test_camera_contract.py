@@ -23,7 +23,10 @@ from tests.capture.camera_helpers import GIGE, PYLON, VIKY, gige_port, require_s
 TRIGGERED = ("simulated", "pylon", "gige")
 
 
-@pytest.fixture(scope="module", params=("simulated", "pylon", "gige", "gentl"))
+@pytest.fixture(
+    scope="module",
+    params=("simulated", *(pytest.param(name, marks=pytest.mark.hardware) for name in ("pylon", "gige", "gentl"))),
+)
 def address(request: pytest.FixtureRequest) -> Iterator[str]:
     if request.param == "gige":
         with gige_port(), GigeServer("gradient"):

@@ -17,6 +17,8 @@ from capture.simulated.gige_server import GigeServer
 from capture.trigger_set import TriggerSet
 from tests.capture.camera_helpers import GIGE, gige_port, number_in, open_camera, set_up
 
+pytestmark = pytest.mark.hardware
+
 
 @pytest.fixture
 def port() -> Iterator[None]:

@@ -11,6 +11,7 @@ from capture.camera import CameraError, DisconnectedError, IncompleteFrameError
 from capture.drivers.cameras.pylon import PylonCamera
 from tests.capture.camera_helpers import PYLON, open_camera, require_silence, set_up
 
+pytestmark = pytest.mark.hardware
 RNG = np.random.default_rng(4)
 
 

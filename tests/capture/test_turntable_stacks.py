@@ -18,6 +18,7 @@ from capture.drivers.turntables.standa import StandaController
 from capture.turntable import Axis, ControllerError, LimitError, Settle, StoppedError, TableDisconnectedError
 from tests.capture.table_server import table_server
 
+pytestmark = pytest.mark.hardware
 DEG = math.pi / 180
 QUICK = Settle(tolerance=0.05 * DEG, still=0.01 * DEG, window_s=0.05, stall_s=0.4, timeout_s=10.0, poll_s=0.005)
 AXES = (Axis("axis1", -60 * DEG, 60 * DEG), Axis("axis2", -170 * DEG, 170 * DEG))
