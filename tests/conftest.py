@@ -1,4 +1,4 @@
-"""How the tests run: side by side on all cores, long statistical tests at a tenth of their size; ``docs/testing.md``."""
+"""How the tests run: side by side on all cores, statistical tests at a tenth of their size (``docs/testing.md``)."""
 
 import os
 from pathlib import Path

@@ -109,6 +109,7 @@ def _solution(monkeypatch: pytest.MonkeyPatch, threads: int) -> str:
             digest.update(value.tobytes() + h.covariance_of(precision, name).tobytes())
         residuals = image_residuals(precision)
         digest.update(residuals.residuals.tobytes() + residuals.redundancy.tobytes())
+        digest.update(f"{done.omega.hex()} {done.iterations}".encode())
     return digest.hexdigest()
 
 
