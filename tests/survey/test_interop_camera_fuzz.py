@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 
 from survey.interop.camera_formats import COLMAP, KALIBR_TARGET, READERS, write_cameras
 from survey.interop.colmap import read_colmap
+from tests.sizes import size
 from tests.survey.test_interop_fuzz import _damaged, _message
 
 configuration.set_hypothesis_home_dir(tempfile.gettempdir())
 _QUICK = settings(
-    max_examples=40, deadline=None, database=None, derandomize=True,
+    max_examples=size(40, 15), deadline=None, database=None, derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
 )  # fmt: skip
 _PLAIN = sorted(set(READERS) - set(COLMAP))
