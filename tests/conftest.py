@@ -34,6 +34,11 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         option.dist = "worksteal"  # neighbours stay together, so that what they share is made once
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Nothing of the whole jobs is imported for the daily loop."""
+    return True if collection_path == ACCEPTANCE and config.option.markexpr.strip() == "not slow" else None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Whole jobs are slow."""
     for item in items:

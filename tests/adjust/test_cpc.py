@@ -117,6 +117,7 @@ def test_our_frames():
     )
 
 
+@pytest.mark.slow
 def test_propagated_sigmas_are_the_scatter():
     item = replace(given(head(0.3), with_cov=True), angle_sigma_rad=3e-4)  # as much as the images
     names, cov = propagate(item)
@@ -129,6 +130,7 @@ def test_propagated_sigmas_are_the_scatter():
     np.testing.assert_allclose(ratio, 1.0, atol=4.5 / np.sqrt(2 * n))
 
 
+@pytest.mark.slow
 def test_each_step_judges_white_noise_rightly():
     """With the noise it supposes (equal, independent, nothing wrong before) the paper's sigma is the scatter."""
     truth, rng = head(0.0), np.random.default_rng(2)

@@ -98,6 +98,7 @@ def test_covariance_is_that_of_the_derivatives_also_of_large_deformations():
     np.testing.assert_allclose(d.euler_cov / scale[6:, 6:], expected[6:, 6:] / scale[6:, 6:], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_without_deformation_the_tests_are_chi_square():
     poses, rng, n = chain(), np.random.default_rng(3), size(200, 25)
     draws = [station_deformations(adjusted(measured(poses, rng)), adjusted(measured(poses, rng))) for _ in range(n)]

@@ -81,6 +81,7 @@ def test_expectation_is_the_covariance_of_an_adjustment_of_simulated_readings() 
         np.testing.assert_allclose(Q[dense.at[name], dense.at[name]] / scale, C, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_scatter_of_simulated_readings_is_the_predicted_covariance() -> None:
     survey, _, start = hall()
     planned, ideal = expect(survey, start), exact(survey, start)

@@ -199,6 +199,7 @@ class Plainly:
         return turn.apply(across) @ y
 
 
+@pytest.mark.slow
 def test_residuals_and_derivatives_of_every_kind() -> None:
     survey, start = geometric(3)
     graph = h.build(survey, start)

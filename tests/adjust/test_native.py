@@ -27,6 +27,7 @@ _SUMS_THAT_CANCEL = ("influence",)
 """Shares of a point in large covariances that cancel: what is left is compared, what was summed is larger."""
 
 
+@pytest.mark.slow
 def test_every_function_of_the_library_has_a_face_and_is_called() -> None:
     assert set(opened("base")) == set(FUNCTIONS)
     assert {call.function.name for call in calls()} == set(FUNCTIONS)
@@ -46,6 +47,7 @@ def test_a_declaration_that_differs_from_the_library_is_refused() -> None:
             Function("fill_upper", arguments)(np.zeros((6, 6)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("instructions", RUNNABLE[1:])
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_vector_instructions_change_nothing(name: str, instructions: str) -> None:
@@ -113,6 +115,7 @@ def _solution(monkeypatch: pytest.MonkeyPatch, threads: int) -> str:
     return digest.hexdigest()
 
 
+@pytest.mark.slow
 def test_threads_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[int] = []
     pool = parallel._pool
@@ -204,6 +207,7 @@ def _told(**environment: str) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_version_tells_which_instructions_run() -> None:
     assert instruction_set() in RUNNABLE
     assert _told()[1].strip().endswith(f"(native core: {instruction_set()})")

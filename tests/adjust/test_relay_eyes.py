@@ -74,6 +74,7 @@ def test_motions_without_noise_give_the_truth() -> None:
     assert np.abs(error(found.station_from_eye, trackers.station_from_eye)).max() < 1e-10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scaled", [False, True])
 def test_derivatives_away_from_zero_error(scaled: bool) -> None:
     trackers = Trackers(5, n=4)
@@ -356,6 +357,7 @@ def _joint_pair(result: object, a: str, b: str) -> tuple[Pose3, FloatArray]:
     return b_from_a, J @ C @ J.T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", [(), ("fx", "u0", "v0")])
 def test_what_condensing_costs(free: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     """Pairs one by one lose what they share; poses with their joint covariance lose nothing."""
@@ -389,6 +391,7 @@ def test_what_condensing_costs(free: tuple[str, ...], capsys: pytest.CaptureFixt
         print("\n" + "\n".join(lines))
 
 
+@pytest.mark.slow
 def test_condensing_costs_nothing_in_the_limit_of_small_noise() -> None:
     off = []
     for sigma_px in (5e-2, 5e-4, 5e-5):
@@ -405,6 +408,7 @@ def test_condensing_costs_nothing_in_the_limit_of_small_noise() -> None:
     assert off[1] < 0.03 * off[0]
 
 
+@pytest.mark.slow
 def test_actual_covariance_of_closed_loops_is_the_scatter() -> None:
     """The covariance claimed by the loops is too small, the one that counts shared errors is right."""
     actual, claimed, n = [], [], size(20, 6)

@@ -3,10 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from adjust.model import Survey
 from adjust.table_checks import probable_causes
 from survey.simulate import head_on_table
+
+pytestmark = pytest.mark.slow
 
 
 def mirrored(survey: Survey, camera_id: str) -> Survey:

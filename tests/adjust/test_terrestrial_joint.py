@@ -29,6 +29,8 @@ from tests.adjust import helpers as h
 from tests.adjust.terrestrial_networks import P, Truth, measured, polar_network, start_near
 from tests.sizes import size
 
+pytestmark = pytest.mark.slow
+
 TRIALS = size(100, 20)
 POLAR = (("direction", 2e-5), ("zenith", 2e-5), ("slope_distance", 2e-4))
 

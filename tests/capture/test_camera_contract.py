@@ -20,6 +20,8 @@ from capture.drivers.cameras import open_camera
 from capture.simulated.gige_server import GigeServer
 from tests.capture.camera_helpers import GIGE, PYLON, VIKY, gige_port, require_silence, set_up
 
+pytestmark = pytest.mark.slow
+
 TRIGGERED = ("simulated", "pylon", "gige")
 
 

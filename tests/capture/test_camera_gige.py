@@ -17,7 +17,7 @@ from capture.simulated.gige_server import GigeServer
 from capture.trigger_set import TriggerSet
 from tests.capture.camera_helpers import GIGE, gige_port, number_in, open_camera, set_up
 
-pytestmark = pytest.mark.hardware
+pytestmark = [pytest.mark.hardware, pytest.mark.slow]
 
 
 @pytest.fixture

@@ -30,6 +30,7 @@ def show(camera: PylonCamera, path: Path, image: np.ndarray) -> None:
     camera.set("ImageFilename", str(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pixel_format", "bits", "shift"), [("Mono8", 8, 0), ("Mono10", 10, 6), ("Mono12", 12, 4), ("Mono16", 16, 0)]
 )

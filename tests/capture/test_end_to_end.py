@@ -22,6 +22,8 @@ from survey.results import read_covariances
 from tests.capture.camera_helpers import GIGE, gige_port
 from tests.capture.table_server import table_server
 
+pytestmark = pytest.mark.slow
+
 COMPARE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "compare_with_truth.py"))
 _AXIS = "{ limits_deg = [-180, 180], wraps = true, speed_deg_s = 100, acceleration_deg_s2 = 4000 }"
 

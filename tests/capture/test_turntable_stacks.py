@@ -35,6 +35,7 @@ def ascii_table(server, dialect="two-axis", signs=(1, 1), zeros=(0.0, 0.0), axes
         table.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dialect", ["two-axis", "newport-esp301"])
 def test_dialect_over_tcp(tmp_path, dialect):
     with table_server(tmp_path, "--language", dialect, "--noise", "1") as server, ascii_table(server, dialect) as table:
@@ -251,6 +252,7 @@ sys.stdout.flush()
 """
 
 
+@pytest.mark.slow
 def test_epics_motor_records(tmp_path):
     """An IOC and a client in processes of their own, on a port of their own."""
     port = str(20000 + os.getpid() % 20000)

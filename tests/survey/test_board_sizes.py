@@ -13,6 +13,8 @@ from survey.rendering import BrownCamera, Imaging, PlacedTarget, render
 from survey.targets import Checkerboard
 from tests.data import data_folder
 
+pytestmark = pytest.mark.slow
+
 CAMERA = BrownCamera((640, 480), 800.0, 800.0, 319.5, 239.5, (-0.25, 0.06, 1e-3, -5e-4))
 SMALL = BrownCamera((400, 300), 500.0, 500.0, 199.5, 149.5, CAMERA.distortion)
 PROJECT = """

@@ -25,6 +25,8 @@ from survey.previous import read_previous
 from survey.removing import remove_job
 from survey.warm_start import WARM, survey_start, warm_adjustment
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def mine(lab, tmp_path):

@@ -24,6 +24,7 @@ def test_names_of_faults_differ() -> None:
     assert len({fault.name for fault in FAULTS}) == len(FAULTS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
 def test_fault_is_named(fault: Fault, tmp_path: Path) -> None:
     write_good_project(tmp_path)
@@ -39,6 +40,7 @@ def test_fault_is_named(fault: Fault, tmp_path: Path) -> None:
         assert line.strip() in named or named.strip() in line, f"{message}\nnames: {named}\nexpected: {line}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", [f for f in DEFINITION_FAULTS if f.name != NEEDS_TABLES], ids=lambda f: f.name)
 def test_definition_alone_finds_its_faults(fault: Fault, tmp_path: Path) -> None:
     write_good_project(tmp_path)

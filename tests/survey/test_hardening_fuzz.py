@@ -11,6 +11,8 @@ from tests.fuzz.called import reading_functions
 from tests.fuzz.mutate import Mutator
 from tests.sizes import size
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 CORPUS = ROOT / "tests" / "fuzz" / "corpus"
 NO_READERS = {

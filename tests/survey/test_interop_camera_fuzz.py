@@ -36,6 +36,7 @@ def _try(read, path):
     assert message is None or str(path.parent) in message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", _PLAIN)
 def test_damaged_files_are_refused_or_read(samples, tmp_path, format):
     text = samples[format].read_text(encoding="utf-8")
@@ -78,6 +79,7 @@ def test_damaged_binary_models_are_refused_or_read(samples, tmp_path, name):
     run()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cameras.txt", "rigs.txt", "frames.txt", "images.txt", "points3D.txt"])
 def test_damaged_text_models_are_refused_or_read(samples, tmp_path, name):
     copy = tmp_path / "model"

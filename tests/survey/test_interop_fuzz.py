@@ -13,6 +13,8 @@ from survey.interop.krumm import read_adjusted
 from tests.sizes import size
 from tests.survey.interop_samples import AICON, CSV, DBAT, DBAT_FILES, GKF, KRUMM, LGC
 
+pytestmark = pytest.mark.slow
+
 # no folder of its own among the sources
 configuration.set_hypothesis_home_dir(tempfile.gettempdir())
 _QUICK = settings(
