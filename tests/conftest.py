@@ -30,6 +30,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     if unsaid and not apart and all(Path(a).is_dir() for a in config.args):
         from adjust.parallel import cores
 
+        os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")  # of each process
         option.numprocesses = cores() + 1  # one waits for a table or a camera
         option.dist = "worksteal"  # neighbours stay together, so that what they share is made once
 
