@@ -67,6 +67,7 @@ def test_adjust_solve_stays_the_function_beside_its_submodule() -> None:
     assert adjust.solve is not step
 
 
+@pytest.mark.slow
 def test_the_api_gives_what_the_command_line_writes(solution: survey.Solution, folder: Path, tmp_path: Path) -> None:
     from survey.cli import main
 
@@ -158,6 +159,7 @@ def test_covariances_by_name(solution: survey.Solution) -> None:
     assert list(cov.frame.columns) == list(cov.labels)
 
 
+@pytest.mark.slow
 def test_joint_covariance_agrees_with_the_scatter_of_solutions() -> None:
     """Two cameras' focal lengths over fresh noise: d' inv(C) d is chi-square with two degrees of freedom."""
     from survey.simulate import resample, stereo
@@ -270,6 +272,7 @@ def test_doctests_of_the_interface() -> None:
     assert found.failed == 0
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # of Jupyter
 def test_notebooks_run(tmp_path: Path) -> None:
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
