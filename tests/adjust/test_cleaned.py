@@ -13,6 +13,7 @@ from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net
 
 
+@pytest.mark.slow
 def test_a_wrong_tape_is_not_blamed_on_the_few_rays_to_its_beacon() -> None:
     """Two images see the beacon: leaving both rays out explains a wrong distance too, but needs twice as many."""
     survey, truth = beacons(2, n_table_epochs=4, n_free_epochs=3, n_night_epochs=5)

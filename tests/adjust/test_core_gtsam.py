@@ -23,6 +23,8 @@ from tests.adjust.test_core_jacobians import others
 from tests.adjust.test_geometry import geometric
 from tests.adjust.test_terrestrial_joint import laboratory, start_of
 
+pytestmark = pytest.mark.slow
+
 Problem = tuple[Survey, StartValues]
 
 

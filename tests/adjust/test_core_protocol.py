@@ -1,9 +1,4 @@
-"""The batches behind GTSAM's factors: right at any values, in any algorithm, on any number of threads."""
-
-import os
-import subprocess
-import sys
-from pathlib import Path
+"""The batches behind GTSAM's factors: right at any values, in any algorithm."""
 
 import gtsam
 import numpy as np
@@ -76,31 +71,3 @@ def test_gtsams_own_optimiser_reaches_the_same_optimum() -> None:
     for name, unknown in graph.unknowns.by_name.items():
         step = theirs.localCoordinates(ours.values).at(unknown.key)
         assert np.all(np.abs(step) < 1e-4 * np.sqrt(np.diag(h.covariance_of(precision, name)))), name
-
-
-PROGRAM = """
-import hashlib, sys
-from survey.simulate import head_on_table
-from tests.adjust import helpers as h
-survey, truth = head_on_table(1, n_cameras=3, n_table_epochs=16, n_free_epochs=10)
-assert sum(len(b.uv) for b in survey.image_blocks) > 5000, "not worth a second thread"
-graph, done = h.solved(survey, h.shaken(h.start_at(truth), 2, 0.005), tight=False)
-assert len(graph.images._all) == int(sys.argv[1])
-digest = hashlib.sha256()
-for unknown in graph.unknowns.by_name.values():
-    x = done.values.atPose3(unknown.key).matrix() if unknown.kind == "pose" else done.values.atVector(unknown.key)
-    digest.update(x.tobytes())
-print(digest.hexdigest(), done.omega.hex(), done.iterations)
-"""
-
-
-def test_threads_do_not_change_a_bit() -> None:
-    root = Path(__file__).parents[2]
-    found = set()
-    for threads in ("1", "2"):
-        environment = {**os.environ, "LABSURVEY_THREADS": threads, "OPENBLAS_NUM_THREADS": "1",
-                       "PYTHONPATH": str(root)}  # fmt: skip
-        done = subprocess.run([sys.executable, "-c", PROGRAM, threads], env=environment, cwd=root, check=True,
-                              capture_output=True, text=True)  # fmt: skip
-        found.add(done.stdout)
-    assert len(found) == 1

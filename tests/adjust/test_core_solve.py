@@ -105,6 +105,7 @@ def test_progress_tells_every_accepted_step() -> None:
     assert told[-1] == (done.iterations, done.omega)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.03, 0.1, 0.3])
 def test_weak_but_determined_geometry_is_solved_by_qr(sigma: float) -> None:
     """A network that hangs in the world by one loosely known pose: GTSAM's Cholesky refuses, nothing is undetermined.
@@ -122,6 +123,7 @@ def test_weak_but_determined_geometry_is_solved_by_qr(sigma: float) -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(h.covariance_of(precision, name))), sigma, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.1, 1.0])
 def test_a_loose_datum_holds_a_larger_network(sigma: float) -> None:
     """Closed form: the pose that alone carries the datum has the covariance of its prior, whatever hangs on it."""

@@ -44,6 +44,7 @@ def warped_stereo() -> tuple[Survey, Truth]:
     return resample(thinned(survey, 3), truth, 2), truth
 
 
+@pytest.mark.slow
 def test_reduced_precision_is_that_of_one_dense_matrix() -> None:
     survey, truth = warped_stereo()
     assert h.build(survey, near(truth)).reduction is not None
@@ -71,6 +72,7 @@ def test_joint_covariance_across_reduced_poses(model: str) -> None:
     np.testing.assert_allclose(found / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_many_points_in_a_block_are_taken_in_parts() -> None:
     """More points than are evaluated together, and a number that no part divides."""
     survey, truth = single_camera(3, n_images=9)
@@ -149,6 +151,7 @@ def test_what_is_undetermined_is_named_as_without_the_reduction() -> None:
     assert text == refusal(plain)
 
 
+@pytest.mark.slow
 def test_what_only_other_observations_determine_is_shown_to_the_solver() -> None:
     """Cameras that never see the same board, joined by a measured pose: the images alone leave the second one free."""
     survey, truth = stereo(2, n_pairs=10)

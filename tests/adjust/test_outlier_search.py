@@ -108,6 +108,7 @@ def planted(seed: int) -> tuple[Survey, Survey, dict[str, float]]:
     return survey, replace(survey, readings=tuple(readings)), sizes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_planted_errors_are_found_and_named(seed: int) -> None:
     _, wrong, sizes = planted(seed)
@@ -162,6 +163,7 @@ def test_a_robust_suspect_that_fits_comes_back() -> None:
     assert out == {d.ids for d in found.rejected}
 
 
+@pytest.mark.slow
 def test_errors_of_other_kinds() -> None:
     """A pair, a distance and an image point off in one survey of a head on a table."""
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=4, n_free_epochs=2)
@@ -189,6 +191,7 @@ def test_errors_of_other_kinds() -> None:
     assert only.suspects[0].ids == image.ids
 
 
+@pytest.mark.slow
 def test_a_wrong_table_reading_and_a_wrong_prior() -> None:
     """The reading is left out and predicted; the prior, part of what is asked for, is only named."""
     survey, truth = head_on_table(2, n_cameras=1, n_table_epochs=5, n_free_epochs=0)
@@ -224,6 +227,7 @@ def test_joint_covariances_are_split() -> None:
     assert adjust(less, start).redundancy == adjustment.redundancy - 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "least"), [(14, 3.0), (29, 2.5), (46, 1.6)])
 def test_good_observations_that_went_out_for_a_bad_one_come_back(seed: int, least: float) -> None:
     """Surveys in which data snooping alone keeps a large error and leaves out good readings of a point."""
@@ -253,6 +257,7 @@ def test_two_explanations_that_cannot_be_told_apart_are_both_named() -> None:
     assert any("either" in n and "S1" in n and "S2" in n for n in found.notes)
 
 
+@pytest.mark.slow
 def test_nothing_is_left_out_of_a_group_whose_residuals_are_far_below_its_sigmas() -> None:
     survey, start = net.hall(4, n_points=60, n_stations=4)
     readings = [replace(r, sigma=20.0 * r.sigma) if r.group == "direction" else r for r in survey.readings]
@@ -293,6 +298,7 @@ def test_the_last_solution_stays_where_there_is_none_without_an_observation(monk
     assert all(r.used for r in found.survey.readings if r.reading_id == needed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_small_group_with_sigmas_too_small_loses_only_what_is_wrong(seed: int) -> None:
     survey, start = net.hall(seed, factors={"tape": 64.0})

@@ -172,6 +172,7 @@ def test_covariance_equals_the_scatter_of_repeated_networks() -> None:
     assert chi2.ppf(1e-4, n) < total < chi2.ppf(1 - 1e-4, n)
 
 
+@pytest.mark.slow
 def test_wrong_pairs_are_found_and_named_in_a_small_network() -> None:
     for seed in range(6):
         sim = simulate(6, 5, seed=seed, wrong=3, extra=25)
@@ -220,6 +221,7 @@ def _with_sigmas(net: PoseNetwork, factor: float, **changes: FloatArray) -> Pose
                         held={0: np.eye(4)})  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_sigmas_that_are_too_small_throughout_make_no_pair_of_a_few_wrong(seed: int) -> None:
     net = simulate(3, 2, seed=seed, extra=9).network
@@ -229,6 +231,7 @@ def test_sigmas_that_are_too_small_throughout_make_no_pair_of_a_few_wrong(seed: 
     assert solution.sigma0 == pytest.approx(5.0, rel=0.4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_a_wrong_pair_of_a_few_is_found_with_sigmas_right_and_too_small(seed: int) -> None:
     sim = simulate(3, 2, seed=seed, extra=9, wrong=1)
@@ -267,6 +270,7 @@ def test_wrong_turns_are_found_among_rotations() -> None:
     assert "deg" in str(solution.rejected[0])
 
 
+@pytest.mark.slow
 def test_false_alarms_stay_at_their_rate() -> None:
     alarms = sum(bool(solve_network(simulate(4, 3, seed=s, extra=8).network).rejected) for s in range(100, 220))
     # alpha = 0.01 a network: 1.2 expected in 120

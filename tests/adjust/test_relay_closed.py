@@ -82,6 +82,7 @@ def test_eyes_that_are_no_stations_close_their_loops(rotations: bool) -> None:
     assert not any("differ" in w for w in found.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [4, 16])
 def test_few_loops_by_closure_factors_many_by_normal_equations(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same from both, and from the normal equations where the factors give up or lose a constraint."""

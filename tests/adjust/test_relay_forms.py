@@ -76,6 +76,7 @@ def test_two_parallel_pairs_give_their_weighted_mean():
 # -- the two forms -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [3, 6])
 @pytest.mark.parametrize("name", NETWORKS)
 def test_all_forms_agree(name, dim):

@@ -145,6 +145,7 @@ def test_compiled_trials_are_the_same_estimator(n):
             assert batch.omega[trial] == pytest.approx(pairs.omega, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_monte_carlo_repeats_itself_and_counts_its_redundancy():
     options = MonteCarloOptions(n_cameras=5, n_trials=3000, seed=3, chunk=1000)
     first, again = simulate_complete(options), simulate_complete(options)

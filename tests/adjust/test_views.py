@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import pytest
 
 from adjust.native.library import SETS, Function, instruction_set
 from adjust.native.views import ViewArrays
@@ -185,6 +186,7 @@ def test_refinement_ends_at_the_least_squares_pose():
             assert abs(up - down) < 1e-2 * (up + down - 2.0 * here)
 
 
+@pytest.mark.slow
 def test_few_points_off_a_plane_have_their_pose_in_any_order():
     """Four points have several minima, of which a solution from all of them may give a wrong one alone."""
     rng, f, views, true = np.random.default_rng(5), 1900.0, [], []

@@ -25,6 +25,8 @@ from survey.project.observed import Observed
 from survey.project.reading import leaving_out, read_all
 from survey.solution.previous import read_previous
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def mine(lab, tmp_path):

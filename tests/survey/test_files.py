@@ -243,6 +243,7 @@ def test_what_only_programs_write(tmp_path: Path) -> None:
     assert differences(survey, again) == []
 
 
+@pytest.mark.slow
 def test_simulated_lab_returns_in_canonical_order(tmp_path: Path) -> None:
     survey, _ = full_lab(1)
     files.write_project(tmp_path, survey)
@@ -416,6 +417,7 @@ def test_units_return_what_was_typed(unit: str) -> None:
     np.testing.assert_allclose(from_si(inside, unit), typed, rtol=3e-16)
 
 
+@pytest.mark.slow
 def test_large_table_is_read_in_blocks(good: Path, record_property: Any) -> None:
     """200 000 rows in random order; the time is recorded, not judged."""
     rng = np.random.default_rng(2)

@@ -130,6 +130,7 @@ def test_more_rows_than_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         read_table(tmp_path / "t.csv", LAYOUT)
 
 
+@pytest.mark.slow
 def test_a_billion_equal_rows_of_parquet(tmp_path: Path) -> None:
     """Run lengths make them a small file; they are counted before they are unpacked."""
     pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
@@ -224,6 +225,7 @@ def head(shape: str, dtype: str = "<f8") -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arrays",
     [
@@ -258,6 +260,7 @@ def test_arrays_of_objects_are_never_unpickled(small: Path, tmp_path: Path) -> N
     assert not (tmp_path / "harmed").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["[]", "{}", "null", "[" * 100_000, '{"inputs": 1}', "\x00", '{"summary": NaN}'])
 def test_solutions_of_others(small: Path, text: str) -> None:
     adjust_job(small, progress=False)
@@ -292,6 +295,7 @@ def test_windows_line_ends_and_byte_order_marks(small: Path) -> None:
     assert adjust_job(small, progress=False).solution["summary"]["sigma0"] == plain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("locale", ["C", "tr_TR.UTF-8"])
 def test_odd_locales(small: Path, locale: str) -> None:
     """A folder with names of another alphabet, where the terminal knows ASCII alone."""

@@ -9,6 +9,9 @@ import pytest
 
 from tests.fuzz.called import reading_functions
 from tests.fuzz.mutate import Mutator
+from tests.sizes import size
+
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 CORPUS = ROOT / "tests" / "fuzz" / "corpus"
@@ -64,9 +67,10 @@ def test_what_was_found_is_found_no_more(tmp_path):
 
 def test_every_reader_is_listed_and_stands_new_inputs(tmp_path):
     """Whether a function reads files is seen in its source; whether it is in the list, by running the list."""
-    out = _fuzzed(tmp_path, "--count", "4", "--seed", "11", "--jobs", "2", "--called", str(tmp_path / "called.json"))
+    called = tmp_path / "called.json"
+    out = _fuzzed(tmp_path, "--count", str(size(4)), "--seed", "11", "--jobs", "1", "--called", str(called))
     assert " 0 findings" in out
-    missing = set(reading_functions()) - set(json.loads((tmp_path / "called.json").read_text()))
+    missing = set(reading_functions()) - set(json.loads(called.read_text()))
     assert sorted(missing - set(NO_READERS)) == []
     assert sorted(set(NO_READERS) - missing) == []
 

@@ -44,6 +44,7 @@ def test_pycolmap_reads_the_model_and_projects_as_the_survey_does(lab, models, f
         np.testing.assert_allclose([xy - 0.5 for xy, _ in seen], np.concatenate(blocks), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", ["colmap", "colmap-text"])
 def test_a_full_disk_leaves_no_half_model(lab, tmp_path, format, capsys):
     """pycolmap alone would write what has room and say nothing."""

@@ -214,6 +214,7 @@ def test_sigmas_too_large_throughout_reject_no_pair():
         assert max(o.test for o in result.other_residuals if o.kind == "pair") > 38.0  # the limit of a single pair
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_sigmas_too_small_throughout_reject_no_pair_of_a_few(seed):
     survey, _ = _network(6, combinations(range(6), 2), 5.0, seed=seed)

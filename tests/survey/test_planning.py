@@ -167,6 +167,7 @@ def test_patterns_name_components(lab, outcome):
         wanted_components(e, ["lens.x"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
@@ -212,6 +213,7 @@ def test_what_a_plan_leaves_open_is_named(lab, tmp_path):
     assert caught.value.parameters
 
 
+@pytest.mark.slow
 def test_trials_of_a_plan(lab):
     found = planning_job(lab[0], PlanRequest(add=0, trials=24, workers=1), progress=False)
     t = found.summary()["monte_carlo"]

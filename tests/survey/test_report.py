@@ -176,6 +176,7 @@ def test_names_cannot_become_markup(adjustment: Adjustment) -> None:
         ET.fromstring(picture)
 
 
+@pytest.mark.slow
 def test_a_large_laboratory_stays_readable_and_small() -> None:
     made = lab_adjustment(Lab(n_epochs=100, n_beacons=60))
     page = report_html(made, RUN)

@@ -18,6 +18,7 @@ from survey.report.drawing import DARK
 from survey.solution.dictionary import RunInfo
 from tests.survey.adjustments import Lab, lab_adjustment
 
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 RUN = RunInfo("lab", "Full lab", {"survey.toml": "12ab"}, {"alpha": 0.05}, {"labsurvey": "0.1.0"}, "2026-01-02")
 COMPONENT, W, OBSERVED = (observations.COLUMNS.index(name) for name in ("Component", "w", "Observed"))
 PHONE = 390

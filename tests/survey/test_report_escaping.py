@@ -44,6 +44,7 @@ def pages(adjustment: Adjustment, run: RunInfo, project: Project | None = None) 
     return {language: report_html(adjustment, run, None, found, language) for language in LANGUAGES}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["total-station", "relay", "alignment"])
 def test_reports_of_whole_projects(name: str, tmp_path: Path) -> None:
     """Of one also with good names: the same page but for the text."""
@@ -64,6 +65,7 @@ def test_reports_of_whole_projects(name: str, tmp_path: Path) -> None:
         assert [tags_of(harmed[k]) ^ tags_of(plain[k]) for k in LANGUAGES] == [{group}, {group}]
 
 
+@pytest.mark.slow
 def test_report_of_cameras_table_beacons_and_spots(tmp_path: Path) -> None:
     made, truth = beacons(3, n_table_epochs=5, n_free_epochs=3, n_night_epochs=1)
     points = tuple(replace(p, x_in_world=PointParameter(truth["point", p.point_id])) for p in made.points)
@@ -101,6 +103,7 @@ def test_working_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert page.count("&lt;script") + page.count("&gt;") > 5
 
 
+@pytest.mark.slow
 def test_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_lab(tmp_path)
     project = read(tmp_path)
