@@ -9,7 +9,7 @@ from adjust.closed_forms.hand_eye import (
     solve_ax_zb,
     solve_views,
 )
-from adjust.closed_forms.planes import homographies, plane_misfits, plane_poses
+from adjust.closed_forms.planes import homographies, plane_poses
 from adjust.closed_forms.rigid import align, inverse, nearest_rotation, rigid, rotation_exp, rotation_log, transform
 from adjust.closed_forms.triangulation import Intersection, intersect
 from adjust.closed_forms.views import refine_poses, tangent_axes, view_errors, view_offsets
@@ -30,7 +30,6 @@ __all__ = [
     "mean_rotation",
     "nearest_rotation",
     "pinhole_from_homographies",
-    "plane_misfits",
     "plane_poses",
     "pose_distance",
     "pose_solutions",

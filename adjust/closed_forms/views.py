@@ -1,44 +1,10 @@
-"""Camera poses of many views at once, refined and judged by the angles between rays and points.
-
-Where NumPy does the work it is done in stacks: x and rays (b, 3, n) of b views with about equal numbers of points,
-``real`` (b, n) one for each point and zero where a view has fewer.
-"""
-
-from collections.abc import Iterator
+"""Camera poses of many views at once, refined and judged by the angles between rays and points."""
 
 import numpy as np
 
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.native.views import ViewArrays, errors_of_views, offsets_of_views, refine_views
 from adjust.parallel import run_split, split_blocks
-
-_STACK = 8192  # points at a time: what they need stays in the processor's cache
-
-
-def stacks(first: IntArray, size: IntArray) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:
-    """Views with ``size`` (B,) rows from ``first`` (B,) on, those of about equal size together.
-
-    Yields their positions (b,), the rows (b, n) of their points, the last one again where a view has fewer, and
-    ``real`` (b, n). None may be empty.
-    """
-    order = np.argsort(size, kind="stable")
-    ends = np.cumsum(size[order])
-    edges = np.searchsorted(ends, np.arange(_STACK, ends[-1] if len(ends) else 0, _STACK))
-    for which in np.split(order, np.unique(edges)):
-        if len(which):
-            step, last = np.arange(size[which[-1]]), size[which, None] - 1
-            yield which, first[which, None] + np.minimum(step, last), (step <= last).astype(float)
-
-
-def gathered(array: FloatArray, rows: IntArray) -> FloatArray:
-    """Rows (b, n) of points (N, k) as a stack (b, k, n)."""
-    return np.ascontiguousarray(np.swapaxes(array[rows], 1, 2))
-
-
-def median(values: FloatArray, real: FloatArray) -> FloatArray:
-    """The median (b,) of the real ones of values (b, n)."""
-    ordered, size, i = np.sort(np.where(real > 0, values, np.inf)), real.sum(axis=1).astype(int), np.arange(len(real))
-    return np.asarray(0.5 * (ordered[i, (size - 1) // 2] + ordered[i, size // 2]))
 
 
 def tangent_axes(rays: FloatArray) -> FloatArray:

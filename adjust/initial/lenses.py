@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.closed_forms import best_poses, homographies, pinhole_from_homographies, plane_misfits
+from adjust.closed_forms import best_poses, homographies, pinhole_from_homographies
 from adjust.errors import SurveyError
-from adjust.initial.lens_refinement import LensFit, fit_lens
 from adjust.lens import (
     LensModel,
     camera_constants,
@@ -18,6 +17,7 @@ from adjust.lens import (
     unit_rays,
 )
 from adjust.model import Camera, FloatArray
+from adjust.native.lenses import fit_lens
 
 _MOST_IMAGES = 30
 _SCAN_IMAGES = 8
@@ -37,6 +37,16 @@ class Sighting:
     block_idx: int
     x: FloatArray
     uv: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A lens (n,) with the poses (B, 4, 4), the median error px, and the covariance (p, p) of what was free."""
+
+    values: FloatArray
+    poses: FloatArray
+    median_px: float
+    cov: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +89,7 @@ class _LensSearch:
     def __init__(self, camera: Camera, model: LensModel) -> None:
         self.camera, self.model, self.size = camera, model, camera.image_size
         self.constants = camera_constants(camera)
-        self._flat: dict[int, bool] = {}
+        self._plane: dict[int, FloatArray | None] = {}
         self.prior = {}
         if camera.lens.prior is not None:
             self.prior = dict(zip(camera.lens.prior.names, camera.lens.prior.mean, strict=True))
@@ -102,30 +112,34 @@ class _LensSearch:
                 " show it a target, or give lens values"
             )
         # the other images of a long series are screened by their poses
-        flat = _every([s for s in usable if self._is_flat(s)], _MOST_SCREENED)
-        good, excluded = self._screen(flat) if flat else ([], {})
-        chosen = spread_out(good) or [s for s in usable if s.block_idx not in excluded][:_MOST_IMAGES]
+        flat = _every([s for s in usable if self._on_plane(s) is not None], _MOST_SCREENED)
+        maps, excluded = self._screen(flat) if flat else ({}, {})
+        chosen = spread_out([s for s in flat if s.block_idx in maps])
+        chosen = chosen or [s for s in usable if s.block_idx not in excluded][:_MOST_IMAGES]
         if not chosen:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: none of its {len(flat)} images fits a plane; the first: "
                 + next(iter(excluded.values()))
             )
-        start, how = self._focal_length([s for s in chosen if self._is_flat(s)], chosen)
+        start, how = self._focal_length([maps[s.block_idx] for s in chosen if s.block_idx in maps], chosen)
         return self._refine(start, how, chosen, excluded)
 
-    def _is_flat(self, sighting: Sighting) -> bool:
-        """Whether the points are a plane; asked once for all images that show the same array of points."""
+    def _on_plane(self, sighting: Sighting) -> FloatArray | None:
+        """Coordinates in the points' plane, asked for once for all images that show the same array of points."""
         key = id(sighting.x)
-        if key not in self._flat:
-            self._flat[key] = _is_plane(sighting.x)
-        return self._flat[key]
+        if key not in self._plane:
+            self._plane[key] = _plane_coordinates(sighting.x)
+        return self._plane[key]
 
-    def _screen(self, flat: Sequence[Sighting]) -> tuple[list[Sighting], dict[int, str]]:
-        """Images whose points lie as on a plane; a wrong point order misses by a good part of the image."""
-        ptr = np.cumsum([0] + [len(s.x) for s in flat])
-        misfit = plane_misfits(np.concatenate([s.x for s in flat]), np.concatenate([s.uv for s in flat]), ptr)
+    def _screen(self, flat: Sequence[Sighting]) -> tuple[dict[int, FloatArray], dict[int, str]]:
+        """Homographies of the images whose points lie as on a plane; a wrong order misses by a good part of the image."""
+        counts = [len(s.x) for s in flat]
+        ptr, uv = np.cumsum([0, *counts]), np.concatenate([s.uv for s in flat])
+        h, misses, _ = homographies(np.concatenate([self._plane[id(s.x)] for s in flat]), uv, ptr)
+        span = np.maximum.reduceat(uv, ptr[:-1]) - np.minimum.reduceat(uv, ptr[:-1])
+        misfit = misses[:, 1] / np.maximum(np.hypot(*span.T), 1e-9)
         limit = max(0.02, 6.0 * float(np.median(misfit)))
-        good = [s for s, m in zip(flat, misfit, strict=True) if m <= limit]
+        good = {s.block_idx: h[i] for i, s in enumerate(flat) if misfit[i] <= limit}
         excluded = {
             s.block_idx: f"the points miss a plane by {100 * m:.0f} % of their extent (wrong order or mis-detected)"
             for s, m in zip(flat, misfit, strict=True)
@@ -133,22 +147,15 @@ class _LensSearch:
         }
         return good, excluded
 
-    def _focal_length(self, flat: Sequence[Sighting], chosen: Sequence[Sighting]) -> tuple[FloatArray, str]:
+    def _focal_length(self, maps: Sequence[FloatArray], chosen: Sequence[Sighting]) -> tuple[FloatArray, str]:
         trials: list[tuple[FloatArray, str]] = []
-        if flat and self.model.name != "fisheye":
-            plane = {id(s.x): s.x for s in flat}  # one for all images that show the same array of points
-            on_plane = {key: _unit(_plane_coordinates(x)) for key, x in plane.items()}
-            xy, ptr = [on_plane[id(s.x)] for s in flat], np.cumsum([0] + [len(s.x) for s in flat])
-            h, _, good = homographies(np.concatenate(xy), np.concatenate([s.uv for s in flat]), ptr)
-            for variants in (("full",), ("centred", "square")) if good.any() else ():
-                try:
-                    found = pinhole_from_homographies(h[good], self.size, variants)
-                except SurveyError:
-                    continue
-                values = self._values(
-                    found.values[0], found.values[1], found.values[2:] if found.variant == "full" else None
-                )
-                trials.append((values, f"Zhang, {found.variant}"))
+        for variants in (("full",), ("centred", "square")) if maps and self.model.name != "fisheye" else ():
+            try:
+                found = pinhole_from_homographies(np.array(maps), self.size, variants)
+            except SurveyError:
+                continue
+            centre = found.values[2:] if found.variant == "full" else None
+            trials.append((self._values(found.values[0], found.values[1], centre), f"Zhang, {found.variant}"))
         trial_images = _every(chosen, _SCAN_IMAGES)
         errors = [self._error_px(values, trial_images) for values, _ in trials]
         if errors and min(errors) < _GOOD_START * max(self.size):
@@ -194,23 +201,34 @@ class _LensSearch:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: no image of known points gives a pose with the {how} lens"
             )
-        x, uv = np.concatenate([s.x for s in images]), np.concatenate([s.uv for s in images])
-        ptr = np.concatenate([[0], np.cumsum([len(s.x) for s in images])])
         for level in _LEVELS:
             directions = self._directions(level)
             if directions.shape[1] == 0 or ("centre" in level and len(images) < 3):
                 continue
-            fit = fit_lens(self.model, self.constants, start, directions, poses, x, uv, ptr)
+            fit = self._fit(start, directions, poses, images)
             if self._sane(fit, directions):
-                if level == _LEVELS[0] and _median(fit) > _SIMPLE_PX:  # a wide lens needs all its terms
+                if level == _LEVELS[0] and fit.median_px > _SIMPLE_PX:  # a wide lens needs all its terms
                     everything = self._directions("all")
-                    full = fit_lens(self.model, self.constants, fit.values, everything, fit.poses, x, uv, ptr, 60)
-                    if self._sane(full, everything) and _median(full) < 0.5 * _median(fit):
+                    full = self._fit(fit.values, everything, fit.poses, images, 60)
+                    if self._sane(full, everything) and full.median_px < 0.5 * fit.median_px:
                         fit, level = full, "all that is free"
-                median = _median(fit)
-                note = f"lens from {len(images)} images ({how}; refined: {level}), median error {median:.2f} px"
+                note = f"lens from {len(images)} images ({how}; refined: {level}), median error {fit.median_px:.2f} px"
                 return LensStart(fit.values, note, excluded)
         return LensStart(start, f"lens from {len(images)} images ({how}; too few to refine it)", excluded)
+
+    def _fit(
+        self, start: FloatArray, directions: FloatArray, poses: FloatArray, images: Sequence[Sighting],
+        iterations: int = 25,
+    ) -> _Fit:  # fmt: skip
+        """Least squares over ``start + directions @ p`` and the poses, with Huber weights."""
+        x, uv = (np.concatenate([getattr(s, name) for s in images]) for name in ("x", "uv"))
+        ptr = np.cumsum([0] + [len(s.x) for s in images])
+        values, poses = start.copy(), poses.copy()
+        squares, cov = fit_lens(
+            self.model.kind, values, self.constants, np.ascontiguousarray(directions), ptr, x, uv, iterations, poses
+        )
+        median = float(np.median(squares))  # of a 2-D normal's square it is s^2 ln 4
+        return _Fit(values, poses, float(np.sqrt(median)), cov * (median / np.log(4.0)))
 
     def _poses(self, values: FloatArray, chosen: Sequence[Sighting]) -> tuple[list[Sighting], FloatArray]:
         some = [(s, r) for s, r in zip(chosen, self._rays(values, chosen), strict=True) if r is not None]
@@ -256,7 +274,7 @@ class _LensSearch:
             columns = [c for c in columns if not (c[0] or c[1])] + ([np.sum(both, axis=0)] if both else [])
         return np.array(columns).reshape(-1, len(names)).T
 
-    def _sane(self, fit: LensFit, directions: FloatArray) -> bool:
+    def _sane(self, fit: _Fit, directions: FloatArray) -> bool:
         """Whether the fit is determined (focal length to 10 %, centre to a tenth of the image) and possible."""
         focal = focal_length_px(self.model, fit.values, self.constants)
         width = max(self.size)
@@ -274,24 +292,15 @@ class _LensSearch:
         return bool(known and inside and 0.05 * width < focal < 50 * width)
 
 
-def _median(fit: LensFit) -> float:
-    return float(np.median(np.linalg.norm(fit.residuals, axis=1)))
-
-
-def _is_plane(x: FloatArray) -> bool:
+def _plane_coordinates(x: FloatArray) -> FloatArray | None:
+    """Coordinates (n, 2) of points in their plane, of unit size; None where they are no plane, or on a line."""
     centred = x - x.mean(axis=0)
-    s = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred), 0.0))
-    return bool(s[1] > 1e-3 * s[2] and s[0] < 1e-2 * s[1])
-
-
-def _plane_coordinates(x: FloatArray) -> FloatArray:
-    centred = x - x.mean(axis=0)
-    _, vectors = np.linalg.eigh(centred.T @ centred)
-    return np.asarray(centred @ vectors[:, :0:-1])
-
-
-def _unit(xy: FloatArray) -> FloatArray:
-    return np.asarray(xy / np.max(np.linalg.norm(xy, axis=1)))
+    squares, vectors = np.linalg.eigh(centred.T @ centred)
+    thin, middle, long = np.sqrt(np.maximum(squares, 0.0))
+    if not (middle > 1e-3 * long and thin < 1e-2 * middle):
+        return None
+    xy = centred @ vectors[:, :0:-1]
+    return np.asarray(xy / np.sqrt((xy**2).sum(axis=1).max()))
 
 
 def _every(images: Sequence[Sighting], n: int) -> list[Sighting]:

@@ -1,8 +1,8 @@
-"""Camera poses of single views in the core: refined and judged by the angles between rays and points.
+"""Camera poses of single views in the core: those of planes, and all refined and judged by the angles to their rays.
 
 Pose k is one of view ``of[k]``, whose points are the rows ``ptr[of[k]]`` to ``ptr[of[k] + 1]`` of x (N, 3) m, on the
 unit rays (N, 3). All functions take the poses that they shall do, so that threads share them. The formulas are in
-``views.h``.
+``views.h`` and ``planes.h``.
 """
 
 from typing import NamedTuple
@@ -16,6 +16,10 @@ _VIEWS = "which[*] of[K] ptr[B+1] x[N,3] rays[N,3]"
 _refine_views = Function("refine_views", f"{_VIEWS} iterations robust poses[K,4,4] work[*]")
 _errors_of_views = Function("errors_of_views", f"{_VIEWS} poses[K,4,4] rms[K] in_front[K]")
 _offsets_of_views = Function("offsets_of_views", f"{_VIEWS} poses[K,4,4] out[N] medians[K] work[*]")
+_plane_poses = Function("plane_poses", f"{_VIEWS} thickness widest poses[K,2,4,4] found[K] work[*]")
+_homographies = Function(
+    "homographies", "which[*] ptr[B+1] xy[N,2] uv[N,2] refinements h[B,3,3] misses[B,2] found[B] work[*]"
+)
 _ROWS, _WIDEST = 26, 8  # of a point's numbers; numbers in the longest vector
 
 
@@ -67,3 +71,22 @@ def offsets_of_views(
     A view without points keeps its median.
     """
     _offsets_of_views(which, *views, poses, out, medians, np.empty(views.most))
+
+
+def plane_poses(
+    which: IntArray, views: ViewArrays, thickness: float, widest: float, poses: FloatArray, found: BoolArray
+) -> None:
+    """Both poses (K, 2, 4, 4) of each listed view of a plane, and whether (K,) it has them.
+
+    thickness: against the extent, below which points count as a plane. widest: cosine of the angle to their mean at
+    which rays are too far off.
+    """
+    _plane_poses(which, *views, thickness, widest, poses, found, np.empty(4 * views.most))
+
+
+def homographies(
+    which: IntArray, ptr: IntArray, xy: FloatArray, uv: FloatArray, refinements: int, h: FloatArray,
+    misses: FloatArray, found: BoolArray,
+) -> None:  # fmt: skip
+    """Of each listed view ``h`` (B, 3, 3), rms and median (B, 2) of what it misses, and whether (B,) it is determined."""
+    _homographies(which, ptr, xy, uv, refinements, h, misses, found, np.empty(int(np.diff(ptr).max(initial=0))))

@@ -72,7 +72,8 @@ def test_homography_of_a_known_map_and_of_noisy_points():
     noisy = uv + rng.normal(0, 0.5, uv.shape)
     n = len(xy)
     xys, uvs = np.concatenate([xy, xy, xy[:11], xy[:3]]), np.concatenate([uv, noisy, uv[:11], uv[:3]])
-    h, rms, good = cf.homographies(xys, uvs, np.array([0, n, 2 * n, 2 * n + 11, 2 * n + 14]))
+    h, misses, good = cf.homographies(xys, uvs, np.array([0, n, 2 * n, 2 * n + 11, 2 * n + 14]))
+    rms = misses[:, 0]
     np.testing.assert_allclose(h[0] / h[0, 2, 2], true, rtol=1e-9)
     assert rms[0] < 1e-9
     reference = cv2.findHomography(xy, noisy)[0]
