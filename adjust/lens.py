@@ -274,7 +274,7 @@ def _affine_inverse(values: FloatArray, uv: FloatArray) -> FloatArray:
 
 
 def _forward_rays(model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatArray) -> FloatArray:
-    """Tangents (n, 2) by Newton on the projection, from the inverse of its radial part."""
+    """Tangents (n, 2) by Newton on the projection, from the distorted ones or else the inverse of its radial part."""
     profile = radial_profile(model.kind, values, constants)
     if model.kind == kernels.BROWN:
         scale, distorted = 1.0, _affine_inverse(values, uv)
@@ -282,14 +282,24 @@ def _forward_rays(model: LensModel, values: FloatArray, constants: FloatArray, u
         s, centre_u, centre_v, _ = constants
         scale = values[0]
         distorted = np.column_stack([(uv[:, 0] - centre_u) * s - values[1], (uv[:, 1] - centre_v) * s + values[2]])
-    tangents = np.ascontiguousarray(_without_distortion(profile, distorted) / scale)
-    solved = np.zeros(len(uv), dtype=np.bool_)
     lens, constants, _, uv = _arrays(values, constants, np.zeros((0, 3)), uv)
-    run_split(
-        kernels.tangents_of, split_blocks(np.arange(len(uv) + 1)), model.kind, lens, constants, uv, MAX_ITERATIONS,
-        RAY_TOLERANCE, PIXEL_TOLERANCE, tangents, solved,
-    )  # fmt: skip
-    found = solved & (np.hypot(tangents[:, 0], tangents[:, 1]) * scale <= profile.limit * BEYOND_LIMIT)
+
+    def solved(tangents: FloatArray, uv: FloatArray) -> BoolArray:
+        found = np.zeros(len(uv), dtype=np.bool_)
+        run_split(
+            kernels.tangents_of, split_blocks(np.arange(len(uv) + 1)), model.kind, lens, constants, uv, MAX_ITERATIONS,
+            RAY_TOLERANCE, PIXEL_TOLERANCE, tangents, found,
+        )  # fmt: skip
+        if np.isfinite(profile.limit):
+            found &= np.hypot(tangents[:, 0], tangents[:, 1]) * scale <= profile.limit * BEYOND_LIMIT
+        return found
+
+    tangents = np.ascontiguousarray(distorted / scale)
+    found = solved(tangents, uv)
+    if not found.all():  # Newton went astray from the distorted point
+        again = np.ascontiguousarray(_without_distortion(profile, distorted[~found]) / scale)
+        better = solved(again, uv[~found])
+        tangents[~found], found[~found] = again, better
     _require_invertible(model, values, constants, uv, found)
     return tangents
 

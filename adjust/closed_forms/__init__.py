@@ -13,7 +13,7 @@ from adjust.closed_forms.planes import homographies, plane_poses
 from adjust.closed_forms.rigid import align, inverse, nearest_rotation, rigid, rotation_exp, rotation_log, transform
 from adjust.closed_forms.triangulation import Intersection, intersect
 from adjust.closed_forms.views import refine_poses, tangent_axes, view_errors, view_offsets
-from adjust.closed_forms.zhang import PinholeStart, pinhole_from_homographies, radial_distortion
+from adjust.closed_forms.zhang import PinholeStart, pinhole_from_homographies
 
 __all__ = [
     "Intersection",
@@ -33,7 +33,6 @@ __all__ = [
     "plane_poses",
     "pose_distance",
     "pose_solutions",
-    "radial_distortion",
     "refine_poses",
     "relative_motions",
     "rigid",

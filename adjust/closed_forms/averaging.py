@@ -2,17 +2,19 @@
 
 import numpy as np
 
-from adjust.closed_forms.rigid import nearest_rotation, rigid, rotation_log
+from adjust.closed_forms.rigid import nearest_rotation, rigid
 from adjust.model import FloatArray, IntArray
 
 _MEDOID_LIMIT = 150  # more candidates than this are thinned out for the quadratic search of the medoid
+_SETTLED = 1e-4  # of the scale: a further step tells nothing that the motions do
 
 
 def pose_distance(a: FloatArray, b: FloatArray, lever: float) -> FloatArray:
     """Distance in m between rigid motions (..., 4, 4): shift, and turn times ``lever`` m, added in squares."""
-    turn = np.linalg.norm(rotation_log(np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3]), axis=-1)
-    shift = np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1)
-    return np.asarray(np.hypot(shift, lever * turn))
+    squares = (a[..., :3, :] - b[..., :3, :]) ** 2
+    # half of the turn has the sine |A - B| / sqrt(8) (Hartley et al., IJCV 103, 2013, sec. 4)
+    turn = 2.0 * np.arcsin(np.minimum(np.sqrt(squares[..., :3].sum(axis=(-2, -1)) / 8.0), 1.0))
+    return np.asarray(np.hypot(np.sqrt(squares[..., 3].sum(axis=-1)), lever * turn))
 
 
 def mean_rotation(rotations: FloatArray, weights: FloatArray | None = None) -> FloatArray:
@@ -40,7 +42,7 @@ def mean_pose(
         r = mean_rotation(poses[:, :3, :3], weights)
         step = rigid(r, weights @ poses[:, :3, 3] / weights.sum())
         moved, mean = float(pose_distance(step, mean, lever)), step
-        if moved < 1e-9 * max(scale, 1e-9) or moved < 1e-14:
+        if moved < _SETTLED * scale:
             break
     return mean, pose_distance(poses, mean, lever)
 

@@ -135,7 +135,7 @@ class _LensSearch:
         """Homographies of the images whose points lie as on a plane; a wrong order misses by a good part of the image."""
         counts = [len(s.x) for s in flat]
         ptr, uv = np.cumsum([0, *counts]), np.concatenate([s.uv for s in flat])
-        h, misses, _ = homographies(np.concatenate([self._plane[id(s.x)] for s in flat]), uv, ptr)
+        h, misses, _ = homographies(np.concatenate([self._plane[id(s.x)] for s in flat]), uv, ptr, 1)
         span = np.maximum.reduceat(uv, ptr[:-1]) - np.minimum.reduceat(uv, ptr[:-1])
         misfit = misses[:, 1] / np.maximum(np.hypot(*span.T), 1e-9)
         limit = max(0.02, 6.0 * float(np.median(misfit)))

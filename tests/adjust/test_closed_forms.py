@@ -105,15 +105,6 @@ def test_zhang_falls_back_to_the_centre_for_one_image_and_refuses_frontal_ones()
         cf.pinhole_from_homographies(homographies(np.random.default_rng(8), 4, tilt=0.0), SIZE)
 
 
-def test_radial_distortion_is_recovered_from_known_poses():
-    rng = np.random.default_rng(9)
-    true = np.array([-0.15, 0.1, 0, 0])
-    ms = views(rng, 5)
-    xy = np.concatenate([(lambda p: p[:, :2] / p[:, 2:])(board() @ m[:3, :3].T + m[:3, 3]) for m in ms])
-    uv = np.concatenate([pixels(board(), m, true) for m in ms])
-    np.testing.assert_allclose(cf.radial_distortion(xy, uv, np.array([1600, 1590, 630, 520.0])), true[:2], atol=1e-9)
-
-
 def test_planar_pose_gives_the_truth_first_and_the_second_solution_with_its_error():
     rng = np.random.default_rng(10)
     for m in views(rng, 10):
