@@ -1,6 +1,6 @@
 """Solutions without a start: pure functions of arrays, each with the source of its formula."""
 
-from adjust.closed_forms.absolute_pose import PoseCandidates, absolute_pose, best_poses, pose_solutions
+from adjust.closed_forms.absolute_pose import best_poses, pose_solutions, view_poses
 from adjust.closed_forms.averaging import mean_pose, mean_rotation, pose_distance
 from adjust.closed_forms.hand_eye import (
     degenerate_direction,
@@ -18,8 +18,6 @@ from adjust.closed_forms.zhang import PinholeStart, pinhole_from_homographies
 __all__ = [
     "Intersection",
     "PinholeStart",
-    "PoseCandidates",
-    "absolute_pose",
     "align",
     "best_poses",
     "degenerate_direction",
@@ -45,4 +43,5 @@ __all__ = [
     "transform",
     "view_errors",
     "view_offsets",
+    "view_poses",
 ]

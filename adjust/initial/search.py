@@ -26,7 +26,6 @@ from adjust.initial.views import (
     block_text,
     focal_px,
     make_views,
-    refine_views,
     target_points,
     untrustworthy,
     used_rows,
@@ -172,10 +171,9 @@ class _Search:
                 x, mine = self._seen_of_target(block, rays[i])
                 if len(x) >= 3:  # fewer give no pose, but may well serve in the adjustment
                     sights.append(Sight(i, x, mine, focal[block.camera_id]))
-        views, without = make_views(sights)
+        refined, without = make_views(sights)
         for i, reason in without.items():
             self.reasons.setdefault(i, f"{block_text(self.survey.image_blocks[i])}: {reason}")
-        refined = refine_views(views)
         reasons, notes = untrustworthy([v for v in refined if v.block_idx not in self.reasons], self.survey)
         self.reasons = {**reasons, **self.reasons}
         self.notes += notes

@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations
 
 import numpy as np
 
-from adjust.closed_forms import plane_poses, pose_solutions, refine_poses, view_errors, view_offsets
+from adjust.closed_forms import refine_poses, view_errors, view_offsets, view_poses
 from adjust.errors import SurveyError
 from adjust.lens import camera_constants, focal_length_px, lens_model, unit_rays
 from adjust.model import BoolArray, Camera, FloatArray, IntArray, Survey, Target
@@ -16,8 +15,7 @@ from adjust.observations import ImageBlock
 _RIVAL = 4.0  # a second pose whose error is within this factor of the best stays a candidate
 _NOISE_PX = 0.3  # ... or within this much of it
 _ENOUGH = 36  # points of a view from which its pose is found before all of them refine it
-_ALL_STEPS = 2  # of refinement with all points of a view
-_FEW = 4, 5  # points of a view, not in a plane, that have poses from each three of them too
+_STEPS = 8, 2  # of refinement with these, and with all points of a view
 _GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustworthy
 
 
@@ -104,111 +102,65 @@ class Sight:
     focal_px: float
 
 
-def make_views(sights: Sequence[Sight]) -> tuple[list[View], dict[int, str]]:
-    """Views with their unrefined candidate poses, and for every block that has none the reason."""
-    if not sights:
-        return [], {}
-    rows, ptr = _samples(sights)
-    x, rays = np.concatenate([s.x for s in sights])[rows], np.concatenate([s.rays for s in sights])[rows]
-    both, planar = plane_poses(x, rays, ptr)
-    candidates, failed = list(both), {}
-    for i in np.flatnonzero(~planar).tolist():
-        part = slice(ptr[i], ptr[i + 1])
-        try:
-            candidates[i] = _solutions(x[part], rays[part])
-            if not len(candidates[i]):
-                n = len(sights[i].x)
-                raise SurveyError(f"no camera pose explains its {n} points; check their order and coordinates")
-        except SurveyError as reason:
-            candidates[i], failed[sights[i].block_idx] = np.zeros((0, 4, 4)), str(reason)
-    of, poses = np.repeat(np.arange(len(sights)), [len(c) for c in candidates]), np.concatenate(candidates)
-    return _with_poses(sights, poses, *view_errors(poses, x, rays, ptr, of), of), failed
-
-
-def _solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
-    """Poses (k, 4, 4) from all points, and where these are four or five from each three of them too.
-
-    The square sum of so few points has several minima, and SQPnP may end in one that is not the least.
-    """
-    every = pose_solutions(x, rays)
-    if not _FEW[0] <= len(x) <= _FEW[1]:
-        return every
-    found = [every]
-    for three in combinations(range(len(x)), 3):
-        try:
-            found.append(pose_solutions(x[list(three)], rays[list(three)]))
-        except SurveyError:  # on a line
-            continue
-    return np.concatenate(found)
-
-
 @lru_cache(maxsize=256)
 def _sample(n: int) -> IntArray:
     """Positions of at most ``_ENOUGH`` of n points, without the pattern of a grid, the same at every call."""
     return np.arange(n) if n <= _ENOUGH else np.sort(np.random.default_rng(n).permutation(n)[:_ENOUGH])
 
 
-def _samples(views: Sequence[View | Sight]) -> tuple[IntArray, IntArray]:
-    """Rows of all views' points, one after the other, that :func:`_sample` takes, and where each view's begin."""
-    sizes = [len(v.x) for v in views]
-    starts = np.cumsum([0, *sizes[:-1]])
-    few = [_sample(n) for n in sizes]
-    ptr = np.cumsum([0] + [len(r) for r in few])
-    return np.concatenate(few) + np.repeat(starts, np.diff(ptr)), ptr
+def make_views(
+    sights: Sequence[Sight], present: Sequence[FloatArray] | None = None
+) -> tuple[list[View], dict[int, str]]:
+    """Views with the likeliest poses that explain each by itself, and for every block that has none the reason.
 
-
-def refine_views(views: Sequence[View], iterations: int = 8) -> list[View]:
-    """All candidates of all views refined in one go, robustly; implausible candidates dropped.
-
-    First on a sample of each view's points, then in two more steps on all of them.
+    present: poses (4, 4) that are to be tried beside those found. All are refined in one go, robustly, first on a
+    sample of each view's points, then in a few more steps on all of them.
     """
-    if not views:
-        return []
-    ptr = np.cumsum([0] + [len(v.x) for v in views])
-    of = np.repeat(np.arange(len(views)), [len(v.poses) for v in views])
-    poses = np.concatenate([v.poses for v in views])
-    x, rays = np.concatenate([v.x for v in views]), np.concatenate([v.rays for v in views])
-    rows, few_ptr = _samples(views)
-    poses = refine_poses(poses, x[rows], rays[rows], few_ptr, iterations, True, of)
-    error, in_front = view_errors(poses, x[rows], rays[rows], few_ptr, of)
-    kept = _likeliest(views, error, in_front, of)
+    if not sights:
+        return [], {}
+    sizes, focal = [len(s.x) for s in sights], np.array([s.focal_px for s in sights])
+    x, rays, ptr = np.concatenate([s.x for s in sights]), np.concatenate([s.rays for s in sights]), np.cumsum([0, *sizes])
+    few = [_sample(n) for n in sizes]
+    few_ptr = np.cumsum([0] + [len(r) for r in few])
+    rows = np.concatenate(few) + np.repeat(ptr[:-1], np.diff(few_ptr))
+    sample = x[rows], rays[rows], few_ptr
+    poses, of, failed = view_poses(*sample)
+    error, in_front = view_errors(poses, *sample, of)
+    kept = _likeliest(focal, error, in_front, of)
+    poses, of = poses[kept], of[kept]
+    if present is not None and len(of):
+        beside = np.unique(of)
+        poses, of = np.concatenate([np.array(present)[beside], poses]), np.concatenate([beside, of])
+    poses = refine_poses(poses, *sample, _STEPS[0], True, of)
+    error, in_front = view_errors(poses, *sample, of)
+    kept = _likeliest(focal, error, in_front, of)
     poses, error, in_front, of = poses[kept], error[kept], in_front[kept], of[kept]
-    more = (np.diff(few_ptr) < np.diff(ptr))[of]
+    more = (np.diff(few_ptr) < sizes)[of]
     if more.any():
-        poses[more] = refine_poses(poses[more], x, rays, ptr, _ALL_STEPS, True, of[more])
+        poses[more] = refine_poses(poses[more], x, rays, ptr, _STEPS[1], True, of[more])
         error[more], in_front[more] = view_errors(poses[more], x, rays, ptr, of[more])
-    return _with_poses(views, poses, error, in_front, of)
-
-
-def _with_poses(
-    seen: Sequence[View | Sight], poses: FloatArray, error: FloatArray, in_front: BoolArray, of: IntArray
-) -> list[View]:
-    """Views with the likeliest of their candidate poses; those without any are left out."""
-    kept = _likeliest(seen, error, in_front, of)
-    poses, error_px = poses[kept], error[kept] * _focal(seen)[of[kept]]
-    ends = np.cumsum(np.bincount(of[kept], minlength=len(seen))).tolist()
-    return [
+        kept = _likeliest(focal, error, in_front, of)
+        poses, error, of = poses[kept], error[kept], of[kept]
+    error_px, ends = error * focal[of], np.searchsorted(of, np.arange(len(sights) + 1)).tolist()
+    views = [
         View(s.block_idx, s.x, s.rays, s.focal_px, poses[a:b], error_px[a:b])
-        for s, a, b in zip(seen, [0, *ends], ends, strict=False)
+        for s, a, b in zip(sights, ends, ends[1:], strict=False)
         if b > a
     ]
+    return views, {sights[i].block_idx: reason for i, reason in failed.items()}
 
 
-def _likeliest(seen: Sequence[View | Sight], error: FloatArray, in_front: BoolArray, of: IntArray) -> IntArray:
+def _likeliest(focal: FloatArray, error: FloatArray, in_front: BoolArray, of: IntArray) -> IntArray:
     """Of candidates (K,) of the views ``of`` (K,) the best, and those in front that come near it, if it is.
 
-    View by view, the best first. error: (K,) rad.
+    View by view, the best first. focal: (B,) px. error: (K,) rad.
     """
     order = np.lexsort((error, ~in_front, of))
     of, error, in_front = of[order], error[order], in_front[order]
     first = np.diff(of, prepend=-1) > 0
     best = np.flatnonzero(first)[np.cumsum(first) - 1]
-    limit = np.maximum(_RIVAL * error[best], error[best] + _NOISE_PX / _focal(seen)[of])
+    limit = np.maximum(_RIVAL * error[best], error[best] + _NOISE_PX / focal[of])
     return np.asarray(order[first | (in_front & (error <= limit))])
-
-
-def _focal(seen: Sequence[View | Sight]) -> FloatArray:
-    return np.array([s.focal_px for s in seen])
 
 
 def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str], list[str]]:
@@ -225,7 +177,7 @@ def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str]
         np.array([v.poses[0] for v in views]), np.concatenate([v.x for v in views]),
         np.concatenate([v.rays for v in views]), ptr,
     )  # fmt: skip
-    focal = _focal(views)
+    focal = np.array([v.focal_px for v in views])
     worst = np.maximum.reduceat(offsets, ptr[:-1]) * focal
     by_camera: dict[str, list[int]] = {}
     for i, view in enumerate(views):

@@ -17,7 +17,6 @@ from adjust.initial.views import (
     all_rays,
     focal_px,
     make_views,
-    refine_views,
     target_points,
     untrustworthy,
     used_rows,
@@ -200,7 +199,7 @@ def poses_of_views(survey: Survey) -> dict[int, View]:
             focal = focal_px(cameras[block.camera_id], lenses[block.camera_id])
             sights.append(Sight(i, x, rays[i][used], focal))
     # those without a pose are named by the search for start values
-    refined = refine_views(make_views(sights)[0])
+    refined = make_views(sights)[0]
     reasons, _ = untrustworthy(refined, survey)
     return {v.block_idx: v for v in refined if v.block_idx not in reasons}
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from adjust.closed_forms import absolute_pose, best_poses, rigid, rotation_exp
+from adjust.closed_forms import best_poses, pose_solutions, refine_poses, rigid, rotation_exp
 from adjust.errors import SurveyError
 from adjust.lens import MODELS, default_start, lens_constants
 from adjust.native.lenses import fit_lens
@@ -27,14 +27,17 @@ def test_best_poses_are_those_of_one_view_after_the_other():
     rays = [seen(part, pose, rng) for part, pose in zip(x, poses, strict=True)]
     found, error = best_poses(x, rays, 3)
     for i in range(len(x)):
+        (alone,), (least,) = best_poses([x[i]], [rays[i]], 3)
         if i == 2:
             with pytest.raises(SurveyError, match="line"):
-                absolute_pose(x[i], rays[i], 3)
-            assert np.isinf(error[i])
+                pose_solutions(x[i], rays[i])
+            assert np.isinf([error[i], least]).all()
             continue
-        one = absolute_pose(x[i], rays[i], 3)
-        assert np.allclose(found[i], one.camera_from_target[0], atol=1e-9)
-        assert error[i] == pytest.approx(one.error[0], rel=1e-6, abs=1e-9)
+        assert np.allclose(found[i], alone, atol=1e-9)
+        assert error[i] == pytest.approx(least, rel=1e-6, abs=1e-9)
+        several = refine_poses(candidates := pose_solutions(x[i], rays[i]), x[i], rays[i], np.array([0, len(x[i])]), 3,
+                               of=np.zeros(len(candidates), dtype=int))  # fmt: skip
+        assert np.abs(several - alone).max(axis=(1, 2)).min() < 1e-9
     assert np.linalg.norm(found[0][:3, 3] - poses[0][:3, 3]) < 0.02
 
 

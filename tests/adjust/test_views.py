@@ -13,7 +13,7 @@ from adjust.closed_forms import (
     view_errors,
     view_offsets,
 )
-from adjust.initial.views import Sight, make_views, refine_views
+from adjust.initial.views import Sight, make_views
 from adjust.native.library import SETS, Function, instruction_set
 from adjust.native.views import ViewArrays
 
@@ -210,6 +210,6 @@ def test_few_points_off_a_plane_have_their_pose_in_any_order():
     for order in ([0, 1, 2, 3], [0, 2, 3, 1], [3, 0, 1, 2], [1, 3, 2, 0]):
         found, failed = make_views([Sight(s.block_idx, s.x[order], s.rays[order], f) for s in views])
         assert not failed
-        for view, pose in zip(refine_views(found), true, strict=True):
+        for view, pose in zip(found, true, strict=True):
             off = np.linalg.norm(view.poses[:, :3, 3] - pose[:3, 3], axis=1)
             assert off.min() < 0.05, view.block_idx
