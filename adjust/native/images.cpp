@@ -13,6 +13,7 @@ extern "C" __attribute__((visibility("default"))) const Entry *images() {
         entry<joint_blocks>("joint_blocks"), entry<solve_cliques>("solve_cliques"),
         entry<refine_views>("refine_views"), entry<errors_of_views>("errors_of_views"),
         entry<offsets_of_views>("offsets_of_views"), entry<homographies>("homographies"),
-        entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<row_influences>("row_influences"), {nullptr, nullptr, nullptr}};
+        entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<turns_by>("turns_by"),
+        entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), {nullptr, nullptr, nullptr}};
     return table;
 }

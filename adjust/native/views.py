@@ -20,6 +20,10 @@ _plane_poses = Function("plane_poses", f"{_VIEWS} thickness widest poses[K,2,4,4
 _homographies = Function(
     "homographies", "which[*] ptr[B+1] xy[N,2] uv[N,2] refinements h[B,3,3] misses[B,2] found[B] work[*]"
 )
+turns_by = Function("turns_by", "w[n,3] R[n,3,3]")
+"""Rotations of rotation vectors (rad)."""
+turns_of = Function("turns_of", "R[n,3,3] w[n,3]")
+"""Rotation vectors (rad) of rotations."""
 _ROWS, _WIDEST = 26, 8  # of a point's numbers; numbers in the longest vector
 
 
