@@ -8,13 +8,13 @@ from gtsam import Pose3
 
 from adjust.errors import SurveyError
 from adjust.initial import Start, find_start
-from adjust.initial.given import given_poses
+from adjust.initial.given import given_poses, with_poses
 from adjust.model import FloatArray, Survey
 from adjust.observations import PositionRef
 from adjust.result import ParameterName
 from adjust.terrestrial.building import reading_refs
 from adjust.terrestrial.start import explain, find_points, given_points, lacking_points, with_start
-from adjust.terrestrial.tilted_start import find_tilted, station_name, tilted_sights, with_poses
+from adjust.terrestrial.tilted_start import find_tilted, station_name, tilted_sights
 
 
 def needs_points(survey: Survey) -> bool:

@@ -5,7 +5,7 @@ points that it sees and that are known, by resection or by fitting; points follo
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from gtsam import Pose3
@@ -290,28 +290,3 @@ def _resections(x: FloatArray, rays: FloatArray) -> FloatArray:
         except SurveyError:  # on a line, or too wide: another group may do
             continue
     return np.concatenate(out)
-
-
-def with_poses(survey: Survey, poses: Mapping[ParameterName, Pose3]) -> Survey:
-    """The survey with these poses of stations and targets as start values where it has none."""
-    stations = []
-    for s in survey.stations:
-        name: ParameterName = ("world_from_station", s.station_id)
-        if s.world_from_station.value is None and name in poses:
-            s = replace(s, world_from_station=replace(s.world_from_station, value=poses[name]))
-        found = {n[2]: p for n, p in poses.items() if len(n) == 3 and n[:2] == name}
-        epochs = dict(s.epochs)
-        for epoch, pose in found.items():
-            own = epochs.get(epoch, s.world_from_station)
-            if own.value is None:
-                epochs[epoch] = replace(own, value=pose)
-        stations.append(replace(s, epochs=epochs))
-    targets = []
-    for t in survey.targets:
-        pose_of = poses.get(("carrier_from_target", t.target_id))
-        if t.carrier_from_target.value is None and pose_of is not None:
-            t = replace(t, carrier_from_target=replace(t.carrier_from_target, value=pose_of))
-        targets.append(t)
-    return replace(survey, stations=tuple(stations), targets=tuple(targets))
-
-
