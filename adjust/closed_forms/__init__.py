@@ -1,7 +1,7 @@
 """Solutions without a start: pure functions of arrays, each with the source of its formula."""
 
 from adjust.closed_forms.absolute_pose import best_poses, pose_solutions, view_poses
-from adjust.closed_forms.averaging import mean_pose, mean_rotation, pose_distance
+from adjust.closed_forms.averaging import mean_pose, pose_distance
 from adjust.closed_forms.hand_eye import (
     degenerate_direction,
     relative_motions,
@@ -25,7 +25,6 @@ __all__ = [
     "intersect",
     "inverse",
     "mean_pose",
-    "mean_rotation",
     "nearest_rotation",
     "pinhole_from_homographies",
     "plane_poses",

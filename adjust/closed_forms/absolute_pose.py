@@ -52,7 +52,7 @@ def best_poses(x: Sequence[FloatArray], rays: Sequence[FloatArray], refinements:
 
 
 def pose_solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
-    """Poses (k, 4, 4) from points (n, 3) m in the target and unit rays (n, 3) in the camera, three or more not on a line.
+    """Poses (k, 4, 4) from points (n, 3) m in the target, not all on a line, and unit rays (n, 3) in the camera, n > 2.
 
     Three points: P3P (Ding et al., CVPR 2023, in OpenCV), up to four solutions. Planar: IPPE (Collins and Bartoli,
     IJCV 109, 2014), both solutions. Otherwise SQPnP (Terzakis and Lourakis, ECCV 2020), from six points on also EPnP;

@@ -17,11 +17,6 @@ def pose_distance(a: FloatArray, b: FloatArray, lever: float) -> FloatArray:
     return np.asarray(np.hypot(np.sqrt(squares[..., 3].sum(axis=-1)), lever * turn))
 
 
-def mean_rotation(rotations: FloatArray, weights: FloatArray | None = None) -> FloatArray:
-    """Chordal L2 mean (3, 3) of rotations (n, 3, 3) (Hartley, Trumpf, Dai and Li, IJCV 103, 2013, sec. 5.3)."""
-    return nearest_rotation(rotations, np.ones(len(rotations)) if weights is None else weights)
-
-
 def mean_pose(
     poses: FloatArray, lever: float, members: IntArray | None = None, iterations: int = 20
 ) -> tuple[FloatArray, FloatArray]:
@@ -39,7 +34,7 @@ def mean_pose(
         scale = max(3.0 * float(np.median(distance[chosen])), 1e-12)
         weights = np.zeros(len(poses))
         weights[chosen] = 1.0 / (1.0 + (distance[chosen] / scale) ** 2) ** 2
-        r = mean_rotation(poses[:, :3, :3], weights)
+        r = nearest_rotation(poses[:, :3, :3], weights)
         step = rigid(r, weights @ poses[:, :3, 3] / weights.sum())
         moved, mean = float(pose_distance(step, mean, lever)), step
         if moved < _SETTLED * scale:

@@ -1,7 +1,5 @@
 """AX = XB and AX = ZB: what is rigidly fixed to something that moves by known motions."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from adjust.closed_forms.rigid import inverse, nearest_rotation, rigid, rotation_log, rotation_to
@@ -70,8 +68,9 @@ def _turn_onto(alpha: FloatArray, beta: FloatArray, weights: FloatArray, axis: F
 def solve_ax_zb(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """``x``, ``z`` (4, 4) with a x = z b for poses a, b (n, 4, 4), and weights (n,) from 0 (a bad pair) to 1.
 
-    Source: Shah, J. Mechanisms and Robotics 5(3), 2013, which is :func:`solve_views` of one thing from one. Raises SurveyError for fewer than three poses, and naming the undetermined direction where all turns between the
-    poses are about one axis or too small.
+    Source: Shah, J. Mechanisms and Robotics 5(3), 2013, which is :func:`solve_views` of one thing from one. Raises
+    SurveyError for fewer than three poses, and naming the undetermined direction where all turns between the poses are
+    about one axis or too small.
     """
     if len(a) < 3:
         raise SurveyError(f"{len(a)} pose(s) cannot determine both transforms of AX = ZB: at least three are needed")
@@ -182,27 +181,16 @@ def _undetermined(axis: FloatArray, n: int) -> str:
     )
 
 
-def screw_pairs(n: int, turns: Callable[[int], FloatArray], per_item: int = 4) -> list[tuple[int, int]]:
-    """Pairs of n poses with large turns between them: ``turns(i)`` gives the angle (n,) rad of each against pose i.
+def relative_motions(a: FloatArray, b: FloatArray, per_item: int = 4) -> tuple[FloatArray, FloatArray]:
+    """Motions between poses a, b (n, 4, 4) of ``a_i x = z b_i`` for :func:`solve_ax_xb`: a_j^-1 a_i and b_j^-1 b_i.
 
-    For every pose the ``per_item`` others nearest to a turn of 100 degrees, where the rotation axis is sharp and the
-    logarithm still unambiguous.
+    Of every pose with the ``per_item`` others nearest to a turn of 100 degrees, where the rotation axis is sharp and
+    the logarithm still unambiguous.
     """
     pairs: set[tuple[int, int]] = set()
-    for i in range(n):
-        order = np.argsort(np.abs(turns(i) - np.deg2rad(100.0)), kind="stable")
-        for j in [int(j) for j in order if j != i][:per_item]:
-            pairs.add((min(i, j), max(i, j)))
-    return sorted(pairs)
-
-
-def relative_motions(a: FloatArray, b: FloatArray, per_item: int = 4) -> tuple[FloatArray, FloatArray]:
-    """Motions between poses a, b (n, 4, 4) of ``a_i x = z b_i`` for :func:`solve_ax_xb`: a_j^-1 a_i and b_j^-1 b_i."""
-
-    def turns(i: int) -> FloatArray:
-        relative = np.swapaxes(a[i : i + 1, :3, :3], -1, -2) @ a[:, :3, :3]
-        return np.asarray(np.linalg.norm(rotation_log(relative), axis=1))
-
-    pairs = np.array(screw_pairs(len(a), turns, per_item), dtype=np.int64).reshape(-1, 2)
-    i, j = pairs[:, 0], pairs[:, 1]
-    return inverse(a[j]) @ a[i], inverse(b[j]) @ b[i]
+    for i in range(len(a)):
+        turns = np.linalg.norm(rotation_log(np.swapaxes(a[i, :3, :3], -1, -2) @ a[:, :3, :3]), axis=1)
+        order = np.argsort(np.abs(turns - np.deg2rad(100.0)), kind="stable")
+        pairs |= {(min(i, j), max(i, j)) for j in order[order != i][:per_item].tolist()}
+    first, second = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2).T
+    return inverse(a[second]) @ a[first], inverse(b[second]) @ b[first]

@@ -7,6 +7,7 @@ import numpy as np
 
 from adjust.closed_forms import best_poses, homographies, pinhole_from_homographies
 from adjust.errors import SurveyError
+from adjust.initial.views import rays_of_images
 from adjust.lens import (
     LensModel,
     camera_constants,
@@ -132,7 +133,7 @@ class _LensSearch:
         return self._plane[key]
 
     def _screen(self, flat: Sequence[Sighting]) -> tuple[dict[int, FloatArray], dict[int, str]]:
-        """Homographies of the images whose points lie as on a plane; a wrong order misses by a good part of the image."""
+        """Homographies of the images that fit a plane; a wrong point order misses by a good part of the image."""
         counts = [len(s.x) for s in flat]
         ptr, uv = np.cumsum([0, *counts]), np.concatenate([s.uv for s in flat])
         h, misses, _ = homographies(np.concatenate([self._plane[id(s.x)] for s in flat]), uv, ptr, 1)
@@ -188,15 +189,25 @@ class _LensSearch:
 
     def _error_px(self, values: FloatArray, images: Sequence[Sighting]) -> float:
         """Median over the images of the best pose's error, relative to the extent of the points, in px."""
-        rays = self._rays(values, images)
-        some = [(s.x, r) for s, r in zip(images, rays, strict=True) if r is not None]
-        errors = np.full(len(images), np.inf)
-        errors[: len(some)] = best_poses([x for x, _ in some], [r for _, r in some], 2)[1]
+        errors = self._poses(values, images, 2)[1]
         return float(np.median(errors)) * focal_length_px(self.model, values, self.constants)
+
+    def _poses(
+        self, values: FloatArray, images: Sequence[Sighting], refinements: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """The best pose (B, 4, 4) of every image and its error (B,) rad, infinite where there is none."""
+        rays = rays_of_images(self.camera, values, [s.uv for s in images])
+        some = [i for i, r in enumerate(rays) if not isinstance(r, SurveyError)]
+        poses, errors = np.tile(np.eye(4), (len(images), 1, 1)), np.full(len(images), np.inf)
+        found = best_poses([images[i].x for i in some], [np.asarray(rays[i]) for i in some], refinements)
+        poses[some], errors[some] = found
+        return poses, errors
 
     def _refine(self, start: FloatArray, how: str, chosen: Sequence[Sighting], excluded: dict[int, str]) -> LensStart:
         """The richest lens that the images determine, refined together with the poses."""
-        images, poses = self._poses(start, chosen)
+        poses, errors = self._poses(start, chosen, 3)
+        # images without a pose are left to the screening of all blocks, which reports them
+        images, poses = [s for s, e in zip(chosen, errors, strict=True) if np.isfinite(e)], poses[np.isfinite(errors)]
         if not images:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: no image of known points gives a pose with the {how} lens"
@@ -229,28 +240,6 @@ class _LensSearch:
         )
         median = float(np.median(squares))  # of a 2-D normal's square it is s^2 ln 4
         return _Fit(values, poses, float(np.sqrt(median)), cov * (median / np.log(4.0)))
-
-    def _poses(self, values: FloatArray, chosen: Sequence[Sighting]) -> tuple[list[Sighting], FloatArray]:
-        some = [(s, r) for s, r in zip(chosen, self._rays(values, chosen), strict=True) if r is not None]
-        poses, error = best_poses([s.x for s, _ in some], [r for _, r in some], 3)
-        # images without a pose are left to the screening of all blocks, which reports them
-        good = np.isfinite(error)
-        return [s for (s, _), g in zip(some, good, strict=True) if g], poses[good]
-
-    def _rays(self, values: FloatArray, images: Sequence[Sighting]) -> list[FloatArray | None]:
-        """Unit rays of every image, None for one with pixels that the lens cannot have imaged."""
-        try:
-            rays = unit_rays(self.model, values, self.constants, np.concatenate([s.uv for s in images]))
-            return list(np.split(rays, np.cumsum([len(s.uv) for s in images])[:-1]))
-        except SurveyError:  # some pixel of some image: find out which
-            pass
-        found: list[FloatArray | None] = []
-        for s in images:
-            try:
-                found.append(unit_rays(self.model, values, self.constants, s.uv))
-            except SurveyError:
-                found.append(None)
-        return found
 
     def _directions(self, level: str) -> FloatArray:
         """Columns (n, p) of the lens components that this level frees, with ties; fx, fy apart only with the centre."""

@@ -220,6 +220,8 @@ class _Search:
     def _advance(self) -> bool:
         """One step, the first of the list that is possible; whether there was one."""
         network, points = self.network, self.points
+        if network.known.keys() >= network.names.keys() and points.known.all():
+            return False
         if network.propagate():
             return True
         for parallax in PARALLAX:

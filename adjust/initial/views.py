@@ -20,16 +20,19 @@ _GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustwort
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """One block as rays. x: (n, 3) m in the target. rays: (n, 3) unit in the camera. focal_px: turns angles into px.
-
-    poses: (k, 4, 4) camera_from_target, likeliest first; error_px: (k,).
-    """
+class Sight:
+    """One block as rays. x: (n, 3) m in the target. rays: (n, 3) unit in the camera. focal_px: turns angles into px."""
 
     block_idx: int
     x: FloatArray
     rays: FloatArray
     focal_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class View(Sight):
+    """A block with what explains it. poses: (k, 4, 4) camera_from_target, likeliest first; error_px: (k,)."""
+
     poses: FloatArray
     error_px: FloatArray
 
@@ -75,31 +78,26 @@ def all_rays(survey: Survey, lenses: dict[str, FloatArray]) -> tuple[dict[int, F
     failed: dict[int, str] = {}
     cameras = {c.camera_id: c for c in survey.cameras}
     for camera_id, values in lenses.items():
-        mine = [i for i, b in enumerate(survey.image_blocks) if b.camera_id == camera_id and len(b.uv)]
-        if not mine:
-            continue
-        camera, blocks = cameras[camera_id], [survey.image_blocks[i] for i in mine]
-        try:
-            found = rays_of(camera, values, np.concatenate([b.uv for b in blocks]))
-            ends = np.cumsum([len(b.uv) for b in blocks])
-            rays.update(zip(mine, np.split(found, ends[:-1]), strict=True))
-        except SurveyError:  # some pixel of some block: find out which
-            for i, block in zip(mine, blocks, strict=True):
-                try:
-                    rays[i] = rays_of(camera, values, block.uv)
-                except SurveyError as error:
-                    failed[i] = str(error)
+        mine = {i: b.uv for i, b in enumerate(survey.image_blocks) if b.camera_id == camera_id and len(b.uv)}
+        found = rays_of_images(cameras[camera_id], values, list(mine.values()))
+        for i, of_block in zip(mine, found, strict=True):
+            if isinstance(of_block, SurveyError):
+                failed[i] = str(of_block)
+            else:
+                rays[i] = of_block
     return rays, failed
 
 
-@dataclass(frozen=True, eq=False)
-class Sight:
-    """One block to make a view of: the same fields."""
-
-    block_idx: int
-    x: FloatArray
-    rays: FloatArray
-    focal_px: float
+def rays_of_images(
+    camera: Camera, values: FloatArray, images: Sequence[FloatArray]
+) -> Sequence[FloatArray | SurveyError]:
+    """Unit rays (n, 3) of every image (n, 2) px, or why it has none."""
+    if not images:
+        return []
+    try:
+        return np.split(rays_of(camera, values, np.concatenate(images)), np.cumsum([len(uv) for uv in images])[:-1])
+    except SurveyError as error:  # some pixel of some image: find out which
+        return [error] if len(images) == 1 else [rays_of_images(camera, values, [uv])[0] for uv in images]
 
 
 @lru_cache(maxsize=256)
@@ -119,7 +117,8 @@ def make_views(
     if not sights:
         return [], {}
     sizes, focal = [len(s.x) for s in sights], np.array([s.focal_px for s in sights])
-    x, rays, ptr = np.concatenate([s.x for s in sights]), np.concatenate([s.rays for s in sights]), np.cumsum([0, *sizes])
+    x, rays = (np.concatenate([getattr(s, name) for s in sights]) for name in ("x", "rays"))
+    ptr = np.cumsum([0, *sizes])
     few = [_sample(n) for n in sizes]
     few_ptr = np.cumsum([0] + [len(r) for r in few])
     rows = np.concatenate(few) + np.repeat(ptr[:-1], np.diff(few_ptr))

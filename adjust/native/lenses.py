@@ -28,7 +28,8 @@ _tangents_of = Function(
 )
 _fit_lens = Function(
     "fit_lens",
-    "kind values[n] constants[4] directions[n,p] ptr[B+1] x[N,3] uv[N,2] iterations poses[B,4,4] squares[N] cov[p,p] work[*]",
+    "kind values[n] constants[4] directions[n,p] ptr[B+1] x[N,3] uv[N,2] iterations poses[B,4,4] squares[N] cov[p,p] "
+    "work[*]",
 )
 _NO_ROWS = np.zeros((0, 2, N_COLUMNS))
 

@@ -92,5 +92,5 @@ def homographies(
     which: IntArray, ptr: IntArray, xy: FloatArray, uv: FloatArray, refinements: int, h: FloatArray,
     misses: FloatArray, found: BoolArray,
 ) -> None:  # fmt: skip
-    """Of each listed view ``h`` (B, 3, 3), rms and median (B, 2) of what it misses, and whether (B,) it is determined."""
+    """Of each listed view h (B, 3, 3), rms and median (B, 2) of what it misses, and whether (B,) it is determined."""
     _homographies(which, ptr, xy, uv, refinements, h, misses, found, np.empty(int(np.diff(ptr).max(initial=0))))

@@ -266,7 +266,8 @@ def test_four_points_in_space_have_the_true_pose_among_their_solutions():
     """Their square sum has several minima, of which one solution from all of them may be a wrong one."""
     rng = np.random.default_rng(5)
     for _ in range(60):
-        m, x = cf.rigid(cf.rotation_exp(rng.normal(0.0, 0.5, 3)), np.array([0.0, 0.0, 3.0])), rng.uniform(-1.2, 1.2, (4, 3))
+        m = cf.rigid(cf.rotation_exp(rng.normal(0.0, 0.5, 3)), np.array([0.0, 0.0, 3.0]))
+        x = rng.uniform(-1.2, 1.2, (4, 3))
         p = cf.transform(m, x)
         rays = np.column_stack([p[:, :2] / p[:, 2:] + rng.normal(0.0, 1.5e-4, (4, 2)), np.ones(4)])
         found, _ = all_poses(x, rays / np.linalg.norm(rays, axis=1)[:, None])

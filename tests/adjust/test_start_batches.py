@@ -1,4 +1,4 @@
-"""What the start does for all views at once, against one pose at a time, and the plain least squares of lens and poses."""
+"""What the start does for all views at once, against one at a time and plain least squares of lens and poses."""
 
 import cv2
 import numpy as np
@@ -63,7 +63,8 @@ def test_a_lens_and_its_poses_are_the_robust_least_squares_of_plain_rows():
         half = np.sqrt(limit / np.maximum(off, limit))
         solved = least_squares(lambda p, half=half: (half[:, None] * (pixels(p) - uv)).ravel(), found, x_scale="jac")
         found = solved.x
-    values, directions = default_start(MODELS["brown"], (1280, 1024), 1550.0), np.ascontiguousarray(np.eye(13)[:, places])
+    values = default_start(MODELS["brown"], (1280, 1024), 1550.0)
+    directions = np.ascontiguousarray(np.eye(13)[:, places])
     start = np.array([rigid(rotation_exp(turn + 0.01), shift + 0.01) for turn, shift in motions])
     squares, cov = fit_lens(0, values, lens_constants("brown", (1280, 1024)), directions, len(x) * np.arange(7),
                             np.tile(x, (6, 1)), uv, 25, start)  # fmt: skip
@@ -87,7 +88,8 @@ def test_what_the_images_leave_open_has_an_infinite_covariance():
     uv = 1500.0 * p[:, :2] / p[:, 2:] + values[3:5]
     constants, ptr = lens_constants("brown", (1280, 1024)), np.array([0, 20])
     values[2] = 3.0
-    squares, cov = fit_lens(0, values, constants, np.outer(np.eye(13)[2], [1.0, 2.0]), ptr, x, uv, 25, pose[None].copy())
+    directions = np.outer(np.eye(13)[2], [1.0, 2.0])
+    squares, cov = fit_lens(0, values, constants, directions, ptr, x, uv, 25, pose[None].copy())
     assert abs(values[2]) < 0.1
     assert np.isinf(np.diag(cov)).all()
     assert squares.max() < 1e-2
