@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
-from adjust.closed_forms.planes import PLANAR, WIDEST, plane_poses
+from adjust.closed_forms.planes import WIDEST, plane_poses
 from adjust.closed_forms.rigid import rigid, rotation_exp, rotation_to
 from adjust.closed_forms.views import refine_poses, view_errors
 from adjust.errors import SurveyError
@@ -55,10 +55,10 @@ def pose_solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
     """Poses (k, 4, 4) from points (n, 3) m in the target, not all on a line, and unit rays (n, 3) in the camera, n > 2.
 
     Three points: P3P (Ding et al., CVPR 2023, in OpenCV), up to four solutions. Planar: IPPE (Collins and Bartoli,
-    IJCV 109, 2014), both solutions. Otherwise SQPnP (Terzakis and Lourakis, ECCV 2020), from six points on also EPnP;
-    the square sum of four or five has several minima, of which SQPnP may find one that is not the least, so that each
-    three of them give theirs too. Unrefined, in no order and not checked for what lies in front. Rays may lie in any
-    direction: they are turned to the mean one first. Raises SurveyError for too few points, or points on a line.
+    IJCV 109, 2014), both solutions. Otherwise SQPnP (Terzakis and Lourakis, ECCV 2020); the square sum of four or five
+    has several minima, of which it may find one that is not the least, so that each three of them give theirs too.
+    Unrefined, in no order and not checked for what lies in front. Rays may lie in any direction: they are turned to the
+    mean one first. Raises SurveyError for too few points, or points on a line.
     """
     both, planar = plane_poses(x, rays, np.array([0, len(x)]))
     return np.asarray(both[0]) if planar[0] else _solutions(x, rays)
@@ -68,15 +68,16 @@ def _solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
     """:func:`pose_solutions` but for what :func:`adjust.closed_forms.plane_poses` does."""
     if len(x) < 3:
         raise SurveyError(f"a camera pose needs 3 known points, got {len(x)}: observe more of them")
-    mean = rays.mean(axis=0)
-    front_from_camera = rotation_to(mean, np.array([0.0, 0.0, 1.0]))
+    front_from_camera = rotation_to(rays.mean(axis=0), np.array([0.0, 0.0, 1.0]))
     turned = rays @ front_from_camera.T
     near = turned[:, 2] > WIDEST
     if near.sum() < 3:
         raise SurveyError("fewer than 3 rays within 80 degrees of their mean: split the view, or observe more points")
-    centre, axes, thin = _principal_axes(x[near])
-    front_from_target = _in_front(x[near], turned[near, :2] / turned[near, 2:], centre, axes, thin)
-    found = [rigid(front_from_camera.T, np.zeros(3)) @ np.array(front_from_target).reshape(-1, 4, 4)]
+    if not near.all():
+        both, planar = plane_poses(x[near], rays[near], np.array([0, near.sum()]))
+        if planar[0]:
+            return np.asarray(both[0])
+    found = [rigid(front_from_camera.T, np.zeros(3)) @ _in_front(x[near], turned[near, :2] / turned[near, 2:])]
     for three in combinations(range(len(x)), 3) if _FEW[0] <= len(x) <= _FEW[1] else ():
         try:
             found.append(_solutions(x[list(three)], rays[list(three)]))
@@ -85,47 +86,19 @@ def _solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
     return np.concatenate(found)
 
 
-def _principal_axes(x: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
-    """Centroid, axes (rows, right-handed, the thinnest last) and whether the points are a plane."""
-    centre = x.mean(axis=0)
-    squares, vectors = np.linalg.eigh((x - centre).T @ (x - centre))
-    s, vt = np.sqrt(np.maximum(squares[::-1], 0.0)), vectors.T[::-1]
-    if s[1] <= 1e-6 * s[0]:
-        raise SurveyError(f"{len(x)} points on one line do not determine a camera pose: add one off the line")
-    axes = vt * np.array([[1.0], [1.0], [np.linalg.det(vt)]])
-    return centre, axes, bool(s[2] < PLANAR * s[0])
-
-
-def _in_front(x: FloatArray, xy: FloatArray, centre: FloatArray, axes: FloatArray, thin: bool) -> list[FloatArray]:
-    """Poses (4, 4) of the target in the turned camera, unrefined."""
+def _in_front(x: FloatArray, xy: FloatArray) -> FloatArray:
+    """Poses (k, 4, 4) from points (n, 3) m at x/z, y/z (n, 2) of the camera, unrefined."""
     import cv2  # here: networks without images start without it
 
-    scale = float(np.max(np.linalg.norm(x - centre, axis=1)))
-    local = (x - centre) @ axes.T / scale  # unit size and the plane at z = 0: what IPPE asks for
-    if thin and len(x) > 3:
-        local = local * np.array([1.0, 1.0, 0.0])
-    found: list[FloatArray] = []
-    identity, none = np.eye(3), np.zeros(0)
-    for flag in _methods(len(x), thin):
-        try:
-            if flag is None:
-                _, turns, shifts = cv2.solveP3P(local[:, None], xy[:, None], identity, none, cv2.SOLVEPNP_P3P)
-            else:
-                _, turns, shifts, _ = cv2.solvePnPGeneric(local[:, None], xy[:, None], identity, none, flags=flag)
-        except cv2.error:  # the linear solution refuses some configurations; the other methods remain
-            continue
-        for turn, shift in zip(turns, shifts, strict=True):
-            pose = rigid(rotation_exp(np.ravel(turn).astype(float)), scale * np.ravel(shift).astype(float))
-            if np.all(np.isfinite(pose)):
-                found.append(pose @ rigid(axes, -axes @ centre))
-    return found
-
-
-def _methods(n: int, thin: bool) -> tuple[int | None, ...]:
-    import cv2
-
-    if n == 3:
-        return (None,)
-    if thin:
-        return (cv2.SOLVEPNP_IPPE,)
-    return (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_EPNP) if n >= 6 else (cv2.SOLVEPNP_SQPNP,)
+    centre = x.mean(axis=0)
+    size = np.linalg.svd(x - centre, compute_uv=False)
+    if size[1] <= 1e-6 * size[0]:
+        raise SurveyError(f"{len(x)} points on one line do not determine a camera pose: add one off the line")
+    local, identity, none = (x - centre)[:, None] / size[0], np.eye(3), np.zeros(0)
+    if len(x) == 3:
+        _, turns, shifts = cv2.solveP3P(local, xy[:, None], identity, none, cv2.SOLVEPNP_P3P)
+    else:
+        _, turns, shifts, _ = cv2.solvePnPGeneric(local, xy[:, None], identity, none, flags=cv2.SOLVEPNP_SQPNP)
+    R, t = rotation_exp(np.array(turns, dtype=float).reshape(-1, 3)), np.array(shifts, dtype=float).reshape(-1, 3)
+    poses = rigid(R, size[0] * t - R @ centre)
+    return poses[np.isfinite(poses).all(axis=(1, 2))]

@@ -15,7 +15,7 @@ from adjust.errors import SurveyError
 from adjust.model import FloatArray, Survey
 from adjust.observations import FrameRef, PositionRef
 from adjust.result import ParameterName
-from adjust.terrestrial.sights import Node, node_of
+from adjust.terrestrial.sights import Node, node_of, spread_differences
 
 _PARALLAX = np.deg2rad(0.3)
 _TOGETHER = np.deg2rad(75.0)
@@ -124,24 +124,10 @@ class _Search:
     def _advance(self) -> bool:
         """One step, the first of the list that is possible; whether there was one."""
         return (
-            self._ties() or self._targets() or self._turns() or self._stations(_SURE) or self._points()
-            or self._stations(_FEWEST) or self._untold_turns() or self._set_freely()
+            spread_differences(self.survey, self.start.known) or self._targets() or self._turns()
+            or self._stations(_SURE) or self._points() or self._stations(_FEWEST) or self._untold_turns()
+            or self._set_freely()
         )  # fmt: skip
-
-    def _ties(self) -> bool:
-        """Positions at the other end of observed coordinate differences."""
-        known, before = self.start.known, len(self.start.known)
-        for d in self.survey.coordinate_differences:
-            variances = np.diag(d.cov).reshape(-1, 3)
-            for a, b, v, var in zip(d.at, d.to, d.values, variances, strict=True):
-                if not d.used or not np.isfinite(var).all():
-                    continue
-                p, q = node_of(a), node_of(b)
-                if p in known and q not in known:
-                    known[q] = known[p] + v
-                elif q in known and p not in known:
-                    known[p] = known[q] - v
-        return len(known) > before
 
     def _targets(self) -> bool:
         """Targets of which three points are known, and from these all their points."""
