@@ -9,11 +9,10 @@ from adjust.closed_forms.hand_eye import (
     solve_ax_zb,
     solve_views,
 )
-from adjust.closed_forms.planes import homographies, plane_poses
 from adjust.closed_forms.rigid import align, inverse, nearest_rotation, rigid, rotation_exp, rotation_log, transform
 from adjust.closed_forms.triangulation import Intersection, intersect
-from adjust.closed_forms.views import refine_poses, tangent_axes, view_errors, view_offsets
 from adjust.closed_forms.zhang import PinholeStart, pinhole_from_homographies
+from adjust.native.views import homographies, plane_poses, refine_poses, view_errors, view_offsets
 
 __all__ = [
     "Intersection",
@@ -38,7 +37,6 @@ __all__ = [
     "solve_ax_xb",
     "solve_ax_zb",
     "solve_views",
-    "tangent_axes",
     "transform",
     "view_errors",
     "view_offsets",

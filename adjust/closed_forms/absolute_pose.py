@@ -5,11 +5,10 @@ from itertools import combinations
 
 import numpy as np
 
-from adjust.closed_forms.planes import WIDEST, plane_poses
 from adjust.closed_forms.rigid import rigid, rotation_exp, rotation_to
-from adjust.closed_forms.views import refine_poses, view_errors
 from adjust.errors import SurveyError
 from adjust.model import FloatArray, IntArray
+from adjust.native.views import WIDEST, plane_poses, refine_poses, view_errors
 
 _FEW = 4, 5  # points that have poses from each three of them too
 

@@ -15,7 +15,6 @@ from adjust.closed_forms import (
 )
 from adjust.initial.views import Sight, make_views
 from adjust.native.library import SETS, Function, instruction_set
-from adjust.native.views import ViewArrays
 
 
 def board_views(n, seed=3, sigma=0.0):
@@ -157,8 +156,8 @@ def test_views_are_the_same_on_any_number_of_threads(monkeypatch):
 
 def test_views_are_the_same_with_all_vector_instructions():
     x, rays, poses = zip(*views_of_many_sizes(), strict=True)
-    views = ViewArrays.of_poses(np.concatenate(x), np.concatenate(rays), np.cumsum([0] + [len(p) for p in x]), None)
     every, found = np.arange(len(poses)), []
+    views = every, np.cumsum([0] + [len(p) for p in x]), np.concatenate(x), np.concatenate(rays)
     for name in SETS[: SETS.index(instruction_set()) + 1]:
         refined = np.array(poses)
         declared = "which[*] of[K] ptr[B+1] x[N,3] rays[N,3] iterations robust poses[K,4,4] work[*]"
