@@ -22,6 +22,8 @@ PIXEL_TOLERANCE = 1e-7
 """What a solved point may miss its equation by, px: far above rounding, far below any measurement."""
 BEYOND_LIMIT = 1.02
 """Tangential terms move the fold of the image a little off the radius where the radial function turns back."""
+WELL_INSIDE = 0.9
+"""Share of that radius up to which a solution is the one on this side of the fold, wherever it was started."""
 MAX_ITERATIONS = 50
 
 
@@ -284,21 +286,21 @@ def _forward_rays(model: LensModel, values: FloatArray, constants: FloatArray, u
         distorted = np.column_stack([(uv[:, 0] - centre_u) * s - values[1], (uv[:, 1] - centre_v) * s + values[2]])
     lens, constants, _, uv = _arrays(values, constants, np.zeros((0, 3)), uv)
 
-    def solved(tangents: FloatArray, uv: FloatArray) -> BoolArray:
+    def solved(tangents: FloatArray, uv: FloatArray, most: float) -> BoolArray:
         found = np.zeros(len(uv), dtype=np.bool_)
         run_split(
             kernels.tangents_of, split_blocks(np.arange(len(uv) + 1)), model.kind, lens, constants, uv, MAX_ITERATIONS,
             RAY_TOLERANCE, PIXEL_TOLERANCE, tangents, found,
         )  # fmt: skip
         if np.isfinite(profile.limit):
-            found &= np.hypot(tangents[:, 0], tangents[:, 1]) * scale <= profile.limit * BEYOND_LIMIT
+            found &= np.hypot(tangents[:, 0], tangents[:, 1]) * scale <= profile.limit * most
         return found
 
     tangents = np.ascontiguousarray(distorted / scale)
-    found = solved(tangents, uv)
-    if not found.all():  # Newton went astray from the distorted point
+    found = solved(tangents, uv, WELL_INSIDE)
+    if not found.all():  # Newton went astray from the distorted point, or near the fold perhaps to its other side
         again = np.ascontiguousarray(_without_distortion(profile, distorted[~found]) / scale)
-        better = solved(again, uv[~found])
+        better = solved(again, uv[~found], BEYOND_LIMIT)
         tangents[~found], found[~found] = again, better
     _require_invertible(model, values, constants, uv, found)
     return tangents
