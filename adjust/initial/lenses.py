@@ -122,7 +122,8 @@ class _LensSearch:
                 f"camera {self.camera.camera_id!r}: none of its {len(flat)} images fits a plane; the first: "
                 + next(iter(excluded.values()))
             )
-        start, how = self._focal_length([maps[s.block_idx] for s in chosen if s.block_idx in maps], chosen)
+        determined = [m for s in chosen if (m := maps.get(s.block_idx)) is not None]
+        start, how = self._focal_length(determined, chosen)
         return self._refine(start, how, chosen, excluded)
 
     def _on_plane(self, sighting: Sighting) -> FloatArray | None:
@@ -132,15 +133,15 @@ class _LensSearch:
             self._plane[key] = _plane_coordinates(sighting.x)
         return self._plane[key]
 
-    def _screen(self, flat: Sequence[Sighting]) -> tuple[dict[int, FloatArray], dict[int, str]]:
-        """Homographies of the images that fit a plane; a wrong point order misses by a good part of the image."""
+    def _screen(self, flat: Sequence[Sighting]) -> tuple[dict[int, FloatArray | None], dict[int, str]]:
+        """Images that fit a plane, with their homographies where determined; a wrong point order misses by far."""
         counts = [len(s.x) for s in flat]
         ptr, uv = np.cumsum([0, *counts]), np.concatenate([s.uv for s in flat])
-        h, misses, _ = homographies(np.concatenate([self._plane[id(s.x)] for s in flat]), uv, ptr, 1)
+        h, misses, found = homographies(np.concatenate([self._plane[id(s.x)] for s in flat]), uv, ptr, 1)
         span = np.maximum.reduceat(uv, ptr[:-1]) - np.minimum.reduceat(uv, ptr[:-1])
         misfit = misses[:, 1] / np.maximum(np.hypot(*span.T), 1e-9)
         limit = max(0.02, 6.0 * float(np.median(misfit)))
-        good = {s.block_idx: h[i] for i, s in enumerate(flat) if misfit[i] <= limit}
+        good = {s.block_idx: h[i] if found[i] else None for i, s in enumerate(flat) if misfit[i] <= limit}
         excluded = {
             s.block_idx: f"the points miss a plane by {100 * m:.0f} % of their extent (wrong order or mis-detected)"
             for s, m in zip(flat, misfit, strict=True)
