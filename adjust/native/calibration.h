@@ -181,7 +181,7 @@ inline void fit_lens(int64_t kind, Out<double, 1> values, Vector constants, In<d
                 step[i] = 0.0;
                 for (int j = 0; j < free; ++j) step[i] -= inverse[i][j] * left[j][free];
             }
-            for (int64_t i = 0; i < n_values; ++i) lens[i] = values.data[i] + dot(&directions(i, 0), step, free);
+            for (int64_t i = 0; i < n_values; ++i) lens[i] = values.data[i] + dot(directions.data + i * free, step, free);
             for (int64_t b = 0; b < B; ++b) {
                 Pose pose, there;
                 copy_pose(poses[b], pose);
