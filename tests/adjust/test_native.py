@@ -24,6 +24,8 @@ _WORK = ("work", "row")  # scratch, of which nothing is expected afterwards
 _BY_LANES = ("covariance_room",)  # answers with the padded size of scratch
 _SUMS_THAT_CANCEL = ("influence",)
 """Shares of a point in large covariances that cancel: what is left is compared, what was summed is larger."""
+_CONDITIONED = {("fit_lens", "cov"): 1e-9}
+"""Inverses of matrices of unknowns that are hard to tell apart, which multiplies rounding."""
 
 
 @pytest.mark.slow
@@ -69,7 +71,7 @@ def test_vector_instructions_change_nothing(name: str, instructions: str) -> Non
                 np.testing.assert_array_equal(x, y)
                 continue
             scale = max(np.abs(x[finite]).max(), 1.0 if argument in ("residual", "residuals") else 0.0)  # px
-            tolerance = 1e-11 if argument in _SUMS_THAT_CANCEL else 1e-12
+            tolerance = _CONDITIONED.get((name, argument), 1e-11 if argument in _SUMS_THAT_CANCEL else 1e-12)
             if x.dtype == np.float32:
                 tolerance = 1e-6
             assert np.abs(x[finite] - y[finite]).max() <= tolerance * scale, argument
