@@ -1,5 +1,6 @@
 """What a project folder holds, as frozen values."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +10,7 @@ from gtsam import Rot3
 
 from adjust.model import FloatArray, IntArray, Survey
 from adjust.observations import Closure, FrameRef
+from survey.files.contents import contents, lines_text
 from survey.files.detected import DetectedImage
 from survey.files.exclusions import Exclusion
 from survey.quantities import SigmaKind
@@ -200,8 +202,15 @@ class Project(Definition):
     notes: tuple[str, ...] = ()
     image_notes: tuple[str, ...] = ()
 
+    @property
+    def contents(self) -> list[tuple[str, str]]:
+        """What is observed, of what, in which datum: names and texts of a table."""
+        return contents(self.survey, sum(len(b.uv) for b in self.spots))
+
     def __repr__(self) -> str:
         """What is in the folder, in a few lines: a notebook prints it."""
-        from survey.notebook.steps import project_text  # the adjustment is not needed to read a folder
-
-        return project_text(self)
+        kinds = Counter(type(k).__name__ for k in self.target_kinds.values())
+        targets = f", targets {', '.join(f'{n} {kind}' for kind, n in kinds.items())}" if kinds else ""
+        images = f", {len(self.images)} images" if self.images else ""
+        head = f"Project {self.title or self.folder.name!r} in {self.folder}{images}{targets}"
+        return "\n".join((head, *lines_text(self.contents)))
