@@ -12,12 +12,13 @@ from adjust.closed_forms import mean_pose
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from adjust.result import Adjustment, ParameterName
+from survey.covariances import read_covariances
 from survey.files import Project
 from survey.files.locking import settled
 from survey.files.poses import rotation_from_quaternion
+from survey.files.project import RESULTS
 from survey.files.text import read_bytes
 from survey.quantities import ARCSEC_PER_RAD, SigmaKind, key_of, unit_for_people
-from survey.results import RESULTS, read_covariances
 
 # what damaged or foreign content makes the readers below raise
 _NOT_OURS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError, OSError)

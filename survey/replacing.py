@@ -22,6 +22,8 @@ from survey.files.locking import (
     BEFORE,
     LIST,
     LOCK,
+    OBSERVATIONS_FOLDER,
+    RESULTS,
     SESSION_LOCK,
     BusyError,
     FileLock,
@@ -29,7 +31,6 @@ from survey.files.locking import (
     holder_of,
     unfinished,
 )
-from survey.files.project import OBSERVATIONS_FOLDER, RESULTS
 from survey.files.text import atomic_write, read_bytes, remove_leftovers, sync_folder
 from survey.trading import MARK, CannotTradeError, carry_over, complete_from, trade
 from survey.whole_folder import whole_folder

@@ -25,8 +25,9 @@ from adjust.statistics.result import (
 )
 from adjust.statistics.system import LinearSystem, precision_of
 from adjust.statistics.weakness import compared_columns, correlations, weak_directions
+from survey.files.project import Tolerance
 from survey.quantities import PROBABILITY, Scale
-from survey.tolerances import Tolerance, Verdict, verdicts
+from survey.tolerances import Verdict, verdicts
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,8 @@ from adjust.distributions import chi2
 from adjust.epoch_states import differences_of, moved_value, origin, value_motions
 from adjust.model import FloatArray
 from adjust.statistics.criteria import sidak
+from survey.covariances import read_covariances
 from survey.quantities import ARCSEC_PER_RAD
-from survey.results import read_covariances
 
 _TURNED = 1e-6
 _ROUNDS, _SETTLED = 20, 1e-13

@@ -20,6 +20,8 @@ try:
 except ImportError:  # no such locks on this system
     fcntl = None  # type: ignore[assignment]
 
+OBSERVATIONS_FOLDER, RESULTS = "observations", "results"
+"""In a project folder: what is given, what is found."""
 LOCK, SESSION_LOCK = ".labsurvey.lock", "capture/lock"
 """In a project folder: held by the command that writes it, by the session that takes its images."""
 BEFORE, LIST = ".before", "entries.json"

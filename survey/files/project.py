@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from gtsam import Rot3
 
@@ -13,15 +13,26 @@ from adjust.observations import Closure, FrameRef
 from survey.files.contents import contents, lines_text
 from survey.files.detected import DetectedImage
 from survey.files.exclusions import Exclusion
-from survey.quantities import SigmaKind
+from survey.files.locking import OBSERVATIONS_FOLDER as OBSERVATIONS_FOLDER
+from survey.files.locking import RESULTS as RESULTS
 from survey.targets import TargetKind
-from survey.tolerances import Tolerance
 
 FORMAT = 1
 DEFINITION_FILE = "survey.toml"
-OBSERVATIONS_FOLDER = "observations"
 IMAGES_FOLDER = "images"
-RESULTS = "results"
+SigmaKind = Literal["a_priori", "a_posteriori"]
+SIGMA_KINDS: tuple[SigmaKind, ...] = get_args(SigmaKind)
+DEMANDED = {
+    "points": ("point",),
+    "stations": ("world_from_station", "mount_from_station"),
+    "cameras": ("station_from_camera",),
+    "lenses": ("lens",),
+    "tables": ("world_from_table",),
+    "table_geometry": ("table_geometry",),
+    "targets": ("carrier_from_target",),
+}
+"""Of what a tolerance may be demanded, and the names of those estimates."""
+POSITION, ROTATION = "position", "rotation"
 
 
 @dataclass(frozen=True)
@@ -47,6 +58,25 @@ class SpotBlock:
     spot_ids: tuple[str, ...]
     uv: FloatArray
     cov: FloatArray
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """One demand. of: a key of ``DEMANDED``; ids: whose (all where empty).
+
+    quantity: "position", "rotation", or the name of a component (of a lens, a table's geometry).
+    expanded: largest expanded uncertainty allowed, in the worst direction; None where only the value matters.
+    nominal, within: the value must be proven to lie within +- ``within`` of ``nominal``; of components only. SI units,
+    px for those in pixels.
+    """
+
+    name: str
+    of: str
+    ids: tuple[str, ...]
+    quantity: str
+    expanded: float | None = None
+    nominal: float | None = None
+    within: float | None = None
 
 
 @dataclass(frozen=True)

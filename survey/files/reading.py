@@ -50,6 +50,7 @@ from survey.files.project import (
     FORMAT,
     IMAGES_FOLDER,
     OBSERVATIONS_FOLDER,
+    SIGMA_KINDS,
     AdjustmentOptions,
     Definition,
     ImagePointsWhere,
@@ -64,7 +65,6 @@ from survey.files.tables import Layout, Table, read_table
 from survey.files.terrestrial import KINDS, TERRESTRIAL, TERRESTRIAL_COVARIANCE, read_reading_covariances, read_readings
 from survey.files.text import id_problem, natural_key, suggestion
 from survey.files.tolerances import read_tolerances
-from survey.quantities import SIGMA_KINDS
 
 LAYOUTS = {
     layout.name: layout

@@ -4,9 +4,9 @@ from typing import Any
 
 from survey.files.declarations import keys_of
 from survey.files.node import Node
+from survey.files.project import DEMANDED, POSITION, ROTATION, Tolerance
 from survey.files.toml_text import Section
 from survey.files.units import from_si, to_si
-from survey.tolerances import OWNERS, POSITION, ROTATION, Tolerance
 
 _UNITS = ("mm", "arcsec", "deg", "px", "1")
 _SAID = {POSITION: ("mm",), ROTATION: ("arcsec", "deg")}
@@ -23,7 +23,7 @@ def _read(name: str, node: Node) -> Tolerance:
         given = [full for unit in _UNITS if node.has(full := key if unit == "1" else f"{key}_{unit}")]
         if len(given) > 1 and not (key == "expanded" and not node.has("component")):  # which has its own words for it
             raise node.error(f"{given[0]} is given too; keep one of the two", given[1])
-    of = node.choice("of", OWNERS)
+    of = node.choice("of", DEMANDED)
     ids = node.names("ids", ())
     if node.has("component"):
         component = node.text("component")

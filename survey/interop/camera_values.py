@@ -16,9 +16,7 @@ from survey.adjusted_frames import AdjustedFrames
 from survey.files import Project
 from survey.interop.lens_maps import MappedLens, mapped_lens
 from survey.interop.rig import Rig, RigCamera
-from survey.jobs import adjust_project
 from survey.quantities import scale_of
-from survey.results import RESULTS
 from survey.targets import TargetKind
 
 
@@ -112,14 +110,13 @@ class CameraValues:
         return [e for e in found if self.frames.world_from(FrameRef("station", station.station_id, e)) is not None]
 
 
-def camera_values(project: Project) -> CameraValues:
-    """The values of a project. One with results is adjusted again, because its files do not hold every covariance."""
+def camera_values(project: Project, result: Adjustment | None = None) -> CameraValues:
+    """The values of a project: those of its adjustment, without one its start values."""
     survey = project.survey
     kinds = project.target_kinds
-    if not (project.folder / RESULTS / "solution.json").is_file():
+    if result is None:
         start = cast(Adjustment, _Start(survey, {}))
         return CameraValues(survey, project.title, AdjustedFrames(start), {}, 1.0, False, kinds)
-    result = adjust_project(project, progress=False)
     factor = scale_of(result, project.options.sigmas).factor
     return CameraValues(
         result.survey, project.title, AdjustedFrames(result), result.estimates, factor, True, kinds

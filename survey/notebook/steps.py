@@ -85,7 +85,8 @@ class Problem:
 
     def __repr__(self) -> str:
         """Counts for people."""
-        return "\n".join([f"Problem {self.project.title or self.project.folder.name}", *lines_text(self.project.contents)])
+        head = f"Problem {self.project.title or self.project.folder.name}"
+        return "\n".join((head, *lines_text(self.project.contents)))
 
     def _repr_html_(self) -> str:
         return heading("Problem", self.project.title or self.project.folder.name) + html_table(

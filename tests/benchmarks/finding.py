@@ -12,7 +12,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.model import BoolArray, FloatArray, IntArray
 from survey.detection import detect_image
-from survey.detection.dictionaries import charuco_board
+from survey.dictionaries import charuco_board
 from survey.rendering import BrownCamera, Imaging, PlacedTarget, render
 from survey.targets import Charuco, Checkerboard
 from tests.benchmarks.cases import Arrays

@@ -17,8 +17,8 @@ from capture.cli import main
 from capture.simulated.folder import write_lab
 from capture.simulated.gige_server import GigeServer
 from capture.simulated.laboratory import LabSize
+from survey.covariances import read_covariances
 from survey.jobs import adjust_job
-from survey.results import read_covariances
 from tests.capture.camera_helpers import GIGE, gige_port
 from tests.capture.table_server import table_server
 

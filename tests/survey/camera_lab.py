@@ -19,8 +19,8 @@ from adjust.model import (
     Target,
 )
 from adjust.observations import FrameRef, ImageBlock
+from survey.converting import adjusted_values
 from survey.files import read, write_project
-from survey.interop.camera_values import camera_values
 from survey.jobs import adjust_job
 from survey.targets import Checkerboard
 
@@ -94,7 +94,7 @@ def adjusted_lab(folder: Path):
     """The project's folder, adjusted, and its values."""
     write_lab(folder)
     adjust_job(folder)
-    return folder, camera_values(read(folder))
+    return folder, adjusted_values(read(folder))
 
 
 def pixels(values, camera, x_in_station):

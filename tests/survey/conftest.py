@@ -3,9 +3,9 @@
 import pytest
 
 from survey.cli import main
+from survey.converting import adjusted_values
 from survey.files import read
 from survey.interop.camera_formats import write_cameras
-from survey.interop.camera_values import camera_values
 from tests.survey.camera_lab import adjusted_lab
 
 
@@ -22,6 +22,6 @@ def there_and_back(lab, tmp_path):
     def convert(format, name):
         write_cameras(lab[1], tmp_path / name, format, None)
         assert main(["convert", str(tmp_path / name), str(tmp_path / "back"), "--format", format, "--quiet"]) == 0
-        return camera_values(read(tmp_path / "back"))
+        return adjusted_values(read(tmp_path / "back"))
 
     return convert

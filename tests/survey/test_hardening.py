@@ -17,7 +17,6 @@ import pytest
 from adjust.errors import SurveyError
 from survey import files
 from survey.cli import FAILED, main
-from survey.commands.common import message
 from survey.detection.gray import read_image
 from survey.detection.image_header import image_size
 from survey.files.node import read_toml
@@ -25,6 +24,7 @@ from survey.files.table_writing import write_table
 from survey.files.tables import Layout, group_names, read_table
 from survey.files.text import cell_text, id_problem, natural_key, read_bytes
 from survey.jobs import adjust_job
+from survey.messages import message
 from survey.previous import read_previous
 from survey.replacing import recover
 from survey.residual_tables import other_residuals_csv

@@ -11,8 +11,8 @@ from gtsam import Pose3
 from adjust.errors import SurveyError
 from adjust.observations import FrameRef
 from survey.cli import main
+from survey.converting import adjusted_values
 from survey.files import read
-from survey.interop.camera_values import camera_values
 from survey.interop.colmap import pose3, reconstruction, rigid3d
 from survey.interop.colmap_model import read_model
 from tests.survey.camera_lab import SIGMA_PX, world_pixels
@@ -63,7 +63,7 @@ def test_a_full_disk_leaves_no_half_model(lab, tmp_path, format, capsys):
 @pytest.mark.parametrize("format", ["colmap", "colmap-text"])
 def test_back_again_the_reprojections_are_equal(lab, models, format, tmp_path):
     assert main(["convert", str(models / format), str(tmp_path / "back"), "--format", format, "--quiet"]) == 0
-    back = camera_values(read(tmp_path / "back"))
+    back = adjusted_values(read(tmp_path / "back"))
     ours, theirs = world_pixels(lab[1]), world_pixels(back)
     assert ours.keys() == theirs.keys()
     for key, uv in ours.items():

@@ -17,10 +17,10 @@ from survey.files.column_texts import COLUMN_TEXTS, column_text
 from survey.files.declarations import DECLARATIONS, declared
 from survey.files.declared import NOTHING, REQUIRED, Declared, Key
 from survey.files.exclusions import EXCLUSIONS
+from survey.files.project import DEMANDED
 from survey.files.reading import LAYOUTS, read_definition
 from survey.reference import reference_page
 from survey.schema import survey_schema
-from survey.tolerances import OWNERS
 
 jsonschema = pytest.importorskip("jsonschema")
 ROOT = Path(__file__).parents[2]
@@ -174,7 +174,7 @@ def test_a_declared_default_is_what_its_absence_means(table: Declared, key: Key,
 
 def test_choices_are_those_of_the_program() -> None:
     assert declared("lens").keys[0].choices == tuple(MODELS)
-    assert next(k for k in declared("tolerance").keys if k.name == "of").choices == tuple(OWNERS)
+    assert next(k for k in declared("tolerance").keys if k.name == "of").choices == tuple(DEMANDED)
 
 
 def test_the_page_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,9 +14,10 @@ from scipy.spatial.transform import Rotation
 from adjust.observations import FrameRef
 from adjust.result import Adjustment, Estimate, GlobalTest
 from survey.adjusted_frames import AdjustedFrames, table_from_mount
+from survey.covariances import covariance_npz, read_covariances
 from survey.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry
 from survey.residual_tables import _fixed, image_residuals_csv, other_residuals_csv
-from survey.results import covariance_npz, read_covariances, write_results
+from survey.results import write_results
 from survey.solution import RunInfo, correlated, solution_dict, solution_json
 from survey.verdict import suspects, verdict
 from tests.survey.adjustments import POSE_COMPONENTS, POSE_UNITS, Lab, correlate, lab_adjustment

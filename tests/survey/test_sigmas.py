@@ -10,9 +10,9 @@ import survey
 from adjust.errors import SurveyError
 from survey.aligning import align_job
 from survey.cli import main
+from survey.covariances import read_covariances
 from survey.files import AdjustmentOptions, read, write_project
 from survey.navigation import NavigateRequest, navigate_job
-from survey.results import read_covariances
 from survey.simulate import beacons
 from tests.adjust.test_deformation import chain, measured, small
 from tests.survey.test_working_sheet import definition, write

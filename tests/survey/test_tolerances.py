@@ -9,9 +9,9 @@ from scipy.stats import norm, t
 
 from adjust.errors import SurveyError
 from survey.files import read, write_project
-from survey.files.project import AdjustmentOptions
+from survey.files.project import AdjustmentOptions, Tolerance
 from survey.quantities import scale_of
-from survey.tolerances import Tolerance, coverage, verdicts
+from survey.tolerances import coverage, verdicts
 from tests.survey.adjustments import Lab, lab_adjustment
 
 TOML = """format = 1
