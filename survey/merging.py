@@ -17,7 +17,7 @@ from survey.files.exclusions import EXCLUSIONS_FILE, appended, read_exclusions
 from survey.files.node import read_toml
 from survey.files.project import DEFINITION_FILE, FORMAT, IMAGES_FOLDER, OBSERVATIONS_FOLDER, Project
 from survey.files.reading import LAYOUTS, read
-from survey.files.tables import read_table
+from survey.files.table_reading import read_table
 from survey.files.text import atomic_write, decode, read_bytes, suggestion
 from survey.files.toml_lines import KeyPath, key_lines
 from survey.files.toml_text import toml_text

@@ -14,7 +14,8 @@ KNOWN = frozenset({"adjustment", "pair_screen", "start_choice"})  # in adjust: o
 
 
 def _modules(root: Path) -> dict[str, Path]:
-    found = {p.relative_to(root).with_suffix("").as_posix(): p for name in PACKAGES for p in (root / name).rglob("*.py")}
+    paths = (path for name in PACKAGES for path in (root / name).rglob("*.py"))
+    found = {path.relative_to(root).with_suffix("").as_posix(): path for path in paths}
     return {name.removesuffix("/__init__").replace("/", "."): path for name, path in found.items()}
 
 
@@ -79,7 +80,7 @@ def test_a_circle_is_found_through_functions_and_relative_imports_but_not_throug
         "__init__": "",
         "a": "def late():\n    from survey.b import thing\n",
         "b": "from . import c\n",
-        "c": "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from .a import late\nelse:\n    import survey.d\n",
+        "c": "import typing\nif typing.TYPE_CHECKING:\n    from .a import late\nelse:\n    import survey.d\n",
         "d": "",
     }
     for name, text in texts.items():

@@ -8,12 +8,14 @@ from adjust.model import FloatArray
 def covariance_from_sigmas(sigmas: FloatArray, rho: FloatArray | None = None) -> FloatArray:
     """Covariances (n, k, k) from ``sigmas`` (n, k) and correlations ``rho`` (n, k(k-1)/2), upper triangle by rows."""
     n, k = sigmas.shape
-    correlation = np.tile(np.eye(k), (n, 1, 1))
-    if rho is not None:
-        rows, columns = np.triu_indices(k, 1)
-        correlation[:, rows, columns] = rho
-        correlation[:, columns, rows] = rho
-    return np.asarray(correlation * sigmas[:, :, None] * sigmas[:, None, :])
+    out = np.zeros((n, k, k))
+    pairs = {pair: place for place, pair in enumerate(zip(*np.triu_indices(k, 1), strict=True))}
+    for i, j in np.ndindex(k, k):
+        if i == j:
+            out[:, i, i] = sigmas[:, i] * sigmas[:, i]
+        elif rho is not None:
+            out[:, i, j] = rho[:, pairs[min(i, j), max(i, j)]] * sigmas[:, i] * sigmas[:, j]
+    return out
 
 
 def sigmas_and_correlations(cov: FloatArray) -> tuple[FloatArray, FloatArray]:

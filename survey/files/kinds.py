@@ -10,7 +10,8 @@ from survey.files.declarations import DECLARATIONS, keys_of
 from survey.files.node import Node
 from survey.files.owners import read_epochs
 from survey.files.poses import read_pose
-from survey.files.tables import Layout, read_table
+from survey.files.table_reading import read_table
+from survey.files.tables import Layout
 from survey.files.text import suggestion
 from survey.files.units import to_si
 from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind

@@ -61,7 +61,8 @@ from survey.files.project import (
 )
 from survey.files.references import Names
 from survey.files.sought import sought_in
-from survey.files.tables import Layout, Table, read_table
+from survey.files.table_reading import read_table
+from survey.files.tables import Layout, Table
 from survey.files.terrestrial import KINDS, TERRESTRIAL, TERRESTRIAL_COVARIANCE, read_reading_covariances, read_readings
 from survey.files.text import id_problem, natural_key, suggestion
 from survey.files.tolerances import read_tolerances

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from survey.files.detected import ImageKey
-from survey.files.table_writing import Columns, cells_of
-from survey.files.tables import Layout, Table, read_table
+from survey.files.table_reading import read_table
+from survey.files.table_writing import cells_of
+from survey.files.tables import Columns, Layout, Table
 from survey.files.text import decode, read_bytes
 
 _FALSE = ("false", "0")

@@ -18,7 +18,7 @@ from survey.files.covariance import sigmas_and_correlations
 from survey.files.differences import DIFFERENCE, DIFFERENCE_RHO, DIFFERENCE_SIGMAS
 from survey.files.geometric import axis_text
 from survey.files.references import frame_text, position_text
-from survey.files.table_writing import Columns
+from survey.files.tables import Columns
 from survey.files.terrestrial import ANGLES, HEIGHTS
 from survey.files.units import from_si
 

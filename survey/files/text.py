@@ -26,7 +26,7 @@ def atomic_write(path: Path, content: bytes | str) -> None:
 
     What killed runs left of the same file goes.
     """
-    data = _utf8(content) if isinstance(content, str) else content
+    data = utf8(content) if isinstance(content, str) else content
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path.parent, path.name)
     handle, temporary = _temporary(path)
@@ -44,7 +44,7 @@ def atomic_write(path: Path, content: bytes | str) -> None:
         raise
 
 
-def _utf8(text: str) -> bytes:
+def utf8(text: str) -> bytes:
     """Where the system knows no UTF-8, names of files in a text stand for their bytes."""
     try:
         return text.encode("utf-8")

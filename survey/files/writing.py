@@ -29,7 +29,8 @@ from survey.files.project import (
 )
 from survey.files.reading import LAYOUTS
 from survey.files.sections import head_section, option_sections, points_file, survey_sections
-from survey.files.table_writing import Columns, write_table
+from survey.files.table_writing import write_table
+from survey.files.tables import Columns
 from survey.files.terrestrial_columns import new_tables
 from survey.files.text import atomic_write
 from survey.files.toml_text import toml_text

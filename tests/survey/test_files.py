@@ -18,7 +18,7 @@ from adjust.model import Camera, LensParameter, PointParameter, PoseParameter, S
 from adjust.model import Point as WorldPoint
 from adjust.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef
 from survey import files
-from survey.files import csv_chunks, tables
+from survey.files import csv_chunks, table_reading, tables
 from survey.files.toml_lines import key_lines
 from survey.files.units import from_si, to_si
 from survey.simulate import full_lab
@@ -316,7 +316,7 @@ def test_chunks_of_a_table_join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     layout = tables.Layout("t", ("id",), ("x",), (), ("y",))
     path = tmp_path / "t.csv"
     path.write_text("id,x,y\n" + "".join(f"{quote}i{i % 4}{quote},{i}.5,{'' if i % 2 else i}\n" for i in range(n)))
-    table = tables.read_table(path, layout)
+    table = table_reading.read_table(path, layout)
     assert table.lines.tolist() == list(range(2, n + 2))
     assert table.text("id").values() == [f"i{i % 4}" for i in range(n)]
     assert table.numbers("x").tolist() == [i + 0.5 for i in range(n)]
@@ -344,16 +344,6 @@ def test_parquet_faults(good: Path) -> None:
     path.write_bytes(b"not Parquet")
     with pytest.raises(SurveyError, match=r"distances\.parquet:1: not a Parquet file"):
         files.read(good)
-
-
-def test_missing_pyarrow_is_explained(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    project = files.read(good)
-    files.write_spots(good, project.spots, parquet=True)
-    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(SurveyError, match=r"spots\.parquet: Parquet needs pyarrow; install"):
-        files.read(good)
-    with pytest.raises(SurveyError, match=r"Parquet needs pyarrow"):
-        files.write_spots(good, project.spots, parquet=True)
 
 
 def test_atomic_write(tmp_path: Path) -> None:

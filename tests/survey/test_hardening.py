@@ -20,8 +20,9 @@ from survey.cli import FAILED, main
 from survey.detection.gray import read_image
 from survey.detection.image_header import image_size
 from survey.files.node import read_toml
+from survey.files.table_reading import read_table
 from survey.files.table_writing import write_table
-from survey.files.tables import Layout, group_names, read_table
+from survey.files.tables import Layout, group_names
 from survey.files.text import cell_text, id_problem, natural_key, read_bytes
 from survey.jobs import adjust_job
 from survey.messages import message
