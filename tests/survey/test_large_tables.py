@@ -21,7 +21,7 @@ from survey.files.tables import Layout, Table, TextColumn
 
 LAYOUT = Layout("t", ("a_id",), ("x_mm",), ("group",), ("sigma_mm",))
 HEADER = "a_id,x_mm,group,sigma_mm\n"
-CELLS = [1.5, -0.0, 0.1 + 0.2, 5e-324, 2.2250738585072014e-308, 1e15, -1e15, 123456789.12345678, 1 / 3, 900719925474099.3]
+CELLS = [1.5, -0.0, 0.1 + 0.2, 5e-324, 2.2250738585072014e-308, 1e15, -1e15, 123456789.12345678, 900719925474099.3]
 
 
 @pytest.fixture
@@ -78,8 +78,8 @@ def test_arrow_reads_the_same_bits(change, tmp_path: Path, monkeypatch: pytest.M
 
 ODD = [
     "p,+1.5,,", "p,1_000,,", "p,nan,,", "p,NaN,,", "p,inf,,", "p,-Infinity,,", "p, 1.5 ,,", "p,\u0661,,", "p,0x10,,",
-    "p,1e400,,", "p,1e16,,", "p,,,", ",1.5,,", "p,NULL,,", "p,#N/A,,", "p,1.5,,NA", "p,1.5,,null", "p,1.5,NULL,", "p,1.5",
-    "p,1,5,,", '"p",1.5,,', "", "p,1.5,,\r", "p,1.5,\x00,", "p,.5,,", "p,5.,,", "p,1E5,,", "p,1d5,,", "p,1e,,", "p,-,,",
+    "p,1e400,,", "p,1e16,,", "p,,,", ",1.5,,", "p,NULL,,", "p,#N/A,,", "p,1.5,,NA", "p,1.5,,null", "p,1.5,NULL,",
+    "p,1.5", "p,1,5,,", '"p",1.5,,', "", "p,1.5,,\r", "p,1.5,\x00,", "p,.5,,", "p,5.,,", "p,1E5,,", "p,1d5,,", "p,1e,,", "p,-,,",
     "p,1.5,,\u00a02", "p,1.5f,,", "p,True,,", " p ,1.5, ,", "p,1e-400,,", "p,00012.50,,", "NULL,1.5,nan,",
 ]  # fmt: skip
 
@@ -139,7 +139,8 @@ def test_a_large_table_comes_back_as_it_was_written(tmp_path: Path, monkeypatch:
     monkeypatch.setattr("survey.files.table_writing.LARGE", 2**60)
     assert write_table(tmp_path / "rows", "t", columns).read_bytes() == path.read_bytes()
     table = _read(path)
-    assert isinstance(table, Table) and _same(table, _by_rows(path, monkeypatch))
+    assert isinstance(table, Table)
+    assert _same(table, _by_rows(path, monkeypatch))
     assert table.numbers("x_mm").tobytes() == values.tobytes()
     assert table.text("a_id").values() == ids
 
