@@ -83,6 +83,7 @@ def run_session(
     worker.start()
     with _keys() as pressed:
         while worker.is_alive():
+            worker.join(_LOOK_S)
             _look(control, progress, pressed)
     worker.join()
     result = found[0]
@@ -96,15 +97,21 @@ def run_session(
 
 
 def _look(control: Control, progress: Progress, pressed: Callable[[], str]) -> None:
-    """Wait for a signal for a moment, then for a key."""
-    heard = signal.sigtimedwait(_SIGNALS, _LOOK_S)
-    if heard is not None and heard.si_signo != signal.SIGUSR1:
-        control.stop(f"{signal.Signals(heard.si_signo).name} received")
+    """Whether there is a signal or a key."""
+    heard = _heard()
+    if heard is not None and heard != signal.SIGUSR1:
+        control.stop(f"{signal.Signals(heard).name} received")
         return
     if heard is not None or pressed() in ("p", " "):
         control.toggle_pause()
         progress.state("paused" if control.paused else "running")
         progress.note("pausing before the next set; p goes on" if control.paused else "going on")
+
+
+def _heard() -> int | None:
+    """A signal that waits, fetched. macOS has no ``sigtimedwait``."""
+    waiting = signal.sigpending() & set(_SIGNALS)
+    return signal.sigwait(waiting) if waiting else None
 
 
 @contextmanager
@@ -114,7 +121,7 @@ def _signals_blocked(control: Control) -> Iterator[Control]:
     try:
         yield control
     finally:
-        while signal.sigtimedwait(_SIGNALS, 0) is not None:
+        while _heard() is not None:
             pass  # a second Ctrl-C while everything is being closed has done its work
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
