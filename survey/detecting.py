@@ -31,10 +31,10 @@ from survey.files.detected import (
 )
 from survey.files.exclusions import EXCLUSIONS_FILE, Exclusion, Name, Row, appended, in_force, read_exclusions
 from survey.files.image_points import IMAGE_POINTS, SPOTS
+from survey.files.images import Sought, sought_in
 from survey.files.observation_columns import image_point_columns, spot_columns
 from survey.files.project import IMAGES_FOLDER, OBSERVATIONS_FOLDER
 from survey.files.row_tables import RowTable, row_table
-from survey.files.sought import Sought, sought_in
 from survey.files.text import atomic_write
 from survey.replacing import changing, replace_parts
 

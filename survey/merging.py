@@ -19,8 +19,7 @@ from survey.files.project import DEFINITION_FILE, FORMAT, IMAGES_FOLDER, OBSERVA
 from survey.files.reading import LAYOUTS, read
 from survey.files.table_reading import read_table
 from survey.files.text import atomic_write, decode, read_bytes, suggestion
-from survey.files.toml_lines import KeyPath, key_lines
-from survey.files.toml_text import toml_text
+from survey.files.toml_text import KeyPath, key_lines, toml_text
 from survey.replacing import copy_folder
 
 _KINDS = ("cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces")

@@ -19,10 +19,10 @@ from adjust.parallel import workers
 from survey.files.tables import LARGEST_ROWS, Columns, Layout, TextColumn, check_header, check_rows, first_row
 from survey.files.text import LARGEST_NUMBER, utf8
 
-LARGE = 2 * 2**20  # bytes of CSV, cells to write / 10: below, loading Arrow (30 ms) costs more than it saves
+LARGE = 2**20  # bytes of CSV, cells to write / 10: below, loading Arrow (30 ms) costs more than it saves
 _LARGEST_DECODED = 8 * 2**30  # bytes of the columns of a Parquet file
 _BLOCK, _ROWS = 4 * 2**20, 2**17  # bytes read, rows written at a time
-_ALIKE = (1e-4, 1e15)  # between these Arrow writes doubles as Python does, but for whole numbers
+_ALIKE = (1e-4, 1e9)  # between these Arrow writes doubles as Python does, but for whole numbers
 
 
 def csv_columns(data: bytes, layout: Layout) -> dict[str, TextColumn | FloatArray] | None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from adjust.observations import CoordinateDifferences, PositionRef
-from survey.files.blank_coordinates import joint_problem, read_triples
+from survey.files.covariance import joint_problem, read_triples
 from survey.files.project import Sigmas
 from survey.files.references import NameProblemError, Names, check_epochs, read_position
 from survey.files.tables import FLAGS, Layout, Table, group_names

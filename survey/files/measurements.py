@@ -7,8 +7,7 @@ import numpy as np
 
 from adjust.model import FloatArray
 from adjust.observations import Coordinates, Distance, PositionRef, TableReading
-from survey.files.blank_coordinates import joint_problem, read_triples
-from survey.files.covariance import covariance_from_sigmas
+from survey.files.covariance import covariance_from_sigmas, joint_problem, read_triples
 from survey.files.project import Sigmas
 from survey.files.references import (
     NameProblemError,

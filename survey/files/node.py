@@ -13,7 +13,7 @@ import numpy as np
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
 from survey.files.text import LARGEST_NUMBER, choice_hint, decode, id_problem, read_bytes, suggestion
-from survey.files.toml_lines import KeyPath, key_lines
+from survey.files.toml_text import KeyPath, key_lines
 from survey.files.units import to_si
 
 _REQUIRED: Any = object()

@@ -9,9 +9,6 @@ import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.model import Datum, FloatArray, Point, PointParameter, Survey
-from survey.files.alignment_tasks import read_alignment_tasks
-from survey.files.bodies import read_beams, read_surfaces
-from survey.files.closures import read_closures
 from survey.files.declarations import keys_of
 from survey.files.detected import DetectedImage, ImageKey, ImageNews, image_news, read_detected
 from survey.files.differences import DIFFERENCES, DIFFERENCES_COVARIANCE, read_differences
@@ -27,8 +24,15 @@ from survey.files.geometric import (
     read_on_surfaces,
 )
 from survey.files.image_points import IMAGE_POINTS, SPOTS, read_image_blocks, read_spots, world_names
-from survey.files.images import find_images
-from survey.files.instruments import read_bearings, read_instruments, read_setups, read_vertical
+from survey.files.images import find_images, sought_in
+from survey.files.instruments import (
+    read_beams,
+    read_bearings,
+    read_instruments,
+    read_setups,
+    read_surfaces,
+    read_vertical,
+)
 from survey.files.kinds import read_targets
 from survey.files.locking import settled
 from survey.files.measurements import (
@@ -42,6 +46,7 @@ from survey.files.measurements import (
 )
 from survey.files.node import Node, read_toml
 from survey.files.observed import Observed, union, without
+from survey.files.options import read_alignment_tasks, read_options
 from survey.files.owners import read_cameras, read_stations, read_tables
 from survey.files.pairs import PAIRS, read_pairs
 from survey.files.poses import flat_point, read_point
@@ -50,8 +55,6 @@ from survey.files.project import (
     FORMAT,
     IMAGES_FOLDER,
     OBSERVATIONS_FOLDER,
-    SIGMA_KINDS,
-    AdjustmentOptions,
     Definition,
     ImagePointsWhere,
     LeftOut,
@@ -60,12 +63,10 @@ from survey.files.project import (
     SpotsRequest,
 )
 from survey.files.references import Names
-from survey.files.sought import sought_in
 from survey.files.table_reading import read_table
 from survey.files.tables import Layout, Table
 from survey.files.terrestrial import KINDS, TERRESTRIAL, TERRESTRIAL_COVARIANCE, read_reading_covariances, read_readings
 from survey.files.text import id_problem, natural_key, suggestion
-from survey.files.tolerances import read_tolerances
 
 LAYOUTS = {
     layout.name: layout
@@ -254,7 +255,7 @@ def _read_definition(folder: Path) -> tuple[Definition, Node]:
         target_kinds=kinds,
         images=find_images(folder / IMAGES_FOLDER, camera_ids),
         spots_request=_read_spots_request(root.table("spots"), camera_ids) if root.has("spots") else None,
-        options=_read_options(root),
+        options=read_options(root),
         sigmas=dataclasses.replace(_read_sigmas(root.table("sigmas"), table_sigmas), instruments=accuracies),
         inputs=inputs,
         target_cameras=seen_by,
@@ -297,25 +298,6 @@ def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest
     if not 0 < smallest <= largest:
         raise node.error(f"found [{smallest:g}, {largest:g}]; expected [smallest, largest]", "diameter_px")
     return SpotsRequest(cameras, epochs, (smallest, largest), node.number("gate_px", 15.0, positive=True))
-
-
-def _read_options(root: Node) -> AdjustmentOptions:
-    """The tables [adjustment], [closures], [tolerances] and [identification]."""
-    node, said = root.table("adjustment"), root.table("identification")
-    node.allow(*keys_of("adjustment"))
-    alpha = node.number("alpha", 0.05, positive=True)
-    if alpha >= 1:
-        raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
-    flags = {name: node.flag(name, True) for name in ("reject_blocks", "reject_points", "reject_pairs")}
-    identification = tuple((key, said.text(key)) for key in said.values)
-    flags["variance_components"] = node.flag("variance_components", False)
-    asked = node.choice("sigmas", SIGMA_KINDS) if node.has("sigmas") else ""
-    sigmas = next((kind for kind in SIGMA_KINDS if kind == asked), None)
-    form, closures = read_closures(root)
-    return AdjustmentOptions(
-        alpha, **flags, sigmas=sigmas, pairs=form, closures=closures, tolerances=read_tolerances(root),
-        identification=identification,
-    )  # fmt: skip
 
 
 def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:

@@ -17,15 +17,13 @@ from adjust.model import (
     Target,
     VectorParameter,
 )
-from survey.files.bodies import body_sections
-from survey.files.closures import closure_sections
-from survey.files.instruments import instrument_sections, vertical_sections
+from survey.files.instruments import body_sections, instrument_sections, vertical_sections
 from survey.files.kinds import WARP
 from survey.files.lenses import lens_to_toml
+from survey.files.options import closure_sections, tolerance_sections
 from survey.files.owners import GEOMETRY_UNITS, geometry_key
 from survey.files.poses import quaternion_wxyz
 from survey.files.project import FORMAT, AdjustmentOptions, Sigmas, SpotsRequest
-from survey.files.tolerances import tolerance_sections
 from survey.files.toml_text import Section
 from survey.files.units import from_si
 from survey.files.vectors import check_vector

@@ -1,16 +1,23 @@
 """Tables of observations out of CSV or Parquet files, with file and line of whatever is wrong in them."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import contextlib
+import csv
+import io
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.model import FloatArray, IntArray
 from survey.files.arrow_columns import csv_columns, parquet_columns
-from survey.files.csv_chunks import Chunk, csv_chunks
 from survey.files.tables import Layout, Table, TextColumn, check_header, check_rows, first_row
 from survey.files.text import LARGEST_NUMBER, decode, read_bytes
+
+CHUNK = 65536
+Chunk = tuple[IntArray, Sequence[Sequence[str]]]
 
 
 def read_table(path: Path, layout: Layout) -> Table:
@@ -103,3 +110,52 @@ class _NumberBuilder:
 
     def column(self) -> FloatArray:
         return np.concatenate([np.zeros(0), *self.parts])
+
+
+def csv_chunks(path: Path, text: str) -> tuple[list[str], Iterator[Chunk]]:
+    """The header, and the rows after it: the line of each row, and the columns. Raises SurveyError for broken rows."""
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    try:
+        header = next(reader)
+    except csv.Error as error:
+        raise SurveyError(f"{path}:1: not a CSV line ({error}); correct the quotes") from error
+    return header, _columns(path, text, reader, len(header))
+
+
+def _columns(path: Path, text: str, reader: Any, n: int) -> Iterator[Chunk]:
+    """Chunk by chunk through the csv module; raises where a row has a wrong length."""
+    line = reader.line_num + 1
+    while rows := _next_rows(path, text, reader):
+        lines = np.arange(line, line + len(rows))
+        _check_lengths(path, rows, lines, n, reader.line_num)
+        line += len(rows)
+        filled = np.fromiter(map(bool, rows), bool, len(rows))
+        if filled.any():
+            yield lines[filled], list(zip(*filter(None, rows), strict=True))
+
+
+def _next_rows(path: Path, text: str, reader: Any) -> list[list[str]]:
+    try:
+        return list(itertools.islice(reader, CHUNK))
+    except csv.Error as error:
+        raise SurveyError(f"{path}:{_last_start(text)}: not a CSV line ({error}); correct the quotes") from error
+
+
+def _check_lengths(path: Path, rows: list[list[str]], lines: IntArray, n: int, last_line: int) -> None:
+    if not set(map(len, rows)) <= {0, n}:
+        i = next(i for i, row in enumerate(rows) if len(row) not in (0, n))
+        hint = "; numbers have a decimal point, not a comma" if len(rows[i]) > n else ""
+        raise SurveyError(f"{path}:{lines[i]}: found {len(rows[i])} fields, expected {n} as in the first line{hint}")
+    if last_line != lines[-1]:
+        i = next(i for i, row in enumerate(rows) if any("\n" in field or "\r" in field for field in row))
+        raise SurveyError(f"{path}:{lines[i]}: a quoted field runs over the end of the line; close its quotes")
+
+
+def _last_start(text: str) -> int:
+    """The line on which the row begins that the csv module cannot read."""
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    line = 1
+    with contextlib.suppress(csv.Error):
+        for _ in reader:
+            line = reader.line_num + 1
+    return line

@@ -9,7 +9,6 @@ import numpy as np
 from adjust.errors import SurveyError
 from adjust.model import Survey
 from adjust.observations import ImageBlock
-from survey.files.alignment_tasks import task_sections
 from survey.files.observation_columns import (
     angle_columns,
     coordinate_columns,
@@ -18,6 +17,7 @@ from survey.files.observation_columns import (
     pair_columns,
     spot_columns,
 )
+from survey.files.options import task_sections
 from survey.files.project import (
     DEFINITION_FILE,
     OBSERVATIONS_FOLDER,

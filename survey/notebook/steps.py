@@ -10,7 +10,7 @@ from survey.detecting import DetectOutcome, detect_job
 from survey.excluding import ExcludeOutcome, exclude_job, include_job
 from survey.files import AdjustmentOptions, Project
 from survey.files import read as read_project
-from survey.files.contents import lines_text, observed, owners
+from survey.files.project import lines_text, observed, owners
 from survey.files.text import suggestion
 from survey.jobs import adjust_project, run_info
 from survey.notebook.html import heading, html_table

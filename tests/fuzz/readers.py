@@ -97,9 +97,9 @@ def _table(name: str, number: int) -> Callable[[Path], Read]:
 
 def _in_pieces(folder: Path) -> Read:
     """A table of quoted words, taken three rows at a time instead of tens of thousands."""
-    from survey.files import csv_chunks
+    from survey.files import table_reading
 
-    csv_chunks.CHUNK = 3
+    table_reading.CHUNK = 3
     return _table("table_angles.csv", 0)(folder)
 
 

@@ -18,8 +18,8 @@ from adjust.model import Camera, LensParameter, PointParameter, PoseParameter, S
 from adjust.model import Point as WorldPoint
 from adjust.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef
 from survey import files
-from survey.files import csv_chunks, table_reading, tables
-from survey.files.toml_lines import key_lines
+from survey.files import table_reading, tables
+from survey.files.toml_text import key_lines
 from survey.files.units import from_si, to_si
 from survey.simulate import full_lab
 from survey.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList
@@ -312,7 +312,7 @@ def test_blank_lines_and_quotes_go_the_other_way(good: Path) -> None:
 @pytest.mark.parametrize("quote", ["", '"'])
 @pytest.mark.parametrize("n", [1, 2, 3, 7])
 def test_chunks_of_a_table_join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n: int, quote: str) -> None:
-    monkeypatch.setattr(csv_chunks, "CHUNK", 3)
+    monkeypatch.setattr(table_reading, "CHUNK", 3)
     layout = tables.Layout("t", ("id",), ("x",), (), ("y",))
     path = tmp_path / "t.csv"
     path.write_text("id,x,y\n" + "".join(f"{quote}i{i % 4}{quote},{i}.5,{'' if i % 2 else i}\n" for i in range(n)))

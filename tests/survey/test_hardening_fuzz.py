@@ -23,7 +23,7 @@ NO_READERS = {
     "survey/files/exclusions.py:_header_of": "read by read_exclusions before",
     "survey/files/row_tables.py:row_table": "read by read_table before",
     "survey/merging.py:read_copy": "the copy of a project that was read before",
-    "survey/files/csv_chunks.py:_last_start": "the line of what could not be read, for the message",
+    "survey/files/table_reading.py:_last_start": "the line of what could not be read, for the message",
     "survey/files/locking.py:FileLock._opened": "a handle for the lock alone",
     "survey/files/locking.py:remove_unheld": "a handle for the lock alone",
     "survey/interop/colmap.py:reconstruction": "an empty model of pycolmap, to be filled and written",

@@ -128,6 +128,13 @@ def test_arrow_writes_what_the_csv_module_writes(numbers: list[float], words: li
     assert csv_rows({"a": texts, "x": finite, "b": coded}).decode() == out.getvalue()
 
 
+def test_arrow_writes_numbers_of_every_size_as_python_does() -> None:
+    rng = np.random.default_rng(5)
+    powers = np.array([float(f"1e{k}") for k in range(-320, 308)])
+    values = np.concatenate([powers, np.nextafter(powers, 0), powers * rng.uniform(1, 10, powers.size), -powers])
+    assert csv_rows({"x": values, "y": values}).decode().splitlines() == [f"{v!r},{v!r}" for v in values.tolist()]
+
+
 @pytest.mark.usefixtures("small")
 def test_a_large_table_comes_back_as_it_was_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(4)
