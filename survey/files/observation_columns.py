@@ -7,8 +7,8 @@ from gtsam import Pose3
 
 from adjust.model import FloatArray, Survey
 from adjust.observations import Coordinates, Distance, ImageBlock, Pair, TableReading
+from survey.files.coordinates import XYZ_RHO, XYZ_SIGMAS
 from survey.files.covariance import sigmas_and_correlations
-from survey.files.measurements import XYZ_RHO, XYZ_SIGMAS
 from survey.files.pairs import COVARIANCE_COLUMNS, QUATERNION, SIGMA_COLUMNS, TRANSLATION
 from survey.files.poses import quaternion_wxyz
 from survey.files.project import SpotBlock

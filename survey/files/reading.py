@@ -9,9 +9,16 @@ import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.model import Datum, FloatArray, Point, PointParameter, Survey
+from survey.files.coordinates import (
+    COORDINATES,
+    COORDINATES_COVARIANCE,
+    DIFFERENCES,
+    DIFFERENCES_COVARIANCE,
+    read_coordinates,
+    read_differences,
+)
 from survey.files.declarations import keys_of
 from survey.files.detected import DetectedImage, ImageKey, ImageNews, image_news, read_detected
-from survey.files.differences import DIFFERENCES, DIFFERENCES_COVARIANCE, read_differences
 from survey.files.exclusions import EXCLUSIONS, EXCLUSIONS_FILE, Exclusion, in_force, read_exclusions
 from survey.files.geometric import (
     ALIGNMENTS,
@@ -37,11 +44,8 @@ from survey.files.kinds import read_targets
 from survey.files.locking import settled
 from survey.files.measurements import (
     ANGLES,
-    COORDINATES,
-    COORDINATES_COVARIANCE,
     DISTANCES,
     read_angles,
-    read_coordinates,
     read_distances,
 )
 from survey.files.node import Node, read_toml

@@ -14,8 +14,8 @@ from adjust.observations import (
     Reading,
     ReadingCovariance,
 )
+from survey.files.coordinates import DIFFERENCE, DIFFERENCE_RHO, DIFFERENCE_SIGMAS
 from survey.files.covariance import sigmas_and_correlations
-from survey.files.differences import DIFFERENCE, DIFFERENCE_RHO, DIFFERENCE_SIGMAS
 from survey.files.geometric import axis_text
 from survey.files.references import frame_text, position_text
 from survey.files.tables import Columns
