@@ -142,12 +142,6 @@ class _State:
         """A hash of the rows of an image that belong to detection."""
         return self.points.digest(key) + self.spots.digest(key)
 
-    def is_given(self, key: ImageKey) -> bool:
-        """Whether the points of an image were there before it was ever looked at."""
-        entry = self.known.get(key)
-        has_rows = key in self.points.images or key in self.spots.images
-        return has_rows and (entry is None or entry.status == "given")
-
 
 def _state(folder: Path) -> _State:
     definition = read_definition(folder)

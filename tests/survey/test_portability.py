@@ -4,7 +4,7 @@ import ctypes
 import errno
 import os
 import signal
-import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -77,12 +77,14 @@ def test_no_lock_is_taken_through_a_link(elsewhere: None, tmp_path: Path) -> Non
 
 
 def test_signals_are_fetched(elsewhere: None) -> None:
+    before = [signal.getsignal(number) for number in (signal.SIGUSR1, signal.SIGTERM)]
     with _signals_blocked(SimpleNamespace()):  # type: ignore[arg-type]
-        assert _heard() is None
-        signal.pthread_kill(threading.get_ident(), signal.SIGUSR1)
-        assert _heard() == signal.SIGUSR1
-        signal.pthread_kill(threading.get_ident(), signal.SIGTERM)  # fetched at the end, else it would end this process
-    assert _heard() is None
+        assert _heard(0.0) is None
+        os.kill(os.getpid(), signal.SIGUSR1)
+        assert _heard(0.01) == signal.SIGUSR1
+        os.kill(os.getpid(), signal.SIGTERM)  # else it would end this process
+        time.sleep(0.01)
+    assert before == [signal.getsignal(number) for number in (signal.SIGUSR1, signal.SIGTERM)]
 
 
 def test_folders_trade_places_as_macos_does_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
