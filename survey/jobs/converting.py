@@ -37,8 +37,7 @@ from survey.interop.networks.values import NetworkValues, left_out, require_netw
 from survey.jobs.adjusting.job import adjust_project
 from survey.jobs.converting_g2o import AS_IN_THE_FILE, project_to_g2o, survey_from_g2o
 from survey.project import AdjustmentOptions, Project, atomic_write, read, write_project
-from survey.project.project import DEFINITION_FILE
-from survey.report.results import RESULTS
+from survey.project.project import DEFINITION_FILE, RESULTS
 from survey.solution.previous import read_previous
 from survey.solution.quantities import scale_of
 
@@ -190,10 +189,11 @@ def _encoding(source: Path, format: str) -> tuple[str, ...]:
     return ("the text is not UTF-8; unless the file names its encoding it was read as Latin-1",)
 
 
-def values_of_cameras(project: Project) -> CameraValues:
+def adjusted_values(project: Project) -> CameraValues:
     """The values of a project. One with results is adjusted again, because its files do not hold every covariance."""
-    solved = (project.folder / RESULTS / "solution.json").is_file()
-    return camera_values(project, adjust_project(project, progress=False) if solved else None)
+    if not (project.folder / RESULTS / "solution.json").is_file():
+        return camera_values(project)
+    return camera_values(project, adjust_project(project, progress=False))
 
 
 def _to_file(
@@ -206,7 +206,7 @@ def _to_file(
         return ConvertOutcome(source, target, "g2o", {"stations": n_stations, "pairs": n_pairs}, poses, rest)
     project = read(source)
     if format in camera_formats.WRITERS:
-        values = values_of_cameras(project)
+        values = adjusted_values(project)
         counts, notes = camera_formats.write_cameras(values, target, format, station)
         said = "adjusted" if values.adjusted else "start values, not adjusted"
         return ConvertOutcome(source, target, format, counts, said, notes)

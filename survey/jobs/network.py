@@ -17,8 +17,9 @@ from survey.jobs.adjusting.warm_start import warm_adjustment
 from survey.project import Definition, Project, read, read_definition
 from survey.project.merging import Merged, merge, read_copy
 from survey.project.project import OBSERVATIONS_FOLDER
+from survey.project.tables.files import read_table
 from survey.project.tables.pairs import COVARIANCE_COLUMNS, EULER, PAIRS, QUATERNION, SIGMA_COLUMNS, TRANSLATION
-from survey.project.tables.reading import Table, read_table
+from survey.project.tables.reading import Table
 from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame
 from survey.report.results import RESULTS
 from survey.solution.loops import network_dict, pair_network

@@ -11,8 +11,8 @@ from survey.project import atomic_write
 from survey.project.project import RESULTS
 from survey.report import report_html, summary_text
 from survey.report.page import report_pdf
+from survey.solution.covariances import covariance_npz
 from survey.solution.dictionary import RunInfo, solution_dict, solution_json
-from survey.solution.previous import covariance_npz, read_covariances
 from survey.solution.residual_tables import image_residuals_csv, other_residuals_csv
 from survey.solution.statistics import Statistics
 
@@ -20,9 +20,7 @@ __all__ = [
     "RESULTS",
     "ReportOptions",
     "RunInfo",
-    "covariance_npz",
     "make_results",
-    "read_covariances",
     "solution_dict",
     "solution_json",
     "summary_text",

@@ -1,13 +1,8 @@
-"""What an earlier adjustment of a project left in its results: values to start from, and sigmas to compare with.
+"""What an earlier adjustment of a project left in its results: values to start from, and sigmas to compare with."""
 
-Also ``covariance.npz``, as it is written and read back.
-"""
-
-import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,13 +12,13 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.spatial.averaging import mean_pose
-from survey.folder.arrays import read_arrays
 from survey.folder.locking import settled
 from survey.folder.text import read_bytes
 from survey.project import Project
 from survey.project.declared.poses import rotation_from_quaternion
 from survey.project.project import RESULTS
-from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind, key_of, scale_of, unit_for_people
+from survey.solution.covariances import read_covariances
+from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind, key_of, unit_for_people
 
 # what damaged or foreign content makes the readers below raise
 _NOT_OURS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError, OSError)
@@ -33,13 +28,6 @@ _POSES = {
     "tables": ("world_from_table",),
     "targets": ("world_from_target", "station_from_target"),
 }
-_README = (
-    "names[i] is kind/id[/epoch]/component; units[i] its unit; parameters[k] is kind/id[/epoch].",
-    "Parameter k has the components start[k]:start[k+1] of names; its covariance is covariance[block[k]:block[k+1]], "
-    "row by row.",
-    "Tangent of a pose a_from_b: rotation (rad) then translation (m), in frame b: a_from_b * Exp(tangent).",
-    "Covariances are a priori times factor**2; factor is 1 where sigmas is a_priori, sigma0 where it is a_posteriori.",
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,43 +193,3 @@ def _fit(previous: Previous, adjustment: Adjustment, names: list[ParameterName])
     offers = [previous.poses[n].compose(v.inverse()).matrix() for n in names
               if isinstance(v := adjustment.estimates[n].value, Pose3)]  # fmt: skip
     return Pose3(mean_pose(np.array(offers), 1.0)[0]) if offers else Pose3()
-
-
-def covariance_npz(adjustment: Adjustment, sigmas: SigmaKind = "a_posteriori") -> bytes:
-    """Covariance of every parameter, joint within the parameter, as an ``.npz`` that explains itself."""
-    scale, estimates = scale_of(adjustment, sigmas), list(adjustment.estimates.values())
-    parameters = ["/".join(e.name) for e in estimates]
-    names = [f"{p}/{c}" for p, e in zip(parameters, estimates, strict=True) for c in e.components]
-    sizes = np.array([len(e.components) for e in estimates], dtype=np.int64)
-    out = io.BytesIO()
-    np.savez_compressed(
-        out,
-        README=np.array(_README),
-        names=np.array(names, dtype=str),
-        units=np.array([u for e in estimates for u in e.units], dtype=str),
-        parameters=np.array(parameters, dtype=str),
-        start=np.concatenate([[0], np.cumsum(sizes)]),
-        block=np.concatenate([[0], np.cumsum(sizes**2)]),
-        covariance=np.concatenate([*((scale.factor**2 * e.cov).ravel() for e in estimates), np.empty(0)]),
-        sigmas=np.array(scale.sigmas),
-        factor=np.array(scale.factor),
-    )
-    return out.getvalue()
-
-
-def read_covariances(path: Path) -> dict[str, Any]:
-    """The blocks of a ``covariance.npz`` by ``kind/id[/epoch]``, each (n, n), as they were written.
-
-    Raises ValueError or OSError for what is no such file.
-    """
-    found = read_arrays(path, ("start", "block", "covariance", "parameters"))
-    start, block, flat, names = found["start"], found["block"], found["covariance"], found["parameters"]
-    n = len(names) + 1 if names.ndim == 1 and names.dtype.kind == "U" else -1
-    if not (start.shape == block.shape == (n,) and start.dtype == block.dtype == np.int64 and flat.dtype == float):
-        raise ValueError(f"{path.name}: start, block and covariance do not fit the parameters")
-    sizes = np.diff(start)
-    if (sizes < 0).any() or (np.diff(block) != sizes**2).any() or flat.shape != (block[-1],) or block[0] != 0:
-        raise ValueError(f"{path.name}: the blocks do not fit the sizes of the parameters")
-    return {
-        str(name): flat[block[k] : block[k + 1]].reshape(sizes[k], sizes[k]) for k, name in enumerate(names)
-    }  # fmt: skip

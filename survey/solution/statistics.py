@@ -25,8 +25,9 @@ from adjust.statistics.result import (
 )
 from adjust.statistics.system import LinearSystem, precision_of
 from adjust.statistics.weakness import compared_columns, correlations, weak_directions
+from survey.project.project import Tolerance
 from survey.solution.quantities import PROBABILITY, Scale
-from survey.solution.tolerances import Tolerance, Verdict, verdicts
+from survey.solution.tolerances import Verdict, verdicts
 
 
 @dataclass(frozen=True, eq=False)

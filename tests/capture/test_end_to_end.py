@@ -18,7 +18,7 @@ from capture.simulated.folder import write_lab
 from capture.simulated.gige_server import GigeServer
 from capture.simulated.laboratory import LabSize
 from survey.jobs.adjusting.job import adjust_job
-from survey.report.results import read_covariances
+from survey.solution.covariances import read_covariances
 from tests.capture.camera_helpers import GIGE, gige_port
 from tests.capture.table_server import table_server
 

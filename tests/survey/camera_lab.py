@@ -11,7 +11,7 @@ from adjust.lenses.models import MODELS, camera_constants, project
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.survey import Camera, LensParameter, Point, PointParameter, PoseParameter, Station, Survey, Target
 from survey.jobs.adjusting.job import adjust_job
-from survey.jobs.converting import values_of_cameras
+from survey.jobs.converting import adjusted_values
 from survey.project import read, write_project
 from survey.project.targets import Checkerboard
 
@@ -85,7 +85,7 @@ def adjusted_lab(folder: Path):
     """The project's folder, adjusted, and its values."""
     write_lab(folder)
     adjust_job(folder)
-    return folder, values_of_cameras(read(folder))
+    return folder, adjusted_values(read(folder))
 
 
 def pixels(values, camera, x_in_station):

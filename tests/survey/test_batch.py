@@ -23,11 +23,11 @@ from survey.batch.control import Series, chart, runs
 from survey.batch.journal import Journal, read_journal
 from survey.batch.page import overview_html, write_overview
 from survey.batch.record import FAILED, Record, record_from
-from survey.batch.run import BatchOptions, attempts, run_batch
+from survey.batch.run import BatchOptions, run_batch
 from survey.batch.tables import folders_csv, overview_json, short_names, summary_table, trends_csv
 from survey.batch.task import adjust_task
 from survey.batch.trends import all_series, trends_of
-from survey.batch.worker import Worker, WorkerDiedError
+from survey.batch.worker import Worker, WorkerDiedError, attempts
 from tests.survey.epochs import write_epochs
 from tests.survey.test_report_browser import CONTRAST, seen
 

@@ -17,14 +17,15 @@ import pytest
 from adjust.model.errors import SurveyError
 from survey import project as files
 from survey.cli import FAILED, main
-from survey.commands.common import message
 from survey.detection.gray import read_image
 from survey.detection.image_header import image_size
+from survey.folder.messages import message
 from survey.folder.replacing import recover
 from survey.folder.text import cell_text, id_problem, natural_key, read_bytes
 from survey.jobs.adjusting.job import adjust_job
 from survey.project.declared.node import read_toml
-from survey.project.tables.reading import Layout, group_names, read_table
+from survey.project.tables.files import read_table
+from survey.project.tables.reading import Layout, group_names
 from survey.project.tables.writing import write_table
 from survey.solution.previous import read_previous
 from survey.solution.residual_tables import other_residuals_csv

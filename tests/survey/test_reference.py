@@ -16,11 +16,11 @@ from survey.examples import EXAMPLES, write_example
 from survey.project.declared.declarations import DECLARATIONS, declared
 from survey.project.declared.keys import NOTHING, REQUIRED, Declared, Key
 from survey.project.exclusions import EXCLUSIONS
+from survey.project.project import DEMANDED
 from survey.project.reading import LAYOUTS, read_definition
 from survey.project.reference import reference_page
 from survey.project.schema import survey_schema
 from survey.project.tables.column_texts import COLUMN_TEXTS, column_text
-from survey.solution.tolerances import OWNERS
 
 jsonschema = pytest.importorskip("jsonschema")
 ROOT = Path(__file__).parents[2]
@@ -177,7 +177,7 @@ def test_a_declared_default_is_what_its_absence_means(table: Declared, key: Key,
 
 def test_choices_are_those_of_the_program() -> None:
     assert declared("lens").keys[0].choices == tuple(MODELS)
-    assert next(k for k in declared("tolerance").keys if k.name == "of").choices == tuple(OWNERS)
+    assert next(k for k in declared("tolerance").keys if k.name == "of").choices == tuple(DEMANDED)
 
 
 def test_the_page_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:

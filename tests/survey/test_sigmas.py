@@ -12,8 +12,8 @@ from survey.cli import main
 from survey.jobs.aligning import align_job
 from survey.jobs.navigating.job import NavigateRequest, navigate_job
 from survey.project import AdjustmentOptions, read, write_project
-from survey.report.results import read_covariances
 from survey.simulate import beacons
+from survey.solution.covariances import read_covariances
 from tests.adjust.test_deformation import chain, measured, small
 from tests.survey.test_working_sheet import definition, write
 
