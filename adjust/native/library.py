@@ -92,7 +92,7 @@ class Function:
         self._run: Callable[[int], int] | None = None
         self._kinds = ""
         self._expected: list[tuple[str, tuple[_Dimension, ...], np.dtype[Any] | None, int, tuple[int, ...]]] = []
-        """Name, shape, kind and needed flags of every argument (of a number: whether it is whole), and zeros after it."""
+        """Of every argument: name, shape, dtype, flags needed (of a number: whether it is whole), zeros that follow."""
 
     def using(self, instructions: str | None) -> "Function":
         """The same function with a set of vector instructions; that in use for None."""

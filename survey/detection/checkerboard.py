@@ -183,7 +183,7 @@ def _on_grid(fit: CornerFit, shape: tuple[int, int]) -> BoolArray:
 
 
 def _off_grid(grid: FloatArray) -> FloatArray:
-    """Second differences of a grid (rows, columns, 2) px along rows and columns, in squares, the larger (rows, columns)."""
+    """Second differences (rows, columns) of a grid (rows, columns, 2) px, the larger of both ways, in squares."""
     steps = np.linalg.norm(np.diff(grid, axis=1), axis=2)
     spacing = float(np.median(steps[np.isfinite(steps)])) if np.isfinite(steps).any() else np.inf
     off = np.zeros(grid.shape[:2])

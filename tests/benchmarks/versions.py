@@ -99,9 +99,8 @@ def _told(row: str, other: Measured, here: Measured) -> list[list[str]]:
     if other.failed or here.failed:
         return [[row, other.failed, here.failed, "", ""]]
     times = [1e3 * min(m.cpu) for m in (other, here)]
-    stages = [
-        f"{stage} {1e3 * min(other.stages.get(stage, [0.0])):.1f}, {1e3 * min(s):.1f}" for stage, s in here.stages.items()
-    ]
+    before = other.stages
+    stages = [f"{s} {1e3 * min(before.get(s, [0.0])):.1f}, {1e3 * min(now):.1f}" for s, now in here.stages.items()]
     return [[row, *(f"{t:.1f}" for t in times), f"{times[1] / times[0]:.2f}", "; ".join(stages)]]
 
 
