@@ -1,5 +1,7 @@
 """Finding a checkerboard's inner corners, in an order that its colours define."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -7,7 +9,7 @@ from adjust.model import BoolArray, FloatArray
 from survey.detection.bent_edges import unbent
 from survey.detection.corners import CornerFit, refine_corners
 from survey.detection.extent import grown, is_of_neighbours
-from survey.detection.gray import AnyImage, Gray8, Gray32, halved, reduced
+from survey.detection.gray import Gray8, Gray32, halved, reduced
 from survey.detection.results import Detection, nothing_found
 from survey.targets import Checkerboard
 
@@ -118,7 +120,7 @@ def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
     return np.reshape(corners, (-1, 2)).astype(float) if ok else None
 
 
-def _found_in(coarse: Gray8, pattern: tuple[int, int]) -> tuple[bool, AnyImage]:
+def _found_in(coarse: Gray8, pattern: tuple[int, int]) -> tuple[bool, Any]:
     """What one finder after the other finds."""
     ok, corners = cv2.findChessboardCorners(coarse, pattern, flags=0)
     if not ok:
