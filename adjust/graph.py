@@ -29,7 +29,7 @@ from adjust.image_reduction import PoseReduction, reduction
 from adjust.model import BoolArray, FloatArray, Survey, VectorPrior
 from adjust.observation_factor import ObservationFactor, frame_text, position_text
 from adjust.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef
-from adjust.result import ParameterName
+from adjust.result import Adjustment, ParameterName
 from adjust.state import State, collect_vectors
 from adjust.terrestrial.batch import TerrestrialBatch
 from adjust.terrestrial.building import build_batch, reading_refs
@@ -47,6 +47,19 @@ class StartValues:
     poses: Mapping[ParameterName, Pose3]
     points: Mapping[str, FloatArray]
     vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
+
+
+def values_of(adjustment: Adjustment) -> StartValues:
+    """Adjusted values as start values."""
+    estimates = adjustment.estimates
+    poses = {n: e.value for n, e in estimates.items() if isinstance(e.value, Pose3)}
+    arrays = {n: np.asarray(e.value) for n, e in estimates.items() if not isinstance(e.value, Pose3)}
+    return StartValues(
+        {n[1]: v for n, v in arrays.items() if n[0] == "lens"},
+        poses,
+        {n[1]: v for n, v in arrays.items() if n[0] == "point"},
+        {n: v for n, v in arrays.items() if n[0] not in ("lens", "point")},
+    )
 
 
 @dataclass(eq=False)

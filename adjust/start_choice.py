@@ -7,7 +7,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.errors import SurveyError
-from adjust.graph import StartValues
+from adjust.graph import StartValues, values_of
 from adjust.initial.given import GivenStarts, given_starts, without_starts
 from adjust.initial.reflection import Apart, apart, mirrored
 from adjust.model import FloatArray, Survey
@@ -154,8 +154,6 @@ def _near_given(survey: Survey, result: Adjustment, run: Callable[[Begun], Adjus
 
 def _from_places(result: Adjustment, places: Mapping[str, FloatArray]) -> StartValues:
     """The adjusted values with other places of points; what is turned there is found anew."""
-    from adjust.pair_screen import values_of  # here: it stands above this module
-
     start = values_of(result)
     vectors = {n: v for n, v in start.vectors.items() if n[0] not in ("orientation", "centring")}
     return replace(start, points={**start.points, **places}, vectors=vectors)

@@ -42,10 +42,6 @@ from survey.symmetric_boards import consistent_turns
 _PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-headless")
 
 
-_OTHERS = ("table_readings", "pairs", "distances", "coordinates", "readings", "coordinate_differences", "levels",
-           "alignments", "laser_spots", "on_surfaces")  # fmt: skip
-
-
 @dataclass(frozen=True, eq=False)
 class AdjustOutcome:
     """An adjusted project and where its results are. solution: all that ``solution.json`` holds."""
@@ -191,11 +187,8 @@ Begin = Callable[[Survey], StartValues | None]
 def adjust_project(project: Project, progress: bool, begin: Begin = lambda _: None) -> Adjustment:
     """Adjust what was read. begin: start values of a survey, found where it gives None. Raises SurveyError."""
     survey = project.survey
-    observed = (
-        survey.image_blocks, project.spots, survey.pairs, survey.distances, survey.coordinates, survey.readings,
-        survey.coordinate_differences, survey.levels, survey.alignments, survey.laser_spots, survey.on_surfaces,
-    )  # fmt: skip
-    if not any(observed):
+    others = (v for k, v in survey.others.items() if k != "table_readings")
+    if not any((survey.image_blocks, project.spots, *others)):
         raise SurveyError(
             f"{project.folder}: there is nothing to adjust; put images at images/<camera_id>/<epoch_id>.png or tables "
             "into observations/"
@@ -234,8 +227,7 @@ def told(project: Project, given: Survey, adjustment: Adjustment) -> Adjustment:
     warnings = adjustment.warnings + project.notes + project.image_notes + image_warnings(project.detected)
     images = sum(len(b.uv) if b.used is None else int(b.used.sum()) for b in given.image_blocks)
     images -= int(adjustment.image_residuals.used.sum())
-    others = sum(o.used for kind in _OTHERS for o in getattr(given, kind))
-    others -= sum(o.used for kind in _OTHERS for o in getattr(adjustment.survey, kind))
+    others = given.n_others_used - adjustment.survey.n_others_used
     return replace(adjustment, warnings=warnings, n_screened=images + others)
 
 
@@ -256,7 +248,9 @@ def _identify(
 
 def _seen_points(survey: Survey) -> Survey:
     """Leave out the beacons that nothing observes any more: a beacon may be hidden in all images."""
-    observed = {survey.points[int(i)].point_id for b in survey.image_blocks if b.target_id is None for i in b.point_idx}
+    observed: set[str | None] = {
+        survey.points[int(i)].point_id for b in survey.image_blocks if b.target_id is None for i in b.point_idx
+    }
     observed |= {r.point_id for c in survey.coordinates for r in c.positions if r.frame is None}
     refs = [r for d in survey.coordinate_differences for r in (*d.at, *d.to)]
     refs += [o.position for o in survey.on_surfaces]

@@ -5,7 +5,6 @@ from gtsam import Pose3, Rot3
 from adjust.initial.result import Start
 from adjust.model import Survey
 from adjust.result import ParameterName
-from adjust.survey_kind import is_pose_network
 
 
 def network_start(survey: Survey) -> Start | None:
@@ -14,7 +13,7 @@ def network_start(survey: Survey) -> Start | None:
     Surveys of rotations alone, whose positions stay open, are left to the general search, too. Raises
     IndeterminateError naming the stations that no pair ties to the others.
     """
-    if not is_pose_network(survey) or not any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
+    if not survey.is_pose_network or not any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
         return None
     # here: a survey without pairs starts without it
     from adjust.pose_network.from_survey import network_from_survey

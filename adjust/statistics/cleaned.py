@@ -8,9 +8,9 @@ import numpy as np
 from adjust.adjustment import adjust
 from adjust.distributions import chi2
 from adjust.errors import SurveyError
-from adjust.graph import StartValues
+from adjust.graph import StartValues, values_of
 from adjust.model import Survey
-from adjust.pair_screen import PairOptions, adjust_with_pairs, is_pure, values_of
+from adjust.pair_screen import PairOptions, adjust_with_pairs, is_pure
 from adjust.result import Adjustment
 from adjust.statistics.criteria import sidak
 from adjust.statistics.outlier_search import OutlierSearch, SearchOptions, search_outliers

@@ -14,9 +14,8 @@ import numpy as np
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.distributions import chi2
 from adjust.errors import IndeterminateError, NotConvergedError
-from adjust.graph import StartValues
+from adjust.graph import StartValues, values_of
 from adjust.model import BoolArray, IntArray, Survey
-from adjust.pair_screen import values_of
 from adjust.result import Adjustment
 from adjust.statistics.candidates import Candidates, candidates, without
 from adjust.statistics.criteria import criteria, sidak

@@ -16,11 +16,10 @@ from scipy import sparse
 from adjust.bundle_batch import BundleBatch
 from adjust.datum import gauge
 from adjust.errors import SurveyError
-from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues, values_of
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.images import block_rows
 from adjust.native.lenses import MAX_LENS
-from adjust.pair_screen import values_of
 from adjust.precision import Precision, noise_of
 from adjust.result import Adjustment, ParameterName
 from adjust.solve import solve

@@ -13,9 +13,8 @@ import numpy as np
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.distributions import chi2
 from adjust.errors import SurveyError
-from adjust.graph import StartValues
+from adjust.graph import StartValues, values_of
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
-from adjust.pair_screen import values_of
 from adjust.result import Adjustment
 from adjust.statistics.group_sums import GroupSums, Moments, group_sums, moments
 from adjust.statistics.result import Component, VarianceComponents
