@@ -15,7 +15,7 @@ from adjust.observations import ImageBlock
 from adjust.precision import Precision, global_test, group_summaries, image_residuals, other_residuals
 from adjust.result import Adjustment, Estimate, ParameterName
 from adjust.robust import limit, screen
-from adjust.solve import Solved, SolveOptions, solve
+from adjust.solve import Solved, SolveOptions, settled, solve
 from adjust.start_choice import Begun, adjusted_from_own_start
 from adjust.terrestrial.joint_start import find_all, needs_points
 from adjust.terrestrial.statistics import JoinedResiduals, reading_residuals
@@ -60,7 +60,7 @@ def _adjusted(
 ) -> Adjustment:
     survey, notes = begun.survey, begun.notes
     graph = GraphBuilder(survey, begun.start.lenses).build(begun.start)
-    solved = solve(graph, options.solve, progress)
+    graph, solved = settled(graph, options.solve, progress)
     if options.reject_points:
         screened = screen(graph, solved, options.solve)
         survey = with_used(survey, screened.used)

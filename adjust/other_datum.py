@@ -74,7 +74,7 @@ def in_datum(result: Adjustment, datum: Datum, reference: Mapping[str, FloatArra
     survey = replace(released(result.survey), datum=datum)
     start = values_of(result)
     graph = GraphBuilder(survey, start.lenses).build(start)
-    inner = inner_datum(graph, graph.start)
+    inner = inner_datum(graph, graph.prepare(graph.start, jacobians=True))
     if inner is None:
         raise SurveyError("the observations define position, orientation and scale: no datum is left to choose")
     values, blocks = graph.start, {u.key: np.eye(u.dim) for u in graph.unknowns.by_name.values()}

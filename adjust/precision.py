@@ -40,11 +40,7 @@ class Precision:
     def __init__(self, graph: AdjustmentGraph, solved: Solved) -> None:
         self.graph, self.solved = graph, solved
         dims = {key: unknown.dim for key, unknown in graph.unknowns.by_key.items()}
-        if solved.use_qr:
-            tree = solved.linear.eliminateMultifrontal(solved.ordering, gtsam.EliminateQR)
-        else:
-            tree = solved.linear.eliminateMultifrontal(solved.ordering)
-        self.tree = TreeCovariance(tree, dims, solved.leaves)
+        self.tree = TreeCovariance(solved.elimination.tree(solved.linear), dims, solved.leaves)
         self.hidden: dict[int, FloatArray] = {}
         self.bundle_influence = np.zeros((0, 3))
         self._hidden = None if graph.bundle is None else BundleHidden(graph.bundle)

@@ -10,7 +10,7 @@ from adjust.graph import GraphBuilder, StartValues
 from adjust.model import FloatArray, Survey
 from adjust.rank import readable
 from adjust.result import CAUTIOUS_SIGMAS, Adjustment, ParameterName
-from adjust.solve import SolveOptions, solve
+from adjust.solve import settled
 
 _PART = 0.25  # of the largest share: what is named of a direction
 
@@ -40,7 +40,7 @@ def expect(survey: Survey, start: StartValues) -> Adjustment:
     """
     ideal = exact(survey, start)
     graph = GraphBuilder(ideal, start.lenses).build(start)
-    result = assemble(graph, solve(graph, SolveOptions()), AdjustOptions())
+    result = assemble(*settled(graph), AdjustOptions())
     kept = tuple(w for w in result.warnings if not w.startswith(("global test", CAUTIOUS_SIGMAS)))
     return replace(result, sigma0=float("nan"), global_test=None, omega=0.0, warnings=kept)
 

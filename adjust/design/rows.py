@@ -81,7 +81,7 @@ def _readings(p: Predictor, by_key: dict[int, slice]) -> list[Rows]:
     batch, out = p.graph.terrestrial, list[Rows]()
     if batch is None:
         return out
-    batch.update_sigmas(p.values)
+    batch, _ = batch.with_sigmas_at(p.values)
     batch.unweighted(p.values)
     for c, chunk in enumerate(batch.layout.chunks):
         columns, A = _ranges([by_key[k] for k in chunk.keys]), batch.jacobian(c)

@@ -22,7 +22,7 @@ from adjust.graph import GraphBuilder, StartValues
 from adjust.model import FloatArray, Survey
 from adjust.parallel import workers
 from adjust.result import Adjustment, ParameterName
-from adjust.solve import SolveOptions, solve
+from adjust.solve import settled
 from adjust.unknowns import Unknown
 
 _CHUNK = 8
@@ -125,7 +125,7 @@ class _Task:
             survey = disturbed(displaced(self.ideal, self.start, rng), rng, self.sigmas)
             try:
                 graph = GraphBuilder(survey, self.start.lenses).build(self.start)
-                found = solve(graph, SolveOptions())
+                _, found = settled(graph)
             except SurveyError as error:
                 out.append(str(error))
                 continue

@@ -22,7 +22,7 @@ from adjust.native.images import block_rows
 from adjust.native.lenses import MAX_LENS
 from adjust.precision import Precision, noise_of
 from adjust.result import Adjustment, ParameterName
-from adjust.solve import solve
+from adjust.solve import settled
 
 DENSE = 3000
 """Unknowns up to which the normal matrix is factored as a full one."""
@@ -324,7 +324,7 @@ def precision_of(adjustment: Adjustment) -> Precision:
     graph = GraphBuilder(survey, start.lenses).build(start)
     if [o.ids for o in graph.others] != [o.ids for o in adjustment.other_residuals[: len(graph.others)]]:
         raise SurveyError("the adjustment does not fit its survey; adjust the survey again")
-    return Precision(graph, solve(graph))
+    return Precision(*settled(graph))
 
 
 def _turning_only(survey: Survey, start: StartValues) -> tuple[Survey, StartValues]:
