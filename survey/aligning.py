@@ -9,10 +9,10 @@ from typing import Any
 
 from adjust.errors import SurveyError
 from adjust.result import Adjustment
+from survey.adjusting import adjust_project
 from survey.files import atomic_write, read
 from survey.files.project import RESULTS
 from survey.files.text import decode, read_bytes
-from survey.jobs import adjust_project
 from survey.replacing import changing, replace_parts
 from survey.report.working_sheet import ROUND_COLUMNS, sheet_html, sheet_text, steps
 from survey.working_sheet import ARCSEC, Sheet, working_sheets

@@ -12,9 +12,9 @@ from adjust.congruence_result import Congruence
 from adjust.deformation import Deformation, DeformationTest, station_deformations
 from adjust.errors import SurveyError
 from adjust.result import Adjustment
+from survey.adjusting import adjust_project
 from survey.congruence_text import congruence_dict, congruence_text
 from survey.files import Project, read
-from survey.jobs import adjust_project
 from survey.quantities import ARCSEC_PER_RAD, SigmaKind
 
 ALPHA = 0.05

@@ -16,6 +16,7 @@ import numpy as np
 
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
+from survey.adjusting import adjust_project
 from survey.converting_g2o import AS_IN_THE_FILE, project_to_g2o, survey_from_g2o
 from survey.files import AdjustmentOptions, Project, atomic_write, read, write_project
 from survey.files.project import DEFINITION_FILE
@@ -36,7 +37,6 @@ from survey.interop.network_json import network_json
 from survey.interop.network_values import NetworkValues, left_out, require_network
 from survey.interop.plain_csv import correlated, plain_csv, read_plain_csv
 from survey.interop.sinex import sinex_text
-from survey.jobs import adjust_project
 from survey.previous import read_previous
 from survey.quantities import scale_of
 from survey.replacing import filling

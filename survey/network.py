@@ -11,12 +11,13 @@ from gtsam import Pose3, Rot3
 
 from adjust.errors import SurveyError
 from adjust.observations import Pair
+from survey.adjusting import adjust_project
 from survey.files import Definition, Project, read, read_definition
 from survey.files.pairs import COVARIANCE_COLUMNS, EULER, PAIRS, QUATERNION, SIGMA_COLUMNS, TRANSLATION
 from survey.files.project import OBSERVATIONS_FOLDER
 from survey.files.references import NameProblemError, Names, check_epochs, read_frame
 from survey.files.tables import Table, read_table
-from survey.jobs import AdjustOutcome, Clock, adjust_project, command_line, made
+from survey.jobs import AdjustOutcome, Clock, command_line, made
 from survey.merging import Merged, merge, read_copy
 from survey.network_summary import network_dict, pair_network
 from survey.previous import Move, Previous, moves, read_previous

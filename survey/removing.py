@@ -18,13 +18,14 @@ from adjust.errors import IndeterminateError, SurveyError
 from adjust.model import Survey
 from adjust.result import Adjustment, ParameterName
 from adjust.supported import supported
+from survey.adjusting import adjust_project
 from survey.excluding import FILE, new_rows
 from survey.files import Project, read
 from survey.files.exclusions import Name, appended
 from survey.files.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.files.reading import read_all
 from survey.files.text import atomic_write
-from survey.jobs import AdjustOutcome, Clock, adjust_project, command_line, made
+from survey.jobs import AdjustOutcome, Clock, command_line, made
 from survey.merging import point_files, read_copy
 from survey.previous import Move, Previous, moves, read_previous
 from survey.replacing import complete, copy_folder, place_for, replace_parts

@@ -23,8 +23,8 @@ from adjust.pair_screen import PairOptions, adjusted_network, is_pure, network_s
 from adjust.pose_network.from_survey import network_from_survey
 from adjust.result import Adjustment, ParameterName
 from adjust.supported import lost_notes, supported
+from survey.adjusting import adjust_project, told
 from survey.files import Project
-from survey.jobs import adjust_project, told
 from survey.previous import Previous
 
 WARM, COLD = "from the previous solution", "from the beginning"

@@ -13,10 +13,10 @@ from adjust.model import Camera, FloatArray, Station, Survey, Target
 from adjust.observations import FrameRef, ImageBlock
 from adjust.result import Adjustment, Estimate, ParameterName
 from survey.adjusted_frames import AdjustedFrames
+from survey.adjusting import adjust_project
 from survey.files import Project
 from survey.interop.lens_maps import MappedLens, mapped_lens
 from survey.interop.rig import Rig, RigCamera
-from survey.jobs import adjust_project
 from survey.quantities import scale_of
 from survey.results import RESULTS
 from survey.targets import TargetKind

@@ -7,12 +7,13 @@ from typing import Any
 
 from adjust.errors import SurveyError
 from adjust.model import Survey
+from survey.adjusting import adjust_project
 from survey.detecting import DetectOutcome, detect_job
 from survey.excluding import ExcludeOutcome, exclude_job, include_job
 from survey.files import AdjustmentOptions, Project
 from survey.files import read as read_project
 from survey.files.text import suggestion
-from survey.jobs import adjust_project, run_info
+from survey.jobs import run_info
 from survey.notebook.html import heading, html_table
 from survey.notebook.solution import Solution
 

@@ -26,9 +26,9 @@ from adjust.design import (
 from adjust.design.selection import Component, Criterion
 from adjust.errors import SurveyError
 from adjust.result import Adjustment
+from survey.adjusting import adjust_project
 from survey.files import Project, atomic_write, read
 from survey.files.project import RESULTS
-from survey.jobs import adjust_project
 from survey.network_summary import network_dict, pair_network
 from survey.planning.building import Planned, build_plan
 from survey.planning.navigation import NavigationOutcome, plan_navigation

@@ -5,10 +5,10 @@ import json
 import numpy as np
 from scipy.stats import chi2
 
+from survey.adjusting import adjust_project
 from survey.cli import main
 from survey.examples.beacons import beacon_files
 from survey.files import read
-from survey.jobs import adjust_project
 
 BEACONS = [f"B{i + 1:02d}" for i in range(12)]
 

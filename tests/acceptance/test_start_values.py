@@ -9,8 +9,8 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.errors import NotConvergedError, SurveyError
+from survey.adjusting import adjust_project
 from survey.files import read
-from survey.jobs import adjust_project
 from survey.navigation import NavigateRequest, navigate_job
 from tests.data import data_folder
 

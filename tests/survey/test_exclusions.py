@@ -13,13 +13,14 @@ from gtsam import Pose3
 from adjust.adjustment import AdjustOptions
 from adjust.errors import SurveyError
 from adjust.solve import SolveOptions
+from survey.adjusting import adjust_project
 from survey.cli import main
 from survey.excluding import exclude_job, include_job
 from survey.files import read
 from survey.files.exclusions import Exclusion, Name
 from survey.files.observed import Observed
 from survey.files.reading import leaving_out, read_all
-from survey.jobs import adjust_job, adjust_project
+from survey.jobs import adjust_job
 from survey.navigation_task import NavigateRequest, observed_epoch
 from survey.previous import read_previous
 from survey.removing import remove_job

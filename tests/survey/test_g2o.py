@@ -6,11 +6,11 @@ import pytest
 
 from adjust.errors import SurveyError
 from adjust.pose_network import NetworkOptions, solve_network
+from survey.adjusting import adjust_project
 from survey.cli import main
 from survey.converting import convert_job
 from survey.files import read
 from survey.interop.g2o import read_g2o, read_g2o_file, write_g2o
-from survey.jobs import adjust_project
 from tests.adjust.pose_networks import simulate
 from tests.data import data_folder
 

@@ -12,6 +12,7 @@ import survey.aligning
 import survey.planning.job
 from adjust.model import PointParameter, Survey
 from adjust.result import Adjustment
+from survey.adjusting import adjust_project
 from survey.aligning import align_job
 from survey.batch.page import overview_html
 from survey.batch.record import FAILED, TEST_FAILED, Number, Record, Turn
@@ -20,7 +21,7 @@ from survey.cli import main
 from survey.examples import write_example
 from survey.examples.alignment import alignment_files
 from survey.files import AdjustmentOptions, Project, Sigmas, read
-from survey.jobs import adjust_project, run_info
+from survey.jobs import run_info
 from survey.notebook.html import heading, html_table
 from survey.planning.job import PlanRequest, planning_job
 from survey.planning.page import plan_page
