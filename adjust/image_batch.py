@@ -16,9 +16,12 @@ from adjust.image_segments import block_keys
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.images import (
     BlockArrays,
+    BlocksAt,
+    ByKeys,
     KeyArrays,
     PointArrays,
     all_statistics,
+    block_rows,
     errors,
     local_by_keys,
     normal_equations,
@@ -124,6 +127,16 @@ class ImageBatch:
         ptr, key = self.of_blocks.ptr.tolist(), self.of_blocks.key.tolist()
         return [key[a:b] for a, b in pairwise(ptr)]
 
+    def at(self, W: FloatArray) -> BlocksAt:
+        """All blocks where the chains were last evaluated, weighted by W (3, N)."""
+        s, c = self.state, self.chains
+        return BlocksAt(self.arrays, self.points, W, s.lenses, c.R, c.t, s.warp)
+
+    @property
+    def by_keys(self) -> ByKeys:
+        """How the local unknowns of all blocks follow from their keys there."""
+        return ByKeys(self.of_blocks.segments, self.chains.C, self.state.D, self.of_blocks.columns)
+
     def prepare(self, jacobians: bool) -> None:
         """Evaluate all blocks at the values that ``state`` was loaded from.
 
@@ -133,12 +146,10 @@ class ImageBatch:
         self._evaluate(self._all, jacobians)
 
     def _evaluate(self, runs: list[IntArray], jacobians: bool) -> None:
-        s, c = self.state, self.chains
-        given = (self.arrays, self.points, self.W, s.lenses, c.R, c.t, s.warp)
         if jacobians:
-            run_split(normal_equations, runs, *given, self.H, self.chi, self.depth)
+            run_split(normal_equations, runs, self.at(self.W), self.H, self.chi, self.depth)
         else:
-            run_split(errors, runs, *given, self.chi, self.depth)
+            run_split(errors, runs, self.at(self.W), self.chi, self.depth)
 
     def serve(self, which: IntArray | None = None) -> None:
         """Condense these blocks, or all, for their factors, as last prepared with Jacobians."""
@@ -147,8 +158,7 @@ class ImageBatch:
         if self._flat is None:
             self._make_room()
         runs = self._all if which is None else [which]
-        run_split(serve, runs, self.arrays, self.state.lenses, self.of_blocks.segments, self.chains.C,
-                  self.state.D, self.of_blocks.columns, self._at, self.H, self._flat, self.r)  # fmt: skip
+        run_split(serve, runs, self.at(self.W), self.by_keys, self._at, self.H, self._flat, self.r)
 
     def _make_room(self) -> None:
         """Where the rows of all factors are written, and views of them for GTSAM."""
@@ -203,11 +213,17 @@ class ImageBatch:
             if keys:
                 graph.add(gtsam.CustomFactor(noise[int(self.n_rows[b])], keys, _callback(self, b)))
 
+    def rows(self, b: int) -> FloatArray:
+        """Whitened rows (2 n, local unknowns and 1) of all points of block ``b``, used or not, the residual last."""
+        out = np.zeros((2 * int(self.ptr[b + 1] - self.ptr[b]), int(self.n_rows[b])))
+        block_rows(b, self.at(self.W_all_columns), out)
+        return out
+
     def local_from_keys(self, b: int) -> FloatArray:
         """Derivative (n_lens + 6 + n_warp, sum of key dims) of the block's local unknowns by its keys."""
         nl = int(self.state.lenses.n_free[self.camera[b]])
         G = np.zeros((int(self.n_rows[b]) - 1, int(self.of_blocks.columns[b])))
-        local_by_keys(b, nl, self.of_blocks.segments, self.chains.C, self.state.D, G)
+        local_by_keys(b, nl, self.by_keys, G)
         return G
 
     def statistics(self, tree: TreeCovariance | None) -> tuple[FloatArray, FloatArray]:
@@ -217,12 +233,11 @@ class ImageBatch:
         """
         residual, influence = np.zeros((self.n_points, 2)), np.zeros((self.n_points, 3))
         number = tree.number if tree is not None else {}
-        s, c, k = self.state, self.chains, self.of_blocks
+        k = self.of_blocks
         keys = np.array([number.get(key, -1) for key in k.key.tolist()], dtype=np.int64)
         lost = np.zeros(len(self.blocks), dtype=np.int64)
         run_split(
-            all_statistics, self._all, self.arrays, self.points, self.W_all_columns, s.lenses, c.R, c.t, s.warp,
-            k.segments, c.C, s.D, k.columns, KeyArrays(k.ptr, keys, k.place),
+            all_statistics, self._all, self.at(self.W_all_columns), self.by_keys, KeyArrays(k.ptr, keys, k.place),
             tree.arrays if tree is not None else TreeArrays.nothing(), residual, influence, lost,
         )  # fmt: skip
         if lost.any() and tree is not None:

@@ -108,9 +108,8 @@ class PoseReduction:
         rest, diagonal = np.zeros((count, n + 1, n + 1)), np.zeros((count, n))
         bad = np.full(count, -1, dtype=np.int64)
         run_split(
-            reduce_poses, self._turns, self.arrays, batch.arrays, batch.state.lenses, batch.of_blocks.segments,
-            batch.of_blocks.columns, batch.chains.C, batch.state.D, damping, batch.H, self.L, self.T, diagonal, rest,
-            bad,
+            reduce_poses, self._turns, self.arrays, batch.at(batch.W), batch.by_keys, damping, batch.H, self.L, self.T,
+            diagonal, rest, bad,
         )  # fmt: skip
         return bool((bad < 0).all()) and self._serve(rest.sum(axis=0), diagonal.sum(axis=0))
 

@@ -18,7 +18,6 @@ from adjust.datum import gauge
 from adjust.errors import SurveyError
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues, values_of
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
-from adjust.native.images import block_rows
 from adjust.native.lenses import MAX_LENS
 from adjust.precision import Precision, noise_of
 from adjust.result import Adjustment, ParameterName
@@ -418,12 +417,10 @@ def _image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns, values:
 
 def _known_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows:
     images, entries = graph.images, Entries()
-    s, c = images.state, images.chains
     e = np.zeros(2 * images.n_points)
     for b, keys in enumerate(images.keys):
         rows = np.arange(2 * int(images.ptr[b]), 2 * int(images.ptr[b + 1]))
-        local = np.zeros((len(rows), int(images.n_rows[b])))
-        block_rows(b, images.arrays, images.points, images.W_all_columns, s.lenses, c.R, c.t, s.warp, local)
+        local = images.rows(b)
         e[rows] = local[:, -1]
         if keys:
             columns = np.concatenate([key_columns[k] for k in keys])
