@@ -27,11 +27,10 @@ from adjust.native.images import (
     normal_equations,
     serve,
 )
-from adjust.native.trees import TreeArrays
+from adjust.native.trees import KeyCovariances, TreeArrays
 from adjust.observations import ImageBlock
 from adjust.parallel import run_split, split_blocks
 from adjust.state import State
-from adjust.tree_covariance import TreeCovariance
 from adjust.unknowns import Chain
 
 
@@ -226,7 +225,7 @@ class ImageBatch:
         local_by_keys(b, nl, self.by_keys, G)
         return G
 
-    def statistics(self, tree: TreeCovariance | None) -> tuple[FloatArray, FloatArray]:
+    def statistics(self, tree: KeyCovariances | None) -> tuple[FloatArray, FloatArray]:
         """Residuals (N, 2) px and whitened A Q A' (N, 3) of all points, where the chains were last evaluated.
 
         tree: covariances of the unknowns; without it, A Q A' is zero.

@@ -20,13 +20,25 @@ from adjust.image_segments import first_seen, ranges
 from adjust.model import FloatArray, IntArray
 from adjust.native.reduction import WEAKEST_PIVOT, ReductionArrays, leaf_rows, pose_steps, reduce_poses
 from adjust.parallel import run_split, split_blocks
-from adjust.tree_covariance import Leaves
 from adjust.unknowns import Unknowns
 
 _FEWEST_POSES = 8
 _WIDEST_INTERFACE = 700
 """Components that the epochs may share: their normal matrix is dense here."""
 _AT_EPOCHS = ("world_from_station", "carrier_from_target")
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """Cliques of one frontal key each, eliminated before a tree: those of S, the others, lie in one of its cliques.
+
+    width: columns of the blocks [R S], one after the other and row by row in ``data``.
+    """
+
+    keys: list[list[int]]
+    front: IntArray
+    width: IntArray
+    data: FloatArray
 
 
 @dataclass(frozen=True)

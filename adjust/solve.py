@@ -15,8 +15,8 @@ from adjust.divergence import describe_divergence
 from adjust.elimination import Elimination
 from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.graph import AdjustmentGraph, Evaluation
+from adjust.image_reduction import Leaves
 from adjust.rank import describe_null_space, unobserved_unknowns
-from adjust.tree_covariance import Leaves
 
 _SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
 """Sigmas that depend on distances (target centring) follow the solution until they change by no more than this."""

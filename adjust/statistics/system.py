@@ -21,6 +21,7 @@ from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.lenses import MAX_LENS
 from adjust.precision import Precision, noise_of
 from adjust.result import Adjustment, ParameterName
+from adjust.s_transformation import without_datum_rows
 from adjust.solve import settled
 
 DENSE = 3000
@@ -227,8 +228,7 @@ class Normal:
         """Covariance (n, n) of the unknowns: the inverse less what the datum's own rows add (S-transformation)."""
         if self.motions.shape[1] == 0:
             return self.inverse
-        seen = datum @ self.motions
-        return np.asarray(self.inverse - self.motions @ np.linalg.inv(seen.T @ seen) @ self.motions.T)
+        return without_datum_rows(self.inverse, self.motions, datum @ self.motions)
 
 
 @dataclass(frozen=True, eq=False)
