@@ -7,8 +7,9 @@ from functools import cached_property
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.closed_forms.rigid import skew
 from adjust.model import FloatArray, IntArray
-from adjust.motions import point_motions, skew
+from adjust.motions import point_motions
 from adjust.named_precision import NamedPrecision, rotations_only
 from adjust.precision import Precision
 from adjust.result import Adjustment, ParameterName

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.closed_forms.rigid import skew
 from adjust.image_batch import Chains
 from adjust.model import FloatArray, PoseParameter, VectorPrior
 from adjust.observations import Coordinates, Distance, Pair
@@ -97,8 +98,7 @@ class Position:
         x = self.x_in_frame
         if self.warp is not None:
             x = x + np.array([0.0, 0.0, np.asarray(self.sag) @ self.warp.full(values)])
-        cross = np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
-        by_pose = np.hstack([-R @ cross, R])
+        by_pose = np.hstack([-R @ skew(x), R])
         out = [(key, by_pose @ J) for key, J in jacobians]
         if self.warp is not None and self.warp.key is not None:
             out.append((self.warp.key, np.outer(R[:, 2], np.asarray(self.sag) @ self.warp.matrix)))

@@ -5,13 +5,9 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
+from adjust.closed_forms.rigid import skew
 from adjust.model import BoolArray, FloatArray
 from adjust.unknowns import Unknown
-
-
-def skew(x: FloatArray) -> FloatArray:
-    """The matrix (3, 3) that multiplies a vector from the left to give ``x`` cross it."""
-    return np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
 
 
 def point_motions(x: FloatArray) -> FloatArray:

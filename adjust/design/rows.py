@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.closed_forms.rigid import skew
 from adjust.design.prediction import Predictor
 from adjust.factors import ChainPose
 from adjust.graph import StartValues
@@ -114,7 +115,7 @@ def _image(p: Predictor, number: int, block: ImageBlock, by_key: dict[int, slice
     if vector.key is not None:
         add(vector.key, by_lens @ vector.matrix)
     by_x = by_q @ R
-    by_pose = np.concatenate([by_x @ -_cross(x), by_x], axis=2)
+    by_pose = np.concatenate([by_x @ -skew(x), by_x], axis=2)
     for key, J in jacobians:
         add(key, by_pose @ J)
     for key, J, row in _own_points(p, block, idx, by_x):
@@ -154,9 +155,3 @@ def _whitening(cov: FloatArray) -> FloatArray:
     W = np.zeros((len(cov), 2, 2))
     W[:, 0, 0], W[:, 0, 1], W[:, 1, 1] = w.T
     return W
-
-
-def _cross(x: FloatArray) -> FloatArray:
-    out = np.zeros((len(x), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -x[:, 2], x[:, 1], -x[:, 0]
-    return out - out.transpose(0, 2, 1)

@@ -3,9 +3,10 @@
 import gtsam
 import numpy as np
 
+from adjust.closed_forms.rigid import skew
 from adjust.directions import tilted
 from adjust.model import FloatArray, Surface, Survey, tilt_axes
-from adjust.motions import point_motions, skew
+from adjust.motions import point_motions
 from adjust.unknowns import Unknown, Unknowns
 
 MOVED = ("vertical", "beam", "surface")

@@ -9,10 +9,10 @@ import gtsam
 import numpy as np
 from gtsam import Pose3
 
+from adjust.closed_forms.rigid import skew
 from adjust.directions import tilted_frame
 from adjust.factors import ChainPose, Jacobians, Position, Residual
 from adjust.model import BoolArray, FloatArray, Surface, tilt_axes
-from adjust.motions import skew
 from adjust.observations import Alignment, CoordinateDifferences, LaserSpot, Level, OnSurface
 from adjust.unknowns import VectorMap
 from adjust.vertical import VerticalMap, up_at

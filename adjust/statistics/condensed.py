@@ -13,6 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from adjust.bundle_batch import BundleBatch
+from adjust.closed_forms.rigid import skew
 from adjust.graph import AdjustmentGraph
 from adjust.image_batch import warp_shape
 from adjust.model import FloatArray, IntArray
@@ -167,10 +168,7 @@ def _of_cameras(R: FloatArray, t: FloatArray) -> FloatArray:
     out = np.zeros((len(R), 6, 6))
     turned = R.transpose(0, 2, 1)
     out[:, :3, :3] = out[:, 3:, 3:] = turned
-    cross = np.zeros((len(R), 3, 3))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        cross[:, i, j], cross[:, j, i] = -t[:, k], t[:, k]
-    out[:, 3:, :3] = -turned @ cross
+    out[:, 3:, :3] = -turned @ skew(t)
     return out
 
 

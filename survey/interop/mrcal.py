@@ -15,10 +15,10 @@ import numpy as np
 from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
+from adjust.closed_forms.rigid import skew
 from adjust.errors import SurveyError
 from adjust.lens import MODELS
 from adjust.model import FloatArray, LensParameter
-from adjust.motions import skew
 from survey.files.text import decode, read_bytes
 from survey.interop.camera_values import CameraValues, rig_values
 from survey.interop.foreign import ForeignNetwork, Where
