@@ -19,7 +19,7 @@ from adjust.errors import SurveyError
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues, values_of
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.lenses import MAX_LENS
-from adjust.precision import Precision, noise_of
+from adjust.precision import Precision
 from adjust.result import Adjustment, ParameterName
 from adjust.s_transformation import without_datum_rows
 from adjust.solve import settled
@@ -468,13 +468,12 @@ def _other_rows(
 ) -> tuple[sparse.csr_matrix, FloatArray, IntArray]:
     entries, residuals, lengths, at = Entries(), [np.zeros(0)], [], 0
     for item in precision.graph.others:
-        linear = item.factor.linearize(precision.solved.values)
-        A, b = linear.jacobian()
-        columns = np.concatenate([key_columns[k] for k in list(linear.keys())])
-        entries.add(np.arange(at, at + len(b)), columns, A)
-        residuals.append(-b)
-        lengths.append(len(b))
-        at += len(b)
+        rows = precision.rows(item)
+        n_rows = len(rows.e)
+        entries.add(np.arange(at, at + n_rows), np.concatenate([key_columns[k] for k in rows.keys]), rows.A)
+        residuals.append(rows.e)
+        lengths.append(n_rows)
+        at += n_rows
     return entries.matrix((at, n)), np.concatenate(residuals), np.array(lengths, dtype=np.int64)
 
 
@@ -500,8 +499,3 @@ def _datum(precision: Precision, n: int, key_columns: KeyColumns) -> tuple[spars
         moved = gauge(precision.graph, precision.graph.unknowns.by_key[key], precision.solved.values) @ datum.directions
         motions[columns[columns >= 0]] = moved[columns >= 0]
     return entries.matrix((datum.defect, n)), motions
-
-
-def root_of(precision: Precision, row: int) -> FloatArray:
-    """Inverse (k, k) of the square root information of the ``row``-th of the graph's other observations."""
-    return np.asarray(np.linalg.inv(noise_of(precision.graph.others[row]).R()))
