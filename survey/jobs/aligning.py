@@ -11,7 +11,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import decode, read_bytes
-from survey.jobs.adjusting.job import adjust_project
+from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.working_sheet import ARCSEC, Sheet, working_sheets
 from survey.project import atomic_write, read
 from survey.project.project import RESULTS

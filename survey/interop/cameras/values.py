@@ -14,7 +14,7 @@ from adjust.model.survey import Camera, FloatArray, Station, Survey, Target
 from adjust.observations.images.batch import warp_shape
 from survey.interop.cameras.lens_maps import MappedLens, mapped_lens
 from survey.interop.cameras.rig import Rig, RigCamera
-from survey.jobs.adjusting.job import adjust_project
+from survey.jobs.adjusting.steps import adjust_project
 from survey.project import Project
 from survey.project.targets import TargetKind
 from survey.report.results import RESULTS
