@@ -11,7 +11,8 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.pose_networks import NamedPrecision, rotations_only
 from adjust.precision.precision import Precision
-from adjust.spatial.motions import point_motions, skew
+from adjust.spatial.motions import point_motions
+from adjust.spatial.rigid import skew
 
 MOTIONS = ("tx", "ty", "tz", "rx", "ry", "rz", "scale")
 _POINT = np.array([3, 4, 5])

@@ -1,7 +1,7 @@
 """From a survey and its start values to one GTSAM factor graph."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -13,7 +13,7 @@ from adjust.frames.state import State, collect_vectors
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef
-from adjust.model.result import ParameterName
+from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, Survey, VectorPrior
 from adjust.observations.factors import (
     ChainPose,
@@ -49,14 +49,40 @@ class StartValues:
     vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
 
 
-@dataclass(eq=False)
+def values_of(adjustment: Adjustment) -> StartValues:
+    """Adjusted values as start values."""
+    estimates = adjustment.estimates
+    poses = {n: e.value for n, e in estimates.items() if isinstance(e.value, Pose3)}
+    arrays = {n: np.asarray(e.value) for n, e in estimates.items() if not isinstance(e.value, Pose3)}
+    return StartValues(
+        {n[1]: v for n, v in arrays.items() if n[0] == "lens"},
+        poses,
+        {n[1]: v for n, v in arrays.items() if n[0] == "point"},
+        {n: v for n, v in arrays.items() if n[0] not in ("lens", "point")},
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A graph evaluated at ``values``, with ``damping`` of what is reduced there.
+
+    reduction: of the poses that only image points touch; None where nothing is reduced. number: as long as it is that
+    of the graph's state, what the batches have computed is this evaluation.
+    """
+
+    values: gtsam.Values
+    damping: float
+    reduction: PoseReduction | None
+    number: int
+
+
+@dataclass(frozen=True, eq=False)
 class AdjustmentGraph:
     """The graph, its start and the batches that serve it. Held together with the survey only by the solver.
 
     ``graph`` has every observation as a factor on its unknowns and nothing else; ``system`` is a view of it for the
     solver, in which points and poses that nothing else touches are reduced.
-    reduction: of the poses that only image points touch, while ``system`` is without them; None where nothing is
-    reduced, or no longer.
+    reduction: of the poses that only image points touch; None where it would not pay.
     """
 
     survey: Survey
@@ -98,11 +124,15 @@ class AdjustmentGraph:
 
     @property
     def system(self) -> gtsam.NonlinearFactorGraph:
-        """What the solver linearises, after :meth:`prepare` at the same values: a view of ``graph``.
+        """What the solver linearises, as long as :attr:`reduction` finds inverses: a view of ``graph``.
 
         Of the same chi-square, with what :attr:`reduction` and :attr:`bundle` reduce eliminated already.
         """
-        return self._unreduced if self.reduction is None else self._reduced
+        return self.view(self.reduction)
+
+    def view(self, reduction: PoseReduction | None) -> gtsam.NonlinearFactorGraph:
+        """``system``, or where ``reduction`` is None what it is with all poses in sight."""
+        return self._unreduced if reduction is None else self._reduced
 
     def _factors(self, reduction: PoseReduction | None) -> gtsam.NonlinearFactorGraph:
         """All factors but those of a bundle, and of the image blocks that ``reduction`` takes."""
@@ -112,29 +142,51 @@ class AdjustmentGraph:
             self.terrestrial.add_factors(graph)
         return graph
 
-    def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
-        """Evaluate all batches at ``values``. Where the reduction finds no inverse, it is given up: all is shown."""
+    def prepare(
+        self, values: gtsam.Values, jacobians: bool, damping: float = 0.0, reduced: bool = True
+    ) -> Evaluation:  # fmt: skip
+        """Evaluate all batches at ``values``, which nobody may change while the evaluation is used.
+
+        reduced: with :attr:`reduction`; where that finds no inverse, all is in sight.
+        """
         self.state.load(values)
-        self.images.prepare(values, jacobians)
+        self.images.prepare(jacobians)
+        reduction = self._reduced_here(damping) if reduced and jacobians else None
         if jacobians:
-            if self.reduction is not None and not self.reduction.reduce(damping):
-                self.reduction = None
-            self.images.serve(None if self.reduction is None else self.reduction.others)
+            self.images.serve(None if reduction is None else reduction.others)
         if self.terrestrial is not None:
             self.terrestrial.prepare(values, jacobians)
         if self.bundle is not None:
             self.bundle.prepare(values, jacobians, damping)
+        return Evaluation(values, damping, reduction, self.state.evaluation)
 
-    def objective(self, values: gtsam.Values) -> float:
-        """Weighted square sum v'Pv at ``values``, at which everything is prepared."""
+    def _reduced_here(self, damping: float) -> PoseReduction | None:
+        return self.reduction if self.reduction is not None and self.reduction.reduce(damping) else None
+
+    def linearized(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
+        """The solver's system, linearised with what was evaluated, once more where something else was in between."""
+        if at.number != self.state.evaluation:
+            at = self.prepare(at.values, True, at.damping, at.reduction is not None)
+        with self.state.serving():
+            return self.view(at.reduction).linearize(at.values)
+
+    def objective(self, at: Evaluation) -> float:
+        """Weighted square sum v'Pv of the last evaluation."""
         images = float(self.images.chi.sum()) + (self.bundle.chi_square if self.bundle is not None else 0.0)
         readings = self.terrestrial.chi_square if self.terrestrial is not None else 0.0
-        return images + readings + 2.0 * float(self.others_graph.error(values))
+        with self.state.serving():
+            return images + readings + 2.0 * float(self.others_graph.error(at.values))
 
     def omega(self, values: gtsam.Values) -> float:
         """Weighted square sum v'Pv at ``values``."""
-        self.prepare(values, jacobians=False)
-        return self.objective(values)
+        return self.objective(self.prepare(values, jacobians=False))
+
+    def with_sigmas_at(self, values: gtsam.Values) -> tuple["AdjustmentGraph", float]:
+        """The graph with sigmas of readings that follow the distances at ``values``; their largest relative change."""
+        if self.terrestrial is None:
+            return self, 0.0
+        readings, change = self.terrestrial.with_sigmas_at(values)
+        return (self if readings is self.terrestrial else replace(self, terrestrial=readings)), change
 
     def _split(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rows (N, ...) in the order of ``Survey.image_blocks``, for the image batch and for the bundle."""
@@ -219,7 +271,7 @@ class GraphBuilder:
         if readings is not None:
             turned = {s: u.key for s, n in self.terrestrial.repeated.items() if (u := self.unknowns.by_name.get(n))}
             readings.orient(values, {name[1] for name in start.vectors if name[0] == "orientation"}, turned)
-            readings.update_sigmas(values)
+            readings, _ = readings.with_sigmas_at(values)
         survey = geometry.find_starts(state, at, values, start.vectors)
         self._other_factors(state, at, pair_chains)
         self.others += geometry.factors(state, at, values)

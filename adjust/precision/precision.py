@@ -5,6 +5,7 @@ Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, ch
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -34,17 +35,29 @@ _AT_A_TIME = 8192
 """Image points tested together: what is computed on the way stays in the second cache."""
 
 
+@dataclass(frozen=True, eq=False)
+class ObservationRows:
+    """An observation over its keys: A (k, n) and its residual e (k,), both whitened, A Q A' (k, k).
+
+    W: square root information (k, k), of which root is the inverse.
+    """
+
+    keys: list[int]
+    A: FloatArray
+    e: FloatArray
+    influence: FloatArray
+    W: FloatArray
+    root: FloatArray
+
+
 class Precision:
     """Covariances of the adjusted unknowns, a priori (sigma0 = 1), in the survey's datum."""
 
     def __init__(self, graph: AdjustmentGraph, solved: Solved) -> None:
         self.graph, self.solved = graph, solved
+        self._rows: dict[ObservationFactor, ObservationRows] = {}
         dims = {key: unknown.dim for key, unknown in graph.unknowns.by_key.items()}
-        if solved.use_qr:
-            tree = solved.linear.eliminateMultifrontal(solved.ordering, gtsam.EliminateQR)
-        else:
-            tree = solved.linear.eliminateMultifrontal(solved.ordering)
-        self.tree = TreeCovariance(tree, dims, solved.leaves)
+        self.tree = TreeCovariance(solved.elimination.tree(solved.linear), dims, solved.leaves)
         self.hidden: dict[int, FloatArray] = {}
         self.bundle_influence = np.zeros((0, 3))
         self._hidden = None if graph.bundle is None else BundleHidden(graph.bundle)
@@ -130,12 +143,21 @@ class Precision:
             L[place.index(seen), at.index(seen)] = 1.0
         return self._in_datum(keys, L @ Q @ L.T + scatter)
 
+    def rows(self, item: ObservationFactor) -> ObservationRows:
+        """An observation that is neither image point nor reading, linearised at the solution: built once, and kept."""
+        found = self._rows.get(item)
+        if found is None:
+            linear = item.factor.linearize(self.solved.values)
+            (A, b), keys = linear.jacobian(), list(linear.keys())
+            M = A @ self._in_datum(keys, self.tree.joint(keys)) @ A.T
+            W = np.asarray(noise_of(item).R())
+            found = self._rows[item] = ObservationRows(keys, A, -b, M, W, np.asarray(np.linalg.inv(W)))
+        return found
+
     def influence(self, item: ObservationFactor) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Whitened residual (k,), whitened A Q A' (k, k), and the square root information's inverse (k, k)."""
-        linear = item.factor.linearize(self.solved.values)
-        A, b = linear.jacobian()
-        Q = self._in_datum(list(linear.keys()), self.tree.joint(list(linear.keys())))
-        return -b, A @ Q @ A.T, np.asarray(np.linalg.inv(noise_of(item).R()))
+        rows = self.rows(item)
+        return rows.e, rows.influence, rows.root
 
 
 def noise_of(item: ObservationFactor) -> gtsam.noiseModel.Gaussian:

@@ -7,13 +7,13 @@ import numpy as np
 
 from adjust.adjustment import adjust
 from adjust.distributions import chi2
-from adjust.graph.assembly import StartValues
+from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 from adjust.statistics.criteria import sidak
 from adjust.statistics.outlier_search import OutlierSearch, SearchOptions, search_outliers
-from adjust.statistics.pair_screen import PairOptions, adjust_with_pairs, is_pure, values_of
+from adjust.statistics.pair_screen import PairOptions, adjust_with_pairs, is_pure
 from adjust.statistics.result import Component, VarianceComponents
 from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.variance_components import ComponentOptions, Scaled, estimate_variance_components

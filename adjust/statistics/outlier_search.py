@@ -13,14 +13,13 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.distributions import chi2
-from adjust.graph.assembly import StartValues
+from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import IndeterminateError, NotConvergedError
 from adjust.model.result import Adjustment
 from adjust.model.survey import BoolArray, IntArray, Survey
 from adjust.statistics.candidates import Candidates, candidates, without
 from adjust.statistics.criteria import criteria, sidak
 from adjust.statistics.exchange import better_set, equal_sets
-from adjust.statistics.pair_screen import values_of
 from adjust.statistics.reliability import observation_name
 from adjust.statistics.result import Alternative, Decision, LevelOptions
 from adjust.statistics.snooping import Snooping, robust_squares

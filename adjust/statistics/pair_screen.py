@@ -12,13 +12,11 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from gtsam import Pose3
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.distributions import chi2
-from adjust.graph.assembly import StartValues
+from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import IndeterminateError, NotConvergedError
-from adjust.model.kinds import is_pose_network
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.statistics.criteria import (
@@ -73,7 +71,7 @@ def adjust_with_pairs(
 
 def is_pure(survey: Survey) -> bool:
     """Whether a survey is a network of pairs between fixed stations, and nothing else."""
-    return is_pose_network(survey) and not (survey.points or survey.targets or survey.tables)
+    return survey.is_pose_network and not (survey.points or survey.targets or survey.tables)
 
 
 def network_solution(
@@ -253,18 +251,3 @@ def _said(o: ObservationResidual) -> str:
     shift = f" and {np.linalg.norm(o.residual[3:]):.4g} m" if len(o.residual) == 6 else ""
     p = chi2.sf(o.test, len(o.components))
     return f"left out: pair {o.ids[0]}: off by {turn:.4g} deg{shift}, test {o.test:.1f}, p {p:.2g}"
-
-
-def values_of(adjustment: Adjustment) -> StartValues:
-    """Adjusted values as start values."""
-    estimates = adjustment.estimates
-    poses = {n: e.value for n, e in estimates.items() if isinstance(e.value, Pose3)}
-    arrays = {n: np.asarray(e.value) for n, e in estimates.items() if not isinstance(e.value, Pose3)}
-    return StartValues(
-        {n[1]: v for n, v in arrays.items() if n[0] == "lens"},
-        poses,
-        {n[1]: v for n, v in arrays.items() if n[0] == "point"},
-        {n: v for n, v in arrays.items() if n[0] not in ("lens", "point")},
-    )
-
-

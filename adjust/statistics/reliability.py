@@ -9,7 +9,7 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.terrestrial.statistics import influences as influences_of_readings
 from adjust.precision.pose_networks import NamedPrecision
-from adjust.precision.precision import Precision, noise_of
+from adjust.precision.precision import Precision
 from adjust.statistics.condensed import CondensedSystem, condensed_system
 from adjust.statistics.criteria import criteria
 from adjust.statistics.influence import influences
@@ -149,8 +149,8 @@ def _others(precision: Precision) -> list[_Batch]:
     n_image = sum(len(b.uv) for b in precision.graph.survey.image_blocks)
     found: dict[int, list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]]] = {}
     for i, item in enumerate(precision.graph.others):
-        e, M, back = precision.influence(item)
-        found.setdefault(len(e), []).append((n_image + i, e, M, np.asarray(noise_of(item).R()), back))
+        x = precision.rows(item)
+        found.setdefault(len(x.e), []).append((n_image + i, x.e, x.influence, x.W, x.root))
     out = []
     for same in found.values():
         rows, e, M, W, back = (np.array([x[i] for x in same]) for i in range(5))

@@ -49,18 +49,18 @@ def screen(graph: AdjustmentGraph, solved: Solved, options: SolveOptions) -> Scr
     precision = Precision(graph, solved)
     test = image_residuals(precision).test
     if not cautious(test[used], np.full(int(used.sum()), 2)) and _suspects(test, used).any():
-        graph.start = _reweighted(graph, solved, used, options)
+        start = _reweighted(graph, solved, used, options)
         for _ in range(_ROUNDS):
-            solved = solve(graph, options)
+            solved = solve(graph, options, start=start)
             precision = Precision(graph, solved)
             now = given & ~_suspects(image_residuals(precision).test, given)
             if (now == used).all():
                 break
             used = now
             graph.set_weights(used.astype(np.float64))
-            graph.start = solved.values
+            start = solved.values
         else:  # still changing its mind: what is returned is the least squares of what it says is used
-            solved = solve(graph, options)
+            solved = solve(graph, options, start=start)
             precision = Precision(graph, solved)
     return Screened(solved, precision, used)
 
@@ -77,8 +77,8 @@ def _reweighted(graph: AdjustmentGraph, solved: Solved, used: BoolArray, options
     for _ in range(15):
         factor = scale(e[used])
         graph.set_weights(used / (1.0 + e / (_CAUCHY * factor)))
-        graph.start = values
-        values = solve(graph, SolveOptions(max_step=1e-2, max_iterations=options.max_iterations)).values
+        roughly = SolveOptions(max_step=1e-2, max_iterations=options.max_iterations)
+        values = solve(graph, roughly, start=values).values
         before, e = e, graph.whitened_squares(values)
         if np.abs(np.sqrt(e[used]) - np.sqrt(before[used])).max() < 0.05 * np.sqrt(factor):
             break

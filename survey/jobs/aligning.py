@@ -14,7 +14,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import decode, read_bytes
-from survey.jobs.adjusting.job import adjust_project
+from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.working_sheet import ARCSEC, STATES, Sheet, angle_text, sheet_text, steps, working_sheets
 from survey.project import atomic_write, read
 from survey.project.project import RESULTS

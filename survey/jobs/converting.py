@@ -34,7 +34,7 @@ from survey.interop.networks.lgc import read_lgc
 from survey.interop.networks.plain_csv import correlated, plain_csv, read_plain_csv
 from survey.interop.networks.sinex import sinex_text
 from survey.interop.networks.values import NetworkValues, left_out, require_network
-from survey.jobs.adjusting.job import adjust_project
+from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.converting_g2o import AS_IN_THE_FILE, project_to_g2o, survey_from_g2o
 from survey.project import AdjustmentOptions, Project, atomic_write, read, write_project
 from survey.project.project import DEFINITION_FILE, RESULTS

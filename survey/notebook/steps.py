@@ -7,7 +7,8 @@ from typing import Any
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey
 from survey.folder.text import suggestion
-from survey.jobs.adjusting.job import adjust_project, run_info
+from survey.jobs.adjusting.job import run_info
+from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.detecting import DetectOutcome, detect_job
 from survey.jobs.excluding import ExcludeOutcome, exclude_job, include_job
 from survey.notebook.html import heading, html_table

@@ -186,7 +186,7 @@ def test_inner_datum_over_points_that_only_images_see() -> None:
 def test_minimal_datum_is_as_large_as_the_defect() -> None:
     survey, truth = free_network(("direction", "zenith", "slope_distance"))
     graph = GraphBuilder(survey, {}).build(start_near(survey, truth, 1))
-    datum = inner_datum(graph, graph.start)
+    datum = inner_datum(graph, graph.prepare(graph.start, jacobians=True))
     assert datum is not None
     assert sum(len(components) for components, _ in datum.minimal.values()) == datum.defect == 4
     assert len(datum.rows) == 8

@@ -1,6 +1,5 @@
-"""An adjustment whose failure, or whose contradictions, are explained where the images can tell."""
+"""Why an adjustment failed, or what contradicts in it, where the images can tell. Nothing is repaired."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
@@ -9,20 +8,18 @@ from adjust.model.survey import Survey
 from survey.project.epoch_names import separate_epochs
 
 
-def checked(survey: Survey, run: Callable[[], Adjustment]) -> Adjustment:
-    """``run()`` with the probable causes of what went wrong as its first warnings. Nothing is repaired.
+def explained(survey: Survey, error: SurveyError) -> SurveyError:
+    """What an adjustment of ``survey`` raised, with the probable causes in front where there are any."""
+    apart, contradictions = separate_epochs(survey), _probable_causes(survey)
+    if not apart and not contradictions:
+        return error
+    lines = "\n  - ".join(["probable cause:", *apart, *contradictions])
+    said = _consequence(error) if contradictions else f"without that: {error}"
+    return SurveyError(f"{lines}\n{said}")
 
-    Raises what ``run`` raises, with the probable causes in front where there are any.
-    """
-    try:
-        result = run()
-    except SurveyError as error:
-        apart, contradictions = separate_epochs(survey), _probable_causes(survey)
-        if not apart and not contradictions:
-            raise
-        lines = "\n  - ".join(["probable cause:", *apart, *contradictions])
-        said = _consequence(error) if contradictions else f"without that: {error}"
-        raise SurveyError(f"{lines}\n{said}") from error
+
+def with_probable_causes(survey: Survey, result: Adjustment) -> Adjustment:
+    """The adjustment of ``survey`` with the probable causes of what contradicts as its first warnings."""
     warnings: tuple[str, ...] = ()
     if survey.tables:
         from adjust.diagnosis.table import sign_warnings  # here: a survey without a table starts without it
