@@ -15,7 +15,7 @@ from survey.detection.bent_edges import unbent
 from survey.detection.corners import CornerFit, refine_corners
 from survey.detection.gray import Gray8, Gray32, reduced
 from survey.detection.results import Detection, nothing_found
-from survey.dictionaries import charuco_board, marker_dictionary
+from survey.project.dictionaries import charuco_board, marker_dictionary
 from survey.project.targets import Charuco, MarkerBlock, MarkerGrid
 
 _COARSE_PX = 1300  # longer side of the image in which markers are looked for first; the full one where some are missing

@@ -11,14 +11,6 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import Datum, FloatArray, Point, PointParameter, Survey
 from survey.folder.locking import settled
 from survey.folder.text import id_problem, natural_key, suggestion
-from survey.project.coordinates import (
-    COORDINATES,
-    COORDINATES_COVARIANCE,
-    DIFFERENCES,
-    DIFFERENCES_COVARIANCE,
-    read_coordinates,
-    read_differences,
-)
 from survey.project.declared.declarations import keys_of
 from survey.project.declared.instruments import (
     read_beams,
@@ -48,6 +40,14 @@ from survey.project.project import (
     Project,
     Sigmas,
     SpotsRequest,
+)
+from survey.project.tables.coordinates import (
+    COORDINATES,
+    COORDINATES_COVARIANCE,
+    DIFFERENCES,
+    DIFFERENCES_COVARIANCE,
+    read_coordinates,
+    read_differences,
 )
 from survey.project.tables.files import read_table
 from survey.project.tables.geometric import (

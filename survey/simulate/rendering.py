@@ -23,7 +23,7 @@ from scipy.special import erf
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from adjust.native.vision import Facets, draw_facets, pixel_corner_rays, spread_and_sum
-from survey.dictionaries import charuco_board, marker_cells
+from survey.project.dictionaries import charuco_board, marker_cells
 from survey.project.targets import Charuco, Checkerboard, DetectableTarget, MarkerBlock, MarkerGrid
 
 GrayImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]

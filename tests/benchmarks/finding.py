@@ -12,7 +12,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from survey.detection import detect_image
-from survey.dictionaries import charuco_board
+from survey.project.dictionaries import charuco_board
 from survey.project.targets import Charuco, Checkerboard
 from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 from tests.benchmarks.cases import Arrays

@@ -72,7 +72,7 @@ def _checkerboard(node: Node) -> TargetKind:
 
 
 def _dictionary(node: Node) -> str:
-    from survey.dictionaries import dictionary_names  # brings in OpenCV, which few projects need here
+    from survey.project.dictionaries import dictionary_names  # brings in OpenCV, which few projects need here
 
     name, known = node.text("dictionary"), dictionary_names()
     if name.upper().removeprefix("DICT_") not in known:

@@ -8,9 +8,9 @@ from gtsam import Pose3
 from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair, TableReading
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.units import from_si
-from survey.project.coordinates import XYZ_RHO, XYZ_SIGMAS
 from survey.project.declared.poses import quaternion_wxyz
 from survey.project.project import SpotBlock
+from survey.project.tables.coordinates import XYZ_RHO, XYZ_SIGMAS
 from survey.project.tables.covariance import sigmas_and_correlations
 from survey.project.tables.pairs import COVARIANCE_COLUMNS, QUATERNION, SIGMA_COLUMNS, TRANSLATION
 from survey.project.tables.reading import Columns, TextColumn
