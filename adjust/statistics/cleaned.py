@@ -155,7 +155,7 @@ def _searched(
 def _fails(now: Adjustment) -> bool:
     tests = [(o.test, len(o.components)) for o in now.other_residuals if o.used and float(o.redundancy.max()) > 1e-6]
     n = len(tests) + int(now.image_residuals.used.sum())
-    level = sidak(SearchOptions().levels.family_alpha, n)
+    level = sidak(SearchOptions().family_alpha, n)
     limits = {k: float(chi2.isf(level, k)) for k in {k for _, k in tests}}
     return any(np.isfinite(t) and t > limits[k] for t, k in tests)
 
