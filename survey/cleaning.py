@@ -9,4 +9,4 @@ from survey.files import AdjustmentOptions
 def clean_options(options: AdjustmentOptions) -> CleanOptions:
     """What ``survey.toml`` says under [adjustment]."""
     how = AdjustOptions(options.alpha, options.reject_blocks, options.reject_points)
-    return CleanOptions(PairOptions(options.reject_pairs, how), options.reject_pairs, options.variance_components)
+    return CleanOptions(PairOptions(options.reject_pairs, how), options.variance_components)

@@ -138,11 +138,12 @@ def best_back_first(state: State[S], returned: BoolArray) -> tuple[BoolArray, Bo
 
 @dataclass(eq=False)
 class Search(Generic[S]):
-    """solve: the solution with the observations (M,) in use and its tests, from the state before where there is one;
-    None where there is no such solution.
+    """How one kind of observations is searched.
 
-    family_alpha: error probability of all tests together; n_tests: how many these are, counted where not given. many:
-    tests from which the typical one widens the limits. factor: (G,) that these are wider by anyhow. said: told of every step before it is made.
+    solve: the solution with the observations (M,) in use and its tests, from the state before where there is one; None
+    where there is no such solution. family_alpha: error probability of all tests together; n_tests: how many these are,
+    counted where not given. many: tests from which the typical one widens the limits. factor: (G,) that these are wider
+    by anyhow. said: told of every step before it is made.
     """
 
     solve: Callable[[BoolArray, State[S] | None], tuple[S, Tests] | None]

@@ -111,34 +111,43 @@ def search_outliers(
     """
     now = first or adjust(survey, start, options.adjust, progress)
     images = options.kinds is None or "image" in options.kinds
-    survey = now.survey if images else as_given(now.survey, survey)
+    survey = as_given(now.survey, survey) if options.adjust.reject_points and not images else now.survey
     round_ = _Round(now, options, images)
-    given = round_.snooping.used
+    found, given = round_.found, round_.snooping.used
     log: list[Decision] = []
     seen: set[frozenset[int]] = {frozenset()}
     needed: set[int] = set()
     out: tuple[int, ...] = ()
-    converged = False
     while True:
-        state = round_.searched(out, needed, log)
-        new = tuple(state.solution.out)
+        state = round_.searched((*out, *sorted(needed)), log)
+        new = tuple(o for o in state.solution.out if o not in needed)
         if frozenset(new) in seen:
-            new = tuple(sorted(set(new) | set(out)))  # turning in circles: the cautious choice
+            new = tuple(sorted({*new, *out}))  # turning in circles: the cautious choice
         converged = set(new) == set(out)
-        if converged:
-            break
-        seen.add(frozenset(new))
-        try:
-            now = adjust(without(survey, round_.found, new), values_of(now), options.adjust, progress)
-            out = new
-        except (IndeterminateError, NotConvergedError):
-            # without all of these there is no solution: the last good one stays, and they take part in it
-            converged = set(new) <= set(out)
-            needed |= set(new) - set(out)
         if converged or round_.number == _ROUNDS:
-            break
+            return round_.result(state, out, needed, log, converged, now)
+        seen.add(frozenset(new))
+        before, (now, out) = out, _left_out(now, out, new, lambda these, now: adjust(
+            without(survey, found, these), values_of(now), options.adjust, progress))  # fmt: skip
+        needed |= set(new) - set(out)
+        if out == before and set(new) <= set(out):  # what should come back has no solution either
+            return round_.result(state, out, needed, log, True, now)
         round_ = _Round(now, options, images, given, round_.number + 1)
-    return round_.result(state, out, log, converged, now)
+
+
+def _left_out(
+    now: Adjustment, out: tuple[int, ...], new: tuple[int, ...],
+    leave: Callable[[tuple[int, ...], Adjustment], Adjustment],
+) -> tuple[Adjustment, tuple[int, ...]]:  # fmt: skip
+    """Adjusted without ``new``; where there is no such solution, without those before and as many more as can go."""
+    try:
+        return leave(new, now), new
+    except (IndeterminateError, NotConvergedError):
+        if len(set(new) - set(out)) > 1:
+            for o in new:
+                if o not in out:
+                    now, out = _left_out(now, out, (*out, o), leave)
+        return now, out
 
 
 class _Round:
@@ -170,10 +179,9 @@ class _Round:
         found = self.now.other_residuals[o]
         return found.kind, found.ids
 
-    def searched(self, out: Iterable[int], needed: Iterable[int], log: list[Decision]) -> State[Snooping]:
-        """The state without gross errors; ``out`` are those of the round before, ``needed`` stay."""
+    def searched(self, out: Iterable[int], log: list[Decision]) -> State[Snooping]:
+        """The state without gross errors; ``out`` are those of the round before."""
         now, begin, how = self.snooping, list(out), ""
-        now.candidates[list(needed)] = False
         self.factor = self._factor(now)
         state = self._search().judged(now, now.tests())
         if not begin and (state.tests.used & (state.over > 1.0)).any():
@@ -254,20 +262,21 @@ class _Round:
         return Decision(action, kind, group, ids, v.statistic, v.freedom, p, limit, v.error, self.number, how)
 
     def result(
-        self, state: State[Snooping], out: Iterable[int], log: list[Decision], converged: bool, adjustment: Adjustment
-    ) -> OutlierSearch:
-        """With ``out`` left out."""
+        self, state: State[Snooping], out: Iterable[int], needed: Iterable[int], log: list[Decision], converged: bool,
+        adjustment: Adjustment,
+    ) -> OutlierSearch:  # fmt: skip
+        """With ``out`` left out, and what is ``needed`` in use, though it fails."""
         used = self.snooping.used.copy()
-        used[list(out)] = False
+        used[[*out, *needed]] = False
         now = state.solution.using(used)
         last, names = self._search().judged(now, now.tests()), now.system.group_names
         rejected = [self._decision("rejected", o, now, "test") for o in out]
-        fails = np.where(last.tests.used, last.over, 0.0)
-        rows = np.argsort(-fails, kind="stable")[: int(np.count_nonzero(fails > 1.0))].tolist()
+        suspects = [*np.flatnonzero(last.tests.used & (last.over > 1.0)).tolist(), *needed]
+        suspects.sort(key=lambda o: -float(last.over[o]))
         mine = {names[g] for g in np.unique(now.group[now.candidates]).tolist()}
         return OutlierSearch(
             adjustment, adjustment.survey, tuple(sorted(rejected, key=lambda d: -d.statistic / d.limit)), tuple(log),
-            tuple(self._decision("rejected", o, now, "test") for o in rows), self.number, converged,
+            tuple(self._decision("rejected", o, now, "test") for o in suspects), self.number, converged,
             tuple(self._alternative(x) for x in equal_sets(now, self._limits())),
             tuple(n for n, timid in zip(names, self.cautious, strict=False) if timid),
             tuple((n, float(f)) for n, f in zip(names, self.factor, strict=False) if f > 1.0 and n in mine),
