@@ -6,20 +6,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from adjust.adjustment import adjust
-from adjust.distributions import chi2
 from adjust.errors import SurveyError
 from adjust.graph import StartValues
 from adjust.model import Survey
 from adjust.observations import ImageBlock
 from adjust.pair_screen import PairOptions, adjust_with_pairs, is_pure, uncontrolled_pairs, values_of
 from adjust.result import Adjustment
-from adjust.statistics.criteria import sidak
+from adjust.statistics.criteria import limits
 from adjust.statistics.outlier_search import OutlierSearch, SearchOptions, search_outliers
 from adjust.statistics.result import Component, VarianceComponents
 from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.variance_components import ComponentOptions, Scaled, estimate_variance_components
 
-_LARGEST = 6000
+_LARGEST, _ROOM = 6000, 1e8
+"""Unknowns up to which gross errors are always searched; above, numbers that the search may need for its columns."""
 _PASSES = 3
 _OTHERS = (
     "table", "pair", "distance", "coordinates", "coordinate_difference", "level", "alignment", "laser", "surface",
@@ -84,12 +84,18 @@ def _cleaned(
 
 def _unsearched(now: Adjustment, options: CleanOptions) -> tuple[str, ...]:
     """That nothing was searched although something fails, in one line."""
-    if not options.pairs.reject_pairs or now.n_unknowns <= _LARGEST or not _fails(now):
+    n = _failing(now) if options.pairs.reject_pairs else 0
+    if not n or _searchable(now, n):
         return ()
     return (
-        f"observations fail their tests, but gross errors were not searched for: {now.n_unknowns} unknowns are more "
-        f"than {_LARGEST}; leave out what the list of tests shows, worst first",
+        f"{n} observations fail their tests, but gross errors were not searched for: these are too many among "
+        f"{now.n_unknowns} unknowns; check the sigmas, or leave out what the list of tests shows, worst first",
     )
+
+
+def _searchable(now: Adjustment, n: int) -> bool:
+    """Whether ``n`` observations that fail can be left out one after the other."""
+    return now.n_unknowns <= _LARGEST or n * len(now.other_residuals) <= _ROOM
 
 
 def _blamed_on_rays(survey: Survey, found: Adjustment) -> bool:
@@ -150,18 +156,19 @@ def _searched(
     given: Survey, now: Adjustment, options: CleanOptions, progress: Callable[[int, float], None] | None
 ) -> OutlierSearch | None:
     """The search for gross errors; None where nothing fails, or nothing can be searched."""
-    if not options.pairs.reject_pairs or now.n_unknowns > _LARGEST or not _fails(now):
+    n = _failing(now) if options.pairs.reject_pairs else 0
+    if not n or not _searchable(now, n):
         return None
     how = SearchOptions(kinds=_OTHERS, adjust=options.pairs.adjust)
     return search_outliers(given, options=how, progress=progress, first=now)
 
 
-def _fails(now: Adjustment) -> bool:
+def _failing(now: Adjustment) -> int:
+    """How many observations that are no image points fail their tests."""
     tests = [(o.test, len(o.components)) for o in now.other_residuals if o.used and float(o.redundancy.max()) > 1e-6]
     n = len(tests) + int(now.image_residuals.used.sum())
-    level = sidak(SearchOptions().family_alpha, n)
-    limits = {k: float(chi2.isf(level, k)) for k in {k for _, k in tests}}
-    return any(np.isfinite(t) and t > limits[k] for t, k in tests)
+    statistic, freedom = np.array(tests, dtype=float).reshape(-1, 2).T
+    return int(np.count_nonzero(statistic > limits(SearchOptions().family_alpha, freedom, n)))
 
 
 def _told(

@@ -28,6 +28,8 @@ _EVEN = 2.0 * float(np.log(20.0))
 """Difference of J up to which an explanation is less than 20 times as likely as another one."""
 _MOST = 600
 """Rejected components beyond which sets are not compared any more: the survey itself is wrong then."""
+_ROOM = 1e8
+"""Numbers that these may put into the residuals of all observations."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def _state(snooping: Snooping, limits: FloatArray) -> _State | None:
     out, ptr = snooping.out, snooping.ptr
     index = [np.arange(int(ptr[x]), int(ptr[x + 1])) for x in out]
     ends = np.cumsum([0] + [len(r) for r in index])
-    if not out or ends[-1] > _MOST:
+    if not out or ends[-1] > _MOST or ends[-1] * len(snooping.g) > _ROOM:
         return None
     U = np.hstack([snooping.columns[x][0] for x in out])
     inverse = np.linalg.inv(U[np.concatenate(index)])  # of the Cholesky factor of their own R

@@ -14,9 +14,11 @@ import numpy as np
 from scipy import sparse
 
 from adjust.model import BoolArray, FloatArray, IntArray
+from adjust.precision import Precision
 from adjust.statistics.data_snooping import Tests
 from adjust.statistics.single_tests import CONTROLLED, eigen2
 from adjust.statistics.system import LinearSystem
+from adjust.terrestrial.statistics import influences as influences_of_readings
 
 _CAUCHY = 2.385**2
 
@@ -49,7 +51,7 @@ class Snooping:
         e = s.e - s.A @ s.normal.solve(np.asarray(s.A[rows].T @ s.e[rows]))
         self.A, self.g = self._turned(s.A[at:], e[at:])
         self.alike = [np.flatnonzero(self.sizes == k) for k in np.unique(self.sizes)]
-        self.R = [self._own_blocks(members) for members in self.alike]
+        self.R = self._own_blocks(first)
         self.out: list[int] = []
         self.columns: dict[int, tuple[FloatArray, FloatArray]] = {}
         self.omega = float(e[rows] @ e[rows])
@@ -75,7 +77,27 @@ class Snooping:
         """Rows (n, k) of observations (n,) of the same size."""
         return np.asarray(self.ptr[observations][:, None] + np.arange(int(self.sizes[observations[0]])))
 
-    def _own_blocks(self, members: IntArray) -> FloatArray:
+    def _own_blocks(self, first: int) -> list[FloatArray]:
+        """Own blocks of R: from the covariances of the tree, but for image points and joint readings."""
+        known = np.zeros(len(self.used), dtype=np.bool_)
+        blocks = [np.tile(np.eye(int(self.sizes[members[0]])), (len(members), 1, 1)) for members in self.alike]
+        if first == self.system.n_image:
+            known[[o for o in range(len(known)) if o not in self.joint_of]] = True
+            influence, before = _influences(self.system.precision)
+            more = np.flatnonzero(self.used != before)  # in use here alone
+            index = np.concatenate([np.arange(self.ptr[o], self.ptr[o + 1]) for o in more] or [more])
+            U = -np.asarray(self.A @ self.system.normal.solve(self.A[index].T.toarray()))
+            inverse = np.linalg.inv(np.eye(len(index)) + U[index])
+            for members, R in zip(self.alike, blocks, strict=True):
+                own = U[self.rows(members)]
+                R -= np.array([influence[o] for o in members]) - own @ inverse @ own.transpose(0, 2, 1)
+        for members, R in zip(self.alike, blocks, strict=True):
+            if not known[members].all():
+                R[~known[members]] = self._solved_blocks(members[~known[members]])
+        return blocks
+
+    def _solved_blocks(self, members: IntArray) -> FloatArray:
+        """The same from the normal matrix, of observations of the same size."""
         k, normal = int(self.sizes[members[0]]), self.system.normal
         blocks = np.tile(np.eye(k), (len(members), 1, 1))
         for first in range(0, len(members), 512):
@@ -227,3 +249,14 @@ class Snooping:
             step = s.normal_of(of_rows).solve(np.asarray(s.A.T @ (of_rows * s.e)))
             squares = of(s.e - s.A @ step)
         return squares
+
+
+def _influences(precision: Precision) -> tuple[list[FloatArray], BoolArray]:
+    """Whitened A Q A' (k, k) of everything but image points in the solution, and which of it that uses (M,)."""
+    graph, readings = precision.graph, precision.graph.terrestrial
+    found = [precision.influence(item)[1] for item in graph.others]
+    used = np.array([item.used for item in graph.others], dtype=np.bool_)
+    if readings is None:
+        return found, used
+    found += list(influences_of_readings(readings, precision.tree)[:, None, None])
+    return found, np.concatenate([used, readings.used])

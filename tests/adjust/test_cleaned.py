@@ -42,6 +42,8 @@ def test_a_search_that_is_left_out_is_said(monkeypatch: pytest.MonkeyPatch) -> N
     survey, start = net.hall(8)
     wrong = net.with_reading(survey, 4, value=survey.readings[4].value + 100.0 * survey.readings[4].sigma)
     monkeypatch.setattr("adjust.statistics.cleaned._LARGEST", 10)
+    assert not [w for w in adjust_cleaned(wrong, start=start).warnings if "not searched for" in w]
+    monkeypatch.setattr("adjust.statistics.cleaned._ROOM", 10.0)
     found = adjust_cleaned(wrong, start=start, options=CleanOptions())
     assert [w for w in found.warnings if "gross errors were not searched for" in w]
     assert not [w for w in adjust_cleaned(survey, CleanOptions(), start=start).warnings if "not searched" in w]

@@ -14,6 +14,7 @@ from adjust.model import FloatArray, Point, PointParameter, Survey
 from adjust.observations import Distance, FrameRef, Pair, PositionRef, Reading, ReadingCovariance
 from adjust.robust import limit
 from adjust.statistics.candidates import candidates, without
+from adjust.statistics.condensed import condensed_system
 from adjust.statistics.data_snooping import Search
 from adjust.statistics.outlier_search import SearchOptions, search_outliers
 from adjust.statistics.reliability import reliability
@@ -93,6 +94,26 @@ def test_elimination_against_a_dense_refit(make, out: list[int]) -> None:  # typ
     before = Snooping(system, snooping.candidates).tests().statistic
     snooping.take_back(out)
     np.testing.assert_allclose(snooping.tests().statistic, before, rtol=1e-7, atol=1e-9)
+
+
+def test_tests_by_the_tree_are_those_of_the_normal_matrix() -> None:
+    """Image points condensed, the rest by covariances of the tree: also what the solution left out and is in here."""
+    survey, truth = h.network(7, n_epochs=3, n_points=9, coordinates=2)
+    distances = tuple(replace(d, used=i not in (1, 3)) for i, d in enumerate(survey.distances))
+    adjustment = adjust(replace(survey, distances=distances), h.start_at(truth))
+    whole, condensed = linear_system(adjustment), condensed_system(adjustment.precision).system
+    every = [replace(s, used=np.ones(len(s.used), dtype=np.bool_)) for s in (whole, condensed)]
+    images = int(adjustment.image_residuals.used.sum())
+    assert images == whole.n_image
+    apart, ours = (Snooping(s, np.ones(len(s.used) - first, dtype=np.bool_), first, n)
+                   for s, first, n in ((every[0], 0, 0), (every[1], condensed.n_image, 2 * images)))  # fmt: skip
+    for out in ((), (2,), (2, 4)):
+        a = apart.using(~np.isin(np.arange(len(apart.used)), np.add(out, images))).tests()
+        b = ours.using(~np.isin(np.arange(len(ours.used)), out)).tests()
+        np.testing.assert_allclose(b.statistic, a.statistic[images:], rtol=1e-5, atol=1e-7)  # weak ones lose digits
+        assert b.freedom.tolist() == a.freedom[images:].tolist()
+        assert b.omega.sum() == pytest.approx(a.omega.sum(), rel=1e-9)
+        assert b.redundancy.sum() == pytest.approx(a.redundancy.sum(), rel=1e-9)
 
 
 def planted(seed: int) -> tuple[Survey, Survey, dict[str, float]]:
