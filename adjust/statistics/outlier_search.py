@@ -164,8 +164,8 @@ class _Round:
         self.found = candidates(system.precision.graph, images)
         points = int(now.image_residuals.used.sum())
         allowed = self.found.mask() & system.used[first:]
-        for o in np.flatnonzero(allowed).tolist() if options.kinds is not None else ():
-            allowed[o] = self._name(o)[0] in options.kinds
+        if options.kinds is not None:
+            allowed &= [self._name(o)[0] in options.kinds for o in range(len(allowed))]
         self.snooping = Snooping(system, allowed, first, 0 if images else 2 * points)
         tests = self.snooping.tests()
         self.cautious, self.factor = tests.cautious, np.ones(len(tests.omega))
@@ -246,7 +246,7 @@ class _Round:
         squares = self.snooping.robust_squares(state.tests.freedom, self.factor)
         limit = limits(self.options.family_alpha, state.tests.freedom, self.n_tests)
         ratio = np.where(state.tests.used & self.snooping.candidates, squares / limit, 0.0)
-        return np.argsort(-ratio, kind="stable")[: int(np.count_nonzero(ratio > 1.0))].tolist()
+        return [int(o) for o in np.argsort(-ratio, kind="stable")[: int(np.count_nonzero(ratio > 1.0))]]
 
     def _limits(self) -> FloatArray:
         """Of the tests (M,) of whole observations."""

@@ -127,8 +127,9 @@ class Snooping:
             T[o], freedom[o] = statistic, self.sizes[o]
         freedom[~self.used] = 0
         rows = used[self.row_of]
-        omega = np.bincount(self.group[self.row_of[rows]], weights=self.g[rows] ** 2, minlength=n_groups)
-        redundancy = np.bincount(self.group[used], weights=own[used], minlength=n_groups)
+        omega, redundancy = np.zeros(n_groups), np.zeros(n_groups)
+        np.add.at(omega, self.group[self.row_of[rows]], self.g[rows] ** 2)
+        np.add.at(redundancy, self.group[used], own[used])
         omega[-1], redundancy[-1] = max(0.0, self.omega - omega.sum()), max(0.0, self.left - redundancy.sum())
         return Tests(T, freedom, used, used & whole & self.candidates, self.group, omega, redundancy)
 
