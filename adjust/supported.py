@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from adjust.geometry.building import carrier_of
-from adjust.lost_points import without_named_points
 from adjust.model import Survey
 from adjust.observations import FrameRef, ImageBlock, PositionRef
 from adjust.result import ParameterName
+from adjust.undetermined_points import without_named_points
 from adjust.unknowns import Chain, FrameTree, Unknowns
 
 Needs = frozenset[ParameterName]

@@ -9,7 +9,7 @@ from gtsam import Pose3
 from adjust.errors import SurveyError
 from adjust.model import PoseParameter, Station, Survey
 from adjust.observations import FrameRef, Pair
-from adjust.pair_screen import is_pure
+from adjust.pair_networks import is_pure
 from adjust.pose_network.from_survey import network_from_survey
 from survey.files import AdjustmentOptions, read
 from survey.files.text import id_problem

@@ -16,7 +16,7 @@ from adjust.observations import FrameRef, ImageBlock
 from adjust.result import Adjustment
 from survey.adjusted_frames import AdjustedFrames
 from survey.files import SpotBlock
-from survey.parts import only_between
+from survey.subnetwork import only_between
 
 _SECOND_BEST = 1.5
 

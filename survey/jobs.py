@@ -20,19 +20,19 @@ from tqdm import tqdm
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.errors import IndeterminateError, SurveyError
 from adjust.graph import StartValues
-from adjust.lost_points import without_lost_points
 from adjust.model import IntArray, Survey
 from adjust.observations import ImageBlock
+from adjust.pair_networks import PairOptions
 from adjust.result import Adjustment
-from adjust.statistics.cleaned import adjust_cleaned
+from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from adjust.supported import lost_notes, supported
-from survey.checked import checked
-from survey.cleaning import clean_options
+from adjust.undetermined_points import without_lost_points
 from survey.detecting import detect_in, detect_job, remember_images
 from survey.files import Project, read
 from survey.files.detected import DetectedImage
 from survey.files.project import RESULTS
 from survey.identify import Identification, identify_spots, without_points
+from survey.probable_causes import checked
 from survey.quantities import USUAL, scale_of
 from survey.replacing import changing, replace_parts
 from survey.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, solution_dict, summary_text
@@ -221,7 +221,7 @@ def adjust_project(project: Project, progress: bool, begin: Begin = lambda _: No
                 notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
             survey = replace(survey, image_blocks=survey.image_blocks + found.blocks)
             survey = _seen_points(survey)
-        how = clean_options(project.options)
+        how = CleanOptions(PairOptions(project.options.reject_pairs, options), project.options.variance_components)
         survey, lost = supported(survey)
         result = checked(
             survey, lambda: without_lost_points(survey, lambda part: adjust_cleaned(part, how, step, begin(part)))

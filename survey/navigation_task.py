@@ -13,7 +13,7 @@ from adjust.navigation import NavigationEpoch, Spots
 from adjust.supported import supported
 from survey.files import Project
 from survey.files.text import decode, natural_key, read_bytes
-from survey.parts import in_use, only_between, points_read
+from survey.subnetwork import in_use, only_between, points_read
 
 
 @dataclass(frozen=True)

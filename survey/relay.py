@@ -27,7 +27,7 @@ from survey.files import read
 from survey.files.observation_columns import pair_columns
 from survey.files.table_writing import write_table
 from survey.files.text import decode, read_bytes
-from survey.parts import in_use
+from survey.subnetwork import in_use
 
 _INTERVALS_S = (1.0, 1.5, 2.0, 3.0, 4.0)
 _GROWTH_S = (0.1, 0.3, 1.0, 3.0, 9.0)

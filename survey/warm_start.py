@@ -19,7 +19,7 @@ from adjust.graph import StartValues
 from adjust.initial import find_start
 from adjust.lens import MODELS
 from adjust.model import Camera, FloatArray, LensParameter, PoseParameter, Survey
-from adjust.pair_screen import PairOptions, adjusted_network, is_pure, network_solution
+from adjust.pair_networks import PairOptions, adjusted_network, is_pure, network_solution
 from adjust.pose_network.from_survey import network_from_survey
 from adjust.result import Adjustment, ParameterName
 from adjust.supported import lost_notes, supported

@@ -14,7 +14,7 @@ from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import DONE, SpotArrays, gauss_newton
 from adjust.navigation.system import Sightings, System
 from adjust.relay.motions import right_jacobian_inverse
-from adjust.statistics.data_snooping import Search, State, Tests, one_group
+from adjust.statistics.gross_errors import Search, State, Tests, one_group
 
 _NO_B: FloatArray = np.zeros((0, 0))
 _NO_ROWS: IntArray = np.zeros(0, dtype=np.int64)

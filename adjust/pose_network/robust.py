@@ -2,7 +2,7 @@
 
 Rotations first, then positions, each by a solver that needs no start, with the truncated least squares weights of Yang,
 Antonante, Tzoumas and Carlone (Graduated non-convexity for robust spatial perception, RA-L 2020). What that sorts out
-is only a proposal: a clean least squares over the rest decides (:mod:`adjust.statistics.data_snooping`), pair by pair,
+is only a proposal: a clean least squares over the rest decides (:mod:`adjust.statistics.gross_errors`), pair by pair,
 by the chi-square test of the pair against all others.
 """
 
@@ -26,7 +26,7 @@ from adjust.pose_network.start import (
     translation_sigmas,
 )
 from adjust.statistics.criteria import CAUTIOUS, MANY
-from adjust.statistics.data_snooping import Search, State, Tests, one_group
+from adjust.statistics.gross_errors import Search, State, Tests, one_group
 
 _TRUNCATION = float(chi2.isf(1e-4, 3))
 _SLACK = 4.0  # positions inherit what is left in the rotations of the first stage

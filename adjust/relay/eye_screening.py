@@ -9,7 +9,7 @@ from adjust.model import BoolArray, FloatArray
 from adjust.relay.eye_checks import OutlierEpoch
 from adjust.relay.eye_setup import EyeSetup
 from adjust.relay.eye_solver import EyeProblem, EyeSolution, linearise, solve_eyes
-from adjust.statistics.data_snooping import Search, State, Tests, one_group
+from adjust.statistics.gross_errors import Search, State, Tests, one_group
 
 
 def solve_screened(setup: EyeSetup, reject: bool, alpha: float) -> tuple[EyeSolution, tuple[OutlierEpoch, ...]]:

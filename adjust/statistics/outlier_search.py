@@ -1,7 +1,7 @@
 """Gross errors among observations of every kind: found by tests, each decision logged, taken back where it was wrong.
 
 A robust solution says what most observations agree on, and whom to suspect first; tests with the error probability of
-the whole family decide (:mod:`adjust.statistics.data_snooping`, on a linear system, :mod:`adjust.statistics.snooping`);
+the whole family decide (:mod:`adjust.statistics.gross_errors`, on a linear system, :mod:`adjust.statistics.snooping`);
 the survey is solved again without what they leave out, and the search repeated there, until nothing changes. The result
 is a plain least squares. Where image points are not searched they stand condensed, and are screened anew at every
 solution.
@@ -18,13 +18,13 @@ from adjust.distributions import chi2
 from adjust.errors import IndeterminateError, NotConvergedError
 from adjust.graph import StartValues
 from adjust.model import BoolArray, FloatArray, Survey
-from adjust.pair_screen import values_of
+from adjust.pair_networks import values_of
 from adjust.result import Adjustment, ObservationResidual
 from adjust.statistics.candidates import as_given, candidates, without
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.criteria import MANY, limits
-from adjust.statistics.data_snooping import Search, State, Tests, best_back_first
 from adjust.statistics.exchange import Exchange, better_set, equal_sets
+from adjust.statistics.gross_errors import Search, State, Tests, best_back_first
 from adjust.statistics.reliability import observation_name
 from adjust.statistics.result import Alternative, Decision
 from adjust.statistics.snooping import Snooping

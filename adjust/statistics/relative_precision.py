@@ -13,7 +13,7 @@ from adjust.graph import GraphBuilder
 from adjust.model import FloatArray
 from adjust.named_precision import rotations_only
 from adjust.observations import FrameRef
-from adjust.pair_screen import values_of
+from adjust.pair_networks import values_of
 from adjust.result import Adjustment, ParameterName
 from adjust.statistics.result import Ellipsoid, RelativePrecision
 

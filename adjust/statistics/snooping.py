@@ -15,7 +15,7 @@ from scipy import sparse
 
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.precision import Precision
-from adjust.statistics.data_snooping import Tests
+from adjust.statistics.gross_errors import Tests
 from adjust.statistics.single_tests import CONTROLLED, eigen2
 from adjust.statistics.system import LinearSystem
 from adjust.terrestrial.statistics import influences as influences_of_readings

@@ -20,7 +20,7 @@ from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.images import block_rows
 from adjust.native.lenses import MAX_LENS
-from adjust.pair_screen import values_of
+from adjust.pair_networks import values_of
 from adjust.precision import Precision, noise_of
 from adjust.result import Adjustment, ParameterName
 from adjust.solve import solve

@@ -15,7 +15,7 @@ from adjust.distributions import chi2
 from adjust.errors import SurveyError
 from adjust.graph import StartValues
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
-from adjust.pair_screen import values_of
+from adjust.pair_networks import values_of
 from adjust.result import Adjustment
 from adjust.statistics.group_sums import GroupSums, Moments, group_sums, moments
 from adjust.statistics.result import Component, VarianceComponents

@@ -15,7 +15,7 @@ from adjust.observations import Distance, FrameRef, Pair, PositionRef, Reading, 
 from adjust.robust import limit
 from adjust.statistics.candidates import candidates, without
 from adjust.statistics.condensed import condensed_system
-from adjust.statistics.data_snooping import Search
+from adjust.statistics.gross_errors import Search
 from adjust.statistics.outlier_search import SearchOptions, search_outliers
 from adjust.statistics.reliability import reliability
 from adjust.statistics.snooping import Snooping

@@ -9,7 +9,7 @@ from gtsam import Pose3, Rot3
 from adjust.errors import NotConvergedError, SurveyError
 from adjust.model import Camera, LensParameter, PoseParameter, Station, Survey, Target
 from adjust.observations import Closure, FrameRef, Pair
-from adjust.pair_screen import PairOptions, adjust_with_pairs
+from adjust.pair_networks import PairOptions, adjust_with_pairs
 from adjust.relay.closed import closed, play
 from adjust.relay.condition_factors import MAX_HARD_LOOPS
 from adjust.relay.conditions import adjust_condition_factors, adjust_conditions, adjust_loops

@@ -15,7 +15,7 @@ from adjust.graph import StartValues
 from adjust.model import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
 from adjust.named_precision import NamedPrecision
 from adjust.observations import FrameRef, Pair
-from adjust.pair_screen import adjust_with_pairs
+from adjust.pair_networks import adjust_with_pairs
 from adjust.result import Adjustment
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.criteria import criteria, noncentrality, sidak

@@ -6,8 +6,8 @@ import pytest
 
 from adjust.adjustment import adjust
 from adjust.errors import SurveyError
-from survey.checked import checked
 from survey.epoch_names import separate_epochs
+from survey.probable_causes import checked
 from survey.simulate import stereo
 
 

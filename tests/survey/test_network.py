@@ -13,8 +13,8 @@ from adjust.adjustment import AdjustOptions, adjust
 from adjust.errors import IndeterminateError, SurveyError
 from adjust.model import Datum, Point, PointParameter, PoseParameter, Station, Survey
 from adjust.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
-from adjust.pair_screen import PairOptions, adjust_with_pairs, is_pure
-from adjust.statistics.cleaned import CleanOptions, adjust_cleaned
+from adjust.pair_networks import PairOptions, adjust_with_pairs, is_pure
+from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from survey import problem, solve
 from survey.cli import main
 from survey.files import read, write_project

@@ -4,7 +4,7 @@ import numpy as np
 
 from adjust.model import TILT, Setup, Survey, VectorParameter, Vertical
 from adjust.observations import Distance, PositionRef, Reading, ReadingCovariance
-from survey.parts import only_between, points_read
+from survey.subnetwork import only_between, points_read
 
 A, B, C = PositionRef("A"), PositionRef("B"), PositionRef("C")
 

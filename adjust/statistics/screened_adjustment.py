@@ -10,7 +10,7 @@ from adjust.errors import SurveyError
 from adjust.graph import StartValues
 from adjust.model import Survey
 from adjust.observations import ImageBlock
-from adjust.pair_screen import PairOptions, adjust_with_pairs, is_pure, uncontrolled_pairs, values_of
+from adjust.pair_networks import PairOptions, adjust_with_pairs, is_pure, uncontrolled_pairs, values_of
 from adjust.result import Adjustment
 from adjust.statistics.criteria import limits
 from adjust.statistics.outlier_search import OutlierSearch, SearchOptions, search_outliers
