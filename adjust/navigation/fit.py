@@ -14,7 +14,7 @@ from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import DONE, SpotArrays, gauss_newton
 from adjust.navigation.system import Sightings, System
 from adjust.relay.motions import right_jacobian_inverse
-from adjust.statistics.gross_errors import Search, State, Tests, one_group
+from adjust.statistics.gross_errors import Search, State, Verdicts, one_group
 
 _NO_B: FloatArray = np.zeros((0, 0))
 _NO_ROWS: IntArray = np.zeros(0, dtype=np.int64)
@@ -151,7 +151,7 @@ def fit_without_outliers(
     None is taken out where the residuals of all are together far smaller than their sigmas say.
     """
 
-    def solve(kept: BoolArray, before: State[PoseFit] | None) -> tuple[PoseFit, Tests] | None:
+    def solve(kept: BoolArray, before: State[PoseFit] | None) -> tuple[PoseFit, Verdicts] | None:
         at = start if before is None else before.solution.pose
         fit = fit_pose(system, seen, used[kept], beacon[kept], at, prior)
         if fit is None:

@@ -26,7 +26,7 @@ from adjust.pose_network.start import (
     translation_sigmas,
 )
 from adjust.statistics.criteria import CAUTIOUS, MANY
-from adjust.statistics.gross_errors import Search, State, Tests, one_group
+from adjust.statistics.gross_errors import Search, State, Verdicts, one_group
 
 _TRUNCATION = float(chi2.isf(1e-4, 3))
 _SLACK = 4.0  # positions inherit what is left in the rotations of the first stage
@@ -116,7 +116,7 @@ def clean(
 ) -> Cleaned:  # fmt: skip
     """Least squares over the pairs that pass their tests. Raises as :func:`adjust.pose_network.solve.minimize`."""
 
-    def solve(used: BoolArray, before: State[Cleaned] | None) -> tuple[Cleaned, Tests]:
+    def solve(used: BoolArray, before: State[Cleaned] | None) -> tuple[Cleaned, Verdicts]:
         here = None if before is None else before.solution.minimum
         return _solved(network, used, options, progress, None if here is None else (here.rotations, here.translations))
 
@@ -142,7 +142,7 @@ def clean(
     return _listed(last.solution, network.used)
 
 
-def _far_below(tests: Tests) -> bool:
+def _far_below(tests: Verdicts) -> bool:
     """Whether residuals are together far smaller than their sigmas say, by v'Pv or by the tests of the pairs."""
     return bool(tests.omega[0] < CAUTIOUS**2 * tests.redundancy[0] or tests.cautious[0])
 
@@ -150,7 +150,7 @@ def _far_below(tests: Tests) -> bool:
 def _solved(
     network: PoseNetwork, used: BoolArray, options: NetworkOptions, progress: Progress | None,
     start: tuple[FloatArray, FloatArray] | None,
-) -> tuple[Cleaned, Tests]:  # fmt: skip
+) -> tuple[Cleaned, Verdicts]:  # fmt: skip
     """Least squares of the pairs in ``used`` (E,), and the tests of all that the network uses."""
     part = network.with_used(used)
     minimum = minimize(part, start, options, progress=progress)

@@ -9,7 +9,7 @@ from adjust.model import BoolArray, FloatArray
 from adjust.relay.eye_checks import OutlierEpoch
 from adjust.relay.eye_setup import EyeSetup
 from adjust.relay.eye_solver import EyeProblem, EyeSolution, linearise, solve_eyes
-from adjust.statistics.gross_errors import Search, State, Tests, one_group
+from adjust.statistics.gross_errors import Search, State, Verdicts, one_group
 
 
 def solve_screened(setup: EyeSetup, reject: bool, alpha: float) -> tuple[EyeSolution, tuple[OutlierEpoch, ...]]:
@@ -21,7 +21,7 @@ def solve_screened(setup: EyeSetup, reject: bool, alpha: float) -> tuple[EyeSolu
     """
     m = len(setup.problem.conditions)
 
-    def solve(used: BoolArray, before: State[EyeSolution] | None) -> tuple[EyeSolution, Tests]:
+    def solve(used: BoolArray, before: State[EyeSolution] | None) -> tuple[EyeSolution, Verdicts]:
         problem = setup.problem
         if before is not None:
             if used.sum() < max(1, 2 * m // 3):

@@ -34,7 +34,7 @@ _LONGEST = 60
 
 
 @dataclass(frozen=True, eq=False)
-class Tests:
+class Verdicts:
     """Of M observations: test statistics, degrees of freedom (0 where nothing tests one), which are in use.
 
     Those out of use are tested against what the others predict. possible: (M,) may be left out. group: (M,). omega,
@@ -58,10 +58,10 @@ class Tests:
 
 def one_group(
     statistic: FloatArray, freedom: IntArray, used: BoolArray, omega: float = np.nan, redundancy: float = np.nan
-) -> Tests:
+) -> Verdicts:
     """Tests of observations that may all be left out, and have the same standard of sigmas."""
     none = np.zeros(len(used), dtype=np.int64)
-    return Tests(statistic, freedom, used, freedom > 0, none, np.array([omega]), np.array([redundancy]))
+    return Verdicts(statistic, freedom, used, freedom > 0, none, np.array([omega]), np.array([redundancy]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class State(Generic[S]):
     """
 
     solution: S
-    tests: Tests
+    tests: Verdicts
     limit: FloatArray
     over: FloatArray
     factor: FloatArray
@@ -146,7 +146,7 @@ class Search(Generic[S]):
     by anyhow. said: told of every step before it is made.
     """
 
-    solve: Callable[[BoolArray, State[S] | None], tuple[S, Tests] | None]
+    solve: Callable[[BoolArray, State[S] | None], tuple[S, Verdicts] | None]
     family_alpha: float
     step: Step[S] = worst_first
     many: float = MANY
@@ -159,7 +159,7 @@ class Search(Generic[S]):
         found = self.solve(used, before)
         return None if found is None else self.judged(*found)
 
-    def judged(self, solution: S, tests: Tests) -> State[S]:
+    def judged(self, solution: S, tests: Verdicts) -> State[S]:
         """Tests over their limits, at one level for all."""
         tested = tests.freedom > 0
         mine = tests.used & tested

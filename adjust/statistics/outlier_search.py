@@ -24,7 +24,7 @@ from adjust.statistics.candidates import as_given, candidates, without
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.criteria import MANY, limits
 from adjust.statistics.exchange import Exchange, better_set, equal_sets
-from adjust.statistics.gross_errors import Search, State, Tests, best_back_first
+from adjust.statistics.gross_errors import Search, State, Verdicts, best_back_first
 from adjust.statistics.reliability import observation_name
 from adjust.statistics.result import Alternative, Decision
 from adjust.statistics.snooping import Snooping
@@ -216,7 +216,7 @@ class _Round:
         return state
 
     def _search(self) -> Search[Snooping]:
-        def solve(used: BoolArray, before: State[Snooping] | None) -> tuple[Snooping, Tests]:
+        def solve(used: BoolArray, before: State[Snooping] | None) -> tuple[Snooping, Verdicts]:
             now = (self.snooping if before is None else before.solution).using(used)
             return now, now.tests()
 

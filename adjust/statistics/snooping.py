@@ -15,7 +15,7 @@ from scipy import sparse
 
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.precision import Precision
-from adjust.statistics.gross_errors import Tests
+from adjust.statistics.gross_errors import Verdicts
 from adjust.statistics.single_tests import CONTROLLED, eigen2
 from adjust.statistics.system import LinearSystem
 from adjust.terrestrial.statistics import influences as influences_of_readings
@@ -109,7 +109,7 @@ class Snooping:
 
     # -- tests -------------------------------------------------------------------------------------------------------
 
-    def tests(self) -> Tests:
+    def tests(self) -> Verdicts:
         """Of all observations (M,), with what is kept as the last of the groups."""
         M, n_groups = len(self.sizes), len(self.system.group_names) + 1
         T, freedom, whole, own = np.zeros(M), np.zeros(M, dtype=np.int64), np.zeros(M, dtype=np.bool_), np.zeros(M)
@@ -131,7 +131,7 @@ class Snooping:
         np.add.at(omega, self.group[self.row_of[rows]], self.g[rows] ** 2)
         np.add.at(redundancy, self.group[used], own[used])
         omega[-1], redundancy[-1] = max(0.0, self.omega - omega.sum()), max(0.0, self.left - redundancy.sum())
-        return Tests(T, freedom, used, used & whole & self.candidates, self.group, omega, redundancy)
+        return Verdicts(T, freedom, used, used & whole & self.candidates, self.group, omega, redundancy)
 
     def verdict(self, observation: int) -> Verdict:
         """Of an observation that is out: with all others out. Of one in use: now."""
