@@ -21,6 +21,7 @@ from adjust.statistics.variance_components import ComponentOptions, Scaled, esti
 _LARGEST, _ROOM = 6000, 1e8
 """Unknowns up to which gross errors are always searched; above, numbers that the search may need for its columns."""
 _PASSES = 3
+_SCREENED = "left out as gross errors"
 _OTHERS = (
     "table", "pair", "distance", "coordinates", "coordinate_difference", "level", "alignment", "laser", "surface",
     "direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance", "height_difference",
@@ -136,10 +137,8 @@ def _others_first(
         found = _cleaned(now.survey, options, progress, values_of(now))
     except SurveyError:
         return None
-    log, said = ((), ()) if search is None else (search.log, search.notes)
-    kept = log if not found.decisions else (*log, *found.decisions)
-    notes = tuple(n for n in said if n not in found.warnings)
-    return replace(found, decisions=kept, warnings=found.warnings + notes)
+    notes = tuple(n for n in search.notes if n not in found.warnings)
+    return replace(found, decisions=(*search.log, *found.decisions), warnings=found.warnings + notes)
 
 
 def _left_out(given: Survey, found: Adjustment) -> int:
@@ -178,7 +177,9 @@ def _told(
     """With its history, and the warnings of the first adjustment that are not about the solution itself."""
     known = set(now.warnings)
     about_first = ("left out", "camera")
-    kept = tuple(w for w in first.warnings if w not in known and w.startswith(about_first))
+    screened = search.adjustment if search is not None and search.rejected else first  # image points, anew
+    about = [w for w in first.warnings if w.startswith(about_first) and _SCREENED not in w]
+    kept = tuple(w for w in (*about, *(w for w in screened.warnings if _SCREENED in w)) if w not in known)
     notes = search.notes if search is not None else unsearched
     components = None
     if scaled is not None:
