@@ -154,7 +154,7 @@ def _near_given(survey: Survey, result: Adjustment, run: Callable[[Begun], Adjus
 
 def _from_places(result: Adjustment, places: Mapping[str, FloatArray]) -> StartValues:
     """The adjusted values with other places of points; what is turned there is found anew."""
-    from adjust.statistics.pair_screen import values_of  # here: it stands above this module
+    from adjust.statistics.pair_networks import values_of  # here: it stands above this module
 
     start = values_of(result)
     vectors = {n: v for n, v in start.vectors.items() if n[0] not in ("orientation", "centring")}

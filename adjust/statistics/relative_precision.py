@@ -14,7 +14,7 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.observations.factors import ChainPose
 from adjust.precision.pose_networks import rotations_only
-from adjust.statistics.pair_screen import values_of
+from adjust.statistics.pair_networks import values_of
 from adjust.statistics.result import Ellipsoid, RelativePrecision
 
 _HELD = 1e-16

@@ -23,7 +23,7 @@ from adjust.native.images import block_rows
 from adjust.native.lenses import MAX_LENS
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision, noise_of
-from adjust.statistics.pair_screen import values_of
+from adjust.statistics.pair_networks import values_of
 
 DENSE = 3000
 """Unknowns up to which the normal matrix is factored as a full one."""

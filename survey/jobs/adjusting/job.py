@@ -23,12 +23,12 @@ from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import IntArray, Survey
-from adjust.statistics.cleaned import adjust_cleaned
-from adjust.statistics.lost_points import without_lost_points
+from adjust.statistics.pair_networks import PairOptions
+from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from adjust.statistics.supported import lost_notes, supported
+from adjust.statistics.undetermined_points import without_lost_points
 from survey.folder.replacing import changing, replace_parts
-from survey.jobs.adjusting.explained import checked
-from survey.jobs.adjusting.options import clean_options
+from survey.jobs.adjusting.probable_causes import checked
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
 from survey.jobs.detecting import detect_in, detect_job, remember_images
 from survey.jobs.identify import Identification, identify_spots, without_points
@@ -221,7 +221,7 @@ def adjust_project(project: Project, progress: bool, begin: Begin = lambda _: No
                 notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
             survey = replace(survey, image_blocks=survey.image_blocks + found.blocks)
             survey = _seen_points(survey)
-        how = clean_options(project.options)
+        how = CleanOptions(PairOptions(project.options.reject_pairs, options), project.options.variance_components)
         survey, lost = supported(survey)
         result = checked(
             survey, lambda: without_lost_points(survey, lambda part: adjust_cleaned(part, how, step, begin(part)))
