@@ -11,6 +11,7 @@ from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.precision import global_test
 from adjust.relay.motions import Motions, right_jacobian_inverse
 from adjust.relay.network import Network
+from adjust.statistics.criteria import sidak
 
 # joint covariance of adjusted pairs by their positions
 Joint = Callable[[Sequence[int]], FloatArray]
@@ -80,7 +81,7 @@ class AdjustedPairs:
         Only the first is surely meant: an error in it also shows in the residuals of its neighbours.
         """
         tested = self.freedom > 0
-        single = -np.expm1(np.log1p(-alpha) / max(1, int(tested.sum())))
+        single = sidak(alpha, int(tested.sum()))
         order = np.argsort(np.where(tested, -self.test / np.maximum(self.freedom, 1), np.inf), kind="stable")
         bad = [int(e) for e in order if tested[e] and self.p_value[e] < single]
         top = self.network.topology

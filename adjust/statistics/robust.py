@@ -14,10 +14,9 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.solver import Solved, SolveOptions, solve
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.precision.precision import Precision, image_residuals
-from adjust.statistics.criteria import cautious
+from adjust.statistics.criteria import cautious, limits, typical_factor
 
 _CAUCHY = 2.385**2
-_MEDIAN = 2.0 * np.log(2.0)  # of chi-square with two degrees of freedom
 _FAMILY = 0.001
 _ROUNDS = 6
 
@@ -33,13 +32,12 @@ class Screened:
 
 def limit(n: int) -> float:
     """Chi-square (2) that one of n good image points exceeds with probability 0.001."""
-    return float(-2.0 * np.log(-np.expm1(np.log1p(-_FAMILY) / max(1, n))))
+    return float(limits(_FAMILY, np.array(2), n))
 
 
 def scale(test: FloatArray) -> float:
     """Variance factor of most points, not below the a priori 1."""
-    test = test[np.isfinite(test)]
-    return max(1.0, float(np.median(test)) / _MEDIAN) if test.size else 1.0
+    return float(np.fmax(1.0, typical_factor(test, np.full(len(test), 2))))
 
 
 def screen(graph: AdjustmentGraph, solved: Solved, options: SolveOptions) -> Screened:

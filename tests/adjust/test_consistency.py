@@ -11,9 +11,8 @@ from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.changes import ChangeSearch, natural
 from adjust.statistics.condensed import condensed_system
-from adjust.statistics.consistency import consistency
+from adjust.statistics.consistency import consistency, eigenvalues, parts_of
 from adjust.statistics.criteria import sidak
-from adjust.statistics.parts import eigenvalues, parts_of
 from adjust.statistics.quadratic_forms import upper_tail, upper_tail_bound
 from adjust.statistics.result import Change, Consistency
 from adjust.statistics.system import linear_system, precision_of

@@ -13,7 +13,7 @@ from adjust.epochs.deformation import relative_pose, station_deformations
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Coordinates, FrameRef, Pair, PositionRef
 from adjust.model.survey import Datum, Point, PoseParameter, Station, Survey
-from adjust.statistics.pair_screen import PairOptions, adjust_with_pairs
+from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs
 from tests.sizes import size
 
 SIGMAS = np.r_[np.full(3, np.radians(10 / 3600)), np.full(3, 1e-4)]

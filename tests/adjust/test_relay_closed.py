@@ -13,7 +13,7 @@ from adjust.model.survey import Camera, LensParameter, PoseParameter, Station, S
 from adjust.relay.closed import closed, play
 from adjust.relay.condition_factors import MAX_HARD_LOOPS
 from adjust.relay.conditions import adjust_condition_factors, adjust_conditions, adjust_loops
-from adjust.statistics.pair_screen import PairOptions, adjust_with_pairs
+from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs
 from survey.simulate import resample, stereo
 from tests.adjust import helpers as h
 from tests.adjust.relay_networks import grid, simulate

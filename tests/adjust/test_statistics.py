@@ -19,7 +19,7 @@ from adjust.precision.pose_networks import NamedPrecision
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.criteria import criteria, noncentrality, sidak
 from adjust.statistics.influence import shifts
-from adjust.statistics.pair_screen import adjust_with_pairs
+from adjust.statistics.pair_networks import adjust_with_pairs
 from adjust.statistics.relative_precision import relative_precision
 from adjust.statistics.reliability import observation_name, reliability
 from adjust.statistics.result import LevelOptions

@@ -13,7 +13,8 @@ from adjust.adjustment import AdjustOptions, adjust
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
 from adjust.model.survey import Datum, Point, PointParameter, PoseParameter, Station, Survey
-from adjust.statistics.pair_screen import PairOptions, adjust_with_pairs, is_pure
+from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs, is_pure
+from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from survey import problem, solve
 from survey.cli import main
 from survey.project import read, write_project
@@ -178,11 +179,11 @@ def test_a_wrong_pair_in_a_survey_with_other_observations_is_left_out():
     length = float(np.linalg.norm(poses[1].translation() - poses[2].translation()))
     survey = replace(survey, pairs=pairs, distances=(Distance("d", origin[1], origin[2], length, 1e-3),))
     assert not is_pure(survey)
-    result = adjust_with_pairs(survey)
+    result = adjust_cleaned(survey)
     assert [p.pair_id for p in result.survey.pairs if not p.used] == [survey.pairs[3].pair_id]
     assert result.global_test.passed
     assert [w for w in result.warnings if w.startswith("left out: pair p0-4: off by ")]
-    kept = adjust_with_pairs(survey, PairOptions(reject_pairs=False))
+    kept = adjust_cleaned(survey, CleanOptions(PairOptions(reject_pairs=False)))
     assert all(p.used for p in kept.survey.pairs)
     assert not kept.global_test.passed
 
@@ -190,7 +191,7 @@ def test_a_wrong_pair_in_a_survey_with_other_observations_is_left_out():
 def test_sigmas_too_small_throughout_reject_no_pair():
     survey, _ = _network(12, combinations(range(12), 2), 5.0)
     for each in (survey, _mixed(survey)):
-        result = adjust_with_pairs(each)
+        result = adjust_cleaned(each)
         assert all(p.used for p in result.survey.pairs)
         assert result.sigma0 == pytest.approx(5.0, rel=0.15)
 
@@ -208,7 +209,7 @@ def test_sigmas_too_large_throughout_reject_no_pair():
     pairs = (replace(survey.pairs[30], b_from_a=survey.pairs[30].b_from_a.compose(off)),)
     survey = replace(survey, pairs=survey.pairs[:30] + pairs + survey.pairs[31:])
     for each in (survey, _mixed(survey)):
-        result = adjust_with_pairs(each)
+        result = adjust_cleaned(each)
         assert all(p.used for p in result.survey.pairs)
         assert result.sigma0 < 0.5
         assert max(o.test for o in result.other_residuals if o.kind == "pair") > 38.0  # the limit of a single pair
@@ -219,11 +220,11 @@ def test_sigmas_too_large_throughout_reject_no_pair():
 def test_sigmas_too_small_throughout_reject_no_pair_of_a_few(seed):
     survey, _ = _network(6, combinations(range(6), 2), 5.0, seed=seed)
     for each in (survey, _mixed(survey)):
-        assert all(p.used for p in adjust_with_pairs(each).survey.pairs)
+        assert all(p.used for p in adjust_cleaned(each).survey.pairs)
     wrong = survey.pairs[4].b_from_a.compose(Pose3(Rot3.Rz(0.02), np.array([0.1, 0.0, 0.0])))
     pairs = survey.pairs[:4] + (replace(survey.pairs[4], b_from_a=wrong),) + survey.pairs[5:]
     for each in (replace(survey, pairs=pairs), _mixed(replace(survey, pairs=pairs))):
-        assert [p.pair_id for p in adjust_with_pairs(each).survey.pairs if not p.used] == [survey.pairs[4].pair_id]
+        assert [p.pair_id for p in adjust_cleaned(each).survey.pairs if not p.used] == [survey.pairs[4].pair_id]
 
 
 def test_a_pair_without_which_there_is_no_solution_stays(monkeypatch):
@@ -238,8 +239,8 @@ def test_a_pair_without_which_there_is_no_solution_stays(monkeypatch):
             raise IndeterminateError("2 directions are undetermined", ("S1",))
         return adjust(given, *arguments)
 
-    monkeypatch.setattr("adjust.statistics.pair_screen.adjust", fragile)
-    result = adjust_with_pairs(survey)
+    monkeypatch.setattr("adjust.statistics.outlier_search.adjust", fragile)
+    result = adjust_cleaned(survey)
     assert next(p for p in result.survey.pairs if p.pair_id == name).used
     assert [w for w in result.warnings if w.startswith(f"fails its test, but cannot be left out: pair {name}")]
 

@@ -8,17 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from tqdm import tqdm
 
-from adjust.adjustment import adjust
+from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import IntArray, Survey
-from adjust.statistics.cleaned import adjust_cleaned
-from adjust.statistics.lost_points import without_lost_points
+from adjust.statistics.pair_networks import PairOptions
+from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from adjust.statistics.supported import lost_notes, supported
-from survey.jobs.adjusting.explained import explained, with_probable_causes
-from survey.jobs.adjusting.options import clean_options
+from adjust.statistics.undetermined_points import without_lost_points
+from survey.jobs.adjusting.probable_causes import explained, with_probable_causes
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
 from survey.jobs.identify import identify_spots, without_points
 from survey.project import Project
@@ -61,6 +61,12 @@ class Step:
     run: Callable[[Work], Work]
 
 
+def _options(project: Project) -> CleanOptions:
+    said = project.options
+    how = AdjustOptions(said.alpha, said.reject_blocks, said.reject_points)
+    return CleanOptions(PairOptions(said.reject_pairs, how), said.variance_components)
+
+
 def _loops_closed(work: Work) -> Work:
     from adjust.relay.closed import closed  # here: a survey without pairs starts without it
 
@@ -74,7 +80,7 @@ def _boards_turned(work: Work) -> Work:
 def _spots_identified(work: Work) -> Work:
     project = work.project
     gate = project.spots_request.gate_px if project.spots_request is not None else 15.0
-    how = clean_options(project.options).pairs.adjust
+    how = _options(project).pairs.adjust
     try:
         part = supported(without_points(project.survey))[0]
         first = adjust(part, work.begin(part), how, work.progress)
@@ -98,7 +104,7 @@ def _unobserved_left_out(work: Work) -> Work:
 
 def _adjusted(work: Work) -> Work:
     """Least squares without gross errors, with variance components where they are asked for."""
-    how = clean_options(work.project.options)
+    how = _options(work.project)
     try:
         result = without_lost_points(
             work.survey, lambda part: adjust_cleaned(part, how, work.progress, work.begin(part))

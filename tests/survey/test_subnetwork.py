@@ -4,7 +4,7 @@ import numpy as np
 
 from adjust.model.observations import Distance, PositionRef, Reading, ReadingCovariance
 from adjust.model.survey import TILT, Setup, Survey, VectorParameter, Vertical
-from survey.jobs.adjusting.less_observations import only_between, points_read
+from survey.jobs.adjusting.subnetwork import only_between, points_read
 
 A, B, C = PositionRef("A"), PositionRef("B"), PositionRef("C")
 

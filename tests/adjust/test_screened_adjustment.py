@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from adjust.adjustment import AdjustOptions
-from adjust.statistics.cleaned import CleanOptions, adjust_cleaned
-from adjust.statistics.pair_screen import PairOptions
+from adjust.statistics.pair_networks import PairOptions
+from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from survey.simulate import beacons
 from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net
@@ -42,7 +42,9 @@ def test_a_wrong_tape_is_not_blamed_on_the_few_rays_to_its_beacon() -> None:
 def test_a_search_that_is_left_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     survey, start = net.hall(8)
     wrong = net.with_reading(survey, 4, value=survey.readings[4].value + 100.0 * survey.readings[4].sigma)
-    monkeypatch.setattr("adjust.statistics.cleaned._LARGEST", 10)
+    monkeypatch.setattr("adjust.statistics.screened_adjustment._LARGEST", 10)
+    assert not [w for w in adjust_cleaned(wrong, start=start).warnings if "not searched for" in w]
+    monkeypatch.setattr("adjust.statistics.screened_adjustment._ROOM", 10.0)
     found = adjust_cleaned(wrong, start=start, options=CleanOptions())
     assert [w for w in found.warnings if "gross errors were not searched for" in w]
     assert not [w for w in adjust_cleaned(survey, CleanOptions(), start=start).warnings if "not searched" in w]
