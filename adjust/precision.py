@@ -5,7 +5,8 @@ Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, ch
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
@@ -16,7 +17,7 @@ from adjust.datum import stacking, survey_motions
 from adjust.distributions import chi2
 from adjust.graph import AdjustmentGraph
 from adjust.image_batch import whitened_squares
-from adjust.model import BoolArray, FloatArray
+from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.observation_factor import ObservationFactor
 from adjust.result import (
     GlobalTest,
@@ -30,6 +31,9 @@ from adjust.s_transformation import STransformation, s_transformation
 from adjust.solve import Solved
 from adjust.tree_covariance import TreeCovariance
 
+if TYPE_CHECKING:
+    from adjust.pair_batch import PairStatistics
+
 _AT_A_TIME = 8192
 """Image points tested together: what is computed on the way stays in the second cache."""
 
@@ -40,11 +44,7 @@ class Precision:
     def __init__(self, graph: AdjustmentGraph, solved: Solved) -> None:
         self.graph, self.solved = graph, solved
         dims = {key: unknown.dim for key, unknown in graph.unknowns.by_key.items()}
-        if solved.use_qr:
-            tree = solved.linear.eliminateMultifrontal(solved.ordering, gtsam.EliminateQR)
-        else:
-            tree = solved.linear.eliminateMultifrontal(solved.ordering)
-        self.tree = TreeCovariance(tree, dims, solved.leaves)
+        self.tree = TreeCovariance(solved.tree, dims, solved.leaves)
         self.hidden: dict[int, FloatArray] = {}
         self.bundle_influence = np.zeros((0, 3))
         self._hidden = None if graph.bundle is None else BundleHidden(graph.bundle)
@@ -130,6 +130,33 @@ class Precision:
             L[place.index(seen), at.index(seen)] = 1.0
         return self._in_datum(keys, L @ Q @ L.T + scatter)
 
+    @cached_property
+    def pairs(self) -> "PairStatistics":
+        """Statistics of the pairs between fixed stations. Raises ValueError where there are none."""
+        if self.graph.pairs is None:
+            raise ValueError("the survey has no pairs between fixed stations")
+        return self.graph.pairs.statistics(self.tree, self.solved.values)
+
+    @cached_property
+    def single(self) -> list[int]:
+        """Which of the other observations are in no batch, by number."""
+        batch, first = self.graph.pairs, self.graph.first_pair
+        within = set() if batch is None else set((first + batch.rows).tolist())
+        return [i for i in range(len(self.graph.others)) if i not in within]
+
+    def covs(self, keys: IntArray, dim: int) -> FloatArray:
+        """Covariances (n, dim, dim) of many unknowns of the same dimension, none of them hidden."""
+        Q = self.tree.pairs(keys, np.full(len(keys), -1), dim)[:, :dim, :dim]
+        t = self.transformation
+        if t is not None:
+            G, W = (np.array([of[k] for k in keys.tolist()]) for of in (t.motions, t.spread))
+            across = G @ np.swapaxes(W, 1, 2)
+            Q += G @ t.core @ np.swapaxes(G, 1, 2) - across - np.swapaxes(across, 1, 2)
+        for i, key in enumerate(keys.tolist()):
+            if held := list(self.graph.unknowns.held.get(key, ())):
+                Q[i, held], Q[i, :, held] = 0.0, 0.0
+        return Q
+
     def influence(self, item: ObservationFactor) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Whitened residual (k,), whitened A Q A' (k, k), and the square root information's inverse (k, k)."""
         linear = item.factor.linearize(self.solved.values)
@@ -208,8 +235,13 @@ def _merge(graph: AdjustmentGraph, parts: list[tuple[Any, ...]]) -> ImageResidua
 
 def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
     """The same for every observation that is neither an image point nor a reading."""
-    out = []
-    for item in precision.graph.others:
+    graph, out = precision.graph, dict[int, ObservationResidual]()
+    if graph.pairs is not None:
+        places = (graph.first_pair + graph.pairs.rows).tolist()
+        found = graph.pairs.residuals(precision.pairs, [graph.others[i] for i in places])
+        out |= dict(zip(places, found, strict=True))
+    for i in precision.single:
+        item = graph.others[i]
         e, M, root = precision.influence(item)
         n = len(e)
         Q = np.eye(n) - M if item.used else np.eye(n) + M
@@ -222,11 +254,9 @@ def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
         test = float(e @ np.linalg.pinv(Q, rcond=1e-9) @ e)
         redundancy = np.diag(Q) if item.used else np.zeros(n)
         adjusted = adjusted_motion(item.observed, v) if item.kind == "pair" else np.asarray(item.observed + v)
-        out.append(
-            ObservationResidual(item.kind, item.group, item.ids, item.components, item.units, item.observed,
-                                adjusted, v, sigma, redundancy, standardized, test, item.used)
-        )  # fmt: skip
-    return tuple(out)
+        out[i] = ObservationResidual(item.kind, item.group, item.ids, item.components, item.units, item.observed,
+                                     adjusted, v, sigma, redundancy, standardized, test, item.used)  # fmt: skip
+    return tuple(out[i] for i in range(len(graph.others)))
 
 
 def adjusted_motion(observed: FloatArray, v: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ nothing of the unknowns hidden in a batch.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -38,16 +39,24 @@ Progress = Callable[[int, float], None]
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """max_step: convergence, what is left to go for any unknown in its own sigmas. max_iterations: steps tried."""
+    """max_step: convergence, what is left to go for any unknown in its own sigmas. max_iterations: steps tried.
+
+    patience: whole steps that may fail to lower chi-square, one after the other, before the search goes back to where
+    it was least. On long corridors of pairs the first ones raise it before it falls (watchdog technique: Chamberlain,
+    Lemarechal, Pedersen and Powell 1982; Nocedal and Wright 2006, section 15.6). determined: what the observations
+    determine was judged before; where GTSAM's Cholesky refuses, QR solves.
+    """
 
     max_step: float = 1e-6
     max_iterations: int = 200
     first_damping: float = 1e-4
+    patience: int = 0
+    determined: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The minimum and how it was reached. linear: GTSAM's linearised graph there, eliminated in ``ordering``."""
+    """The minimum and how it was reached. linear: GTSAM's linearised graph there, eliminated in ``ordering``: tree."""
 
     values: gtsam.Values
     linear: gtsam.GaussianFactorGraph
@@ -59,6 +68,11 @@ class Solved:
     datum: InnerDatum | None
     leaves: Leaves | None = None
     """The poses that were reduced before, as cliques of the Bayes tree of ``linear``."""
+
+    @cached_property
+    def tree(self) -> gtsam.GaussianBayesTree:
+        """The Bayes tree."""
+        return eliminated(self.linear, self.ordering, self.use_qr)
 
 
 class _Loop:
@@ -78,6 +92,9 @@ class _Loop:
         self.judging = True
         self.behind: frozenset[tuple[str, str, str | None]] = frozenset()
         self._ordering: tuple[gtsam.NonlinearFactorGraph, gtsam.Ordering] | None = None
+        self.best: tuple[gtsam.Values, float] = self.values, np.inf
+        self.waited = 0
+        self.steps: list[float] = []
 
     def _set_datum(self) -> None:
         self.datum = inner_datum(self.graph, self.values)
@@ -138,7 +155,9 @@ class _Loop:
                 self.graph.prepare(self.values, True, self.damping)
                 self.linearize()
                 return self.step()
-            names = describe_null_space(self.graph, self.linear, self.values)
+            names = None
+            if not self.options.determined:
+                names = describe_null_space(self.graph, self.linear, self.values)
             if names is not None:
                 raise names from None
             self.use_qr = True  # weak, but determined: GTSAM's Cholesky refuses pivots that QR still resolves
@@ -150,11 +169,19 @@ class _Loop:
     def _last_keys(self) -> list[int]:
         by_key, all_keys = self.graph.unknowns.by_key, list(self.graph.system.keyVector())
         keys = [k for k in all_keys if k in by_key and by_key[k].name[0] in _LATE]
+        if self.options.determined and self.graph.pairs is not None:
+            # far stations eliminated last would have lost nearly all of their information by then
+            keys += sorted(self.graph.pairs.next_to_held() | self._with_prior())
         keys += [k for k in (self.datum.minimal if self.datum is not None else ()) if k not in keys]
         return keys if len(keys) < len(all_keys) else []
 
+    def _with_prior(self) -> set[int]:
+        by_name = self.graph.unknowns.by_name
+        return {by_name[item.ids].key for item in self.graph.singles if item.kind == "prior"}
+
     def run(self) -> Solved:
         omega = self.evaluate(self.values)
+        self.best = self.values, omega
         self.behind = self._images_behind()
         self.linearize()
         for iteration in range(1, self.options.max_iterations + 1):
@@ -163,14 +190,19 @@ class _Loop:
             except IndeterminateError:
                 if self.judging:
                     raise
+                self.values, omega = self.best
                 self._damp(iteration)
                 continue
             self.before, self.moved = self.moved, np.sqrt(max(0.0, promised))
-            found = self._along(delta, omega, promised)
+            watched = self.options.patience > 0 and self.damping == 0.0
+            found = self._watched(delta, omega, promised) if watched else self._along(delta, omega, promised)
             if found is None:
+                self.values, omega = self.best
                 self._damp(iteration)
                 continue
             self.values, omega, gain = found
+            if omega < self.best[1] or not watched:
+                self.best, self.waited = (self.values, omega), 0
             if self.progress:
                 self.progress(iteration, omega)
             if self._arrived():
@@ -206,6 +238,17 @@ class _Loop:
             length *= 0.5
         return None
 
+    def _watched(
+        self, delta: gtsam.VectorValues, omega: float, promised: float
+    ) -> tuple[gtsam.Values, float, float] | None:
+        """The whole step, whether chi-square falls or not; None where it has not fallen for too long."""
+        trial = self.values.retract(delta)
+        new = self.evaluate(trial)
+        self.waited += 1
+        if not np.isfinite(new) or (self.waited >= self.options.patience and self.moved > 1e-3):
+            return None
+        return trial, new, (omega - new) / max(promised, 1e-300)
+
     def _at_the_bottom(self, new: float, old: float) -> bool:
         """Where rounding decides whether chi-square falls."""
         return self.moved < 1e-4 or (self.moved**2 < 1e-11 * old and new <= old * (1.0 + 1e-11))
@@ -218,6 +261,10 @@ class _Loop:
         """Whether what is left to go is small: steps shrink at least linearly near the minimum."""
         if self.damping > 0.0:
             return False
+        self.steps.append(self.moved)
+        last = self.steps[-4:]
+        if self.options.patience and len(self.steps) > 4 and max(last) < 1e-3 and last[-1] > 0.1 * last[0]:
+            return True  # where rounding alone moves the unknowns the steps stay small
         ratio = min(1.0, self.moved / self.before) if np.isfinite(self.before) else 1.0
         return self.moved * max(ratio, 1.0 - self.length) < self.options.max_step
 
@@ -250,7 +297,7 @@ class _Loop:
 
     def _damp(self, iteration: int) -> None:
         """From the present values once more, with shorter steps."""
-        self.length = 1.0
+        self.length, self.waited, self.steps = 1.0, 0, []
         while True:
             self.damping = max(self.damping * 10.0, self.options.first_damping)
             if self.damping > 1e8:
@@ -276,12 +323,27 @@ class _Loop:
             self.graph.prepare(self.values, True)
         self.linearize()
         # the covariances need this linearisation anyway: its step costs one elimination and brings the last digits
-        delta, _ = self.completed(self.step())
+        try:
+            tree = eliminated(self.linear, self.ordering, self.use_qr)
+            step = tree.optimize()
+        except RuntimeError:  # judged by the next elimination
+            tree, step = None, self.step()
+        delta, _ = self.completed(step)
         self.values = self.values.retract(delta)
         leaves = None if self.graph.reduction is None else self.graph.reduction.leaves()
-        return Solved(
+        found = Solved(
             self.values, self.linear, self.ordering, self.use_qr, omega, iteration, self.moved, self.datum, leaves
         )
+        if tree is not None:
+            found.__dict__["tree"] = tree
+        return found
+
+
+def eliminated(
+    linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, use_qr: bool
+) -> gtsam.GaussianBayesTree:
+    """The Bayes tree of a linearised graph."""
+    return linear.eliminateMultifrontal(*((ordering, gtsam.EliminateQR) if use_qr else (ordering,)))
 
 
 def damped(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.GaussianFactorGraph:

@@ -148,7 +148,8 @@ def _others(precision: Precision) -> list[_Batch]:
     """All other observations, those with the same number of components together."""
     n_image = sum(len(b.uv) for b in precision.graph.survey.image_blocks)
     found: dict[int, list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]]] = {}
-    for i, item in enumerate(precision.graph.others):
+    for i in precision.single:
+        item = precision.graph.others[i]
         e, M, back = precision.influence(item)
         found.setdefault(len(e), []).append((n_image + i, e, M, np.asarray(noise_of(item).R()), back))
     out = []
@@ -156,6 +157,23 @@ def _others(precision: Precision) -> list[_Batch]:
         rows, e, M, W, back = (np.array([x[i] for x in same]) for i in range(5))
         used = np.array([precision.graph.others[i - n_image].used for i in rows], dtype=np.bool_)
         out.append(_Batch(rows, whitened(e, M, used), W, back))
+    return out + _pairs(precision, n_image)
+
+
+def _pairs(precision: Precision, n_image: int) -> list[_Batch]:
+    """Pairs between fixed stations, poses and rotations."""
+    batch, out = precision.graph.pairs, list[_Batch]()
+    if batch is None:
+        return out
+    stats, arrays = precision.pairs, batch.arrays
+    for k, kind in ((6, arrays.is_pose), (3, ~arrays.is_pose)):
+        chosen = np.flatnonzero(kind)
+        if len(chosen):
+            W = arrays.whitening[chosen, :k, :k]
+            M = W @ stats.adjusted_cov[chosen, :k, :k] @ W.transpose(0, 2, 1)
+            x = whitened(stats.whitened[chosen, :k], M, np.asarray(arrays.used[chosen], dtype=np.bool_))
+            rows = n_image + precision.graph.first_pair + batch.rows[chosen]
+            out.append(_Batch(rows, x, W, np.asarray(np.linalg.inv(W))))
     return out
 
 
