@@ -27,7 +27,7 @@ from adjust.tree_covariance import TreeCovariance
 from adjust.unknowns import POSE_COMPONENTS, POSE_UNITS, FrameTree, Unknowns
 
 UNCONTROLLED = 1e-4
-"""Share of a pair's direction that others must control for it to be tested; covariances of weak networks lose digits."""
+"""Share of a pair's direction that others must control for it to be tested; weak covariances lose digits."""
 _HELD = -1
 
 
@@ -35,7 +35,7 @@ _HELD = -1
 class PairArrays:
     """E measured ``b_from_a``: rotations (E, 3, 3), translations (E, 3) m, nan where only the rotation was measured.
 
-    cov: (E, 6, 6) in the tangent of the frame on the right (a), infinite variance where nothing was measured. used: (E,).
+    cov: (E, 6, 6) in the tangent of the frame on the right (a), infinite variance where nothing was measured.
     """
 
     rotations: FloatArray
@@ -310,8 +310,8 @@ def simple_pairs(survey: Survey, frames: FrameTree) -> tuple[IntArray, IntArray,
     fixed = {s.station_id: s.world_from_station for s in survey.stations if s.motion == "fixed"}
     rows = [row for row, p in enumerate(survey.pairs) if p.a.kind == p.b.kind == "station" and p.a != p.b
             and p.a.frame_id in fixed and p.b.frame_id in fixed]  # fmt: skip
-    ends = [[getattr(survey.pairs[row], end).frame_id for row in rows] for end in ("a", "b")]
-    joined = set(ends[0]).union(ends[1])
-    slot = {s: frames.unknowns.slot(("world_from_station", s), given) for s, given in fixed.items() if s in joined}
-    of_a, of_b = (np.array([slot[s] for s in ids], dtype=np.int64) for ids in ends)
+    ends = [(survey.pairs[row].b.frame_id, survey.pairs[row].a.frame_id) for row in rows]
+    joined = dict.fromkeys(s for both in ends for s in both)
+    slot = {s: frames.unknowns.slot(("world_from_station", s), fixed[s]) for s in joined}
+    of_b, of_a = np.array([(slot[b], slot[a]) for b, a in ends], dtype=np.int64).reshape(-1, 2).T
     return np.array(rows, dtype=np.int64), of_a, of_b

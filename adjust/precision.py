@@ -20,6 +20,7 @@ from adjust.image_batch import whitened_squares
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.observation_factor import ObservationFactor
 from adjust.result import (
+    Adjustment,
     GlobalTest,
     GroupSummary,
     ImageResiduals,
@@ -50,6 +51,8 @@ class Precision:
         self._hidden = None if graph.bundle is None else BundleHidden(graph.bundle)
         if self._hidden is not None:
             self._add_hidden(self._hidden)
+        self.by_conditions: Mapping[str, FloatArray] = {}
+        """Covariances (k, k) of adjusted pairs by id, where they are from the conditions of their loops."""
         self.transformation: STransformation | None = None
         if solved.datum is not None:
             motions = survey_motions(graph, solved.values, solved.datum.directions)
@@ -157,12 +160,39 @@ class Precision:
                 Q[i, held], Q[i, :, held] = 0.0, 0.0
         return Q
 
+    def pair_covariances(self) -> dict[str, FloatArray]:
+        """Covariances (k, k) of the adjusted pairs by id, a priori, in the tangent in frame a."""
+        graph, out = self.graph, dict[str, FloatArray]()
+        if graph.pairs is not None:
+            cov, sizes = self.pairs.adjusted_cov, np.where(graph.pairs.arrays.is_pose, 6, 3).tolist()
+            out = {graph.survey.pairs[row].pair_id: cov[e, :k, :k]
+                   for e, (row, k) in enumerate(zip(graph.pairs.rows.tolist(), sizes, strict=True))}  # fmt: skip
+        for item in graph.singles:
+            if item.kind == "pair":
+                _, M, root = self.influence(item)
+                out[item.ids[0]] = root @ M @ root.T
+        return out | dict(self.by_conditions)
+
     def influence(self, item: ObservationFactor) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Whitened residual (k,), whitened A Q A' (k, k), and the square root information's inverse (k, k)."""
         linear = item.factor.linearize(self.solved.values)
         A, b = linear.jacobian()
         Q = self._in_datum(list(linear.keys()), self.tree.joint(list(linear.keys())))
         return -b, A @ Q @ A.T, np.asarray(np.linalg.inv(noise_of(item).R()))
+
+
+def rotations_only(adjustment: Adjustment) -> bool:
+    """Whether nothing but rotations was measured, so that nothing is where it seems to be."""
+    found = adjustment.precision
+    if not isinstance(found, Precision) or found.graph.pairs is None or found.graph.pairs.arrays.is_pose.any():
+        return False
+    unknowns = found.graph.unknowns
+    return all(unknowns.held.get(key) == (3, 4, 5) for key in unknowns.by_key)
+
+
+def in_conditions(adjustment: Adjustment) -> bool:
+    """Whether what the adjustment says of pairs is from the conditions of their loops, not from the poses of frames."""
+    return isinstance(adjustment.precision, Precision) and bool(adjustment.precision.by_conditions)
 
 
 def noise_of(item: ObservationFactor) -> gtsam.noiseModel.Gaussian:

@@ -11,7 +11,7 @@ import numpy as np
 from adjust.distributions import norm
 from adjust.epoch_states import datum_carriers, open_directions
 from adjust.model import FloatArray
-from adjust.named_precision import in_conditions
+from adjust.precision import in_conditions
 from adjust.result import Adjustment, Estimate, GroupSummary
 from survey.files.detected import DetectedImage
 from survey.files.project import LeftOut

@@ -14,10 +14,9 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.errors import SurveyError
-from adjust.model import FloatArray
-from adjust.observations import Pair
 from adjust.factors import pose_prior_factor
-from adjust.model import PoseParameter
+from adjust.model import FloatArray, PoseParameter
+from adjust.observations import Pair
 from adjust.pair_batch import NoiseCache, native_factor
 from adjust.pose_network.growth import Batch, Growth, Tree, moved_over
 from adjust.pose_network.network import PoseNetwork, pose_network

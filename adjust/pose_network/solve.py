@@ -11,9 +11,9 @@ from adjust.datum import inner_datum
 from adjust.errors import IndeterminateError, NotConvergedError
 from adjust.graph import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.model import FloatArray
+from adjust.pose_network.from_survey import survey_of
 from adjust.pose_network.network import PoseNetwork, check_determined
 from adjust.pose_network.start import find_network_start
-from adjust.pose_network.from_survey import survey_of
 from adjust.relay.motions import Motions
 from adjust.result import ParameterName
 from adjust.solve import Solved, SolveOptions, solve
@@ -51,7 +51,7 @@ class Minimum:
 
     @cached_property
     def omega(self) -> float:
-        """v'Pv of the pairs in use and the priors."""
+        """V'Pv of the pairs in use and the priors."""
         batch, values = self.graph.pairs, self.solved.values
         if batch is None:
             raise ValueError("a network has pairs")
@@ -74,8 +74,12 @@ def minimize(
     R, t = find_network_start(network) if start is None else (start[0].copy(), start[1].copy())
     held = network.held
     R[held], t[held] = network.station_rotations[held], np.nan_to_num(network.station_translations[held])
-    builder = GraphBuilder(survey_of(network), {}, network.arrays)
+    survey = survey_of(network)
+    builder = GraphBuilder(survey, {}, network.arrays)
+    given = {s.station_id: s.world_from_station for s in survey.stations}
     names: list[ParameterName] = [("world_from_station", s) for s in network.station_ids]
+    for name in names:  # in this order they are eliminated where nothing else tells, and listed
+        builder.unknowns.slot(name, given[name[1]])
     at = np.zeros_like(t) if network.rotation_only else t
     graph = builder.build(StartValues({}, {n: Pose3(Rot3(a), b) for n, a, b in zip(names, R, at, strict=True)}, {}))
     try:

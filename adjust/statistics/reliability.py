@@ -6,13 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.model import FloatArray, IntArray
-from adjust.named_precision import NamedPrecision
 from adjust.precision import Precision, noise_of
 from adjust.result import Adjustment
 from adjust.statistics.condensed import CondensedSystem, condensed_system
 from adjust.statistics.criteria import criteria
 from adjust.statistics.influence import influences
-from adjust.statistics.pose_networks import network_whitening
 from adjust.statistics.result import (
     Criteria,
     ImageEllipses,
@@ -32,6 +30,7 @@ from adjust.statistics.single_tests import (
     whitened,
 )
 from adjust.statistics.system import precision_of
+from adjust.survey_kind import is_pose_network
 from adjust.terrestrial.statistics import influences as influences_of_readings
 
 DEFAULT_LEVELS = LevelOptions()
@@ -67,7 +66,7 @@ def reliability(
     n_tests = int(sum(np.count_nonzero(b.x.freedom) for b in batches))
     found = criteria(options, n_tests, int(sizes.max(initial=1)))
     tests = _table(adjustment, batches, ptr, found)
-    if isinstance(adjustment.precision, NamedPrecision) and len(ptr) > LARGEST_NETWORK:
+    if is_pose_network(adjustment.survey) and len(ptr) > LARGEST_NETWORK:
         most_influences = 0
     return Reliability(
         found, tests, _ellipses(batches[0], found),
@@ -78,13 +77,6 @@ def reliability(
 
 def _batches(adjustment: Adjustment, system: CondensedSystem | None) -> list[_Batch]:
     """Image points first."""
-    if isinstance(adjustment.precision, NamedPrecision):
-        none = np.zeros((0, 2, 2))
-        first = _Batch(np.zeros(0, dtype=np.int64), whitened(none[:, 0], none, np.zeros(0, dtype=np.bool_)), none, none)
-        found = network_whitening(adjustment, adjustment.precision)
-        backs = [np.asarray(np.linalg.inv(W), dtype=float) for _, _, _, W, _ in found]
-        return [first, *(_Batch(rows, whitened(e, M, used), W, back)
-                         for (rows, e, M, W, used), back in zip(found, backs, strict=True))]  # fmt: skip
     precision = system.system.precision if system is not None else precision_of(adjustment)
     return [_images(precision), *_others(precision), *_readings(precision)]
 
