@@ -200,7 +200,7 @@ class PairBatch:
     def next_to_held(self) -> set[int]:
         """The variables that a pair in use joins with something held."""
         a, b, used = self.a_key, self.b_key, self.arrays.used
-        return set(b[used & (a == _HELD)].tolist()) | set(a[used & (b == _HELD)].tolist()) - {_HELD}
+        return {*b[used & (a == _HELD)].tolist(), *a[used & (b == _HELD)].tolist()} - {_HELD}
 
     def items(self, pairs: Sequence[Pair]) -> list[ObservationFactor]:
         """What a report needs to know of each; ``pairs`` are those of the survey."""

@@ -12,7 +12,7 @@ from adjust.closed_forms import nearest_rotation
 from adjust.errors import IndeterminateError, SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray, Survey
 from adjust.pair_batch import PairArrays
-from adjust.relay.graphs import loop_labels
+from adjust.relay.cycles import loop_labels
 
 _FEW = 8
 

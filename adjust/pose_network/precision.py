@@ -56,6 +56,8 @@ class NetworkPrecision:
 
         It does not depend on the datum.
         """
+        if a == b:
+            return np.eye(4), np.zeros((self.network.dim,) * 2)
         both = self.world_from_station
         b_from_a = both[np.array([b])].inverse() @ both[np.array([a])]
         J = np.hstack([np.eye(self.network.dim), -b_from_a.inverse().adjoint()[0]])

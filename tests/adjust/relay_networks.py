@@ -7,7 +7,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.observations import FrameRef, Pair
 from adjust.relay.motions import Motions
-from adjust.relay.network import Network, complete_topology, topology
+from adjust.relay.network import Network, topology
 
 ARCMIN = np.pi / 180 / 60
 
@@ -31,7 +31,9 @@ def grid(nx, ny):
 
 
 def complete(n):
-    return complete_topology([f"C{i + 1}" for i in range(n)])
+    """Every camera measured with every other, in the order (1, 2), (1, 3), ..., (2, 3), ...; ids are ``a-b``."""
+    ids = [f"C{i + 1}" for i in range(n)]
+    return topology([(f"{a}-{b}", a, b) for i, a in enumerate(ids) for b in ids[i + 1 :]], ids)
 
 
 def chain_with_chords(n, chords, seed=0):
