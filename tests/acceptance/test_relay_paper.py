@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from adjust.errors import IndeterminateError
-from adjust.relay.condition_factors import MAX_HARD_LOOPS
-from adjust.relay.conditions import ConditionOptions, adjust_condition_factors, adjust_conditions
+from adjust.relay.conditions import MAX_HARD_LOOPS, ConditionOptions, adjust_condition_factors, adjust_conditions
 from adjust.relay.counts import count
 from adjust.relay.loops import loop_misclosures
 from adjust.relay.motions import Motions

@@ -11,8 +11,7 @@ from adjust.model import Camera, LensParameter, PoseParameter, Station, Survey, 
 from adjust.observations import Closure, FrameRef, Pair
 from adjust.pair_screen import PairOptions, adjust_with_pairs
 from adjust.relay.closed import closed, play
-from adjust.relay.condition_factors import MAX_HARD_LOOPS
-from adjust.relay.conditions import adjust_condition_factors, adjust_conditions, adjust_loops
+from adjust.relay.conditions import MAX_HARD_LOOPS, adjust_condition_factors, adjust_conditions, adjust_loops
 from adjust.result import Adjustment
 from survey.simulate import resample, stereo
 from tests.adjust import helpers as h

@@ -10,8 +10,7 @@ from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.graph import StartValues
 from adjust.model import Datum, PoseParameter, Station, Survey
 from adjust.observations import FrameRef, Pair
-from adjust.relay.condition_factors import MAX_HARD_LOOPS
-from adjust.relay.conditions import ConditionOptions, adjust_condition_factors, adjust_conditions
+from adjust.relay.conditions import MAX_HARD_LOOPS, ConditionOptions, adjust_condition_factors, adjust_conditions
 from adjust.relay.loops import evaluate_loops, loop_basis, loop_misclosures
 from adjust.relay.motions import Motions
 from adjust.relay.network import Network, network_from_pairs, topology
