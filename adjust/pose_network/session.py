@@ -15,9 +15,10 @@ from gtsam import Pose3, Rot3
 
 from adjust.errors import SurveyError
 from adjust.factors import pose_prior_factor
-from adjust.model import FloatArray, PoseParameter
+from adjust.model import FloatArray, PoseParameter, Survey
 from adjust.observations import Pair
 from adjust.pair_batch import NoiseCache, native_factor
+from adjust.pose_network.from_survey import network_from_survey
 from adjust.pose_network.growth import Batch, Growth, Tree, moved_over
 from adjust.pose_network.network import PoseNetwork, pose_network
 from adjust.pose_network.solution import NetworkSolution, as_solution, solve_network
@@ -77,9 +78,15 @@ class NetworkSession:
     """A solved network that takes additions; not a value, but the state of one piece of work."""
 
     def __init__(
-        self, network: PoseNetwork | NetworkSolution, options: SessionOptions = SessionOptions(),
+        self, network: Survey | PoseNetwork | NetworkSolution, options: SessionOptions = SessionOptions(),
         solve: NetworkOptions = DEFAULTS,
     ) -> None:  # fmt: skip
+        """network: fixed stations and pairs of poses between them, solved here where they are not.
+
+        Raises SurveyError for a survey of anything else, and for rotations alone.
+        """
+        if isinstance(network, Survey):
+            network = network_from_survey(network)
         solution = network if isinstance(network, NetworkSolution) else solve_network(network, options=solve)
         self.options, self.solve_options = options, solve
         self._base = solution.network
