@@ -85,11 +85,6 @@ class PoseNetwork:
         return {s: i for i, s in enumerate(self.station_ids)}
 
     @cached_property
-    def pair_index_of(self) -> dict[str, int]:
-        """Position of every pair id."""
-        return {p: i for i, p in enumerate(self.pair_ids)}
-
-    @cached_property
     def anchor(self) -> int | None:
         """The station that a free network is solved against, None where the datum is given."""
         if len(self.held) or self.prior_cov or not len(self.inner):
@@ -121,7 +116,7 @@ class PoseNetwork:
     def with_used(self, used: BoolArray) -> "PoseNetwork":
         """The same network with other pairs in use; nothing else is computed again."""
         out = replace(self, used=np.asarray(used, dtype=np.bool_))
-        for name in ("rotation_only", "index_of", "pair_index_of", "as_survey"):
+        for name in ("rotation_only", "index_of", "as_survey"):
             if name in self.__dict__:
                 out.__dict__[name] = self.__dict__[name]
         out.__dict__["arrays"] = self.arrays.with_used(out.used)

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from adjust.model import FloatArray, IntArray
-from adjust.pair_batch import PairStatistics, pair_jacobians
+from adjust.pair_batch import PairStatistics
 from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.solve import Minimum
 from adjust.precision import Precision
@@ -71,12 +71,3 @@ class NetworkPrecision:
     def pairs(self) -> PairStatistics:
         """Statistics of all pairs, in use or not."""
         return self.of_survey.pairs.first(self.network.dim)
-
-
-def network_jacobians(
-    network: PoseNetwork, world_from_station: Motions
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Residuals (E, dim) of all pairs, their derivatives (E, dim, dim) by b and by a, and Ad(b_from_a^-1)."""
-    here, measured = world_from_station, network.arrays.motions
-    b_from_a = here[network.b_idx].inverse() @ here[network.a_idx]
-    return pair_jacobians(measured if network.dim == 6 else Motions(measured.rotation), b_from_a)

@@ -293,11 +293,6 @@ class NetworkSession:
         self._factor_of = {pair: table[n] for pair, n in self._factor_of.items()}
         self._growth, self._shares, self._switched_at = growth, [], len(self._ids)
 
-    @property
-    def in_batches(self) -> bool:
-        """Whether additions are solved by batch iterations."""
-        return isinstance(self._growth, Batch)
-
     def network(self) -> PoseNetwork:
         """The whole network as it stands."""
         base, g = self._base, self._grown

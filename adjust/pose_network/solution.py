@@ -57,12 +57,6 @@ class NetworkSolution:
         index = self.network.index_of
         return self.precision.relative(index[a_id], index[b_id])
 
-    def reinstated(self, pair_ids: tuple[str, ...]) -> PoseNetwork:
-        """The network with these rejected pairs in use again, to be solved anew."""
-        used = self.network.used.copy()
-        used[[self.network.pair_index_of[p] for p in pair_ids]] = True
-        return self.network.with_used(used)
-
 
 def solve_network(
     network: PoseNetwork, start: tuple[FloatArray, FloatArray] | None = None,

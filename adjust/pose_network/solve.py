@@ -14,7 +14,6 @@ from adjust.model import FloatArray
 from adjust.pose_network.from_survey import survey_of
 from adjust.pose_network.network import PoseNetwork, check_determined
 from adjust.pose_network.start import find_network_start
-from adjust.relay.motions import Motions
 from adjust.result import ParameterName
 from adjust.solve import Solved, SolveOptions, solve
 
@@ -121,8 +120,3 @@ def _take(R: FloatArray, t: FloatArray, network: PoseNetwork, graph: AdjustmentG
     R[rows] = graph.state.slot_R[list(index.values())]
     if not network.rotation_only:
         t[rows] = graph.state.slot_t[list(index.values())]
-
-
-def world_from_stations(network: PoseNetwork, minimum: Minimum) -> Motions:
-    """All stations, rotations alone in a network of rotations."""
-    return Motions(minimum.rotations, None if network.rotation_only else minimum.translations)

@@ -98,3 +98,11 @@ def pairs_of(simulated):
         )
         for e in range(top.n_pairs)
     )
+
+
+def suspects(pairs, alpha=0.001):
+    """Positions of the pairs that do not fit, worst first, at one level for the whole network (Sidak)."""
+    tested = np.flatnonzero(pairs.freedom > 0)
+    single = 1.0 - (1.0 - alpha) ** (1.0 / len(tested))
+    order = tested[np.argsort(-pairs.test[tested] / pairs.freedom[tested], kind="stable")]
+    return order[pairs.p_value[order] < single].tolist()

@@ -13,13 +13,12 @@ from adjust.pair_screen import PairOptions, adjust_with_pairs
 from adjust.pose_network import NetworkOptions, pose_network, solve_network
 from adjust.pose_network.from_survey import network_from_survey
 from adjust.pose_network.network import PoseNetwork, loop_marks
-from adjust.pose_network.precision import network_jacobians
 from adjust.pose_network.robust import _worst_around, graduated_weights
 from adjust.pose_network.solve import minimize
 from adjust.relay.motions import Motions
 from adjust.solve import _Loop
 from tests.adjust.chordal import chordal_cost, minimize_chordal
-from tests.adjust.pose_networks import exp6, simulate
+from tests.adjust.pose_networks import exp6, network_jacobians, simulate
 
 PLAIN = NetworkOptions(robust="off")
 
@@ -184,7 +183,7 @@ def test_wrong_pairs_are_found_and_named_in_a_small_network() -> None:
         test = solution.global_test(1e-4)
         assert test is not None
         assert test.passed
-        again = solve_network(solution.reinstated(tuple(sim.wrong)), options=PLAIN)
+        again = solve_network(solution.network.with_used(np.ones(sim.network.n_pairs, dtype=bool)), options=PLAIN)
         assert again.network.used.all()
         assert again.omega > 100 * solution.omega
 

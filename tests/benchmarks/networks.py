@@ -16,10 +16,9 @@ from gtsam import Pose3, Rot3
 from adjust.model import FloatArray
 from adjust.observations import FrameRef, Pair
 from adjust.pose_network import NetworkOptions, NetworkSolution, PoseNetwork, pose_network, solve_network
-from adjust.pose_network.precision import network_jacobians
 from adjust.pose_network.session import NetworkSession
 from adjust.relay.motions import Motions
-from tests.adjust.pose_networks import simulate
+from tests.adjust.pose_networks import network_jacobians, simulate
 
 PLAIN = NetworkOptions(robust="off")
 
