@@ -77,6 +77,23 @@ def test_a_ring_with_a_tail_names_the_tail():
     assert found.redundancy == 6
 
 
+def test_a_held_component_of_a_station_keeps_its_value_in_a_network_of_pairs():
+    survey, poses = _network(4, combinations(range(4), 2), noise=1.0)
+    held = PoseParameter(poses[2], held=("tz",))
+    stations = tuple(_station(s.station_id, held) if s.station_id == "S2" else s for s in survey.stations)
+    free, found = adjust_with_pairs(survey), adjust_with_pairs(replace(survey, stations=stations))
+    station = found.estimates["world_from_station", "S2"]
+    moved = Pose3.Logmap(poses[2].between(station.value))
+    assert abs(moved[5]) < 1e-11
+    assert np.abs(moved[:5]).min() > 1e-7
+    assert station.status == ("free",) * 5 + ("held",)
+    assert station.cov[5, 5] == 0.0
+    assert (found.n_unknowns, found.redundancy) == (free.n_unknowns - 1, free.redundancy + 1)
+    # the same numbers as beside observations of another kind, which the whole way of adjusting takes
+    general = adjust(replace(survey, stations=stations))
+    np.testing.assert_allclose(station.cov, general.estimates["world_from_station", "S2"].cov, atol=1e-12)
+
+
 def _rig(off):
     """Two calibrated cameras and a target on one station, pairs from the cameras to a marker and one between them."""
     poses = {"a": Pose3(Rot3.Ry(0.4), [0.1, 0, 0]), "b": Pose3(Rot3.Ry(-0.3), [-0.1, 0.02, 0]),
