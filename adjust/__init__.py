@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from adjust.errors import IndeterminateError, NotConvergedError, SurveyError
     from adjust.model import Datum, Survey
     from adjust.other_datum import in_datum
+    from adjust.pose_network.session import NetworkSession
     from adjust.result import Adjustment, Estimate
 
 _PLACES = {
@@ -29,6 +30,7 @@ _PLACES = {
     "Estimate": ("adjust.result", "Estimate"),
     "IndeterminateError": ("adjust.errors", "IndeterminateError"),
     "NotConvergedError": ("adjust.errors", "NotConvergedError"),
+    "NetworkSession": ("adjust.pose_network.session", "NetworkSession"),
     "Survey": ("adjust.model", "Survey"),
     "SurveyError": ("adjust.errors", "SurveyError"),
     "in_datum": ("adjust.other_datum", "in_datum"),
@@ -42,6 +44,7 @@ __all__ = [
     "Datum",
     "Estimate",
     "IndeterminateError",
+    "NetworkSession",
     "NotConvergedError",
     "Survey",
     "SurveyError",

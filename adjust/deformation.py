@@ -17,7 +17,7 @@ from gtsam import Pose3, Rot3
 from adjust.distributions import chi2
 from adjust.errors import SurveyError
 from adjust.model import FloatArray
-from adjust.named_precision import rotations_only
+from adjust.precision import rotations_only
 from adjust.relay.motions import right_jacobian_inverse
 from adjust.result import Adjustment, Estimate, ParameterName
 from adjust.rotation_forms import euler_cov_from_tangent, euler_from_matrix

@@ -16,7 +16,7 @@ from adjust.datum import InnerDatum, datum_rows, in_world, inner_datum, survey_m
 from adjust.errors import SurveyError
 from adjust.graph import AdjustmentGraph, GraphBuilder, values_of
 from adjust.model import Datum, FloatArray, Point, PoseParameter, Survey, Target
-from adjust.precision import Precision
+from adjust.precision import Precision, rotations_only
 from adjust.result import Adjustment, Estimate, ParameterName
 from adjust.s_transformation import STransformation, s_transformation
 
@@ -70,6 +70,8 @@ def in_datum(result: Adjustment, datum: Datum, reference: Mapping[str, FloatArra
         raise SurveyError("a solution can be moved to a datum of kind 'inner' only; to hold points, adjust again")
     if not isinstance(result.precision, Precision):
         raise SurveyError("only a solution with its covariances can be moved to another datum; adjust the survey again")
+    if rotations_only(result):
+        raise SurveyError("nothing but rotations was measured: there are no coordinates to be moved to another datum")
     precision = result.precision
     survey = replace(released(result.survey), datum=datum)
     start = values_of(result)

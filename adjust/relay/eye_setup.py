@@ -11,8 +11,8 @@ from adjust.closed_forms.hand_eye import relative_motions, solve_ax_xb
 from adjust.errors import SurveyError
 from adjust.model import BoolArray, FloatArray, IntArray
 from adjust.observations import FrameRef
+from adjust.relay.cycles import adjacency
 from adjust.relay.eye_solver import EyeConditions, EyeProblem, KnownMotion, stacked
-from adjust.relay.graphs import adjacency
 from adjust.relay.motions import Motions, identities
 
 if TYPE_CHECKING:  # the frozen values live with the functions that take them

@@ -11,8 +11,8 @@ from adjust.errors import SurveyError
 from adjust.factors import ChainPose
 from adjust.graph import GraphBuilder, values_of
 from adjust.model import FloatArray
-from adjust.named_precision import rotations_only
 from adjust.observations import FrameRef
+from adjust.precision import rotations_only
 from adjust.result import Adjustment, ParameterName
 from adjust.statistics.result import Ellipsoid, RelativePrecision
 
