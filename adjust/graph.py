@@ -263,7 +263,7 @@ class GraphBuilder:
     def __init__(
         self, survey: Survey, lenses: Mapping[str, FloatArray], measured: "PairArrays | None" = None
     ) -> None:
-        """measured: the pairs of the survey as arrays, where these are known and all between fixed stations."""
+        """measured: the pairs of the survey as arrays, where these and :attr:`simple` are known."""
         self.survey, self.unknowns, self.measured = survey, Unknowns(), measured
         collect_vectors(survey, self.unknowns, dict(lenses))
         self.terrestrial = collect_terrestrial(survey, self.unknowns)
@@ -386,7 +386,10 @@ class GraphBuilder:
             return positions, {}
         from adjust.pair_batch import simple_pairs  # here: a survey without pairs starts without it
 
-        self.simple = simple_pairs(self.survey, self.frames)
+        if self.measured is None:
+            self.simple = simple_pairs(self.survey, self.frames)
+        elif len(self.simple[0]) == len(self.survey.pairs):
+            return positions, {}
         alone = set(range(len(self.survey.pairs))).difference(self.simple[0].tolist())
         return positions, {i: self.frames.relative((p := self.survey.pairs[i]).a, p.b) for i in sorted(alone)}
 

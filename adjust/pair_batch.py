@@ -193,6 +193,11 @@ class PairBatch:
             if used and factor is not None:
                 graph.push_back(factor)
 
+    @cached_property
+    def both_held(self) -> BoolArray:
+        """Pairs (E,) between two held bodies."""
+        return np.asarray((self.a_key == _HELD) & (self.b_key == _HELD), dtype=np.bool_)
+
     def keys(self) -> set[int]:
         """The variables of all pairs, used or not."""
         return set(np.concatenate([self.a_key, self.b_key]).tolist()) - {_HELD}
@@ -242,7 +247,7 @@ class PairBatch:
 
     def statistics(self, tree: TreeCovariance, values: gtsam.Values) -> PairStatistics:
         """Statistics of all pairs, in use or not; they do not depend on the datum of ``tree``."""
-        arrays, a, b, held = self.arrays, self.a_key, self.b_key, (self.a_key == _HELD) & (self.b_key == _HELD)
+        arrays, a, b, held = self.arrays, self.a_key, self.b_key, self.both_held
         used = np.asarray(arrays.used, dtype=np.bool_)
         residual, by_b, by_a, turn = self.jacobians(values)
         Q = np.zeros((len(self), 12, 12))

@@ -54,10 +54,12 @@ class Minimum:
         batch, values = self.graph.pairs, self.solved.values
         if batch is None:
             raise ValueError("a network has pairs")
-        used, residual = batch.arrays.used, batch.jacobians(values)[0]
-        pairs = np.einsum("nij,nj->ni", batch.arrays.whitening[used], residual[used])
-        priors = [item.factor.error(values) for item in self.graph.singles if item.kind == "prior"]
-        return float(np.sum(pairs**2)) + 2.0 * float(np.sum(priors))
+        omega = 2.0 * float(self.graph.others_graph.error(values))
+        between_held = np.flatnonzero(batch.arrays.used & batch.both_held)
+        if len(between_held):  # these have no factor
+            white = batch.arrays.whitening[between_held] @ batch.jacobians(values)[0][between_held, :, None]
+            omega += float(np.sum(white**2))
+        return omega
 
 
 def minimize(
@@ -77,8 +79,9 @@ def minimize(
     builder = GraphBuilder(survey, {}, network.arrays)
     given = {s.station_id: s.world_from_station for s in survey.stations}
     names: list[ParameterName] = [("world_from_station", s) for s in network.station_ids]
-    for name in names:  # in this order they are eliminated where nothing else tells, and listed
-        builder.unknowns.slot(name, given[name[1]])
+    # in this order they are eliminated where nothing else tells, and listed
+    slots = np.array([builder.unknowns.slot(name, given[name[1]]) for name in names], dtype=np.int64)
+    builder.simple = np.arange(network.n_pairs), slots[network.a_idx], slots[network.b_idx]
     at = np.zeros_like(t) if network.rotation_only else t
     graph = builder.build(StartValues({}, {n: Pose3(Rot3(a), b) for n, a, b in zip(names, R, at, strict=True)}, {}))
     try:
