@@ -17,8 +17,9 @@ import numpy as np
 from adjust.distributions import chi2
 from adjust.model.errors import IndeterminateError, NotConvergedError
 from adjust.model.survey import BoolArray, FloatArray
+from adjust.observations.pairs import PairStatistics
 from adjust.pose_network.network import PoseNetwork, loop_marks
-from adjust.pose_network.precision import NetworkPrecision, PairStatistics
+from adjust.pose_network.precision import NetworkPrecision
 from adjust.pose_network.solve import Minimum, NetworkOptions, Progress, minimize
 from adjust.pose_network.start import (
     rotation_residuals,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adjust.adjustment import AdjustOptions, adjust
+from adjust.adjustment import AdjustOptions, adjust, assemble
 from adjust.distributions import chi2
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import IndeterminateError, NotConvergedError
@@ -101,17 +101,12 @@ def network_solution(
 
 def adjusted_network(survey: Survey, solution: "NetworkSolution", options: PairOptions) -> Adjustment:
     """The solution of a pure survey as its adjustment, with warnings."""
-    from adjust.pose_network.from_survey import network_adjustment  # here: as above
-
-    used = solution.network.used.tolist()
+    used, minimum = solution.network.used.tolist(), solution.minimum
     pairs = tuple(replace(p, used=bool(u)) for p, u in zip(survey.pairs, used, strict=True))
-    result = network_adjustment(replace(survey, pairs=pairs), solution, options.adjust.alpha)
-    return replace(result, warnings=_test_warning(result) + result.warnings + _uncontrolled_warning(result))
-
-
-def _test_warning(result: Adjustment) -> tuple[str, ...]:
-    test = result.global_test
-    return () if test is None or test.passed else (test.warning(result.sigma0),)
+    notes = tuple(f"left out: {r}" for r in solution.rejected)
+    result = assemble(minimum.graph, minimum.solved, options.adjust, notes, solution.precision.of_survey)
+    result = replace(result, survey=replace(survey, pairs=pairs))
+    return replace(result, warnings=result.warnings + _uncontrolled_warning(result))
 
 
 def _uncontrolled_warning(result: Adjustment) -> tuple[str, ...]:
