@@ -18,7 +18,7 @@ from adjust.distributions import chi2
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
-from adjust.precision.pose_networks import rotations_only
+from adjust.precision.precision import rotations_only
 from adjust.relay.motions import right_jacobian_inverse
 from adjust.spatial.rotation_forms import euler_cov_from_tangent, euler_from_matrix
 from adjust.statistics.criteria import sidak

@@ -39,19 +39,28 @@ Progress = Callable[[int, float], None]
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """max_step: convergence, what is left to go for any unknown in its own sigmas. max_iterations: steps tried."""
+    """max_step: convergence, what is left to go for any unknown in its own sigmas. max_iterations: steps tried.
+
+    patience: whole steps that may fail to lower chi-square, one after the other, before the search goes back to where
+    it was least. On long corridors of pairs the first ones raise it before it falls (watchdog technique: Chamberlain,
+    Lemarechal, Pedersen and Powell 1982; Nocedal and Wright 2006, section 15.6). determined: what the observations
+    determine was judged before; where GTSAM's Cholesky refuses, QR solves.
+    """
 
     max_step: float = 1e-6
     max_iterations: int = 200
     first_damping: float = 1e-4
+    patience: int = 0
+    determined: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The minimum and how it was reached. linear: GTSAM's graph linearised there, as ``elimination`` eliminates it."""
+    """The minimum and how it was reached. linear: GTSAM's graph linearised there; tree: what it was eliminated to."""
 
     values: gtsam.Values
     linear: gtsam.GaussianFactorGraph
+    tree: gtsam.GaussianBayesTree
     elimination: Elimination
     omega: float
     iterations: int
@@ -84,6 +93,8 @@ class _Loop:
         self.behind = self._images_behind()
         self.datum = inner_datum(graph, self.at)
         self._linearize()
+        self.best, self.waited = (self.at, self.omega), 0
+        self.steps: list[float] = []
 
     def _evaluated(self, values: gtsam.Values) -> Evaluation:
         """Everything at ``values``, ready to be linearised there. A reduction without inverse is given up for good."""
@@ -140,7 +151,9 @@ class _Loop:
             self.at = self._evaluated(self.at.values)
             self._linearize()
             return self.step()
-        names = describe_null_space(self.graph, self.linear, self.at.values)
+        names = None
+        if not self.options.determined:
+            names = describe_null_space(self.graph, self.linear, self.at.values)
         if names is not None:
             raise names
         self.use_qr = True  # weak, but determined: GTSAM's Cholesky refuses pivots that QR still resolves
@@ -149,8 +162,15 @@ class _Loop:
     def _last_keys(self) -> list[int]:
         by_key, all_keys = self.graph.unknowns.by_key, list(self.graph.view(self.at.reduction).keyVector())
         keys = [k for k in all_keys if k in by_key and by_key[k].name[0] in _LATE]
+        if self.options.determined and self.graph.pairs is not None:
+            # far stations eliminated last would have lost nearly all of their information by then
+            keys += sorted(self.graph.pairs.next_to_held() | self._with_prior())
         keys += [k for k in (self.datum.minimal if self.datum is not None else ()) if k not in keys]
         return keys if len(keys) < len(all_keys) else []
+
+    def _with_prior(self) -> set[int]:
+        by_name = self.graph.unknowns.by_name
+        return {by_name[item.ids].key for item in self.graph.singles if item.kind == "prior"}
 
     def run(self) -> Solved:
         for iteration in range(1, self.options.max_iterations + 1):
@@ -159,14 +179,19 @@ class _Loop:
             except IndeterminateError:
                 if self.judging:
                     raise
+                self.at, self.omega = self.best
                 self._damp(iteration)
                 continue
             self.before, self.moved = self.moved, np.sqrt(max(0.0, promised))
-            found = self._along(delta, promised)
+            watched = self.options.patience > 0 and self.damping == 0.0
+            found = self._watched(delta, promised) if watched else self._along(delta, promised)
             if found is None:
+                self.at, self.omega = self.best
                 self._damp(iteration)
                 continue
             self.at, self.omega, gain = found
+            if self.omega < self.best[1] or not watched:
+                self.best, self.waited = (self.at, self.omega), 0
             if self.progress:
                 self.progress(iteration, self.omega)
             if self._arrived():
@@ -203,6 +228,18 @@ class _Loop:
             length *= 0.5
         return None
 
+    def _watched(self, delta: gtsam.VectorValues, promised: float) -> tuple[Evaluation, float, float] | None:
+        """The whole step, whether chi-square falls or not; None where it has not fallen for too long."""
+        try:
+            at = self._evaluated(self.at.values.retract(delta))
+        except IndeterminateError:
+            return None
+        new = self.graph.objective(at)
+        self.waited += 1
+        if not np.isfinite(new) or (self.waited >= self.options.patience and self.moved > 1e-3):
+            return None
+        return at, new, (self.omega - new) / max(promised, 1e-300)
+
     def _at_the_bottom(self, new: float, old: float) -> bool:
         """Where rounding decides whether chi-square falls."""
         return self.moved < 1e-4 or (self.moved**2 < 1e-11 * old and new <= old * (1.0 + 1e-11))
@@ -215,6 +252,10 @@ class _Loop:
         """Whether what is left to go is small: steps shrink at least linearly near the minimum."""
         if self.damping > 0.0:
             return False
+        self.steps.append(self.moved)
+        last = self.steps[-4:]
+        if self.options.patience and len(self.steps) > 4 and max(last) < 1e-3 and last[-1] > 0.1 * last[0]:
+            return True  # where rounding alone moves the unknowns the steps stay small
         ratio = min(1.0, self.moved / self.before) if np.isfinite(self.before) else 1.0
         return self.moved * max(ratio, 1.0 - self.length) < self.options.max_step
 
@@ -247,7 +288,7 @@ class _Loop:
 
     def _damp(self, iteration: int) -> None:
         """From the present values once more, with shorter steps."""
-        self.length = 1.0
+        self.length, self.waited, self.steps = 1.0, 0, []
         while True:
             self.damping = max(self.damping * 10.0, self.options.first_damping)
             if self.damping > 1e8:
@@ -272,11 +313,17 @@ class _Loop:
             self.datum = inner_datum(self.graph, self.at)  # about the solution, where the covariances belong
         self._linearize()
         # the covariances need this linearisation anyway: its step costs one elimination and brings the last digits
-        delta, _ = self.completed(self.step())
+        try:
+            tree = self.elimination.tree(self.linear)
+            step = tree.optimize()
+        except RuntimeError:  # judged by the next elimination
+            step = self.step()
+            tree = self.elimination.tree(self.linear)
+        delta, _ = self.completed(step)
         leaves = None if self.at.reduction is None else self.at.reduction.leaves()
         return Solved(
-            self.at.values.retract(delta), self.linear, self.elimination, self.omega, iteration, self.moved, self.datum,
-            leaves,
+            self.at.values.retract(delta), self.linear, tree, self.elimination, self.omega, iteration, self.moved,
+            self.datum, leaves,
         )  # fmt: skip
 
 

@@ -228,6 +228,8 @@ def hold_factor(unknown: Unknown, held: Sequence[int], value: Pose3 | FloatArray
     cov = np.eye(len(rows)) * HOLD**2
     key = unknown.key
     if isinstance(value, Pose3):
+        if rows == [3, 4, 5]:
+            return gtsam.PoseTranslationPrior3D(key, value, gaussian(cov))
 
         def pose_residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
             D = np.zeros((6, 6), order="F")

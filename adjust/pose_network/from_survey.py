@@ -1,19 +1,15 @@
 """Between a survey of stations and pairs and a pose network, both ways."""
 
+from dataclasses import replace
+
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.model.errors import IndeterminateError, SurveyError
-from adjust.model.observations import FrameRef
-from adjust.model.result import Adjustment, Estimate, GroupSummary, ImageResiduals, ObservationResidual, ParameterName
-from adjust.model.survey import FloatArray, PoseParameter, Survey
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import Datum, FloatArray, PoseParameter, Station, Survey, Treatment
+from adjust.observations.pairs import pair_arrays
 from adjust.pose_network.network import PoseNetwork, pose_network
-from adjust.pose_network.precision import UNCONTROLLED
-from adjust.pose_network.solution import NetworkSolution
-from adjust.precision.pose_networks import NamedPrecision
-from adjust.precision.precision import adjusted_motion, global_test
-from adjust.relay.motions import Motions, right_jacobian_inverse
 
 
 def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:
@@ -33,11 +29,7 @@ def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:
     ids = list(dict.fromkeys(r.frame_id for p in survey.pairs for r in (p.a, p.b)))
     index = {s: i for i, s in enumerate(ids)}
     given = {index[s]: stations[s].world_from_station for s in ids}
-    cov = np.zeros((len(survey.pairs), 6, 6))
-    for e, pair in enumerate(survey.pairs):
-        k = len(pair.cov)
-        cov[e, :k, :k] = pair.cov
-    measured = [p.b_from_a for p in survey.pairs]
+    measured = pair_arrays(survey.pairs)
     inner = survey.datum.kind == "inner"
     if not inner and not any_datum and all(p.treatment == "free" for p in given.values()):
         raise IndeterminateError(
@@ -46,18 +38,13 @@ def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:
     return pose_network(
         ids, [p.pair_id for p in survey.pairs],
         [index[p.a.frame_id] for p in survey.pairs], [index[p.b.frame_id] for p in survey.pairs],
-        np.array([_rotation(m) for m in measured]),
-        np.array([m.translation() if isinstance(m, Pose3) else np.full(3, np.nan) for m in measured]), cov,
+        measured.rotations, measured.translations, np.nan_to_num(measured.cov, posinf=0.0),
         held={i: _matrix(p) for i, p in given.items() if p.treatment == "held"},
         prior={i: (_matrix(p), _prior(p, ids[i])) for i, p in given.items() if p.treatment == "prior"},
         start={i: _matrix(p) for i, p in given.items() if p.treatment == "free" and p.value is not None},
         inner=[index[s] for s in survey.datum.stations or ids if s in index] if inner else None,
-        used=np.array([p.used for p in survey.pairs]),
+        used=measured.used, survey=survey,
     )  # fmt: skip
-
-
-def _rotation(motion: Pose3 | Rot3) -> FloatArray:
-    return np.asarray(motion.rotation().matrix() if isinstance(motion, Pose3) else motion.matrix())
 
 
 def _matrix(parameter: PoseParameter) -> FloatArray:
@@ -70,97 +57,52 @@ def _prior(parameter: PoseParameter, station_id: str) -> FloatArray:
     return parameter.prior_cov
 
 
-def network_adjustment(survey: Survey, solution: NetworkSolution, alpha: float = 0.05) -> Adjustment:
-    """The solution as an adjustment of ``survey``, as reports and files take it."""
-    network = solution.network
-    pairs = _pair_residuals(survey, solution)
-    groups: dict[str, list[float]] = {}
-    used = network.used
-    whitened = solution.precision.pairs.whitened
-    for e, item in enumerate(pairs):
-        if used[e]:
-            row = groups.setdefault(item.group, [0.0, 0.0, 0.0])
-            row[0], row[1] = row[0] + len(item.residual), row[1] + float(item.redundancy.sum())
-            row[2] += float(whitened[e] @ whitened[e])
-    summaries = [GroupSummary(g, int(n), r, omega) for g, (n, r, omega) in groups.items()]
-    priors, prior_group = _prior_residuals(solution)
-    summaries += prior_group
-    empty = np.zeros((0, 2))
-    images = ImageResiduals(np.zeros(1, dtype=np.int64), empty, empty, empty, np.zeros(0), np.zeros(0, dtype=np.bool_))
-    n_unknowns = network.dim * (network.n_stations - len(network.held))
-    defect = network.dim if network.anchor is not None else 0
-    n_observations = sum(g.n_observations for g in summaries)
-    test = global_test(solution.omega, solution.redundancy, alpha)
-    return Adjustment(
-        survey, _estimates(survey, solution), images, pairs + priors, tuple(summaries), n_observations, n_unknowns,
-        defect, solution.redundancy, solution.omega, solution.sigma0, test, solution.iterations, solution.max_step,
-        True, tuple(f"left out: {r}" for r in solution.rejected), NamedPrecision(solution),
-    )  # fmt: skip
+def survey_of(network: PoseNetwork) -> Survey:
+    """The stations and pairs of a network as the survey that is solved: its datum, and the pairs in use of now.
+
+    Where nothing but rotations was measured, all stations are held in one place.
+    """
+    survey = network.as_survey
+    pairs, given = list(survey.pairs), np.array([p.used for p in survey.pairs], dtype=np.bool_)
+    for e in np.flatnonzero(given != network.used).tolist():
+        pairs[e] = replace(pairs[e], used=bool(network.used[e]))
+    return replace(survey, pairs=tuple(pairs))
 
 
-def _estimates(survey: Survey, solution: NetworkSolution) -> dict[ParameterName, Estimate]:
-    network, out = solution.network, {}
-    treatment = {s.station_id: s.world_from_station.treatment for s in survey.stations}
-    covs, d = solution.precision.station_cov, network.dim
-    for i, station in enumerate(network.station_ids):
-        name: ParameterName = ("world_from_station", station)
-        cov = np.zeros((6, 6))
-        cov[:d, :d] = covs[i]
-        status = tuple(treatment[station] if k < d else "held" for k in range(6))
-        out[name] = Estimate(name, solution.pose(station), POSE_COMPONENTS, POSE_UNITS, cov, status)
-    return out
+def as_survey(network: PoseNetwork) -> Survey:
+    """All stations and pairs of a network, in the datum that it is solved in."""
+    inner = network.anchor is not None
+    whole = len(network.inner) == network.n_stations
+    datum = Datum("inner", (), () if whole else tuple(network.station_ids[i] for i in network.inner.tolist()))
+    known = network.survey or Survey(stations=_stations(network), pairs=_pairs(network))
+    stations = known.stations
+    if network.rotation_only:
+        stations = tuple(replace(s, world_from_station=_turning_only(s.world_from_station)) for s in stations)
+    return replace(known, stations=stations, datum=datum if inner else Datum())
 
 
-def _pair_residuals(survey: Survey, solution: NetworkSolution) -> tuple[ObservationResidual, ...]:
-    network, stats = solution.network, solution.precision.pairs
+def _turning_only(given: PoseParameter) -> PoseParameter:
+    """With its position held, which nothing tells; at the origin, for all turn about it."""
+    if given.treatment == "held":
+        return given
+    turn = Rot3() if given.value is None else given.value.rotation()
+    return replace(given, value=Pose3(turn, np.zeros(3)), held=("tx", "ty", "tz"))
+
+
+def _stations(network: PoseNetwork) -> tuple[Station, ...]:
     out = []
-    for e, pair in enumerate(survey.pairs):
-        k = 6 if network.is_pose[e] else 3
-        v, cov = stats.residual[e, :k], network.cov[e, :k, :k]
-        spread = np.diag(stats.residual_cov[e, :k, :k])
-        sigma = np.sqrt(np.diag(cov))
-        seen = spread > UNCONTROLLED * sigma**2
-        standardized = np.where(seen, v / np.sqrt(np.where(seen, spread, 1.0)), np.nan)
-        motion = Motions(network.rotations[e : e + 1], network.translations[e : e + 1] if k == 6 else None)
-        observed = motion.log()[0]
-        out.append(
-            ObservationResidual("pair", pair.group, (pair.pair_id, _text(pair.a), _text(pair.b)), POSE_COMPONENTS[:k],
-                                POSE_UNITS[:k], observed, adjusted_motion(observed, v), v, sigma,
-                                stats.redundancy[e, :k], standardized, float(stats.test[e]), bool(network.used[e]))
-        )  # fmt: skip
+    for i, station in enumerate(network.station_ids):
+        R, t = network.station_rotations[i], network.station_translations[i]
+        value = Pose3(Rot3(R), t) if np.isfinite(t).all() else None
+        prior = network.prior_cov.get(i)
+        treatment: Treatment = "held" if network.is_held[i] else "free" if prior is None else "prior"
+        out.append(Station(station, world_from_station=PoseParameter(value, treatment, prior)))
     return tuple(out)
 
 
-def _prior_residuals(solution: NetworkSolution) -> tuple[tuple[ObservationResidual, ...], list[GroupSummary]]:
-    network, out = solution.network, []
-    total = np.zeros(3)
-    for i, cov in network.prior_cov.items():
-        known = np.flatnonzero(np.isfinite(np.diag(cov)[: network.dim]))
-        given = Motions(network.station_rotations[[i]], network.station_translations[[i]])
-        here = Motions(solution.rotations[[i]], solution.translations[[i]])
-        if network.rotation_only:
-            given, here = Motions(given.rotation), Motions(here.rotation)
-        v = (given.inverse() @ here).log()[0]
-        J = right_jacobian_inverse(v[None])[0]
-        e, C = v[known], cov[np.ix_(known, known)]
-        Q = (J @ solution.precision.joint([i]) @ J.T)[np.ix_(known, known)]
-        W = np.linalg.cholesky(np.linalg.inv(C)).T
-        rest = np.eye(len(known)) - W @ Q @ W.T
-        white, spread, sigma = W @ e, np.diag(C - Q), np.sqrt(np.diag(C))
-        seen = spread > UNCONTROLLED * sigma**2
-        standardized = np.where(seen, e / np.sqrt(np.where(seen, spread, 1.0)), np.nan)
-        test = float(white @ np.linalg.pinv(rest, rcond=1e-9, hermitian=True) @ white)
-        redundancy = np.diag(rest)
-        total += np.array([len(known), redundancy.sum(), white @ white])
-        names = tuple(np.array(POSE_COMPONENTS)[known]), tuple(np.array(POSE_UNITS)[known])
-        out.append(
-            ObservationResidual("prior", "prior", ("world_from_station", network.station_ids[i]), *names,
-                                np.zeros(len(known)), e, e, sigma, redundancy, standardized, test, True)
-        )  # fmt: skip
-    summary = [GroupSummary("prior", int(total[0]), float(total[1]), float(total[2]))] if out else []
-    return tuple(out), summary
-
-
-def _text(ref: FrameRef) -> str:
-    return f"{ref.kind}:{ref.frame_id}"
-
+def _pairs(network: PoseNetwork) -> tuple[Pair, ...]:
+    frames = [FrameRef("station", s) for s in network.station_ids]
+    rows = zip(network.pair_ids, network.a_idx.tolist(), network.b_idx.tolist(), network.arrays.poses,
+               network.is_pose.tolist(), network.cov, network.used.tolist(), strict=True)  # fmt: skip
+    return tuple(Pair(i, frames[a], frames[b], motion if pose else motion.rotation(), cov if pose else cov[:3, :3],
+                      used=used) for i, a, b, motion, pose, cov, used in rows)  # fmt: skip

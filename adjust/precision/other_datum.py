@@ -17,7 +17,7 @@ from adjust.graph.datum import InnerDatum, datum_rows, in_world, inner_datum, su
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import Datum, FloatArray, Point, PoseParameter, Survey, Target
-from adjust.precision.precision import Precision
+from adjust.precision.precision import Precision, rotations_only
 from adjust.precision.s_transformation import STransformation, s_transformation
 
 _ROUNDS, _SETTLED = 20, 1e-13
@@ -70,6 +70,8 @@ def in_datum(result: Adjustment, datum: Datum, reference: Mapping[str, FloatArra
         raise SurveyError("a solution can be moved to a datum of kind 'inner' only; to hold points, adjust again")
     if not isinstance(result.precision, Precision):
         raise SurveyError("only a solution with its covariances can be moved to another datum; adjust the survey again")
+    if rotations_only(result):
+        raise SurveyError("nothing but rotations was measured: there are no coordinates to be moved to another datum")
     precision = result.precision
     survey = replace(released(result.survey), datum=datum)
     start = values_of(result)

@@ -184,9 +184,10 @@ class TreeCovariance:
 
         Raises KeyError for a pair that shares none.
         """
-        table = np.full(max(self.number, default=0) + 2, -1, dtype=np.int64)
-        table[np.array(list(self.number), dtype=np.int64)] = np.arange(len(self.number))
-        a, b = table[first], table[second]
+        known = np.array(list(self.number), dtype=np.int64)
+        order = np.argsort(known)
+        a, b = (np.where(keys < 0, -1, order[np.searchsorted(known, np.maximum(keys, known.min()), sorter=order)])
+                for keys in (first, second))  # fmt: skip
         out = np.empty((len(a), 2 * dim, 2 * dim))
         lost = joint_blocks(self.arrays, a, b, out)
         if lost >= 0:

@@ -13,8 +13,7 @@ import numpy as np
 
 from adjust.distributions import chi2
 from adjust.model.survey import FloatArray, IntArray
-from adjust.relay.cycles import bits_of, flat, forest_loops, shortest_loops
-from adjust.relay.graphs import adjacency, breadth_first
+from adjust.relay.cycles import adjacency, bits_of, breadth_first, flat, forest_loops, shortest_loops
 from adjust.relay.motions import Motions, identities, right_jacobian_inverse
 from adjust.relay.network import Network, Topology
 from adjust.statistics.criteria import sidak

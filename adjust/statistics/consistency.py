@@ -15,7 +15,6 @@ from adjust.distributions import chi2, fisher
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.images.batch import whitened_squares
-from adjust.precision.pose_networks import NamedPrecision
 from adjust.statistics.changes import ChangeSearch
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.criteria import sidak
@@ -35,17 +34,16 @@ def consistency(
 ) -> Consistency:
     """Test every part, and look for changes; ``alpha`` is the error probability of all of it together.
 
-    condensed: the system of this adjustment; None where it was solved as a pose network, of which the groups are
-    tested. Where the global test fails because residuals are too large, every part is tested against the rest: else
-    wrong sigmas would make everything suspect. Groups whose variance was estimated from these residuals are not tested
-    for it.
+    condensed: the system of this adjustment; None for a network of pairs, of which the groups are tested. Where the
+    global test fails because residuals are too large, every part is tested against the rest: else wrong sigmas would
+    make everything suspect. Groups whose variance was estimated from these residuals are not tested for it.
     """
     test = adjustment.global_test
     if test is None:
         return Consistency(alpha, alpha, 0, (), (), False, 0)
     relative = test.status == "failed"
     system = None if condensed is None else condensed.system
-    if condensed is None or isinstance(adjustment.precision, NamedPrecision):
+    if condensed is None or adjustment.survey.is_pose_network:
         parts = parts_of_network(adjustment) if len(adjustment.groups) > 1 else ()
     else:
         parts = parts_of(adjustment, condensed.system, condensed.numbers)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from adjust.adjustment import AdjustOptions, adjust
+from adjust.adjustment import AdjustOptions, adjust, assemble
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError
 from adjust.model.result import Adjustment
@@ -79,17 +79,12 @@ def network_solution(
 
 def adjusted_network(survey: Survey, solution: "NetworkSolution", options: PairOptions) -> Adjustment:
     """The solution of a pure survey as its adjustment, with warnings."""
-    from adjust.pose_network.from_survey import network_adjustment  # here: as above
-
-    used = solution.network.used.tolist()
+    used, minimum = solution.network.used.tolist(), solution.minimum
     pairs = tuple(replace(p, used=bool(u)) for p, u in zip(survey.pairs, used, strict=True))
-    result = network_adjustment(replace(survey, pairs=pairs), solution, options.adjust.alpha)
-    return replace(result, warnings=_test_warning(result) + result.warnings + uncontrolled_pairs(result))
-
-
-def _test_warning(result: Adjustment) -> tuple[str, ...]:
-    test = result.global_test
-    return () if test is None or test.passed else (test.warning(result.sigma0),)
+    notes = tuple(f"left out: {r}" for r in solution.rejected)
+    result = assemble(minimum.graph, minimum.solved, options.adjust, notes, solution.precision.of_survey)
+    result = replace(result, survey=replace(survey, pairs=pairs))
+    return replace(result, warnings=result.warnings + uncontrolled_pairs(result))
 
 
 def uncontrolled_pairs(result: Adjustment) -> tuple[str, ...]:

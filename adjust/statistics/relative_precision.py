@@ -13,7 +13,7 @@ from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.observations.factors import ChainPose
-from adjust.precision.pose_networks import rotations_only
+from adjust.precision.precision import rotations_only
 from adjust.statistics.result import Ellipsoid, RelativePrecision
 
 _HELD = 1e-16

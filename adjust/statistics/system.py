@@ -5,20 +5,19 @@ influences, the search for outliers) needs them apart. Rows are linearised at th
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import scipy
-from gtsam import Pose3, Rot3, Values
+from gtsam import Values
 from scipy import sparse
 
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues, values_of
+from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import gauge
-from adjust.graph.solver import settled
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
@@ -250,7 +249,7 @@ KeyColumns = dict[int, IntArray]
 
 
 def linear_system(adjustment: Adjustment) -> LinearSystem:
-    """The system of an adjustment; one that was solved as a pose network is built anew. Raises SurveyError."""
+    """The system of an adjustment. Raises SurveyError for one without covariances."""
     return assembled(precision_of(adjustment), _points_apart)
 
 
@@ -313,30 +312,11 @@ def mixed_blocks(system: LinearSystem) -> list[tuple[IntArray, tuple[str, ...], 
 
 
 def precision_of(adjustment: Adjustment) -> Precision:
-    """The precision with its graph; solved once more from the adjusted values where the adjustment has none."""
+    """The precision with its graph. Raises SurveyError where the adjustment has none."""
     found = adjustment.precision
     if isinstance(found, Precision):
         return found
-    survey, start = adjustment.survey, values_of(adjustment)
-    if all(isinstance(p.b_from_a, Rot3) for p in survey.pairs):  # nothing tells where the stations are
-        survey, start = _turning_only(survey, start)
-    graph = GraphBuilder(survey, start.lenses).build(start)
-    if [o.ids for o in graph.others] != [o.ids for o in adjustment.other_residuals[: len(graph.others)]]:
-        raise SurveyError("the adjustment does not fit its survey; adjust the survey again")
-    return Precision(*settled(graph))
-
-
-def _turning_only(survey: Survey, start: StartValues) -> tuple[Survey, StartValues]:
-    """A network of rotations with its stations held at the origin."""
-    poses = {n: Pose3(p.rotation(), np.zeros(3)) for n, p in start.poses.items()}
-    stations = []
-    for s in survey.stations:
-        given = s.world_from_station
-        held = given.held if given.treatment == "held" else ("tx", "ty", "tz")
-        own = poses.get(("world_from_station", s.station_id), given.value)
-        pose = given.value if given.treatment == "prior" else own
-        stations.append(replace(s, world_from_station=replace(given, value=pose, held=held)))
-    return replace(survey, stations=tuple(stations)), replace(start, poses=poses)
+    raise SurveyError("the adjustment has no covariances; adjust the survey again")
 
 
 def _columns(graph: AdjustmentGraph) -> Columns:

@@ -192,16 +192,17 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
 
     The project is as before whatever goes wrong.
     """
-    begin = time.perf_counter()
+    begin, clock = time.perf_counter(), Clock()
     folder, new = Path(folder), Path(new)
     with place_for(folder, out) as place:
-        project = read(folder)
-        before = read_previous(project)
-        merged = merge(folder, new, place)
-        grown = _read_merged(merged, project, out or folder)
-        adjustment, start = warm_adjustment(grown, before, lambda p: adjust_project(p, progress), progress)
-        said = command_line("add", folder, new, out=out)
-        outcome = made(grown, adjustment, place, Clock({"adjust": time.perf_counter() - begin}), command=said)
+        with clock.step("read"):
+            project = read(folder)
+            before = read_previous(project)
+            merged = merge(folder, new, place)
+            grown = _read_merged(merged, project, out or folder)
+        with clock.step("adjust"):
+            adjustment, start = warm_adjustment(grown, before, lambda p: adjust_project(p, progress), progress)
+        outcome = made(grown, adjustment, place, clock, command=command_line("add", folder, new, out=out))
         if out is None:
             replace_parts(folder, [*merged.entries, RESULTS])
         else:

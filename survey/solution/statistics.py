@@ -7,7 +7,6 @@ from gtsam import Pose3
 
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray, IntArray
-from adjust.precision.pose_networks import NamedPrecision
 from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.consistency import consistency
@@ -99,7 +98,7 @@ _LARGE_NETWORK = (
 
 
 def _is_large_network(adjustment: Adjustment) -> bool:
-    return isinstance(adjustment.precision, NamedPrecision) and len(adjustment.other_residuals) > LARGEST_NETWORK
+    return adjustment.survey.is_pose_network and len(adjustment.other_residuals) > LARGEST_NETWORK
 
 
 def _left_out(adjustment: Adjustment, system: LinearSystem, n_budgets: int) -> tuple[str, ...]:

@@ -84,7 +84,7 @@ def test_additions_say_what_is_new_and_what_moved() -> None:
     session.remove(["wrong"])
     batch = solve_network(sim.network, options=PLAIN)
     finished = session.finish()
-    assert not finished.network.used[finished.network.pair_index_of["wrong"]]
+    assert not finished.network.used[finished.network.pair_ids.index("wrong")]
     assert finished.omega == pytest.approx(batch.omega, rel=1e-9)
     assert finished.pose("s40").translation() == pytest.approx(before.translation(), abs=1e-2)
 

@@ -11,10 +11,10 @@ from adjust.relay.conditions import adjust_conditions
 from adjust.relay.loops import loop_basis
 from adjust.relay.motions import Motions
 from adjust.relay.network import Network
-from adjust.relay.parametric import adjust_parametric
 from adjust.spatial.rotation_forms import euler_cov_from_tangent, euler_from_matrix
 from tests.adjust.relay_monte_carlo import MonteCarloOptions, adjust_batch, simulate_complete
 from tests.adjust.relay_networks import ARCMIN, complete, simulate
+from tests.adjust.relay_parametric import adjust_parametric
 
 
 def rotation(angles):

@@ -1,4 +1,4 @@
-"""How the vertical, beams and surfaces move with the seven motions of a whole survey (:mod:`adjust.spatial.motions`)."""
+"""How the vertical, beams and surfaces move with the seven motions of a survey (``adjust.spatial.motions``)."""
 
 import gtsam
 import numpy as np
