@@ -10,7 +10,6 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("adjust", "survey", "capture")
-KNOWN = frozenset({"adjustment", "pair_screen", "start_choice"})  # in adjust: one circle is left
 
 
 def _modules(root: Path) -> dict[str, Path]:
@@ -68,9 +67,6 @@ def _circle(imports: Mapping[str, set[str]]) -> list[str]:
 def test_no_module_imports_itself_round_about(package: str) -> None:
     imports = {name: of for name, of in _imports(ROOT).items() if name.split(".")[0] == package}
     assert imports
-    if package == "adjust":
-        known = {name for name in imports if name.split(".")[-1] in KNOWN}
-        imports = {name: of - known if name in known else of for name, of in imports.items()}
     assert _circle(imports) == []
 
 

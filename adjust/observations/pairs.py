@@ -3,8 +3,8 @@
 A pair with a held end is exactly a prior on the other: with a held, Log(Z^-1 B^-1 A) = -Ad(Z^-1) Log(Z A^-1 B). Of a
 pair of which only the rotation was measured the rows of the translation weigh nothing.
 
-Redundancy numbers and tests as in :mod:`adjust.precision.precision`: v' Q_vv^-1 v of a whole pair is chi-square with the rank of
-Q_vv degrees of freedom (Baarda 1968; Koch 1999, section 4.2).
+Redundancy numbers and tests as in :mod:`adjust.precision.precision`: v' Q_vv^-1 v of a whole pair is
+chi-square with the rank of Q_vv degrees of freedom (Baarda 1968; Koch 1999, section 4.2).
 """
 
 from collections.abc import Iterable, Sequence

@@ -6,10 +6,12 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from gtsam import Pose3, Rot3
 from scipy.sparse import coo_array
 
 from adjust.model.errors import IndeterminateError, SurveyError
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Station, Survey, Treatment
 from adjust.observations.pairs import PairArrays
 from adjust.relay.cycles import loop_labels
 from adjust.spatial.rigid import nearest_rotation
@@ -94,9 +96,7 @@ class PoseNetwork:
     @cached_property
     def as_survey(self) -> Survey:
         """What is solved, all pairs as they were when it was first asked for."""
-        from adjust.pose_network.from_survey import as_survey
-
-        return as_survey(self)
+        return _as_survey(self)
 
     @cached_property
     def is_held(self) -> BoolArray:
@@ -262,3 +262,54 @@ def loop_marks(network: PoseNetwork, used: BoolArray) -> tuple[BoolArray, IntArr
     mark = np.zeros(network.n_pairs, dtype=np.int64)
     mark[rows] = loop_labels(network.n_stations, a, b)
     return mark != 0, mark
+
+
+def survey_of(network: PoseNetwork) -> Survey:
+    """The stations and pairs of a network as the survey that is solved: its datum, and the pairs in use of now.
+
+    Where nothing but rotations was measured, all stations are held in one place.
+    """
+    survey = network.as_survey
+    pairs, given = list(survey.pairs), np.array([p.used for p in survey.pairs], dtype=np.bool_)
+    for e in np.flatnonzero(given != network.used).tolist():
+        pairs[e] = replace(pairs[e], used=bool(network.used[e]))
+    return replace(survey, pairs=tuple(pairs))
+
+
+def _as_survey(network: PoseNetwork) -> Survey:
+    """All stations and pairs of a network, in the datum that it is solved in."""
+    inner = network.anchor is not None
+    whole = len(network.inner) == network.n_stations
+    datum = Datum("inner", (), () if whole else tuple(network.station_ids[i] for i in network.inner.tolist()))
+    known = network.survey or Survey(stations=_stations(network), pairs=_pairs(network))
+    stations = known.stations
+    if network.rotation_only:
+        stations = tuple(replace(s, world_from_station=_turning_only(s.world_from_station)) for s in stations)
+    return replace(known, stations=stations, datum=datum if inner else Datum())
+
+
+def _turning_only(given: PoseParameter) -> PoseParameter:
+    """With its position held, which nothing tells; at the origin, for all turn about it."""
+    if given.treatment == "held":
+        return given
+    turn = Rot3() if given.value is None else given.value.rotation()
+    return replace(given, value=Pose3(turn, np.zeros(3)), held=("tx", "ty", "tz"))
+
+
+def _stations(network: PoseNetwork) -> tuple[Station, ...]:
+    out = []
+    for i, station in enumerate(network.station_ids):
+        R, t = network.station_rotations[i], network.station_translations[i]
+        value = Pose3(Rot3(R), t) if np.isfinite(t).all() else None
+        prior = network.prior_cov.get(i)
+        treatment: Treatment = "held" if network.is_held[i] else "free" if prior is None else "prior"
+        out.append(Station(station, world_from_station=PoseParameter(value, treatment, prior)))
+    return tuple(out)
+
+
+def _pairs(network: PoseNetwork) -> tuple[Pair, ...]:
+    frames = [FrameRef("station", s) for s in network.station_ids]
+    rows = zip(network.pair_ids, network.a_idx.tolist(), network.b_idx.tolist(), network.arrays.poses,
+               network.is_pose.tolist(), network.cov, network.used.tolist(), strict=True)  # fmt: skip
+    return tuple(Pair(i, frames[a], frames[b], motion if pose else motion.rotation(), cov if pose else cov[:3, :3],
+                      used=used) for i, a, b, motion, pose, cov, used in rows)  # fmt: skip

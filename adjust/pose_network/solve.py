@@ -13,8 +13,7 @@ from adjust.graph.solver import Solved, SolveOptions, solve
 from adjust.model.errors import IndeterminateError, NotConvergedError
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray
-from adjust.pose_network.from_survey import survey_of
-from adjust.pose_network.network import PoseNetwork, check_determined
+from adjust.pose_network.network import PoseNetwork, check_determined, survey_of
 from adjust.pose_network.start import find_network_start
 
 Progress = Callable[[int, float], None]

@@ -1,7 +1,6 @@
 import gtsam
 import numpy as np
 import pytest
-from adjust.statistics.pair_screen import PairOptions, adjust_with_pairs
 from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -17,6 +16,7 @@ from adjust.pose_network.network import PoseNetwork, loop_marks
 from adjust.pose_network.robust import _worst_around, graduated_weights
 from adjust.pose_network.solve import minimize
 from adjust.relay.motions import Motions
+from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs
 from tests.adjust.chordal import chordal_cost, minimize_chordal
 from tests.adjust.pose_networks import exp6, network_jacobians, simulate
 
