@@ -119,7 +119,7 @@ def _check_overview(nights: list[Path], place: Path) -> None:
     assert sum(ratios) / len(ratios) == pytest.approx(1.0, abs=1.5 * within)
     page = (place / "overview.html").read_text()
     assert page.count('href="../nights/night-') >= N - 2
-    assert "found &#x27;6x1.2&#x27;" in page
+    assert "found &#39;6x1.2&#39;" in page
 
 
 def test_the_table_ends_with_the_count(

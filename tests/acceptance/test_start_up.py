@@ -53,6 +53,6 @@ def test_the_times_of_the_stages_are_the_time_that_passed(network, capsys):
     passed = time.perf_counter() - begin
     told = capsys.readouterr().out.strip().splitlines()[-1]
     stages = {name: float(s) for name, s in re.findall(r"(\w+) ([\d.]+) s", told)}
-    assert set(stages) == {"read", "adjust", "statistics", "report"}
+    assert set(stages) >= {"read", "adjust", "statistics", "report"}
     rounding = 0.005 * len(stages)
     assert 0.6 * passed - rounding <= sum(stages.values()) <= passed + rounding

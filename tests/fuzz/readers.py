@@ -295,7 +295,7 @@ def _recover(folder: Path) -> Read:
 
 
 def _alignment_rounds() -> list[bytes]:
-    from survey.jobs.working_sheet import ROUND_COLUMNS
+    from survey.jobs.aligning import ROUND_COLUMNS
 
     return [",".join(ROUND_COLUMNS).encode() + b"\n2025-01-01,board,turn,1,2,3,0.1,0.1,0.1\n"]
 

@@ -265,7 +265,7 @@ class BundleBatch:
         gradient = np.asarray(self.G.T @ g)
         rest = self.chi_square - float(np.einsum("ja,jab,jb->", self.h, self.Vi, self.h))
         self.blind = self._blind_motions(values) if damping == 0.0 else np.zeros((self.n_keys - self.n_hidden, 0))
-        floor = FLOOR * self._without_points() + 1e-300
+        floor = FLOOR * np.abs(self._without_points()) + 1e-300  # far out, rounding takes squares below zero
         if self.alone:
             across = self._interface_rows(S)
             inner = across[:, self.n_hidden :]
