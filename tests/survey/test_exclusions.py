@@ -222,7 +222,7 @@ def test_warm_is_cold_with_spots_exclusions_and_rows_not_used(mine, monkeypatch)
     assert project.spots
     # until rounding ends it: to its usual limit, 1e-6 sigmas, each run stops somewhere else
     exact = partial(AdjustOptions, solve=SolveOptions(max_step=1e-9))
-    monkeypatch.setattr("survey.jobs.adjusting.options.AdjustOptions", exact)
+    monkeypatch.setattr("survey.jobs.adjusting.steps.AdjustOptions", exact)
     cold = adjust_project(project, False)
     warm, how = warm_adjustment(project, previous, lambda _: pytest.fail("went cold"), False)
     assert how == WARM
