@@ -19,7 +19,7 @@ from adjust.start import Start, find_start
 from adjust.start.choice import Begun, adjusted_from_own_start
 from adjust.start.given import GivenStarts, given_starts, moved_onto
 from adjust.start.readings.joint import find_all, needs_points
-from adjust.statistics.robust import limit, screen
+from adjust.start.robust import limit, screen
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from adjust.model.errors import SurveyError
 from survey.commands.common import DONE, Version, is_set, print_json, run_as_program, run_command, say
-from survey.commands.completing import declare_completion
+from survey.commands.completion import declare_completion
 from survey.commands.parser import Parser, name_commands, port, project_folder
 
 if TYPE_CHECKING:

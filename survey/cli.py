@@ -13,7 +13,7 @@ from survey.commands.adjusting import declare_adjust
 from survey.commands.aligning import declare_align
 from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, Version, run_as_program, run_command
 from survey.commands.comparing import declare_compare
-from survey.commands.completing import declare_completion
+from survey.commands.completion import declare_completion
 from survey.commands.converting import declare_convert
 from survey.commands.detecting import declare_detect
 from survey.commands.examples import declare_example

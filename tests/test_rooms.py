@@ -1,6 +1,8 @@
-"""The order of the modules: none imports itself round about, read from the sources of all three packages."""
+"""The order of modules and rooms: none imports itself round about or a room above, as the sources have it."""
 
 import ast
+import configparser
+import itertools
 from collections.abc import Iterator, Mapping
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -81,7 +83,41 @@ def test_a_circle_is_found_through_functions_and_relative_imports_but_not_throug
     }
     for name, text in texts.items():
         (tmp_path / "survey" / f"{name}.py").write_text(text)
-    assert _circle(_imports(tmp_path)) == []
+    assert _circle(_imports.__wrapped__(tmp_path)) == []
     (tmp_path / "survey/d.py").write_text("from .a import late\n")
-    _imports.cache_clear()
-    assert set(_circle(_imports(tmp_path))) == {f"survey.{name}" for name in "abcd"}
+    assert set(_circle(_imports.__wrapped__(tmp_path))) == {f"survey.{name}" for name in "abcd"}
+
+
+@cache
+def _floors(package: str) -> dict[str, int]:
+    """The rooms of a package from the top, as its contract in setup.cfg has them."""
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / "setup.cfg", encoding="utf-8")
+    layers = setup[f"importlinter:contract:{package}"]["layers"].split()
+    return {name.strip("()"): floor for floor, name in enumerate(layers)}
+
+
+def _upward(imports: Mapping[str, set[str]], package: str, floors: Mapping[str, int]) -> list[str]:
+    """Imports of a room above: "a.high.thing -> a.low.thing" of a package's modules."""
+    inside = {m: m.split(".")[1] for m in imports if m.startswith(f"{package}.")}
+    return [f"{m} -> {of}" for m in sorted(inside) for of in sorted(imports[m])
+            if of in inside and floors[inside[of]] < floors[inside[m]]]  # fmt: skip
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_room_imports_rooms_below_it_only(package: str) -> None:
+    assert _upward(_imports(ROOT), package, _floors(package)) == []
+
+
+def test_an_import_of_a_room_above_is_found() -> None:
+    imports = {"a.x.one": {"a.y.two"}, "a.y.two": {"a.y.three"}, "a.y.three": {"a.x.one", "b"}, "b": set()}
+    assert _upward(imports, "a", {"x": 0, "y": 1}) == ["a.y.three -> a.x.one"]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_the_page_on_architecture_has_the_rooms_of_the_contract_in_its_order(package: str) -> None:
+    lines = iter((ROOT / "docs/architecture.md").read_text(encoding="utf-8").splitlines())
+    assert any(line.startswith(f"| room of `{package}` |") for line in lines)
+    next(lines)
+    rows = list(itertools.takewhile(lambda line: line.startswith("|"), lines))
+    assert [row.split("`")[1] for row in rows] == [room for room in _floors(package) if room != "__main__"]

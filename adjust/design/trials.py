@@ -16,7 +16,6 @@ import numpy as np
 from adjust.design.expectation import shared_names
 from adjust.design.noise import disturbed
 from adjust.design.readings import displaced, reading_sigmas
-from adjust.distributions import chi2
 from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import GraphBuilder, StartValues
 from adjust.graph.solver import settled
@@ -24,6 +23,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, Survey
 from adjust.native.parallel import workers
+from adjust.testing.distributions import chi2
 
 _CHUNK = 8
 

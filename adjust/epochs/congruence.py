@@ -19,9 +19,9 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.s_transformation import transformation_matrix
-from adjust.statistics.criteria import noncentrality, sidak
 from adjust.statistics.relative_precision import ellipsoid
-from adjust.statistics.result import Ellipsoid, LevelOptions
+from adjust.statistics.result import Ellipsoid
+from adjust.testing.criteria import LevelOptions, noncentrality, sidak
 
 _DETERMINED = 1e-9
 

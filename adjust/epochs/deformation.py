@@ -14,14 +14,14 @@ from itertools import pairwise
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.distributions import chi2
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.precision.precision import rotations_only
-from adjust.relay.motions import right_jacobian_inverse
+from adjust.spatial.rigid_motions import right_jacobian_inverse
 from adjust.spatial.rotation_forms import euler_cov_from_tangent, euler_from_matrix
-from adjust.statistics.criteria import sidak
+from adjust.testing.criteria import sidak
+from adjust.testing.distributions import chi2
 
 # smallest eigenvalue of the correlation matrix that still counts as determined; joint covariances lose about ten digits
 _DETERMINED = 1e-9

@@ -64,6 +64,10 @@ class KeyCovariances(Protocol):
         """Joint covariance of these keys, stacked."""
         ...
 
+    def pairs(self, first: IntArray, second: IntArray, dim: int) -> FloatArray:
+        """Joint covariances (p, 2 dim, 2 dim) of pairs of keys that share a factor; -1 stands for a constant."""
+        ...
+
 
 def row_influences(
     row_ptr: IntArray, key_ptr: IntArray, key: IntArray, start: IntArray, J: FloatArray, tree: TreeArrays

@@ -12,9 +12,9 @@ import numpy as np
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import DONE, SpotArrays, gauss_newton
 from adjust.navigation.system import Sightings, System
-from adjust.relay.motions import right_jacobian_inverse
 from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log
-from adjust.statistics.gross_errors import Search, State, Verdicts, one_group
+from adjust.spatial.rigid_motions import right_jacobian_inverse
+from adjust.testing.gross_errors import Search, State, Verdicts, one_group
 
 _NO_B: FloatArray = np.zeros((0, 0))
 _NO_ROWS: IntArray = np.zeros(0, dtype=np.int64)

@@ -12,7 +12,6 @@ from itertools import combinations
 
 import numpy as np
 
-from adjust.distributions import chi2
 from adjust.lenses.models import MODELS, focal_length_px
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import FoundArrays, SkyArrays, search
@@ -20,6 +19,7 @@ from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers
 from adjust.navigation.model import NavigateOptions
 from adjust.navigation.system import Sightings, System, evaluate, station_rays, visible
 from adjust.spatial.rigid import rigid
+from adjust.testing.distributions import chi2
 
 _KEPT = 400
 _ADJUSTED = 60

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from gtsam import Pose3
 
-from adjust.distributions import chi2
 from adjust.model.survey import FloatArray, IntArray
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, local
 from adjust.navigation.identification import Candidate, with_prior, without_prior
@@ -23,6 +22,7 @@ from adjust.navigation.model import (
 from adjust.navigation.motion import MotionState, given_prior, predicted, started, table_prior, updated
 from adjust.navigation.precision import open_directions, own_covariance, shares, some_pose, spot_noise
 from adjust.navigation.system import Sightings, System, make_sightings, make_system, station_rays, visible, with_rays
+from adjust.testing.distributions import chi2
 
 _AGREES = 1e-6
 _WEAKEST_RAD = 0.2  # a covariance from first derivatives means nothing beyond

@@ -15,16 +15,16 @@ import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.distributions import chi2
 from adjust.frames.state import State
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, FrameTree, Unknowns
 from adjust.model.observations import Pair
 from adjust.model.result import ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.native.trees import KeyCovariances
 from adjust.observations.factors import Jacobians, custom
 from adjust.observations.listed import ObservationFactor, frame_text
-from adjust.precision.tree import TreeCovariance
-from adjust.relay.motions import Motions, exp, right_jacobian_inverse
+from adjust.spatial.rigid_motions import Motions, exp, right_jacobian_inverse
+from adjust.testing.distributions import chi2
 
 UNCONTROLLED = 1e-4
 """Share of a pair's direction that others must control for it to be tested; weak covariances lose digits."""
@@ -245,7 +245,7 @@ class PairBatch:
         a, b = (Motions(R[slots], t[slots]) for slots in (self.a_slot, self.b_slot))
         return pair_jacobians(self.arrays.motions, b.inverse() @ a)
 
-    def statistics(self, tree: TreeCovariance, values: gtsam.Values) -> PairStatistics:
+    def statistics(self, tree: KeyCovariances, values: gtsam.Values) -> PairStatistics:
         """Statistics of all pairs, in use or not; they do not depend on the datum of ``tree``."""
         arrays, a, b, held = self.arrays, self.a_key, self.b_key, self.both_held
         used = np.asarray(arrays.used, dtype=np.bool_)

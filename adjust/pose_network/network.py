@@ -13,7 +13,7 @@ from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Station, Survey, Treatment
 from adjust.observations.pairs import PairArrays
-from adjust.relay.cycles import loop_labels
+from adjust.pose_network.cycles import loop_labels
 from adjust.spatial.rigid import nearest_rotation
 
 _FEW = 8

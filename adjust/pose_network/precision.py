@@ -10,7 +10,7 @@ from adjust.observations.pairs import PairStatistics
 from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.solve import Minimum
 from adjust.precision.precision import Precision
-from adjust.relay.motions import Motions
+from adjust.spatial.rigid_motions import Motions
 
 
 class NetworkPrecision:

@@ -2,7 +2,7 @@
 
 Rotations first, then positions, each by a solver that needs no start, with the truncated least squares weights of Yang,
 Antonante, Tzoumas and Carlone (Graduated non-convexity for robust spatial perception, RA-L 2020). What that sorts out
-is only a proposal: a clean least squares over the rest decides (:mod:`adjust.statistics.gross_errors`), pair by pair,
+is only a proposal: a clean least squares over the rest decides (:mod:`adjust.testing.gross_errors`), pair by pair,
 by the chi-square test of the pair against all others.
 """
 
@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.distributions import chi2
 from adjust.model.errors import IndeterminateError, NotConvergedError
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.pose_network.network import PoseNetwork, loop_marks
@@ -25,8 +24,9 @@ from adjust.pose_network.start import (
     translation_misfits,
     translation_sigmas,
 )
-from adjust.statistics.criteria import CAUTIOUS, MANY
-from adjust.statistics.gross_errors import Search, State, Verdicts, one_group
+from adjust.testing.criteria import CAUTIOUS, MANY
+from adjust.testing.distributions import chi2
+from adjust.testing.gross_errors import Search, State, Verdicts, one_group
 
 _TRUNCATION = float(chi2.isf(1e-4, 3))
 _SLACK = 4.0  # positions inherit what is left in the rotations of the first stage

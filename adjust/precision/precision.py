@@ -13,7 +13,6 @@ import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.distributions import chi2
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import stacking, survey_motions
 from adjust.graph.solver import Solved
@@ -32,6 +31,7 @@ from adjust.observations.images.bundle_hidden import BundleHidden
 from adjust.observations.listed import ObservationFactor
 from adjust.precision.s_transformation import STransformation, s_transformation
 from adjust.precision.tree import TreeCovariance
+from adjust.testing.distributions import chi2
 
 if TYPE_CHECKING:
     from adjust.observations.pairs import PairStatistics

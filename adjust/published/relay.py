@@ -19,9 +19,9 @@ import scipy.linalg
 from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
 from adjust.relay.loops import LoopBasis, evaluate_loops, loop_basis
-from adjust.relay.motions import Motions, exp, right_jacobian
 from adjust.relay.network import Network
 from adjust.spatial.rigid import skew
+from adjust.spatial.rigid_motions import Motions, exp, right_jacobian
 from adjust.spatial.rotation_forms import euler_cov_from_tangent, euler_from_matrix, euler_jacobian, matrix_from_euler
 
 ARCSECOND = np.pi / (180.0 * 3600.0)

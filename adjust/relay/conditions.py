@@ -25,7 +25,6 @@ from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
 from adjust.relay.counts import parts
 from adjust.relay.loops import LoopBasis, evaluate_loops, loop_basis, loop_misclosures
-from adjust.relay.motions import Motions, right_jacobian
 from adjust.relay.network import Network, gtsam_motion, motions_from_values, prior_factor, station_values
 from adjust.relay.normal_equations import (
     NormalEquations,
@@ -35,6 +34,7 @@ from adjust.relay.normal_equations import (
     joint_covariance,
 )
 from adjust.relay.result import AdjustedPairs, Joint, adjusted_pairs, whitening
+from adjust.spatial.rigid_motions import Motions, right_jacobian
 
 # complete networks were exact far beyond; grids of loops went wrong from about 300 on
 MAX_HARD_LOOPS = 200

@@ -11,12 +11,12 @@ from typing import Literal
 
 import numpy as np
 
-from adjust.distributions import chi2
 from adjust.model.survey import FloatArray, IntArray
-from adjust.relay.cycles import adjacency, bits_of, breadth_first, flat, forest_loops, shortest_loops
-from adjust.relay.motions import Motions, identities, right_jacobian_inverse
+from adjust.pose_network.cycles import adjacency, bits_of, breadth_first, flat, forest_loops, shortest_loops
 from adjust.relay.network import Network, Topology
-from adjust.statistics.criteria import sidak
+from adjust.spatial.rigid_motions import Motions, identities, right_jacobian_inverse
+from adjust.testing.criteria import sidak
+from adjust.testing.distributions import chi2
 
 LoopKind = Literal["shortest", "tree"]
 

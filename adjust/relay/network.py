@@ -17,7 +17,7 @@ from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.factors import gaussian
 from adjust.observations.listed import frame_text
-from adjust.relay.motions import Motions
+from adjust.spatial.rigid_motions import Motions
 
 
 @dataclass(frozen=True, eq=False)

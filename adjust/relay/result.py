@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.distributions import chi2
 from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.precision import global_test
-from adjust.relay.motions import Motions, right_jacobian_inverse
 from adjust.relay.network import Network
+from adjust.spatial.rigid_motions import Motions, right_jacobian_inverse
+from adjust.testing.distributions import chi2
 
 # joint covariance of adjusted pairs by their positions
 Joint = Callable[[Sequence[int]], FloatArray]

@@ -2,7 +2,8 @@
 
 With planes as level surfaces the plumb lines are parallel; with a radius they meet at ``-radius * up``. The first
 horizontal axis is the axis ``zero`` of the world, turned by the tilt and laid into the horizon; the second stands 90
-degrees counter-clockwise of it, seen from above.
+degrees counter-clockwise of it, seen from above. Directions that are unknown (of the plumb line, of planes and lines)
+are so by two small turns.
 """
 
 from dataclasses import dataclass
@@ -131,3 +132,21 @@ def up_at(plumb_line: Plumb, x: FloatArray) -> tuple[FloatArray, FloatArray, Flo
     up = horizon.axes[0, 2]
     cross = -skew(up)  # w -> w x up
     return up, cross @ horizon.by_x[0], cross @ horizon.by_tilt[0]
+
+
+def tilted_frame(direction: FloatArray, tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The axes of a unit ``direction`` (3,) turned by ``tilt`` (2,) rad about the first two of them.
+
+    Returns their directions as columns (3, 3), the tilted direction last, and the turn (3, 2) by the tilts, as a small
+    rotation about these axes (perturbation on the right; Sola, Deray, Atchuthan 2018, equation 67).
+    """
+    axes = np.vstack([tilt_axes(direction), direction]).T
+    right = np.zeros((3, 3), order="F")
+    rotation = Rot3.Expmap(axes[:, :2] @ tilt, right)
+    return np.asarray(rotation.matrix() @ axes), np.asarray(axes.T @ right @ axes[:, :2])
+
+
+def tilted(direction: FloatArray, tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A unit ``direction`` (3,) turned by ``tilt`` (2,) rad about ``tilt_axes(direction)``, with derivative (3, 2)."""
+    axes, turn = tilted_frame(direction, tilt)
+    return axes[:, 2], axes @ np.cross(turn, np.array([0.0, 0.0, 1.0]), axisa=0).T

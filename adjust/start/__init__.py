@@ -1,4 +1,8 @@
-"""Start values for a whole survey from its observations alone."""
+"""Start values for a whole survey from its observations alone, and which of several an adjustment begins with.
+
+Closed forms, how knowledge spreads from frame to frame, readings by themselves, and image points that no start fits.
+What is solved to the end belongs to :mod:`adjust.adjustment`.
+"""
 
 from adjust.start.result import Start
 from adjust.start.search import find_start, turns_of_views

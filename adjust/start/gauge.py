@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from adjust.model.result import ParameterName
 from adjust.model.survey import Survey
-from adjust.start.network import IDENTITY, ChainObservation, PoseNetwork, partial_pose
+from adjust.start.network import IDENTITY, ChainObservation, FrameNetwork, partial_pose
 
 Node = tuple[str, ...]
 End = tuple[int, bool]  # a slot and its side: False the frame on the left of its name, True the one on the right
@@ -34,7 +34,7 @@ class _Classes:
         self.between.setdefault(min(a, b), set()).update(known)
 
 
-def fix_one_gauge(network: PoseNetwork, observations: list[ChainObservation]) -> int | None:
+def fix_one_gauge(network: FrameNetwork, observations: list[ChainObservation]) -> int | None:
     """Set one pose of one frame that floats, at identity or at the mean of its incomplete prior; its slot, or None.
 
     Source: a transformation of a frame's coordinates changes every pose that leads to it and no observation, so the
@@ -62,7 +62,7 @@ def fix_one_gauge(network: PoseNetwork, observations: list[ChainObservation]) ->
     return slot
 
 
-def _join_chain(classes: _Classes, network: PoseNetwork, observation: ChainObservation) -> None:
+def _join_chain(classes: _Classes, network: FrameNetwork, observation: ChainObservation) -> None:
     previous: End = _BOUND if observation.ends[0] else _POINTS
     known: list[int] = []
     open_links = network.unknown_links(observation.chain)
@@ -79,7 +79,7 @@ def _join_chain(classes: _Classes, network: PoseNetwork, observation: ChainObser
     classes.join(previous, _BOUND if observation.ends[1] else _POINTS, known)
 
 
-def _has_ring(network: PoseNetwork, slots: set[int]) -> bool:
+def _has_ring(network: FrameNetwork, slots: set[int]) -> bool:
     parent: dict[Node, Node] = {}
 
     def find(node: Node) -> Node:
@@ -96,7 +96,7 @@ def _has_ring(network: PoseNetwork, slots: set[int]) -> bool:
     return False
 
 
-def frames_of(network: PoseNetwork, name: ParameterName) -> tuple[Node, Node]:
+def frames_of(network: FrameNetwork, name: ParameterName) -> tuple[Node, Node]:
     """The frames on the left and on the right of a pose's name."""
     kind, owner = name[0], name[1]
     frames = network.frames
@@ -114,7 +114,7 @@ def frames_of(network: PoseNetwork, name: ParameterName) -> tuple[Node, Node]:
     return ("world",) if carrier is None else ("station", carrier), ("target", owner)
 
 
-def _rank(network: PoseNetwork, slot: int) -> int:
+def _rank(network: FrameNetwork, slot: int) -> int:
     """What is set first: a pose with some prior, a fixed target in the world, the mount, a fixed station, a camera."""
     name = network.names[slot]
     if partial_pose(network.unknowns.parameters.get(name)) is not None:
@@ -125,7 +125,7 @@ def _rank(network: PoseNetwork, slot: int) -> int:
     return order.get(name[0], 6) + (3 if len(name) == 3 else 0)
 
 
-def world_is_free(network: PoseNetwork, survey: Survey) -> bool:
+def world_is_free(network: FrameNetwork, survey: Survey) -> bool:
     """Whether nothing given holds the world, so that it may still be moved as a whole."""
     touching = [s for s, name in network.names.items() if ("world",) in frames_of(network, name)]
     held = any(s in network.fixed for s in touching)

@@ -11,7 +11,7 @@ from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import inverse, rotation_log
 from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb, solve_ax_zb, solve_views
-from adjust.start.network import ChainObservation, PoseNetwork
+from adjust.start.network import ChainObservation, FrameNetwork
 
 _CHOICES = 4
 
@@ -38,7 +38,7 @@ class _Group:
         return _Group((b, not b_inverse), (a, not a_inverse), inverse(self.motions), inverse(self.products))
 
 
-def solve_motion(network: PoseNetwork, degenerate: bool = True) -> str | None:
+def solve_motion(network: FrameNetwork, degenerate: bool = True) -> str | None:
     """Find what two unknowns and the motion between them determine; a note on what was done, or None.
 
     Robot-world closed form where a group of observations turns about two axes; else hand-eye from the motions of all
@@ -59,7 +59,7 @@ def solve_motion(network: PoseNetwork, degenerate: bool = True) -> str | None:
     return note or (_shared(network, groups, True) if degenerate else None)
 
 
-def _shared(network: PoseNetwork, groups: list[_Group], minimum_norm: bool) -> str | None:
+def _shared(network: FrameNetwork, groups: list[_Group], minimum_norm: bool) -> str | None:
     """Hand-eye over all groups with the same unknown; also from turns about one axis with ``minimum_norm``."""
     by_second: dict[tuple[int, bool], list[_Group]] = {}
     for group in groups + [g.swapped() for g in groups]:
@@ -94,7 +94,7 @@ class _RowsOfPoses:
     products: list[FloatArray]
 
 
-def _together(network: PoseNetwork) -> str | None:
+def _together(network: FrameNetwork) -> str | None:
     """Everything on what moves and everything around it at once; a note, or None where that determines nothing."""
     for found in _connected(_rows_of_poses(network)):
         first, inside = np.unique(found.first, return_inverse=True)
@@ -132,7 +132,7 @@ def _solved_views(
     return x, z
 
 
-def _rows_of_poses(network: PoseNetwork) -> _RowsOfPoses:
+def _rows_of_poses(network: FrameNetwork) -> _RowsOfPoses:
     rows: dict[tuple[tuple[int, bool], ...], int] = {}
     out = _RowsOfPoses([], [], [], np.zeros((0, 4, 4)), [])
     motions = []
@@ -152,7 +152,7 @@ def _rows_of_poses(network: PoseNetwork) -> _RowsOfPoses:
     return replace(out, motions=np.array(motions).reshape(-1, 4, 4))
 
 
-def _split(network: PoseNetwork, observation: ChainObservation) -> tuple[tuple[int, int], tuple[int, int]] | None:
+def _split(network: FrameNetwork, observation: ChainObservation) -> tuple[tuple[int, int], tuple[int, int]] | None:
     """Begin and end of the two rows of unknown poses in a chain, with something known between them; None if other."""
     missing = network.unknown_links(observation.chain)
     gaps = [i for i in range(1, len(missing)) if missing[i] > missing[i - 1] + 1]
@@ -182,7 +182,7 @@ def _connected(found: _RowsOfPoses) -> list[_RowsOfPoses]:
     return parts
 
 
-def _groups(network: PoseNetwork) -> list[_Group]:
+def _groups(network: FrameNetwork) -> list[_Group]:
     found: dict[tuple[tuple[int, bool], tuple[int, bool]], list[tuple[FloatArray, FloatArray, bool]]] = {}
     for observation in network.observations:
         chain = observation.chain
@@ -204,11 +204,11 @@ def _groups(network: PoseNetwork) -> list[_Group]:
     return groups
 
 
-def _set(network: PoseNetwork, link: tuple[int, bool], value: FloatArray) -> None:
+def _set(network: FrameNetwork, link: tuple[int, bool], value: FloatArray) -> None:
     slot, inverted = link
     network.known[slot] = inverse(value) if inverted else value
 
 
-def _text(network: PoseNetwork, link: tuple[int, bool]) -> str:
+def _text(network: FrameNetwork, link: tuple[int, bool]) -> str:
     name: ParameterName = network.names[link[0]]
     return " ".join(name)

@@ -40,7 +40,7 @@ class ChainObservation:
 
 
 @dataclass(eq=False)
-class PoseNetwork:
+class FrameNetwork:
     """Slots by number (see :class:`adjust.frames.unknowns.Unknowns`) with what is known of them; filled step by step.
 
     known: values (4, 4). fixed: slots that were given. gauged: slots that were set freely. lever: m, typical distance

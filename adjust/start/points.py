@@ -10,7 +10,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.spatial.rigid import inverse
 from adjust.start import views as single
 from adjust.start.closed_forms.triangulation import intersect
-from adjust.start.network import ChainObservation, PoseNetwork
+from adjust.start.network import ChainObservation, FrameNetwork
 from adjust.start.views import View, block_text, make_views, used_rows
 
 PARALLAX = (np.deg2rad(3.0), np.deg2rad(0.3), 0.0)
@@ -97,7 +97,7 @@ def point_field(survey: Survey) -> PointField:
     return PointField(x, given, given & ~firm, released=not boards)
 
 
-def resect(network: PoseNetwork, points: PointField) -> bool:
+def resect(network: FrameNetwork, points: PointField) -> bool:
     """Give a pose to the blocks that see enough known points and have none yet; whether there were any."""
     have, known = {o.block_idx for o in network.observations}, points.known
     sights = {s.block_idx: s for s in points.sights if s.block_idx not in have and network.unknown_links(s.chain)}
@@ -122,7 +122,7 @@ def _views(sights: Sequence[Sight], points: PointField, present: Sequence[FloatA
     return make_views(seen, present)[0]
 
 
-def _resect_together(network: PoseNetwork, points: PointField) -> bool:
+def _resect_together(network: FrameNetwork, points: PointField) -> bool:
     """Poses of stations whose cameras see enough known points only together; whether one was found."""
     groups: dict[tuple[int, bool], list[tuple[Sight, int]]] = {}
     for sight in points.sights:
@@ -140,7 +140,7 @@ def _resect_together(network: PoseNetwork, points: PointField) -> bool:
 
 
 def _generalised_pose(
-    network: PoseNetwork, points: PointField, group: Sequence[tuple[Sight, int]]
+    network: FrameNetwork, points: PointField, group: Sequence[tuple[Sight, int]]
 ) -> FloatArray | None:
     """Pose (4, 4) of the link that all these chains lack (GP3P inside RANSAC with a fixed seed, COLMAP), or None."""
     import pycolmap  # slow to load, and few surveys come here
@@ -172,7 +172,7 @@ def _generalised_pose(
     return pose
 
 
-def intersect_points(network: PoseNetwork, points: PointField, parallax: float, renew: bool = False) -> int:
+def intersect_points(network: FrameNetwork, points: PointField, parallax: float, renew: bool = False) -> int:
     """Intersect the unknown points (all but the given ones with ``renew``) from the cameras known; how many are new."""
     origins, directions, rows = [], [], []
     for sight in points.sights:
@@ -196,7 +196,7 @@ def intersect_points(network: PoseNetwork, points: PointField, parallax: float, 
     return int(new.sum())
 
 
-def improve(network: PoseNetwork, points: PointField, movable: set[int]) -> None:
+def improve(network: FrameNetwork, points: PointField, movable: set[int]) -> None:
     """One round: every block's pose from all points now known, the movable poses from these, and the points again."""
     known = points.known
     placed = [s for s in points.sights if not network.unknown_links(s.chain) and known[s.rows].sum() >= 4]

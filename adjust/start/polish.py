@@ -9,7 +9,7 @@ from scipy.sparse import csc_array
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log, skew
-from adjust.start.network import ChainObservation, PoseNetwork
+from adjust.start.network import ChainObservation, FrameNetwork
 from adjust.start.views import View
 
 _DAMPING = 1e-7  # of the diagonal: what the observations leave open stays where it is
@@ -31,7 +31,7 @@ class _Chains:
     roots: FloatArray
 
 
-def polish(network: PoseNetwork, movable: set[int], views: Mapping[int, View], iterations: int = 6) -> None:
+def polish(network: FrameNetwork, movable: set[int], views: Mapping[int, View], iterations: int = 6) -> None:
     """Move the movable poses to the minimum of the chains' misfit in px, robustly; nothing else changes.
 
     Source: pose-graph least squares with each measured pose weighted by the normal matrix of its image points, which is
@@ -54,7 +54,7 @@ def polish(network: PoseNetwork, movable: set[int], views: Mapping[int, View], i
 
 
 def _arrays(
-    network: PoseNetwork,
+    network: FrameNetwork,
     items: Sequence[ChainObservation],
     slots: Sequence[int],
     moving: Sequence[int],

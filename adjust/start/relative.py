@@ -7,7 +7,7 @@ import numpy as np
 from adjust.model.survey import FloatArray
 from adjust.spatial.rigid import inverse, rigid
 from adjust.start.closed_forms.triangulation import intersect
-from adjust.start.network import PoseNetwork
+from adjust.start.network import FrameNetwork
 from adjust.start.points import PointField, Sight
 
 _SHARED = 8
@@ -15,7 +15,7 @@ _TRIALS = 30  # pairs of images that are tried, those with the most common point
 _THRESHOLD_PX = 3.0
 
 
-def orient_second(network: PoseNetwork, points: PointField) -> str | None:
+def orient_second(network: FrameNetwork, points: PointField) -> str | None:
     """Give a pose to one more image of unknown points, relative to one that has a pose; a note, or None.
 
     The distance of the two cameras is set to one metre. Source: Nister, PAMI 26(6), 2004 (five points, in OpenCV, with
@@ -77,7 +77,7 @@ def _parallax(second_from_first: FloatArray, a: FloatArray, b: FloatArray) -> fl
     return float(np.median(intersect(origins, directions, np.tile(np.arange(n), 2), n, iterations=0).parallax))
 
 
-def scale_lengths(network: PoseNetwork, points: PointField, factor: float, slots: Sequence[int]) -> None:
+def scale_lengths(network: FrameNetwork, points: PointField, factor: float, slots: Sequence[int]) -> None:
     """Multiply the translations of these poses and all points that are not given."""
     for slot in slots:
         network.known[slot] = rigid(network.known[slot][:3, :3], factor * network.known[slot][:3, 3])

@@ -19,7 +19,7 @@ from adjust.spatial.rigid import align, rigid
 from adjust.start.gauge import fix_one_gauge, frames_of, world_is_free
 from adjust.start.lenses import Sighting, start_lens
 from adjust.start.motion import solve_motion
-from adjust.start.network import ChainObservation, PoseNetwork, as_pose3, partial_pose
+from adjust.start.network import ChainObservation, FrameNetwork, as_pose3, partial_pose
 from adjust.start.pairs import network_start
 from adjust.start.points import PARALLAX, PointField, improve, intersect_points, point_field, resect
 from adjust.start.polish import polish
@@ -95,7 +95,7 @@ class _Search:
         self.seen_x: dict[tuple[str, bytes], FloatArray] = {}
         self.cameras = {c.camera_id: c for c in survey.cameras}
         unknowns = Unknowns()
-        self.network = PoseNetwork(unknowns, FrameTree(survey, unknowns))
+        self.network = FrameNetwork(unknowns, FrameTree(survey, unknowns))
         self.chains: list[Chain] = [self.network.frames.of_image(block) for block in survey.image_blocks]
         self.points: PointField = point_field(survey)
         self.lenses: dict[str, FloatArray] = {}

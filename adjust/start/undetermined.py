@@ -2,11 +2,11 @@
 
 from adjust.model.result import ParameterName
 from adjust.model.survey import Survey
-from adjust.start.network import PoseNetwork
+from adjust.start.network import FrameNetwork
 from adjust.start.points import PointField
 
 
-def undetermined(survey: Survey, network: PoseNetwork, points: PointField) -> str:
+def undetermined(survey: Survey, network: FrameNetwork, points: PointField) -> str:
     """One line for each pose and point without a value; empty where there is none."""
     lines = [
         f"{' '.join(name)}: {_missing_pose(network, points, name, slot)}"
@@ -23,7 +23,7 @@ def undetermined(survey: Survey, network: PoseNetwork, points: PointField) -> st
     return "no start value can be found for " + str(len(lines)) + " parameter(s):\n  " + "\n  ".join(shown)
 
 
-def _missing_pose(network: PoseNetwork, points: PointField, name: ParameterName, slot: int) -> str:
+def _missing_pose(network: FrameNetwork, points: PointField, name: ParameterName, slot: int) -> str:
     seen = [o for o in network.observations if any(link.slot == slot for link in o.chain)]
     if seen:
         others = sorted(
@@ -47,7 +47,7 @@ def _missing_pose(network: PoseNetwork, points: PointField, name: ParameterName,
     return f"no trusted image or pair reaches it{epoch}; add an observation or give its pose"
 
 
-def _missing_point(network: PoseNetwork, points: PointField, row: int) -> str:
+def _missing_point(network: FrameNetwork, points: PointField, row: int) -> str:
     seen = [s for s in points.sights if row in s.rows]
     if not seen:
         return "no image shows it and it has no coordinates; give them, or take it out of the survey"

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adjust.distributions import norm, student
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.result import BudgetEntry, BudgetLine, VarianceComponents
 from adjust.statistics.system import LinearSystem, linear_system
 from adjust.statistics.weakness import covariance_columns
+from adjust.testing.distributions import norm, student
 
 
 def uncertainty_budget(

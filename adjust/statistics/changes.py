@@ -16,7 +16,6 @@ from itertools import pairwise
 import numpy as np
 from scipy import sparse
 
-from adjust.distributions import chi2, fisher, norm
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
@@ -24,6 +23,7 @@ from adjust.precision.precision import noise_of
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Change, ChangeShift
 from adjust.statistics.system import LinearSystem
+from adjust.testing.distributions import chi2, fisher, norm
 
 _SEEN = 1e-4
 """Share of a column that no unknown takes over, below which it is not told from rounding."""

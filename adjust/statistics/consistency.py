@@ -11,16 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.distributions import chi2, fisher
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.images.batch import whitened_squares
 from adjust.statistics.changes import ChangeSearch
 from adjust.statistics.condensed import CondensedSystem
-from adjust.statistics.criteria import sidak
-from adjust.statistics.quadratic_forms import upper_tail, upper_tail_bound
 from adjust.statistics.result import Consistency, PartTest
 from adjust.statistics.system import LinearSystem
+from adjust.testing.criteria import sidak
+from adjust.testing.distributions import chi2, fisher
+from adjust.testing.quadratic_forms import upper_tail, upper_tail_bound
 
 _LEAST = 1e-3
 """Redundancy below which the squares of a part are rounding."""

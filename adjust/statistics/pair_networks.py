@@ -4,11 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from adjust.adjustment import AdjustOptions, adjust, assemble
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError
 from adjust.model.result import Adjustment
-from adjust.model.survey import FloatArray, Survey
+from adjust.model.survey import Survey
 
 if TYPE_CHECKING:
     from adjust.pose_network import NetworkSolution
@@ -38,7 +40,7 @@ def adjust_with_pairs(
     start: where the adjustment begins; found where not given. Raises as :func:`adjust.adjustment.adjust`.
     """
     if is_pure(survey):
-        found = adjusted_network(survey, network_solution(survey, options, progress), options)
+        found = _adjusted_network(survey, _network_solution(survey, options, progress, start), options)
         if survey.pair_form == "poses":
             return found
         from adjust.relay.closed import in_condition_form  # here: as below
@@ -52,11 +54,11 @@ def is_pure(survey: Survey) -> bool:
     return survey.is_pose_network and not (survey.points or survey.targets or survey.tables)
 
 
-def network_solution(
+def _network_solution(
     survey: Survey, options: PairOptions = PairOptions(), progress: Progress | None = None,
-    start: tuple[FloatArray, FloatArray] | None = None,
+    start: StartValues | None = None,
 ) -> "NetworkSolution":  # fmt: skip
-    """The pose network of a pure survey, solved. start: rotations (N, 3, 3) and translations (N, 3) of its stations.
+    """The pose network of a pure survey, solved. start: poses of all its stations, where there are any.
 
     Raises IndeterminateError naming the stations that no pair in use reaches.
     """
@@ -74,10 +76,14 @@ def network_solution(
 
     network = network_from_survey(survey)
     how = NetworkOptions(robust="auto" if options.reject_pairs else "off", alpha=_FAMILY)
-    return solve_network(network, start, how, progress)
+    if start is None:
+        return solve_network(network, options=how, progress=progress)
+    poses = [start.poses["world_from_station", s] for s in network.station_ids]
+    begin = np.array([p.rotation().matrix() for p in poses]), np.array([p.translation() for p in poses])
+    return solve_network(network, begin, how, progress)
 
 
-def adjusted_network(survey: Survey, solution: "NetworkSolution", options: PairOptions) -> Adjustment:
+def _adjusted_network(survey: Survey, solution: "NetworkSolution", options: PairOptions) -> Adjustment:
     """The solution of a pure survey as its adjustment, with warnings."""
     used, minimum = solution.network.used.tolist(), solution.minimum
     pairs = tuple(replace(p, used=bool(u)) for p, u in zip(survey.pairs, used, strict=True))

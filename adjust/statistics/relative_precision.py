@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3
 
-from adjust.distributions import chi2, fisher
 from adjust.graph.assembly import GraphBuilder, values_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
@@ -15,6 +14,7 @@ from adjust.model.survey import FloatArray
 from adjust.observations.factors import ChainPose
 from adjust.precision.precision import rotations_only
 from adjust.statistics.result import Ellipsoid, RelativePrecision
+from adjust.testing.distributions import chi2, fisher
 
 _HELD = 1e-16
 """Variance (m^2) of what is held, (10 nm)^2."""

@@ -10,17 +10,11 @@ from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.terrestrial.statistics import influences as influences_of_readings
 from adjust.precision.precision import Precision
 from adjust.statistics.condensed import CondensedSystem, condensed_system
-from adjust.statistics.criteria import criteria
 from adjust.statistics.influence import influences
-from adjust.statistics.result import (
-    Criteria,
-    ImageEllipses,
-    Influence,
-    LevelOptions,
-    ObservationTests,
-    Reliability,
-)
-from adjust.statistics.single_tests import (
+from adjust.statistics.result import ImageEllipses, Influence, ObservationTests, Reliability
+from adjust.statistics.system import precision_of
+from adjust.testing.criteria import Criteria, LevelOptions, criteria
+from adjust.testing.single_tests import (
     Whitened,
     component_tests,
     eigen2,
@@ -30,7 +24,6 @@ from adjust.statistics.single_tests import (
     p_tau,
     whitened,
 )
-from adjust.statistics.system import precision_of
 
 DEFAULT_LEVELS = LevelOptions()
 LARGEST_NETWORK = 3000

@@ -7,35 +7,7 @@ import numpy as np
 
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-
-Method = Literal["b", "sidak"]
-
-
-@dataclass(frozen=True)
-class LevelOptions:
-    """How observations are tested.
-
-    method: "b" (Baarda's B-method: ``alpha0`` is the level of a test of one component; tests of several components get
-    the level at which they find the same non-centrality with the same power) or "sidak" (``family_alpha`` is the error
-    probability of all tests together, each of them has the same level). power: probability 1 - beta with which a
-    minimal detectable bias is found.
-    """
-
-    method: Method = "sidak"
-    family_alpha: float = 0.05
-    alpha0: float = 0.001
-    power: float = 0.80
-
-
-@dataclass(frozen=True, eq=False)
-class Criteria:
-    """Levels, critical values of chi-square and non-centralities of tests with 1, 2, ... components; (q,), q >= 6."""
-
-    options: LevelOptions
-    n_tests: int
-    alpha: FloatArray
-    critical: FloatArray
-    lambda0: FloatArray
+from adjust.testing.criteria import Criteria
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,12 +11,12 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
-from adjust.statistics.criteria import limits
-from adjust.statistics.outlier_search import OutlierSearch, SearchOptions, search_outliers
+from adjust.statistics.outliers.search import OutlierSearch, SearchOptions, search_outliers
 from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs, is_pure, uncontrolled_pairs
 from adjust.statistics.result import Component, VarianceComponents
 from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.variance_components import ComponentOptions, Scaled, estimate_variance_components
+from adjust.testing.criteria import limits
 
 _LARGEST, _ROOM = 6000, 1e8
 """Unknowns up to which gross errors are always searched; above, numbers that the search may need for its columns."""

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
-from adjust.distributions import chi2
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
@@ -20,6 +19,7 @@ from adjust.statistics.group_sums import GroupSums, Moments, group_sums, moments
 from adjust.statistics.result import Component, VarianceComponents
 from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.system import DENSE, LinearSystem, linear_system, mixed_blocks, precision_of
+from adjust.testing.distributions import chi2
 
 _VANISHED = 1e-6
 _SINGULAR = 1e-6

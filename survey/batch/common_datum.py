@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.distributions import chi2
 from adjust.epochs.states import differences_of, moved_value, origin, value_motions
 from adjust.model.survey import FloatArray
-from adjust.statistics.criteria import sidak
+from adjust.testing.criteria import sidak
+from adjust.testing.distributions import chi2
 from survey.solution.covariances import read_covariances
 from survey.solution.quantities import ARCSEC_PER_RAD
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.distributions import chi2, norm, student
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.testing.distributions import chi2, norm, student
 
 WIDTH = 3.0
 """Limits in sigmas."""

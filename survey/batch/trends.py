@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from adjust.distributions import norm
-from adjust.statistics.criteria import sidak
+from adjust.testing.criteria import sidak
+from adjust.testing.distributions import norm
 from survey.batch.common_datum import (
     Moved,
     in_common_datum,

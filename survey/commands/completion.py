@@ -2,10 +2,20 @@
 
 import argparse
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from survey.commands.common import DONE
 
 SHELLS = ("bash", "zsh", "fish")
+_EPILOG = """\
+bash: {program} completion bash > ~/.local/share/bash-completion/completions/{program}
+zsh:  {program} completion zsh > a file named _{program} in a folder of $fpath
+fish: {program} completion fish > ~/.config/fish/completions/{program}.fish
+Next: open a new shell, type {program} and press Tab
+"""
 
 
 @dataclass(frozen=True)
@@ -121,3 +131,24 @@ def _fish(program: str, commands: tuple[Command, ...]) -> Iterator[str]:
             yield f"complete -c {program} {seen} {names}{value} -d '{flag.help}'"
         if c.words:
             yield f"complete -c {program} {seen} -a '{' '.join(c.words)}'"
+
+
+def declare_completion(
+    program: str, build_parser: Callable[[], argparse.ArgumentParser], commands: Any, shaped: dict[str, Any]
+) -> None:
+    """Add ``completion`` to the commands of a program whose parser ``build_parser`` makes."""
+    parser = commands.add_parser(
+        "completion",
+        help="print what makes Tab complete commands and flags in bash, zsh or fish",
+        usage=f"{program} completion bash   ({program} completion SHELL)",
+        description="Prints a script for the shell; nothing is installed.",
+        epilog=_EPILOG.format(program=program),
+        **shaped,
+    )
+    parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help="bash, zsh or fish")
+    parser.set_defaults(run=partial(_completion, build_parser))
+
+
+def _completion(build_parser: Callable[[], argparse.ArgumentParser], arguments: argparse.Namespace) -> int:
+    print(completion_script(build_parser(), arguments.shell), end="")
+    return DONE

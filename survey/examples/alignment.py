@@ -6,7 +6,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.survey import FloatArray
-from adjust.spatial.directions import tilted
+from adjust.spatial.vertical import tilted
 
 ARCSEC = np.pi / 648000.0
 UP = tilted(np.array([0.0, 0.0, 1.0]), np.array([90.0, -60.0]) * ARCSEC)[0]

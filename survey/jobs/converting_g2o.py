@@ -13,7 +13,7 @@ from adjust.pose_network.from_survey import network_from_survey
 from adjust.statistics.pair_networks import is_pure
 from survey.folder.text import id_problem
 from survey.interop.networks.g2o import Information, read_g2o_file, write_g2o
-from survey.jobs.adjusting.warm_start import network_start
+from survey.jobs.adjusting.warm_start import network_poses
 from survey.project import AdjustmentOptions, read
 from survey.report.results import RESULTS
 from survey.solution.previous import read_previous
@@ -68,12 +68,14 @@ def project_to_g2o(source: Path, target: Path, information: Information) -> tupl
     network = network_from_survey(survey, any_datum=True)
     adjusted = (source / RESULTS / "solution.json").is_file()
     known = dict(read_previous(project).poses) if adjusted else _given(survey)
-    start = network_start(survey, known)
-    if start is None:
+    found = network_poses(survey, known)
+    if found is None:
         raise SurveyError(f"{source}: pairs leave stations without a pose; give them a start")
-    write_g2o(target, network, *start, information=information)
-    poses = "adjusted" if adjusted else "start values, not adjusted"
-    return network.n_stations, int(network.used.sum()), poses, _left_out(survey, network.station_ids)
+    poses = [found[s] for s in network.station_ids]
+    R, t = np.array([p.rotation().matrix() for p in poses]), np.array([p.translation() for p in poses])
+    write_g2o(target, network, R, t, information=information)
+    which = "adjusted" if adjusted else "start values, not adjusted"
+    return network.n_stations, int(network.used.sum()), which, _left_out(survey, network.station_ids)
 
 
 def _given(survey: Survey) -> dict[tuple[str, ...], Pose3]:

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3
 
-from adjust.distributions import chi2
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
-from adjust.relay.eye_drift import sequences
-from adjust.relay.eye_pairs import EyePairs, close_loops, triangle_misclosure
-from adjust.relay.eyes import adjust_eye_motions
+from adjust.relay.eyes.drift import sequences
+from adjust.relay.eyes.eyes import adjust_eye_motions
+from adjust.relay.eyes.pairs import EyePairs, close_loops, triangle_misclosure
 from adjust.relay.network import gtsam_motion
+from adjust.testing.distributions import chi2
 from survey.folder.whole import whole_folder
 from survey.jobs.relay import (
     RelayPairs,

@@ -16,18 +16,18 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
-from adjust.relay.eye_drift import DriftModel, choose_interval, growth, rescaled, sequences
-from adjust.relay.eye_images import eye_sequences
-from adjust.relay.eye_pairs import EyePairs, LoopedPairs, close_loops, pairs_of
-from adjust.relay.eye_trajectories import CommonMotions, TimeOffset, Trajectory, time_offset
-from adjust.relay.eyes import EyeAdjustment, EyeOptions, adjust_eyes
-from adjust.relay.motions import Motions
+from adjust.relay.eyes.drift import DriftModel, choose_interval, growth, rescaled, sequences
+from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eyes
+from adjust.relay.eyes.images import eye_sequences
+from adjust.relay.eyes.pairs import EyePairs, LoopedPairs, close_loops, pairs_of
+from adjust.relay.eyes.trajectories import CommonMotions, TimeOffset, Trajectory, time_offset
 from adjust.spatial.rigid import rotation_log
+from adjust.spatial.rigid_motions import Motions
 from survey.folder.text import decode, read_bytes
 from survey.jobs.adjusting.subnetwork import in_use
 from survey.project import read
+from survey.project.tables.files import write_table
 from survey.project.tables.observation_columns import pair_columns
-from survey.project.tables.writing import write_table
 
 _INTERVALS_S = (1.0, 1.5, 2.0, 3.0, 4.0)
 _GROWTH_S = (0.1, 0.3, 1.0, 3.0, 9.0)

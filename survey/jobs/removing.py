@@ -17,7 +17,7 @@ from typing import Any
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Survey
-from adjust.statistics.supported import supported
+from adjust.statistics.outliers.supported import supported
 from survey.folder.replacing import complete, copy_folder, place_for, replace_parts
 from survey.folder.text import atomic_write
 from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, made

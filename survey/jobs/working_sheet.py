@@ -13,13 +13,13 @@ from typing import Literal
 import numpy as np
 from gtsam import Rot3
 
-from adjust.distributions import norm
 from adjust.frames.unknowns import FrameTree
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
 from adjust.observations.factors import ChainPose
+from adjust.testing.distributions import norm
 from survey.project.project import AlignmentTask
 from survey.solution.quantities import SigmaKind, scale_of
 

@@ -24,6 +24,7 @@ from survey.project.project import (
     SpotsRequest,
 )
 from survey.project.reading import LAYOUTS
+from survey.project.tables.files import write_table
 from survey.project.tables.observation_columns import (
     angle_columns,
     coordinate_columns,
@@ -34,7 +35,6 @@ from survey.project.tables.observation_columns import (
 )
 from survey.project.tables.reading import Columns
 from survey.project.tables.terrestrial_columns import new_tables
-from survey.project.tables.writing import write_table
 from survey.project.targets import PointList, TargetKind
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from adjust.distributions import beta, norm
 from adjust.model.survey import BoolArray, FloatArray
+from adjust.testing.distributions import beta, norm
 from survey.report import drawing as d
 from survey.report.language import esc, known, localised, t
 from survey.report.markup import MINUS, count

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from adjust.distributions import norm
 from adjust.epochs.states import datum_carriers, open_directions
 from adjust.model.result import Adjustment, Estimate, GroupSummary
 from adjust.model.survey import FloatArray
 from adjust.precision.precision import in_conditions
+from adjust.testing.distributions import norm
 from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries

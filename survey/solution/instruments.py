@@ -6,7 +6,7 @@ import numpy as np
 
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray, Survey
-from adjust.spatial.directions import tilted
+from adjust.spatial.vertical import tilted
 from survey.solution.quantities import Scale, vector_entry
 
 

@@ -19,8 +19,8 @@ from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.relay.closed import play
 from adjust.relay.counts import Counts, count
 from adjust.relay.loops import LoopMisclosures, evaluate_loops, loop_misclosures
-from adjust.relay.motions import Motions
 from adjust.relay.network import Network, Topology, topology
+from adjust.spatial.rigid_motions import Motions
 from survey.folder.text import natural_key
 from survey.solution.quantities import ARCSEC_PER_RAD
 

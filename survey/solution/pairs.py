@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3
 
-from adjust.distributions import chi2
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray
 from adjust.precision.precision import Precision
+from adjust.testing.distributions import chi2
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import ARCSEC_PER_RAD, Scale, pose_dict
 

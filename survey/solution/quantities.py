@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3
 
-from adjust.distributions import chi2, fisher
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate
 from adjust.model.survey import FloatArray
+from adjust.testing.distributions import chi2, fisher
 from survey.project.project import SIGMA_KINDS
 from survey.project.project import SigmaKind as SigmaKind
 

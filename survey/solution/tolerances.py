@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3
 
-from adjust.distributions import norm, student
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate
+from adjust.testing.distributions import norm, student
 from survey.project.project import DEMANDED, POSITION, ROTATION, Tolerance
 from survey.solution.quantities import PROBABILITY, Scale
 

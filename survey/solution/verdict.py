@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from adjust.distributions import chi2, norm
 from adjust.model.result import CAUTIOUS_SIGMAS, Adjustment
 from adjust.statistics.result import Consistency
+from adjust.testing.distributions import chi2, norm
 
 
 @dataclass(frozen=True)

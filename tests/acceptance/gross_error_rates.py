@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 
 from adjust.adjustment import adjust
-from adjust.distributions import chi2
-from adjust.statistics.criteria import sidak
-from adjust.statistics.outlier_search import SearchOptions, search_outliers
+from adjust.statistics.outliers.search import SearchOptions, search_outliers
 from adjust.statistics.reliability import observation_name, reliability
+from adjust.testing.criteria import sidak
+from adjust.testing.distributions import chi2
 from tests.adjust import statistics_networks as net
 from tests.adjust.test_outlier_search import planted
 

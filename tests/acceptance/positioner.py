@@ -14,12 +14,12 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
-from adjust.distributions import fisher
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair, TableReading
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import TABLE_GEOMETRY, FloatArray, Station, Survey, Table, VectorParameter
 from adjust.spatial.rigid import nearest_rotation
+from adjust.testing.distributions import fisher
 
 POSITIONER, PLATFORM = "positioner", "platform"
 AXIS_PARAMETERS = ("non_orthogonality", "axis_offset")

@@ -12,8 +12,8 @@ from adjust.published.relay import paper_iteration
 from adjust.relay.conditions import MAX_HARD_LOOPS, ConditionOptions, adjust_condition_factors, adjust_conditions
 from adjust.relay.counts import count
 from adjust.relay.loops import loop_misclosures
-from adjust.relay.motions import Motions
 from adjust.relay.network import Network, topology
+from adjust.spatial.rigid_motions import Motions
 from tests.adjust.relay_monte_carlo import MonteCarloOptions, simulate_complete
 from tests.adjust.relay_networks import ARCMIN, chain_with_chords, complete, differences, grid, simulate, suspects
 from tests.adjust.relay_parametric import adjust_parametric

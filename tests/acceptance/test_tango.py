@@ -20,13 +20,13 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey
 from adjust.relay.conditions import adjust_conditions
-from adjust.relay.eye_drift import fit_drift, rescaled, sequences
-from adjust.relay.eye_pairs import close_loops, pairs_of, triangle_misclosure
-from adjust.relay.eye_trajectories import CommonMotions, Trajectory, common_motions, time_offset
-from adjust.relay.eyes import EyeOptions, PoseSequence, adjust_eye_motions, adjust_eyes
+from adjust.relay.eyes.drift import fit_drift, rescaled, sequences
+from adjust.relay.eyes.eyes import EyeOptions, PoseSequence, adjust_eye_motions, adjust_eyes
+from adjust.relay.eyes.pairs import close_loops, pairs_of, triangle_misclosure
+from adjust.relay.eyes.trajectories import CommonMotions, Trajectory, common_motions, time_offset
 from adjust.relay.loops import loop_misclosures
-from adjust.relay.motions import Motions
 from adjust.relay.network import network_from_pairs
+from adjust.spatial.rigid_motions import Motions
 from survey.jobs.relay import (
     RelayTrackers,
     one_metre,

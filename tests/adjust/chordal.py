@@ -14,8 +14,8 @@ from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
 from adjust.pose_network.network import PoseNetwork, check_determined
 from adjust.pose_network.start import find_network_start
-from adjust.relay.motions import Motions
 from adjust.spatial.rigid import skew
+from adjust.spatial.rigid_motions import Motions
 
 _GENERATORS = skew(np.eye(3))
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from adjust.model.survey import FloatArray
 from adjust.observations.pairs import pair_jacobians
 from adjust.pose_network import PoseNetwork, pose_network
-from adjust.relay.motions import Motions
+from adjust.spatial.rigid_motions import Motions
 
 
 @dataclass(frozen=True, eq=False)

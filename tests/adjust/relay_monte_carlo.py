@@ -86,7 +86,7 @@ def adjust_batch(b_from_a: FloatArray, information: FloatArray, n_cameras: int) 
     """Adjust T complete networks: measured (T, E, 3, 3) in the order (0, 1), (0, 2), ..., (1, 2), ...
 
     information: inverse covariances (T, E, 3, 3), in the tangents on the right. The estimator is that of
-    :mod:`adjust.relay.parametric`, of all networks at once.
+    :mod:`tests.adjust.relay_parametric`, of all networks at once.
     """
     return Batch(*adjust_trials(b_from_a, information, n_cameras, _LIMIT, _MOST))
 

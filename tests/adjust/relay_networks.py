@@ -6,8 +6,8 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.observations import FrameRef, Pair
-from adjust.relay.motions import Motions
 from adjust.relay.network import Network, topology
+from adjust.spatial.rigid_motions import Motions
 
 ARCMIN = np.pi / 180 / 60
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.pose_network import NetworkOptions, NetworkSolution, pose_network, solve_network
-from adjust.relay.motions import Motions
 from adjust.relay.result import AdjustedPairs, adjusted_pairs
+from adjust.spatial.rigid_motions import Motions
 from tests.adjust.relay_networks import as_gtsam
 
 OPTIONS = NetworkOptions(robust="off", max_step=1e-9)

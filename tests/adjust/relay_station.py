@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey, Target
-from adjust.relay.eyes import PoseSequence
-from adjust.relay.motions import Motions
+from adjust.relay.eyes.eyes import PoseSequence
+from adjust.spatial.rigid_motions import Motions
 from survey.simulate.scene import BROWN
 
 EYES = ("a", "b", "c", "d")

@@ -92,7 +92,7 @@ def _around(r: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _inverse_jacobian(r: FloatArray) -> FloatArray:
-    """Jr^-1 (3, 3, E, T), as of :mod:`adjust.relay.motions`."""
+    """Jr^-1 (3, 3, E, T), as of :mod:`adjust.spatial.rigid_motions`."""
     x = (r**2).sum(axis=0)
     half = 0.5 * np.sqrt(np.maximum(x, 1e-3))
     series = 1.0 / 12.0 + x / 720.0 + x * x / 30240.0

@@ -12,10 +12,10 @@ from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.changes import ChangeSearch, natural
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.consistency import consistency, eigenvalues, parts_of
-from adjust.statistics.criteria import sidak
-from adjust.statistics.quadratic_forms import upper_tail, upper_tail_bound
 from adjust.statistics.result import Change, Consistency
 from adjust.statistics.system import linear_system, precision_of
+from adjust.testing.criteria import sidak
+from adjust.testing.quadratic_forms import upper_tail, upper_tail_bound
 from survey.simulate import head_on_table
 from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net

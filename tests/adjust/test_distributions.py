@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats as st
 
-from adjust import distributions as d
+from adjust.testing import distributions as d
 
 P = np.array([1e-12, 1e-6, 1e-3, 0.05, 0.5, 0.95, 0.999])
 K = np.array([1, 2, 3, 6, 40, 5000])[:, None]

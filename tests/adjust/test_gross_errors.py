@@ -6,7 +6,7 @@ from scipy.stats import chi2
 
 from adjust.model.errors import NotConvergedError
 from adjust.model.survey import BoolArray, FloatArray
-from adjust.statistics.gross_errors import Search, State, Verdicts, best_back_first, one_group, worst_first
+from adjust.testing.gross_errors import Search, State, Verdicts, best_back_first, one_group, worst_first
 
 ALPHA = 0.01
 

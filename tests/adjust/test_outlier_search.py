@@ -12,14 +12,14 @@ from adjust.graph.assembly import StartValues
 from adjust.model.errors import NotConvergedError
 from adjust.model.observations import Distance, FrameRef, Pair, PositionRef, Reading, ReadingCovariance
 from adjust.model.survey import FloatArray, Point, PointParameter, Survey
-from adjust.statistics.candidates import candidates, without
+from adjust.start.robust import limit
 from adjust.statistics.condensed import condensed_system
-from adjust.statistics.gross_errors import Search
-from adjust.statistics.outlier_search import SearchOptions, search_outliers
+from adjust.statistics.outliers.candidates import candidates, without
+from adjust.statistics.outliers.search import SearchOptions, search_outliers
+from adjust.statistics.outliers.snooping import Snooping
 from adjust.statistics.reliability import reliability
-from adjust.statistics.robust import limit
-from adjust.statistics.snooping import Snooping
 from adjust.statistics.system import LinearSystem, linear_system
+from adjust.testing.gross_errors import Search
 from survey.simulate import head_on_table, resample
 from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net
@@ -314,7 +314,7 @@ def test_the_last_solution_stays_where_there_is_none_without_an_observation(monk
             raise NotConvergedError("it went astray")
         return adjust(given, *arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("adjust.statistics.outlier_search.adjust", fragile)
+    monkeypatch.setattr("adjust.statistics.outliers.search.adjust", fragile)
     found = search_outliers(wrong, start)
     assert needed not in {d.ids[0] for d in found.rejected}
     assert any(f"cannot be left out: {wrong.readings[4].kind}" in n and needed in n for n in found.notes)

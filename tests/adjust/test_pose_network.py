@@ -15,7 +15,7 @@ from adjust.pose_network.from_survey import network_from_survey
 from adjust.pose_network.network import PoseNetwork, loop_marks
 from adjust.pose_network.robust import _worst_around, graduated_weights
 from adjust.pose_network.solve import minimize
-from adjust.relay.motions import Motions
+from adjust.spatial.rigid_motions import Motions
 from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs
 from tests.adjust.chordal import chordal_cost, minimize_chordal
 from tests.adjust.pose_networks import exp6, network_jacobians, simulate

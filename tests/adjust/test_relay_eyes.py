@@ -14,11 +14,7 @@ from adjust.adjustment import adjust
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.survey import FloatArray
-from adjust.relay.eye_images import camera_sequence, eye_sequences, target_sequence
-from adjust.relay.eye_pairs import close_loops, pairs_of, triangle_misclosure
-from adjust.relay.eye_setup import motion_setup, pose_setup
-from adjust.relay.eye_solver import EyeProblem, linearise
-from adjust.relay.eyes import (
+from adjust.relay.eyes.eyes import (
     EyeOptions,
     KnownWorlds,
     MotionSequence,
@@ -27,7 +23,11 @@ from adjust.relay.eyes import (
     adjust_eyes,
     pair_from_marker,
 )
-from adjust.relay.motions import Motions
+from adjust.relay.eyes.images import camera_sequence, eye_sequences, target_sequence
+from adjust.relay.eyes.pairs import close_loops, pairs_of, triangle_misclosure
+from adjust.relay.eyes.setup import motion_setup, pose_setup
+from adjust.relay.eyes.solver import EyeProblem, linearise
+from adjust.spatial.rigid_motions import Motions
 from tests.adjust.relay_station import EYES, Station4, Trackers, motions, poses, random_rigid
 from tests.sizes import size
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.relay.motions import Motions, exp, identities, right_jacobian, right_jacobian_inverse
+from adjust.spatial.rigid_motions import Motions, exp, identities, right_jacobian, right_jacobian_inverse
 from tests.adjust.relay_networks import as_gtsam
 
 

@@ -9,8 +9,8 @@ from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.published.relay import ARCSECOND, PaperOptions, loop_equations, paper_iteration
 from adjust.relay.conditions import adjust_conditions
 from adjust.relay.loops import loop_basis
-from adjust.relay.motions import Motions
 from adjust.relay.network import Network
+from adjust.spatial.rigid_motions import Motions
 from adjust.spatial.rotation_forms import euler_cov_from_tangent, euler_from_matrix
 from tests.adjust.relay_monte_carlo import MonteCarloOptions, adjust_batch, simulate_complete
 from tests.adjust.relay_networks import ARCMIN, complete, simulate

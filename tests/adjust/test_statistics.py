@@ -16,13 +16,12 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment
 from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
 from adjust.statistics.condensed import condensed_system
-from adjust.statistics.criteria import criteria, noncentrality, sidak
 from adjust.statistics.influence import shifts
 from adjust.statistics.pair_networks import adjust_with_pairs
 from adjust.statistics.relative_precision import relative_precision
 from adjust.statistics.reliability import observation_name, reliability
-from adjust.statistics.result import LevelOptions
 from adjust.statistics.system import linear_system
+from adjust.testing.criteria import LevelOptions, criteria, noncentrality, sidak
 from survey.simulate import head_on_table, resample, stereo
 from tests.adjust import helpers as h
 

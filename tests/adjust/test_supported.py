@@ -9,7 +9,7 @@ from gtsam import Pose3, Rot3
 from adjust.adjustment import adjust
 from adjust.model.observations import Coordinates, Distance, FrameRef, Pair, PositionRef, Reading
 from adjust.model.survey import Point, PointParameter, PoseParameter, Setup, Station, Survey
-from adjust.statistics.supported import lost_notes, supported
+from adjust.statistics.outliers.supported import lost_notes, supported
 from survey.simulate import head_on_table, single_camera
 
 

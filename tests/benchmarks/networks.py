@@ -17,7 +17,7 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import FloatArray
 from adjust.pose_network import NetworkOptions, NetworkSolution, PoseNetwork, pose_network, solve_network
 from adjust.pose_network.session import NetworkSession
-from adjust.relay.motions import Motions
+from adjust.spatial.rigid_motions import Motions
 from tests.adjust.pose_networks import network_jacobians, simulate
 
 PLAIN = NetworkOptions(robust="off")

@@ -24,9 +24,8 @@ from survey.folder.replacing import recover
 from survey.folder.text import cell_text, id_problem, natural_key, read_bytes
 from survey.jobs.adjusting.job import adjust_job
 from survey.project.declared.node import read_toml
-from survey.project.tables.files import read_table
+from survey.project.tables.files import read_table, write_table
 from survey.project.tables.reading import Layout, group_names
-from survey.project.tables.writing import write_table
 from survey.solution.previous import read_previous
 from survey.solution.residual_tables import other_residuals_csv
 from tests.adjust.test_deformation import adjusted, chain, measured

@@ -16,9 +16,8 @@ from adjust.model.errors import SurveyError
 from survey.project.tables import arrow as arrow_columns
 from survey.project.tables import files as table_reading
 from survey.project.tables.arrow import csv_columns, csv_rows
-from survey.project.tables.files import read_table
+from survey.project.tables.files import read_table, write_table
 from survey.project.tables.reading import Layout, Table, TextColumn
-from survey.project.tables.writing import write_table
 
 LAYOUT = Layout("t", ("a_id",), ("x_mm",), ("group",), ("sigma_mm",))
 HEADER = "a_id,x_mm,group,sigma_mm\n"
@@ -144,7 +143,7 @@ def test_a_large_table_comes_back_as_it_was_written(tmp_path: Path, monkeypatch:
     ids = [f"p{i % 999}" for i in range(len(values))]
     columns = {"a_id": ids, "x_mm": values, "sigma_mm": sigma}
     path = write_table(tmp_path, "t", columns)
-    monkeypatch.setattr("survey.project.tables.writing.LARGE", 2**60)
+    monkeypatch.setattr("survey.project.tables.files.LARGE", 2**60)
     assert write_table(tmp_path / "rows", "t", columns).read_bytes() == path.read_bytes()
     table = _read(path)
     assert isinstance(table, Table)
@@ -159,8 +158,7 @@ def test_a_small_table_loads_no_arrow_and_a_large_one_no_pandas(tmp_path: Path) 
     code = """
 import sys
 from pathlib import Path
-from survey.project.tables.files import read_table
-from survey.project.tables.writing import write_table
+from survey.project.tables.files import read_table, write_table
 from survey.project.tables.reading import Layout
 layout = Layout("t", ("a_id",), ("x_mm",), ("group",), ("sigma_mm",))
 for name, seldom in (("small", "pyarrow"), ("large", "pandas")):

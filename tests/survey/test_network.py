@@ -298,7 +298,7 @@ def test_a_pair_without_which_there_is_no_solution_stays(monkeypatch):
             raise IndeterminateError("2 directions are undetermined", ("S1",))
         return adjust(given, *arguments)
 
-    monkeypatch.setattr("adjust.statistics.outlier_search.adjust", fragile)
+    monkeypatch.setattr("adjust.statistics.outliers.search.adjust", fragile)
     result = adjust_cleaned(survey)
     assert next(p for p in result.survey.pairs if p.pair_id == name).used
     assert [w for w in result.warnings if w.startswith(f"fails its test, but cannot be left out: pair {name}")]

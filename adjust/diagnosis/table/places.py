@@ -6,9 +6,9 @@ import numpy as np
 
 from adjust.diagnosis.table.fit import TableFit, fit_table, residuals
 from adjust.diagnosis.table.views import TableViews
-from adjust.distributions import chi2
 from adjust.model.survey import FloatArray, IntArray, Target
 from adjust.spatial.rigid import inverse, rotation_exp, rotation_log, transform
+from adjust.testing.distributions import chi2
 
 LIMIT = float(chi2.isf(1e-9, 6))
 _MOST_SPLITS = 40

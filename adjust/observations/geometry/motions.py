@@ -5,9 +5,9 @@ import numpy as np
 
 from adjust.frames.unknowns import Unknown, Unknowns
 from adjust.model.survey import FloatArray, Surface, Survey, tilt_axes
-from adjust.spatial.directions import tilted
 from adjust.spatial.motions import point_motions
 from adjust.spatial.rigid import skew
+from adjust.spatial.vertical import tilted
 
 MOVED = ("vertical", "beam", "surface")
 

@@ -13,9 +13,8 @@ from adjust.frames.unknowns import VectorMap
 from adjust.model.observations import Alignment, CoordinateDifferences, LaserSpot, Level, OnSurface
 from adjust.model.survey import BoolArray, FloatArray, Surface, tilt_axes
 from adjust.observations.factors import ChainPose, Jacobians, Position, Residual
-from adjust.spatial.directions import tilted_frame
 from adjust.spatial.rigid import skew
-from adjust.spatial.vertical import VerticalMap, up_at
+from adjust.spatial.vertical import VerticalMap, tilted_frame, up_at
 
 
 def differences_residual(

@@ -64,7 +64,7 @@ def pose_solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
 
 
 def _solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
-    """:func:`pose_solutions` but for what :func:`adjust.start.closed_forms.plane_poses` does."""
+    """:func:`pose_solutions` but for what :func:`adjust.native.views.plane_poses` does."""
     if len(x) < 3:
         raise SurveyError(f"a camera pose needs 3 known points, got {len(x)}: observe more of them")
     front_from_camera = rotation_to(rays.mean(axis=0), np.array([0.0, 0.0, 1.0]))

@@ -14,10 +14,10 @@ from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import IntArray, Survey
+from adjust.statistics.outliers.supported import lost_notes, supported
+from adjust.statistics.outliers.undetermined_points import without_lost_points
 from adjust.statistics.pair_networks import PairOptions
 from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
-from adjust.statistics.supported import lost_notes, supported
-from adjust.statistics.undetermined_points import without_lost_points
 from survey.jobs.adjusting.probable_causes import explained, with_probable_causes
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
 from survey.jobs.identify import identify_spots, without_points

@@ -5,15 +5,13 @@ might (free networks, whose datum is that of the start; networks of pairs in whi
 begins anew.
 """
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 from gtsam import Pose3, Rot3
-from tqdm import tqdm
 
-from adjust.adjustment import AdjustOptions, start_values
+from adjust.adjustment import start_values
 from adjust.graph.assembly import StartValues
 from adjust.lenses.models import MODELS
 from adjust.model.errors import NotConvergedError
@@ -21,9 +19,8 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Survey
 from adjust.pose_network.from_survey import network_from_survey
 from adjust.start import find_start
-from adjust.statistics.pair_networks import PairOptions, adjusted_network, is_pure, network_solution
-from adjust.statistics.supported import lost_notes, supported
-from survey.jobs.adjusting.steps import adjust_project, told
+from adjust.statistics.pair_networks import is_pure
+from survey.jobs.adjusting.steps import adjust_project
 from survey.project import Project
 from survey.solution.previous import Previous
 
@@ -41,12 +38,10 @@ def warm_adjustment(
     survey = project.survey
     if survey.datum.kind == "inner" or project.options.pairs == "closed" or (is_pure(survey) and not previous.clean):
         return cold(project), COLD
-    if is_pure(survey):
-        return _warm_network(project, previous, progress) or (cold(project), COLD)
     found: list[bool] = []
 
     def begin(part: Survey) -> StartValues | None:
-        start = survey_start(part, previous)
+        start = (network_start if is_pure(part) else survey_start)(part, previous)
         found.append(start is not None)
         return start
 
@@ -57,28 +52,14 @@ def warm_adjustment(
     return adjustment, WARM if all(found) else COLD
 
 
-def _warm_network(project: Project, previous: Previous, progress: bool) -> tuple[Adjustment, str] | None:
-    """A network of nothing but pairs; None where these do not reach all stations from those that are known."""
-    survey, lost = supported(project.survey)
-    begin = network_start(survey, previous.poses)
-    if begin is None:
-        return None
-    options = AdjustOptions(project.options.alpha, project.options.reject_blocks, project.options.reject_points)
-    pairs = PairOptions(project.options.reject_pairs, options)
-    with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
-
-        def step(_iteration: int, omega: float) -> None:
-            bar.set_postfix_str(f"v'Pv = {omega:.6g}")
-            bar.update()
-
-        result = adjusted_network(survey, network_solution(survey, pairs, step, begin), pairs)
-    return told(project, survey, replace(result, warnings=result.warnings + lost_notes(lost))), WARM
+def network_start(survey: Survey, previous: Previous) -> StartValues | None:
+    """Of a network of nothing but pairs; None where these do not reach all stations from those that are known."""
+    poses = network_poses(survey, previous.poses)
+    return None if poses is None else StartValues({}, {("world_from_station", s): p for s, p in poses.items()}, {})
 
 
-def network_start(
-    survey: Survey, known: Mapping[ParameterName, Pose3]
-) -> tuple[FloatArray, FloatArray] | None:  # fmt: skip
-    """Rotations (N, 3, 3) and translations (N, 3) of a pure network: known ones, the others by the best pairs.
+def network_poses(survey: Survey, known: Mapping[ParameterName, Pose3]) -> dict[str, Pose3] | None:
+    """``world_from_station`` of a pure network by station: known ones, the others by the best pairs.
 
     None where the pairs do not reach all stations.
     """
@@ -100,7 +81,7 @@ def network_start(
             elif b in poses and a not in poses:
                 poses[a] = poses[b].compose(b_from_a)
         waiting = [p for p in waiting if p.a.frame_id not in poses or p.b.frame_id not in poses]
-    return np.array([poses[s].rotation().matrix() for s in ids]), np.array([poses[s].translation() for s in ids])
+    return {s: poses[s] for s in ids}
 
 
 def survey_start(survey: Survey, previous: Previous) -> StartValues | None:

@@ -1,9 +1,10 @@
-"""Tables of observations out of CSV or Parquet files, with file and line of whatever is wrong in them."""
+"""Tables out of CSV or Parquet files, with file and line of whatever is wrong in them, and columns as such files."""
 
 import contextlib
 import csv
 import io
 import itertools
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,12 @@ import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray
-from survey.folder.text import LARGEST_NUMBER, decode, read_bytes
-from survey.project.tables.arrow import csv_columns, parquet_columns
-from survey.project.tables.reading import Layout, Table, TextColumn, check_header, check_rows, first_row
+from survey.folder.text import LARGEST_NUMBER, atomic_write, decode, formula_problem, read_bytes, utf8
+from survey.project.tables.arrow import LARGE, csv_columns, csv_rows, parquet_bytes, parquet_columns
+from survey.project.tables.reading import Columns, Layout, Table, TextColumn, check_header, check_rows, first_row
 
 CHUNK = 65536
+_NUMBERS = re.compile(r"[-+.\deE ]+")  # the components of an axis in one cell
 Chunk = tuple[IntArray, Sequence[Sequence[str]]]
 
 
@@ -159,3 +161,51 @@ def _last_start(text: str) -> int:
         for _ in reader:
             line = reader.line_num + 1
     return line
+
+
+def write_table(folder: Path, name: str, columns: Columns, parquet: bool = False) -> Path:
+    """Write ``folder/name.csv`` or ``.parquet`` and remove the other of the two; nan becomes blank.
+
+    Numbers keep all their digits: reading gives back the same doubles. Raises SurveyError for a text that a spreadsheet
+    would take for a formula.
+    """
+    for column, values in columns.items():
+        for text in _names(values):
+            if (problem := formula_problem(text)) and not _NUMBERS.fullmatch(text):
+                raise SurveyError(f"{folder}/{name}: {column}: {text[:40]!r}: {problem}")
+    path, other = folder / f"{name}.csv", folder / f"{name}.parquet"
+    if parquet:
+        path, other = other, path
+    atomic_write(path, parquet_bytes(columns) if parquet else _csv(columns))
+    other.unlink(missing_ok=True)
+    return path
+
+
+def _names(column: Sequence[str] | TextColumn | FloatArray) -> Sequence[str]:
+    """The different texts of a column; none of numbers."""
+    if isinstance(column, TextColumn):
+        return column.names
+    return () if isinstance(column, np.ndarray) else tuple(dict.fromkeys(column))
+
+
+def _csv(columns: Columns) -> bytes:
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    doubles = all(c.dtype == np.float64 for c in columns.values() if isinstance(c, np.ndarray))
+    if doubles and 10 * len(columns) * max(map(len, columns.values()), default=0) > LARGE:
+        return utf8(stream.getvalue()) + csv_rows(columns)
+    writer.writerows(zip(*(cells_of(column) for column in columns.values()), strict=True))
+    return utf8(stream.getvalue())
+
+
+def cells_of(column: Sequence[str] | TextColumn | FloatArray) -> Sequence[object]:
+    """The cells of a column as the csv module writes them; nan is blank."""
+    if isinstance(column, TextColumn):
+        return column.values()
+    if not isinstance(column, np.ndarray):
+        return column
+    values: list[object] = column.tolist()
+    for row in np.flatnonzero(np.isnan(column)).tolist():
+        values[row] = None
+    return values

@@ -8,8 +8,7 @@ from survey.folder.text import LARGEST_NUMBER, natural_key, suggestion
 from survey.folder.units import to_si
 from survey.project.project import Sigmas
 from survey.project.tables.covariance import covariance_from_sigmas
-from survey.project.tables.quantity_columns import needed, one_of, quantity
-from survey.project.tables.reading import FLAGS, Layout, Table, first_row, group_names
+from survey.project.tables.reading import FLAGS, Layout, Table, first_row, group_names, needed, one_of, quantity
 from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame, read_position
 
 _TILTS = ("arcsec", "mgon", "deg", "mm_per_m")

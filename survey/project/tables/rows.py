@@ -14,9 +14,8 @@ import numpy as np
 
 from survey.folder.text import decode, read_bytes
 from survey.project.detected import ImageKey
-from survey.project.tables.files import read_table
+from survey.project.tables.files import cells_of, read_table
 from survey.project.tables.reading import Columns, Layout, Table
-from survey.project.tables.writing import cells_of
 
 _FALSE = ("false", "0")
 

@@ -11,8 +11,7 @@ from survey.folder.units import to_si
 from survey.project.declared.instruments import setup_problem
 from survey.project.project import Accuracy, Sigmas
 from survey.project.tables.covariance import covariance_problem
-from survey.project.tables.quantity_columns import ANGLE_UNITS, dms_angles, one_of, quantity
-from survey.project.tables.reading import FLAGS, Layout, Table, first_row
+from survey.project.tables.reading import ANGLE_UNITS, FLAGS, Layout, Table, dms_angles, first_row, one_of, quantity
 from survey.project.tables.references import NameProblemError, Names, check_epochs, read_position
 
 KINDS: tuple[ReadingKind, ...] = (

@@ -6,10 +6,10 @@ import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray
-from adjust.relay.eye_checks import OutlierEpoch
-from adjust.relay.eye_setup import EyeSetup
-from adjust.relay.eye_solver import EyeProblem, EyeSolution, linearise, solve_eyes
-from adjust.statistics.gross_errors import Search, State, Verdicts, one_group
+from adjust.relay.eyes.checks import OutlierEpoch
+from adjust.relay.eyes.setup import EyeSetup
+from adjust.relay.eyes.solver import EyeProblem, EyeSolution, linearise, solve_eyes
+from adjust.testing.gross_errors import Search, State, Verdicts, one_group
 
 
 def solve_screened(setup: EyeSetup, reject: bool, alpha: float) -> tuple[EyeSolution, tuple[OutlierEpoch, ...]]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray
-from adjust.relay.eye_setup import EyeSetup
+from adjust.relay.eyes.setup import EyeSetup
 from adjust.spatial.rigid import rotation_log
 from adjust.start.closed_forms.hand_eye import degenerate_direction
 

@@ -8,19 +8,48 @@ Baarda's B-method asks the same lambda0 of all tests, so that a bias is found eq
 """
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 
-from adjust.distributions import chi2, ncx2
 from adjust.model.survey import FloatArray, IntArray
-from adjust.statistics.result import Criteria, LevelOptions
+from adjust.testing.distributions import chi2, ncx2
 
+Method = Literal["b", "sidak"]
 CAUTIOUS = 0.5
 """Size of residuals over their sigmas, all together, below which no observation is left out."""
 MANY = 20
 """Tests from which the typical one of a group, by itself, says whether its sigmas are too small."""
 _OF_A_FACTOR = 0.001
+
+
+@dataclass(frozen=True)
+class LevelOptions:
+    """How observations are tested.
+
+    method: "b" (Baarda's B-method: ``alpha0`` is the level of a test of one component; tests of several components get
+    the level at which they find the same non-centrality with the same power) or "sidak" (``family_alpha`` is the error
+    probability of all tests together, each of them has the same level). power: probability 1 - beta with which a
+    minimal detectable bias is found.
+    """
+
+    method: Method = "sidak"
+    family_alpha: float = 0.05
+    alpha0: float = 0.001
+    power: float = 0.80
+
+
+@dataclass(frozen=True, eq=False)
+class Criteria:
+    """Levels, critical values of chi-square and non-centralities of tests with 1, 2, ... components; (q,), q >= 6."""
+
+    options: LevelOptions
+    n_tests: int
+    alpha: FloatArray
+    critical: FloatArray
+    lambda0: FloatArray
 
 
 def cautious(statistics: FloatArray, freedom: IntArray) -> bool:
@@ -72,8 +101,8 @@ def cost_of_leaving_out(statistics: FloatArray, freedom: IntArray, limits: Float
 def explanation_cost(groups: Iterable[tuple[float, float]], left_out: float) -> float:
     """-2 ln likelihood of what is left, (omega, redundancy) of every group, and the cost of what was left out.
 
-    As ``J`` of :mod:`adjust.statistics.exchange`, where the sigmas of a group may also be too small throughout: the
-    least cost tells wrong observations from wrong sigmas, also among few.
+    As ``J`` of :mod:`adjust.statistics.outliers.exchange`, where the sigmas of a group may also be too small
+    throughout: the least cost tells wrong observations from wrong sigmas, also among few.
     """
     total = left_out
     for omega, redundancy in groups:

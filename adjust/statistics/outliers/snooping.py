@@ -16,9 +16,9 @@ from scipy import sparse
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.observations.terrestrial.statistics import influences as influences_of_readings
 from adjust.precision.precision import Precision
-from adjust.statistics.gross_errors import Verdicts
-from adjust.statistics.single_tests import CONTROLLED, eigen2
 from adjust.statistics.system import LinearSystem
+from adjust.testing.gross_errors import Verdicts
+from adjust.testing.single_tests import CONTROLLED, eigen2
 
 _CAUCHY = 2.385**2
 

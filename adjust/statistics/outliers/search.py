@@ -1,10 +1,10 @@
 """Gross errors among observations of every kind: found by tests, each decision logged, taken back where it was wrong.
 
 A robust solution says what most observations agree on, and whom to suspect first; tests with the error probability of
-the whole family decide (:mod:`adjust.statistics.gross_errors`, on a linear system, :mod:`adjust.statistics.snooping`);
-the survey is solved again without what they leave out, and the search repeated there, until nothing changes. The result
-is a plain least squares. Where image points are not searched they stand condensed, and are screened anew at every
-solution.
+the whole family decide (:mod:`adjust.testing.gross_errors`, on the linear system of
+:mod:`adjust.statistics.outliers.snooping`); the survey is solved again without what they leave out, and the
+search repeated there, until nothing changes. The result is a plain least squares. Where image points are not searched
+they stand condensed, and are screened anew at every solution.
 """
 
 from collections.abc import Callable, Iterable
@@ -14,20 +14,20 @@ from typing import Literal
 import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
-from adjust.distributions import chi2
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import IndeterminateError, NotConvergedError
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, Survey
-from adjust.statistics.candidates import as_given, candidates, without
 from adjust.statistics.condensed import condensed_system
-from adjust.statistics.criteria import MANY, limits
-from adjust.statistics.exchange import Exchange, better_set, equal_sets
-from adjust.statistics.gross_errors import Search, State, Verdicts, best_back_first
+from adjust.statistics.outliers.candidates import as_given, candidates, without
+from adjust.statistics.outliers.exchange import Exchange, better_set, equal_sets
+from adjust.statistics.outliers.snooping import Snooping
 from adjust.statistics.reliability import observation_name
 from adjust.statistics.result import Alternative, Decision
-from adjust.statistics.snooping import Snooping
 from adjust.statistics.system import linear_system, precision_of
+from adjust.testing.criteria import MANY, limits
+from adjust.testing.distributions import chi2
+from adjust.testing.gross_errors import Search, State, Verdicts, best_back_first
 
 _ROUNDS = 12
 

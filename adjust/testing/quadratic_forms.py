@@ -6,8 +6,8 @@ to its redundancy r, and their squares to half its variance.
 
 import numpy as np
 
-from adjust.distributions import chi2, norm
 from adjust.model.survey import FloatArray
+from adjust.testing.distributions import chi2, norm
 
 _STEPS = 100
 _NEAR = 1e-4

@@ -13,8 +13,8 @@ from scipy.optimize import minimize_scalar
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.relay.motions import Motions
 from adjust.spatial.rigid import rotation_exp, rotation_log
+from adjust.spatial.rigid_motions import Motions
 
 _STEP_S = 0.02  # of the comparison of clocks
 _HALF_S = 0.1  # turning speed over twice this time

@@ -14,7 +14,7 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.solver import Solved, SolveOptions, solve
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.precision.precision import Precision, image_residuals
-from adjust.statistics.criteria import cautious, limits, typical_factor
+from adjust.testing.criteria import cautious, limits, typical_factor
 
 _CAUCHY = 2.385**2
 _FAMILY = 0.001

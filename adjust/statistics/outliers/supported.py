@@ -18,7 +18,7 @@ from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName
 from adjust.model.survey import Survey
 from adjust.observations.geometry.building import carrier_of
-from adjust.statistics.undetermined_points import without_named_points
+from adjust.statistics.outliers.undetermined_points import without_named_points
 
 Needs = frozenset[ParameterName]
 _NOTHING: Needs = frozenset()

@@ -7,7 +7,7 @@ small throughout, and the step from one state to the next.
 
 Sigmas that are too small are told from wrong observations: of many the typical test says it, and the limits grow. Among
 few a wrong one shows in most of the others; there the search is gone through worst first, and the state whose
-explanation is likeliest counts (:func:`adjust.statistics.criteria.explanation_cost`).
+explanation is likeliest counts (:func:`adjust.testing.criteria.explanation_cost`).
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ import numpy as np
 
 from adjust.model.errors import IndeterminateError, NotConvergedError
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.statistics.criteria import (
+from adjust.testing.criteria import (
     MANY,
     cautious,
     cost_of_leaving_out,

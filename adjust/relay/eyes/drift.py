@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.distributions import norm
 from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
-from adjust.relay.eye_solver import EyeProblem, EyeSolution, linearise
-from adjust.relay.eye_trajectories import CommonMotions, Trajectory, common_motions
-from adjust.relay.eyes import EyeAdjustment, EyeOptions, MotionSequence, adjust_eye_motions
-from adjust.relay.motions import Motions
+from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, MotionSequence, adjust_eye_motions
+from adjust.relay.eyes.solver import EyeProblem, EyeSolution, linearise
+from adjust.relay.eyes.trajectories import CommonMotions, Trajectory, common_motions
+from adjust.spatial.rigid_motions import Motions
+from adjust.testing.distributions import norm
 
 _PARTS = (slice(0, 3), slice(3, 6))
 

@@ -15,8 +15,8 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.statistics.single_tests import CONTROLLED
-from adjust.statistics.snooping import Snooping
+from adjust.statistics.outliers.snooping import Snooping
+from adjust.testing.single_tests import CONTROLLED
 
 _POOL = 12
 """Observations among which all sets are compared: 4095 sets."""

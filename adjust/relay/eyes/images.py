@@ -13,9 +13,9 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, PoseParameter, Station, Survey, Target
-from adjust.relay.eye_setup import from_matrix
-from adjust.relay.eye_solver import stacked
-from adjust.relay.eyes import PoseSequence, symmetric
+from adjust.relay.eyes.eyes import PoseSequence, symmetric
+from adjust.relay.eyes.setup import from_matrix
+from adjust.relay.eyes.solver import stacked
 
 ROOM = "room"  # the world of targets that the survey holds
 _ADJUST = AdjustOptions()

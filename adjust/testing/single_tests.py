@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.distributions import chi2, fisher, norm, student
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.testing.distributions import chi2, fisher, norm, student
 
 CONTROLLED = 1e-6
 """Share of an error that must show in the residuals to be told from rounding."""

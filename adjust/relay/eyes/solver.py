@@ -20,7 +20,7 @@ from scipy.sparse.linalg import splu
 
 from adjust.model.errors import NotConvergedError
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.relay.motions import Motions, exp, right_jacobian, right_jacobian_inverse
+from adjust.spatial.rigid_motions import Motions, exp, right_jacobian, right_jacobian_inverse
 
 
 @dataclass(frozen=True, eq=False)

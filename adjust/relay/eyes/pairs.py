@@ -11,7 +11,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray
 from adjust.relay.conditions import ConditionAdjustment, adjust_conditions
-from adjust.relay.eyes import (
+from adjust.relay.eyes.eyes import (
     EyeAdjustment,
     EyeOptions,
     MotionSequence,

@@ -18,12 +18,12 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray
 from adjust.precision.precision import global_test
-from adjust.relay.eye_checks import OutlierEpoch, refuse_undetermined
-from adjust.relay.eye_screening import solve_screened
-from adjust.relay.eye_setup import EyeSetup, motion_setup, pose_setup
-from adjust.relay.eye_solver import EyeSolution
-from adjust.relay.motions import Motions
+from adjust.relay.eyes.checks import OutlierEpoch, refuse_undetermined
+from adjust.relay.eyes.screening import solve_screened
+from adjust.relay.eyes.setup import EyeSetup, motion_setup, pose_setup
+from adjust.relay.eyes.solver import EyeSolution
 from adjust.relay.network import gtsam_motion
+from adjust.spatial.rigid_motions import Motions
 
 
 @dataclass(frozen=True, eq=False)

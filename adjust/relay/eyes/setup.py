@@ -10,13 +10,13 @@ import scipy.linalg
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.relay.cycles import adjacency
-from adjust.relay.eye_solver import EyeConditions, EyeProblem, KnownMotion, stacked
-from adjust.relay.motions import Motions, identities
+from adjust.pose_network.cycles import adjacency
+from adjust.relay.eyes.solver import EyeConditions, EyeProblem, KnownMotion, stacked
+from adjust.spatial.rigid_motions import Motions, identities
 from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb
 
 if TYPE_CHECKING:  # the frozen values live with the functions that take them
-    from adjust.relay.eyes import KnownWorlds, MotionSequence, PoseSequence
+    from adjust.relay.eyes.eyes import KnownWorlds, MotionSequence, PoseSequence
 
 
 @dataclass(frozen=True, eq=False)
