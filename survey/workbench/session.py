@@ -211,6 +211,19 @@ class Workbench:
                 self._statistics = self.version, statistics_of(self.adjustment, options.tolerances, self.scale)
             return self._statistics[1]
 
+    def spot_name(self, row: int) -> str:
+        """The name under which a spot that has got a name is left out, by its row; raises IndexError for others."""
+        at, there = row, self.situation.everything
+        at -= sum(len(b.uv) for b in there.survey.image_blocks)
+        for block in self.situation.identified:
+            if 0 <= at < len(block.uv):
+                place, z = (block.camera_id, block.epoch_id), complex(*block.uv[at].tolist())
+                return next(f"spot:{'/'.join(place)}/{name}" for s in there.spots for name, spot in
+                            zip(s.spot_ids, _complex(s.uv), strict=True)
+                            if (s.camera_id, s.epoch_id) == place and spot == z)  # fmt: skip
+            at -= len(block.uv)
+        raise IndexError(row)
+
     def changed_files(self) -> tuple[str, ...]:
         """Files of the project that were written since they were read, by path in the folder."""
         now, before = signature_of(self.folder), self.situation.signature
