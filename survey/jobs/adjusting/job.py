@@ -188,8 +188,13 @@ def made(
 Begin = Callable[[Survey], StartValues | None]
 
 
-def adjust_project(project: Project, progress: bool, begin: Begin = lambda _: None) -> Adjustment:
-    """Adjust what was read. begin: start values of a survey, found where it gives None. Raises SurveyError."""
+def adjust_project(
+    project: Project, progress: bool, begin: Begin = lambda _: None, watch: Callable[[int, float], None] | None = None
+) -> Adjustment:
+    """Adjust what was read. begin: start values of a survey, found where it gives None. Raises SurveyError.
+
+    watch: called with (iteration, v'Pv); what it raises ends the adjustment.
+    """
     survey = project.survey
     observed = (
         survey.image_blocks, project.spots, survey.pairs, survey.distances, survey.coordinates, survey.readings,
@@ -209,9 +214,11 @@ def adjust_project(project: Project, progress: bool, begin: Begin = lambda _: No
     project = replace(project, survey=survey)
     with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
 
-        def step(_iteration: int, omega: float) -> None:
+        def step(iteration: int, omega: float) -> None:
             bar.set_postfix_str(f"v'Pv = {omega:.6g}")
             bar.update()
+            if watch is not None:
+                watch(iteration, omega)
 
         notes = turned
         if project.spots:
@@ -220,7 +227,7 @@ def adjust_project(project: Project, progress: bool, begin: Begin = lambda _: No
             if found.unidentified:
                 notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
             survey = replace(survey, image_blocks=survey.image_blocks + found.blocks)
-            survey = _seen_points(survey)
+            survey = seen_points(survey)
         how = clean_options(project.options)
         survey, lost = supported(survey)
         result = checked(
@@ -254,7 +261,7 @@ def _identify(
     return identify_spots(project.survey, first, project.spots, gate)
 
 
-def _seen_points(survey: Survey) -> Survey:
+def seen_points(survey: Survey) -> Survey:
     """Leave out the beacons that nothing observes any more: a beacon may be hidden in all images."""
     observed = {survey.points[int(i)].point_id for b in survey.image_blocks if b.target_id is None for i in b.point_idx}
     observed |= {r.point_id for c in survey.coordinates for r in c.positions if r.frame is None}
