@@ -1,6 +1,6 @@
 // Before and after of every parameter, the runs that were kept, and any two of them compared.
 
-import { button, link, make, plainTable } from "./dom.js";
+import { button, fill, link, make, plainTable } from "./dom.js";
 import { count, known, number, significant, t, time } from "./words.js";
 import { anchor, current, go } from "./store.js";
 import { get, post } from "./source.js";
@@ -41,12 +41,12 @@ export class CompareView {
       try {
         const changes = await get(`compare?a=${encodeURIComponent(against)}&b=${encodeURIComponent(run)}`);
         this.show(t("Run {a} → run {b}", { a: against, b: run }), changes);
-      } catch (error) { this.element.replaceChildren(make("p", { class: "warn" }, error.message)); }
+      } catch (error) { fill(this.element, make("p", { class: "warn" }, error.message)); }
     } else if (this.bench.state.changes) this.show(t("Before and after the last change"), this.bench.state.changes);
-    else this.element.replaceChildren(make("p", { class: "quiet" }, t("Nothing has been changed yet. Leave something out (x), or choose two runs under History.")));
+    else fill(this.element, make("p", { class: "quiet" }, t("Nothing has been changed yet. Leave something out (x), or choose two runs under History.")));
   }
 
-  show(title, changes) { this.element.replaceChildren(make("h2", {}, title), changesText(changes)); }
+  show(title, changes) { fill(this.element, make("h2", {}, title), changesText(changes)); }
 }
 
 export class HistoryView {
@@ -63,14 +63,14 @@ export class HistoryView {
     if (key === this.key) return;
     this.key = key;
     let runs = [];
-    try { runs = (await get("runs")).runs; } catch (error) { this.element.replaceChildren(make("p", { class: "warn" }, error.message)); return; }
+    try { runs = (await get("runs")).runs; } catch (error) { fill(this.element, make("p", { class: "warn" }, error.message)); return; }
     const { state } = this.bench, chosen = current();
     const pick = (name, run) => make("input", { type: "radio", name, "aria-label": `${t(name)} ${run}`, checked: String(chosen[name === "before" ? "against" : "run"]) === String(run), onchange: () => go(name === "before" ? { against: String(run) } : { run: String(run) }, true) });
     const rows = runs.map((run) => [pick("before", run.run), pick("after", run.run), link(`#run=${run.run}`, String(run.run)), time(run.time), run.author ?? "", run.why ?? run.command ?? "",
       known(`verdict ${run.verdict}`), number(run.sigma0, 4), count(run.redundancy),
       make("span", {}, button(run.pinned ? "★" : "☆", () => this.act("pin", run), "", { "aria-label": run.pinned ? t("not kept for ever") : t("keep for ever") }), state.read_only ? null : button(t("restore"), () => this.act("restore", run)))]);
     const steps = (title, labels) => labels?.length ? make("div", {}, make("h3", {}, title), make("ol", {}, ...labels.map((label) => make("li", {}, label)))) : null;
-    this.element.replaceChildren(make("h2", {}, t("History")), steps(t("Can be undone"), state.undo), steps(t("Can be done again"), state.redo), make("h3", {}, t("Runs")),
+    fill(this.element, make("h2", {}, t("History")), steps(t("Can be undone"), state.undo), steps(t("Can be done again"), state.redo), make("h3", {}, t("Runs")),
       rows.length ? plainTable(t("Runs"), [t("before"), t("after"), t("run"), t("time"), t("who"), t("why"), t("verdict"), "sigma0", t("redundancy"), ""], rows, [7, 8]) : make("p", { class: "quiet" }, t("No runs are kept yet; Save writes one.")),
       rows.length > 1 ? button(t("Compare"), () => this.compare(), "d", { class: "primary" }) : null);
   }

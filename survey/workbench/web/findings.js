@@ -1,7 +1,7 @@
 // What is wrong, worst first: verdict, warnings, suspects with their probable cause and what may be done about them.
 
-import { button, by, link, make, plainTable } from "./dom.js";
-import { count, known, number, t } from "./words.js";
+import { button, by, fill, link, make, plainTable } from "./dom.js";
+import { count, known, number, significant, t } from "./words.js";
 import { anchor, current, select } from "./store.js";
 import { placeOf } from "./tree.js";
 
@@ -24,27 +24,25 @@ export class FindingsView {
 
   draw(state, findings) {
     const suspects = findings.suspects ?? [], causes = findings.causes ?? [];
-    this.element.replaceChildren(
+    fill(this.element, 
       make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
-      (findings.warnings ?? []).length ? make("ul", { class: "problems" }, ...findings.warnings.map((text) => make("li", {}, text))) : null,
+      (findings.warnings ?? []).length ? make("ul", { class: "problems" }, ...findings.warnings.map((w) => make("li", {}, w.text, ...w.anchors.flatMap((to) => [" ", link(to, decodeURIComponent(to.replace(/^#\w+=/, "")))])))) : null,
       ...causes.map((cause) => this.cause(cause)),
       make("h2", {}, t("Suspects"), " ", make("span", { class: "quiet" }, count(findings.n_suspects ?? suspects.length))),
-      suspects.length ? this.suspects(suspects) : make("p", { class: "quiet" }, t("Nothing disagrees with the others.")),
-      state.exclusions.length ? this.exclusions(state.exclusions) : "",
-      (findings.groups ?? []).length ? make("h2", {}, t("Groups")) : "",
-      (findings.groups ?? []).length ? this.groups(findings.groups) : "");
+      suspects.length ? this.suspects(t("Suspects, worst first"), suspects) : make("p", { class: "quiet" }, t("Nothing disagrees with the others.")),
+      state.exclusions.length ? this.exclusions(state.exclusions) : null,
+      (findings.groups ?? []).length ? make("h2", {}, t("Groups")) : null,
+      (findings.groups ?? []).length ? this.groups(findings.groups) : null,
+      findings.largest?.length ? make("h2", {}, t("Largest within the limit")) : null,
+      findings.largest?.length ? this.suspects(t("Largest within the limit"), findings.largest) : null);
   }
 
-  cause(cause) {
-    const remedies = (cause.remedies ?? []).map((remedy) => make("li", {}, remedy.text ?? remedy.title ?? "", " ",
-      remedy.apply && !this.bench.state.read_only ? button(t("apply"), () => this.actions.remedy(remedy), "") : null));
-    return make("section", { class: "cause" }, make("h3", {}, cause.title ?? cause.text), cause.text && cause.title ? make("p", {}, cause.text) : null, remedies.length ? make("ul", {}, ...remedies) : null);
-  }
+  cause(text) { return make("p", { class: "cause" }, make("b", {}, t("Probable cause")), " ", text); }
 
-  suspects(rows) {
-    const table = plainTable(t("Suspects, worst first"), [t("observation"), "w", t("share of limit"), "r", t("detectable error"), t("cause")],
-      rows.map((s) => [make("a", { href: anchor(...s.place), data: { id: s.place[1] } }, `${known(s.kind)} ${s.text}`), number(s.w, 2), make("span", { class: "share", data: { share: Math.min(3, s.share) } }, `${number(100 * s.share, 0)} %`), number(s.redundancy, 2), s.detectable ?? "–", s.cause ?? ""]), [1, 2, 3, 4]);
-    return table;
+  suspects(title, rows) {
+    return plainTable(title, [t("observation"), "w", t("share of limit"), "r", t("residual"), ""],
+      rows.map((s) => [make("a", { href: s.anchor, data: { id: s.place[1] } }, `${t(`kind ${s.kind}`)} ${s.text}`), s.w === null ? t("{k} of {n} points", { k: s.n_points, n: s.n_in_image }) : number(s.w, 2), s.share === null ? "–" : `${number(100 * s.share, 0)} %`,
+        number(s.redundancy, 2), s.residual === undefined ? "–" : `${[s.residual].flat().map((x) => significant(x, 3)).join(", ")} ${s.unit}`, s.why === 0 ? "" : t("left out")]), [1, 2, 3, 4]);
   }
 
   groups(rows) {
@@ -61,7 +59,7 @@ export class FindingsView {
 
   /** The next or previous suspect is looked at. @param {number} by */
   step(by) {
-    const suspects = this.bench.findings.suspects ?? [], at = suspects.findIndex((s) => current().ids.includes(s.place[1]));
+    const suspects = [...(this.bench.findings.suspects ?? []), ...(this.bench.findings.largest ?? [])], at = suspects.findIndex((s) => current().ids.includes(s.place[1]));
     const next = suspects[at < 0 ? (by > 0 ? 0 : suspects.length - 1) : at + by];
     if (next) select(next.place[0], next.place[1], true);
   }
@@ -77,7 +75,7 @@ export function drawHeader(state) {
   by("verdict").className = state.verdict;
   by("verdict").textContent = verdictText(state.verdict);
   const fact = (name, value) => make("span", {}, make("span", { class: "quiet" }, `${name} `), value);
-  by("facts").replaceChildren(fact("sigma0", number(state.sigma0, 4)), fact(t("redundancy"), count(state.redundancy)),
+  fill(by("facts"), fact("sigma0", number(state.sigma0, 4)), fact(t("redundancy"), count(state.redundancy)),
     fact(t("left out"), count(state.exclusions.length)), state.unsaved ? fact(t("unsaved"), count(state.unsaved)) : "", state.read_only ? make("span", { class: "pill" }, t("for reading only")) : "");
 }
 

@@ -26,7 +26,7 @@ export class ImageView {
     this.element = make("div", { class: "view image" },
       make("div", { class: "bar" }, this.title, this.scale,
         button("−", () => this.enlarge(-1), "-", { "aria-label": t("shorter vectors") }), button("+", () => this.enlarge(1), "+", { "aria-label": t("longer vectors") }),
-        button(t("Whole"), () => { this.fit = true; this.surface.redraw(); }, "0"), button("1:1", () => this.zoomTo(1 / (devicePixelRatio || 1)), "1:1")),
+        button("⤢", () => { this.fit = true; this.surface.redraw(); }, "0", { "aria-label": t("Whole") }), button("1:1", () => this.zoomTo(1 / (devicePixelRatio || 1)), "", { "aria-label": "1:1" })),
       make("div", { class: "stage" }, canvas, this.note), this.strip);
     this.listen(canvas);
     this.follow();

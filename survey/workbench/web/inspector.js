@@ -1,6 +1,6 @@
 // What is known of the thing that is chosen, and what may be done with it.
 
-import { button, by, link, make, plainTable } from "./dom.js";
+import { button, by, fill, link, make, plainTable } from "./dom.js";
 import { count, known, number, significant, t } from "./words.js";
 import { anchor, current, names } from "./store.js";
 import { pointId, pointName, rowOf, rowsOfImage } from "./source.js";
@@ -18,9 +18,9 @@ export function chosenNames() {
 /** @param {any} bench @param {any} actions */
 export function drawInspector(bench, actions) {
   const { kind, ids } = current(), id = ids[0];
-  if (!kind || id === undefined) { by("inspector").replaceChildren(make("p", { class: "quiet" }, t("Choose something: a suspect, a row, a point in an image or in space."))); return; }
+  if (!kind || id === undefined) { fill(by("inspector"), make("p", { class: "quiet" }, t("Choose something: a suspect, a row, a point in an image or in space."))); return; }
   const parts = (ABOUT[kind] ?? (() => []))(bench, id, actions) ?? [];
-  by("inspector").replaceChildren(make("h2", {}, `${t(`kind ${kind}`)} ${id.replace(/^\w+:/, "")}`, ids.length > 1 ? make("span", { class: "pill" }, `+ ${ids.length - 1}`) : null), ...doing(bench, actions), ...parts,
+  fill(by("inspector"), make("h2", {}, `${t(`kind ${kind}`)} ${id.replace(/^\w+:/, "")}`, ids.length > 1 ? make("span", { class: "pill" }, `+ ${ids.length - 1}`) : null), ...doing(bench, actions), ...parts,
     make("p", { class: "quiet anchor" }, anchor(kind, id)));
 }
 

@@ -22,7 +22,7 @@ export class SceneView {
     this.element = make("div", { class: "view scene" },
       make("div", { class: "bar" }, this.told,
         button("−", () => this.enlarge(0.5), "-", { "aria-label": t("smaller ellipsoids") }), button("+", () => this.enlarge(2), "+", { "aria-label": t("larger ellipsoids") }),
-        button(t("Whole"), () => { Object.assign(this, { zoom: 1, dx: 0, dy: 0 }); this.surface.redraw(); }, "0")),
+        button("⤢", () => { Object.assign(this, { zoom: 1, dx: 0, dy: 0 }); this.surface.redraw(); }, "0", { "aria-label": t("Whole") })),
       make("div", { class: "stage" }, this.surface.canvas, this.note));
     this.listen(this.surface.canvas);
     this.measure();
@@ -123,7 +123,7 @@ export class SceneView {
     for (const outline of scene.outlines) line(outline.x, true);
     this.clouds(context, to);
     const chosen = this.chosen();
-    for (const shot of scene.shots) this.shot(context, line, shot, chosen.cameras.has(shot.camera));
+    for (const shot of scene.shots) this.shot(context, line, to, shot, chosen.image ? shot.image === chosen.image : chosen.cameras.has(shot.camera) && shot.main);
     this.rays(context, line, chosen);
     for (const spot of scene.spots) this.spot(context, line, to, spot, chosen.points.has(spot.id));
     this.labels(context, to);
@@ -157,39 +157,55 @@ export class SceneView {
   /** Cameras and points that the selection means. */
   chosen() {
     const { kind, ids } = current(), cameras = new Set(), points = new Set();
+    let image = "";
     for (const id of ids) {
       const { what, ids: parts } = names(id);
-      if (kind === "camera" || kind === "image") cameras.add(parts[0]);
-      else if (kind === "obs" && what === "image_point") { cameras.add(parts[0]); points.add(parts[3]); this.epoch = parts[1]; }
+      if (kind === "camera") cameras.add(parts[0]);
+      else if (kind === "image" || (kind === "obs" && what === "image_point")) { image = this.placeOf(parts[0], parts[1]); if (parts.length === 3) points.add(parts[2]); }
       else if (kind === "point" || kind === "station" || kind === "target") points.add(id);
       else if (kind === "param") points.add(parts[1]);
       else if (kind === "reading" || kind === "obs") for (const part of parts) for (const name of part.split("-")) points.add(name);
     }
-    return { cameras, points };
+    return { cameras, points, image };
   }
 
-  shot(context, line, shot, here) {
+  /** The image that stands for the place of this one: of equal places only one is drawn. */
+  placeOf(camera, epoch) {
+    const pose = this.bench.scene.poses[`${camera}/${epoch}`];
+    return this.bench.scene.shots.find((shot) => shot.camera === camera && pose && shot.pose.every((x, k) => Math.abs(x - pose[k]) < 1e-4))?.image ?? "";
+  }
+
+  /** A camera: its frustum at its first image and where it is chosen, a small mark at every other place. */
+  shot(context, line, to, shot, here) {
+    context.strokeStyle = context.fillStyle = colour(here ? "point-here" : "blue");
+    if (!here && !shot.main) {
+      const [u, v] = to([shot.pose[3], shot.pose[7], shot.pose[11]]);
+      context.globalAlpha = 0.55;
+      context.fillRect(u - 1.5, v - 1.5, 3, 3);
+      context.globalAlpha = 1;
+      return;
+    }
     const m = shot.pose, [tx, ty] = shot.half.map(Math.tan), d = 0.09 * this.reach;
     const w = (x, y, z) => [0, 1, 2].map((i) => m[4 * i] * x + m[4 * i + 1] * y + m[4 * i + 2] * z + m[4 * i + 3]);
     const eye = w(0, 0, 0), corners = [[-tx, -ty], [tx, -ty], [tx, ty], [-tx, ty]].map(([a, b]) => w(a * d, b * d, d));
-    context.strokeStyle = colour(here ? "point-here" : "blue");
-    context.globalAlpha = here || shot.main ? 1 : 0.35;
     context.lineWidth = here ? 2.2 : 1;
     line(corners, true);
     for (const corner of corners) line([eye, corner]);
     line([w(-0.4 * tx * d, -1.25 * ty * d, d), w(0, -1.5 * ty * d, d), w(0.4 * tx * d, -1.25 * ty * d, d)]); // which way is up in the image
-    context.globalAlpha = 1;
   }
 
-  /** Lines of sight to the points that are chosen, from every place that saw them. */
+  /** Lines of sight to the points that are chosen, from every image that saw them. */
   rays(context, line, chosen) {
-    const { scene } = this.bench, seen = scene.rays ?? [];
+    const { scene, points } = this.bench;
     context.strokeStyle = colour("point-here");
     context.lineWidth = 1;
     context.setLineDash([5, 4]);
-    for (const spot of scene.spots) if (chosen.points.has(spot.id)) {
-      const cameras = new Set(seen.filter((ray) => ray.point === spot.id).map((ray) => ray.camera));
-      for (const shot of scene.shots) if (shot.main !== false && (cameras.size ? cameras.has(shot.camera) : chosen.cameras.has(shot.camera))) line([[shot.pose[3], shot.pose[7], shot.pose[11]], spot.x]);
+    for (const spot of scene.spots) if (spot.kind === "point" && chosen.points.has(spot.id)) {
+      const at = points.points[""]?.indexOf(spot.id) ?? -1;
+      for (let i = 0; at >= 0 && i < points.n; i++) {
+        const block = points.blocks[points.block[i]], pose = points.point[i] === at && !block.target && scene.poses[`${block.camera}/${block.epoch}`];
+        if (pose) line([[pose[3], pose[7], pose[11]], spot.x]);
+      }
     }
     context.setLineDash([]);
   }
@@ -243,7 +259,7 @@ export class SceneView {
   nearest(x, y) {
     if (!this.to) return null;
     const { scene } = this.bench, things = [...scene.spots.map((s) => ({ kind: s.kind === "point" ? "point" : "station", id: s.id, x: s.x, spot: s })),
-      ...scene.shots.map((s) => ({ kind: "camera", id: s.camera, x: [s.pose[3], s.pose[7], s.pose[11]] })), ...scene.outlines.map((o) => ({ kind: "target", id: o.id, x: o.x[0] }))];
+      ...scene.shots.map((s) => ({ kind: "image", id: s.image, x: [s.pose[3], s.pose[7], s.pose[11]] })), ...scene.outlines.map((o) => ({ kind: "target", id: o.id, x: o.x[0] }))];
     let best = null, least = 12;
     for (const thing of things) { const [u, v] = this.to(thing.x), far = Math.hypot(u - x, v - y); if (far < least) { least = far; best = thing; } }
     return best;

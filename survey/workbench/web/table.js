@@ -45,8 +45,9 @@ export class Table {
   }
 
   heads() {
-    const widths = this.data.columns.map((c) => (c.wide ? `minmax(${c.wide}rem, ${c.wide}fr)` : c.values ? "minmax(4.6rem, 1fr)" : "minmax(6rem, 1.5fr)")).join(" ");
-    this.scroll.style.setProperty("--columns", widths);
+    const widths = this.data.columns.map((c) => c.wide ?? (c.values ? 4.6 : 6));
+    this.scroll.style.setProperty("--columns", widths.map((rem) => `minmax(0, ${rem}fr)`).join(" "));
+    this.scroll.style.setProperty("--width", `${widths.reduce((sum, rem) => sum + rem + 0.6, 1)}rem`);
     this.head.replaceChildren(...this.data.columns.map((column, k) => {
       const head = make("button", { type: "button", tabindex: -1, class: column.values ? "r" : "l", onclick: () => this.sort(k, this.sorted?.column === k ? !this.sorted.up : !column.size) }, column.title);
       return make("span", { role: "columnheader", "aria-colindex": k + 1 }, head);

@@ -1,4 +1,5 @@
-// Words and numbers in the language of the reader: texts by their English form, one JSON for each other language.
+// Words and numbers in the language of the reader: texts by their English form, one JSON for each language; that of
+// English holds only words that stand for a code (`kind obs`, `key next suspect`).
 
 /** @type {Object<string, string>} */
 let texts = {};
@@ -7,7 +8,7 @@ let language = "en";
 /** @param {string} wanted "en" or "de" */
 export async function speak(wanted) {
   language = wanted;
-  texts = wanted === "en" ? {} : await (await fetch(new URL(`${wanted}.json`, import.meta.url))).json();
+  texts = await (await fetch(new URL(`${wanted}.json`, import.meta.url))).json();
   document.documentElement.lang = wanted;
 }
 
