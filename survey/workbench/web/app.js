@@ -16,7 +16,7 @@ import { chosenNames, drawInspector } from "./inspector.js";
 import { findingsOf, parametersOf, readingsOf, sceneOf, shiftsOf, sizesOf, stateOf } from "./shapes.js";
 
 /** Everything the views show; new values replace old ones, nothing is changed in place. */
-const bench = { state: null, points: null, readings: [], parameters: [], findings: {}, scene: null, sizes: {}, leftOut: new Map(), shifts: new Map(), runs: [] };
+const bench = { state: null, points: null, limit: 1, readings: [], parameters: [], findings: {}, scene: null, sizes: {}, leftOut: new Map(), shifts: new Map(), runs: [] };
 const VIEWS = {
   findings: ["Findings", () => new FindingsView(bench, actions)],
   image: ["Image", () => new ImageView(bench)],
@@ -130,7 +130,7 @@ async function renew(answer) {
   if (fresh && state.solved) {
     const [columns, readings, parameters, findings, scene] = await parts(state.version);
     const before = bench.scene;
-    Object.assign(bench, { state, points: columns, readings: readingsOf(readings), parameters: parametersOf(parameters), findings: findingsOf(findings, raw), scene: sceneOf(scene), sizes: sizesOf(raw) });
+    Object.assign(bench, { state, points: columns, readings: readingsOf(readings), limit: readings.limit, parameters: parametersOf(parameters), findings: findingsOf(findings, raw), scene: sceneOf(scene), sizes: sizesOf(raw) });
     bench.shifts = shiftsOf(before, bench.scene);
     bench.leftOut = leftOut(columns);
     state.changes = answer?.changes ?? (await get("changes")).changes;
@@ -194,7 +194,7 @@ function tableData() {
     const residual = Float32Array.from(data.du, (du, i) => Math.hypot(du, data.dv[i]));
     return {
       n: data.n, id: (i) => `image_point:${pointId(data, i)}`, state: (i) => (data.used[i] ? (data.w[i] > data.limit ? "suspect" : "") : "out"),
-      columns: [column("camera", t("camera")), column("epoch", t("epoch")), column("target", t("target")),
+      columns: [column("camera", t("camera")), column("epoch", t("kind epoch")), column("target", t("target")),
         { key: "point", title: t("point"), names: all, codes: Uint32Array.from(data.point, (p, i) => lists[data.block[i]][p]), wide: 5 },
         { key: "residual", title: t("residual, px"), values: residual, digits: 3, size: true }, { key: "w", title: "w", values: data.w, digits: 2, size: true },
         ...(data.redundancy ? [{ key: "r", title: "r", values: data.redundancy, digits: 3 }] : []), { key: "used", title: t("used"), values: data.used, digits: 0, text: (i) => (data.used[i] ? "✓" : "✕") }],
@@ -204,7 +204,7 @@ function tableData() {
   if (tableName === "readings") {
     const rows = bench.readings;
     return { n: rows.length, id: (i) => rows[i].id, state: (i) => (rows[i].used ? (rows[i].share > 1 ? "suspect" : "") : "out"), kind: "reading", sort: "w",
-      columns: [named("table", t("table"), rows.map((r) => known(r.table.replaceAll("_", " ")))), named("name", t("reading"), rows.map((r) => r.name)), named("component", t("component"), rows.map((r) => r.component)),
+      columns: [named("table", t("kind of reading"), rows.map((r) => known(r.table.replaceAll("_", " ")))), named("name", t("reading"), rows.map((r) => r.name)), named("component", t("component"), rows.map((r) => r.component)),
         number4("observed", t("observed"), rows), number4("residual", t("residual"), rows, true), named("unit", t("unit"), rows.map((r) => r.sigma_unit ?? "")), numbers("w", "w", rows.map((r) => r.w), { digits: 2, size: true }), numbers("r", "r", rows.map((r) => r.redundancy), { digits: 3 }), numbers("used", t("used"), rows.map((r) => Number(r.used)), { text: (i) => (rows[i].used ? "✓" : "✕") })] };
   }
   if (tableName === "parameters") {

@@ -3,6 +3,7 @@
 import { button, by, fill, link, make, plainTable } from "./dom.js";
 import { count, known, number, significant, t } from "./words.js";
 import { anchor, current, select } from "./store.js";
+import { rowOf, rowsOfImage } from "./source.js";
 import { placeOf } from "./tree.js";
 
 export class FindingsView {
@@ -46,15 +47,23 @@ export class FindingsView {
   }
 
   groups(rows) {
-    return plainTable(t("Groups"), [t("group"), t("observations"), t("redundancy"), t("sigmas fit ×"), t("state")],
-      rows.map((g) => [link(anchor("group", g.id), known(g.id)), count(g.n), number(g.redundancy, 1), number(g.scale, 3), g.state ?? ""]), [1, 2, 3]);
+    return plainTable(t("Groups"), [t("group"), t("observations"), t("redundancy"), t("sigmas fit ×")],
+      rows.map((g) => [link(anchor("group", g.id), known(g.id)), count(g.n), number(g.redundancy, 1), number(g.scale, 3)]), [1, 2, 3]);
   }
 
   exclusions(rows) {
     return make("div", {}, make("h2", {}, t("Excluded by people"), " ", make("span", { class: "quiet" }, count(rows.length))),
-      plainTable(t("Excluded by people"), [t("what"), t("reason"), t("who"), t("fits now"), ""],
-        rows.map((row) => [link(anchor(...placeOf(row.what, row.id)), `${t(`kind ${row.what}`)} ${row.id}`), row.reason || t("no reason given"), row.author ?? "", row.w === null || row.w === undefined ? "–" : `w ${number(row.w, 2)}`,
+      plainTable(t("Excluded by people"), [t("what"), t("reason"), t("who"), t("Largest |w| now"), ""],
+        rows.map((row) => [link(anchor(...placeOf(row.what, row.id)), `${t(`kind ${row.what}`)} ${row.id}`), row.reason || t("no reason given"), row.author ?? "", number(this.fits(row), 2),
           this.bench.state.read_only ? null : button(t("take back"), () => this.actions.include([`${row.what}:${row.id}`]), "e")]), [3]));
+  }
+
+  /** Largest |w| now of what is left out: small, where it would fit again. */
+  fits(row) {
+    const { points, readings } = this.bench, ids = row.id.split("/");
+    const rows = row.what === "image_point" ? [rowOf(points, ids)] : row.what === "image" ? [...rowsOfImage(points, row.id)] : [];
+    const all = row.what === "reading" ? readings.filter((r) => r.id === row.id).map((r) => Math.abs(r.w ?? NaN)) : rows.filter((i) => i >= 0).map((i) => points.w[i]);
+    return all.reduce((most, w) => (w > most || !Number.isFinite(most) ? w : most), NaN);
   }
 
   /** The next or previous suspect is looked at. @param {number} by */

@@ -81,7 +81,7 @@ const ABOUT = {
   },
   image(bench, id) {
     const rows = rowsOfImage(bench.points, id), [camera, epoch] = id.split("/");
-    return [sums(bench.points, rows), facts([[t("camera"), link(anchor("camera", camera), camera)], [t("epoch"), link(anchor("epoch", epoch), epoch)]])];
+    return [sums(bench.points, rows), facts([[t("camera"), link(anchor("camera", camera), camera)], [t("kind epoch"), link(anchor("epoch", epoch), epoch)]])];
   },
   camera: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.camera === id)), ...parameters(bench, `lens/${id}`, `station_from_camera/${id}`)],
   epoch: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.epoch === id)), ...imagesOf(bench, (b) => b.epoch === id), ...parametersOfEpoch(bench, id)],
@@ -91,7 +91,7 @@ const ABOUT = {
   reading(bench, id) {
     const rows = bench.readings.filter((row) => row.id === id);
     if (!rows.length) return [make("p", { class: "warn" }, t("There is no such observation in this solution."))];
-    return [facts([[t("table"), rows[0].table], [t("group"), link(anchor("group", rows[0].group), known(rows[0].group))], [t("joins"), (rows[0].joins ?? []).join(", ") || undefined], [t("state"), t(WHY[rows[0].why ?? 0])]]),
+    return [facts([[t("kind of reading"), known(rows[0].table.replaceAll("_", " "))], [t("group"), link(anchor("group", rows[0].group), known(rows[0].group))], [t("joins"), (rows[0].joins ?? []).join(", ") || undefined], [t("state"), t(WHY[rows[0].why ?? 0])]]),
       ...rows.map((row) => facts([[row.component || t("component"), ""], [t("observed"), `${significant(row.observed, 8)} ${row.unit ?? ""}`], [t("adjusted"), `${significant(row.adjusted, 8)} ${row.unit ?? ""}`], [t("residual"), `${significant(row.residual, 3)} ${row.sigma_unit ?? ""}`], [t("sigma"), `${significant(row.sigma, 3)} ${row.sigma_unit ?? ""}`], ["w", number(row.w, 2)], [t("redundancy"), number(row.redundancy, 3)]]))];
   },
   param(bench, id, actions) {

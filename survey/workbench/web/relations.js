@@ -1,7 +1,7 @@
 // One camera, and what hangs together: residuals of the table over its angles, loops, correlations.
 
 import { link, make, plainTable } from "./dom.js";
-import { count, known, number, significant, t } from "./words.js";
+import { count, number, significant, t } from "./words.js";
 import { anchor, current, names, select } from "./store.js";
 import { get } from "./source.js";
 import { heat, residualField, scatter } from "./plots.js";
@@ -58,32 +58,37 @@ export class CameraView extends Asked {
   }
 }
 
+/** Standardized residuals of a turntable's readings over its angle, the axes as series. */
 export class TableAnglesView extends Asked {
   async parts() {
-    const { axes, limit } = await get("angles");
-    if (!axes.length) return [make("p", { class: "quiet" }, t("No turntable in this survey."))];
-    return axes.map((axis) => scatter(`${axis.table} ${axis.axis}`, axis.series.map((s) => ({ ...s, name: known(s.name), anchors: s.ids?.map((id) => ["reading", id]) })),
-      { x: `${axis.over ?? axis.axis} [deg]`, y: `w`, band: limit, onpick: select }));
+    const rows = this.bench.readings.filter((row) => row.table === "table_angles" && row.w !== null && row.w !== undefined);
+    if (!rows.length) return [make("p", { class: "quiet" }, t("No turntable in this survey."))];
+    const tables = Map.groupBy(rows, (row) => row.name.split("/")[0]);
+    return [...tables].flatMap(([table, mine]) => [...Map.groupBy(mine, (row) => row.component)].map(([axis, readings]) => scatter(`${table} ${axis}`,
+      [{ name: t("in use"), of: readings.filter((r) => r.used) }, { name: t("left out"), of: readings.filter((r) => !r.used) }].filter((s) => s.of.length)
+        .map((s) => ({ name: s.name, x: s.of.map((r) => r.observed), y: s.of.map((r) => r.w), anchors: s.of.map((r) => ["reading", r.id]) })),
+      { x: `${axis} [${readings[0].unit}]`, y: "w", band: this.bench.limit, onpick: select })));
   }
 }
 
 export class LoopsView extends Asked {
   async parts() {
-    const { loops } = await get("loops");
+    const found = (await get("statistics/loops")).loops, loops = found?.worst_first ?? [];
     if (!loops.length) return [make("p", { class: "quiet" }, t("No loops: the survey measures no pairs."))];
-    return [make("h2", {}, t("Loops")), plainTable(t("Loops"), [t("loop"), t("misclosure"), t("sigma"), t("in sigmas"), ""],
-      loops.map((loop) => [loop.text, `${significant(loop.misclosure, 3)} ${loop.unit}`, `${significant(loop.sigma, 3)} ${loop.unit}`, number(loop.share, 2), make("span", {}, ...(loop.pairs ?? []).flatMap((pair) => [link(anchor("reading", `pairs:${pair}`), pair), " "]))]), [1, 2, 3])];
+    const closing = (loop, unit) => (loop[`misclosure_${unit}`] === undefined ? "–" : `${significant(loop[`misclosure_${unit}`], 3)} ± ${significant(loop[`sigma_misclosure_${unit}`], 2)}`);
+    const rows = loops.map((loop) => [make("span", { class: loop.closes ? "" : "bad" }, `${loop.closes ? "" : "■ "}${loop.stations.join(" → ")}`), closing(loop, "arcsec"), closing(loop, "mm"), significant(loop.test, 3), significant(loop.p_value, 2),
+      make("span", {}, ...loop.pairs.flatMap((pair) => [link(anchor("reading", `pairs:${pair}`), pair), " "]))]);
+    return [make("h2", {}, t("Loops"), " ", make("span", { class: "quiet" }, count(found.n_loops))), plainTable(t("Loops"), [t("loop"), t("misclosure, arcsec"), t("misclosure, mm"), t("Test"), "p", t("Pairs")], rows, [1, 2, 3, 4])];
   }
 }
 
 export class CorrelationsView extends Asked {
   async parts() {
-    const { correlated, weak } = await get("statistics/correlations");
+    const [correlated, weak] = await Promise.all(["correlated_above_95_percent", "weak_directions"].map(async (part) => (await get(`statistics/${part}`))[part] ?? []));
     const name = (id) => link(anchor("param", id), id);
     return [make("h2", {}, t("Correlations"), " ", make("span", { class: "quiet" }, count(correlated.length))),
       plainTable(t("Correlations"), [t("parameter"), t("parameter"), t("correlation")], correlated.slice(0, 300).map((c) => [name(c.a), name(c.b), number(c.correlation, 4)]), [2]),
       make("h2", {}, t("Weak directions")),
-      ...(weak ?? []).slice(0, 8).map((w) => make("p", {}, make("b", {}, `× ${significant(w.inflation, 3)}`), "  ", Object.entries(w.parts).slice(0, 6).map(([id, share]) => `${id} ${number(share, 3)}`).join("   ")))];
+      ...weak.slice(0, 8).map((w) => make("p", {}, make("b", {}, `× ${significant(w.inflation, 3)}`), "  ", Object.entries(w.parts).slice(0, 6).map(([id, share]) => `${id} ${number(share, 3)}`).join("   ")))];
   }
 }
-
