@@ -8,8 +8,10 @@ from urllib.parse import quote
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
+from survey.folder.text import suggestion
 from survey.report.scene import scene_of
 from survey.solution.changes import snapshot
 from survey.solution.dictionary import plain, solution_dict
@@ -202,11 +204,17 @@ def scene(bench: Workbench) -> dict[str, Any]:
     }))  # fmt: skip
 
 
+PARTS = {
+    "solution": None, "reliability": "reliability", "correlations": "correlated_above_95_percent",
+    "weak": "weak_directions", "relative": "relative_precision", "budget": "budget", "consistency": "consistency",
+    "tolerances": "tolerances", "components": "variance_components", "outliers": "outliers",
+}  # fmt: skip
+"""What statistics there are, by the key of ``solution.json`` that has them; ``solution``: all of it."""
+
+
 def statistics_part(bench: Workbench, part: str) -> dict[str, Any]:
-    """A part of what ``solution.json`` says of the statistics; all of it where ``part`` is "all"."""
-    solution = solution_dict(bench.adjustment, bench.run(), bench.statistics)
-    if part == "all":
-        return {"version": bench.version, **solution}
-    if part not in solution:
-        return {"version": bench.version, "error": f"there is no part {part!r}", "parts": list(solution)}
-    return {"version": bench.version, part: solution[part]}
+    """A part of what ``solution.json`` says, one of ``PARTS``; computed when first asked for. Raises SurveyError."""
+    if part not in PARTS:
+        raise SurveyError(f"there are no statistics {part!r}; {suggestion(part, PARTS)}")
+    solution, key = solution_dict(bench.adjustment, bench.run(), bench.statistics), PARTS[part]
+    return {"version": bench.version, part: solution if key is None else solution[key]}
