@@ -204,7 +204,7 @@ function tableData() {
   if (tableName === "readings") {
     const rows = bench.readings;
     return { n: rows.length, id: (i) => rows[i].id, state: (i) => (rows[i].used ? (rows[i].share > 1 ? "suspect" : "") : "out"), kind: "reading", sort: "w",
-      columns: [named("table", t("kind of reading"), rows.map((r) => known(r.table.replaceAll("_", " ")))), named("name", t("reading"), rows.map((r) => r.name)), named("component", t("component"), rows.map((r) => r.component)),
+      columns: [named("table", t("sort of reading"), rows.map((r) => known(r.table.replaceAll("_", " ")))), named("name", t("reading"), rows.map((r) => r.name)), named("component", t("component"), rows.map((r) => r.component)),
         number4("observed", t("observed"), rows), number4("residual", t("residual"), rows, true), named("unit", t("unit"), rows.map((r) => r.sigma_unit ?? "")), numbers("w", "w", rows.map((r) => r.w), { digits: 2, size: true }), numbers("r", "r", rows.map((r) => r.redundancy), { digits: 3 }), numbers("used", t("used"), rows.map((r) => Number(r.used)), { text: (i) => (rows[i].used ? "✓" : "✕") })] };
   }
   if (tableName === "parameters") {

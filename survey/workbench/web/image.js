@@ -3,7 +3,7 @@
 import { button, colour, make, surface } from "./dom.js";
 import { count, number, t } from "./words.js";
 import { current, names, select } from "./store.js";
-import { picture, pointId, pointName, rowOf, rowsOfImage } from "./source.js";
+import { picture, pointId, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./source.js";
 
 const NEAR = 14; // px on the screen: what a click takes hold of
 const SCALES = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
@@ -70,12 +70,11 @@ export class ImageView {
     } else if (kind === "camera") image = data.images.find((name) => name.startsWith(`${ids[0]}/`)) ?? image;
     else if (kind === "epoch") image = data.images.find((name) => name.endsWith(`/${ids[0]}`)) ?? image;
     else if (kind === "point" || kind === "target") {
-      const at = this.worstOf((i) => (kind === "point" ? pointName(data, i) : data.blocks[data.block[i]].target) === ids[0]);
+      const at = this.worstOf(kind === "point" ? rowsOfPoint(data, null, ids[0]) : rowsWhere(data, (b) => b.target === ids[0]));
       if (at >= 0) { const block = data.blocks[data.block[at]]; image = `${block.camera}/${block.epoch}`; if (kind === "point") this.row = at; }
     }
     if (!image && data.images.length) {
-      const at = this.worstOf(() => true);
-      const block = data.blocks[data.block[at]];
+      const at = this.worstOf(data.rows), block = data.blocks[data.block[at]];
       if (block) image = `${block.camera}/${block.epoch}`;
     }
     if (image !== this.image) this.open(image);
@@ -83,10 +82,11 @@ export class ImageView {
     this.surface.redraw();
   }
 
-  worstOf(test) {
-    const data = this.bench.points;
-    let at = -1;
-    for (let i = 0; i < data.n; i++) if (test(i) && (at < 0 || Math.abs(data.w[i]) > Math.abs(data.w[at]))) at = i;
+  /** @param {ArrayLike<number>} rows */
+  worstOf(rows) {
+    const { w } = this.bench.points;
+    let at = rows.length ? rows[0] : -1;
+    for (let k = 0; k < rows.length; k++) if (w[rows[k]] > w[at] || !(w[at] >= 0)) at = rows[k];
     return at;
   }
 

@@ -3,7 +3,7 @@
 import { button, by, fill, link, make, plainTable } from "./dom.js";
 import { count, known, number, significant, t } from "./words.js";
 import { anchor, current, names } from "./store.js";
-import { pointId, pointName, rowOf, rowsOfImage } from "./source.js";
+import { pointId, pointName, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./source.js";
 
 const WHY = ["in use", "used = false in its table", "excluded by people", "left out by this adjustment"];
 const MOST = 40;
@@ -47,12 +47,6 @@ function sums(data, rows) {
     [t("largest w"), worst < 0 ? "–" : link(anchor("obs", `image_point:${pointId(data, worst)}`), `${number(data.w[worst], 2)}  ${pointName(data, worst)}`)]]);
 }
 
-function rowsWhere(data, test) {
-  const fits = data.blocks.map(test), out = [];
-  for (let i = 0; i < data.n; i++) if (fits[data.block[i]]) out.push(i);
-  return out;
-}
-
 /** The parameters whose name begins like this. */
 function parameters(bench, ...starts) {
   const rows = bench.parameters.filter((p) => starts.some((start) => p.name === start || p.name.startsWith(`${start}/`)));
@@ -61,8 +55,8 @@ function parameters(bench, ...starts) {
 }
 
 /** Every observation of one point, worst first. */
-function seenBy(data, wanted) {
-  const rows = rowsWhere(data, () => true).filter(wanted).sort((a, b) => (data.w[b] || 0) - (data.w[a] || 0));
+function seenBy(data, found) {
+  const rows = found.sort((a, b) => (data.w[b] || 0) - (data.w[a] || 0));
   return [make("h3", {}, t("Seen by {n} images", { n: count(rows.length) })), plainTable(t("Seen by"), [t("image"), t("residual, px"), "w"], rows.slice(0, MOST).map((i) => {
     const block = data.blocks[data.block[i]];
     return [link(anchor("obs", `image_point:${pointId(data, i)}`), `${block.camera}/${block.epoch}`, { class: data.used[i] ? "" : "out" }), number(Math.hypot(data.du[i], data.dv[i]), 3), number(data.w[i], 2)];
@@ -77,7 +71,7 @@ const ABOUT = {
     return [facts([[t("image"), link(anchor("image", `${block.camera}/${block.epoch}`), `${block.camera}/${block.epoch}`)], [t("target"), block.target && link(anchor("target", block.target), block.target)],
       [t("point"), block.target ? name : link(anchor("point", name), name)], [t("observed"), `${number(data.u[i], 3)}, ${number(data.v[i], 3)} px`], [t("residual"), `${number(data.du[i], 4)}, ${number(data.dv[i], 4)} px`],
       ["w", `${number(data.w[i], 2)} (${number((100 * data.w[i]) / data.limit, 0)} % ${t("of the limit")})`], [t("redundancy"), data.redundancy && number(data.redundancy[i], 3)], [t("state"), t(WHY[data.why?.[i] ?? (data.used[i] ? 0 : 3)])]]),
-    ...seenBy(data, (j) => pointName(data, j) === name && data.blocks[data.block[j]].target === block.target && !(block.target && data.blocks[data.block[j]].camera !== block.camera))];
+    ...seenBy(data, rowsOfPoint(data, block.target, name, block.target ? block.camera : ""))];
   },
   image(bench, id) {
     const rows = rowsOfImage(bench.points, id), [camera, epoch] = id.split("/");
@@ -86,12 +80,12 @@ const ABOUT = {
   camera: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.camera === id)), ...parameters(bench, `lens/${id}`, `station_from_camera/${id}`)],
   epoch: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.epoch === id)), ...imagesOf(bench, (b) => b.epoch === id), ...parametersOfEpoch(bench, id)],
   target: (bench, id) => [sums(bench.points, rowsWhere(bench.points, (b) => b.target === id)), ...parameters(bench, `world_from_target/${id}`, `target/${id}`)],
-  point: (bench, id) => [...parameters(bench, `point/${id}`), ...seenBy(bench.points, (i) => pointName(bench.points, i) === id && !bench.points.blocks[bench.points.block[i]].target)],
+  point: (bench, id) => [...parameters(bench, `point/${id}`), ...seenBy(bench.points, rowsOfPoint(bench.points, null, id))],
   station: (bench, id) => parameters(bench, `world_from_station/${id}`, `mount_from_station/${id}`),
   reading(bench, id) {
     const rows = bench.readings.filter((row) => row.id === id);
     if (!rows.length) return [make("p", { class: "warn" }, t("There is no such observation in this solution."))];
-    return [facts([[t("kind of reading"), known(rows[0].table.replaceAll("_", " "))], [t("group"), link(anchor("group", rows[0].group), known(rows[0].group))], [t("joins"), (rows[0].joins ?? []).join(", ") || undefined], [t("state"), t(WHY[rows[0].why ?? 0])]]),
+    return [facts([[t("sort of reading"), known(rows[0].table.replaceAll("_", " "))], [t("group"), link(anchor("group", rows[0].group), known(rows[0].group))], [t("joins"), (rows[0].joins ?? []).join(", ") || undefined], [t("state"), t(WHY[rows[0].why ?? 0])]]),
       ...rows.map((row) => facts([[row.component || t("component"), ""], [t("observed"), `${significant(row.observed, 8)} ${row.unit ?? ""}`], [t("adjusted"), `${significant(row.adjusted, 8)} ${row.unit ?? ""}`], [t("residual"), `${significant(row.residual, 3)} ${row.sigma_unit ?? ""}`], [t("sigma"), `${significant(row.sigma, 3)} ${row.sigma_unit ?? ""}`], ["w", number(row.w, 2)], [t("redundancy"), number(row.redundancy, 3)]]))];
   },
   param(bench, id, actions) {

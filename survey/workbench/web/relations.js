@@ -73,7 +73,7 @@ export class TableAnglesView extends Asked {
 
 export class LoopsView extends Asked {
   async parts() {
-    const found = (await get("statistics/loops")).loops, loops = found?.worst_first ?? [];
+    const found = (await get("statistics/solution")).solution.loops, loops = found?.worst_first ?? [];
     if (!loops.length) return [make("p", { class: "quiet" }, t("No loops: the survey measures no pairs."))];
     const closing = (loop, unit) => (loop[`misclosure_${unit}`] === undefined ? "–" : `${significant(loop[`misclosure_${unit}`], 3)} ± ${significant(loop[`sigma_misclosure_${unit}`], 2)}`);
     const rows = loops.map((loop) => [make("span", { class: loop.closes ? "" : "bad" }, `${loop.closes ? "" : "■ "}${loop.stations.join(" → ")}`), closing(loop, "arcsec"), closing(loop, "mm"), significant(loop.test, 3), significant(loop.p_value, 2),
@@ -84,7 +84,7 @@ export class LoopsView extends Asked {
 
 export class CorrelationsView extends Asked {
   async parts() {
-    const [correlated, weak] = await Promise.all(["correlated_above_95_percent", "weak_directions"].map(async (part) => (await get(`statistics/${part}`))[part] ?? []));
+    const [correlated, weak] = await Promise.all(["correlations", "weak"].map(async (part) => (await get(`statistics/${part}`))[part] ?? []));
     const name = (id) => link(anchor("param", id), id);
     return [make("h2", {}, t("Correlations"), " ", make("span", { class: "quiet" }, count(correlated.length))),
       plainTable(t("Correlations"), [t("parameter"), t("parameter"), t("correlation")], correlated.slice(0, 300).map((c) => [name(c.a), name(c.b), number(c.correlation, 4)]), [2]),

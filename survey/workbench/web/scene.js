@@ -3,6 +3,7 @@
 import { button, colour, make, surface } from "./dom.js";
 import { number, significant, t } from "./words.js";
 import { current, names, select } from "./store.js";
+import { rowsOfPoint } from "./source.js";
 
 /** Right and up of the flat views, by axes of the world. */
 const FLAT = { plan: [0, 1], south: [0, 2], east: [1, 2] };
@@ -201,9 +202,8 @@ export class SceneView {
     context.lineWidth = 1;
     context.setLineDash([5, 4]);
     for (const spot of scene.spots) if (spot.kind === "point" && chosen.points.has(spot.id)) {
-      const at = points.points[""]?.indexOf(spot.id) ?? -1;
-      for (let i = 0; at >= 0 && i < points.n; i++) {
-        const block = points.blocks[points.block[i]], pose = points.point[i] === at && !block.target && scene.poses[`${block.camera}/${block.epoch}`];
+      for (const i of rowsOfPoint(points, null, spot.id)) {
+        const block = points.blocks[points.block[i]], pose = scene.poses[`${block.camera}/${block.epoch}`];
         if (pose) line([[pose[3], pose[7], pose[11]], spot.x]);
       }
     }

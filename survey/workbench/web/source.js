@@ -104,6 +104,24 @@ export function rowOf(data, ids) {
   return -1;
 }
 
+/**
+ * Rows of one point, of one target or of the world; numbers are compared, not names. @param {any} data
+ * @param {string|null} target @param {string} name @param {string} [camera] @returns {number[]}
+ */
+export function rowsOfPoint(data, target, name, camera = "") {
+  const at = (data.points[target ?? ""] ?? []).indexOf(name), out = [];
+  const fits = Uint8Array.from(data.blocks, (b) => Number((b.target ?? null) === target && (!camera || b.camera === camera)));
+  for (let i = 0; at >= 0 && i < data.n; i++) if (data.point[i] === at && fits[data.block[i]]) out.push(i);
+  return out;
+}
+
+/** Rows of all blocks that fit. @param {any} data @param {(block: any) => boolean} test @returns {number[]} */
+export function rowsWhere(data, test) {
+  const fits = Uint8Array.from(data.blocks, (b) => Number(test(b))), out = [];
+  for (let i = 0; i < data.n; i++) if (fits[data.block[i]]) out.push(i);
+  return out;
+}
+
 const pictures = new Map(); // the last few only: a picture of 5 MP holds 20 MB
 const MOST_PICTURES = 12;
 
