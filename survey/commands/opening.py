@@ -4,7 +4,7 @@ import argparse
 import os
 from typing import Any
 
-from survey.commands.common import DONE, is_set, not_negative, require_project, say
+from survey.commands.common import DONE, not_negative, require_project, say
 from survey.commands.parser import project_folder
 
 

@@ -22,7 +22,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from adjust.model.errors import SurveyError
-from survey.commands.parser import port_error
 from survey.folder.locking import BusyError
 from survey.workbench import guard, pictures, views
 from survey.workbench.session import CancelledError, ChangedError, Workbench
@@ -436,5 +435,5 @@ def _bound(host: str, port: int) -> socket.socket:
         found.bind((host, port))
     except OSError as error:
         found.close()
-        raise port_error(port, error) from error
+        raise guard.port_error(port, error) from error
     return found

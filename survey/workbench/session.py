@@ -20,17 +20,18 @@ from typing import Any, Literal
 import numpy as np
 from gtsam import Pose3
 
-from adjust.graph.assembly import StartValues
+from adjust.graph.assembly import StartValues, values_of
 from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
-from adjust.statistics.pair_screen import is_pure, values_of
+from adjust.statistics.pair_networks import is_pure
 from survey.folder.locking import LOCK, holder_of
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, decode, read_bytes
-from survey.jobs.adjusting.job import AdjustOutcome, Clock, adjust_project, command_line, made, run_info, seen_points
+from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, made, run_info
+from survey.jobs.adjusting.steps import adjust_project, seen_points
 from survey.jobs.detecting import author_name
 from survey.jobs.excluding import FILE, included_rows, new_rows
 from survey.project import Project
@@ -291,7 +292,7 @@ class Workbench:
             return start
 
         try:
-            found = adjust_project(replace(project, survey=survey, spots=()), False, begin, self._step)
+            found = adjust_project(replace(project, survey=survey, spots=()), False, begin, watch=self._step)
         except CancelledError:
             raise
         except SurveyError:  # the values of before may be far from what is asked for now
