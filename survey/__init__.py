@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from adjust.model.errors import SurveyError
-    from survey.batch.python import Batch, adjust_many
     from survey.examples import write_example
     from survey.jobs.pairs import PairsOutcome, station_pairs
+    from survey.notebook.batch import Batch, adjust_many
     from survey.notebook.covariance import Covariance
     from survey.notebook.plots import Plot
     from survey.notebook.solution import Solution
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from survey.workbench.session import Workbench
 
 _PLACES = {
-    "Batch": "survey.batch.python",
+    "Batch": "survey.notebook.batch",
     "Covariance": "survey.notebook.covariance",
     "PairsOutcome": "survey.jobs.pairs",
     "Plot": "survey.notebook.plots",
@@ -38,7 +38,7 @@ _PLACES = {
     "SurveyError": "adjust.model.errors",
     "Workbench": "survey.workbench.session",
     "adjust": "survey.notebook.steps",
-    "adjust_many": "survey.batch.python",
+    "adjust_many": "survey.notebook.batch",
     "detect": "survey.notebook.steps",
     "exclude": "survey.notebook.steps",
     "include": "survey.notebook.steps",

@@ -25,6 +25,7 @@ from survey.commands.pairing import declare_pairs
 from survey.commands.parser import Parser, name_commands
 from survey.commands.planning import declare_plan
 from survey.commands.reporting import declare_report
+from survey.commands.running import declare_runs
 from survey.commands.schema import declare_schema
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "TEST_FAILED", "USAGE", "build_parser", "main"]
@@ -51,6 +52,7 @@ _COMMANDS = (
     declare_remove,
     declare_exclude,
     declare_include,
+    declare_runs,
     declare_convert,
     declare_pairs,
     declare_trackers,
@@ -59,7 +61,6 @@ _COMMANDS = (
     declare_compare,
     declare_example,
     declare_schema,
-    declare_completion,
 )
 
 
@@ -92,6 +93,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for declare in _COMMANDS:
         declare(commands, shaped)
+    declare_completion("labsurvey", build_parser, commands, shaped)
     name_commands(commands)
     return parser
 

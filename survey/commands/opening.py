@@ -4,7 +4,7 @@ import argparse
 import os
 from typing import Any
 
-from survey.commands.common import DONE, is_set, not_negative, require_project, say
+from survey.commands.common import DONE, not_negative, say
 from survey.commands.parser import project_folder
 
 
@@ -29,6 +29,8 @@ def declare_open(commands: Any, shaped: dict[str, Any]) -> None:
 
 
 def _open(arguments: argparse.Namespace) -> int:
+    from survey.folder.kept import require_project
+
     require_project(arguments.folder)
     from survey.workbench.guard import loopback_address
     from survey.workbench.opening import open_folder

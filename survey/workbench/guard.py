@@ -64,3 +64,8 @@ def loopback_address(host: str, port: int = 8780) -> str:
             f"another machine go through: ssh -L {port}:127.0.0.1:{port} THIS_MACHINE"
         )
     return text
+
+
+def port_error(number: int, error: OSError) -> SurveyError:
+    """What to say where a port cannot be listened on."""
+    return SurveyError(f"port {number} cannot be used ({error.strerror}); name another with --port, 0 takes a free one")

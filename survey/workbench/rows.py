@@ -22,7 +22,7 @@ from survey.solution.dictionary import plain
 from survey.solution.quantities import sigma_unit_for_people, unit_for_people
 
 IN_USE, BY_FILE, BY_PEOPLE, BY_THIS_RUN = 0, 1, 2, 3
-"""Why an image point takes no part: it does, a table says used = false, exclusions.csv says so, this run left it out."""
+"""Why an image point takes no part: it does, a table says used = false, exclusions.csv does, this run left it out."""
 _Key = tuple[str, str, str | None]
 
 

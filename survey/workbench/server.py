@@ -22,8 +22,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from adjust.model.errors import SurveyError
-from survey.commands.parser import port_error
 from survey.folder.locking import BusyError
+from survey.solution.runs import pin_run
 from survey.workbench import guard, pictures, views
 from survey.workbench.session import CancelledError, ChangedError, Workbench
 
@@ -176,11 +176,12 @@ class Server:
             "/api/state": self._state, "/api/points": self._points, "/api/image/{camera}/{epoch}": self._image,
             "/api/readings": self._view(views.readings), "/api/parameters": self._view(views.parameters),
             "/api/scene": self._view(views.scene), "/api/findings": self._view(views.findings),
-            "/api/changes": self._view(_changes), "/api/statistics/{part}": self._statistics,
+            "/api/changes": self._view(_changes), "/api/runs": self._view(views.runs), "/api/compare": self._compare, "/api/statistics/{part}": self._statistics,
         }  # fmt: skip
         post: dict[str, _Handler] = {
             "/api/preview": self._preview, "/api/exclusions": self._exclusions, "/api/adjust": self._adjust,
             "/api/undo": self._act("undo"), "/api/redo": self._act("redo"), "/api/save": self._save,
+            "/api/runs/{number:int}/restore": self._restore, "/api/runs/{number:int}/pin": self._pin,
             "/api/reload": self._reload, "/api/cancel": self._cancel,
         }  # fmt: skip
         routes = [Route(path, self._said(f), methods=["GET"]) for path, f in get.items()]
@@ -290,6 +291,12 @@ class Server:
         part = request.path_params["part"]
         return JSONResponse(await self._run("statistics", lambda: views.statistics_part(self.bench, part)))
 
+    async def _compare(self, request: Request) -> Response:
+        a, b = (int(q) if (q := request.query_params.get(k, "")).isdecimal() else None for k in "ab")
+        most = request.query_params.get("most", "")
+        found = await self._run("compare", lambda: self.bench.compare(a, b))
+        return JSONResponse(found.as_dict(int(most) if most.isdecimal() else None))
+
     async def _image(self, request: Request) -> Response:
         key = request.path_params["camera"], request.path_params["epoch"]
         project = self.bench.situation.everything
@@ -334,6 +341,15 @@ class Server:
 
         return answering
 
+    async def _restore(self, request: Request) -> Response:
+        number, base = request.path_params["number"], _Body(await _json(request)).base()
+        return await self._decided(lambda: self.bench.restore(number, base))
+
+    async def _pin(self, request: Request) -> Response:
+        number, pinned = request.path_params["number"], _Body(await _json(request)).flag("pinned")
+        run = await self._run("pin", lambda: pin_run(self.bench.folder, number, pinned))
+        return JSONResponse(run.as_dict())
+
     async def _reload(self, _request: Request) -> Response:
         return await self._decided(self.bench.reload)
 
@@ -375,6 +391,12 @@ class _Body:
         value = self._values.get(key, "")
         if not isinstance(value, str):
             raise _BodyError(f"{key}: expected a text")
+        return value
+
+    def flag(self, key: str) -> bool:
+        value = self._values.get(key, True)
+        if type(value) is not bool:
+            raise _BodyError(f"{key}: expected true or false")
         return value
 
     def base(self) -> int | None:
@@ -436,5 +458,5 @@ def _bound(host: str, port: int) -> socket.socket:
         found.bind((host, port))
     except OSError as error:
         found.close()
-        raise port_error(port, error) from error
+        raise guard.port_error(port, error) from error
     return found

@@ -20,17 +20,18 @@ from typing import Any, Literal
 import numpy as np
 from gtsam import Pose3
 
-from adjust.graph.assembly import StartValues
+from adjust.graph.assembly import StartValues, values_of
 from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
-from adjust.statistics.pair_screen import is_pure, values_of
+from adjust.statistics.pair_networks import is_pure
 from survey.folder.locking import LOCK, holder_of
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, decode, read_bytes
-from survey.jobs.adjusting.job import AdjustOutcome, Clock, adjust_project, command_line, made, run_info, seen_points
+from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, kept_run, made, run_info
+from survey.jobs.adjusting.steps import adjust_project, seen_points
 from survey.jobs.detecting import author_name
 from survey.jobs.excluding import FILE, included_rows, new_rows
 from survey.project import Project
@@ -38,8 +39,9 @@ from survey.project.exclusions import Exclusion, Name, Row, appended, in_force, 
 from survey.project.observed import Hits, Observed, union
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, SpotBlock
 from survey.project.reading import leaving_out, read_all
-from survey.solution.changes import Changes, snapshot, solution_changes
+from survey.solution.changes import Changes, Snapshot, snapshot, solution_changes
 from survey.solution.quantities import Scale, scale_of
+from survey.solution.runs import definition_of, find_run, load_run, remove_empty
 from survey.solution.statistics import Statistics, statistics_of
 from survey.workbench.rows import PointRows, point_rows
 
@@ -291,7 +293,7 @@ class Workbench:
             return start
 
         try:
-            found = adjust_project(replace(project, survey=survey, spots=()), False, begin, self._step)
+            found = adjust_project(replace(project, survey=survey, spots=()), False, begin, watch=self._step)
         except CancelledError:
             raise
         except SurveyError:  # the values of before may be far from what is asked for now
@@ -350,15 +352,48 @@ class Workbench:
             if include:
                 rows += included_rows(now.everything, include, reason, author)
             label = label or ", ".join(f"{'exclude' if r.excluded else 'include'} {r.exclusion.name}" for r in rows)
-            step = Step(
-                label, tuple(r.exclusion for r in rows if r.excluded),
-                tuple(now.exclusions[r.exclusion.name] for r in rows if not r.excluded),
-                now.definition_text if definition else "", definition,
-            )  # fmt: skip
-            changes = self._apply(step, rows)
-            self._done.append(step)
-            self._undone = []
-            return changes
+            return self._decided(rows, definition, label)
+
+    def _decided(self, rows: Sequence[Row], definition: str, label: str) -> Changes | None:
+        now = self.situation
+        step = Step(
+            label, tuple(r.exclusion for r in rows if r.excluded),
+            tuple(now.exclusions[r.exclusion.name] for r in rows if not r.excluded),
+            now.definition_text if definition else "", definition,
+        )  # fmt: skip
+        changes = self._apply(step, rows)
+        self._done.append(step)
+        self._undone = []
+        return changes
+
+    def restore(self, number: int, base: int | None = None) -> tuple[str, ...]:
+        """survey.toml and exclusions as they were at a run, as one decision; what else has changed since, for people.
+
+        Raises as :meth:`exclude`, and where there is no such run.
+        """
+        with self._lock:
+            self._check(base)
+            run, text, now = find_run(self.folder, number), definition_of(self.folder, number), self.situation
+            then = {e.name: e for e in run.exclusions}
+            who = author_name(now.project.options.identification)
+            why = f"run {number}"
+            rows = [Row(True, replace(e, line=0)) for name, e in then.items() if name not in now.exclusions]
+            rows += [Row(False, replace(e, reason=why, author=who)) for n, e in now.exclusions.items() if n not in then]
+            definition = text if text != now.definition_text else ""
+            if rows or definition:
+                self._decided(rows, definition, f"restore run {number}")
+            inputs = self.situation.everything.inputs
+            other = sorted(k for k in {*inputs, *run.hashes} if inputs.get(k) != run.hashes.get(k))
+            known = {DEFINITION_FILE, FILE}
+            return tuple(f"{name}: is not as it was at run {number}; it stays as it is" for name in other
+                         if name not in known)  # fmt: skip
+
+    def compare(self, a: int | None = None, b: int | None = None) -> Changes:
+        """From run ``a`` to run ``b``, every parameter in sigmas of ``a``; None: the solution in memory."""
+        return solution_changes(self._snapshot(a), self._snapshot(b))
+
+    def _snapshot(self, number: int | None) -> Snapshot:
+        return snapshot(self.adjustment) if number is None else load_run(self.folder, number)
 
     def undo(self, base: int | None = None) -> Changes | None:
         """Take the last decision back. Raises SurveyError where there is none; else as :meth:`exclude`."""
@@ -447,7 +482,9 @@ class Workbench:
                     raise ChangedError(f"{self.folder}: {', '.join(changed)} changed meanwhile; load it again")
                 said = command_line("open", self.folder)
                 outcome = made(self.situation.project, self.adjustment, place, clock, command=said)
-                replace_parts(self.folder)
+                gone = kept_run(self.folder, place, self.situation.project, outcome)
+                replace_parts(self.folder, gone=gone)
+            remove_empty(self.folder, gone)
             self.n_unsaved = 0
             return outcome.at(self.folder)
 

@@ -17,6 +17,7 @@ from survey.solution.changes import snapshot
 from survey.solution.dictionary import plain, solution_dict
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import sigma_unit_for_people, sigmas_of, status_of, unit_for_people
+from survey.solution.runs import list_runs
 from survey.solution.verdict import suspects
 from survey.workbench.rows import BY_THIS_RUN, IN_USE, columns, reading_rows
 from survey.workbench.session import Workbench
@@ -181,6 +182,11 @@ def _of_images(bench: Workbench, failing: list[dict[str, Any]]) -> list[dict[str
                         "w": None, "share": None, "why": BY_THIS_RUN, "n_points": n, "n_in_image": len(rows),
                         "remedies": [_exclude(bench, f"image:{image}")]})  # fmt: skip
     return out
+
+
+def runs(bench: Workbench) -> dict[str, Any]:
+    """The runs that were kept, the last first."""
+    return {"version": bench.version, "runs": [r.as_dict() for r in reversed(list_runs(bench.folder))]}
 
 
 def scene(bench: Workbench) -> dict[str, Any]:

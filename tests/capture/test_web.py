@@ -16,8 +16,9 @@ from capture.cli import main
 from capture.plan.plan import read_plan
 from capture.session.run import run_plan
 from capture.simulated import controller
-from capture.web.serve import PageServer, loopback_address
+from capture.web.serve import PageServer
 from capture.web.state import FolderView, LiveView, Shown, png_with_overlay
+from survey.workbench.guard import loopback_address
 from tests.capture.session_runs import write_plan
 from tests.capture.table_server import table_server
 
@@ -155,6 +156,7 @@ def test_head_is_answered_without_a_body(tmp_path):
         assert ask(server, "HEAD", "/", {"Host": "evil.example"})[0] == 403
 
 
+@pytest.mark.slow
 def test_client_that_leaves_is_no_traceback(tmp_path, capsys):
     with served(FolderView(read_plan(write_plan(tmp_path)))) as server:
         for sent in (b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"GET /app.js HTTP/1.1\r\nHost: localhost\r\n\r\n"):
