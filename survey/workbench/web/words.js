@@ -7,8 +7,8 @@ let language = "en";
 
 /** @param {string} wanted "en" or "de" */
 export async function speak(wanted) {
-  language = wanted;
-  texts = await (await fetch(new URL(`${wanted}.json`, import.meta.url))).json();
+  const found = await (await fetch(new URL(`${wanted}.json`, import.meta.url))).json();
+  [texts, language] = [found, wanted]; // at once: something may be drawn while they are fetched
   document.documentElement.lang = wanted;
 }
 
