@@ -1,7 +1,7 @@
 // Before and after of every parameter, the runs that were kept, and any two of them compared.
 
 import { button, fill, link, make, plainTable } from "./dom.js";
-import { count, known, number, significant, t, time } from "./words.js";
+import { count, number, significant, t, time } from "./words.js";
 import { anchor, current, go } from "./store.js";
 import { get, post } from "./source.js";
 import { tell } from "./dialogs.js";
@@ -66,12 +66,12 @@ export class HistoryView {
     try { runs = (await get("runs")).runs; } catch (error) { fill(this.element, make("p", { class: "warn" }, error.message)); return; }
     const { state } = this.bench, chosen = current();
     const pick = (name, run) => make("input", { type: "radio", name, "aria-label": `${t(name)} ${run}`, checked: String(chosen[name === "before" ? "against" : "run"]) === String(run), onchange: () => go(name === "before" ? { against: String(run) } : { run: String(run) }, true) });
-    const rows = runs.map((run) => [pick("before", run.run), pick("after", run.run), link(`#run=${run.run}`, String(run.run)), time(run.time), run.author ?? "", run.why ?? run.command ?? "",
-      known(`verdict ${run.verdict}`), number(run.sigma0, 4), count(run.redundancy),
-      make("span", {}, button(run.pinned ? "★" : "☆", () => this.act("pin", run), "", { "aria-label": run.pinned ? t("not kept for ever") : t("keep for ever") }), state.read_only ? null : button(t("restore"), () => this.act("restore", run)))]);
+    const rows = runs.map((run) => [pick("before", run.number), pick("after", run.number), link(`#run=${run.number}`, String(run.number)), time(run.time), run.author ?? "", run.command ?? "",
+      t(`verdict ${run.summary.verdict}`), number(run.summary.sigma0, 4), count(run.summary.redundancy),
+      state.read_only ? null : make("span", {}, button(run.pinned ? "★" : "☆", () => this.act("pin", run), "", { "aria-label": run.pinned ? t("not kept for ever") : t("keep for ever") }), " ", button(t("restore"), () => this.act("restore", run)))]);
     const steps = (title, labels) => labels?.length ? make("div", {}, make("h3", {}, title), make("ol", {}, ...labels.map((label) => make("li", {}, label)))) : null;
     fill(this.element, make("h2", {}, t("History")), steps(t("Can be undone"), state.undo), steps(t("Can be done again"), state.redo), make("h3", {}, t("Runs")),
-      rows.length ? plainTable(t("Runs"), [t("before"), t("after"), t("run"), t("time"), t("who"), t("why"), t("verdict"), "sigma0", t("redundancy"), ""], rows, [7, 8]) : make("p", { class: "quiet" }, t("No runs are kept yet; Save writes one.")),
+      rows.length ? plainTable(t("Runs"), [t("before"), t("after"), t("run"), t("time"), t("who"), t("Command"), t("verdict"), "sigma0", t("redundancy"), ""], rows, [7, 8]) : make("p", { class: "quiet" }, t("No runs are kept yet; Save writes one.")),
       rows.length > 1 ? button(t("Compare"), () => this.compare(), "d", { class: "primary" }) : null);
   }
 
@@ -82,7 +82,7 @@ export class HistoryView {
   }
 
   async act(what, run) {
-    try { await this.actions.done(await post(`runs/${run.run}/${what}`, { base: this.bench.state.version, pinned: !run.pinned })); } catch (error) { tell(error.message, "warn"); }
+    try { await this.actions.done(await post(`runs/${run.number}/${what}`, { base: this.bench.state.version, pinned: !run.pinned })); } catch (error) { tell(error.message, "warn"); }
     this.key = "";
     this.follow();
   }

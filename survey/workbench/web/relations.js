@@ -48,7 +48,7 @@ export class CameraView extends Asked {
     const choose = make("select", { "aria-label": t("Camera"), onchange: (event) => select("camera", event.target.value) }, ...Object.keys(this.bench.sizes).map((id) => make("option", { value: id, selected: id === camera }, id)));
     const distance = make("input", { type: "number", min: "0.01", step: "any", value: this.distance ?? "", placeholder: "∞", "aria-label": t("distance, m"), onchange: () => { this.distance = distance.value; this.follow(); } });
     const others = make("select", { "aria-label": t("difference to"), onchange: () => { this.against = others.value; this.follow(); } },
-      make("option", { value: "" }, t("before the last change")), ...(this.bench.runs ?? []).map((run) => make("option", { value: run.run, selected: String(run.run) === this.against }, `${t("run")} ${run.run}`)));
+      make("option", { value: "" }, t("before the last change")), ...(this.bench.runs ?? []).map((run) => make("option", { value: run.number, selected: String(run.number) === this.against }, `${t("run")} ${run.number}`)));
     const said = make("p", { class: "warn" });
     for (const [what, title] of [["distortion", t("Distortion: what the lens moves")], ["uncertainty", t("Uncertainty of projection (one sigma)")], ["difference", t("Difference of two lens results, implied rotation fitted")]]) {
       const ask = new URLSearchParams({ ...(this.distance ? { distance: this.distance } : {}), ...(what === "difference" && this.against ? { run: this.against } : {}) });
