@@ -128,17 +128,17 @@ def test_a_wrong_point_is_found_left_out_and_taken_back(page: Page, folder: Path
     page.wait("document.querySelector('dialog p[aria-live]')?.textContent.includes('1 image point')")
     p.keyboard.type("reflection")
     page.done(lambda: p.keyboard.press("Enter"))
-    assert "left out 1" in page.facts()
+    assert "excluded 1" in page.facts()
     rows = (folder / "observations" / "exclusions.csv").read_text().splitlines()
     assert rows[-1].startswith(f"image_point,{NAME},excluded,reflection,")
     assert "excluded by people" in p.inner_text("#inspector")
     page.done(lambda: p.keyboard.press("d") or p.keyboard.press("u"))
-    assert "left out 0" in page.facts()
+    assert "excluded 0" in page.facts()
     assert "sigma0" in p.inner_text("#left"), "before and after"
     page.done(lambda: p.keyboard.press("U"))
-    assert "left out 1" in page.facts()
+    assert "excluded 1" in page.facts()
     page.done(lambda: p.keyboard.press("e"))
-    assert "left out 0" in page.facts()
+    assert "excluded 0" in page.facts()
 
 
 def test_back_and_links_lead_to_places(page: Page) -> None:

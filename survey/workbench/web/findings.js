@@ -85,6 +85,6 @@ export function drawHeader(state) {
   by("verdict").textContent = verdictText(state.verdict);
   const fact = (name, value) => make("span", {}, make("span", { class: "quiet" }, `${name} `), value);
   fill(by("facts"), fact("sigma0", number(state.sigma0, 4)), fact(t("redundancy"), count(state.redundancy)),
-    fact(t("left out"), count(state.exclusions.length)), state.unsaved ? fact(t("unsaved"), count(state.unsaved)) : "", state.read_only ? make("span", { class: "pill" }, t("for reading only")) : "");
+    fact(t("excluded"), count(state.exclusions.length)), state.n_not_used ? fact(t("not used"), count(state.n_not_used)) : null, state.unsaved ? fact(t("unsaved"), count(state.unsaved)) : null, state.read_only ? make("span", { class: "pill" }, t("for reading only")) : null);
 }
 

@@ -226,7 +226,8 @@ export class ImageView {
       context.imageSmoothingEnabled = this.s * size[0] < 4 * this.bitmap.width;
       context.drawImage(this.bitmap, this.ox, this.oy, this.s * size[0], this.s * size[1]);
     } else { context.fillStyle = colour("sunk"); context.fillRect(this.ox, this.oy, this.s * size[0], this.s * size[1]); }
-    this.scale.textContent = this.overlay ? t("vectors × {k}", { k: count(this.enlarged) }) : t("overlay off (o)");
+    this.scale.textContent = this.overlay ? `v × ${count(this.enlarged)}` : t("overlay off (o)");
+    this.scale.title = t("residual vectors enlarged");
     const rows = rowsOfImage(data, this.image);
     if (this.overlay) this.marks(context, rows);
     const out = rows.reduce((sum, i) => sum + (data.used[i] ? 0 : 1), 0);
