@@ -25,7 +25,7 @@ const VIEWS = {
   south: ["South view", () => new SceneView(bench, "south")],
   east: ["East view", () => new SceneView(bench, "east")],
   camera: ["Camera", () => new CameraView(bench)],
-  compare: ["Before and after", () => new CompareView(bench)],
+  compare: ["Compare", () => new CompareView(bench)],
   history: ["History", () => new HistoryView(bench, actions)],
   angles: ["Angles", () => new TableAnglesView(bench)],
   loops: ["Loops", () => new LoopsView(bench)],
@@ -35,7 +35,7 @@ const PANES = ["left", "right"];
 const REGIONS = [["tree", "Project"], ["left", "First view"], ["right", "Second view"], ["tables", "Tables"], ["inspector", "Details"]];
 const shown = { left: null, right: null };
 const TABLES = { points: "Image points", readings: "Readings", parameters: "Parameters", exclusions: "Excluded by people" };
-let table = null, tableName = "points", lastPane = "right", busy = false;
+let followed = "", table = null, tableName = "points", lastPane = "right", busy = false;
 
 // what may be done
 
@@ -217,7 +217,13 @@ function tableData() {
 
 const number4 = (key, title, rows, size = false) => numbers(key, title, rows.map((r) => r[key]), { size, text: (i) => significant(rows[i][key], 6) });
 
+/** Tables in which a chosen thing is found. */
+const TABLE_OF = { obs: "points", reading: "readings", param: "parameters" };
+
 function drawTable(fresh) {
+  const wanted = TABLE_OF[current().kind];
+  if (wanted && wanted !== tableName && !fresh && followed !== current().ids[0]) { tableName = wanted; table = null; }
+  followed = current().ids[0];
   if (!table) {
     const data = tableData();
     table = new Table(t(TABLES[tableName]), data, { sort: data.sort, onselect: (rows, quiet) => selectRows(data.kind, rows, quiet), onenter: (row) => { selectRows(data.kind, [row], false); actions.show("image", "right"); } });

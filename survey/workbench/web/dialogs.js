@@ -40,9 +40,13 @@ export async function askReason(things, preview) {
   return lastReason;
 }
 
-/** A message that stays until it is read. @param {string} text @param {string} [kind] warn or bad */
+const READ_MS = 8000;
+
+/** A message; a warning stays until it is read. @param {string} text @param {string} [kind] warn or bad */
 export function tell(text, kind = "") {
-  by("message").replaceChildren(make("span", { class: kind }, text), button("×", () => by("message").replaceChildren(), "", { "aria-label": t("close") }));
+  const shown = make("span", { class: kind }, text);
+  by("message").replaceChildren(shown, button("×", () => by("message").replaceChildren(), "", { "aria-label": t("close") }));
+  if (!kind) setTimeout(() => { if (shown.isConnected) by("message").replaceChildren(); }, READ_MS);
 }
 
 /** @param {[string, string][]} keys key and what it does */
