@@ -1,8 +1,9 @@
 """Runs of a project, kept under ``runs/NNNN`` so that any two can be compared and any can come back.
 
 ``run.json``: when, by whom, what came out, what was excluded, hashes of all inputs. ``survey.toml``: as it was then.
-``estimates.npz``: every parameter with its covariance a priori. ``solution.json``: as in the results. A run that says
-the same as the last one is not kept again; of runs that nobody pinned the last ``MOST`` stay. Images are never kept.
+``estimates.npz``: every parameter with its covariance a priori. ``solution.json``: as in the results. A run of the
+same inputs, options and versions as the last one is not kept again; of runs that nobody pinned the last ``MOST`` stay.
+Images are never kept.
 """
 
 import hashlib
@@ -25,7 +26,7 @@ from survey.folder.text import atomic_write, decode, read_bytes
 from survey.project.exclusions import Exclusion, Name
 from survey.project.project import DEFINITION_FILE
 from survey.solution.changes import Snapshot, snapshot
-from survey.solution.dictionary import RunInfo, solution_json
+from survey.solution.dictionary import RunInfo, plain, solution_json
 
 RUNS, MOST = "runs", 50
 _RUN, _ESTIMATES, _SOLUTION = "run.json", "estimates.npz", "solution.json"
@@ -54,10 +55,10 @@ class Run:
 
     def text(self) -> str:
         """One line for people."""
-        sigma0 = self.summary.get("sigma0")
-        shown = "-" if sigma0 is None else f"{sigma0:.4f}"
-        return (f"{self.number:4d}{'*' if self.pinned else ' '} {self.time}  {self.summary.get('verdict', ''):<7} sigma0 "
-                f"{shown}  redundancy {self.summary.get('redundancy')}  excluded {len(self.exclusions)}  {self.author}")
+        sigma0, mark = self.summary.get("sigma0"), "*" if self.pinned else " "
+        shown, verdict = "-" if sigma0 is None else f"{sigma0:.4f}", self.summary.get("verdict", "")
+        return (f"{self.number:4d}{mark} {self.time}  {verdict:<7} sigma0 {shown}  redundancy "
+                f"{self.summary.get('redundancy')}  excluded {len(self.exclusions)}  {self.author}")  # fmt: skip
 
 
 def _exclusion(e: Exclusion) -> dict[str, Any]:
@@ -70,8 +71,8 @@ def record_run(
 ) -> tuple[str, ...]:
     """Keep a run: its files made in ``place`` while ``folder`` is being changed; old files that are to go then."""
     runs = list_runs(folder)
-    print_ = {k: v for k, v in solution.items() if k != "inputs"} | {"hashes": dict(run.input_hashes)}
-    fingerprint = hashlib.sha256(json.dumps(print_, sort_keys=True, allow_nan=False).encode()).hexdigest()
+    of = [dict(run.input_hashes), plain(run.options), dict(run.versions), sorted(solution)]
+    fingerprint = hashlib.sha256(json.dumps(of, sort_keys=True, allow_nan=False).encode()).hexdigest()
     if runs and runs[-1].fingerprint == fingerprint:
         return ()
     number = runs[-1].number + 1 if runs else 1

@@ -24,7 +24,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from adjust.model.errors import SurveyError
 from survey.folder.locking import BusyError
 from survey.solution.runs import pin_run
-from survey.workbench import guard, pictures, views
+from survey.workbench import cameras, guard, pictures, views
 from survey.workbench.session import CancelledError, ChangedError, Workbench
 
 WEB = Path(__file__).parent / "web"
@@ -176,10 +176,15 @@ class Server:
             "/api/state": self._state, "/api/points": self._points, "/api/image/{camera}/{epoch}": self._image,
             "/api/readings": self._view(views.readings), "/api/parameters": self._view(views.parameters),
             "/api/scene": self._view(views.scene), "/api/findings": self._view(views.findings),
-            "/api/changes": self._view(_changes), "/api/runs": self._view(views.runs), "/api/compare": self._compare, "/api/statistics/{part}": self._statistics,
+            "/api/changes": self._view(_changes), "/api/loops": self._view(views.loops),
+            "/api/table_residuals": self._view(views.table_residuals), "/api/camera/{camera}": self._camera,
+            "/api/camera/{camera}/difference": self._difference, "/api/runs": self._view(views.runs),
+            "/api/compare": self._compare,
+            "/api/statistics/{part}": self._statistics,
         }  # fmt: skip
         post: dict[str, _Handler] = {
             "/api/preview": self._preview, "/api/exclusions": self._exclusions, "/api/adjust": self._adjust,
+            "/api/definition": self._definition,
             "/api/undo": self._act("undo"), "/api/redo": self._act("redo"), "/api/save": self._save,
             "/api/runs/{number:int}/restore": self._restore, "/api/runs/{number:int}/pin": self._pin,
             "/api/reload": self._reload, "/api/cancel": self._cancel,
@@ -297,6 +302,16 @@ class Server:
         found = await self._run("compare", lambda: self.bench.compare(a, b))
         return JSONResponse(found.as_dict(int(most) if most.isdecimal() else None))
 
+    async def _camera(self, request: Request) -> Response:
+        camera, distance = request.path_params["camera"], _distance(request)
+        return JSONResponse(await self._run("view", lambda: cameras.camera_view(self.bench, camera, distance)))
+
+    async def _difference(self, request: Request) -> Response:
+        camera, distance, q = request.path_params["camera"], _distance(request), request.query_params
+        run = int(q["run"]) if q.get("run", "").isdecimal() else None
+        other, bench = q.get("other", ""), self.bench
+        return JSONResponse(await self._run("view", lambda: cameras.lens_change(bench, camera, run, other, distance)))
+
     async def _image(self, request: Request) -> Response:
         key = request.path_params["camera"], request.path_params["epoch"]
         project = self.bench.situation.everything
@@ -325,6 +340,18 @@ class Server:
         return await self._decided(lambda: self.bench.decide(
             exclude=excluded, include=included, reason=body.text("reason"), author=body.text("author"), base=body.base()
         ))  # fmt: skip
+
+    async def _definition(self, request: Request) -> Response:
+        """One of: {group, factor}, {parameter, treatment}, {datum: kind, points, stations}."""
+        body = _Body(await _json(request))
+        base, bench = body.base(), self.bench
+        if body.text("group"):
+            return await self._decided(lambda: bench.set_sigma_scale(body.text("group"), body.number("factor"), base))
+        if body.text("parameter"):
+            name, treatment = body.text("parameter"), body.text("treatment")
+            return await self._decided(lambda: bench.set_treatment(name, treatment, base))
+        kind, points, stations = body.text("datum"), body.names("points"), body.names("stations")
+        return await self._decided(lambda: bench.set_datum(kind, points, stations, base))
 
     async def _decided(self, work: Callable[[], Any]) -> Response:
         await self._run("adjust", work)
@@ -367,6 +394,18 @@ def _changes(bench: Workbench) -> dict[str, Any]:
     return {"version": bench.version, "changes": None if found is None else found.as_dict(500)}
 
 
+def _distance(request: Request) -> float:
+    """What a request says of how far a point is, m; at infinity where it says nothing. Raises SurveyError."""
+    text = request.query_params.get("distance_m", "inf")
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not value > 0.0:
+        raise SurveyError(f"distance_m: found {text!r}; expected metres, or inf")
+    return value
+
+
 class _BodyError(Exception):
     pass
 
@@ -391,6 +430,18 @@ class _Body:
         value = self._values.get(key, "")
         if not isinstance(value, str):
             raise _BodyError(f"{key}: expected a text")
+        return value
+
+    def number(self, key: str) -> float:
+        value = self._values.get(key)
+        if type(value) not in (int, float):
+            raise _BodyError(f"{key}: expected a number")
+        return float(value)
+
+    def names(self, key: str) -> list[str]:
+        value = self._values.get(key, [])
+        if not isinstance(value, list) or not all(isinstance(x, str) for x in value):
+            raise _BodyError(f"{key}: expected a list of names")
         return value
 
     def flag(self, key: str) -> bool:

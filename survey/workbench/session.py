@@ -35,6 +35,7 @@ from survey.jobs.adjusting.steps import adjust_project, seen_points
 from survey.jobs.detecting import author_name
 from survey.jobs.excluding import FILE, included_rows, new_rows
 from survey.project import Project
+from survey.project.declared.editing import with_datum, with_sigma_scale, with_treatment
 from survey.project.exclusions import Exclusion, Name, Row, appended, in_force, read_exclusions
 from survey.project.observed import Hits, Observed, union
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, SpotBlock
@@ -366,6 +367,27 @@ class Workbench:
         self._undone = []
         return changes
 
+    def set_sigma_scale(self, group: str, factor: float, base: int | None = None) -> Changes | None:
+        """Multiply all sigmas of a group, in survey.toml; otherwise as :meth:`exclude`."""
+        text = with_sigma_scale(self.situation.definition_text, group, factor)
+        return self.decide(definition=text, label=f"sigmas of {group} times {factor:g}", base=base)
+
+    def set_treatment(self, name: str, treatment: str, base: int | None = None) -> Changes | None:
+        """Make a parameter free, or hold it at its adjusted value, in survey.toml; otherwise as :meth:`exclude`.
+
+        name: as in results: ``lens/X/k1``, ``point/B07``, ``station_from_camera/X``.
+        """
+        now = self.situation
+        text = with_treatment(now.definition_text, now.project.survey, self.adjustment.estimates, name, treatment)
+        return self.decide(definition=text, label=f"{name} {treatment}", base=base)
+
+    def set_datum(
+        self, kind: str, points: Sequence[str] = (), stations: Sequence[str] = (), base: int | None = None
+    ) -> Changes | None:
+        """Choose the datum, in survey.toml: ``given``, or ``inner`` over points and stations."""
+        text = with_datum(self.situation.definition_text, kind, points, stations)
+        return self.decide(definition=text, label=f"datum {kind}", base=base)
+
     def restore(self, number: int, base: int | None = None) -> tuple[str, ...]:
         """survey.toml and exclusions as they were at a run, as one decision; what else has changed since, for people.
 
@@ -422,6 +444,12 @@ class Workbench:
             raise SurveyError(f"{self.folder}: is open for reading only; open it without --read-only to change it")
         if base is not None and base != self.version:
             raise ChangedError(f"the solution has changed since (now {self.version}, not {base}); look at it again")
+        self._require_unchanged()
+
+    def _require_unchanged(self) -> None:
+        changed = self.changed_files()
+        if changed:
+            raise ChangedError(f"{self.folder}: {', '.join(changed)} changed meanwhile; load the project again")
 
     def _apply(self, step: Step, rows: Sequence[Row]) -> Changes | None:
         """Solve first, then write, then take: what cannot be solved is not recorded."""
@@ -438,6 +466,8 @@ class Workbench:
             now, everything=everything, project=leaving_out(everything, exclusions.values()), exclusions=exclusions,
             definition_text=text or now.definition_text,
         )  # fmt: skip
+        if text:  # which spot is which beacon may be another question now
+            trial = replace(trial, identified=(), known_spots=frozenset())
         solved = self._solved(trial, "warm")
         self._write(text, rows)
         changes = self._take(self._as_written(solved))
@@ -446,9 +476,7 @@ class Workbench:
 
     def _write(self, text: str, rows: Sequence[Row]) -> None:
         with changing(self.folder, inputs=True) as place:
-            changed = self.changed_files()
-            if changed:
-                raise ChangedError(f"{self.folder}: {', '.join(changed)} changed meanwhile; load the project again")
+            self._require_unchanged()
             if text:
                 atomic_write(place / DEFINITION_FILE, text)
             if rows:
@@ -477,9 +505,7 @@ class Workbench:
             self._check(None)
             clock = Clock({"adjust": self.situation.seconds})
             with changing(self.folder) as place:
-                changed = self.changed_files()
-                if changed:
-                    raise ChangedError(f"{self.folder}: {', '.join(changed)} changed meanwhile; load it again")
+                self._require_unchanged()
                 said = command_line("open", self.folder)
                 outcome = made(self.situation.project, self.adjustment, place, clock, command=said)
                 gone = kept_run(self.folder, place, self.situation.project, outcome)

@@ -12,11 +12,12 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from survey.folder.text import suggestion
+from survey.project.observed import name_of_residual
 from survey.report.scene import scene_of
 from survey.solution.changes import snapshot
 from survey.solution.dictionary import plain, solution_dict
 from survey.solution.frames import AdjustedFrames
-from survey.solution.quantities import sigma_unit_for_people, sigmas_of, status_of, unit_for_people
+from survey.solution.quantities import ARCSEC_PER_RAD, sigma_unit_for_people, sigmas_of, status_of, unit_for_people
 from survey.solution.runs import list_runs
 from survey.solution.verdict import suspects
 from survey.workbench.rows import BY_THIS_RUN, IN_USE, columns, reading_rows
@@ -208,6 +209,25 @@ def scene(bench: Workbench) -> dict[str, Any]:
                    for table, pose, axes in drawn.tables],
         "moves": drawn.moves, "n_left_out": drawn.n_left_out,
     }))  # fmt: skip
+
+
+def loops(bench: Workbench) -> dict[str, Any]:
+    """Loops of measured pairs and how they close, the worst first; None where there are none."""
+    solution = solution_dict(bench.adjustment, bench.run(), None)
+    return {"version": bench.version, "loops": solution.get("loops"), "network": solution.get("network")}
+
+
+def table_residuals(bench: Workbench) -> dict[str, Any]:
+    """Residuals of turntables (arcsec) over the adjusted angles (deg) of all their axes, by table, in use or not."""
+    out: dict[str, list[dict[str, Any]]] = {}
+    for o in bench.adjustment.other_residuals:
+        if o.kind == "table":
+            out.setdefault(o.ids[0], []).append({
+                "epoch": o.ids[-1], "id": name_of_residual(o), "angles_deg": np.degrees(o.adjusted),
+                "residual_arcsec": ARCSEC_PER_RAD * o.residual, "sigma_arcsec": ARCSEC_PER_RAD * o.sigma,
+                "w": o.standardized, "used": o.used,
+            })  # fmt: skip
+    return dict(plain({"version": bench.version, "tables": out}))
 
 
 PARTS = {

@@ -154,7 +154,7 @@ def test_back_and_links_lead_to_places(page: Page) -> None:
     assert p.inner_text("#inspector h2").startswith("observation ")
 
 
-@pytest.mark.parametrize("view", ["scene", "plan", "south", "east", "compare", "angles", "loops", "correlations"])
+@pytest.mark.parametrize("view", ["scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations"])
 def test_every_view_is_drawn(page: Page, view: str) -> None:
     p = page.page
     p.locator("#right .chooser select").select_option(view)

@@ -16,7 +16,7 @@ import { chosenNames, drawInspector } from "./inspector.js";
 import { findingsOf, parametersOf, readingsOf, sceneOf, shiftsOf, sizesOf, stateOf } from "./shapes.js";
 
 /** Everything the views show; new values replace old ones, nothing is changed in place. */
-const bench = { state: null, points: null, limit: 1, readings: [], parameters: [], findings: {}, scene: null, sizes: {}, leftOut: new Map(), shifts: new Map(), runs: [] };
+const bench = { state: null, points: null, limit: 1, readings: [], parameters: [], findings: {}, scene: null, sizes: {}, leftOut: new Map(), shifts: new Map() };
 const VIEWS = {
   findings: ["Findings", () => new FindingsView(bench, actions)],
   image: ["Image", () => new ImageView(bench)],
@@ -71,8 +71,7 @@ const actions = {
     if (image) actions.exclude([`image:${image}`]);
   },
 
-  remedy: (remedy) => (remedy.changes?.every((c) => c.excluded) ? actions.exclude(remedy.changes.map((c) => c.name)) : act(() => post("remedy", { base: bench.state.version, ...remedy }))),
-  setting: (change) => act(() => post("settings", { base: bench.state.version, changes: [change] })),
+  setting: (change) => act(() => post("definition", { base: bench.state.version, ...change })),
   undo: () => bench.state.undo.length && act(() => post("undo", { base: bench.state.version })),
   redo: () => bench.state.redo.length && act(() => post("redo", { base: bench.state.version })),
   adjust: (mode = "warm") => act(() => post("adjust", { base: bench.state.version, mode })),

@@ -91,7 +91,9 @@ const ABOUT = {
   param(bench, id, actions) {
     const row = bench.parameters.find((p) => p.name === id);
     if (!row) return parameters(bench, id);
-    const acts = bench.state.read_only || !row.treatments ? [] : row.treatments.filter((x) => x !== row.treatment).map((x) => button(t(`make ${x}`), () => actions.setting({ parameter: id, treatment: x })));
+    // a component of a lens or turntable by itself, poses and points as a whole, those of single epochs in survey.toml
+    const single = /^(lens|table_geometry)\//.test(id), name = single ? id : row.owner, to = row.treatment === "free" ? "held" : "free";
+    const acts = bench.state.read_only || (!single && name.split("/").length !== 2) ? [] : [button(t(`make ${to}`), () => actions.setting({ parameter: name, treatment: to }))];
     return [facts([[t("value"), `${significant(row.value, 9)} ${row.unit ?? ""}`], [t("sigma"), row.sigma === null ? "–" : `${significant(row.sigma, 3)} ${row.sigma_unit ?? row.unit ?? ""}`], [t("treatment"), row.treatment && known(row.treatment)]]), make("div", { class: "actions" }, ...acts)];
   },
   group(bench, id, actions) {

@@ -43,7 +43,7 @@ export function heat(label, grid) {
       context.fillRect(box.x + (k % grid.columns) * dx, box.y + Math.floor(k / grid.columns) * dy, dx + 0.5, dy + 0.5);
     });
     if (grid.arrows) {
-      const grow = (0.9 * Math.min(dx, dy)) / longest;
+      const grow = (1.6 * Math.min(dx, dy)) / longest;
       for (const [u, v, du, dv] of grid.arrows) arrow(context, box.x + (u + 0.5) * box.scale, box.y + (v + 0.5) * box.scale, grow * du, grow * dv);
     }
     context.strokeStyle = colour("edge");
@@ -66,6 +66,18 @@ function arrow(context, x, y, dx, dy) {
     if (far > 2) { const a = Math.atan2(dy, dx); for (const turn of [2.6, -2.6]) { context.moveTo(x + dx, y + dy); context.lineTo(x + dx + head * Math.cos(a + turn), y + dy + head * Math.sin(a + turn)); } }
     context.stroke();
   }
+}
+
+/**
+ * Values at the pixels of a regular grid of which some may be missing, with an arrow at every second one.
+ * @param {number[]} size @param {number[][]} uv @param {(number|null)[]} values @param {number[][]} [shifts]
+ */
+export function gridOf(size, uv, values, shifts) {
+  const at = (k) => [...new Set(uv.map((x) => x[k]))].sort((a, b) => a - b), [us, vs] = [at(0), at(1)];
+  const u = new Map(us.map((x, k) => [x, k])), v = new Map(vs.map((x, k) => [x, k])), all = new Array(us.length * vs.length).fill(null);
+  uv.forEach((x, k) => { all[v.get(x[1]) * us.length + u.get(x[0])] = values[k]; });
+  const arrows = shifts && uv.map((x, k) => [...x, ...shifts[k]]).filter((x) => u.get(x[0]) % 2 === 0 && v.get(x[1]) % 2 === 0 && Number.isFinite(x[2]));
+  return { size, columns: Math.max(1, us.length), rows: Math.max(1, vs.length), values: all, unit: "px", low: 0, arrows };
 }
 
 /** A picture with its title and the same facts in words. */

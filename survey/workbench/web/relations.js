@@ -4,7 +4,7 @@ import { link, make, plainTable } from "./dom.js";
 import { count, number, significant, t } from "./words.js";
 import { anchor, current, names, select } from "./store.js";
 import { get } from "./source.js";
-import { heat, residualField, scatter } from "./plots.js";
+import { gridOf, heat, residualField, scatter } from "./plots.js";
 
 /** A view whose content is fetched once for each solution and question. */
 class Asked {
@@ -33,7 +33,7 @@ class Asked {
 }
 
 export class CameraView extends Asked {
-  question() { return `${this.camera()}/${this.against ?? ""}/${this.distance ?? ""}`; }
+  question() { return `${this.camera()}/${JSON.stringify(this.against)}/${this.distance ?? ""}`; }
 
   camera() {
     const { kind, ids } = current(), cameras = Object.keys(this.bench.sizes);
@@ -47,13 +47,22 @@ export class CameraView extends Asked {
     const plots = make("div", { class: "figures" }, heat(t("Residual field: mean vectors over the root mean square"), field), heat(t("Coverage: image points"), coverage));
     const choose = make("select", { "aria-label": t("Camera"), onchange: (event) => select("camera", event.target.value) }, ...Object.keys(this.bench.sizes).map((id) => make("option", { value: id, selected: id === camera }, id)));
     const distance = make("input", { type: "number", min: "0.01", step: "any", value: this.distance ?? "", placeholder: "∞", "aria-label": t("distance, m"), onchange: () => { this.distance = distance.value; this.follow(); } });
-    const others = make("select", { "aria-label": t("difference to"), onchange: () => { this.against = others.value; this.follow(); } },
-      make("option", { value: "" }, t("before the last change")), ...(this.bench.runs ?? []).map((run) => make("option", { value: run.number, selected: String(run.number) === this.against }, `${t("run")} ${run.number}`)));
+    const runs = (await get("runs")).runs, choices = [...runs.map((run) => [{ run: run.number }, `${t("run")} ${run.number}`]), ...Object.keys(this.bench.sizes).filter((id) => id !== camera && this.bench.sizes[id].join() === size.join()).map((id) => [{ other: id }, `${t("camera")} ${id}`])];
+    const others = make("select", { "aria-label": t("difference to"), onchange: () => { this.against = choices[others.selectedIndex - 1]?.[0]; this.follow(); } },
+      make("option", {}, "–"), ...choices.map(([what, text]) => make("option", { selected: JSON.stringify(what) === JSON.stringify(this.against) }, text)));
     const said = make("p", { class: "warn" });
-    for (const [what, title] of [["distortion", t("Distortion: what the lens moves")], ["uncertainty", t("Uncertainty of projection (one sigma)")], ["difference", t("Difference of two lens results, implied rotation fitted")]]) {
-      const ask = new URLSearchParams({ ...(this.distance ? { distance: this.distance } : {}), ...(what === "difference" && this.against ? { run: this.against } : {}) });
-      get(`camera/${encodeURIComponent(camera)}/${what}?${ask}`).then((grid) => plots.append(heat(grid.text ? `${title}: ${grid.text}` : title, { size, ...grid })), (error) => { if (what !== "difference" || this.against) said.textContent = error.message; });
-    }
+    const asked = this.distance ? `distance_m=${encodeURIComponent(this.distance)}` : "";
+    const refused = (error) => { said.textContent = error.message; };
+    get(`camera/${encodeURIComponent(camera)}?${asked}`).then((found) => {
+      const { distortion: d, uncertainty: s } = found, body = s.station ?? s.camera;
+      const away = d.uv.map((uv, k) => [uv[0] - d.without[k][0], uv[1] - d.without[k][1]]);
+      plots.append(heat(t("Distortion: what the lens moves"), gridOf(size, d.uv, away.map((x) => Math.hypot(...x)), away)),
+        heat(s.station ? t("Uncertainty of projection (one sigma), camera on its station") : t("Uncertainty of projection (one sigma), camera by itself"), gridOf(size, s.uv, body.map((x, k) => (s.covered[k] ? x : null)))));
+      if (s.station) plots.append(heat(t("Uncertainty of projection (one sigma), camera by itself"), gridOf(size, s.uv, s.camera.map((x, k) => (s.covered[k] ? x : null)))));
+    }).catch(refused);
+    if (this.against) get(`camera/${encodeURIComponent(camera)}/difference?${new URLSearchParams(this.against)}&${asked}`).then((found) => {
+      plots.append(heat(`${t("Difference of two lens results, implied rotation fitted")}: ${significant(found.rotation_deg, 2)}°, ${significant(found.translation_mm, 2)} mm`, gridOf(size, found.uv, found.shift.map((x) => Math.hypot(...x)), found.shift)));
+    }).catch(refused);
     return [make("div", { class: "bar" }, choose, make("label", {}, t("distance, m"), " ", distance), make("label", {}, t("difference to"), " ", others)), plots, said];
   }
 }
@@ -73,7 +82,7 @@ export class TableAnglesView extends Asked {
 
 export class LoopsView extends Asked {
   async parts() {
-    const found = (await get("statistics/solution")).solution.loops, loops = found?.worst_first ?? [];
+    const found = (await get("loops")).loops, loops = found?.worst_first ?? [];
     if (!loops.length) return [make("p", { class: "quiet" }, t("No loops: the survey measures no pairs."))];
     const closing = (loop, unit) => (loop[`misclosure_${unit}`] === undefined ? "–" : `${significant(loop[`misclosure_${unit}`], 3)} ± ${significant(loop[`sigma_misclosure_${unit}`], 2)}`);
     const rows = loops.map((loop) => [make("span", { class: loop.closes ? "" : "bad" }, `${loop.closes ? "" : "■ "}${loop.stations.join(" → ")}`), closing(loop, "arcsec"), closing(loop, "mm"), significant(loop.test, 3), significant(loop.p_value, 2),
