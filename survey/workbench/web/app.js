@@ -172,6 +172,7 @@ function panes() {
 function drawPane(pane) {
   const name = panes()[PANES.indexOf(pane)];
   if (shown[pane]?.name === name) { shown[pane].view.follow(); return; }
+  drawTabs();
   const chooser = make("select", { "aria-label": t("view"), onchange: () => actions.show(chooser.value, pane) }, ...Object.entries(VIEWS).map(([id, [title]]) => make("option", { value: id, selected: id === name }, t(title))));
   shown[pane] = { name, view: VIEWS[name][1]() };
   by(pane).replaceChildren(make("div", { class: "chooser" }, chooser), shown[pane].view.element);
@@ -221,7 +222,7 @@ const TABLE_OF = { obs: "points", reading: "readings", param: "parameters" };
 
 function drawTable(fresh) {
   const wanted = TABLE_OF[current().kind];
-  if (wanted && wanted !== tableName && !fresh && followed !== current().ids[0]) { tableName = wanted; table = null; }
+  if (wanted && wanted !== tableName && followed !== current().ids[0]) { tableName = wanted; table = null; }
   followed = current().ids[0];
   if (!table) {
     const data = tableData();
@@ -311,7 +312,7 @@ function drawDoing() {
 
 function drawTabs() {
   by("tabs").setAttribute("aria-label", t("Parts of the page"));
-  by("tabs").replaceChildren(...REGIONS.map(([id, title]) => make("button", { type: "button", "aria-current": document.body.dataset.pane === id ? "page" : null, onclick: () => focus(id) }, t(title))));
+  by("tabs").replaceChildren(...REGIONS.map(([id, title]) => make("button", { type: "button", "aria-current": document.body.dataset.pane === id ? "page" : null, onclick: () => focus(id) }, t(PANES.includes(id) ? VIEWS[panes()[PANES.indexOf(id)]][0] : title))));
 }
 
 async function changeLanguage() {

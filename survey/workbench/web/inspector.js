@@ -1,7 +1,7 @@
 // What is known of the thing that is chosen, and what may be done with it.
 
 import { button, by, fill, link, make, plainTable } from "./dom.js";
-import { count, known, number, significant, t } from "./words.js";
+import { count, known, measure, number, significant, t } from "./words.js";
 import { anchor, current, names } from "./store.js";
 import { pointId, pointName, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./source.js";
 
@@ -51,7 +51,7 @@ function sums(data, rows) {
 function parameters(bench, ...starts) {
   const rows = bench.parameters.filter((p) => starts.some((start) => p.name === start || p.name.startsWith(`${start}/`)));
   if (!rows.length) return [];
-  return [make("h3", {}, t("Parameters")), plainTable(t("Parameters"), [t("parameter"), t("value"), t("sigma")], rows.slice(0, MOST).map((p) => [link(anchor("param", p.name), p.name.split("/").slice(2).join("/") || p.name), `${significant(p.value, 7)} ${p.unit ?? ""}`, p.sigma === null ? known(p.treatment ?? "") || "–" : significant(p.sigma, 2)]), [1, 2])];
+  return [make("h3", {}, t("Parameters")), plainTable(t("Parameters"), [t("parameter"), t("value"), t("sigma")], rows.slice(0, MOST).map((p) => [link(anchor("param", p.name), p.name.split("/").slice(2).join("/") || p.name), measure(p.value, p.unit), p.sigma === null ? known(p.treatment ?? "") || "–" : significant(p.sigma, 2)]), [1, 2])];
 }
 
 /** Every observation of one point, worst first. */
@@ -86,7 +86,7 @@ const ABOUT = {
     const rows = bench.readings.filter((row) => row.id === id);
     if (!rows.length) return [make("p", { class: "warn" }, t("There is no such observation in this solution."))];
     return [facts([[t("sort of reading"), known(rows[0].table.replaceAll("_", " "))], [t("group"), link(anchor("group", rows[0].group), known(rows[0].group))], [t("joins"), (rows[0].joins ?? []).join(", ") || undefined], [t("state"), t(WHY[rows[0].why ?? 0])]]),
-      ...rows.map((row) => facts([[row.component || t("component"), ""], [t("observed"), `${significant(row.observed, 8)} ${row.unit ?? ""}`], [t("adjusted"), `${significant(row.adjusted, 8)} ${row.unit ?? ""}`], [t("residual"), `${significant(row.residual, 3)} ${row.sigma_unit ?? ""}`], [t("sigma"), `${significant(row.sigma, 3)} ${row.sigma_unit ?? ""}`], ["w", number(row.w, 2)], [t("redundancy"), number(row.redundancy, 3)]]))];
+      ...rows.map((row) => facts([[row.component || t("component"), ""], [t("observed"), measure(row.observed, row.unit, 8)], [t("adjusted"), measure(row.adjusted, row.unit, 8)], [t("residual"), measure(row.residual, row.sigma_unit, 3)], [t("sigma"), measure(row.sigma, row.sigma_unit, 3)], ["w", number(row.w, 2)], [t("redundancy"), number(row.redundancy, 3)]]))];
   },
   param(bench, id, actions) {
     const row = bench.parameters.find((p) => p.name === id);
@@ -94,7 +94,7 @@ const ABOUT = {
     // a component of a lens or turntable by itself, poses and points as a whole, those of single epochs in survey.toml
     const single = /^(lens|table_geometry)\//.test(id), name = single ? id : row.owner, to = row.treatment === "free" ? "held" : "free";
     const acts = bench.state.read_only || (!single && name.split("/").length !== 2) ? [] : [button(t(`make ${to}`), () => actions.setting({ parameter: name, treatment: to }))];
-    return [facts([[t("value"), `${significant(row.value, 9)} ${row.unit ?? ""}`], [t("sigma"), row.sigma === null ? "–" : `${significant(row.sigma, 3)} ${row.sigma_unit ?? row.unit ?? ""}`], [t("treatment"), row.treatment && known(row.treatment)]]), make("div", { class: "actions" }, ...acts)];
+    return [facts([[t("value"), measure(row.value, row.unit, 9)], [t("sigma"), measure(row.sigma, row.sigma_unit, 3)], [t("treatment"), row.treatment && known(row.treatment)]]), make("div", { class: "actions" }, ...acts)];
   },
   group(bench, id, actions) {
     const group = (bench.findings.groups ?? []).find((g) => g.id === id);

@@ -107,7 +107,7 @@ export function residualField(points, camera, size) {
   const arrows = [...n.keys()].filter((k) => n[k] >= 3).map((k) => [...centre(k), sums[0][k] / n[k], sums[1][k] / n[k]]);
   return {
     field: { size, columns, rows, unit: "px", low: 0, values: [...n].map((m, k) => (m ? Math.sqrt(sums[2][k] / (2 * m)) : null)), arrows },
-    coverage: { size, columns, rows, unit: t("points"), low: 0, values: [...n], arrows: undefined },
+    coverage: { size, columns, rows, unit: t("points"), low: 0, values: [...n].map((m) => m || null), arrows: undefined },
   };
 }
 

@@ -50,6 +50,9 @@ export function significant(value, digits = 4) {
   return number(value, Math.max(0, decimals));
 }
 
+/** A value with its unit, a dash alone for none. @param {number|null|undefined} value @param {string} [unit] */
+export const measure = (value, unit = "", digits = 7) => (Number.isFinite(value) ? `${significant(value, digits)} ${unit}`.trim() : "–");
+
 /** A time as people read it. @param {string} iso */
 export function time(iso) {
   const date = new Date(iso);
