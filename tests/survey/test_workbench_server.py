@@ -108,7 +108,7 @@ def test_bodies_that_are_too_long_or_no_sense(mine):
 
         assert client.post("/api/exclusions", content=pieces(), headers=HERE | kind).status_code == 413
         for body in (b"{", b"[]", b'{"changes": 3}', b'{"changes": [{"what": "image", "id": "x"}]}', b"[" * 100_000,
-                     b'{"base": "1", "changes": [{"what": "image", "id": "x", "excluded": true}]}', b"\xff"):  # fmt: skip
+                     b'{"base": "1", "changes": [{"name": "x", "excluded": true}]}', b"\xff"):  # fmt: skip
             assert client.post("/api/exclusions", content=body, headers=HERE | kind).status_code == 400, body[:60]
         answer = post(client, "/api/exclusions", exclude("image:../../etc/passwd", 1))
         assert answer.status_code == 409
