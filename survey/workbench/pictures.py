@@ -5,12 +5,13 @@ import os
 import stat
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from adjust.model.errors import SurveyError
-from survey.detection.gray import gray_values, read_image
+from survey.detection.gray import Gray8, Gray32, gray_values, read_image
 from survey.project.detected import DetectedImage
 
 _QUALITY = 85
@@ -26,7 +27,7 @@ def picture(images: Mapping[tuple[str, str], Path], key: tuple[str, str], size: 
     if not stat.S_ISREG(os.lstat(path).st_mode):
         raise SurveyError(f"{path}: is a link or no file; put the image itself into the project")
     stored = read_image(path)
-    image = stored if stored.dtype == np.uint8 else _in_8_bit(gray_values(stored))
+    image: Any = stored if stored.dtype == np.uint8 else _in_8_bit(gray_values(stored))
     if size is None:
         return _encoded(path, ".png", image, []), "image/png"
     factor = min(1.0, min(size, _LARGEST_SIDE) / max(image.shape[:2]))
@@ -35,12 +36,12 @@ def picture(images: Mapping[tuple[str, str], Path], key: tuple[str, str], size: 
     return _encoded(path, ".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]), "image/jpeg"
 
 
-def _in_8_bit(image: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+def _in_8_bit(image: Gray32) -> Gray8:
     low, high = float(image.min()), float(image.max())
     return np.asarray(np.clip((image - low) * (255.0 / max(high - low, 1e-9)), 0, 255), dtype=np.uint8)
 
 
-def _encoded(path: Path, ending: str, image: np.ndarray, how: list[int]) -> bytes:  # type: ignore[type-arg]
+def _encoded(path: Path, ending: str, image: Any, how: list[int]) -> bytes:
     done, data = cv2.imencode(ending, image, how)
     if not done:
         raise SurveyError(f"{path}: cannot be shown; export it again as PNG")

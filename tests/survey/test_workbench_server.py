@@ -20,6 +20,7 @@ from tests.survey.test_workbench import exclusions, wrong_point
 
 TOKEN = "secret-token-of-this-test"
 HERE = {"X-Token": TOKEN}
+LIVE = "ws://127.0.0.1:8790/live"
 
 
 @pytest.fixture
@@ -54,7 +55,7 @@ def test_refused_is_what_does_not_come_from_here(mine):
         wanted = exclude("camera:right", 1)
         assert client.get("/api/state").status_code == 403
         assert client.get("/api/state", headers={"X-Token": "x" * len(TOKEN)}).status_code == 403
-        assert client.get("/api/state", headers={"X-Token": "ä"}).status_code == 403
+        assert client.get("/api/state", headers={"X-Token": "ä".encode()}).status_code == 403
         assert client.get("/api/state", headers=HERE | {"Host": "evil.example"}).status_code == 403
         assert client.get("/api/state", headers=HERE | {"Host": "127.0.0.1.evil.example"}).status_code == 403
         assert client.get("/api/state", headers=HERE | {"Origin": "http://evil.example"}).status_code == 403
@@ -107,7 +108,7 @@ def test_bodies_that_are_too_long_or_no_sense(mine):
 
         assert client.post("/api/exclusions", content=pieces(), headers=HERE | kind).status_code == 413
         for body in (b"{", b"[]", b'{"changes": 3}', b'{"changes": [{"what": "image", "id": "x"}]}', b"[" * 100_000,
-                     b'{"base": "1", "changes": [{"what": "image", "id": "x", "excluded": true}]}', b"\xff"):  # fmt: skip
+                     b'{"base": "1", "changes": [{"name": "x", "excluded": true}]}', b"\xff"):  # fmt: skip
             assert client.post("/api/exclusions", content=body, headers=HERE | kind).status_code == 400, body[:60]
         answer = post(client, "/api/exclusions", exclude("image:../../etc/passwd", 1))
         assert answer.status_code == 409
@@ -124,11 +125,13 @@ def test_read_only_is_get_only(mine):
 
 def test_the_socket_needs_origin_and_token(mine):
     with page(mine) as client:
-        for headers in ({}, {"Origin": "http://127.0.0.1:8790"}, HERE, HERE | {"Origin": "http://evil.example"}):
-            with pytest.raises(WebSocketDisconnect), client.websocket_connect("/live", headers=headers):
+        for headers in ({}, {"Origin": "http://127.0.0.1:8790"}, HERE, HERE | {"Origin": "http://evil.example"},
+                        {"Cookie": f"labsurvey={TOKEN}"},
+                        {"Cookie": f"labsurvey={TOKEN}", "Origin": "http://evil.example"}):  # fmt: skip
+            with pytest.raises(WebSocketDisconnect), client.websocket_connect(LIVE, headers=headers):
                 pass
-        client.get("/api/state", headers=HERE)  # gives the cookie
-        with client.websocket_connect("/live", headers={"Origin": "http://127.0.0.1:8790"}) as socket:
+        known = {"Origin": "http://127.0.0.1:8790", "Cookie": f"labsurvey={TOKEN}"}
+        with client.websocket_connect(LIVE, headers=known) as socket:
             assert post(client, "/api/adjust", {"mode": "cold"}).status_code == 200
             kinds = []
             while "state" not in kinds:
@@ -225,7 +228,8 @@ def test_it_ends_with_pages_still_open(mine):
         with urlopen(Request(f"{listening.address}api/state", headers=HERE), timeout=20) as answer:
             assert json.load(answer)["version"] == 1
         origin = listening.address.rstrip("/")
-        socket = connect(f"{origin.replace('http', 'ws')}/live", origin=origin, additional_headers={"Cookie": f"c={TOKEN}"})
+        known = {"Cookie": f"c={TOKEN}"}
+        socket = connect(f"{origin.replace('http', 'ws')}/live", origin=origin, additional_headers=known)
     assert not any(t.is_alive() and "uvicorn" in t.name for t in threading.enumerate())
     with socket:
         assert list(socket) == []  # closed by the server

@@ -14,6 +14,8 @@ from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
 from adjust.model.result import Estimate
 from adjust.model.survey import Survey
+from survey.folder.units import from_si
+from survey.project.declared.owners import GEOMETRY_UNITS, geometry_key
 from survey.project.declared.poses import quaternion_wxyz
 
 _OF_POSE = ("rotation_euler_xyz_deg", "held", "sigma_rotation_arcsec", "sigma_translation_mm", "covariance")
@@ -62,7 +64,7 @@ def with_treatment(text: str, survey: Survey, estimates: Mapping[Any, Estimate],
     if kind in ("lens", "table_geometry"):
         _of_vector(document, estimate, component, treatment, survey)
     elif component:
-        raise SurveyError(f"{name}: poses of single epochs, and components of a pose or point, are edited in survey.toml")
+        raise SurveyError(f"{name}: single epochs, and components of a pose or point, are edited in survey.toml")
     elif kind == "point":
         entry = _table(document, "points", owner)
         entry["treatment"] = treatment
@@ -76,17 +78,23 @@ def with_treatment(text: str, survey: Survey, estimates: Mapping[Any, Estimate],
 
 def _of_vector(document: Any, estimate: Estimate, component: str, treatment: str, survey: Survey) -> None:
     kind, owner = estimate.name[:2]
-    entry = _table(document, "cameras", owner, "lens") if kind == "lens" else _table(document, "tables", owner, "geometry")
-    names = estimate.components
+    place = ("cameras", owner, "lens") if kind == "lens" else ("tables", owner, "geometry")
+    entry, names = _table(document, *place), estimate.components
+    declared = {**{("lens", c.camera_id): c.lens.free for c in survey.cameras},
+                **{("table_geometry", t.table_id): t.geometry.free for t in survey.tables}}  # fmt: skip
     wanted = (component,) if component else names
     if component and component not in names:
         raise SurveyError(f"{'/'.join(estimate.name)}: has no {component!r}; its components are {', '.join(names)}")
-    before = set(entry.get("free", ()))
+    before = set(declared[kind, owner])
     after = before | set(wanted) if treatment == "free" else before - set(wanted)
     entry["free"] = [n for n in names if n in after]
-    if kind != "lens" or treatment == "free":
+    if treatment == "free":
         return
     values = dict(zip(names, np.asarray(estimate.value, dtype=float).tolist(), strict=True))
+    if kind == "table_geometry":
+        for key in wanted:
+            entry[geometry_key(key)] = float(from_si(values[key], GEOMETRY_UNITS[key]))
+        return
     known = _table(entry, "values")
     for key in values if not known else wanted:
         known[key] = values[key]
