@@ -19,7 +19,6 @@ CHROMIUM = "/usr/bin/chromium"
 PICTURES = {  # name: place, width, colours
     "workbench": ("", 1280, "light"),
     "workbench-scene": ("point=B07&view=camera,scene", 1280, "dark"),
-    "workbench-plan": ("image=R1/cR101&view=angles,plan", 1280, "light"),
     "workbench-phone": ("view=findings,image", 390, "dark"),
 }
 

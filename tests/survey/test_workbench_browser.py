@@ -285,3 +285,12 @@ def test_columns_as_the_page_reads_them(page: Page, folder: Path) -> None:
     )
     u = np.concatenate([b.uv for b in bench.rows.survey.image_blocks])[1234, 0]
     assert found == [5544, bench.rows.id_of(1234), float(np.float32(u)), 63, 88]
+
+
+def test_what_others_write_is_told_and_loaded(page: Page, folder: Path) -> None:
+    p = page.page
+    toml = folder / "survey.toml"
+    toml.write_text(toml.read_text().replace('title = "', 'title = "again '))
+    page.wait("document.querySelector('#message').textContent.includes('survey.toml')")
+    page.done(lambda: p.locator("#message button").click())
+    assert p.inner_text("#title").startswith("again ")

@@ -12,7 +12,7 @@ const MOST = 40;
 export function chosenNames() {
   const { kind, ids } = current();
   if (kind === "obs") return ids;
-  return ["image", "epoch", "camera", "target", "point", "reading", "group"].includes(kind) ? ids.map((id) => `${kind}:${id}`) : [];
+  return ["image", "epoch", "camera", "target", "point", "reading"].includes(kind) ? ids.map((id) => `${kind}:${id}`) : [];
 }
 
 /** @param {any} bench @param {any} actions */

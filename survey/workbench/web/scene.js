@@ -94,7 +94,7 @@ export class SceneView {
   projection(width, height) {
     const { middle, reach } = this, cx = width / 2 + this.dx, cy = height / 2 + this.dy;
     if (this.mode !== "scene") {
-      const [a, b] = FLAT[this.mode], scale = 0.9 * this.zoom * Math.min(width / Math.max(1e-3, this.high[a] - this.low[a]), height / Math.max(1e-3, this.high[b] - this.low[b]));
+      const [a, b] = FLAT[this.mode], scale = 0.8 * this.zoom * Math.min(width / Math.max(1e-3, this.high[a] - this.low[a]), height / Math.max(1e-3, this.high[b] - this.low[b]));
       this.scale = scale;
       return (x) => [cx + scale * (x[a] - middle[a]), cy - scale * (x[b] - middle[b])];
     }
