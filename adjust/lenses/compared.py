@@ -103,7 +103,7 @@ def _derivatives(optics: Optics, points: FloatArray, uv: FloatArray) -> tuple[Fl
         ahead, behind = (lens_derivatives(optics.model, optics.values, optics.constants, points, uv + s * step)[0]
                          for s in (1.0, -1.0))  # fmt: skip
         by_uv[:, :, k] = (ahead - behind) / 2e-3
-    return -np.linalg.solve(by_uv, by_lens), -np.linalg.solve(by_uv, by_point)
+    return np.asarray(-np.linalg.solve(by_uv, by_lens)), np.asarray(-np.linalg.solve(by_uv, by_point))
 
 
 def _by_motion(by_point: FloatArray, points: FloatArray) -> FloatArray:
@@ -144,4 +144,4 @@ def projection_covariance(
 
 def worst_sigma(cov: FloatArray) -> FloatArray:
     """Sigmas (n,) px in the worst direction of covariances (n, 2, 2)."""
-    return np.sqrt(np.clip(np.linalg.eigvalsh(cov)[:, -1], 0.0, None))
+    return np.asarray(np.sqrt(np.clip(np.linalg.eigvalsh(cov)[:, -1], 0.0, None)))

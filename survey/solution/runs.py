@@ -11,6 +11,7 @@ import io
 import json
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -70,12 +71,12 @@ def record_run(
     folder: Path, place: Path, adjustment: Adjustment, run: RunInfo, solution: Mapping[str, Any], author: str
 ) -> tuple[str, ...]:
     """Keep a run: its files made in ``place`` while ``folder`` is being changed; old files that are to go then."""
-    runs = list_runs(folder)
+    runs, there = _readable(folder), [int(path.parent.name) for path in _places(folder)]
     of = [dict(run.input_hashes), plain(run.options), dict(run.versions), sorted(solution)]
     fingerprint = hashlib.sha256(json.dumps(of, sort_keys=True, allow_nan=False).encode()).hexdigest()
     if runs and runs[-1].fingerprint == fingerprint:
         return ()
-    number = runs[-1].number + 1 if runs else 1
+    number = max(there, default=0) + 1
     said = Run(number, run.date, author, run.command, False, snapshot(adjustment).summary, dict(run.input_hashes),
                tuple(one.exclusion for one in run.left_out), fingerprint)  # fmt: skip
     into = place / RUNS / f"{number:04d}"
@@ -90,8 +91,21 @@ def record_run(
 
 def list_runs(folder: Path) -> tuple[Run, ...]:
     """All runs of a project in their order. Raises SurveyError for one that is not as it was written."""
-    found = sorted((folder / RUNS).glob("*/" + _RUN)) if (folder / RUNS).is_dir() else []
-    return tuple(_read(path) for path in found if re.fullmatch(r"\d{4,9}", path.parent.name))
+    return tuple(_read(path) for path in _places(folder))
+
+
+def _places(folder: Path) -> list[Path]:
+    found = [p for p in (folder / RUNS).glob(f"*/{_RUN}") if re.fullmatch(r"\d{4,9}", p.parent.name)]
+    return sorted(found, key=lambda path: int(path.parent.name))
+
+
+def _readable(folder: Path) -> list[Run]:
+    """Runs that are as they were written: a damaged one must not keep anybody from adjusting."""
+    out = []
+    for path in _places(folder):
+        with suppress(SurveyError):
+            out.append(_read(path))
+    return out
 
 
 def find_run(folder: Path, number: int) -> Run:

@@ -189,7 +189,7 @@ def _component(o: ObservationResidual, k: int, limit: float) -> dict[str, Any]:
               "residual": o.residual[k] * sigma_factor, "sigma": o.sigma[k] * sigma_factor,
               "redundancy": o.redundancy[k], "w": o.standardized[k],
               "share": abs(o.standardized[k]) / limit}  # fmt: skip
-    return {"component": o.components[k], "unit": unit, "sigma_unit": sigma_unit, "kind": o.kind} | plain(values)
+    return {"component": o.components[k], "unit": unit, "sigma_unit": sigma_unit, "kind": o.kind, **plain(values)}
 
 
 def _joins(item: Any) -> list[str]:

@@ -436,7 +436,7 @@ class _Body:
         value = self._values.get(key)
         if type(value) not in (int, float):
             raise _BodyError(f"{key}: expected a number")
-        return float(value)
+        return float(str(value))
 
     def names(self, key: str) -> list[str]:
         value = self._values.get(key, [])

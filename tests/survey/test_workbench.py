@@ -353,3 +353,15 @@ def test_a_pose_held_where_it_was_adjusted_gives_the_same(bench, mine):
     assert bench.adjustment.omega == pytest.approx(first.omega, rel=1e-6)
     bench.set_treatment("station_from_camera/right", "free")
     assert same(first, bench.adjustment) < 1e-4
+
+
+def test_a_damaged_run_stops_nobody(bench, mine, capsys):
+    bench.save()
+    n = list_runs(mine)[-1].number
+    (mine / f"runs/{n:04d}/run.json").write_text("{")
+    bench.exclude("camera:right", reason="x")
+    bench.save()
+    assert main(["runs", str(mine)]) == 1
+    assert "remove its folder" in capsys.readouterr().err
+    shutil.rmtree(mine / f"runs/{n:04d}")
+    assert list_runs(mine)[-1].number == n + 1
