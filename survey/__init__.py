@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from survey.notebook.solution import Solution
     from survey.notebook.steps import Problem, adjust, detect, exclude, include, problem, read, solve
     from survey.project import Project, write_project
+    from survey.workbench.session import Workbench
 
 _PLACES = {
     "Batch": "survey.notebook.batch",
@@ -35,6 +36,7 @@ _PLACES = {
     "Project": "survey.project",
     "Solution": "survey.notebook.solution",
     "SurveyError": "adjust.model.errors",
+    "Workbench": "survey.workbench.session",
     "adjust": "survey.notebook.steps",
     "adjust_many": "survey.notebook.batch",
     "detect": "survey.notebook.steps",
@@ -57,6 +59,7 @@ __all__ = [
     "Project",
     "Solution",
     "SurveyError",
+    "Workbench",
     "adjust",
     "adjust_many",
     "detect",

@@ -20,10 +20,12 @@ from survey.commands.examples import declare_example
 from survey.commands.excluding import declare_exclude, declare_include
 from survey.commands.navigating import declare_navigate
 from survey.commands.networks import declare_add, declare_remove, declare_trackers
+from survey.commands.opening import declare_open
 from survey.commands.pairing import declare_pairs
 from survey.commands.parser import Parser, name_commands
 from survey.commands.planning import declare_plan
 from survey.commands.reporting import declare_report
+from survey.commands.running import declare_runs
 from survey.commands.schema import declare_schema
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "TEST_FAILED", "USAGE", "build_parser", "main"]
@@ -42,6 +44,7 @@ Exit codes: 0 done, 1 error in the project, 2 wrong usage, 3 solved, but somethi
 """
 _COMMANDS = (
     declare_adjust,
+    declare_open,
     declare_detect,
     declare_report,
     declare_plan,
@@ -49,6 +52,7 @@ _COMMANDS = (
     declare_remove,
     declare_exclude,
     declare_include,
+    declare_runs,
     declare_convert,
     declare_pairs,
     declare_trackers,

@@ -24,7 +24,8 @@ import numpy as np
 
 from capture.devices.turntables.simulated_axis import AxisPhysics, SimulatedAxis
 from survey.commands.common import not_negative, positive, run_command
-from survey.commands.parser import Parser, port, port_error
+from survey.commands.parser import Parser, port
+from survey.workbench.guard import port_error
 
 _PROGRAM = "python -m capture.simulated.controller"
 _TRUTH_S = 0.005

@@ -4,9 +4,7 @@ A page of another site that the same browser shows must not reach it: the Host h
 rebinding would do), commands need a token that only the printed address holds, and no other origin is accepted.
 """
 
-import ipaddress
 import json
-import secrets
 import signal
 import socket
 import sys
@@ -21,45 +19,16 @@ from urllib.parse import unquote, urlsplit
 from adjust.model.errors import SurveyError
 from capture.plan.plan import read_plan
 from capture.web.state import FolderView, LiveView, View, png_with_overlay
-from survey.commands.parser import port_error
+from survey.workbench import guard
 
 _FILES = {
     "/": ("page.html", "text/html"),
     "/style.css": ("style.css", "text/css"),
     "/app.js": ("app.js", "text/javascript"),
 }
-_HEADERS = {
-    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
-}
+_HEADERS = {**guard.HEADERS, "Cache-Control": "no-store"}
 _LONGEST_BODY = 4096
 _ENDINGS = {signal.SIGINT, signal.SIGTERM}
-
-
-def _is_this_machine(host: str) -> bool:
-    """Whether the name in a Host header, whatever the port, is this machine's own: no name that others can give."""
-    try:
-        name = urlsplit(f"//{host}").hostname or ""
-        return name == "localhost" or ipaddress.ip_address(name).is_loopback
-    except ValueError:
-        return False
-
-
-def loopback_address(host: str) -> str:
-    """The address to listen on; raises SurveyError for anything that others could reach."""
-    text = "127.0.0.1" if host == "localhost" else host
-    try:
-        address = ipaddress.ip_address(text)
-    except ValueError as error:
-        raise SurveyError(f"--host {host!r}: not an address; the page is served on 127.0.0.1 or ::1") from error
-    if not address.is_loopback:
-        raise SurveyError(
-            f"--host {host}: others could reach the laboratory there; the page is served on loopback only, so from "
-            "another machine go through: ssh -L 8780:127.0.0.1:8780 THIS_MACHINE"
-        )
-    return text
 
 
 class PageServer(ThreadingHTTPServer):
@@ -69,13 +38,13 @@ class PageServer(ThreadingHTTPServer):
 
     def __init__(self, view: View, host: str = "127.0.0.1", port: int = 0, token: str | None = None) -> None:
         self.view, self.token = view, token
-        address = loopback_address(host)
+        address = guard.loopback_address(host)
         if ":" in address:
             self.address_family = socket.AF_INET6
         try:
             super().__init__((address, port), _Handler)
         except OSError as error:
-            raise port_error(port, error) from error
+            raise guard.port_error(port, error) from error
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A browser that leaves in the middle of an answer is no error of ours."""
@@ -147,10 +116,9 @@ class _Handler(BaseHTTPRequestHandler):
 
         The port is what the browser was told: behind a forwarded one it is not ours.
         """
-        host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
-        if _is_this_machine(host) and (origin is None or origin.partition("://")[2] == host):
+        if guard.is_from_here(self.headers.get("Host", ""), self.headers.get("Origin")):
             return True
-        self._refuse(HTTPStatus.FORBIDDEN, "this page is for this machine only")
+        self._refuse(HTTPStatus.FORBIDDEN, guard.NOT_FROM_HERE)
         return False
 
     def _may_move(self) -> bool:
@@ -158,8 +126,8 @@ class _Handler(BaseHTTPRequestHandler):
         if token is None:
             self._refuse(HTTPStatus.FORBIDDEN, "read-only; start it with --live --allow-move to turn the table")
             return False
-        if not secrets.compare_digest(self.headers.get("X-Token", "").encode(), token.encode()):
-            self._refuse(HTTPStatus.FORBIDDEN, "the token is missing or wrong; use the address that was printed")
+        if not guard.is_token(self.headers.get("X-Token", ""), token):
+            self._refuse(HTTPStatus.FORBIDDEN, guard.WRONG_TOKEN)
             return False
         return True
 
@@ -183,10 +151,10 @@ def serve(
 ) -> int:
     """Serve until Ctrl-C; the exit code. Raises SurveyError."""
     plan = read_plan(path)
-    loopback_address(host)
+    guard.loopback_address(host)
     if allow_move and not live:
         raise SurveyError("--allow-move needs --live: while a session runs, the session alone moves the table")
-    token = secrets.token_urlsafe(16) if allow_move else None
+    token = guard.new_token() if allow_move else None
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDINGS)  # in all threads from here on: this one waits for them
     try:
         view: View = LiveView(plan, allow_move) if live else FolderView(plan)

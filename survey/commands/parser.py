@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from adjust.model.errors import SurveyError
-
 _CHOICE = re.compile(
     r"argument (?P<what>.+?): invalid choice: '?(?P<found>.*?)'? \(choose from (?P<known>.*)\)", re.DOTALL
 )
@@ -84,8 +82,3 @@ def port(text: str) -> int:
     if not 0 <= value <= 65535:
         raise argparse.ArgumentTypeError(f"found {text!r}; expected a port, 1 to 65535, or 0 for one that is free")
     return value
-
-
-def port_error(number: int, error: OSError) -> SurveyError:
-    """What to say where a port cannot be listened on."""
-    return SurveyError(f"port {number} cannot be used ({error.strerror}); name another with --port, 0 takes a free one")

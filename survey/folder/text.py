@@ -102,6 +102,11 @@ def read_bytes(path: Path, largest: int = LARGEST_FILE) -> tuple[bytes, str]:
         data = path.read_bytes()
     except OSError as error:
         raise SurveyError(f"{path}: cannot be read ({error.strerror}); check the name and the permissions") from error
+    return with_digest(data)
+
+
+def with_digest(data: bytes) -> tuple[bytes, str]:
+    """Bytes and their sha256."""
     return data, hashlib.sha256(data).hexdigest()
 
 

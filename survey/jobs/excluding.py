@@ -82,7 +82,7 @@ def include_job(folder: Path, names: Sequence[str], reason: str = "", author: st
     folder = Path(folder)
     with changing(folder, inputs=True) as place:
         project = read_all(folder)
-        rows = [Row(False, _said(project, found, reason, author)) for found in _in_force(project, names)]
+        rows = included_rows(project, names, reason, author)
         _add(folder, place, rows)
     return _outcome(folder, project, rows, False)
 
@@ -131,6 +131,11 @@ def new_rows(project: Project, names: Sequence[str], reason: str, author: str = 
             raise SurveyError(f"{place}: {name} is left out already, by {by}; name only what is not")
         rows[name] = Row(True, _said(project, name, reason, author, observed.place_of(name)))
     return list(rows.values())
+
+
+def included_rows(project: Project, names: Sequence[str], reason: str = "", author: str = "") -> list[Row]:
+    """Rows that take ``names`` back, of a project as it is without exclusions. Raises as :func:`include_job`."""
+    return [Row(False, _said(project, found, reason, author)) for found in _in_force(project, names)]
 
 
 def _in_force(project: Project, names: Sequence[str]) -> list[Name]:

@@ -107,10 +107,13 @@ def read(folder: Path) -> Project:
     return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
 
 
-def read_all(folder: Path) -> Project:
-    """:func:`read`, with what is excluded as if it were not."""
+def read_all(folder: Path, definition_text: str | None = None) -> Project:
+    """:func:`read`, with what is excluded as if it were not.
+
+    definition_text: what is to stand in survey.toml, not yet written.
+    """
     with settled(Path(folder)):
-        definition, root = _read_definition(Path(folder))
+        definition, root = _read_definition(Path(folder), definition_text)
         place = definition.folder / OBSERVATIONS_FOLDER
         tables = _read_tables(place)
         _, digest = read_exclusions(place)
@@ -222,11 +225,11 @@ def _terrestrial_and_geometric(tables: dict[str, Table], names: Names, sigmas: S
     return found
 
 
-def _read_definition(folder: Path) -> tuple[Definition, Node]:
+def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition, Node]:
     path = folder / DEFINITION_FILE
     if not path.is_file():
         raise SurveyError(f"{path}: there is no such file; a project folder holds a {DEFINITION_FILE}")
-    root, digest = read_toml(path)
+    root, digest = read_toml(path, text)
     _check_format(root)
     root.allow(*keys_of("root"))
     inputs = {DEFINITION_FILE: digest}

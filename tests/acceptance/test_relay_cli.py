@@ -224,7 +224,7 @@ def test_what_was_added_equals_adjusting_everything_at_once(lab, tmp_path, capsy
     assert main(["add", str(lab), str(lab / "more"), "--quiet"]) == 0
     assert "added: stations E1, E2, E3; pairs 6\nredundancy 180 -> 198" in capsys.readouterr().out
     _compare(_solution(lab), grown)
-    assert {p.name for p in lab.iterdir()} == {"survey.toml", "observations", "results", "more", "truth.json"}
+    assert {p.name for p in lab.iterdir()} == {"survey.toml", "observations", "results", "runs", "more", "truth.json"}
     assert (lab / "survey.toml").read_text().startswith(before["survey.toml"].decode())
     assert len(_rows(lab)) == 65
 

@@ -16,8 +16,9 @@ from capture.cli import main
 from capture.plan.plan import read_plan
 from capture.session.run import run_plan
 from capture.simulated import controller
-from capture.web.serve import PageServer, loopback_address
+from capture.web.serve import PageServer
 from capture.web.state import FolderView, LiveView, Shown, png_with_overlay
+from survey.workbench.guard import loopback_address
 from tests.capture.session_runs import write_plan
 from tests.capture.table_server import table_server
 

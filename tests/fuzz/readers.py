@@ -187,6 +187,22 @@ def _results(which: str) -> Callable[[Path], Read]:
     return prepare
 
 
+def _run(which: str) -> Callable[[Path], Read]:
+    def prepare(folder: Path) -> Read:
+        from survey.solution.runs import definition_of, list_runs, load_run
+
+        put(folder, adjusted())
+        path = folder / "runs/0001" / which
+
+        def run(data: bytes) -> object:
+            path.write_bytes(data)
+            return list_runs(folder), definition_of(folder, 1), load_run(folder, 1)
+
+        return run
+
+    return prepare
+
+
 def _npz() -> list[bytes]:
     """Compressed as written, and stored: a flipped byte of a compressed one mostly fails its checksum alone."""
     with np.load(io.BytesIO(adjusted()["results/covariance.npz"])) as found:
@@ -318,6 +334,8 @@ READERS: dict[str, Reader] = {
     "image": Reader(_images, _image, is_text=False),
     "solution": Reader(lambda: [adjusted()["results/solution.json"]], _results("solution.json")),
     "covariance": Reader(_npz, _results("covariance.npz"), is_text=False),
+    "run": Reader(lambda: [adjusted()["runs/0001/run.json"]], _run("run.json")),
+    "run-estimates": Reader(lambda: [adjusted()["runs/0001/estimates.npz"]], _run("estimates.npz"), is_text=False),
     "replaced-list": Reader(lambda: [b'{"survey.toml": true, "results": false, "observations/pairs.csv": true}'],
                             _recover, dictionary=[b"../victim", b"..", b".", b"images/../..", b"victim"]),
     "alignment-rounds": Reader(_alignment_rounds, in_file("alignment_rounds.csv", _rounds)),

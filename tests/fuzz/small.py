@@ -26,7 +26,8 @@ def adjusted() -> dict[str, bytes]:
         folder = Path(name) / "small"
         small_project(folder)
         adjust_job(folder, progress=False)
-        names = ("survey.toml", "observations/pairs.csv", "results/solution.json", "results/covariance.npz")
+        names = ("survey.toml", "observations/pairs.csv", "results/solution.json", "results/covariance.npz",
+                 "runs/0001/run.json", "runs/0001/estimates.npz", "runs/0001/survey.toml")  # fmt: skip
         return {name: (folder / name).read_bytes() for name in names}
 
 

@@ -100,7 +100,7 @@ def test_what_is_refused_leaves_the_folder_as_it_was(lab, ids, message, capsys):
     assert main(["remove", str(lab), *ids, "--quiet"]) == 1
     assert message in capsys.readouterr().err
     assert _state(lab) == before
-    assert sorted(p.name for p in lab.iterdir()) == ["observations", "results", "survey.toml"]
+    assert sorted(p.name for p in lab.iterdir()) == ["observations", "results", "runs", "survey.toml"]
 
 
 def test_undetermined_names_the_station(lab):

@@ -16,11 +16,12 @@ from typing import Any
 from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
 from survey.jobs.adjusting.steps import adjust_project
-from survey.jobs.detecting import detect_in, detect_job, remember_images
+from survey.jobs.detecting import author_name, detect_in, detect_job, remember_images
 from survey.project import Project, read
 from survey.project.project import RESULTS
 from survey.report.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, solution_dict, summary_text
 from survey.solution.quantities import USUAL, scale_of
+from survey.solution.runs import record_run, remove_empty
 from survey.solution.statistics import Statistics, statistics_of
 
 _PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-headless")
@@ -109,8 +110,16 @@ def adjust_job(
             project = replace(project, detected=remember_images(folder, place))
         adjustment = adjust_project(project, progress, timed=clock.step)
         outcome = made(project, adjustment, place, clock, report, said, published=method == "published")
-        replace_parts(target)
+        gone = () if out is not None else kept_run(folder, place, project, outcome)
+        replace_parts(target, gone=gone)
+    remove_empty(target, gone)
     return outcome.at(target)
+
+
+def kept_run(folder: Path, place: Path, project: Project, outcome: AdjustOutcome) -> tuple[str, ...]:
+    """Keep what was adjusted among the runs of its project; the files of old runs that are to go."""
+    who = author_name(project.options.identification)
+    return record_run(folder, place, outcome.adjustment, outcome.run, outcome.solution, who)
 
 
 def command_line(command: str, folder: Path, *words: str | Path, **flags: Any) -> str:

@@ -94,7 +94,7 @@ def _spots_identified(work: Work) -> Work:
     if found.unidentified:
         notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
     survey = project.survey
-    return work.of(_seen_points(replace(survey, image_blocks=survey.image_blocks + found.blocks)), notes)
+    return work.of(seen_points(replace(survey, image_blocks=survey.image_blocks + found.blocks)), notes)
 
 
 def _unobserved_left_out(work: Work) -> Work:
@@ -137,11 +137,12 @@ def _untimed(_name: str) -> AbstractContextManager[None]:
 
 def adjust_project(
     project: Project, progress: bool, begin: Begin = lambda _: None,
-    timed: Callable[[str], AbstractContextManager[None]] = _untimed,
+    timed: Callable[[str], AbstractContextManager[None]] = _untimed, watch: Progress | None = None,
 ) -> Adjustment:  # fmt: skip
     """Adjust what was read. Raises SurveyError.
 
-    begin: start values of a survey, found where it gives None. timed: what each step is run in, by its name.
+    begin: start values of a survey, found where it gives None. timed: what each step is run in, by its name. watch:
+    called with (iteration, v'Pv); what it raises ends the adjustment.
     """
     others = (v for k, v in project.survey.others.items() if k != "table_readings")
     if not any((project.survey.image_blocks, project.spots, *others)):
@@ -151,9 +152,11 @@ def adjust_project(
         )
     with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
 
-        def told_bar(_iteration: int, omega: float) -> None:
+        def told_bar(iteration: int, omega: float) -> None:
             bar.set_postfix_str(f"v'Pv = {omega:.6g}")
             bar.update()
+            if watch is not None:
+                watch(iteration, omega)
 
         work = Work(project, begin, told_bar)
         for step in STEPS:
@@ -192,7 +195,7 @@ def image_warnings(images: Mapping[tuple[str, str], DetectedImage]) -> tuple[str
     )  # fmt: skip
 
 
-def _seen_points(survey: Survey) -> Survey:
+def seen_points(survey: Survey) -> Survey:
     """Leave out the beacons that nothing observes any more: a beacon may be hidden in all images."""
     observed: set[str | None] = {
         survey.points[int(i)].point_id for b in survey.image_blocks if b.target_id is None for i in b.point_idx

@@ -12,7 +12,7 @@ import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
-from survey.folder.text import LARGEST_NUMBER, choice_hint, decode, id_problem, read_bytes, suggestion
+from survey.folder.text import LARGEST_NUMBER, choice_hint, decode, id_problem, read_bytes, suggestion, with_digest
 from survey.folder.units import to_si
 from survey.project.declared.toml_text import KeyPath, key_lines
 
@@ -23,9 +23,9 @@ _LONGEST_INTEGER = 1000  # bits: all that a double can hold, and less than what 
 _KEY_PART = re.compile(r"[ \t]*([A-Za-z0-9_-]+|\"[^\"\n]*\"|'[^'\n]*')[ \t]*")
 
 
-def read_toml(path: Path) -> tuple["Node", str]:
-    """The root table of a TOML file and the sha256 of the file."""
-    data, digest = read_bytes(path, _LARGEST_TOML)
+def read_toml(path: Path, instead: str | None = None) -> tuple["Node", str]:
+    """The root table of a TOML file and the sha256 of the file. instead: what is to stand in it, not yet written."""
+    data, digest = read_bytes(path, _LARGEST_TOML) if instead is None else with_digest(instead.encode())
     text = decode(path, data)
     if not text.strip():
         raise SurveyError(f"{path}:1: the file is empty; it starts with 'format = 1'")

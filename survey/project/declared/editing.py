@@ -1,0 +1,141 @@
+"""Single decisions written into the text of ``survey.toml``: everything else, comments too, stays to the letter.
+
+What a text says after that is for the readers to judge; here only the place of a key is known.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import tomlkit
+from gtsam import Pose3
+
+from adjust.lenses.models import MODELS
+from adjust.model.errors import SurveyError
+from adjust.model.result import Estimate
+from adjust.model.survey import Survey
+from survey.folder.units import from_si
+from survey.project.declared.owners import GEOMETRY_UNITS, geometry_key
+from survey.project.declared.poses import quaternion_wxyz
+
+_OF_POSE = ("rotation_euler_xyz_deg", "held", "sigma_rotation_arcsec", "sigma_translation_mm", "covariance")
+
+
+def with_sigma_scale(text: str, group: str, factor: float) -> str:
+    """With the factor on all sigmas of a group ([sigmas.scale]); 1 takes it out. Raises SurveyError."""
+    if not (np.isfinite(factor) and factor > 0.0):
+        raise SurveyError(f"group {group}: the factor of its sigmas is {factor:g}; it must be positive")
+    document: Any = tomlkit.parse(text)
+    scale = _table(document, "sigmas", "scale")
+    if factor == 1.0:
+        scale.pop(group, None)
+    else:
+        scale[group] = float(factor)
+    return tomlkit.dumps(document)
+
+
+def with_datum(text: str, kind: str, points: Sequence[str] = (), stations: Sequence[str] = ()) -> str:
+    """With this datum ([datum]): ``given``, or ``inner`` over these points and stations, over all where none."""
+    document: Any = tomlkit.parse(text)
+    datum = _table(document, "datum")
+    datum["kind"] = kind
+    for key, names in (("points", points), ("stations", stations)):
+        if names and kind == "inner":
+            datum[key] = list(names)
+        else:
+            datum.pop(key, None)
+    return tomlkit.dumps(document)
+
+
+def with_treatment(text: str, survey: Survey, estimates: Mapping[Any, Estimate], name: str, treatment: str) -> str:
+    """With a parameter ``free``, or ``held`` at its adjusted value.
+
+    name: as in results, such as ``lens/X/k1``, ``lens/X``, ``point/B07``, ``station_from_camera/X``. Raises SurveyError
+    for what has no place of its own in survey.toml.
+    """
+    if treatment not in ("free", "held"):
+        raise SurveyError(f"{name}: a parameter is made free or held, not {treatment!r}")
+    kind, owner, *rest = (*name.split("/"), "")[:3]
+    estimate = estimates.get((kind, owner))
+    if estimate is None:
+        raise SurveyError(f"{name}: no parameter of the solution has this name; take it from the list of parameters")
+    document: Any = tomlkit.parse(text)
+    component = rest[0] if rest else ""
+    if kind in ("lens", "table_geometry"):
+        _of_vector(document, estimate, component, treatment, survey)
+    elif component:
+        raise SurveyError(f"{name}: single epochs, and components of a pose or point, are edited in survey.toml")
+    elif kind == "point":
+        entry = _table(document, "points", owner)
+        entry["treatment"] = treatment
+        _drop(entry, ("held", "sigma_mm", "covariance_mm2"))
+        if treatment == "held":
+            entry["x_mm"] = (1e3 * np.asarray(estimate.value)).tolist()
+    else:
+        _of_pose(_pose_table(document, survey, kind, owner, name), estimate, treatment)
+    return tomlkit.dumps(document)
+
+
+def _of_vector(document: Any, estimate: Estimate, component: str, treatment: str, survey: Survey) -> None:
+    kind, owner = estimate.name[:2]
+    place = ("cameras", owner, "lens") if kind == "lens" else ("tables", owner, "geometry")
+    entry, names = _table(document, *place), estimate.components
+    declared = {**{("lens", c.camera_id): c.lens.free for c in survey.cameras},
+                **{("table_geometry", t.table_id): t.geometry.free for t in survey.tables}}  # fmt: skip
+    wanted = (component,) if component else names
+    if component and component not in names:
+        raise SurveyError(f"{'/'.join(estimate.name)}: has no {component!r}; its components are {', '.join(names)}")
+    before = set(declared[kind, owner])
+    after = before | set(wanted) if treatment == "free" else before - set(wanted)
+    entry["free"] = [n for n in names if n in after]
+    if treatment == "free":
+        return
+    values = dict(zip(names, np.asarray(estimate.value, dtype=float).tolist(), strict=True))
+    if kind == "table_geometry":
+        for key in wanted:
+            entry[geometry_key(key)] = float(from_si(values[key], GEOMETRY_UNITS[key]))
+        return
+    known = _table(entry, "values")
+    for key in values if not known else wanted:
+        known[key] = values[key]
+    for key in wanted:
+        if "prior" in entry:
+            entry["prior"].pop(key, None)
+    model = next(c.lens.model for c in survey.cameras if c.camera_id == owner)
+    if set(values) != set(MODELS[model].names):
+        raise SurveyError(f"camera {owner}: the solution has a lens of another model than {model}")
+
+
+def _of_pose(entry: Any, estimate: Estimate, treatment: str) -> None:
+    entry["treatment"] = treatment
+    _drop(entry, [key for key in entry if key in _OF_POSE or key.startswith(("sigma", "covariance"))])
+    if treatment == "held" and isinstance(estimate.value, Pose3):
+        entry["translation_mm"] = (1e3 * np.asarray(estimate.value.translation())).tolist()
+        entry["rotation_quaternion_wxyz"] = quaternion_wxyz(estimate.value.rotation())
+
+
+def _pose_table(document: Any, survey: Survey, kind: str, owner: str, name: str) -> Any:
+    places = {"station_from_camera": "cameras", "world_from_station": "stations", "mount_from_station": "stations",
+              "world_from_table": "tables"}  # fmt: skip
+    if kind in places:
+        return _table(document, places[kind], owner, kind)
+    if kind == "carrier_from_target":
+        on_station = next(t.station_id for t in survey.targets if t.target_id == owner) is not None
+        return _table(document, "targets", owner, "station_from_target" if on_station else "world_from_target")
+    raise SurveyError(f"{name}: cannot be held from here; write that into survey.toml")
+
+
+def _drop(entry: Any, keys: Sequence[str]) -> None:
+    for key in keys:
+        entry.pop(key, None)
+
+
+def _table(document: Any, *path: str) -> Any:
+    """The table at a path, made where it is not there: inside an inline table as one, else with a header of its own."""
+    at = document
+    for i, key in enumerate(path):
+        if key not in at:
+            inline = isinstance(at, tomlkit.items.InlineTable)
+            at[key] = tomlkit.inline_table() if inline else tomlkit.table(is_super_table=i + 1 < len(path))
+        at = at[key]
+    return at

@@ -1,0 +1,56 @@
+"""Images of a project for a page: looked up by camera and epoch, never by a path."""
+
+import hashlib
+import os
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from adjust.model.errors import SurveyError
+from survey.detection.gray import Gray8, Gray32, gray_values, read_image
+from survey.project.detected import DetectedImage
+
+_QUALITY = 85
+_LARGEST_SIDE = 4096
+
+
+def picture(images: Mapping[tuple[str, str], Path], key: tuple[str, str], size: int | None) -> tuple[bytes, str]:
+    """An image as bytes and their media type: a JPEG whose longer side has ``size`` px, None: a PNG of every pixel.
+
+    Grey values are stretched to 8 bit. Raises KeyError for what is no image, SurveyError for what cannot be read.
+    """
+    path = images[key]
+    if not stat.S_ISREG(os.lstat(path).st_mode):
+        raise SurveyError(f"{path}: is a link or no file; put the image itself into the project")
+    stored = read_image(path)
+    image: Any = stored if stored.dtype == np.uint8 else _in_8_bit(gray_values(stored))
+    if size is None:
+        return _encoded(path, ".png", image, []), "image/png"
+    factor = min(1.0, min(size, _LARGEST_SIDE) / max(image.shape[:2]))
+    if factor < 1.0:
+        image = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    return _encoded(path, ".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]), "image/jpeg"
+
+
+def _in_8_bit(image: Gray32) -> Gray8:
+    low, high = float(image.min()), float(image.max())
+    return np.asarray(np.clip((image - low) * (255.0 / max(high - low, 1e-9)), 0, 255), dtype=np.uint8)
+
+
+def _encoded(path: Path, ending: str, image: Any, how: list[int]) -> bytes:
+    done, data = cv2.imencode(ending, image, how)
+    if not done:
+        raise SurveyError(f"{path}: cannot be shown; export it again as PNG")
+    return data.tobytes()
+
+
+def etag(known: DetectedImage | None, path: Path, size: int | None) -> str:
+    """A name for what an image looks like: by the hash that detection made of the file, else by its time and size."""
+    status = path.stat()
+    same = known is not None and (known.size, known.mtime_ns) == (status.st_size, status.st_mtime_ns)
+    text = known.sha256 if same and known is not None else f"{path.name} {status.st_size} {status.st_mtime_ns}"
+    return f'"{hashlib.sha256(f"{text} {size}".encode()).hexdigest()[:32]}"'

@@ -1,0 +1,246 @@
+"""What the views of the workbench show, as plain values: state, findings, parameters, scene, exclusions."""
+
+import re
+from collections.abc import Iterable
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef
+from adjust.model.result import Adjustment
+from survey.folder.text import suggestion
+from survey.project.observed import name_of_residual
+from survey.report.scene import scene_of
+from survey.solution.changes import snapshot
+from survey.solution.dictionary import plain, solution_dict
+from survey.solution.frames import AdjustedFrames
+from survey.solution.quantities import ARCSEC_PER_RAD, sigma_unit_for_people, sigmas_of, status_of, unit_for_people
+from survey.solution.runs import list_runs
+from survey.solution.verdict import suspects
+from survey.workbench.rows import BY_THIS_RUN, IN_USE, columns, reading_rows
+from survey.workbench.session import Workbench
+
+_MOST_FINDINGS = 100
+_MOST_FITTING = 20
+_IN_WARNING = re.compile(r"camera (?P<camera>\S+) at epoch (?P<epoch>[^\s,:]+)")
+
+
+def anchor(kind: str, text: str) -> str:
+    """The part of an address that names a thing: ``#image=X/hX05``."""
+    return f"#{kind}={quote(text, safe='/:@,.-_')}"
+
+
+def limits(adjustment: Adjustment | None) -> tuple[float, float]:
+    """Of |w| of image points (square root of the chi-square test's) and of other observations."""
+    if adjustment is None:
+        return 1.0, 1.0
+    found = suspects(adjustment)
+    return float(np.sqrt(found.image_limit)), found.w_limit
+
+
+def state(bench: Workbench) -> dict[str, Any]:
+    """What there is, how it stands, and what can be done; the tree of names among it."""
+    now = bench.situation
+    solved = now.adjustment
+    return dict(plain({
+        "version": bench.version, "folder": str(bench.folder), "title": now.project.title,
+        "read_only": bench.read_only, "lock": bench.holder(), "changed_files": bench.changed_files(),
+        "unsaved": bench.n_unsaved, "undo": bench.undoable, "redo": bench.redoable,
+        "solution": None if solved is None else {**snapshot(solved).summary, "mode": now.mode, "seconds": now.seconds,
+                                                 "sigmas": bench.scale.sigmas},
+        "warnings": [] if solved is None else solved.warnings,
+        "exclusions": [{"name": str(e.name), "what": e.name.what, "id": e.name.id, "reason": e.reason,
+                        "author": e.author, "time": e.time, "line": e.line} for e in now.exclusions.values()],
+        "tree": _tree(bench),
+        "groups": [] if solved is None else [
+            {"group": g.group, "n_observations": g.n_observations, "redundancy": g.redundancy, "omega": g.omega,
+             "factor": g.factor, "scale": now.project.sigmas.scale.get(g.group, 1.0)} for g in solved.groups],
+        "datum": {"kind": now.project.survey.datum.kind, "points": now.project.survey.datum.points,
+                  "stations": now.project.survey.datum.stations},
+    }))  # fmt: skip
+
+
+def _tree(bench: Workbench) -> dict[str, Any]:
+    survey, project = bench.situation.survey, bench.situation.project
+    images: dict[str, list[str]] = {c.camera_id: [] for c in survey.cameras}
+    seen = dict.fromkeys([*project.images, *((b.camera_id, b.epoch_id) for b in survey.image_blocks)])
+    for camera, epoch in seen:
+        images.setdefault(camera, []).append(epoch)
+    epochs = dict.fromkeys([*(e for _, e in seen), *(r.epoch_id for r in survey.table_readings)])
+    return {
+        "cameras": [{"id": c.camera_id, "station": c.station_id, "size": list(c.image_size),
+                     "images": images[c.camera_id]} for c in survey.cameras],
+        "epochs": list(epochs),
+        "targets": [t.target_id for t in survey.targets], "stations": [s.station_id for s in survey.stations],
+        "tables": [t.table_id for t in survey.tables], "points": [p.point_id for p in survey.points],
+    }  # fmt: skip
+
+
+def points(bench: Workbench, camera: str = "", epoch: str = "", worst: int = 0) -> bytes:
+    """Image points as :func:`survey.workbench.rows.columns`: all, those of one image, or the ``worst`` by |w|."""
+    rows, chosen = bench.rows, None
+    if camera and epoch:
+        chosen = rows.in_image(camera, epoch)
+    elif 0 < worst < len(rows.test):
+        chosen = np.sort(np.argpartition(-np.nan_to_num(rows.test, nan=-1.0), worst)[:worst])
+    return columns(rows, limits(bench.situation.adjustment)[0], bench.version, chosen)
+
+
+def readings(bench: Workbench) -> dict[str, Any]:
+    """All observations that are no image points."""
+    now = bench.situation
+    limit = limits(now.adjustment)[1]
+    rows = reading_rows(now.everything.survey, now.left, now.adjustment, limit)
+    return {"version": bench.version, "limit": limit, "rows": rows}
+
+
+def parameters(bench: Workbench) -> dict[str, Any]:
+    """Every component of every parameter: value, sigma and status in the units shown, as columns."""
+    out: dict[str, list[Any]] = {k: [] for k in ("name", "component", "value", "unit", "sigma", "sigma_unit", "status")}
+    for name, e in bench.adjustment.estimates.items():
+        pose, sigmas = isinstance(e.value, Pose3), sigmas_of(e, bench.scale)
+        values = [*(3 * [None]), *np.asarray(e.value.translation()).tolist()] if isinstance(e.value, Pose3) \
+            else np.asarray(e.value, dtype=float).tolist()  # fmt: skip
+        one = status_of(e)
+        for k, component in enumerate(e.components):
+            unit, factor = unit_for_people(component, e.units[k])
+            sigma_unit, sigma_factor = sigma_unit_for_people(e.units[k], component)
+            status = one if isinstance(one, str) else one[component]
+            row = ("/".join(name), component, None if values[k] is None else values[k] * factor,
+                   sigma_unit if pose else unit, sigmas[k] * sigma_factor, sigma_unit, status)  # fmt: skip
+            for key, value in zip(out, row, strict=True):
+                out[key].append(value)
+    return {"version": bench.version, "sigmas": bench.scale.sigmas, "columns": plain(out)}
+
+
+def findings(bench: Workbench) -> dict[str, Any]:
+    """The verdict, warnings, and what is suspect or was left out by this run, worst first, each with its remedies."""
+    now = bench.situation
+    solved = now.solved
+    image_limit, limit = limits(solved)
+    found = [*_of_points(bench, image_limit), *_of_readings(bench, limit)]
+    worst = sorted(found, key=lambda f: -(f["share"] or 0.0))
+    failing = [f for f in worst if f["why"] == BY_THIS_RUN or (f["share"] or 0.0) > 1.0]
+    fitting = [f for f in worst if f["why"] == IN_USE and (f["share"] or 0.0) <= 1.0]
+    causes = [w.removeprefix("probable cause: ") for w in solved.warnings if w.startswith("probable cause")]
+    shown = [*_of_images(bench, failing), *failing[:_MOST_FINDINGS], *fitting[:_MOST_FITTING]]
+    return dict(plain({
+        "version": bench.version, **{k: snapshot(solved).summary[k] for k in ("verdict", "reason")},
+        "warnings": [{"text": w, "anchors": _anchors_in(w)} for w in solved.warnings], "causes": causes,
+        "n_failing": len(failing), "findings": shown,
+    }))  # fmt: skip
+
+
+def _anchors_in(text: str) -> list[str]:
+    return [anchor("image", f"{m['camera']}/{m['epoch']}") for m in _IN_WARNING.finditer(text)]
+
+
+def _of_points(bench: Workbench, limit: float) -> Iterable[dict[str, Any]]:
+    rows = bench.rows
+    test = np.where((rows.why == IN_USE) | (rows.why == BY_THIS_RUN), np.nan_to_num(rows.test, nan=-1.0), -1.0)
+    for row in np.argsort(-test)[: _MOST_FINDINGS + _MOST_FITTING].tolist():
+        if test[row] >= 0.0:
+            name, w = rows.id_of(row), float(np.sqrt(test[row]))
+            yield {
+                "kind": "image_point", "id": f"image_point:{name}", "anchor": anchor("obs", f"image_point:{name}"),
+                "image": "/".join(name.split("/")[:2]), "w": w, "limit": limit, "share": w / limit,
+                "redundancy": rows.redundancy[row].mean(), "residual": rows.residuals[row], "unit": "px",
+                "why": int(rows.why[row]), "remedies": [_exclude(bench, f"image_point:{name}", row)],
+            }  # fmt: skip
+
+
+def _exclude(bench: Workbench, name: str, row: int | None = None) -> dict[str, Any]:
+    if row is not None and row >= sum(len(b.uv) for b in bench.situation.everything.survey.image_blocks):
+        name = bench.spot_name(row)
+    return {"label": f"exclude {name}", "changes": [{"name": name, "excluded": True}]}
+
+
+def _of_readings(bench: Workbench, limit: float) -> Iterable[dict[str, Any]]:
+    for row in readings(bench)["rows"]:
+        if row["w"] is not None and row["why"] in (IN_USE, BY_THIS_RUN):
+            yield {
+                "kind": "reading", "id": row["id"], "anchor": anchor("reading", row["id"]), "image": None,
+                "component": row["component"], "limit": limit, "unit": row["sigma_unit"],
+                **{k: row[k] for k in ("w", "share", "redundancy", "residual", "why")},
+                "remedies": [_exclude(bench, row["id"])],
+            }  # fmt: skip
+
+
+def _of_images(bench: Workbench, failing: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Images of which a fifth of the points or more do not fit: the image is wrong rather than each of them."""
+    counts: dict[str, int] = {}
+    for f in failing:
+        if f["image"]:
+            counts[f["image"]] = counts.get(f["image"], 0) + 1
+    out = []
+    for image, n in counts.items():
+        rows = bench.rows.in_image(*image.split("/"))
+        if n >= 4 and 5 * n >= len(rows):
+            out.append({"kind": "image", "id": f"image:{image}", "anchor": anchor("image", image), "image": image,
+                        "w": None, "share": None, "why": BY_THIS_RUN, "n_points": n, "n_in_image": len(rows),
+                        "remedies": [_exclude(bench, f"image:{image}")]})  # fmt: skip
+    return out
+
+
+def runs(bench: Workbench) -> dict[str, Any]:
+    """The runs that were kept, the last first."""
+    return {"version": bench.version, "runs": [r.as_dict() for r in reversed(list_runs(bench.folder))]}
+
+
+def scene(bench: Workbench) -> dict[str, Any]:
+    """Cameras, targets, tables, points and stations in the world (m), covariances (m^2) as sigmas are given."""
+    adjustment, scale = bench.adjustment, bench.scale
+    drawn, frames = scene_of(adjustment, scale), AdjustedFrames(adjustment)
+    images = {}
+    for camera, epoch in dict.fromkeys((b.camera_id, b.epoch_id) for b in adjustment.survey.image_blocks):
+        pose = frames.world_from(FrameRef("camera", camera, epoch))
+        if pose is not None:
+            images[f"{camera}/{epoch}"] = pose.matrix()[:3].ravel()
+    return dict(plain({
+        "version": bench.version, "ellipsoid": scale.ellipsoid, "images": images,
+        "cameras": {s.label: {"index": s.camera_idx, "half_angles_rad": s.half_angles} for s in drawn.shots},
+        "spots": [{"id": s.label, "kind": s.kind, "x": s.x, "cov": s.cov.ravel()} for s in drawn.spots],
+        "outlines": [{"target": label, "x": x} for label, x in drawn.outlines],
+        "clouds": [{"target": label, "x": x} for label, x in drawn.clouds],
+        "tables": [{"id": table, "world_from_table": pose.matrix()[:3].ravel(), "axes": axes}
+                   for table, pose, axes in drawn.tables],
+        "moves": drawn.moves, "n_left_out": drawn.n_left_out,
+    }))  # fmt: skip
+
+
+def loops(bench: Workbench) -> dict[str, Any]:
+    """Loops of measured pairs and how they close, the worst first; None where there are none."""
+    solution = solution_dict(bench.adjustment, bench.run(), None)
+    return {"version": bench.version, "loops": solution.get("loops"), "network": solution.get("network")}
+
+
+def table_residuals(bench: Workbench) -> dict[str, Any]:
+    """Residuals of turntables (arcsec) over the adjusted angles (deg) of all their axes, by table, in use or not."""
+    out: dict[str, list[dict[str, Any]]] = {}
+    for o in bench.adjustment.other_residuals:
+        if o.kind == "table":
+            out.setdefault(o.ids[0], []).append({
+                "epoch": o.ids[-1], "id": name_of_residual(o), "angles_deg": np.degrees(o.adjusted),
+                "residual_arcsec": ARCSEC_PER_RAD * o.residual, "sigma_arcsec": ARCSEC_PER_RAD * o.sigma,
+                "w": o.standardized, "used": o.used,
+            })  # fmt: skip
+    return dict(plain({"version": bench.version, "tables": out}))
+
+
+PARTS = {
+    "solution": None, "reliability": "reliability", "correlations": "correlated_above_95_percent",
+    "weak": "weak_directions", "relative": "relative_precision", "budget": "budget", "consistency": "consistency",
+    "tolerances": "tolerances", "components": "variance_components", "outliers": "outliers",
+}  # fmt: skip
+"""What statistics there are, by the key of ``solution.json`` that has them; ``solution``: all of it."""
+
+
+def statistics_part(bench: Workbench, part: str) -> dict[str, Any]:
+    """A part of what ``solution.json`` says, one of ``PARTS``; computed when first asked for. Raises SurveyError."""
+    if part not in PARTS:
+        raise SurveyError(f"there are no statistics {part!r}; {suggestion(part, PARTS)}")
+    solution, key = solution_dict(bench.adjustment, bench.run(), bench.statistics), PARTS[part]
+    return {"version": bench.version, part: solution if key is None else solution[key]}

@@ -1,0 +1,89 @@
+// Before and after of every parameter, the runs that were kept, and any two of them compared.
+
+import { button, fill, link, make, plainTable } from "./dom.js";
+import { count, number, significant, t, time } from "./words.js";
+import { anchor, current, go } from "./store.js";
+import { get, post } from "./source.js";
+import { tell } from "./dialogs.js";
+
+const MOST = 300;
+
+/** @param {any} changes before, after, new, gone, components: name, unit, before, after, difference, sigmas, ratio */
+export function changesText(changes) {
+  const { before: a, after: b } = changes;
+  const fact = (title, x, y) => make("div", {}, make("span", { class: "quiet" }, title), make("b", {}, x === y ? x : `${x} → ${y}`));
+  const rows = changes.components.slice(0, MOST).map((c) => [
+    link(anchor("param", c.name), c.name), number(c.sigmas, 2), `${c.difference > 0 ? "+" : ""}${significant(c.difference, 3)} ${c.unit}`,
+    significant(c.before, 8), significant(c.after, 8), number(c.ratio, 3)]);
+  return make("div", {},
+    make("div", { class: "cards" }, fact(t("verdict"), t(`verdict ${a.verdict}`), t(`verdict ${b.verdict}`)), fact("sigma0", number(a.sigma0, 4), number(b.sigma0, 4)),
+      fact(t("redundancy"), count(a.redundancy), count(b.redundancy)), fact(t("suspects"), count(a.n_suspects ?? 0), count(b.n_suspects ?? 0))),
+    changes.gone?.length ? make("p", {}, t("Only before: {names}", { names: changes.gone.join(", ") })) : null,
+    changes.new?.length ? make("p", {}, t("Only after: {names}", { names: changes.new.join(", ") })) : null,
+    plainTable(t("Before and after"), [t("parameter"), t("in sigmas"), t("difference"), t("before"), t("after"), t("sigma ratio")], rows, [1, 2, 3, 4, 5]),
+    make("p", { class: "quiet" }, t("{n} components, the one that moved by most of its sigmas first", { n: count(changes.n_components ?? changes.components.length) })));
+}
+
+export class CompareView {
+  /** @param {any} bench */
+  constructor(bench) {
+    this.bench = bench;
+    this.element = make("div", { class: "view page", tabindex: 0 });
+    this.follow();
+  }
+
+  async follow() {
+    const { run, against } = current();
+    const key = `${run}/${against}/${this.bench.state.version}`;
+    if (key === this.key) return;
+    this.key = key;
+    if (run && against) {
+      try {
+        const changes = await get(`compare?a=${encodeURIComponent(against)}&b=${encodeURIComponent(run)}`);
+        this.show(t("Run {a} → run {b}", { a: against, b: run }), changes);
+      } catch (error) { fill(this.element, make("p", { class: "warn" }, error.message)); }
+    } else if (this.bench.state.changes) this.show(t("Before and after the last change"), this.bench.state.changes);
+    else fill(this.element, make("p", { class: "quiet" }, t("Nothing has been changed yet. Leave something out (x), or choose two runs under History.")));
+  }
+
+  show(title, changes) { fill(this.element, make("h2", {}, title), changesText(changes)); }
+}
+
+export class HistoryView {
+  /** @param {any} bench @param {any} actions */
+  constructor(bench, actions) {
+    this.bench = bench;
+    this.actions = actions;
+    this.element = make("div", { class: "view page", tabindex: 0 });
+    this.follow();
+  }
+
+  async follow() {
+    const key = `${this.bench.state.version}/${this.bench.state.unsaved}/${current().run}`;
+    if (key === this.key) return;
+    this.key = key;
+    let runs = [];
+    try { runs = (await get("runs")).runs; } catch (error) { fill(this.element, make("p", { class: "warn" }, error.message)); return; }
+    const { state } = this.bench, chosen = current();
+    const pick = (name, run) => make("input", { type: "radio", name, "aria-label": `${t(name)} ${run}`, checked: String(chosen[name === "before" ? "against" : "run"]) === String(run), onchange: () => go(name === "before" ? { against: String(run) } : { run: String(run) }, true) });
+    const rows = runs.map((run) => [pick("before", run.number), pick("after", run.number), link(`#run=${run.number}`, String(run.number)), time(run.time), run.author ?? "", run.command ?? "",
+      t(`verdict ${run.summary.verdict}`), number(run.summary.sigma0, 4), count(run.summary.redundancy),
+      state.read_only ? null : make("span", {}, button(run.pinned ? "★" : "☆", () => this.act("pin", run), "", { "aria-label": run.pinned ? t("not kept for ever") : t("keep for ever") }), " ", button(t("restore"), () => this.act("restore", run)))]);
+    const steps = (title, labels) => labels?.length ? make("div", {}, make("h3", {}, title), make("ol", {}, ...labels.map((label) => make("li", {}, label)))) : null;
+    fill(this.element, make("h2", {}, t("History")), steps(t("Can be undone"), state.undo), steps(t("Can be done again"), state.redo), make("h3", {}, t("Runs")),
+      rows.length ? plainTable(t("Runs"), [t("before"), t("after"), t("run"), t("time"), t("who"), t("Command"), t("verdict"), "sigma0", t("redundancy"), ""], rows, [7, 8]) : make("p", { class: "quiet" }, t("No runs are kept yet; Save writes one.")),
+      rows.length > 1 ? button(t("Compare"), () => this.compare(), "d", { class: "primary" }) : null);
+  }
+
+  compare() {
+    const { run, against } = current();
+    if (run && against) this.actions.show("compare");
+    else tell(t("Choose one run as before and one as after."));
+  }
+
+  async act(what, run) {
+    try { await this.actions.done(await post(`runs/${run.number}/${what}`, { base: this.bench.state.version, pinned: !run.pinned })); } catch (error) { tell(error.message, "warn"); }
+    this.key = "";
+    this.follow();
+  }
+}

@@ -1,0 +1,85 @@
+// Elements without markup: everything a project says arrives as text, never as HTML.
+
+/**
+ * An element with attributes, listeners (`onclick`), and children (elements or text).
+ * @param {string} tag @param {Object<string, any>} [given] @param {...(Node|string|null|undefined|false)} children
+ * @returns {any}
+ */
+export function make(tag, given = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(given)) {
+    if (value === undefined || value === null || (value === false && !name.startsWith("aria-"))) continue;
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else if (name === "class") element.className = value;
+    else if (name === "data") Object.assign(element.dataset, value);
+    else element.setAttribute(name, value === true && !name.startsWith("aria-") ? "" : String(value));
+  }
+  return fill(element, ...children);
+}
+
+/** New children instead of the old ones; none for null. @param {any} element @param {...(Node|string|null|undefined|false)} children */
+export function fill(element, ...children) {
+  element.replaceChildren(...children.filter((child) => child !== null && child !== undefined && child !== false));
+  return element;
+}
+
+/** @param {string} id @returns {any} */
+export const by = (id) => document.getElementById(id);
+
+/** A button that says what it does and by which key. @param {string} text @param {() => void} act @param {string} [key] */
+export function button(text, act, key = "", extra = {}) {
+  return make("button", { type: "button", onclick: act, "aria-keyshortcuts": key || null, title: key ? `${text} (${key})` : null, ...extra }, text);
+}
+
+/** A link to a place of the page. @param {string} hash @param {string} text */
+export const link = (hash, text, extra = {}) => make("a", { href: hash, ...extra }, text);
+
+/**
+ * A small table: head of texts, rows of texts or elements; columns in `right` hold numbers.
+ * @param {string} name @param {string[]} head @param {any[][]} rows @param {number[]} [right]
+ */
+export function plainTable(name, head, rows, right = []) {
+  const cell = (tag) => (value, k) => make(tag, { class: right.includes(k) ? "r" : "l", scope: tag === "th" ? "col" : null }, value ?? "–");
+  return make("div", { class: "t" }, make("table", { "aria-label": name },
+    make("thead", {}, make("tr", {}, ...head.map(cell("th")))),
+    make("tbody", {}, ...rows.map((row) => make("tr", {}, ...row.map(cell("td")))))));
+}
+
+/**
+ * A canvas that keeps the pixels of the screen and the size of its place; `draw(context, width, height)` in CSS pixels.
+ * @param {string} label @param {(context: CanvasRenderingContext2D, width: number, height: number) => void} draw
+ */
+export function surface(label, draw) {
+  const canvas = make("canvas", { tabindex: 0, role: "img", "aria-label": label });
+  const context = canvas.getContext("2d");
+  let waiting = false;
+  const paint = () => {
+    waiting = false;
+    const ratio = devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
+    if (!width || !height) return;
+    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+      canvas.width = Math.round(width * ratio);
+      canvas.height = Math.round(height * ratio);
+    }
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.clearRect(0, 0, width, height);
+    draw(context, width, height);
+  };
+  const redraw = () => { if (!waiting) { waiting = true; requestAnimationFrame(paint); } };
+  new ResizeObserver(redraw).observe(canvas);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  return { canvas, redraw };
+}
+
+const colours = new Map();
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => colours.clear());
+
+/** The colour of a custom property as it is now, light or dark. @param {string} name @returns {string} */
+export function colour(name) {
+  if (!colours.has(name)) {
+    const probe = by("probe");
+    probe.style.color = `var(--${name})`;
+    colours.set(name, getComputedStyle(probe).color);
+  }
+  return colours.get(name);
+}

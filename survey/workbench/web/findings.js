@@ -1,0 +1,90 @@
+// What is wrong, worst first: verdict, warnings, suspects with their probable cause and what may be done about them.
+
+import { button, by, fill, link, make, plainTable } from "./dom.js";
+import { count, known, number, significant, t } from "./words.js";
+import { anchor, current, select } from "./store.js";
+import { rowOf, rowsOfImage } from "./source.js";
+import { placeOf } from "./tree.js";
+
+export class FindingsView {
+  /** @param {any} bench @param {any} actions */
+  constructor(bench, actions) {
+    this.bench = bench;
+    this.actions = actions;
+    this.element = make("div", { class: "view page", tabindex: 0 });
+    this.follow();
+  }
+
+  follow() {
+    const { state, findings } = this.bench;
+    if (this.drawn !== findings) { this.drawn = findings; this.draw(state, findings); }
+    const { ids } = current();
+    for (const row of this.element.querySelectorAll("[data-id]")) row.classList.toggle("here", ids.includes(row.dataset.id));
+    this.element.querySelector(".here")?.scrollIntoView({ block: "nearest" });
+  }
+
+  draw(state, findings) {
+    const suspects = findings.suspects ?? [], causes = findings.causes ?? [];
+    fill(this.element, 
+      make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
+      (findings.warnings ?? []).length ? make("ul", { class: "problems" }, ...findings.warnings.map((w) => make("li", {}, w.text, ...w.anchors.flatMap((to) => [" ", link(to, decodeURIComponent(to.replace(/^#\w+=/, "")))])))) : null,
+      ...causes.map((cause) => this.cause(cause)),
+      make("h2", {}, t("Suspects"), " ", make("span", { class: "quiet" }, count(findings.n_suspects ?? suspects.length))),
+      suspects.length ? this.suspects(t("Suspects, worst first"), suspects) : make("p", { class: "quiet" }, t("Nothing disagrees with the others.")),
+      state.exclusions.length ? this.exclusions(state.exclusions) : null,
+      (findings.groups ?? []).length ? make("h2", {}, t("Groups")) : null,
+      (findings.groups ?? []).length ? this.groups(findings.groups) : null,
+      findings.largest?.length ? make("h2", {}, t("Largest within the limit")) : null,
+      findings.largest?.length ? this.suspects(t("Largest within the limit"), findings.largest) : null);
+  }
+
+  cause(text) { return make("p", { class: "cause" }, make("b", {}, t("Probable cause")), " ", text); }
+
+  suspects(title, rows) {
+    return plainTable(title, [t("observation"), "w", t("share of limit"), "r", t("residual"), ""],
+      rows.map((s) => [make("a", { href: s.anchor, data: { id: s.place[1] } }, `${t(`kind ${s.kind}`)} ${s.text}`), s.w === null ? t("{k} of {n} points", { k: s.n_points, n: s.n_in_image }) : number(s.w, 2), s.share === null ? "–" : `${number(100 * s.share, 0)} %`,
+        number(s.redundancy, 2), s.residual === undefined ? "–" : `${[s.residual].flat().map((x) => significant(x, 3)).join(", ")} ${s.unit}`, s.why === 0 ? "" : t("left out")]), [1, 2, 3, 4]);
+  }
+
+  groups(rows) {
+    return plainTable(t("Groups"), [t("group"), t("observations"), t("redundancy"), t("sigmas fit ×")],
+      rows.map((g) => [link(anchor("group", g.id), known(g.id)), count(g.n), number(g.redundancy, 1), number(g.scale, 3)]), [1, 2, 3]);
+  }
+
+  exclusions(rows) {
+    return make("div", {}, make("h2", {}, t("Excluded by people"), " ", make("span", { class: "quiet" }, count(rows.length))),
+      plainTable(t("Excluded by people"), [t("what"), t("reason"), t("who"), t("Largest |w| now"), ""],
+        rows.map((row) => [link(anchor(...placeOf(row.what, row.id)), `${t(`kind ${row.what}`)} ${row.id}`), row.reason || t("no reason given"), row.author ?? "", number(this.fits(row), 2),
+          this.bench.state.read_only ? null : button(t("take back"), () => this.actions.include([`${row.what}:${row.id}`]), "e")]), [3]));
+  }
+
+  /** Largest |w| now of what is left out: small, where it would fit again. */
+  fits(row) {
+    const { points, readings } = this.bench, ids = row.id.split("/");
+    const rows = row.what === "image_point" ? [rowOf(points, ids)] : row.what === "image" ? [...rowsOfImage(points, row.id)] : [];
+    const all = row.what === "reading" ? readings.filter((r) => r.id === row.id).map((r) => Math.abs(r.w ?? NaN)) : rows.filter((i) => i >= 0).map((i) => points.w[i]);
+    return all.reduce((most, w) => (w > most || !Number.isFinite(most) ? w : most), NaN);
+  }
+
+  /** The next or previous suspect is looked at. @param {number} by */
+  step(by) {
+    const suspects = [...(this.bench.findings.suspects ?? []), ...(this.bench.findings.largest ?? [])], at = suspects.findIndex((s) => current().ids.includes(s.place[1]));
+    const next = suspects[at < 0 ? (by > 0 ? 0 : suspects.length - 1) : at + by];
+    if (next) select(next.place[0], next.place[1], true);
+  }
+}
+
+/** @param {string} verdict passed, check or failed */
+export const verdictText = (verdict) => ({ passed: `✓ ${t("verdict passed")}`, check: `! ${t("verdict check")}`, failed: `✕ ${t("verdict failed")}` })[verdict] ?? known(verdict);
+
+/** The header: what the solution is worth. @param {any} state */
+export function drawHeader(state) {
+  by("title").textContent = state.title;
+  document.title = `${state.title} · labsurvey`;
+  by("verdict").className = state.verdict;
+  by("verdict").textContent = verdictText(state.verdict);
+  const fact = (name, value) => make("span", {}, make("span", { class: "quiet" }, `${name} `), value);
+  fill(by("facts"), fact("sigma0", number(state.sigma0, 4)), fact(t("redundancy"), count(state.redundancy)),
+    fact(t("excluded"), count(state.exclusions.length)), state.n_not_used ? fact(t("not used"), count(state.n_not_used)) : null, state.unsaved ? fact(t("unsaved"), count(state.unsaved)) : null, state.read_only ? make("span", { class: "pill" }, t("for reading only")) : null);
+}
+

@@ -1,0 +1,278 @@
+// One image: the picture, detected (o) and predicted (+) points, residual vectors enlarged, what is left out dashed.
+
+import { button, colour, make, surface } from "./dom.js";
+import { count, number, t } from "./words.js";
+import { current, names, select } from "./store.js";
+import { picture, pointId, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./source.js";
+
+const NEAR = 14; // px on the screen: what a click takes hold of
+const SCALES = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
+
+export class ImageView {
+  /** @param {any} bench the page's values: `points`, `sizes` of images by camera, `limit` of w */
+  constructor(bench) {
+    this.bench = bench;
+    this.image = "";
+    this.enlarged = 200;
+    this.overlay = true;
+    this.fit = true;
+    this.hover = -1;
+    this.surface = surface(t("Image"), (context, width, height) => this.paint(context, width, height));
+    const canvas = this.surface.canvas;
+    this.title = make("b", { class: "ellipsis" });
+    this.scale = make("output", { class: "quiet" });
+    this.note = make("p", { class: "note floating", "aria-live": "polite" });
+    this.strip = make("div", { class: "filmstrip", role: "listbox", "aria-label": t("Images of this camera") });
+    this.element = make("div", { class: "view image" },
+      make("div", { class: "bar" }, this.title, this.scale,
+        button("−", () => this.enlarge(-1), "-", { "aria-label": t("shorter vectors") }), button("+", () => this.enlarge(1), "+", { "aria-label": t("longer vectors") }),
+        button("⤢", () => { this.fit = true; this.surface.redraw(); }, "0", { "aria-label": t("Whole") }), button("1:1", () => this.zoomTo(1 / (devicePixelRatio || 1)), "", { "aria-label": "1:1" })),
+      make("div", { class: "stage" }, canvas, this.note), this.strip);
+    this.listen(canvas);
+    this.follow();
+  }
+
+  listen(canvas) {
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoom(Math.exp(-event.deltaY * 0.0015), event.offsetX, event.offsetY);
+    }, { passive: false });
+    const held = new Map();
+    canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); held.set(event.pointerId, event); this.moved = 0; });
+    canvas.addEventListener("pointermove", (event) => {
+      const before = held.get(event.pointerId);
+      if (!before) { this.point(event.offsetX, event.offsetY); return; }
+      if (held.size === 2) this.pinch(held, event);
+      else { this.moved += Math.abs(event.movementX) + Math.abs(event.movementY); this.pan(event.clientX - before.clientX, event.clientY - before.clientY); }
+      held.set(event.pointerId, event);
+    });
+    for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => {
+      held.delete(event.pointerId);
+      if (name === "pointerup" && this.moved < 5) this.click(event);
+    });
+    canvas.addEventListener("keydown", (event) => {
+      const by = { ArrowLeft: [40, 0], ArrowRight: [-40, 0], ArrowUp: [0, 40], ArrowDown: [0, -40] }[event.key];
+      if (by) { event.preventDefault(); this.pan(by[0], by[1]); }
+    });
+  }
+
+  /** What is looked at follows the selection. */
+  follow() {
+    const { kind, ids } = current(), data = this.bench.points;
+    if (!data) return;
+    let image = this.image;
+    this.row = -1;
+    if (kind === "image" && ids[0]) image = ids[0];
+    else if (kind === "obs" && names(ids[0]).what === "image_point") {
+      const parts = names(ids[0]).ids;
+      image = `${parts[0]}/${parts[1]}`;
+      this.row = rowOf(data, parts);
+    } else if (kind === "camera") image = data.images.find((name) => name.startsWith(`${ids[0]}/`)) ?? image;
+    else if (kind === "epoch") image = data.images.find((name) => name.endsWith(`/${ids[0]}`)) ?? image;
+    else if (kind === "point" || kind === "target") {
+      const at = this.worstOf(kind === "point" ? rowsOfPoint(data, null, ids[0]) : rowsWhere(data, (b) => b.target === ids[0]));
+      if (at >= 0) { const block = data.blocks[data.block[at]]; image = `${block.camera}/${block.epoch}`; if (kind === "point") this.row = at; }
+    }
+    if (!image && data.images.length) {
+      const at = this.worstOf(data.rows), block = data.blocks[data.block[at]];
+      if (block) image = `${block.camera}/${block.epoch}`;
+    }
+    if (image !== this.image) this.open(image);
+    else if (this.row >= 0) this.keepInSight();
+    this.surface.redraw();
+  }
+
+  /** @param {ArrayLike<number>} rows */
+  worstOf(rows) {
+    const { w } = this.bench.points;
+    let at = rows.length ? rows[0] : -1;
+    for (let k = 0; k < rows.length; k++) if (w[rows[k]] > w[at] || !(w[at] >= 0)) at = rows[k];
+    return at;
+  }
+
+  async open(image) {
+    this.image = image;
+    this.bitmap = null;
+    this.fit = true;
+    this.size = this.bench.sizes[image.split("/")[0]];
+    this.title.textContent = image.replace("/", " · ");
+    this.film();
+    this.note.textContent = "";
+    const started = performance.now();
+    try {
+      const bitmap = await picture(image, 1600);
+      if (this.image !== image) return;
+      this.bitmap = bitmap;
+      this.size ??= [bitmap.width, bitmap.height];
+      this.note.textContent = "";
+    } catch (error) {
+      if (this.image === image) this.note.textContent = t("No picture: {why}", { why: error.message });
+    }
+    this.surface.redraw();
+    document.body.dataset.picture = String(Math.round(performance.now() - started));
+  }
+
+  /** Pictures of the same camera, or those of the same moment; only what is in sight is fetched. */
+  film() {
+    const [camera, epoch] = this.image.split("/"), data = this.bench.points;
+    const near = data.images.filter((name) => name.startsWith(`${camera}/`));
+    if (near.join() !== this.filmed) {
+      this.filmed = near.join();
+      this.seen?.disconnect();
+      this.seen = new IntersectionObserver((entries) => { for (const entry of entries) if (entry.isIntersecting) this.thumbnail(entry.target); }, { root: this.strip, rootMargin: "200px" });
+      this.strip.replaceChildren(...near.map((name) => {
+        const place = make("button", { type: "button", role: "option", class: "frame", data: { image: name }, tabindex: -1, onclick: () => select("image", name) },
+          make("canvas", { width: 96, height: 72, "aria-hidden": "true" }), make("span", {}, name.split("/")[1]));
+        this.seen.observe(place);
+        return place;
+      }));
+    }
+    for (const place of this.strip.children) {
+      const here = place.dataset.image === `${camera}/${epoch}`;
+      place.setAttribute("aria-selected", String(here));
+      if (here) requestAnimationFrame(() => { this.strip.scrollLeft = place.offsetLeft - this.strip.clientWidth / 2 + 48; });
+    }
+  }
+
+  async thumbnail(place) {
+    this.seen.unobserve(place);
+    try {
+      const bitmap = await picture(place.dataset.image, 240), canvas = place.querySelector("canvas");
+      const scale = Math.min(96 / bitmap.width, 72 / bitmap.height);
+      canvas.getContext("2d").drawImage(bitmap, (96 - scale * bitmap.width) / 2, (72 - scale * bitmap.height) / 2, scale * bitmap.width, scale * bitmap.height);
+    } catch { /* an image without a file keeps its name only */ }
+  }
+
+  /** The image before or after in the strip (`[`, `]`), or of the next epoch. @param {number} by */
+  next(by, sameEpoch = false) {
+    const all = this.bench.points.images, [camera, epoch] = this.image.split("/");
+    const among = all.filter((name) => (sameEpoch ? name.endsWith(`/${epoch}`) : name.startsWith(`${camera}/`)));
+    const to = among[(among.indexOf(this.image) + by + among.length) % among.length];
+    if (to) select("image", to, true);
+  }
+
+  enlarge(by) {
+    const at = SCALES.findIndex((scale) => scale >= this.enlarged);
+    this.enlarged = SCALES[Math.max(0, Math.min(SCALES.length - 1, at + by))];
+    this.surface.redraw();
+  }
+
+  zoom(factor, x, y) {
+    const scale = Math.max(0.02, Math.min(64, this.s * factor)), by = scale / this.s;
+    this.fit = false;
+    this.ox = x - (x - this.ox) * by;
+    this.oy = y - (y - this.oy) * by;
+    this.s = scale;
+    this.surface.redraw();
+  }
+
+  zoomTo(scale) {
+    const canvas = this.surface.canvas;
+    let x = canvas.clientWidth / 2, y = canvas.clientHeight / 2;
+    if (this.row >= 0) { const data = this.bench.points; x = this.ox + (data.u[this.row] + 0.5) * this.s; y = this.oy + (data.v[this.row] + 0.5) * this.s; }
+    this.zoom(scale / this.s, x, y);
+    this.keepInSight();
+  }
+
+  pan(dx, dy) { this.fit = false; this.ox += dx; this.oy += dy; this.surface.redraw(); }
+
+  pinch(held, event) {
+    const [a, b] = [...held.values()], other = a.pointerId === event.pointerId ? b : a, old = a.pointerId === event.pointerId ? a : b;
+    const span = (p) => Math.hypot(p.clientX - other.clientX, p.clientY - other.clientY);
+    this.zoom(span(event) / Math.max(1, span(old)), other.offsetX, other.offsetY);
+  }
+
+  keepInSight() {
+    const data = this.bench.points, canvas = this.surface.canvas, x = this.ox + (data.u[this.row] + 0.5) * this.s, y = this.oy + (data.v[this.row] + 0.5) * this.s;
+    if (x < 20 || y < 20 || x > canvas.clientWidth - 20 || y > canvas.clientHeight - 20) this.pan(canvas.clientWidth / 2 - x, canvas.clientHeight / 2 - y);
+  }
+
+  nearest(x, y) {
+    const data = this.bench.points;
+    let best = -1, least = NEAR;
+    for (const i of rowsOfImage(data, this.image)) {
+      const far = Math.hypot(this.ox + (data.u[i] + 0.5) * this.s - x, this.oy + (data.v[i] + 0.5) * this.s - y);
+      if (far < least) { least = far; best = i; }
+    }
+    return best;
+  }
+
+  point(x, y) {
+    const at = this.nearest(x, y), data = this.bench.points;
+    if (at === this.hover) return;
+    this.hover = at;
+    this.surface.canvas.style.cursor = at < 0 ? "grab" : "pointer";
+    this.note.textContent = at < 0 ? "" : `${pointId(data, at)}   v = (${number(data.du[at], 3)}, ${number(data.dv[at], 3)}) px   w = ${number(data.w[at], 2)}`;
+  }
+
+  click(event) {
+    const at = this.nearest(event.offsetX, event.offsetY);
+    if (at < 0) return;
+    const id = `image_point:${pointId(this.bench.points, at)}`, { kind, ids } = current();
+    if (event.shiftKey && kind === "obs") select("obs", ids.includes(id) ? ids.filter((x) => x !== id) : [...ids, id]);
+    else select("obs", id);
+  }
+
+  paint(context, width, height) {
+    if (!this.image) return;
+    const size = this.size ?? [1280, 1024], data = this.bench.points;
+    if (this.fit) {
+      this.s = Math.min(width / size[0], height / size[1]);
+      this.ox = (width - this.s * size[0]) / 2;
+      this.oy = (height - this.s * size[1]) / 2;
+    }
+    if (this.bitmap) {
+      if (this.s * (devicePixelRatio || 1) > 1.2 * this.bitmap.width / size[0] && this.bitmap.width < size[0]) this.sharper();
+      context.imageSmoothingEnabled = this.s * size[0] < 4 * this.bitmap.width;
+      context.drawImage(this.bitmap, this.ox, this.oy, this.s * size[0], this.s * size[1]);
+    } else { context.fillStyle = colour("sunk"); context.fillRect(this.ox, this.oy, this.s * size[0], this.s * size[1]); }
+    this.scale.textContent = this.overlay ? `v × ${count(this.enlarged)}` : t("overlay off (o)");
+    this.scale.title = t("residual vectors enlarged");
+    const rows = rowsOfImage(data, this.image);
+    if (this.overlay) this.marks(context, rows);
+    const out = rows.reduce((sum, i) => sum + (data.used[i] ? 0 : 1), 0);
+    this.surface.canvas.setAttribute("aria-label", t("Image {image}: {n} points, {out} left out, residual vectors enlarged {k} times", { image: this.image, n: rows.length, out, k: this.enlarged }));
+  }
+
+  sharper() {
+    const image = this.image;
+    if (this.asked === image) return;
+    this.asked = image;
+    picture(image, "full").then((bitmap) => { if (this.image === image) { this.bitmap = bitmap; this.surface.redraw(); } }, () => {}).finally(() => { this.asked = ""; });
+  }
+
+  marks(context, rows) {
+    const data = this.bench.points, chosen = new Set(current().kind === "obs" ? current().ids : []);
+    const colours = { good: colour("point-good"), bad: colour("point-bad"), out: colour("point-out"), here: colour("point-here") };
+    const size = Math.max(3, Math.min(7, 3 + this.s));
+    for (const wide of [true, false]) for (const i of rows) {
+      const x = this.ox + (data.u[i] + 0.5) * this.s, y = this.oy + (data.v[i] + 0.5) * this.s;
+      const suspect = data.used[i] && Math.abs(data.w[i]) > data.limit, here = i === this.row || chosen.has(`image_point:${pointId(data, i)}`);
+      context.strokeStyle = wide ? "rgba(0,0,0,0.55)" : here ? colours.here : suspect ? colours.bad : data.used[i] ? colours.good : colours.out;
+      context.lineWidth = (here ? 2.4 : 1.4) + (wide ? 1.6 : 0);
+      context.setLineDash(data.used[i] ? [] : [3, 2.5]);
+      context.beginPath();
+      if (suspect) context.rect(x - size - 1, y - size - 1, 2 * size + 2, 2 * size + 2); // a square: told apart without colour
+      else { context.moveTo(x + size, y); context.arc(x, y, size, 0, 7); }
+      if (here) { context.moveTo(x + size + 6, y); context.arc(x, y, size + 6, 0, 7); }
+      const px = x + data.du[i] * this.s, py = y + data.dv[i] * this.s;
+      if (this.s > 3) { context.moveTo(px - 4, py); context.lineTo(px + 4, py); context.moveTo(px, py - 4); context.lineTo(px, py + 4); }
+      const length = Number.isFinite(data.du[i]) ? this.enlarged * this.s / Math.max(1, this.s / 4) : 0;
+      if (length) { context.moveTo(x, y); context.lineTo(x + length * data.du[i], y + length * data.dv[i]); }
+      context.stroke();
+      if (!wide && here && data.sigma_u) this.ellipse(context, i, x, y, length);
+    }
+    context.setLineDash([]);
+  }
+
+  /** The sigma of the detected place, as large as the vectors are. */
+  ellipse(context, i, x, y, length) {
+    const data = this.bench.points;
+    context.setLineDash([]);
+    context.lineWidth = 1.2;
+    context.beginPath();
+    context.ellipse(x, y, Math.abs(length * data.sigma_u[i]), Math.abs(length * data.sigma_v[i]), 0, 0, 7);
+    context.stroke();
+  }
+}
+

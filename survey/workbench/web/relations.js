@@ -1,0 +1,103 @@
+// One camera, and what hangs together: residuals of the table over its angles, loops, correlations.
+
+import { link, make, plainTable } from "./dom.js";
+import { count, number, significant, t } from "./words.js";
+import { anchor, current, names, select } from "./store.js";
+import { get } from "./source.js";
+import { gridOf, heat, residualField, scatter } from "./plots.js";
+
+/** A view whose content is fetched once for each solution and question. */
+class Asked {
+  /** @param {any} bench */
+  constructor(bench) {
+    this.bench = bench;
+    this.element = make("div", { class: "view page", tabindex: 0 });
+    this.follow();
+  }
+
+  question() { return ""; }
+
+  async follow() {
+    const key = `${this.bench.state.version}/${this.question()}`;
+    if (key === this.key) return;
+    this.key = key;
+    this.element.setAttribute("aria-busy", "true");
+    try {
+      const parts = await this.parts();
+      if (this.key === key) this.element.replaceChildren(...parts);
+    } catch (error) {
+      this.element.replaceChildren(make("p", { class: "warn" }, error.message));
+    }
+    this.element.removeAttribute("aria-busy");
+  }
+}
+
+export class CameraView extends Asked {
+  question() { return `${this.camera()}/${JSON.stringify(this.against)}/${this.distance ?? ""}`; }
+
+  camera() {
+    const { kind, ids } = current(), cameras = Object.keys(this.bench.sizes);
+    const said = kind === "camera" ? ids[0] : kind === "image" ? ids[0].split("/")[0] : kind === "obs" ? names(ids[0]).ids[0] : kind === "param" && ids[0].startsWith("lens/") ? ids[0].split("/")[1] : "";
+    if (cameras.includes(said)) this.last = said;
+    return this.last ?? cameras[0];
+  }
+
+  async parts() {
+    const camera = this.camera(), size = this.bench.sizes[camera], { field, coverage } = residualField(this.bench.points, camera, size);
+    const plots = make("div", { class: "figures" }, heat(t("Residual field: mean vectors over the root mean square"), field), heat(t("Coverage: image points"), coverage));
+    const choose = make("select", { "aria-label": t("Camera"), onchange: (event) => select("camera", event.target.value) }, ...Object.keys(this.bench.sizes).map((id) => make("option", { value: id, selected: id === camera }, id)));
+    const distance = make("input", { type: "number", min: "0.01", step: "any", value: this.distance ?? "", placeholder: "∞", "aria-label": t("distance, m"), onchange: () => { this.distance = distance.value; this.follow(); } });
+    const runs = (await get("runs")).runs, choices = [...runs.map((run) => [{ run: run.number }, `${t("run")} ${run.number}`]), ...Object.keys(this.bench.sizes).filter((id) => id !== camera && this.bench.sizes[id].join() === size.join()).map((id) => [{ other: id }, `${t("camera")} ${id}`])];
+    const others = make("select", { "aria-label": t("difference to"), onchange: () => { this.against = choices[others.selectedIndex - 1]?.[0]; this.follow(); } },
+      make("option", {}, "–"), ...choices.map(([what, text]) => make("option", { selected: JSON.stringify(what) === JSON.stringify(this.against) }, text)));
+    const said = make("p", { class: "warn" });
+    const asked = this.distance ? `distance_m=${encodeURIComponent(this.distance)}` : "";
+    const refused = (error) => { said.textContent = error.message; };
+    get(`camera/${encodeURIComponent(camera)}?${asked}`).then((found) => {
+      const { distortion: d, uncertainty: s } = found, body = s.station ?? s.camera;
+      const away = d.uv.map((uv, k) => [uv[0] - d.without[k][0], uv[1] - d.without[k][1]]);
+      plots.append(heat(t("Distortion: what the lens moves"), gridOf(size, d.uv, away.map((x) => Math.hypot(...x)), away)),
+        heat(s.station ? t("Uncertainty of projection (one sigma), camera on its station") : t("Uncertainty of projection (one sigma), camera by itself"), gridOf(size, s.uv, body.map((x, k) => (s.covered[k] ? x : null)))));
+      if (s.station) plots.append(heat(t("Uncertainty of projection (one sigma), camera by itself"), gridOf(size, s.uv, s.camera.map((x, k) => (s.covered[k] ? x : null)))));
+    }).catch(refused);
+    if (this.against) get(`camera/${encodeURIComponent(camera)}/difference?${new URLSearchParams(this.against)}&${asked}`).then((found) => {
+      plots.append(heat(`${t("Difference of two lens results, implied rotation fitted")}: ${significant(found.rotation_deg, 2)}°, ${significant(found.translation_mm, 2)} mm`, gridOf(size, found.uv, found.shift.map((x) => Math.hypot(...x)), found.shift)));
+    }).catch(refused);
+    return [make("div", { class: "bar" }, choose, make("label", {}, t("distance, m"), " ", distance), make("label", {}, t("difference to"), " ", others)), plots, said];
+  }
+}
+
+/** Standardized residuals of a turntable's readings over its angle, the axes as series. */
+export class TableAnglesView extends Asked {
+  async parts() {
+    const rows = this.bench.readings.filter((row) => row.table === "table_angles" && row.w !== null && row.w !== undefined);
+    if (!rows.length) return [make("p", { class: "quiet" }, t("No turntable in this survey."))];
+    const tables = Map.groupBy(rows, (row) => row.name.split("/")[0]);
+    return [...tables].flatMap(([table, mine]) => [...Map.groupBy(mine, (row) => row.component)].map(([axis, readings]) => scatter(`${table} ${axis}`,
+      [{ name: t("in use"), of: readings.filter((r) => r.used) }, { name: t("left out"), of: readings.filter((r) => !r.used) }].filter((s) => s.of.length)
+        .map((s) => ({ name: s.name, x: s.of.map((r) => r.observed), y: s.of.map((r) => r.w), anchors: s.of.map((r) => ["reading", r.id]) })),
+      { x: `${axis} [${readings[0].unit}]`, y: "w", band: this.bench.limit, onpick: select })));
+  }
+}
+
+export class LoopsView extends Asked {
+  async parts() {
+    const found = (await get("loops")).loops, loops = found?.worst_first ?? [];
+    if (!loops.length) return [make("p", { class: "quiet" }, t("No loops: the survey measures no pairs."))];
+    const closing = (loop, unit) => (loop[`misclosure_${unit}`] === undefined ? "–" : `${significant(loop[`misclosure_${unit}`], 3)} ± ${significant(loop[`sigma_misclosure_${unit}`], 2)}`);
+    const rows = loops.map((loop) => [make("span", { class: loop.closes ? "" : "bad" }, `${loop.closes ? "" : "■ "}${loop.stations.join(" → ")}`), closing(loop, "arcsec"), closing(loop, "mm"), significant(loop.test, 3), significant(loop.p_value, 2),
+      make("span", {}, ...loop.pairs.flatMap((pair) => [link(anchor("reading", `pairs:${pair}`), pair), " "]))]);
+    return [make("h2", {}, t("Loops"), " ", make("span", { class: "quiet" }, count(found.n_loops))), plainTable(t("Loops"), [t("loop"), t("misclosure, arcsec"), t("misclosure, mm"), t("Test"), "p", t("Pairs")], rows, [1, 2, 3, 4])];
+  }
+}
+
+export class CorrelationsView extends Asked {
+  async parts() {
+    const [correlated, weak] = await Promise.all(["correlations", "weak"].map(async (part) => (await get(`statistics/${part}`))[part] ?? []));
+    const name = (id) => link(anchor("param", id), id);
+    return [make("h2", {}, t("Correlations"), " ", make("span", { class: "quiet" }, count(correlated.length))),
+      plainTable(t("Correlations"), [t("parameter"), t("parameter"), t("correlation")], correlated.slice(0, 300).map((c) => [name(c.a), name(c.b), number(c.correlation, 4)]), [2]),
+      make("h2", {}, t("Weak directions")),
+      ...weak.slice(0, 8).map((w) => make("p", {}, make("b", {}, `× ${significant(w.inflation, 3)}`), "  ", Object.entries(w.parts).slice(0, 6).map(([id, share]) => `${id} ${number(share, 3)}`).join("   ")))];
+  }
+}

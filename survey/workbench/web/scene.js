@@ -1,0 +1,289 @@
+// The survey in space: cameras, targets, points with their ellipsoids; in perspective, as a plan and as elevations.
+
+import { button, colour, make, surface } from "./dom.js";
+import { number, significant, t } from "./words.js";
+import { current, names, select } from "./store.js";
+import { rowsOfPoint } from "./source.js";
+
+/** Right and up of the flat views, by axes of the world. */
+const FLAT = { plan: [0, 1], south: [0, 2], east: [1, 2] };
+const NAMES = { plan: "Plan", south: "Elevation from the south", east: "Elevation from the east" };
+const CIRCLE = Array.from({ length: 33 }, (_, k) => [Math.cos((k * Math.PI) / 16), Math.sin((k * Math.PI) / 16)]);
+const MOST = 1e5; // points drawn at once
+
+export class SceneView {
+  /** @param {any} bench `scene`: shots, spots, outlines, clouds, moves; `shifts` of points @param {string} mode scene, plan, south or east */
+  constructor(bench, mode) {
+    this.bench = bench;
+    this.mode = mode;
+    Object.assign(this, { azimuth: -1.08, elevation: 0.47, zoom: 1, dx: 0, dy: 0, hover: null, factor: null });
+    this.surface = surface(t("The survey in space"), (context, width, height) => this.paint(context, width, height));
+    this.note = make("p", { class: "note floating", "aria-live": "polite" });
+    this.told = make("output", { class: "quiet" });
+    this.element = make("div", { class: "view scene" },
+      make("div", { class: "bar" }, this.told,
+        button("−", () => this.enlarge(0.5), "-", { "aria-label": t("smaller ellipsoids") }), button("+", () => this.enlarge(2), "+", { "aria-label": t("larger ellipsoids") }),
+        button("⤢", () => { Object.assign(this, { zoom: 1, dx: 0, dy: 0 }); this.surface.redraw(); }, "0", { "aria-label": t("Whole") })),
+      make("div", { class: "stage" }, this.surface.canvas, this.note));
+    this.listen(this.surface.canvas);
+    this.measure();
+  }
+
+  /** Middle and size of everything. */
+  measure() {
+    const { scene } = this.bench;
+    if (!scene) return;
+    const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+    const places = [...scene.spots.map((spot) => spot.x), ...scene.shots.map((shot) => [shot.pose[3], shot.pose[7], shot.pose[11]]), ...scene.outlines.flatMap((line) => line.x)];
+    for (const x of places) for (let k = 0; k < 3; k++) { low[k] = Math.min(low[k], x[k]); high[k] = Math.max(high[k], x[k]); }
+    this.low = low;
+    this.high = high;
+    this.middle = low.map((x, k) => (x + high[k]) / 2);
+    this.reach = Math.max(1e-3, Math.hypot(...low.map((x, k) => high[k] - x)) / 2);
+    const largest = Math.max(1e-12, ...scene.spots.map((spot) => Math.sqrt(Math.max(spot.cov[0][0], spot.cov[1][1], spot.cov[2][2]))));
+    if (this.factor === null) this.factor = 10 ** Math.round(Math.log10(0.08 * this.reach / largest));
+  }
+
+  follow() { this.measure(); this.surface.redraw(); }
+
+  listen(canvas) {
+    const held = new Map();
+    canvas.addEventListener("wheel", (event) => { event.preventDefault(); this.nearer(Math.exp(-event.deltaY * 0.0012), event.offsetX, event.offsetY); }, { passive: false });
+    canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); held.set(event.pointerId, event); this.moved = 0; });
+    canvas.addEventListener("pointermove", (event) => {
+      const before = held.get(event.pointerId);
+      if (!before) { this.point(event.offsetX, event.offsetY); return; }
+      const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
+      this.moved += Math.abs(dx) + Math.abs(dy);
+      if (held.size === 2) {
+        const other = [...held.values()].find((e) => e.pointerId !== event.pointerId), span = (e) => Math.hypot(e.clientX - other.clientX, e.clientY - other.clientY);
+        this.nearer(span(event) / Math.max(1, span(before)), other.offsetX, other.offsetY);
+      } else if (this.mode === "scene" && !event.shiftKey && event.buttons !== 2) this.turn(-dx * 0.008, dy * 0.008);
+      else { this.dx += dx; this.dy += dy; this.surface.redraw(); }
+      held.set(event.pointerId, event);
+    });
+    canvas.addEventListener("pointerup", (event) => { held.delete(event.pointerId); if (this.moved < 5) this.click(event); });
+    canvas.addEventListener("pointercancel", (event) => held.delete(event.pointerId));
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("keydown", (event) => {
+      const turn = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
+      if (!turn) return;
+      event.preventDefault();
+      if (this.mode === "scene") this.turn(turn[0], turn[1]);
+      else { this.dx += 300 * turn[0]; this.dy += 300 * turn[1]; this.surface.redraw(); }
+    });
+  }
+
+  turn(azimuth, elevation) {
+    this.azimuth += azimuth;
+    this.elevation = Math.min(1.55, Math.max(-1.55, this.elevation + elevation));
+    this.surface.redraw();
+  }
+
+  nearer(by, x = this.surface.canvas.clientWidth / 2, y = this.surface.canvas.clientHeight / 2) {
+    const zoom = Math.min(400, Math.max(0.1, this.zoom * by)), real = zoom / this.zoom, cx = this.surface.canvas.clientWidth / 2, cy = this.surface.canvas.clientHeight / 2;
+    this.dx = x - cx - (x - cx - this.dx) * real;
+    this.dy = y - cy - (y - cy - this.dy) * real;
+    this.zoom = zoom;
+    this.surface.redraw();
+  }
+
+  enlarge(by) { this.factor *= by; this.surface.redraw(); }
+
+  /** The function from the world (m) to the screen (px). */
+  projection(width, height) {
+    const { middle, reach } = this, cx = width / 2 + this.dx, cy = height / 2 + this.dy;
+    if (this.mode !== "scene") {
+      const [a, b] = FLAT[this.mode], scale = 0.8 * this.zoom * Math.min(width / Math.max(1e-3, this.high[a] - this.low[a]), height / Math.max(1e-3, this.high[b] - this.low[b]));
+      this.scale = scale;
+      return (x) => [cx + scale * (x[a] - middle[a]), cy - scale * (x[b] - middle[b])];
+    }
+    const ca = Math.cos(this.azimuth), sa = Math.sin(this.azimuth), ce = Math.cos(this.elevation), se = Math.sin(this.elevation);
+    const unit = 0.5 * this.zoom * Math.min(width, height) / reach;
+    return (x) => {
+      const d = [x[0] - middle[0], x[1] - middle[1], x[2] - middle[2]], along = ca * d[0] + sa * d[1];
+      const scale = unit * 2.4 * reach / Math.max(2.4 * reach - (ce * along + se * d[2]), 0.3 * reach);
+      return [cx + scale * (ca * d[1] - sa * d[0]), cy - scale * (ce * d[2] - se * along)];
+    };
+  }
+
+  paint(context, width, height) {
+    const { scene } = this.bench;
+    if (!scene || !this.middle || !Number.isFinite(this.reach)) return;
+    const to = this.projection(width, height);
+    this.to = to;
+    const line = (points, closed = false) => {
+      context.beginPath();
+      points.forEach((x, k) => { const [u, v] = to(x); if (k) context.lineTo(u, v); else context.moveTo(u, v); });
+      if (closed) context.closePath();
+      context.stroke();
+    };
+    this.ground(context, line);
+    context.lineWidth = 1.1;
+    context.strokeStyle = colour("ink");
+    for (const outline of scene.outlines) line(outline.x, true);
+    this.clouds(context, to);
+    const chosen = this.chosen();
+    for (const shot of scene.shots) this.shot(context, line, to, shot, chosen.image ? shot.image === chosen.image : chosen.cameras.has(shot.camera) && shot.main);
+    this.rays(context, line, chosen);
+    for (const spot of scene.spots) this.spot(context, line, to, spot, chosen.points.has(spot.id));
+    this.labels(context, to);
+    this.ruler(context, width, height);
+    this.told.textContent = t("ellipsoids × {k}", { k: significant(this.factor, 2) });
+    this.surface.canvas.setAttribute("aria-label", t("{view}: {c} camera places, {n} points and stations; the same in the tables below", { view: t(NAMES[this.mode] ?? "The survey in space"), c: scene.shots.length, n: scene.spots.length }));
+  }
+
+  ground(context, line) {
+    const { low, high, mode } = this, [a, b] = FLAT[mode] ?? [0, 1], rest = 3 - a - b;
+    const span = Math.max(high[a] - low[a], high[b] - low[b]) / 5, power = 10 ** Math.floor(Math.log10(span || 1)), step = power * ([5, 2, 1].find((k) => k * power <= span) ?? 1);
+    this.step = step;
+    context.strokeStyle = colour("rule");
+    context.lineWidth = 1;
+    for (const [along, across] of [[a, b], [b, a]]) for (let at = Math.ceil(low[along] / step) * step; at <= high[along] && span > 0; at += step) {
+      const ends = [low.slice(), low.slice()];
+      for (const end of ends) { end[along] = at; end[rest] = low[rest]; }
+      ends[1][across] = high[across];
+      line(ends);
+    }
+    const axis = 0.12 * this.reach;
+    [["axis-x", [axis, 0, 0]], ["axis-y", [0, axis, 0]], ["axis-z", [0, 0, axis]]].forEach(([name, end]) => { context.strokeStyle = colour(name); context.lineWidth = 2; line([[0, 0, 0], end]); });
+  }
+
+  clouds(context, to) {
+    context.fillStyle = colour("quiet");
+    let left = MOST;
+    for (const cloud of this.bench.scene.clouds ?? []) for (const x of cloud.x) { if (left-- <= 0) return; const [u, v] = to(x); context.fillRect(u - 1, v - 1, 2, 2); }
+  }
+
+  /** Cameras and points that the selection means. */
+  chosen() {
+    const { kind, ids } = current(), cameras = new Set(), points = new Set();
+    let image = "";
+    for (const id of ids) {
+      const { what, ids: parts } = names(id);
+      if (kind === "camera") cameras.add(parts[0]);
+      else if (kind === "image" || (kind === "obs" && what === "image_point")) { image = this.placeOf(parts[0], parts[1]); if (parts.length === 3) points.add(parts[2]); }
+      else if (kind === "point" || kind === "station" || kind === "target") points.add(id);
+      else if (kind === "param") points.add(parts[1]);
+      else if (kind === "reading" || kind === "obs") for (const part of parts) for (const name of part.split("-")) points.add(name);
+    }
+    return { cameras, points, image };
+  }
+
+  /** The image that stands for the place of this one: of equal places only one is drawn. */
+  placeOf(camera, epoch) {
+    const pose = this.bench.scene.poses[`${camera}/${epoch}`];
+    return this.bench.scene.shots.find((shot) => shot.camera === camera && pose && shot.pose.every((x, k) => Math.abs(x - pose[k]) < 1e-4))?.image ?? "";
+  }
+
+  /** A camera: its frustum at its first image and where it is chosen, a small mark at every other place. */
+  shot(context, line, to, shot, here) {
+    context.strokeStyle = context.fillStyle = colour(here ? "point-here" : "blue");
+    if (!here && !shot.main) {
+      const [u, v] = to([shot.pose[3], shot.pose[7], shot.pose[11]]);
+      context.globalAlpha = 0.55;
+      context.fillRect(u - 1.5, v - 1.5, 3, 3);
+      context.globalAlpha = 1;
+      return;
+    }
+    const m = shot.pose, [tx, ty] = shot.half.map(Math.tan), d = 0.09 * this.reach;
+    const w = (x, y, z) => [0, 1, 2].map((i) => m[4 * i] * x + m[4 * i + 1] * y + m[4 * i + 2] * z + m[4 * i + 3]);
+    const eye = w(0, 0, 0), corners = [[-tx, -ty], [tx, -ty], [tx, ty], [-tx, ty]].map(([a, b]) => w(a * d, b * d, d));
+    context.lineWidth = here ? 2.2 : 1;
+    line(corners, true);
+    for (const corner of corners) line([eye, corner]);
+    line([w(-0.4 * tx * d, -1.25 * ty * d, d), w(0, -1.5 * ty * d, d), w(0.4 * tx * d, -1.25 * ty * d, d)]); // which way is up in the image
+  }
+
+  /** Lines of sight to the points that are chosen, from every image that saw them. */
+  rays(context, line, chosen) {
+    const { scene, points } = this.bench;
+    context.strokeStyle = colour("point-here");
+    context.lineWidth = 1;
+    context.setLineDash([5, 4]);
+    for (const spot of scene.spots) if (spot.kind === "point" && chosen.points.has(spot.id)) {
+      for (const i of rowsOfPoint(points, null, spot.id)) {
+        const block = points.blocks[points.block[i]], pose = scene.poses[`${block.camera}/${block.epoch}`];
+        if (pose) line([[pose[3], pose[7], pose[11]], spot.x]);
+      }
+    }
+    context.setLineDash([]);
+  }
+
+  spot(context, line, to, spot, here) {
+    const [u, v] = to(spot.x), axes = axesOf(spot.cov);
+    context.strokeStyle = colour(here ? "point-here" : spot.kind === "point" ? "point-bad" : "point-good");
+    context.fillStyle = context.strokeStyle;
+    context.lineWidth = here ? 1.8 : 0.9;
+    context.globalAlpha = 0.8;
+    for (const [a, b] of [[0, 1], [0, 2], [1, 2]]) line(CIRCLE.map(([c, s]) => spot.x.map((x, k) => x + this.factor * (c * axes[a][k] + s * axes[b][k]))));
+    context.globalAlpha = 1;
+    context.beginPath();
+    if (spot.kind === "point") context.arc(u, v, here ? 5 : 3, 0, 7);
+    else context.rect(u - 3.5, v - 3.5, 7, 7); // stations are squares, points are round
+    context.fill();
+    const shift = this.bench.shifts?.get(spot.id);
+    if (shift) { context.lineWidth = 2; context.strokeStyle = colour("warn"); line([spot.x, spot.x.map((x, k) => x + this.factor * shift[k])]); }
+  }
+
+  labels(context, to) {
+    const { scene } = this.bench, taken = [];
+    context.font = "11px system-ui, sans-serif";
+    context.lineJoin = "round";
+    const first = new Map(scene.shots.filter((shot) => shot.main !== false).map((shot) => [shot.camera, { id: shot.camera, x: [shot.pose[3], shot.pose[7], shot.pose[11]] }]));
+    const boards = scene.outlines.map((o) => ({ id: o.id, x: [0, 1, 2].map((k) => o.x.reduce((sum, x) => sum + x[k], 0) / o.x.length) }));
+    for (const { id, x } of [...scene.spots, ...first.values(), ...boards]) {
+      const [u, v] = to(x), width = 7 * String(id).length;
+      if (taken.some(([a, b, w]) => u < a + w && a < u + width && Math.abs(b - v) < 12)) continue; // none over another
+      taken.push([u, v, width]);
+      context.lineWidth = 3;
+      context.strokeStyle = colour("paper");
+      context.strokeText(id, u + 7, v - 5);
+      context.fillStyle = colour("ink");
+      context.fillText(id, u + 7, v - 5);
+    }
+  }
+
+  /** A length to compare with: exact in the flat views. */
+  ruler(context, width, height) {
+    if (this.mode === "scene") return;
+    const length = this.step * this.scale, metres = this.step >= 1 ? `${significant(this.step, 2)} m` : `${significant(1000 * this.step, 2)} mm`;
+    context.strokeStyle = context.fillStyle = colour("ink");
+    context.lineWidth = 2;
+    context.beginPath();
+    context.moveTo(12, height - 26); context.lineTo(12, height - 22); context.lineTo(12 + length, height - 22); context.lineTo(12 + length, height - 26);
+    context.stroke();
+    context.fillText(`${metres}   ${"xyz"[FLAT[this.mode][0]]} →  ${"xyz"[FLAT[this.mode][1]]} ↑`, 16 + length, height - 20);
+  }
+
+  nearest(x, y) {
+    if (!this.to) return null;
+    const { scene } = this.bench, things = [...scene.spots.map((s) => ({ kind: s.kind === "point" ? "point" : "station", id: s.id, x: s.x, spot: s })),
+      ...scene.shots.map((s) => ({ kind: "image", id: s.image, x: [s.pose[3], s.pose[7], s.pose[11]] })), ...scene.outlines.map((o) => ({ kind: "target", id: o.id, x: o.x[0] }))];
+    let best = null, least = 12;
+    for (const thing of things) { const [u, v] = this.to(thing.x), far = Math.hypot(u - x, v - y); if (far < least) { least = far; best = thing; } }
+    return best;
+  }
+
+  point(x, y) {
+    const found = this.nearest(x, y);
+    this.surface.canvas.style.cursor = found ? "pointer" : "grab";
+    const sigmas = found?.spot ? `   σ = ${[0, 1, 2].map((k) => number(1000 * Math.sqrt(Math.max(0, found.spot.cov[k][k])), 3)).join(" / ")} mm` : "";
+    this.note.textContent = found ? `${t(`kind ${found.kind}`)} ${found.id}   ${found.x.map((c) => number(1000 * c, 2)).join("  ")} mm${sigmas}` : "";
+  }
+
+  click(event) { const found = this.nearest(event.offsetX, event.offsetY); if (found) select(found.kind, found.id); }
+}
+
+/** Principal axes (one sigma, m) of a covariance (3, 3): Jacobi's rotations. @param {number[][]} cov @returns {number[][]} */
+export function axesOf(cov) {
+  const a = cov.map((row) => row.slice()), v = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+  for (let sweep = 0; sweep < 12; sweep++) for (const [p, q] of [[0, 1], [0, 2], [1, 2]]) {
+    if (Math.abs(a[p][q]) <= 1e-30) continue;
+    const theta = 0.5 * Math.atan2(2 * a[p][q], a[q][q] - a[p][p]), c = Math.cos(theta), s = Math.sin(theta);
+    for (let k = 0; k < 3; k++) { const [x, y] = [a[k][p], a[k][q]]; a[k][p] = c * x - s * y; a[k][q] = s * x + c * y; }
+    for (let k = 0; k < 3; k++) { const [x, y] = [a[p][k], a[q][k]]; a[p][k] = c * x - s * y; a[q][k] = s * x + c * y; }
+    for (let k = 0; k < 3; k++) { const [x, y] = [v[k][p], v[k][q]]; v[k][p] = c * x - s * y; v[k][q] = s * x + c * y; }
+  }
+  return [0, 1, 2].map((k) => [0, 1, 2].map((j) => v[j][k] * Math.sqrt(Math.max(0, a[k][k]))));
+}

@@ -1,0 +1,60 @@
+// Words and numbers in the language of the reader: texts by their English form, one JSON for each language; that of
+// English holds only words that stand for a code (`kind obs`, `key next suspect`).
+
+/** @type {Object<string, string>} */
+let texts = {};
+let language = "en";
+
+/** @param {string} wanted "en" or "de" */
+export async function speak(wanted) {
+  const found = await (await fetch(new URL(`${wanted}.json`, import.meta.url))).json();
+  [texts, language] = [found, wanted]; // at once: something may be drawn while they are fetched
+  document.documentElement.lang = wanted;
+}
+
+export const spoken = () => language;
+
+/** The language asked for: by the reader, then by the browser. */
+export function wantedLanguage() {
+  const kept = localStorage.getItem("language");
+  return kept || (navigator.language.toLowerCase().startsWith("de") ? "de" : "en");
+}
+
+/** A text, with `{name}` filled in; one that the language does not have is a bug that the tests find. @param {string} text */
+export function t(text, values = {}) {
+  if (language !== "en" && !(text in texts)) console.error(`no translation: ${text}`);
+  return (texts[text] ?? text).replace(/\{(\w+)\}/g, (all, name) => (name in values ? String(values[name]) : all));
+}
+
+/** A word that may be data: translated where the language has it. @param {string} text */
+export const known = (text) => texts[text] ?? text;
+
+const formats = new Map();
+/** A number with fixed decimals, a true minus, and a dash for none. @param {number|null|undefined} value @param {number} digits */
+export function number(value, digits = 3) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+  const key = `${language}${digits}`;
+  if (!formats.has(key)) formats.set(key, new Intl.NumberFormat(language, { minimumFractionDigits: digits, maximumFractionDigits: digits }));
+  return formats.get(key).format(value).replace("-", "−");
+}
+
+/** A count. @param {number} value */
+export const count = (value) => number(value, 0);
+
+/** A number to `digits` significant digits, for values whose size is not known beforehand. @param {number|null|undefined} value */
+export function significant(value, digits = 4) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+  if (value === 0) return "0";
+  const decimals = digits - 1 - Math.floor(Math.log10(Math.abs(value)));
+  if (decimals > 9) return value.toExponential(digits - 1).replaceAll("-", "−");
+  return number(value, Math.max(0, decimals));
+}
+
+/** A value with its unit, a dash alone for none. @param {number|null|undefined} value @param {string} [unit] */
+export const measure = (value, unit = "", digits = 7) => (Number.isFinite(value) ? `${significant(value, digits)} ${unit}`.trim() : "–");
+
+/** A time as people read it. @param {string} iso */
+export function time(iso) {
+  const date = new Date(iso);
+  return Number.isNaN(date.getTime()) ? iso : date.toLocaleString(language, { dateStyle: "short", timeStyle: "short" });
+}

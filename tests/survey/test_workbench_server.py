@@ -1,0 +1,235 @@
+"""The local server of the workbench: what it refuses, what it answers, and the loop of a mistake found and mended."""
+
+import json
+import shutil
+import threading
+from contextlib import contextmanager
+from urllib.request import Request, urlopen
+
+import cv2
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+from websockets.sync.client import connect
+
+from survey.cli import main
+from survey.workbench.server import Listening, Server
+from survey.workbench.session import Workbench
+from tests.survey.test_workbench import exclusions, wrong_point
+
+TOKEN = "secret-token-of-this-test"
+HERE = {"X-Token": TOKEN}
+LIVE = "ws://127.0.0.1:8790/live"
+
+
+@pytest.fixture
+def mine(lab, tmp_path):
+    return shutil.copytree(lab[0], tmp_path / "lab")
+
+
+@contextmanager
+def page(folder, read_only=False):
+    bench = Workbench(folder, read_only=read_only)
+    bench.adjust()
+    with TestClient(Server(bench, TOKEN).app(), base_url="http://127.0.0.1:8790") as client:
+        yield client
+
+
+def image_of(folder):
+    survey = Workbench(folder).situation.survey
+    return f"left/{next(b.epoch_id for b in survey.image_blocks if b.camera_id == 'left')}"
+
+
+def post(client, path, body, **headers):
+    return client.post(path, json=body, headers=HERE | headers)
+
+
+def exclude(name, base, reason="blur"):
+    what, _, text = name.partition(":")
+    return {"base": base, "reason": reason, "changes": [{"what": what, "id": text, "excluded": True}]}
+
+
+def test_refused_is_what_does_not_come_from_here(mine):
+    with page(mine) as client:
+        wanted = exclude("camera:right", 1)
+        assert client.get("/api/state").status_code == 403
+        assert client.get("/api/state", headers={"X-Token": "x" * len(TOKEN)}).status_code == 403
+        assert client.get("/api/state", headers={"X-Token": "ä".encode()}).status_code == 403
+        assert client.get("/api/state", headers=HERE | {"Host": "evil.example"}).status_code == 403
+        assert client.get("/api/state", headers=HERE | {"Host": "127.0.0.1.evil.example"}).status_code == 403
+        assert client.get("/api/state", headers=HERE | {"Origin": "http://evil.example"}).status_code == 403
+        assert client.get("/api/state", headers=HERE | {"Origin": "null"}).status_code == 403
+        assert client.get("/", headers={"Host": "evil.example"}).status_code == 403
+        forwarded = {"Host": "localhost:9000", "Origin": "http://localhost:9000"}
+        assert client.get("/api/state", headers=HERE | forwarded).status_code == 200
+        cookie = client.cookies["labsurvey"]
+        assert cookie == TOKEN
+        plain = {"Content-Type": "text/plain"}
+        assert client.post("/api/exclusions", json=wanted).status_code == 403  # the cookie alone
+        assert client.post("/api/exclusions", content=json.dumps(wanted), headers=HERE | plain).status_code == 415
+        assert client.get("/api/state").status_code == 403
+        assert client.delete("/api/state", headers=HERE).status_code == 405
+        assert client.post("/", headers=HERE).status_code == 405
+        assert not exclusions(mine)
+
+
+@pytest.mark.parametrize("path", [
+    "/..%2f..%2fsurvey.toml", "/%2e%2e/%2e%2e/server.py", "/server.py", "/api/image/left/..%2f..%2fsurvey.toml",
+    "/api/image/..%2fobservations/image_points", "/api/image/%2fetc/passwd", "/api/image/left/nope", "/api/nope",
+])  # fmt: skip
+def test_no_way_to_other_files(mine, path):
+    with page(mine) as client:
+        answer = client.get(path, headers=HERE)
+        assert answer.status_code == 404
+        assert "format" not in answer.text
+
+
+def test_headers_of_every_answer(mine):
+    with page(mine) as client:
+        for answer in (client.get("/"), client.get("/api/state", headers=HERE), client.get("/api/state")):
+            assert "default-src 'self'" in answer.headers["content-security-policy"]
+            assert "unsafe" not in answer.headers["content-security-policy"]
+            assert answer.headers["x-content-type-options"] == "nosniff"
+            assert answer.headers["cache-control"] == "no-store"
+            assert TOKEN not in answer.text
+        said = client.get("/api/state", headers=HERE).headers["set-cookie"].lower()
+        assert "httponly" in said
+        assert "samesite=strict" in said
+
+
+def test_bodies_that_are_too_long_or_no_sense(mine):
+    with page(mine) as client:
+        kind = {"Content-Type": "application/json"}
+
+        def pieces():
+            for _ in range(40):
+                yield b" " * 50_000
+
+        assert client.post("/api/exclusions", content=pieces(), headers=HERE | kind).status_code == 413
+        for body in (b"{", b"[]", b'{"changes": 3}', b'{"changes": [{"what": "image", "id": "x"}]}', b"[" * 100_000,
+                     b'{"base": "1", "changes": [{"name": "x", "excluded": true}]}', b"\xff"):  # fmt: skip
+            assert client.post("/api/exclusions", content=body, headers=HERE | kind).status_code == 400, body[:60]
+        answer = post(client, "/api/exclusions", exclude("image:../../etc/passwd", 1))
+        assert answer.status_code == 409
+        assert not exclusions(mine)
+
+
+def test_read_only_is_get_only(mine):
+    with page(mine, read_only=True) as client:
+        assert client.get("/api/findings", headers=HERE).status_code == 200
+        for path in ("exclusions", "adjust", "undo", "save", "runs/1/restore"):
+            assert post(client, f"/api/{path}", {}).status_code == 403
+    assert not exclusions(mine)
+
+
+def test_the_socket_needs_origin_and_token(mine):
+    with page(mine) as client:
+        for headers in ({}, {"Origin": "http://127.0.0.1:8790"}, HERE, HERE | {"Origin": "http://evil.example"},
+                        {"Cookie": f"labsurvey={TOKEN}"},
+                        {"Cookie": f"labsurvey={TOKEN}", "Origin": "http://evil.example"}):  # fmt: skip
+            with pytest.raises(WebSocketDisconnect), client.websocket_connect(LIVE, headers=headers):
+                pass
+        known = {"Origin": "http://127.0.0.1:8790", "Cookie": f"labsurvey={TOKEN}"}
+        with client.websocket_connect(LIVE, headers=known) as socket:
+            assert post(client, "/api/adjust", {"mode": "cold"}).status_code == 200
+            kinds = []
+            while "state" not in kinds:
+                kinds.append(socket.receive_json()["type"])
+            assert "progress" in kinds
+
+
+def test_a_mistake_is_found_seen_left_out_and_taken_back(mine):
+    name = wrong_point(mine)
+    with page(mine) as client:
+        state = client.get("/api/state", headers=HERE).json()
+        found = client.get("/api/findings", headers=HERE).json()["findings"][0]
+        assert found["id"] == f"image_point:{name}"
+        assert found["anchor"] == f"#obs=image_point:{name}"
+        seen = client.get(f"/api/points?image={found['image']}", headers=HERE)
+        header = json.loads(seen.content[4 : 4 + int.from_bytes(seen.content[:4], "little")])
+        assert header["n"] > 3
+        changes = found["remedies"][0]["changes"]
+        told = post(client, "/api/preview", {"changes": changes}).json()
+        assert told["n_image_points"] == 1
+        body = {"base": state["version"], "reason": "reflection", "changes": changes}
+        after = post(client, "/api/exclusions", body).json()
+        assert after["version"] == state["version"] + 1
+        assert after["exclusions"][0]["reason"] == "reflection"
+        assert after["changes"]["components"][0]["sigmas"] >= 0.0
+        old = post(client, "/api/exclusions", body)
+        assert old.status_code == 409
+        assert "changed since" in old.json()["error"]
+        back = post(client, "/api/undo", {"base": after["version"]}).json()
+        assert back["exclusions"] == []
+        assert back["redo"] == [f"exclude image_point:{name}"]
+        assert [line.split(",")[2] for line in exclusions(mine)] == ["excluded", "included"]
+        saved = post(client, "/api/save", {}).json()
+        assert "solution.json" in saved["written"]
+        runs = client.get("/api/runs", headers=HERE).json()["runs"]
+        same = client.get(f"/api/compare?b={runs[0]['number']}&most=5", headers=HERE).json()
+        assert all(c["sigmas"] < 1e-6 for c in same["components"] if c["sigmas"] is not None)
+
+
+def test_the_command_line_and_two_pages_lose_nothing_of_each_other(mine):
+    first, second = image_of(mine), "right/" + image_of(mine).split("/")[1]
+    with page(mine) as a, page(mine) as b:
+        assert post(a, "/api/exclusions", exclude(f"image:{first}", 1)).status_code == 200
+        late = post(b, "/api/exclusions", exclude(f"image:{second}", 1))
+        assert late.status_code == 409
+        assert late.json()["retry"]
+        assert b.get("/api/state", headers=HERE).json()["changed_files"] == ["observations/exclusions.csv"]
+        assert main(["include", str(mine), first, "--quiet"]) == 0
+        state = post(b, "/api/reload", {}).json()
+        assert state["changed_files"] == []
+        assert post(b, "/api/exclusions", exclude(f"image:{second}", state["version"])).status_code == 200
+    assert [line.split(",")[1:3] for line in exclusions(mine)] == [
+        [first, "excluded"], [first, "included"], [second, "excluded"],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("path", ["readings", "parameters", "scene", "findings", "runs", "statistics/correlations",
+                                  "statistics/reliability", "changes", "camera/left?distance_m=3", "loops",
+                                  "table_residuals"])  # fmt: skip
+def test_every_view_answers(mine, path):
+    with page(mine) as client:
+        answer = client.get(f"/api/{path}", headers=HERE)
+        assert answer.status_code == 200, answer.text
+        assert answer.json()["version"] == 1
+
+
+def test_an_unknown_part_offers_the_nearest(mine):
+    with page(mine) as client:
+        answer = client.get("/api/statistics/correlation", headers=HERE)
+        assert answer.status_code == 409
+        assert "did you mean 'correlations'" in answer.json()["error"]
+
+
+def test_images_by_name_with_a_tag(mine):
+    camera, epoch = image_of(mine).split("/")
+    place = mine / "images" / camera
+    place.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(place / f"{epoch}.png"), np.full((60, 80), 90, np.uint8))
+    with page(mine) as client:
+        answer = client.get(f"/api/image/{camera}/{epoch}?size=40", headers=HERE)
+        assert answer.headers["content-type"] == "image/jpeg"
+        tag = answer.headers["etag"]
+        again = client.get(f"/api/image/{camera}/{epoch}?size=40", headers=HERE | {"If-None-Match": tag})
+        assert again.status_code == 304
+        assert client.get(f"/api/image/{camera}/{epoch}?size=full", headers=HERE).headers["etag"] != tag
+        client.get("/api/state", headers=HERE)
+        assert client.get(f"/api/image/{camera}/{epoch}").status_code == 200  # by the cookie, as <img> asks
+
+
+def test_it_ends_with_pages_still_open(mine):
+    bench = Workbench(mine)
+    bench.adjust()
+    with Listening(Server(bench, TOKEN, "c"), "127.0.0.1", 0) as listening:
+        with urlopen(Request(f"{listening.address}api/state", headers=HERE), timeout=20) as answer:
+            assert json.load(answer)["version"] == 1
+        origin = listening.address.rstrip("/")
+        known = {"Cookie": f"c={TOKEN}"}
+        socket = connect(f"{origin.replace('http', 'ws')}/live", origin=origin, additional_headers=known)
+    assert not any(t.is_alive() and "uvicorn" in t.name for t in threading.enumerate())
+    with socket:
+        assert list(socket) == []  # closed by the server
