@@ -121,7 +121,8 @@ def _difference(a: Estimate, b: Estimate) -> FloatArray:
     """After minus before, of a pose in the tangent of before."""
     if isinstance(a.value, Pose3) and isinstance(b.value, Pose3):
         return np.asarray(Pose3.Logmap(a.value.between(b.value)))
-    return np.subtract(np.asarray(b.value, dtype=float), np.asarray(a.value, dtype=float))
+    old, new = np.asarray(a.value, dtype=float), np.asarray(b.value, dtype=float)
+    return np.asarray(new - old)
 
 
 def _shown(e: Estimate) -> list[float | None]:

@@ -220,7 +220,7 @@ class Server:
         while True:
             await asyncio.sleep(_LOOK_S)
             changed = await asyncio.to_thread(self.bench.changed_files)
-            if changed != told:
+            if changed != told and not self._running:  # else it may be what is being written here
                 told = changed
                 self.live.post({"type": "folder", "changed": list(changed), "lock": self.bench.holder()})
 

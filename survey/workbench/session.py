@@ -469,12 +469,13 @@ class Workbench:
         if text:  # which spot is which beacon may be another question now
             trial = replace(trial, identified=(), known_spots=frozenset())
         solved = self._solved(trial, "warm")
-        self._write(text, rows)
-        changes = self._take(self._as_written(solved))
+        signature = self._write(text, rows)
+        changes = self._take(replace(self._as_written(solved), signature=signature))
         self.n_unsaved += 1
         return changes
 
-    def _write(self, text: str, rows: Sequence[Row]) -> None:
+    def _write(self, text: str, rows: Sequence[Row]) -> Mapping[str, tuple[int, int]]:
+        """Write what was decided; the signature of the files then, taken while nobody else may write."""
         with changing(self.folder, inputs=True) as place:
             self._require_unchanged()
             if text:
@@ -482,6 +483,7 @@ class Workbench:
             if rows:
                 atomic_write(place / FILE, appended(self.folder / FILE, rows))
             replace_parts(self.folder)
+            return signature_of(self.folder)
 
     def _as_written(self, situation: Situation) -> Situation:
         """With the hashes of the files as they are now, and the lines on which exclusions stand."""
@@ -490,8 +492,7 @@ class Workbench:
         inputs = {**situation.everything.inputs, **({FILE: digest} if digest else {})}
         everything = replace(situation.everything, inputs=dict(sorted(inputs.items())))
         project = leaving_out(everything, exclusions.values())
-        return replace(situation, everything=everything, project=project, exclusions=exclusions,
-                       signature=signature_of(self.folder))  # fmt: skip
+        return replace(situation, everything=everything, project=project, exclusions=exclusions)
 
     def _name(self, observed: Observed, text: str) -> Name:
         for name in self.situation.exclusions:
