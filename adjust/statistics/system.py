@@ -395,16 +395,23 @@ def _image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns, values:
     return A[order], e[order]
 
 
+def columns_of_blocks(graph: AdjustmentGraph, key_columns: KeyColumns) -> Callable[[IntArray], IntArray]:
+    """Columns (g, w) of g image blocks of known targets with equally many: those of their keys, one after the other."""
+    k = graph.images.of_blocks
+    every = np.concatenate([np.zeros(0, dtype=np.int64), *(key_columns[key] for key in k.key.tolist())])
+    first = np.cumsum(k.columns) - k.columns
+    return lambda mine: every[first[mine][:, None] + np.arange(int(k.columns[mine[0]]))]
+
+
 def _known_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows:
     images, entries = graph.images, Entries()
     e = np.zeros(2 * images.n_points)
-    for b, keys in enumerate(images.keys):
-        rows = np.arange(2 * int(images.ptr[b]), 2 * int(images.ptr[b + 1]))
-        local = images.rows(b)
-        e[rows] = local[:, -1]
-        if keys:
-            columns = np.concatenate([key_columns[k] for k in keys])
-            entries.add(rows, columns, local[:, :-1] @ images.local_from_keys(b))
+    columns = columns_of_blocks(graph, key_columns)
+    for mine in images.alike():
+        local = images.rows(mine)
+        rows = 2 * images.ptr[mine][:, None] + np.arange(local.shape[1])
+        e[rows] = local[:, :, -1]
+        entries.add_blocks(rows, columns(mine), local[:, :, :-1] @ images.local_from_keys(mine))
     return entries.matrix((len(e), n)), e
 
 
