@@ -223,8 +223,9 @@ class Adjustment:
         n = len(self.other_residuals) - (0 if readings is None else len(readings.used))
         first = self.other_residuals[:n]
         parts = [
-            (np.array([len(o.components) for o in first], dtype=np.int64), np.array([o.used for o in first], dtype=bool),
-             np.array([o.test for o in first]), np.array([float(o.redundancy.max()) for o in first]),
+            (np.array([len(o.components) for o in first], dtype=np.int64),
+             np.array([o.used for o in first], dtype=np.bool_), np.array([o.test for o in first]),
+             np.array([float(o.redundancy.max()) for o in first]),
              np.concatenate([np.zeros(0), *(o.standardized for o in first)]))
         ]  # fmt: skip
         if readings is not None:

@@ -137,7 +137,7 @@ def _known(
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Rows of g alike blocks, k each: by the columns of their keys (g, k, w), the rest as ``CondensedSystem`` has it."""
+    """Rows of g alike blocks, k each: by the columns of their keys (g, k, w), the rest as in ``CondensedSystem``."""
 
     by_key: FloatArray
     lens: FloatArray

@@ -293,7 +293,10 @@ def _ellipses(batches: Sequence[_Batch], n_image: int, found: Criteria) -> Image
 
 
 def _ellipses_of(batch: _Batch, found: Criteria) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Major and minor axis (px) and direction (rad) of the ellipses of biases b with b' W'KW b = lambda0: axes of lambda0 inv(W'KW), inf where uncontrolled."""
+    """Major and minor axis (px), direction (rad) of biases b with b' W'KW b = lambda0.
+
+    They are the axes of lambda0 inv(W'KW), inf where uncontrolled.
+    """
     x = batch.x
     inverse = np.divide(1.0, x.values, out=np.full_like(x.values, 1e300), where=x.controlled)
     root = np.einsum("nij,njk->nik", batch.back, x.vectors * np.sqrt(inverse)[:, None, :])

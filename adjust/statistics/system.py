@@ -302,6 +302,7 @@ def _points_apart(precision: Precision, n: int, key_columns: KeyColumns) -> Imag
 
 
 def groups_of_others(graph: AdjustmentGraph) -> list[str]:
+    """Of all observations that are no image points, the readings last."""
     return [o.group for o in graph.others] + [r.group for r in graph.survey.readings]
 
 

@@ -220,8 +220,11 @@ class ImageBatch:
         """All blocks in sets with the same numbers of points, rows and columns, none of much more than ``_AT_ONCE``."""
         sizes = np.stack([np.diff(self.ptr), self.n_rows, self.of_blocks.columns], axis=1)
         kinds, kind = np.unique(sizes, axis=0, return_inverse=True)
-        sets = [(np.flatnonzero(kind.ravel() == j), max(_AT_ONCE // max(int(n), 1), 1)) for j, (n, *_) in enumerate(kinds)]
-        return [mine[i : i + most] for mine, most in sets for i in range(0, len(mine), most)]
+        sets = []
+        for j, n in enumerate(kinds[:, 0].tolist()):
+            mine, most = np.flatnonzero(kind.ravel() == j), max(_AT_ONCE // max(n, 1), 1)
+            sets += [mine[i : i + most] for i in range(0, len(mine), most)]
+        return sets
 
     def rows(self, which: IntArray) -> FloatArray:
         """Whitened rows (g, 2 n, local unknowns and 1) of all points of g blocks that are alike, the residual last.
@@ -234,7 +237,7 @@ class ImageBatch:
         return out
 
     def local_from_keys(self, which: IntArray) -> FloatArray:
-        """Derivative (g, n_lens + 6 + n_warp, sum of key dims) of the local unknowns of g alike blocks by their keys."""
+        """Derivative (g, n_lens + 6 + n_warp, sum of key dims) of the local unknowns of g alike blocks by keys."""
         nl, b = self.state.lenses.n_free[self.camera[which]], int(which[0])
         G = np.zeros((len(which), int(self.n_rows[b]) - 1, int(self.of_blocks.columns[b])))
         local_by_keys(which, nl, self.by_keys, G)
