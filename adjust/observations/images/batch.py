@@ -220,7 +220,7 @@ class ImageBatch:
         """All blocks in sets with the same numbers of points, rows and columns, none of much more than ``_AT_ONCE``."""
         sizes = np.stack([np.diff(self.ptr), self.n_rows, self.of_blocks.columns], axis=1)
         kinds, kind = np.unique(sizes, axis=0, return_inverse=True)
-        sets = []
+        sets: list[IntArray] = []
         for j, n in enumerate(kinds[:, 0].tolist()):
             mine, most = np.flatnonzero(kind.ravel() == j), max(_AT_ONCE // max(n, 1), 1)
             sets += [mine[i : i + most] for i in range(0, len(mine), most)]
