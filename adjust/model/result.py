@@ -2,8 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
+import numpy as np
 from gtsam import Pose3
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
@@ -93,6 +95,32 @@ class ObservationResidual:
     standardized: FloatArray
     test: float
     used: bool
+
+
+@dataclass(frozen=True, eq=False)
+class OtherArrays:
+    """What ``Adjustment.other_residuals`` (M) say, as arrays: n_components, used, test, most redundancy of a component.
+
+    All (M,); standardized: (K,) component by component.
+    """
+
+    n_components: IntArray
+    used: BoolArray
+    test: FloatArray
+    redundancy: FloatArray
+    standardized: FloatArray
+
+    @cached_property
+    def observation(self) -> IntArray:
+        """Of every component (K,)."""
+        return np.repeat(np.arange(len(self.n_components)), self.n_components)
+
+    @property
+    def largest(self) -> FloatArray:
+        """Largest standardized residual (M,) in size; 0 where there is none."""
+        out = np.zeros(len(self.used))
+        np.maximum.at(out, self.observation, np.where(np.isnan(self.standardized), 0.0, np.abs(self.standardized)))
+        return out
 
 
 @dataclass(frozen=True)
@@ -187,6 +215,23 @@ class Adjustment:
     variance_components: Any = None
     decisions: tuple[Any, ...] = ()
     n_screened: int = 0
+
+    @cached_property
+    def other_arrays(self) -> OtherArrays:
+        """``other_residuals`` as arrays; of readings none is made for that."""
+        readings = self.reading_residuals
+        n = len(self.other_residuals) - (0 if readings is None else len(readings.used))
+        first = self.other_residuals[:n]
+        parts = [
+            (np.array([len(o.components) for o in first], dtype=np.int64),
+             np.array([o.used for o in first], dtype=np.bool_), np.array([o.test for o in first]),
+             np.array([float(o.redundancy.max()) for o in first]),
+             np.concatenate([np.zeros(0), *(o.standardized for o in first)]))
+        ]  # fmt: skip
+        if readings is not None:
+            one, r = np.ones(len(readings.used), dtype=np.int64), readings
+            parts.append((one, r.used, r.test, r.redundancy, r.standardized))
+        return OtherArrays(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
     def __repr__(self) -> str:
         """The key figures in one line."""

@@ -200,8 +200,7 @@ inline void errors(Ints which, const Batch &B, Out<double, 1> chi, Out<double, 1
 }
 
 // Whitened rows (2 n, n_local + 1) of block b over its local unknowns, residual last.
-inline void block_rows(int64_t b, const Batch &B, Out<double, 2> out) {
-    Room room;
+inline void rows_of_block(int64_t b, const Batch &B, Room &room, Out<double, 2> out) {
     const int n = int(B.n_local(b)) + 1;
     V least = all<V>(__builtin_inf());
     clear_unused(B, b, room);
@@ -214,6 +213,12 @@ inline void block_rows(int64_t b, const Batch &B, Out<double, 2> out) {
                     for (int j = 0; j < n; ++j) out(2 * (lo - B.blocks.ptr[b] + p) + s, j) = room.A[j][s * chunk.full + p];
         });
     });
+}
+
+// The same of listed blocks, which have equally many points and columns: out (g, 2 n, n_local + 1).
+inline void block_rows(Ints which, const Batch &B, Out<double, 3> out) {
+    Room room;
+    for (int64_t i = 0; i < which.n[0]; ++i) rows_of_block(which[i], B, room, out[i]);
 }
 
 // Upper triangular R with R'R = H, positive semidefinite (n, n), in place; a vanishing pivot leaves a zero row. H is
@@ -302,7 +307,7 @@ inline void serve(Ints which, const Blocks &blocks, const Lenses &lenses, const 
 }
 
 // Derivative G (n_local, sum of key dims) of a block's local unknowns by its keys.
-inline void local_by_keys(int64_t b, int64_t nl, const Segments &S, In<double, 3> C, In<double, 3> D, Out<double, 2> G) {
+inline void block_by_keys(int64_t b, int64_t nl, const Segments &S, In<double, 3> C, In<double, 3> D, Out<double, 2> G) {
     double E[6][MAX_LENS];
     std::memset(G.data, 0, sizeof(double) * G.n[0] * G.n[1]);
     each_segment(S, b, nl,
@@ -314,6 +319,11 @@ inline void local_by_keys(int64_t b, int64_t nl, const Segments &S, In<double, 3
             for (int i = 0; i < 6; ++i)
                 for (int64_t j = 0; j < S.n[s]; ++j) G(nl + i, S.place[s] + j) += E[i][j];
         });
+}
+
+// The same of listed blocks, which have equally many columns on either side: G (g, n_local, sum of key dims).
+inline void local_by_keys(Ints which, Ints n_lens, const Segments &S, In<double, 3> C, In<double, 3> D, Out<double, 3> G) {
+    for (int64_t i = 0; i < which.n[0]; ++i) block_by_keys(which[i], n_lens[i], S, C, D, G[i]);
 }
 
 // Keys of blocks as a tree numbers them: block b has key[ptr[b]] .., whose columns begin at place; -1: known exactly.
@@ -364,7 +374,7 @@ inline void all_statistics(Ints which, const Batch &B, const Segments &S, In<dou
         const int n = int(B.n_local(b));
         double *joint = work.data, *G = joint + w * w, *K = G + n * w;
         if (!joint_of_keys(b, keys, tree, joint, w)) lost.data[b] = 1;
-        local_by_keys(b, nl, S, C, D, Out<double, 2>(G, {n, w}));
+        block_by_keys(b, nl, S, C, D, Out<double, 2>(G, {n, w}));
         congruent(G, joint, n, w, K, Q);
         clear_unused(B, b, room);
         with_lens(B.lenses.kind[B.blocks.camera[b]], [&]<class Lens>(Lens) {

@@ -24,11 +24,11 @@ _BATCH = f"{BLOCKS} X[3,N] shape[2,N] uv[2,N] W[3,N] {LENSES} R[B,3,3] t[B,3] wa
 CHAINED = "C[*,6,6] D[*,6,*]"
 _normal_equations = Function("normal_equations", f"which[*] {_BATCH} H[B,m,m] chi[B] depth[B]")
 _errors = Function("errors", f"which[*] {_BATCH} chi[B] depth[B]")
-_block_rows = Function("block_rows", f"b {_BATCH} out[*,*]")
+_block_rows = Function("block_rows", f"which[g] {_BATCH} out[g,*,*]")
 _serve = Function(
     "serve", f"which[*] {BLOCKS} {LENSES} {SEGMENTS} {CHAINED} width[B] at[B] H[B,m,m] flat[*] r[B,m]"
 )
-_local_by_keys = Function("local_by_keys", f"b n_lens {SEGMENTS} {CHAINED} G[*,*]")
+_local_by_keys = Function("local_by_keys", f"which[g] n_lens[g] {SEGMENTS} {CHAINED} G[g,*,*]")
 _all_statistics = Function(
     "all_statistics",
     f"which[*] {_BATCH} {SEGMENTS} {CHAINED} columns[B] keys_ptr[B+1] key[k] key_place[k] {TREE} "
@@ -135,9 +135,9 @@ def errors(which: IntArray, at: BlocksAt, chi: FloatArray, depth: FloatArray) ->
     _errors(which, *at.arrays, chi, depth)
 
 
-def block_rows(b: int, at: BlocksAt, out: FloatArray) -> None:
-    """Whitened rows (2 n, n_lens + 6 + n_warp + 1) of block b over its local unknowns, residual last."""
-    _block_rows(b, *at.arrays, out)
+def block_rows(which: IntArray, at: BlocksAt, out: FloatArray) -> None:
+    """Whitened rows (g, 2 n, n_lens + 6 + n_warp + 1) of g blocks of one size over local unknowns, residual last."""
+    _block_rows(which, *at.arrays, out)
 
 
 def serve(
@@ -151,9 +151,9 @@ def serve(
     _serve(which, *at.blocks, *at.lenses, *segments, C, D, width, begin, H, flat, r_out)
 
 
-def local_by_keys(b: int, n_lens: int, keys: ByKeys, G: FloatArray) -> None:
-    """Derivative G (n_lens + 6 + n_warp, sum of key dims) of a block's local unknowns by its keys."""
-    _local_by_keys(b, n_lens, *keys.segments, keys.C, keys.D, G)
+def local_by_keys(which: IntArray, n_lens: IntArray, keys: ByKeys, G: FloatArray) -> None:
+    """Derivative G (g, n_lens + 6 + n_warp, sum of key dims) of the local unknowns of g blocks of one size by keys."""
+    _local_by_keys(which, n_lens, *keys.segments, keys.C, keys.D, G)
 
 
 def all_statistics(

@@ -1,15 +1,18 @@
 """Compiled kernels on all cores: they hold no lock and write disjoint places, so threads need no copies."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from typing import TypeVar
 
 import numpy as np
 
 from adjust.model.survey import IntArray
 
 _WORTHWHILE = 5_000
+_Part = TypeVar("_Part")
+_Result = TypeVar("_Result")
 
 
 @cache
@@ -34,6 +37,16 @@ def split_blocks(ptr: IntArray) -> list[IntArray]:
     count = 1 if total < _WORTHWHILE else min(n, workers())
     edges = np.searchsorted(ptr, np.linspace(0, total, count + 1)[1:-1])
     return [run.astype(np.int64) for run in np.split(np.arange(n), edges) if len(run)]
+
+
+def side_by_side(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -> list[_Result]:
+    """The results of a function of every part, in their order; where the parts are the same, so are the results.
+
+    The function must not come back here.
+    """
+    if len(parts) <= 1 or workers() == 1:
+        return [function(part) for part in parts]
+    return list(_pool(workers()).map(function, parts))
 
 
 def run_split(kernel: Callable[..., object], runs: list[IntArray], *arguments: object) -> None:

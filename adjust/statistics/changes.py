@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -80,6 +81,7 @@ class _Chosen:
     amounts: FloatArray
 
 
+@cache
 def natural(name: str) -> tuple[tuple[int, str], ...]:
     """Key that sorts names with numbers as people do: e2 before e10."""
     parts = re.split(r"(\d+)", name)

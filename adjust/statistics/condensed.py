@@ -8,6 +8,7 @@ epochs, another shape of its target. What the residuals say of these is asked in
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
@@ -15,11 +16,21 @@ from scipy import sparse
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
+from adjust.native.parallel import side_by_side
 from adjust.observations.images.batch import warp_shape
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
 from adjust.spatial.rigid import skew
-from adjust.statistics.system import Entries, ImageRows, KeyColumns, LinearSystem, assembled, bundle_order, bundle_rows
+from adjust.statistics.system import (
+    Entries,
+    ImageRows,
+    KeyColumns,
+    LinearSystem,
+    assembled,
+    bundle_order,
+    bundle_rows,
+    columns_of_blocks,
+)
 
 N_SHAPE = 4
 _FLAT = 1e-9
@@ -48,20 +59,26 @@ class CondensedSystem:
 
     def point_rows(self, row: int) -> tuple[IntArray, FloatArray]:
         """Columns (k,) and the whitened rows (2, k) over them of an image point that is in use."""
-        graph = self.system.precision.graph
-        ptr = np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks])
+        graph, (ptr, place) = self.system.precision.graph, self._places
         i = int(np.searchsorted(ptr, row, side="right")) - 1
-        point, known = row - int(ptr[i]), [k for k, free in graph.image_order if not free]
-        if i not in known:  # its rows are among those of the system
+        point = row - int(ptr[i])
+        if i not in place:  # its rows are among those of the system
             first = int(np.flatnonzero(self.block == i)[0])
             A = self.system.A[first + 2 * point : first + 2 * point + 2]
             columns = np.unique(A.indices)
             return columns, A[:, columns].toarray()
-        b = known.index(i)
-        local = graph.images.rows(b)[2 * point : 2 * point + 2, :-1]
+        b, which = place[i], np.array([place[i]])
+        local = graph.images.rows(which)[0, 2 * point : 2 * point + 2, :-1]
         columns = np.concatenate([self.key_columns[key] for key in graph.images.keys[b]])
         kept = columns >= 0
-        return columns[kept], (local @ graph.images.local_from_keys(b))[:, kept]
+        return columns[kept], (local @ graph.images.local_from_keys(which)[0])[:, kept]
+
+    @cached_property
+    def _places(self) -> tuple[IntArray, dict[int, int]]:
+        """First image point of every block, and the place of blocks of known targets among these."""
+        graph = self.system.precision.graph
+        known = [i for i, free in graph.image_order if not free]
+        return np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks]), {i: b for b, i in enumerate(known)}
 
 
 def condensed_system(precision: Precision) -> CondensedSystem:
@@ -100,26 +117,50 @@ def _known(
     number = np.array([i for i, free in graph.image_order if not free], dtype=np.int64)
     shapes: dict[str | None, FloatArray] = {}
     shapes.update({t.target_id: _shape_factors(t.x_in_target) for t in graph.survey.targets})
-    sizes = np.stack([np.diff(images.ptr), images.n_rows, images.of_blocks.columns], axis=1)
-    kinds, kind = np.unique(sizes, axis=0, return_inverse=True)
-    at, order, lengths, e = 0, np.zeros(0, dtype=np.int64), [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
-    for j in range(len(kinds)):
-        mine = np.flatnonzero(kind.ravel() == j)
-        rows = _condensed_rows(graph, mine, shapes)
-        g, k, width = len(mine), rows.shape[1], int(kinds[j, 1]) - 1
-        if kinds[j, 2]:
-            columns = np.array([np.concatenate([key_columns[key] for key in images.keys[b]]) for b in mine])
-            by_key = rows[:, :, :width] @ np.array([images.local_from_keys(int(b)) for b in mine])
-            entries.add_blocks(at + np.arange(g * k).reshape(g, k), columns, by_key)
-        _keep(graph, mine, rows, width, kept)
+    columns, sets = columns_of_blocks(graph, key_columns), images.alike()
+    at, lengths, e = 0, [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+    for mine, part in zip(sets, side_by_side(lambda mine: _condensed(graph, mine, shapes), sets), strict=True):
+        g, k = part.e.shape
+        entries.add_blocks(at + np.arange(g * k).reshape(g, k), columns(mine), part.by_key)
+        for name, values in kept.items():
+            values.append(getattr(part, name).reshape(g * k, -1))
         blocks.append(np.repeat(number[mine], k))
-        e.append(rows[:, :, -1].ravel())
+        e.append(part.e.ravel())
         lengths.append(np.full(g, k))
-        order, at = np.concatenate([order, mine]), at + g * k
+        at += g * k
+    order = np.concatenate([np.zeros(0, dtype=np.int64), *sets])
     numbers.append(number[order])
-    groups = [images.blocks[b].group for b in order]
+    groups = [images.blocks[b].group for b in order.tolist()]
     used = np.ones(len(groups), dtype=np.bool_)
     return ImageRows(entries.matrix((at, n)), np.concatenate(e), np.concatenate(lengths), used, groups)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of g alike blocks, k each: by the columns of their keys (g, k, w), the rest as in ``CondensedSystem``."""
+
+    by_key: FloatArray
+    lens: FloatArray
+    camera: FloatArray
+    target: FloatArray
+    shape: FloatArray
+    e: FloatArray
+
+
+def _condensed(graph: AdjustmentGraph, mine: IntArray, shapes: Mapping[str | None, FloatArray]) -> _Rows:
+    """Of blocks that are alike."""
+    images, width = graph.images, int(graph.images.n_rows[mine[0]]) - 1
+    rows = _condensed_rows(graph, mine, shapes)
+    nl = images.state.lenses.n_free[images.camera[mine]]
+    lens = np.zeros((*rows.shape[:2], MAX_LENS))
+    pose = np.empty((*rows.shape[:2], 6))
+    for count in np.unique(nl):  # warps make up for lens parameters in the number of columns
+        those = nl == count
+        lens[those, :, :count] = rows[those][:, :, :count]
+        pose[those] = rows[those][:, :, count : count + 6]
+    by_camera = pose @ _of_cameras(images.chains.R[mine], images.chains.t[mine])
+    by_key = rows[:, :, :width] @ images.local_from_keys(mine)
+    return _Rows(by_key, lens, by_camera, pose, rows[:, :, width:-1].copy(), rows[:, :, -1].copy())
 
 
 def _condensed_rows(
@@ -127,7 +168,7 @@ def _condensed_rows(
 ) -> FloatArray:
     """Rows (g, k, lens + pose + warp + shape + 1) of g blocks with equally many points and columns."""
     images = graph.images
-    local = np.array([graph.images.rows(int(b)) for b in mine])
+    local = images.rows(mine)
     n = local.shape[1] // 2
     none = np.zeros((0, N_SHAPE))
     factors = np.zeros((len(mine), n, N_SHAPE))
@@ -142,25 +183,6 @@ def _condensed_rows(
     used = images.used[images.ptr[mine][:, None] + np.arange(n)]
     rows *= np.repeat(used, 2, axis=1)[:, :, None]
     return np.asarray(np.linalg.qr(rows, mode="r")) if rows.shape[1] > rows.shape[2] else rows
-
-
-def _keep(
-    graph: AdjustmentGraph, mine: IntArray, rows: FloatArray, width: int, kept: dict[str, list[FloatArray]]
-) -> None:
-    """The columns of what a block may have of its own."""
-    images = graph.images
-    nl = images.state.lenses.n_free[images.camera[mine]]
-    lens = np.zeros((*rows.shape[:2], MAX_LENS))
-    pose = np.empty((*rows.shape[:2], 6))
-    for count in np.unique(nl):  # warps make up for lens parameters in the number of columns
-        those = nl == count
-        lens[those, :, :count] = rows[those][:, :, :count]
-        pose[those] = rows[those][:, :, count : count + 6]
-    by_camera = _of_cameras(images.chains.R[mine], images.chains.t[mine])
-    kept["lens"].append(lens.reshape(-1, MAX_LENS))
-    kept["target"].append(pose.reshape(-1, 6))
-    kept["camera"].append((pose @ by_camera).reshape(-1, 6))
-    kept["shape"].append(rows[:, :, width:-1].reshape(-1, N_SHAPE))
 
 
 def _of_cameras(R: FloatArray, t: FloatArray) -> FloatArray:

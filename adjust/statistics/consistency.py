@@ -173,14 +173,15 @@ def _p(part: Part, level: float, system: LinearSystem | None) -> float:
     bound = upper_tail_bound(part.omega, part.redundancy)
     if bound < level or system is None or not len(part.members):
         return bound
-    rows = np.flatnonzero(np.isin(system.row_of, part.members))
-    k = min(len(rows), part.n)
+    n_rows = int((system.ptr[part.members + 1] - system.ptr[part.members]).sum())
+    k = min(n_rows, part.n)
     lost = part.n - part.redundancy  # degrees of freedom that the unknowns take; evenly, the variance is least
     squares = part.n - k + k * (1.0 - lost / k) ** 2
     scale = max(squares, 1e-12) / part.redundancy
     best = float(chi2.sf(part.omega / scale, part.redundancy / scale))
-    if best > level or len(rows) > _EXACT:
+    if best > level or n_rows > _EXACT:
         return bound
+    rows = np.concatenate([np.arange(system.ptr[o], system.ptr[o + 1]) for o in part.members.tolist()])
     return min(bound, upper_tail(part.omega, eigenvalues(system, rows, round(part.n))))
 
 

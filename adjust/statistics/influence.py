@@ -11,7 +11,7 @@ from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Influence
 from adjust.statistics.system import LinearSystem
 
-_CHUNK = 256
+_CHUNK = 64
 
 
 def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]) -> FloatArray:

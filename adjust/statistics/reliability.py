@@ -7,12 +7,13 @@ import numpy as np
 
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.parallel import side_by_side
 from adjust.observations.terrestrial.statistics import influences as influences_of_readings
 from adjust.precision.precision import Precision
 from adjust.statistics.condensed import CondensedSystem, condensed_system
 from adjust.statistics.influence import influences
 from adjust.statistics.result import ImageEllipses, Influence, ObservationTests, Reliability
-from adjust.statistics.system import precision_of
+from adjust.statistics.system import groups_of_others, precision_of
 from adjust.testing.criteria import Criteria, LevelOptions, criteria
 from adjust.testing.single_tests import (
     Whitened,
@@ -26,6 +27,8 @@ from adjust.testing.single_tests import (
 )
 
 DEFAULT_LEVELS = LevelOptions()
+_AT_ONCE = 50_000
+"""Image points that are tested in one go."""
 LARGEST_NETWORK = 3000
 """Pairs and priors of a pose network above which no influences are named."""
 _OF_ROWS = ("redundancy", "least", "statistic", "p", "p_posterior", "detectable", "external")
@@ -34,12 +37,20 @@ _OF_COMPONENTS = ("w", "p_w", "p_tau", "error", "detectable_component", "bias")
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """Observations of the same number of components: their rows in the table, what they are whitened with."""
+    """Observations of the same number of components: their rows in the table, what they are whitened with.
+
+    weakest: their weakest controlled directions, as :meth:`Whitened.weakest` has them.
+    """
 
     rows: IntArray
     x: Whitened
     W: FloatArray
     back: FloatArray
+    weakest: tuple[FloatArray, FloatArray]
+
+
+def _batch(rows: IntArray, x: Whitened, W: FloatArray, back: FloatArray) -> _Batch:
+    return _Batch(rows, x, W, back, x.weakest())
 
 
 def reliability(
@@ -61,7 +72,7 @@ def reliability(
     if adjustment.survey.is_pose_network and len(ptr) > LARGEST_NETWORK:
         most_influences = 0
     return Reliability(
-        found, tests, _ellipses(batches[0], found),
+        found, tests, _ellipses(batches, tests.n_image, found),
         _influences(adjustment, tests, batches, found, most_influences, system), _uncontrolled(adjustment, tests),
         adjustment.sigma0, adjustment.redundancy,
     )  # fmt: skip
@@ -70,7 +81,7 @@ def reliability(
 def _batches(adjustment: Adjustment, system: CondensedSystem | None) -> list[_Batch]:
     """Image points first."""
     precision = system.system.precision if system is not None else precision_of(adjustment)
-    return [_images(precision), *_others(precision), *_readings(precision)]
+    return [*_images(precision), *_others(precision), *_readings(precision)]
 
 
 def observation_name(adjustment: Adjustment, row: int) -> tuple[str, tuple[str, ...]]:
@@ -120,12 +131,20 @@ def _image_order(precision: Precision) -> IntArray:
     return np.concatenate(out)
 
 
-def _images(precision: Precision) -> _Batch:
-    e, M, W = image_whitened(precision)
-    back = np.zeros_like(W)
-    back[:, 0, 0], back[:, 1, 1] = 1.0 / W[:, 0, 0], 1.0 / W[:, 1, 1]
-    back[:, 0, 1] = -W[:, 0, 1] * back[:, 0, 0] * back[:, 1, 1]
-    return _Batch(np.arange(len(e)), whitened(e, M, precision.graph.used()), W, back)
+def _images(precision: Precision) -> list[_Batch]:
+    """All image points, so many in each."""
+    e, M, every = image_whitened(precision)
+    used = precision.graph.used()
+
+    def batch(first: int) -> _Batch:
+        part = slice(first, first + _AT_ONCE)
+        W = every[part]
+        back = np.zeros_like(W)
+        back[:, 0, 0], back[:, 1, 1] = 1.0 / W[:, 0, 0], 1.0 / W[:, 1, 1]
+        back[:, 0, 1] = -W[:, 0, 1] * back[:, 0, 0] * back[:, 1, 1]
+        return _batch(np.arange(first, first + len(W)), whitened(e[part], M[part], used[part]), W, back)
+
+    return side_by_side(batch, range(0, len(e), _AT_ONCE))
 
 
 def _others(precision: Precision) -> list[_Batch]:
@@ -139,7 +158,7 @@ def _others(precision: Precision) -> list[_Batch]:
     for same in found.values():
         rows, e, M, W, back = (np.array([x[i] for x in same]) for i in range(5))
         used = np.array([precision.graph.others[i - n_image].used for i in rows], dtype=np.bool_)
-        out.append(_Batch(rows, whitened(e, M, used), W, back))
+        out.append(_batch(rows, whitened(e, M, used), W, back))
     return out + _pairs(precision, n_image)
 
 
@@ -156,7 +175,7 @@ def _pairs(precision: Precision, n_image: int) -> list[_Batch]:
             M = W @ stats.adjusted_cov[chosen, :k, :k] @ W.transpose(0, 2, 1)
             x = whitened(stats.whitened[chosen, :k], M, np.asarray(arrays.used[chosen], dtype=np.bool_))
             rows = n_image + precision.graph.first_pair + batch.rows[chosen]
-            out.append(_Batch(rows, x, W, np.asarray(np.linalg.inv(W))))
+            out.append(_batch(rows, x, W, np.asarray(np.linalg.inv(W))))
     return out
 
 
@@ -180,7 +199,7 @@ def _readings(precision: Precision) -> list[_Batch]:
         g[rows] = whitener.T @ (e[rows] if used else Q @ e[rows]) / W[rows]
     n, first = len(e), sum(len(b.uv) for b in precision.graph.survey.image_blocks) + len(precision.graph.others)
     x = Whitened(g[:, None], K[:, None, None], K[:, None], np.ones((n, 1, 1)), batch.used)
-    return [_Batch(first + np.arange(n), x, W[:, None, None], 1.0 / W[:, None, None])]
+    return [_batch(first + np.arange(n), x, W[:, None, None], 1.0 / W[:, None, None])]
 
 
 def _table(
@@ -190,37 +209,40 @@ def _table(
     of_row = {name: np.zeros(M) for name in _OF_ROWS}
     of_part = {name: np.full(K, np.nan) for name in _OF_COMPONENTS}
     freedom, used = np.zeros(M, dtype=np.int64), np.zeros(M, dtype=np.bool_)
-    for batch in batches:
-        x, rows = batch.x, batch.rows
-        parts = (ptr[rows][:, None] + np.arange(x.g.shape[1])).ravel()
-        freedom[rows], used[rows] = x.freedom, x.used
-        for name, values in _of_rows(x, found).items():
+
+    def fill(batch: _Batch) -> None:
+        rows = batch.rows
+        parts = (ptr[rows][:, None] + np.arange(batch.x.g.shape[1])).ravel()
+        freedom[rows], used[rows] = batch.x.freedom, batch.x.used
+        for name, values in _of_rows(batch, adjustment, found).items():
             of_row[name][rows] = values
-        of_row["p_posterior"][rows] = p_posterior(
-            x.statistic, x.freedom, x.used, adjustment.omega, adjustment.redundancy
-        )
         for name, values in _of_components(batch, adjustment, found).items():
             of_part[name][parts] = values.ravel()
+
+    side_by_side(fill, batches)
     readings = adjustment.reading_residuals
     if readings is not None:  # of joint readings: the shares of the degrees of freedom, not of a bias that shows
         of_row["redundancy"][M - len(readings.used) :] = readings.redundancy
     level = found.alpha[np.maximum(freedom, 1) - 1]
-    groups = [b.group for b in adjustment.survey.image_blocks for _ in range(len(b.uv))]
-    groups += [o.group for o in adjustment.other_residuals]
-    names = tuple(dict.fromkeys(groups))
+    blocks = adjustment.survey.image_blocks
+    groups, counts = [b.group for b in blocks], [len(b.uv) for b in blocks]
+    others = groups_of_others(precision_of(adjustment).graph)
+    groups += others
+    names = tuple(dict.fromkeys(g for g, n in zip(groups, counts + [1] * len(others), strict=True) if n))
     number = {g: i for i, g in enumerate(names)}
     with np.errstate(invalid="ignore"):
         fails, fails_posterior = of_row["p"] < level, of_row["p_posterior"] < level
     sigma0 = adjustment.sigma0 if adjustment.sigma0 > 0.0 else np.nan
     return ObservationTests(
-        n_image=len(batches[0].rows), ptr=ptr, group=np.array([number[g] for g in groups], dtype=np.int64),
+        n_image=sum(counts), ptr=ptr,
+        group=np.repeat(np.array([number.get(g, 0) for g in groups], dtype=np.int64), counts + [1] * len(others)),
         group_names=names, used=used, n_components=np.diff(ptr), freedom=freedom, fails=fails,
         fails_posterior=fails_posterior, tau=of_part["w"] / sigma0, **of_row, **of_part,
     )  # fmt: skip
 
 
-def _of_rows(x: Whitened, found: Criteria) -> dict[str, FloatArray]:
-    weakest, _ = x.weakest()
+def _of_rows(batch: _Batch, adjustment: Adjustment, found: Criteria) -> dict[str, FloatArray]:
+    x, (weakest, _), statistic = batch.x, batch.weakest, batch.x.statistic
     lambda0 = found.lambda0[np.maximum(x.freedom, 1) - 1]
     some = x.freedom > 0
     least = np.where(some, weakest, 1.0)
@@ -230,8 +252,9 @@ def _of_rows(x: Whitened, found: Criteria) -> dict[str, FloatArray]:
     return {
         "redundancy": np.where(x.used, np.trace(x.K, axis1=1, axis2=2), 0.0),
         "least": np.clip(x.values.min(axis=1), 0.0, 1.0),
-        "statistic": np.where(some, x.statistic, np.nan),
-        "p": p_prior(x.statistic, x.freedom),
+        "statistic": np.where(some, statistic, np.nan),
+        "p": p_prior(statistic, x.freedom),
+        "p_posterior": p_posterior(statistic, x.freedom, x.used, adjustment.omega, adjustment.redundancy),
         "detectable": detectable,
         "external": np.where(x.used, moved, 0.0),
     }
@@ -241,9 +264,8 @@ def _of_components(batch: _Batch, adjustment: Adjustment, found: Criteria) -> di
     x = batch.x
     single = component_tests(x, batch.W)
     sigma0 = adjustment.sigma0 if adjustment.sigma0 > 0.0 else np.nan
-    _, direction = x.weakest()
-    lambda0 = found.lambda0[np.maximum(x.freedom, 1) - 1]
-    size = np.sqrt(lambda0 / x.weakest()[0])
+    weakest, direction = batch.weakest
+    size = np.sqrt(found.lambda0[np.maximum(x.freedom, 1) - 1] / weakest)
     with np.errstate(divide="ignore"):
         detectable = np.sqrt(found.lambda0[0] / single.information)
     some = (x.freedom > 0)[:, None]
@@ -257,12 +279,21 @@ def _of_components(batch: _Batch, adjustment: Adjustment, found: Criteria) -> di
     }
 
 
-def _ellipses(batch: _Batch, found: Criteria) -> ImageEllipses:
-    """Of biases b with b' W'KW b = lambda0: axes of lambda0 inv(W'KW), inf where uncontrolled."""
+def _ellipses(batches: Sequence[_Batch], n_image: int, found: Criteria) -> ImageEllipses:
+    """Of all image points, which the first batches hold."""
+    parts = side_by_side(lambda b: _ellipses_of(b, found), [b for b in batches if b.rows[0] < n_image])
+    return ImageEllipses(*(np.concatenate([np.zeros(0), *(p[i] for p in parts)]) for i in range(3)))
+
+
+def _ellipses_of(batch: _Batch, found: Criteria) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Major and minor axis (px), direction (rad) of biases b with b' W'KW b = lambda0.
+
+    They are the axes of lambda0 inv(W'KW), inf where uncontrolled.
+    """
     x = batch.x
     inverse = np.divide(1.0, x.values, out=np.full_like(x.values, 1e300), where=x.controlled)
     root = np.einsum("nij,njk->nik", batch.back, x.vectors * np.sqrt(inverse)[:, None, :])
-    largest = np.maximum(np.abs(root).max(axis=(1, 2)), 1e-300) if len(root) else np.ones(0)
+    largest = np.maximum(np.abs(root).max(axis=(1, 2)), 1e-300)
     unit = root / largest[:, None, None]  # so that what is not controlled does not overflow
     values, vectors = eigen2(np.einsum("nij,nkj->nik", unit, unit))
     size = np.sqrt(found.lambda0[np.maximum(x.freedom, 1) - 1])
@@ -273,7 +304,7 @@ def _ellipses(batch: _Batch, found: Criteria) -> ImageEllipses:
         normal = np.stack([-vectors[lost, 1, 0], vectors[lost, 0, 0]], axis=1)
         K = np.einsum("nji,njk,nkl->nil", batch.W[lost], x.K[lost], batch.W[lost])
         axes[lost, 1] = size[lost] / np.sqrt(np.einsum("ni,nij,nj->n", normal, K, normal))
-    return ImageEllipses(axes[:, 0], axes[:, 1], np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0]))
+    return axes[:, 0], axes[:, 1], np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0])
 
 
 def _influences(
@@ -291,9 +322,9 @@ def _influences(
     for batch in batches:
         chosen = np.isin(batch.rows, rows)
         if chosen.any():
-            weakest, direction = batch.x.weakest()
-            size = np.sqrt(found.lambda0[np.maximum(batch.x.freedom, 1) - 1] / weakest)
-            bias |= {int(r): d for r, d in zip(batch.rows[chosen], (direction * size[:, None])[chosen], strict=True)}
+            weakest, direction = (x[chosen] for x in batch.weakest)
+            size = np.sqrt(found.lambda0[np.maximum(batch.x.freedom[chosen], 1) - 1] / weakest)
+            bias |= dict(zip(batch.rows[chosen].tolist(), direction * size[:, None], strict=True))
     return influences(system or condensed_system(precision_of(adjustment)), [int(r) for r in rows], bias)
 
 

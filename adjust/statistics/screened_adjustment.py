@@ -164,10 +164,11 @@ def _searched(
 
 def _failing(now: Adjustment) -> int:
     """How many observations that are no image points fail their tests."""
-    tests = [(o.test, len(o.components)) for o in now.other_residuals if o.used and float(o.redundancy.max()) > 1e-6]
-    n = len(tests) + int(now.image_residuals.used.sum())
-    statistic, freedom = np.array(tests, dtype=float).reshape(-1, 2).T
-    return int(np.count_nonzero(statistic > limits(SearchOptions().family_alpha, freedom, n)))
+    others = now.other_arrays
+    tested = others.used & (others.redundancy > 1e-6)
+    n = int(tested.sum()) + int(now.image_residuals.used.sum())
+    limit = limits(SearchOptions().family_alpha, others.n_components[tested], n)
+    return int(np.count_nonzero(others.test[tested] > limit))
 
 
 def _told(

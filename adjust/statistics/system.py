@@ -7,6 +7,7 @@ influences, the search for outliers) needs them apart. Rows are linearised at th
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -19,6 +20,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
+from adjust.native.parallel import side_by_side
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
 from adjust.precision.s_transformation import without_datum_rows
@@ -31,6 +33,8 @@ _PLAIN = 600
 """Unknowns up to which nothing is gained by their structure."""
 _SMALL_SET = 100
 """Unknowns of one epoch, or one point, up to which they are eliminated by themselves."""
+_AT_ONCE = 64
+"""Right-hand sides that are solved in one go."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,22 +171,33 @@ def _arrow(scaled: sparse.csc_matrix) -> Solver | None:
         return None
     sets = [np.argsort(label, kind="stable")[np.repeat(sizes, sizes) == k].reshape(-1, k) for k in np.unique(sizes)]
     inverses = [np.linalg.inv(_blocks(own, x)) for x in sets]
+    inside = np.concatenate([x.ravel() for x in sets])  # the sets one after the other, those of a size together
+    order, m = np.concatenate([rest[inside], core]), len(rest)
+    edges = np.cumsum([0, *(x.size for x in sets)]).tolist()
 
     def inner(b: FloatArray) -> FloatArray:
         out = np.empty_like(b)
-        for index, inverse in zip(sets, inverses, strict=True):
-            out[index] = inverse @ b[index]
+        for inverse, (i, j) in zip(inverses, pairwise(edges), strict=True):
+            shape = (*inverse.shape[:2], -1)
+            np.matmul(inverse, b[i:j].reshape(shape), out=out[i:j].reshape(shape))
         return out
 
-    T = inner(across.toarray())
+    across = across[inside].toarray()
+    T = inner(across)
     factor = scipy.linalg.cho_factor(head - across.T @ T)
+
+    def solve_some(b: FloatArray) -> FloatArray:
+        y = b[order]
+        x = np.empty_like(b)
+        x[core] = x_core = scipy.linalg.cho_solve(factor, y[m:] - T.T @ y[:m])
+        x[order[:m]] = inner(y[:m]) - T @ x_core
+        return x
 
     def solve(b: FloatArray) -> FloatArray:
         columns = b.reshape(len(b), -1)
-        x = np.empty_like(columns)
-        x[core] = scipy.linalg.cho_solve(factor, columns[core] - T.T @ columns[rest])
-        x[rest] = inner(columns[rest]) - T @ x[core]
-        return x.reshape(b.shape)
+        parts = [columns[:, i : i + _AT_ONCE] for i in range(0, columns.shape[1], _AT_ONCE)]
+        solved = side_by_side(solve_some, parts)
+        return (solved[0] if len(solved) == 1 else np.concatenate(solved, axis=1)).reshape(b.shape)
 
     return solve, 2.0 * len(rest) * len(core) + len(core) ** 2
 
@@ -268,7 +283,7 @@ def assembled(precision: Precision, image_rows: Callable[[Precision, int, KeyCol
     lengths = np.concatenate([images.lengths, others[2], np.ones(len(readings[1]))])
     ptr = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
     used = np.concatenate([images.used, _used_others(graph)])
-    groups = images.groups + _groups_of_others(graph)
+    groups = images.groups + groups_of_others(graph)
     names = tuple(dict.fromkeys(groups))
     number = {g: i for i, g in enumerate(names)}
     group = np.array([number[g] for g in groups], dtype=np.int64)
@@ -286,7 +301,8 @@ def _points_apart(precision: Precision, n: int, key_columns: KeyColumns) -> Imag
     return ImageRows(A, e, np.full(len(groups), 2), graph.used(), groups)
 
 
-def _groups_of_others(graph: AdjustmentGraph) -> list[str]:
+def groups_of_others(graph: AdjustmentGraph) -> list[str]:
+    """Of all observations that are no image points, the readings last."""
     return [o.group for o in graph.others] + [r.group for r in graph.survey.readings]
 
 
@@ -395,16 +411,23 @@ def _image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns, values:
     return A[order], e[order]
 
 
+def columns_of_blocks(graph: AdjustmentGraph, key_columns: KeyColumns) -> Callable[[IntArray], IntArray]:
+    """Columns (g, w) of g image blocks of known targets with equally many: those of their keys, one after the other."""
+    k = graph.images.of_blocks
+    every = np.concatenate([np.zeros(0, dtype=np.int64), *(key_columns[key] for key in k.key.tolist())])
+    first = np.cumsum(k.columns) - k.columns
+    return lambda mine: every[first[mine][:, None] + np.arange(int(k.columns[mine[0]]))]
+
+
 def _known_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows:
     images, entries = graph.images, Entries()
     e = np.zeros(2 * images.n_points)
-    for b, keys in enumerate(images.keys):
-        rows = np.arange(2 * int(images.ptr[b]), 2 * int(images.ptr[b + 1]))
-        local = images.rows(b)
-        e[rows] = local[:, -1]
-        if keys:
-            columns = np.concatenate([key_columns[k] for k in keys])
-            entries.add(rows, columns, local[:, :-1] @ images.local_from_keys(b))
+    columns = columns_of_blocks(graph, key_columns)
+    for mine in images.alike():
+        local = images.rows(mine)
+        rows = 2 * images.ptr[mine][:, None] + np.arange(local.shape[1])
+        e[rows] = local[:, :, -1]
+        entries.add_blocks(rows, columns(mine), local[:, :, :-1] @ images.local_from_keys(mine))
     return entries.matrix((len(e), n)), e
 
 

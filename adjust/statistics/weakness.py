@@ -12,7 +12,8 @@ from adjust.statistics.system import DENSE, FEW, LinearSystem, linear_system
 
 _MOST = 200
 _SHARE = 0.1
-_AT_A_TIME = 500
+_AT_A_TIME = 64
+"""Columns of the covariance matrix that are compared in one go: as many as a solution takes at once."""
 _WORK = 20_000_000
 """Correlations that are looked at in surveys of more than ``DENSE`` unknowns."""
 _KRYLOV, _RESTARTS = 40, 50
@@ -63,15 +64,18 @@ def correlations(
     number = np.full(len(c), -1)
     number[index] = np.arange(len(index))
     sigma = np.sqrt(np.maximum(_variances(system, among), 1e-300))
-    found: list[tuple[int, int, float]] = []
-    for first in range(0, len(index), _AT_A_TIME):
+
+    def above(first: int) -> list[tuple[int, int, float]]:
         part = index[first : first + _AT_A_TIME]
-        Q = covariance_columns(system, part)[among]
-        C = Q / np.outer(sigma, np.sqrt(np.maximum(_variances(system, part), 1e-300)))
+        C = covariance_columns(system, part)[among]
+        C /= sigma[:, None]
+        C /= np.sqrt(np.maximum(_variances(system, part), 1e-300))
         a, b = np.nonzero(np.abs(C) >= limit)
         i, j = among[a], part[b]
         kept = np.where(number[i] < 0, True, number[i] < number[j])  # each pair once, nothing with itself
-        found += zip(i[kept].tolist(), j[kept].tolist(), C[a, b][kept].tolist(), strict=True)
+        return list(zip(i[kept].tolist(), j[kept].tolist(), C[a, b][kept].tolist(), strict=True))
+
+    found = [x for part in map(above, range(0, len(index), _AT_A_TIME)) for x in part]
     if names is None and len(index) < len(c):
         found += _within(system, number, limit)
     order = sorted(found, key=lambda x: (-abs(x[2]), x[0], x[1]))[:_MOST]

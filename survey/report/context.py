@@ -40,7 +40,7 @@ def worst(values: FloatArray, most: int) -> IntArray:
 
 def other_components(adjustment: Adjustment) -> tuple[IntArray, IntArray, FloatArray]:
     """Of everything but image points, row by row: position of the observation, component, standardized residual."""
-    counts = np.array([len(o.components) for o in adjustment.other_residuals], dtype=np.int64)
-    observation = np.repeat(np.arange(len(counts)), counts)
-    component = np.arange(len(observation)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return observation, component, np.concatenate([np.empty(0), *(o.standardized for o in adjustment.other_residuals)])
+    others = adjustment.other_arrays
+    first = np.cumsum(others.n_components) - others.n_components
+    component = np.arange(len(others.observation)) - first[others.observation]
+    return others.observation, component, others.standardized

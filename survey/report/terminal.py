@@ -219,19 +219,15 @@ def _published(solution: dict[str, Any]) -> Iterator[str]:
 
 
 def _observations(adjustment: Adjustment, limit: float) -> Iterator[str]:
-    sized = [
-        (float(np.nanmax(np.abs(o.standardized), initial=0.0)), k)
-        for k, o in enumerate(adjustment.other_residuals)
-        if o.used
-    ]
-    worst = sorted(sized, key=lambda x: (-x[0], x[1]))[:_MOST_OTHER]
+    size, used = adjustment.other_arrays.largest, np.flatnonzero(adjustment.other_arrays.used)
+    worst = used[np.argsort(-size[used], kind="stable")][:_MOST_OTHER].tolist()
     if worst:
         yield ""
         yield "  largest standardized residuals"
-    for size, k in worst:
+    for k in worst:
         o = adjustment.other_residuals[k]
-        flag = "  SUSPECT" if size > limit else ""
-        yield f"  {_cut(f'{o.kind} {chr(32).join(o.ids)}', 44):<44}{size:>8.2f}{flag}"
+        flag = "  SUSPECT" if size[k] > limit else ""
+        yield f"  {_cut(f'{o.kind} {chr(32).join(o.ids)}', 44):<44}{size[k]:>8.2f}{flag}"
 
 
 def _points(solution: dict[str, Any]) -> Iterator[str]:

@@ -31,14 +31,13 @@ class Suspects:
 def suspects(adjustment: Adjustment) -> Suspects:
     """Count observations that disagree with the others more than chance allows."""
     test = adjustment.global_test
-    image, others = adjustment.image_residuals, adjustment.other_residuals
-    used = [o for o in others if o.used]
-    n = max(int(image.used.sum()) + sum(len(o.components) for o in used), 1)
+    image, others = adjustment.image_residuals, adjustment.other_arrays
+    n = max(int(image.used.sum()) + int(others.n_components[others.used].sum()), 1)
     alpha = test.alpha if test is not None else 0.05
     spread = adjustment.sigma0 if test is not None and test.omega > test.upper else 1.0
     image_limit, w_limit = spread**2 * float(chi2.isf(alpha / n, 2)), spread * float(norm.isf(alpha / (2 * n)))
-    n_not_used = int((~image.used).sum()) + len(others) - len(used)
-    n_other = sum(bool(np.nanmax(np.abs(o.standardized), initial=0.0) > w_limit) for o in used)
+    n_not_used = int((~image.used).sum()) + int((~others.used).sum())
+    n_other = int(np.count_nonzero(others.largest[others.used] > w_limit))
     n_image = int(((image.test > image_limit) & image.used).sum())
     return Suspects(alpha, image_limit, w_limit, n_image, n_other, n_not_used)
 

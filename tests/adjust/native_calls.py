@@ -98,8 +98,8 @@ def _images() -> None:
     names = list(graph.unknowns.by_name)
     precision.joint([names[0], names[-1]])
     batch = graph.images
-    batch.rows(0)
-    batch.local_from_keys(0)
+    batch.rows(np.array([0]))
+    batch.local_from_keys(np.array([0]))
     solve_network(pose_networks.simulate(3, 2).network)
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
     graph, done = h.solved(survey, near(truth))  # nothing to reduce: every block is condensed for itself

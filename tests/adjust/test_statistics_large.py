@@ -8,10 +8,13 @@ from scipy import sparse
 
 from adjust.adjustment import adjust
 from adjust.model.result import Adjustment
+from adjust.observations.images import batch as batch_module
+from adjust.statistics import reliability as reliability_module
 from adjust.statistics import system as system_module
 from adjust.statistics import weakness
 from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.condensed import condensed_system
+from adjust.statistics.reliability import reliability
 from adjust.statistics.system import linear_system, precision_of
 from adjust.statistics.weakness import correlations, principal_component, weak_directions
 from survey.simulate import head_on_table
@@ -113,3 +116,45 @@ def test_the_budget_is_that_of_all_rows() -> None:
         for line in entry.lines:
             group = full.group[full.row_of] == full.group_names.index(line.source)
             assert line.u**2 == pytest.approx(float(effects[group, at].sum()), rel=1e-5, abs=1e-9 * entry.u**2)
+
+
+def test_threads_and_portions_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests, condensed rows, solutions and correlations by one thread and by three, and tests in other portions."""
+    adjustment = lab()
+
+    def everything() -> list[np.ndarray]:
+        condensed = condensed_system(precision_of(adjustment))
+        found = reliability(adjustment, system=condensed)
+        listed = correlations(adjustment, 0.5, system=condensed.system)
+        tests = [x for x in vars(found.tests).values() if isinstance(x, np.ndarray)]
+        ellipses = [found.ellipses.major, found.ellipses.minor, found.ellipses.direction]
+        rows = [condensed.system.A.toarray(), condensed.e, condensed.lens, condensed.camera, condensed.shape]
+        shifts = np.array([x.shift for x in found.influences])
+        return [*tests, *ellipses, *rows, shifts, np.array([x.coefficient for x in listed])]
+
+    monkeypatch.setattr(reliability_module, "_AT_ONCE", 300)
+    monkeypatch.setattr(system_module, "_AT_ONCE", 7)
+    monkeypatch.setattr(batch_module, "_AT_ONCE", 200)
+    found = []
+    for threads in ("1", "3"):
+        monkeypatch.setenv("LABSURVEY_THREADS", threads)
+        found.append(everything())
+    monkeypatch.setattr(reliability_module, "_AT_ONCE", 50_000)
+    found.append(everything())
+    assert len(found[0][0]) > 300
+    for others in found[1:]:
+        for a, b in zip(found[0], others, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_what_others_say_as_arrays_is_what_they_say_one_by_one() -> None:
+    adjustment = adjust(*net.hall(2, n_points=30))
+    one_by_one, arrays = adjustment.other_residuals, adjustment.other_arrays
+    assert len(one_by_one) > 100
+    np.testing.assert_array_equal(arrays.n_components, [len(o.components) for o in one_by_one])
+    np.testing.assert_array_equal(arrays.used, [o.used for o in one_by_one])
+    np.testing.assert_array_equal(arrays.test, [o.test for o in one_by_one])
+    np.testing.assert_array_equal(arrays.redundancy, [o.redundancy.max() for o in one_by_one])
+    np.testing.assert_array_equal(arrays.standardized, np.concatenate([o.standardized for o in one_by_one]))
+    largest = [np.nanmax(np.abs(o.standardized), initial=0.0) for o in one_by_one]
+    np.testing.assert_array_equal(arrays.largest, largest)

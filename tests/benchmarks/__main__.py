@@ -19,7 +19,7 @@ CASES: dict[str, Callable[[Session], None]] = {
     "graphs": sections_networks.published_graphs, "additions": sections_networks.additions,
     "large": sections_networks.large_networks, "readings": sections_networks.readings,
     "trials": sections_networks.simulations, "targets": sections_other.targets, "start": sections_other.start_up,
-    "stages": sections_other.stages, "script": sections_other.script,
+    "stages": sections_other.stages, "script": sections_other.script, "sizes": sections_other.sizes,
 }  # fmt: skip
 PACKAGES = ("gtsam", "numpy", "scipy", "opencv-contrib-python-headless", "pycolmap")
 

@@ -12,10 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.benchmarks import finding, profiles, tables
+from survey.project import write_project
+from tests.benchmarks import finding, profiles, tables, terrestrial
+from tests.benchmarks.data import calibration, survey
 from tests.benchmarks.session import Session
 from tests.data import data_folder
 
+_STEPS = ("read", "adjust", "statistics", "report")
 OUR_COMMAND, SCRIPT = "labsurvey adjust rig", "OpenCV's classic script"
 
 
@@ -79,6 +82,37 @@ def start_up(session: Session) -> None:
     what = "139 readings, the whole command: times as long as its adjustment alone"
     session.compare(what, whole / kernel, "the same run", "the rest: libraries, files, report")
     session.say(tables.table(("", "s (median)", "range", "CPU s"), rows))
+
+
+def sizes(session: Session) -> None:
+    """Whole commands by size: processor time of every step, on how many threads, and the largest memory."""
+    session.say("", "## Whole commands by size", "")
+    session.say(
+        "`labsurvey adjust` with every statistic and the report, one run each; seconds of the steps as the command "
+        "counts them. Images: two cameras, 100 points a view. Networks: three readings a line, held datum.", "",
+    )  # fmt: skip
+    views, points = ((50, 500), (300, 1000)) if session.quick else ((50, 500, 5000), (300, 1000, 3000))
+    cases = {f"{200 * n} image points": survey(calibration(2, n)) for n in views}
+    cases |= {f"network of {n} points": terrestrial.network(n, False) for n in points}
+    rows, steps = [], list[dict[str, str]]()
+    with tempfile.TemporaryDirectory() as folder:
+        for name, given in cases.items():
+            write_project(Path(folder) / name, given)
+            for threads in ("1", "2"):
+                command = [sys.executable, "-m", "survey", "adjust", str(Path(folder) / name), "--quiet"]
+                begin = time.perf_counter()
+                child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True,
+                                         env={**os.environ, "LABSURVEY_THREADS": threads})  # fmt: skip
+                said = child.stdout.read() if child.stdout is not None else ""
+                _, status, used = os.wait4(child.pid, 0)
+                child.returncode = os.waitstatus_to_exitcode(status)
+                wall = time.perf_counter() - begin
+                if child.returncode not in (0, 3):
+                    raise RuntimeError(f"{' '.join(command)}: exit code {child.returncode}")
+                steps.append(dict(re.findall(r"(\w+) ([\d.]+) s", said.strip().splitlines()[-1])))
+                rows.append([name, threads, f"{wall:.2f}", f"{used.ru_utime + used.ru_stime:.2f}",
+                             f"{used.ru_maxrss / 1024:.0f}", *(steps[-1].get(x, "") for x in _STEPS)])  # fmt: skip
+    session.say(tables.table(("", "threads", "s", "CPU s", "MB", *_STEPS), rows))
 
 
 def script(session: Session) -> None:

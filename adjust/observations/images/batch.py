@@ -81,6 +81,10 @@ class Chains:
         return [int(slot) for slot in self.slot[self.ptr[b] : self.ptr[b + 1]]]
 
 
+_AT_ONCE = 20_000
+"""Image points of which rows are made at once."""
+
+
 class ImageBatch:
     """Image points of known targets (and of held world points), grouped per block.
 
@@ -212,17 +216,31 @@ class ImageBatch:
             if keys:
                 graph.add(gtsam.CustomFactor(noise[int(self.n_rows[b])], keys, _callback(self, b)))
 
-    def rows(self, b: int) -> FloatArray:
-        """Whitened rows (2 n, local unknowns and 1) of all points of block ``b``, used or not, the residual last."""
-        out = np.zeros((2 * int(self.ptr[b + 1] - self.ptr[b]), int(self.n_rows[b])))
-        block_rows(b, self.at(self.W_all_columns), out)
+    def alike(self) -> list[IntArray]:
+        """All blocks in sets with the same numbers of points, rows and columns, none of much more than ``_AT_ONCE``."""
+        sizes = np.stack([np.diff(self.ptr), self.n_rows, self.of_blocks.columns], axis=1)
+        kinds, kind = np.unique(sizes, axis=0, return_inverse=True)
+        sets: list[IntArray] = []
+        for j, n in enumerate(kinds[:, 0].tolist()):
+            mine, most = np.flatnonzero(kind.ravel() == j), max(_AT_ONCE // max(n, 1), 1)
+            sets += [mine[i : i + most] for i in range(0, len(mine), most)]
+        return sets
+
+    def rows(self, which: IntArray) -> FloatArray:
+        """Whitened rows (g, 2 n, local unknowns and 1) of all points of g blocks that are alike, the residual last.
+
+        Used or not.
+        """
+        b = int(which[0])
+        out = np.zeros((len(which), 2 * int(self.ptr[b + 1] - self.ptr[b]), int(self.n_rows[b])))
+        block_rows(which, self.at(self.W_all_columns), out)
         return out
 
-    def local_from_keys(self, b: int) -> FloatArray:
-        """Derivative (n_lens + 6 + n_warp, sum of key dims) of the block's local unknowns by its keys."""
-        nl = int(self.state.lenses.n_free[self.camera[b]])
-        G = np.zeros((int(self.n_rows[b]) - 1, int(self.of_blocks.columns[b])))
-        local_by_keys(b, nl, self.by_keys, G)
+    def local_from_keys(self, which: IntArray) -> FloatArray:
+        """Derivative (g, n_lens + 6 + n_warp, sum of key dims) of the local unknowns of g alike blocks by keys."""
+        nl, b = self.state.lenses.n_free[self.camera[which]], int(which[0])
+        G = np.zeros((len(which), int(self.n_rows[b]) - 1, int(self.of_blocks.columns[b])))
+        local_by_keys(which, nl, self.by_keys, G)
         return G
 
     def statistics(self, tree: KeyCovariances | None) -> tuple[FloatArray, FloatArray]:

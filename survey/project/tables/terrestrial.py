@@ -50,7 +50,8 @@ def read_readings(table: Table, names: Names, sigmas: Sigmas) -> tuple[Reading, 
     readings = []
     for row, (from_text, to_text) in enumerate(ends):
         kind, setup_id = kinds[row], setup_ids[row]
-        _check_setup(table, row, kind, setup_id, names)
+        if setup_id not in setups:
+            _check_setup(table, row, kind, setup_id, names)
         at, to, second = _positions(table, row, (from_text, to_text, seconds[row]), kind, names)
         instrument_id = setups[setup_id].instrument_id if setup_id else None
         accuracy = sigmas.instruments.get(instrument_id or "", Accuracy())
