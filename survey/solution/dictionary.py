@@ -354,14 +354,21 @@ def solution_json(solution: Mapping[str, Any]) -> str:
 
 
 def _lines(value: Any, depth: int) -> str:
-    if isinstance(value, Mapping) and value:
-        inner = ",\n".join(f"{' ' * (depth + 1)}{_one(k)}: {_lines(v, depth + 1)}" for k, v in value.items())
+    if isinstance(value, dict) and value:
+        inner = ",\n".join([f"{' ' * (depth + 1)}{_one(k)}: {_lines(v, depth + 1)}" for k, v in value.items()])
         return f"{{\n{inner}\n{' ' * depth}}}"
-    if isinstance(value, list) and any(isinstance(v, Mapping | str) for v in value):
-        inner = ",\n".join(" " * (depth + 1) + _lines(v, depth + 1) for v in value)
-        return f"[\n{inner}\n{' ' * depth}]"
+    if isinstance(value, list):
+        if any(isinstance(v, dict | str) for v in value):
+            inner = ",\n".join([" " * (depth + 1) + _lines(v, depth + 1) for v in value])
+            return f"[\n{inner}\n{' ' * depth}]"
+        return f"[{', '.join(map(_one, value))}]"
     return _one(value)
 
 
 def _one(value: Any) -> str:
-    return _JSON.encode(value)
+    kind = type(value)
+    if kind is float and math.isfinite(value):
+        return float.__repr__(value)
+    if kind is int:
+        return int.__repr__(value)
+    return json.encoder.encode_basestring(value) if kind is str else _JSON.encode(value)
