@@ -124,7 +124,7 @@ def meeting_stations(ptr: IntArray, neighbour: IntArray) -> list[int]:
 def shortest_loops(
     walk: tuple[IntArray, IntArray, IntArray], chords: IntArray, budget: int
 ) -> tuple[list[list[int]], list[int], BoolArray]:
-    """Independent loops, shortest first, until there is one for each chord or the budget of elementary steps is used up.
+    """Independent loops, shortest first, until there is one for each chord or the budget of steps is used up.
 
     walk: of :func:`adjacency`; chords: (L,) pairs outside a spanning forest. Returns the loops' pairs in the order of
     the walk, the stations at which they begin, and which (L,) chords lead a set of the elimination: the loops that the
@@ -135,7 +135,8 @@ def shortest_loops(
     chord[chords] = np.arange(n_loops)
     words = -(-n_loops // 64)
     depth, room = np.full(n, -1, dtype=np.int64), [np.zeros(n, dtype=np.int64) for _ in range(4)]
-    sets = chord, np.zeros(words, dtype=np.int64), np.empty((n_loops, words), dtype=np.int64), np.zeros(n_loops, np.bool_)
+    bits, rows = np.zeros(words, dtype=np.int64), np.empty((n_loops, words), dtype=np.int64)
+    sets = chord, bits, rows, np.zeros(n_loops, dtype=np.bool_)
     roots, work = np.array(meeting_stations(*walk[:2]), dtype=np.int64), np.zeros(1, dtype=np.int64)
     found: list[list[int]] = []
     start: list[int] = []
