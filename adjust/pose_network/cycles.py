@@ -1,8 +1,7 @@
 """Walks through a network in linear time, and the search for a shortest set of independent loops.
 
 A network is given by compressed adjacency: the neighbours of station v, and the pairs that lead there, are the ranges
-``ptr[v]:ptr[v + 1]`` of ``neighbour`` and ``pair``. Two stations may be measured more than once. Sets of pairs outside
-a spanning forest are integers, bit by bit.
+``ptr[v]:ptr[v + 1]`` of ``neighbour`` and ``pair``. Two stations may be measured more than once.
 
 Horton (1987, SIAM J. Comput. 16, 358-366): the loops "shortest way from v to x, pair (x, y), shortest way back" over
 all stations v and pairs (x, y) contain a minimal cycle basis; taken shortest first, those independent over GF(2) of the
@@ -11,14 +10,14 @@ meets every loop (Mehlhorn and Michail 2009, ACM J. Exp. Algorithmics 14).
 """
 
 import heapq
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from adjust.model.survey import IntArray
-
-_Ways = Sequence[Sequence[tuple[int, int]]]  # of every station the neighbours, and the pairs that lead there
+from adjust.model.survey import BoolArray, IntArray
+from adjust.native.loops import horton_loops
 
 
 def adjacency(n: int, a: IntArray, b: IntArray) -> tuple[IntArray, IntArray, IntArray]:
@@ -89,39 +88,13 @@ def loop_labels(n: int, a: IntArray, b: IntArray) -> IntArray:
     return out
 
 
-class Independent:
-    """Elimination over GF(2): which loops are independent of those before. ``work`` counts its steps."""
-
-    def __init__(self) -> None:
-        self.rows: dict[int, int] = {}
-        self.work = 0
-
-    def add(self, bits: int) -> bool:
-        """Take a set in; False where it is a sum of those before."""
-        while bits:
-            self.work += 1
-            lead = bits.bit_length()
-            if lead not in self.rows:
-                self.rows[lead] = bits
-                return True
-            bits ^= self.rows[lead]
-        return False
-
-
-def bits_of(pairs: Iterable[int], chord: Sequence[int]) -> int:
-    """The set of chords among pairs; chord: number of each pair outside a spanning forest, -1 inside."""
-    bits = 0
-    for e in pairs:
-        if chord[e] >= 0:
-            bits ^= 1 << chord[e]
-    return bits
-
-
-def meeting_stations(ways: _Ways) -> list[int]:
+def meeting_stations(ptr: IntArray, neighbour: IntArray) -> list[int]:
     """Stations that meet every loop: dead ends pruned, then always the station with most neighbours left taken out.
 
     Among equals the lowest number goes first. A pair measured twice is a loop as well.
     """
+    ends, others = ptr.tolist(), neighbour.tolist()
+    ways = [others[i:j] for i, j in pairwise(ends)]
     degree = [len(w) for w in ways]
     heap = [(-d, v) for v, d in enumerate(degree)]
     heapq.heapify(heap)
@@ -130,7 +103,7 @@ def meeting_stations(ways: _Ways) -> list[int]:
     out: list[int] = []
     while True:
         while stack:
-            for w, _ in ways[stack.pop()]:
+            for w in ways[stack.pop()]:
                 if not gone[w]:
                     degree[w] -= 1
                     if degree[w] < 2:
@@ -149,54 +122,33 @@ def meeting_stations(ways: _Ways) -> list[int]:
 
 
 def shortest_loops(
-    ways: _Ways, chord: Sequence[int], n_loops: int, budget: int
-) -> tuple[list[list[int]], list[int], Independent]:
-    """Independent loops, shortest first, until there are ``n_loops`` or the budget of elementary steps is used up.
+    walk: tuple[IntArray, IntArray, IntArray], chords: IntArray, budget: int
+) -> tuple[list[list[int]], list[int], BoolArray]:
+    """Independent loops, shortest first, until there is one for each chord or the budget of steps is used up.
 
-    Returns their pairs in the order of the walk, the stations at which they begin, and the elimination so far.
+    walk: of :func:`adjacency`; chords: (L,) pairs outside a spanning forest. Returns the loops' pairs in the order of
+    the walk, the stations at which they begin, and which (L,) chords lead a set of the elimination: the loops that the
+    other chords close with the forest are what is missing.
     """
+    n, n_loops = len(walk[0]) - 1, len(chords)
+    chord = np.full(len(walk[1]) // 2, -1, dtype=np.int64)
+    chord[chords] = np.arange(n_loops)
+    words = -(-n_loops // 64)
+    depth, room = np.full(n, -1, dtype=np.int64), [np.zeros(n, dtype=np.int64) for _ in range(4)]
+    bits, rows = np.zeros(words, dtype=np.int64), np.empty((n_loops, words), dtype=np.int64)
+    sets = chord, bits, rows, np.zeros(n_loops, dtype=np.bool_)
+    roots, work = np.array(meeting_stations(*walk[:2]), dtype=np.int64), np.zeros(1, dtype=np.int64)
     found: list[list[int]] = []
     start: list[int] = []
-    roots, independent, seen, work = meeting_stations(ways), Independent(), set[int](), 0
-    for length in range(2, len(ways) + 1):
-        for root in roots:
-            if len(found) == n_loops or work + independent.work >= budget:
-                return found, start, independent
-            loops, visited = _loops_at(root, length, ways)
-            work += visited
-            for pairs in loops:
-                bits = bits_of(pairs, chord)
-                if bits not in seen and len(found) < n_loops:
-                    seen.add(bits)
-                    if independent.add(bits):
-                        found.append(pairs)
-                        start.append(root)
-    return found, start, independent
-
-
-def _loops_at(root: int, length: int, ways: _Ways) -> tuple[list[list[int]], int]:
-    """Horton's loops of a length at a station, and the number of steps: they close at the last level of a search."""
-    half = length // 2
-    # pairs from the root, and the first station on the way, by station
-    way: dict[int, list[int]] = {root: []}
-    branch, order, visited, out = {root: root}, [root], 0, []
-    for v in order:
-        mine = way[v]
-        here = len(mine)
-        visited += len(ways[v])
-        for w, e in ways[v]:
-            other = way.get(w)
-            if other is None:
-                if here < half:
-                    way[w], branch[w] = [*mine, e], branch[v] if mine else w
-                    order.append(w)
-                continue
-            there = len(other)
-            # each closing pair once: from its deeper end, or from the lower number among equals
-            if (here + there + 1 == length and branch[v] != branch[w] and (here > there or (here == there and v < w))
-                    and e != mine[-1] and (not other or e != other[-1])):  # fmt: skip
-                out.append([*mine, e, *reversed(other)])
-    return out, visited
+    for length in range(2, n + 1):
+        if len(found) == n_loops or work[0] >= budget:
+            break
+        loops = np.empty((n_loops - len(found), length), dtype=np.int64)
+        begin = np.empty(len(loops), dtype=np.int64)
+        more = horton_loops((*walk, depth, *room), sets, roots, budget, work, loops, begin)
+        found += loops[:more].tolist()
+        start += begin[:more].tolist()
+    return found, start, sets[-1]
 
 
 def forest_loops(a: IntArray, b: IntArray, forest: Forest, chords: IntArray) -> list[list[int]]:

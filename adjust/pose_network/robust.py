@@ -14,7 +14,7 @@ import numpy as np
 
 from adjust.model.errors import IndeterminateError, NotConvergedError
 from adjust.model.survey import BoolArray, FloatArray
-from adjust.pose_network.network import PoseNetwork, loop_marks
+from adjust.pose_network.network import PoseNetwork, sole_loops
 from adjust.pose_network.precision import NetworkPrecision
 from adjust.pose_network.solve import Minimum, NetworkOptions, Progress, minimize
 from adjust.pose_network.start import (
@@ -220,10 +220,9 @@ def _connected(network: PoseNetwork, weights: FloatArray) -> BoolArray:
 def _listed(found: Cleaned, candidates: BoolArray) -> Cleaned:
     """With the pairs that were left out, worst first."""
     out, network, pairs = [], found.network, found.precision.pairs
-    for e in np.flatnonzero(candidates & ~network.used):
-        loops, mark = loop_marks(network, network.used | (np.arange(network.n_pairs) == e))
-        same = np.flatnonzero((mark == mark[e]) & (loops > 0)) if loops[e] else np.zeros(0, dtype=np.int64)
-        alike = tuple(network.pair_ids[i] for i in same if i != e)
+    rows = np.flatnonzero(candidates & ~network.used)
+    for e, same in zip(rows.tolist(), sole_loops(network, rows), strict=True):
+        alike = tuple(network.pair_ids[i] for i in same)
         out.append(
             RejectedPair(network.pair_ids[e], float(pairs.test[e]), int(pairs.freedom[e]), float(pairs.p_value[e]),
                          pairs.residual[e], alike)

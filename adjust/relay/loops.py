@@ -6,13 +6,12 @@ the identity without errors. Its logarithm is the misclosure, in the frame of th
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
-from adjust.pose_network.cycles import adjacency, bits_of, breadth_first, flat, forest_loops, shortest_loops
+from adjust.pose_network.cycles import adjacency, breadth_first, flat, forest_loops, shortest_loops
 from adjust.relay.network import Network, Topology
 from adjust.spatial.rigid_motions import Motions, identities, right_jacobian_inverse
 from adjust.testing.criteria import sidak
@@ -83,15 +82,10 @@ def loop_basis(topology: Topology, kind: LoopKind = "shortest", budget: int = SE
     if len(chords) > MAX_SHORTEST_LOOPS:
         note = f"loops of a spanning tree: more than {MAX_SHORTEST_LOOPS} loops are too many for the shortest ones"
         return _basis(topology, tree, first, False, note, chords)
-    number = np.full(topology.n_pairs, -1, dtype=np.int64)
-    number[chords] = np.arange(len(chords))
-    chord, ends = number.tolist(), walk[0].tolist()
-    entries = list(zip(walk[1].tolist(), walk[2].tolist(), strict=True))
-    ways = [entries[i:j] for i, j in pairwise(ends)]
-    loops, start, independent = shortest_loops(ways, chord, len(chords), budget)
+    loops, start, led = shortest_loops(walk, chords, budget)
     if len(start) == len(chords):
         return _basis(topology, loops, start, True, "shortest independent loops")
-    kept = [k for k, pairs in enumerate(tree) if independent.add(bits_of(pairs, chord))]
+    kept = np.flatnonzero(~led).tolist()
     note = f"the {len(start)} shortest loops, and {len(kept)} of a spanning tree: the search used up its budget"
     return _basis(topology, [*loops, *(tree[k] for k in kept)], [*start, *first[kept].tolist()], False, note)
 

@@ -25,6 +25,7 @@ from survey.solution.verdict import findings, fit_of, suspects, verdict
 CORRELATION_LIMIT = 0.95
 # parameters for which "zero" is no sensible hypothesis
 _NEVER_ZERO = {"fx", "fy", "u0", "v0", "c", "xp", "yp"}
+_FLOATS = {float}
 _JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 CONVENTIONS = {
     "poses": "a_from_b takes coordinates in b to coordinates in a; camera x right, y down, z forward",
@@ -117,6 +118,8 @@ def plain(value: Any) -> Any:
         return value
     if kind is float:
         return value if math.isfinite(value) else None
+    if kind is list and set(map(type, value)) == _FLOATS and all(map(math.isfinite, value)):
+        return value
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
@@ -354,14 +357,24 @@ def solution_json(solution: Mapping[str, Any]) -> str:
 
 
 def _lines(value: Any, depth: int) -> str:
-    if isinstance(value, Mapping) and value:
-        inner = ",\n".join(f"{' ' * (depth + 1)}{_one(k)}: {_lines(v, depth + 1)}" for k, v in value.items())
+    kind = type(value)
+    if kind is dict and value:
+        inner = ",\n".join([f"{' ' * (depth + 1)}{_one(k)}: {_lines(v, depth + 1)}" for k, v in value.items()])
         return f"{{\n{inner}\n{' ' * depth}}}"
-    if isinstance(value, list) and any(isinstance(v, Mapping | str) for v in value):
-        inner = ",\n".join(" " * (depth + 1) + _lines(v, depth + 1) for v in value)
+    if kind is not list:
+        return _one(value)
+    kinds = set(map(type, value))
+    if dict in kinds or str in kinds:
+        inner = ",\n".join([" " * (depth + 1) + _lines(v, depth + 1) for v in value])
         return f"[\n{inner}\n{' ' * depth}]"
-    return _one(value)
+    plainly = kinds == _FLOATS and all(map(math.isfinite, value))
+    return f"[{', '.join(map(float.__repr__ if plainly else _one, value))}]"
 
 
 def _one(value: Any) -> str:
-    return _JSON.encode(value)
+    kind = type(value)
+    if kind is float and math.isfinite(value):
+        return float.__repr__(value)
+    if kind is int:
+        return int.__repr__(value)
+    return json.encoder.encode_basestring(value) if kind is str else _JSON.encode(value)

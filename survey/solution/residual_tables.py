@@ -8,6 +8,7 @@ import io
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 import numpy.typing as npt
@@ -137,19 +138,24 @@ def other_residuals_csv(adjustment: Adjustment) -> bytes:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(OTHER_COLUMNS.split(","))
+    units: dict[tuple[str, str], tuple[str, float, str, float]] = {}
     for o in adjustment.other_residuals:
-        ids = cell_text(" ".join(o.ids))
-        for i, (component, unit) in enumerate(zip(o.components, o.units, strict=True)):
-            value_unit, value_factor = unit_for_people(component, unit)
-            sigma_unit, sigma_factor = sigma_unit_for_people(unit)
-            values = (o.observed[i] * value_factor, o.adjusted[i] * value_factor)
-            small = (o.residual[i] * sigma_factor, o.sigma[i] * sigma_factor, o.redundancy[i], o.standardized[i])
-            writer.writerow(
-                (o.kind, cell_text(o.group), ids, component, value_unit, *map(_number, values), sigma_unit)
-                + (*map(_number, (*small, o.test)), int(o.used))
-            )
+        of, used = (o.kind, cell_text(o.group), cell_text(" ".join(o.ids))), int(o.used)
+        values = (np.asarray(x, dtype=float).tolist()
+                  for x in (o.observed, o.adjusted, o.residual, o.sigma, o.redundancy, o.standardized))  # fmt: skip
+        test = _number(o.test)
+        for component, unit, observed, adjusted, residual, sigma, *numbers in zip(
+            o.components, o.units, *values, strict=True
+        ):
+            if (component, unit) not in units:
+                units[component, unit] = *unit_for_people(component, unit), *sigma_unit_for_people(unit)
+            value_unit, factor, small_unit, small = units[component, unit]
+            writer.writerow((
+                *of, component, value_unit, _number(observed * factor), _number(adjusted * factor), small_unit,
+                _number(residual * small), _number(sigma * small), *map(_number, numbers), test, used,
+            ))  # fmt: skip
     return out.getvalue().encode()
 
 
 def _number(value: float) -> str:
-    return f"{float(value):.12g}" if np.isfinite(value) else ""
+    return f"{value:.12g}" if isfinite(value) else ""

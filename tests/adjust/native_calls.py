@@ -12,11 +12,13 @@ from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
 from adjust.model.survey import PoseParameter
-from adjust.native import bundles, images, lenses, navigation, reduction, trees, views, vision
+from adjust.native import bundles, images, lenses, loops, navigation, reduction, trees, views, vision
 from adjust.native.library import Function
 from adjust.navigation import navigate
 from adjust.pose_network import solve_network
 from adjust.precision.precision import Precision, image_residuals
+from adjust.relay.loops import loop_basis
+from adjust.relay.network import topology
 from adjust.start import find_start
 from survey.detection import SpotOptions, detect_image, detect_spots
 from survey.project.targets import Checkerboard
@@ -37,7 +39,7 @@ from tests.adjust.navigation import (
 from tests.adjust.terrestrial_networks import measured, polar_network
 from tests.adjust.test_image_reduction import near, warped_stereo
 
-_MODULES = (lenses, images, trees, reduction, bundles, navigation, views, vision)
+_MODULES = (lenses, images, trees, reduction, bundles, navigation, views, vision, loops)
 FUNCTIONS = {f.name: f for module in _MODULES for f in vars(module).values() if isinstance(f, Function)}
 """All functions of the core that have a face in Python."""
 _KEPT = 2
@@ -101,6 +103,7 @@ def _images() -> None:
     batch.rows(np.array([0]))
     batch.local_from_keys(np.array([0]))
     solve_network(pose_networks.simulate(3, 2).network)
+    loop_basis(topology([(a + b, a, b) for a, b in ("AB", "BC", "CA", "CD", "DA")]))
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
     graph, done = h.solved(survey, near(truth))  # nothing to reduce: every block is condensed for itself
     graph.prepare(done.values, jacobians=False)

@@ -12,7 +12,7 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Datum, FloatArray, PoseParameter, Station, Survey
 from adjust.pose_network import NetworkOptions, pose_network, solve_network
 from adjust.pose_network.from_survey import network_from_survey
-from adjust.pose_network.network import PoseNetwork, loop_marks
+from adjust.pose_network.network import PoseNetwork, loop_marks, sole_loops
 from adjust.pose_network.robust import _worst_around, graduated_weights
 from adjust.pose_network.solve import minimize
 from adjust.spatial.rigid_motions import Motions
@@ -447,3 +447,19 @@ def test_a_place_without_a_step_on_the_way_is_no_verdict_on_the_pairs(monkeypatc
     at, calls[:] = 1, []
     with pytest.raises(IndeterminateError):
         minimize(sim.network)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_pair_taken_back_shares_its_loops_with_the_bridges_on_its_way(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n, m = 9, 12
+    ends = np.array([*((i, rng.integers(max(0, i - 2), i)) for i in range(1, n)), (0, 4), (1, 6), (3, 8), (2, 5)])
+    held = {0: np.eye(4)} | ({n - 1: np.eye(4)} if seed % 2 else {})
+    net = pose_network(
+        [f"s{i}" for i in range(n)], [f"p{i}" for i in range(m)], *ends.T, np.tile(np.eye(3), (m, 1, 1)),
+        np.zeros((m, 3)), np.tile(np.eye(6), (m, 1, 1)), held=held,
+    ).with_used(rng.random(m) < 0.75)  # fmt: skip
+    out = np.flatnonzero(~net.used)
+    for e, alike in zip(out.tolist(), sole_loops(net, out), strict=True):
+        loops, mark = loop_marks(net, net.used | (np.arange(m) == e))
+        assert alike == [i for i in np.flatnonzero(mark == mark[e]).tolist() if loops[e] and i != e]

@@ -405,3 +405,14 @@ def test_results_are_written_whole(adjustment: Adjustment, tmp_path: Path) -> No
     again = write_results(tmp_path, adjustment, replace(RUN, date="another day", seconds={"solve": 2.0}))
     for name, path in again.items():
         assert path.read_bytes().replace(b"another day", RUN.date.encode()) == first[name], name
+
+
+def test_json_is_one_line_for_an_entry_and_for_a_list_of_numbers():
+    solution = {"a": {"x": 1.5, "n": 3, "ok": True, "no": None, "ä\n": []}, "m": [[1.0, 2], [1e-300]], "w": ["é", {}]}
+    text = solution_json(solution)
+    assert json.loads(text) == solution
+    assert '  "x": 1.5,\n  "n": 3,\n  "ok": true,' in text
+    assert ' "m": [[1.0, 2], [1e-300]],\n "w": [\n  "é",\n  {}\n ]' in text
+    for nothing in (float("nan"), [float("inf"), 1.0]):
+        with pytest.raises(ValueError, match="JSON compliant"):
+            solution_json({"x": nothing})

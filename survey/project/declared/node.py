@@ -14,7 +14,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from survey.folder.text import LARGEST_NUMBER, choice_hint, decode, id_problem, read_bytes, suggestion, with_digest
 from survey.folder.units import to_si
-from survey.project.declared.toml_text import KeyPath, key_lines
+from survey.project.declared.toml_text import KeyLines, KeyPath
 
 _REQUIRED: Any = object()
 _LARGEST_TOML = 16 * 2**20  # bytes
@@ -32,7 +32,7 @@ def read_toml(path: Path, instead: str | None = None) -> tuple["Node", str]:
     _check_keys(path, text)
     try:
         values = tomllib.loads(text)
-        root = Node(path, key_lines(text), (), values)
+        root = Node(path, KeyLines(text), (), values)
         _check_integers(root, values, ())
     except ValueError as error:  # of tomllib, or of the interpreter for an integer of thousands of digits
         found = re.search(r"at line (\d+)", str(error))

@@ -4,7 +4,8 @@ import bisect
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cached_property
 from typing import Any
 
 Section = tuple[tuple[str, ...], Mapping[str, Any]]
@@ -55,6 +56,26 @@ def key_lines(text: str) -> dict[KeyPath, int]:
     scanner = _Scanner(text.replace("\r\n", "\n"))
     scanner.document()
     return scanner.lines
+
+
+class KeyLines(Mapping[KeyPath, int]):
+    """The lines of :func:`key_lines`, looked for when one is first asked for: only errors ask."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    @cached_property
+    def _found(self) -> dict[KeyPath, int]:
+        return key_lines(self._text)
+
+    def __getitem__(self, key: KeyPath) -> int:
+        return self._found[key]
+
+    def __iter__(self) -> Iterator[KeyPath]:
+        return iter(self._found)
+
+    def __len__(self) -> int:
+        return len(self._found)
 
 
 class _Scanner:
