@@ -1,0 +1,71 @@
+"""The way of a diagnosis: hypotheses from cheap evidence, the likeliest tried, those that explain the misfit ranked."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.ranking import Candidate, ranked
+from adjust.diagnosis.trial import Misfit, misfit_of, tried
+from adjust.model.errors import SurveyError
+
+MOST_TRIALS = 10
+_SHOWN = 3
+
+FAMILIES: tuple[str, ...] = ()
+"""Rooms of this one, each with ``hypotheses(case) -> Iterable[Hypothesis]``: what cheap evidence makes worth a try."""
+
+Family = Callable[[Case], Iterable[Hypothesis]]
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What explains that a survey does not fit: candidates, the best first; empty where nothing that was tried does.
+
+    tried: names of the kinds of causes that were tried, whether they explain anything or not.
+    """
+
+    candidates: tuple[Candidate, ...]
+    tried: tuple[str, ...]
+    misfit: Misfit
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """For people: the first cause, what it changes, how sure it is, and the next one."""
+        return tuple(_text(i, c) for i, c in enumerate(self.candidates[:_SHOWN], start=1))
+
+
+def diagnose(case: Case, families: Sequence[Family] | None = None, most: int = MOST_TRIALS) -> Diagnosis:
+    """Form the hypotheses of all families, try the likeliest of them, and rank those that explain the misfit.
+
+    families: those of ``FAMILIES`` where None. most: adjustments at most. Nothing is repaired, nothing is written.
+    """
+    formed = [h for family in (_all_families() if families is None else families) for h in _formed(family, case)]
+    formed.sort(key=lambda h: -h.evidence)
+    base = misfit_of(case.result, case.survey)
+    trials = [tried(h, case) for h in formed[:most]]
+    looked_at = sum(h.looked_at for h in formed)
+    return Diagnosis(ranked(base, trials, looked_at), tuple(dict.fromkeys(h.name for h in formed[:most])), base)
+
+
+def _all_families() -> list[Family]:
+    return [import_module(f"adjust.diagnosis.{name}").hypotheses for name in FAMILIES]
+
+
+def _formed(family: Family, case: Case) -> list[Hypothesis]:
+    """The hypotheses of one family; none where the observations do not even suffice to form them."""
+    try:
+        return list(family(case))
+    except SurveyError:
+        return []
+
+
+def _text(number: int, candidate: Candidate) -> str:
+    h = candidate.hypothesis
+    sure = "" if candidate.probability > 0.99 else f", probability {100.0 * candidate.probability:.0f} %"
+    first = "probable cause" if number == 1 else "or"
+    return (
+        f"{first}: {h.cause}; {h.change} (explains {100.0 * candidate.explained:.0f} % of the misfit, sigma0 becomes "
+        f"{candidate.sigma0:.3g}{sure}; --try {number})"
+    )
