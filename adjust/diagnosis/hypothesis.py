@@ -80,7 +80,8 @@ class Hypothesis:
     changes of a project, none where only a person can do it. evidence: how clearly cheap evidence speaks for it, a
     ratio of misfits or of sigmas; only the order of trials follows it. parameters: how many numbers of the change were
     chosen to fit (a cut's epoch, a factor). looked_at: how many such hypotheses were compared with each other, for the
-    family-wise level. start: start values, found where None.
+    family-wise level. start: start values, found where None. penalty: what the change adds to minus
+    twice the log likelihood beside v'Pv, where it changes variances: the sum of the logarithms of their factors.
     """
 
     name: str
@@ -93,3 +94,4 @@ class Hypothesis:
     parameters: int = 1
     looked_at: int = 1
     start: StartValues | None = None
+    penalty: float = 0.0

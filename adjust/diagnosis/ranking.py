@@ -48,13 +48,17 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
     out = []
     for trial, probability in zip(good, weight, strict=True):
         critical = float(chi2.isf(_ALPHA / number, max(1, trial.hypothesis.parameters)))
-        statistic = (base.omega - trial.misfit.omega) / scale
-        share = (base.omega - trial.misfit.omega) / max(base.excess - scale_excess(base, scale), 1e-9)
+        statistic = (base.omega - _cost(trial)) / scale
+        share = (base.omega - _cost(trial)) / max(base.excess - scale_excess(base, scale), 1e-9)
         if statistic > critical and share > _EXPLAINED and trial.misfit.unused <= base.unused:
             sigma0 = trial.result.sigma0 if trial.result is not None else float("nan")
             explained = float(np.clip(share, 0.0, 1.0))
             out.append(Candidate(trial.hypothesis, explained, statistic, critical, float(probability), sigma0))
     return tuple(sorted(out, key=lambda c: -c.probability))
+
+
+def _cost(trial: Trial) -> float:
+    return trial.misfit.omega + trial.hypothesis.penalty
 
 
 def scale_excess(base: Misfit, scale: float) -> float:
@@ -65,7 +69,7 @@ def scale_excess(base: Misfit, scale: float) -> float:
 def _probabilities(base: Misfit, trials: Sequence[Trial], scale: float) -> FloatArray:
     """(k,) of the trials, with the survey as it stands as one more explanation."""
     n = max(base.count, 2)
-    score = [base.omega / scale, *(t.misfit.omega / scale + t.hypothesis.parameters * np.log(n) for t in trials)]
+    score = [base.omega / scale, *(_cost(t) / scale + t.hypothesis.parameters * np.log(n) for t in trials)]
     half = -0.5 * (np.array(score) - min(score))
     likelihood = np.exp(np.maximum(half, -_LOG_LARGEST))
     return np.asarray((likelihood / likelihood.sum())[1:])

@@ -1,6 +1,7 @@
 """One hypothesis, tried: its survey adjusted, and what is left unexplained."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -58,17 +59,32 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
     explanation that leaves more of them out would look the better one.
     """
     points = 2 * sum(len(b.uv) if b.used is None else int(b.used.sum()) for b in survey.image_blocks)
+    n_others = n_other_components(survey)
     if result is None:
-        return Misfit(CAP * points, points, points, 0)
+        return Misfit(CAP * (points + n_others), points + n_others, points + n_others, 0)
     images = result.image_residuals
     cov = np.concatenate([np.zeros((0, 2, 2)), *(b.cov for b in result.survey.image_blocks)])
     squares = _whitened(images.residuals, cov)
     others = np.concatenate([np.zeros(0), *(_squares(o.residual, o.sigma) for o in result.other_residuals)])
-    unused = int(2 * (~images.used).sum()) + max(0, points - 2 * len(cov))
+    gone = max(0, points - 2 * len(cov)) + max(0, n_others - n_other_components(result.survey, used_only=False))
+    unused = int(2 * (~images.used).sum()) + gone
     unused += sum(len(o.residual) for o in result.other_residuals if not o.used)
     omega = float(np.minimum(squares, 2.0 * CAP).sum() + np.minimum(others, CAP).sum())
-    omega += CAP * max(0, points - 2 * len(cov))  # blocks that are not even predicted
-    return Misfit(omega, unused, points + len(others), result.redundancy)
+    omega += CAP * gone  # what is not even predicted
+    return Misfit(omega, unused, points + max(len(others), n_others), result.redundancy)
+
+
+def n_other_components(survey: Survey, used_only: bool = True) -> int:
+    """Observed components in use, or all, that are no image points."""
+    kinds = (survey.table_readings, survey.pairs, survey.distances, survey.coordinates, survey.readings, survey.levels,
+             survey.coordinate_differences, survey.alignments, survey.laser_spots, survey.on_surfaces)  # fmt: skip
+    return sum(_n_components(o) for kind in kinds for o in kind if o.used or not used_only)
+
+
+def _n_components(observed: Any) -> int:
+    """Of one observation: the finite variances of its covariance, one where it has a sigma."""
+    cov = getattr(observed, "cov", None)
+    return 1 if cov is None else int(np.isfinite(np.diag(cov)).sum())
 
 
 def _whitened(residuals: FloatArray, cov: FloatArray) -> FloatArray:

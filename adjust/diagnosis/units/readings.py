@@ -1,0 +1,146 @@
+"""Readings in another unit, sense or from another zero than they were read: everywhere, in one set-up, of one kind.
+
+Evidence: values as mended against those that the rest of the survey predicts at its robust start (or at the adjustment,
+where there is one). What concerns every reading of its kind may have spoilt the start: then it is found anew.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
+from adjust.diagnosis.screen import Screen, screen
+from adjust.diagnosis.units.conventions import ANGLES, MISREADINGS, SLIPS, TURNS, Misreading
+from adjust.model.observations import Reading
+from adjust.model.survey import IntArray, Survey
+from adjust.statistics.pair_screen import values_of
+
+_CAP = 25.0
+_CLEARLY = 3.0
+"""By how much the misfit of the readings concerned has to fall."""
+_MOST = 6
+_LARGE_START = 2500
+"""Readings up to which start values are found anew for every hypothesis that concerns all of a kind."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scope:
+    """Readings (rows) that are mended together; text: what they are called."""
+
+    rows: IntArray
+    text: str
+    place: Place
+
+
+def misread_readings(case: Case) -> Iterator[Hypothesis]:
+    """The misreadings for which the rest of the survey speaks, the clearest first."""
+    survey = case.survey
+    if not survey.readings:
+        return
+    before = at_best(case)
+    looked_at, found = 0, list[tuple[float, Scope, Misreading]]()
+    for scope in scopes(survey):
+        for misreading in _possible(survey, scope):
+            looked_at += 1
+            found.append((_evidence(survey, before, scope, misreading), scope, misreading))
+    found.sort(key=lambda f: (-f[0], -len(f[1].rows)))
+    for evidence, scope, misreading in found[:_MOST]:
+        if evidence > _CLEARLY:
+            yield _hypothesis(survey, scope, misreading, evidence, looked_at)
+
+
+def at_best(case: Case) -> Screen | None:
+    """At the adjustment where there is one that left out what contradicts, else at the start."""
+    if case.result is not None and case.result.global_test is not None and case.result.global_test.passed:
+        return screen(case.survey, values_of(case.result)) or screen(case.survey)
+    return screen(case.survey)
+
+
+def scopes(survey: Survey) -> Iterator[Scope]:
+    """All readings of a kind; of a set-up, by kind and all its angles; single ones."""
+    readings = survey.readings
+    kinds = list(dict.fromkeys(r.kind for r in readings))
+    for kind in kinds:
+        rows = _rows(readings, lambda r, kind=kind: r.kind == kind)
+        yield Scope(rows, f"all readings of kind {kind}", Place("reading", (kind,), "value"))
+    for names in (ANGLES, TURNS):
+        rows = _rows(readings, lambda r, names=names: r.kind in names)
+        if len({readings[i].kind for i in rows}) > 1:
+            what = "angles" if names is ANGLES else "horizontal angles"
+            yield Scope(rows, f"all {what}", Place("reading", (what,), "value"))
+    lengths = _rows(readings, lambda r: r.kind not in ANGLES)
+    if len({readings[i].kind for i in lengths}) > 1:
+        yield Scope(lengths, "all lengths", Place("reading", ("lengths",), "value"))
+    setups = list(dict.fromkeys(r.setup_id for r in readings if r.setup_id))
+    for setup_id in setups if len(setups) > 1 else []:
+        mine = _rows(readings, lambda r, s=setup_id: r.setup_id == s)
+        place = Place("setup", (setup_id,), "value")
+        for kind in dict.fromkeys(readings[i].kind for i in mine):
+            rows = np.array([i for i in mine if readings[i].kind == kind], dtype=np.int64)
+            yield Scope(rows, f"the readings of kind {kind} of set-up {setup_id}", place)
+        angles = np.array([i for i in mine if readings[i].kind in ANGLES], dtype=np.int64)
+        if len({readings[i].kind for i in angles}) > 1:
+            yield Scope(angles, f"the angles of set-up {setup_id}", place)
+
+
+def _rows(readings: Sequence[Reading], wanted: Callable[[Reading], bool]) -> IntArray:
+    return np.array([i for i, r in enumerate(readings) if wanted(r)], dtype=np.int64)
+
+
+def _possible(survey: Survey, scope: Scope) -> Iterator[Misreading]:
+    """A scope of several kinds is misread as a whole, in a way that all of them can be."""
+    kinds = {survey.readings[i].kind for i in scope.rows}
+    yield from (m for m in MISREADINGS if kinds <= set(m.kinds))
+
+
+def mended(survey: Survey, rows: IntArray, misreading: Misreading) -> Survey:
+    """The survey with these readings as they were meant."""
+    values = misreading.mend(np.array([survey.readings[i].value for i in rows]))
+    new = dict(zip(rows.tolist(), values.tolist(), strict=True))
+    readings = tuple(replace(r, value=new[i]) if i in new else r for i, r in enumerate(survey.readings))
+    return replace(survey, readings=readings)
+
+
+def _evidence(survey: Survey, before: Screen | None, scope: Scope, misreading: Misreading) -> float:
+    """How many times smaller the bounded misfit becomes."""
+    whole = _concerns_all(survey, scope)
+    changed = mended(survey, scope.rows, misreading)
+    start = None if before is None or (whole and len(survey.readings) <= _LARGE_START) else before.start
+    after = screen(changed, start)
+    if after is None:
+        return 0.0
+    if before is None:
+        n = len(survey.readings)
+        return _CAP * n / (after.misfit(after.scale) + 0.1 * n)
+    rows = np.arange(len(survey.readings)) if whole else scope.rows
+    scale = min(before.scale, after.scale)
+    old, new = (np.minimum(s.readings[rows] / scale, _CAP).sum() for s in (before, after))
+    return float(old / (new + 0.1 * len(rows)))
+
+
+def _concerns_all(survey: Survey, scope: Scope) -> bool:
+    kinds = {survey.readings[i].kind for i in scope.rows}
+    return len(scope.rows) == sum(r.kind in kinds for r in survey.readings)
+
+
+def _hypothesis(survey: Survey, scope: Scope, misreading: Misreading, evidence: float, looked_at: int) -> Hypothesis:
+    return Hypothesis(
+        misreading.name, f"{scope.text}: their values {misreading.said}", _remedy(misreading), scope.place,
+        mended(survey, scope.rows, misreading), edits(survey, scope.rows, misreading), evidence, 1, max(looked_at, 1),
+    )  # fmt: skip
+
+
+def _remedy(misreading: Misreading) -> str:
+    if misreading.offset:
+        return "in terrestrial.csv give them as zenith angles"
+    return f"in terrestrial.csv multiply them by {misreading.factor:.10g}, or name the column by their unit"
+
+
+def edits(survey: Survey, rows: IntArray, misreading: Misreading) -> tuple[ChangeColumns, ...]:
+    """The same in the table, where the value stands in one column by its unit; angles in degrees."""
+    ids = tuple(survey.readings[i].reading_id for i in rows)
+    if misreading.offset:
+        return ()
+    return (ChangeColumns("terrestrial", ("value",), np.array([[misreading.factor]]), np.zeros(1), {"reading_id": ids}),)
