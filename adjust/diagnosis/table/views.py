@@ -12,17 +12,7 @@ from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Station, Survey, Table, Target
 from adjust.spatial.rigid import inverse, rigid, rotation_exp, skew
 from adjust.start.lenses import Sighting, start_lens
-from adjust.start.views import (
-    Sight,
-    View,
-    all_rays,
-    focal_px,
-    make_views,
-    refine_views,
-    target_points,
-    untrustworthy,
-    used_rows,
-)
+from adjust.start.views import Sight, View, all_rays, focal_px, make_views, target_points, untrustworthy, used_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +189,7 @@ def poses_of_views(survey: Survey) -> dict[int, View]:
             focal = focal_px(cameras[block.camera_id], lenses[block.camera_id])
             sights.append(Sight(i, x, rays[i][used], focal))
     # those without a pose are named by the search for start values
-    refined = refine_views(make_views(sights)[0])
+    refined = make_views(sights)[0]
     reasons, _ = untrustworthy(refined, survey)
     return {v.block_idx: v for v in refined if v.block_idx not in reasons}
 
