@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
     from adjust.model.result import Adjustment, Estimate
     from adjust.model.survey import Datum, Survey
+    from adjust.pose_network.session import NetworkSession
     from adjust.precision.other_datum import in_datum
 
 _PLACES = {
@@ -26,6 +27,7 @@ _PLACES = {
     "Estimate": ("adjust.model.result", "Estimate"),
     "IndeterminateError": ("adjust.model.errors", "IndeterminateError"),
     "NotConvergedError": ("adjust.model.errors", "NotConvergedError"),
+    "NetworkSession": ("adjust.pose_network.session", "NetworkSession"),
     "Survey": ("adjust.model.survey", "Survey"),
     "SurveyError": ("adjust.model.errors", "SurveyError"),
     "in_datum": ("adjust.precision.other_datum", "in_datum"),
@@ -39,6 +41,7 @@ __all__ = [
     "Datum",
     "Estimate",
     "IndeterminateError",
+    "NetworkSession",
     "NotConvergedError",
     "Survey",
     "SurveyError",

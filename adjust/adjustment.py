@@ -8,7 +8,7 @@ from gtsam import Pose3
 
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
-from adjust.graph.solver import Solved, SolveOptions, solve
+from adjust.graph.solver import Solved, SolveOptions, settled, solve
 from adjust.lenses.models import MODELS, camera_constants, monotone_radius_px, principal_point_px
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, Estimate, ParameterName
@@ -60,7 +60,7 @@ def _adjusted(
 ) -> Adjustment:
     survey, notes = begun.survey, begun.notes
     graph = GraphBuilder(survey, begun.start.lenses).build(begun.start)
-    solved = solve(graph, options.solve, progress)
+    graph, solved = settled(graph, options.solve, progress)
     if options.reject_points:
         screened = screen(graph, solved, options.solve)
         survey = with_used(survey, screened.used)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from adjust.model.errors import SurveyError
 from survey.commands.common import DONE, Version, is_set, print_json, run_as_program, run_command, say
-from survey.commands.completing import declare_completion_of
+from survey.commands.completing import declare_completion
 from survey.commands.parser import Parser, name_commands, port, project_folder
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_table(commands, shaped)
     _add_view(commands, shaped)
     _add_export(commands, shaped)
-    declare_completion_of("labcapture", build_parser, commands, shaped)
+    declare_completion("labcapture", build_parser, commands, shaped)
     name_commands(commands)
     return parser
 

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from adjust.model.errors import SurveyError
-    from survey.batch.python import Batch, adjust_many
     from survey.examples import write_example
     from survey.jobs.pairs import PairsOutcome, station_pairs
+    from survey.notebook.batch import Batch, adjust_many
     from survey.notebook.covariance import Covariance
     from survey.notebook.plots import Plot
     from survey.notebook.solution import Solution
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from survey.project import Project, write_project
 
 _PLACES = {
-    "Batch": "survey.batch.python",
+    "Batch": "survey.notebook.batch",
     "Covariance": "survey.notebook.covariance",
     "PairsOutcome": "survey.jobs.pairs",
     "Plot": "survey.notebook.plots",
@@ -36,7 +36,7 @@ _PLACES = {
     "Solution": "survey.notebook.solution",
     "SurveyError": "adjust.model.errors",
     "adjust": "survey.notebook.steps",
-    "adjust_many": "survey.batch.python",
+    "adjust_many": "survey.notebook.batch",
     "detect": "survey.notebook.steps",
     "exclude": "survey.notebook.steps",
     "include": "survey.notebook.steps",

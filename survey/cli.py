@@ -57,7 +57,6 @@ _COMMANDS = (
     declare_compare,
     declare_example,
     declare_schema,
-    declare_completion,
 )
 
 
@@ -90,6 +89,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for declare in _COMMANDS:
         declare(commands, shaped)
+    declare_completion("labsurvey", build_parser, commands, shaped)
     name_commands(commands)
     return parser
 

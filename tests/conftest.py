@@ -1,14 +1,47 @@
-"""Work for several workers: what takes long comes first."""
+"""How the tests run: side by side on all cores, statistical tests at a tenth of their size (``docs/testing.md``)."""
+
+import os
+from pathlib import Path
 
 import pytest
 
-_LONG = ("test_docs", "test_end_to_end", "test_coverage", "test_planted_faults", "test_hardening_fuzz", "test_mfns",
-         "test_navigation", "test_pose_networks", "test_led_selfcal", "test_networks", "test_relay_paper",
-         "test_positioner", "test_batch", "test_detection", "test_camera_lab", "test_camera_gige")  # fmt: skip
-"""Files of 20 s and more: what is begun last is waited for by all workers."""
+from tests import sizes
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: threads of several processes wait for each other
+ACCEPTANCE = Path(__file__).parent / "acceptance"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--whole``."""
+    parser.addoption("--whole", action="store_true", help="long statistical tests at their whole size, not a tenth")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Before test modules are imported: they ask for sizes then."""
+    sizes.whole = config.getoption("--whole")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Folders run on all cores where pytest-xdist is there and nothing else is said (``-n``, ``--pdb``)."""
+    option = config.option
+    unsaid = hasattr(option, "numprocesses") and option.numprocesses is None and option.dist == "no" and not option.tx
+    apart = hasattr(config, "workerinput") or option.usepdb or option.collectonly or option.trace
+    if unsaid and not apart and all(Path(a).is_dir() for a in config.args):
+        from adjust.native.parallel import cores
+
+        os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")  # of each process
+        option.numprocesses = cores() + 1  # one waits for a table or a camera
+        option.dist = "worksteal"  # neighbours stay together, so that what they share is made once
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Nothing of the whole jobs is imported for the daily loop."""
+    return True if collection_path == ACCEPTANCE and config.option.markexpr.strip() == "not slow" else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The long files first, all others in their order."""
-    rank = {name: i for i, name in enumerate(_LONG)}
-    items.sort(key=lambda item: rank.get(item.path.stem, len(_LONG)))
+    """Whole jobs are slow."""
+    for item in items:
+        if item.path.is_relative_to(ACCEPTANCE):
+            item.add_marker("slow")

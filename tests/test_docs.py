@@ -52,6 +52,7 @@ def named(page: Page) -> str:
     return page.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", RUN, ids=named)
 def test_a_page_runs_from_top_to_bottom(page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -223,6 +224,7 @@ def test_pages_that_are_not_run_here_are_run_by_their_own_tests() -> None:
         assert stem in (ROOT / test).read_text(encoding="utf-8"), f"{test} does not speak of {name}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_every_block_is_understood(page: Page) -> None:
     for block in page.blocks:

@@ -8,7 +8,7 @@ from adjust.adjustment import AdjustOptions, assemble
 from adjust.design.exact import exact
 from adjust.graph.assembly import GraphBuilder, StartValues
 from adjust.graph.rank import readable
-from adjust.graph.solver import SolveOptions, solve
+from adjust.graph.solver import settled
 from adjust.model.result import CAUTIOUS_SIGMAS, Adjustment, ParameterName
 from adjust.model.survey import FloatArray, Survey
 
@@ -40,7 +40,7 @@ def expect(survey: Survey, start: StartValues) -> Adjustment:
     """
     ideal = exact(survey, start)
     graph = GraphBuilder(ideal, start.lenses).build(start)
-    result = assemble(graph, solve(graph, SolveOptions()), AdjustOptions())
+    result = assemble(*settled(graph), AdjustOptions())
     kept = tuple(w for w in result.warnings if not w.startswith(("global test", CAUTIOUS_SIGMAS)))
     return replace(result, sigma0=float("nan"), global_test=None, omega=0.0, warnings=kept)
 

@@ -17,7 +17,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray
 from adjust.navigation.model import Beacons, Head
 from adjust.navigation.system import make_system, visible
-from adjust.spatial.rigid import rotation_exp, rotation_log
+from adjust.spatial.rigid import rotation_exp, rotation_log, skew
 
 SOURCES = ("spots", "beacons", "camera positions", "camera attitudes")
 UNITS = ("px", "m", "m", "rad")
@@ -133,12 +133,12 @@ def _jacobians(
         p = (q - tc) @ Rc
         by_x = lens_derivatives(MODELS[own.model], own.lens, own.constants, p, np.zeros((len(rows), 2)))[2]
         by_q = by_x @ Rc.T
-        H[rows] = np.concatenate([by_q @ _cross(q), -by_q], axis=2)
+        H[rows] = np.concatenate([by_q @ skew(q), -by_q], axis=2)
         for i, row in enumerate(rows):
             b = 3 * int(beacon[row])
             by_b[row, :, b : b + 3] = by_q[i] @ R.T
         by_p[rows, :, 3 * k : 3 * k + 3] = -by_q
-        by_a[rows, :, 3 * k : 3 * k + 3] = by_x @ _cross(p)
+        by_a[rows, :, 3 * k : 3 * k + 3] = by_x @ skew(p)
     return tuple(a.reshape(2 * n, -1) for a in (H, by_b, by_p, by_a))
 
 
@@ -188,7 +188,7 @@ def _solved(
             )
             by_q = by_x @ Rc.T
             residual[:, rows] = uv.reshape(n_trials, len(rows), 2)
-            both = np.concatenate([by_q @ _cross(q.reshape(-1, 3)), -by_q], axis=2)
+            both = np.concatenate([by_q @ skew(q.reshape(-1, 3)), -by_q], axis=2)
             H[:, rows] = both.reshape(n_trials, len(rows), 2, 6)
         A = H.reshape(n_trials, -1, 6)
         AT = A.transpose(0, 2, 1)
@@ -197,9 +197,3 @@ def _solved(
         R = R @ rotation_exp(step[:, :3])
     turn = rotation_log(pose[:3, :3].T @ R)
     return np.concatenate([turn, (t - pose[:3, 3]) @ pose[:3, :3]], axis=1)
-
-
-def _cross(x: FloatArray) -> FloatArray:
-    out = np.zeros((len(x), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -x[:, 2], x[:, 1], -x[:, 0]
-    return out - out.transpose(0, 2, 1)

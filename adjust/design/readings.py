@@ -72,8 +72,7 @@ def reading_sigmas(survey: Survey, start: StartValues) -> FloatArray:
     batch = p.graph.terrestrial
     if batch is None:
         return np.zeros(0)
-    batch.update_sigmas(p.values)
-    return np.array(batch.sigma)
+    return np.array(batch.with_sigmas_at(p.values)[0].sigma)
 
 
 def displaced(survey: Survey, start: StartValues, rng: Rng) -> Survey:

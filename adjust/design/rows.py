@@ -17,6 +17,7 @@ from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.observations.factors import ChainPose
 from adjust.observations.images.batch import square_root_information, warp_shape
+from adjust.spatial.rigid import skew
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,7 @@ def _readings(p: Predictor, by_key: dict[int, slice]) -> list[Rows]:
     batch, out = p.graph.terrestrial, list[Rows]()
     if batch is None:
         return out
-    batch.update_sigmas(p.values)
+    batch, _ = batch.with_sigmas_at(p.values)
     batch.unweighted(p.values)
     for c, chunk in enumerate(batch.layout.chunks):
         columns, A = _ranges([by_key[k] for k in chunk.keys]), batch.jacobian(c)
@@ -114,7 +115,7 @@ def _image(p: Predictor, number: int, block: ImageBlock, by_key: dict[int, slice
     if vector.key is not None:
         add(vector.key, by_lens @ vector.matrix)
     by_x = by_q @ R
-    by_pose = np.concatenate([by_x @ -_cross(x), by_x], axis=2)
+    by_pose = np.concatenate([by_x @ -skew(x), by_x], axis=2)
     for key, J in jacobians:
         add(key, by_pose @ J)
     for key, J, row in _own_points(p, block, idx, by_x):
@@ -154,9 +155,3 @@ def _whitening(cov: FloatArray) -> FloatArray:
     W = np.zeros((len(cov), 2, 2))
     W[:, 0, 0], W[:, 0, 1], W[:, 1, 1] = w.T
     return W
-
-
-def _cross(x: FloatArray) -> FloatArray:
-    out = np.zeros((len(x), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -x[:, 2], x[:, 1], -x[:, 0]
-    return out - out.transpose(0, 2, 1)

@@ -19,7 +19,7 @@ from adjust.design.readings import displaced, reading_sigmas
 from adjust.distributions import chi2
 from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import GraphBuilder, StartValues
-from adjust.graph.solver import SolveOptions, solve
+from adjust.graph.solver import settled
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, Survey
@@ -125,7 +125,7 @@ class _Task:
             survey = disturbed(displaced(self.ideal, self.start, rng), rng, self.sigmas)
             try:
                 graph = GraphBuilder(survey, self.start.lenses).build(self.start)
-                found = solve(graph, SolveOptions())
+                _, found = settled(graph)
             except SurveyError as error:
                 out.append(str(error))
                 continue

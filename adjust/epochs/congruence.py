@@ -18,6 +18,7 @@ from adjust.epochs.states import MOTIONS, EpochState, aligned, differences, epoc
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
+from adjust.precision.s_transformation import transformation_matrix
 from adjust.statistics.criteria import noncentrality, sidak
 from adjust.statistics.relative_precision import ellipsoid
 from adjust.statistics.result import Ellipsoid, LevelOptions
@@ -72,13 +73,12 @@ class _Change:
             return self
         E = np.zeros(len(self.d))
         E[self.rows(stable)] = self.weight[self.rows(stable)]
-        seen = self.G.T @ (E[:, None] * self.G)
         if np.linalg.matrix_rank(np.sqrt(E)[:, None] * self.G) < self.G.shape[1]:
             raise SurveyError(
                 f"{len(stable)} stable points cannot carry the {self.G.shape[1]} motions that the epochs leave open; "
                 "name more, or hold something in both"
             )
-        S = np.eye(len(self.d)) - self.G @ np.linalg.solve(seen, self.G.T * E)
+        S = transformation_matrix(self.G, E)
         return replace(self, d=S @ self.d, Q=S @ self.Q @ S.T)
 
 
@@ -188,7 +188,7 @@ def _weights(change: _Change) -> FloatArray:
         return np.ones(len(position))
     Q, G = change.Q, change.G
     if G.shape[1]:
-        S = np.eye(len(Q)) - G @ np.linalg.solve(G.T @ G, G.T)
+        S = transformation_matrix(G)
         Q = S @ Q @ S.T
     precision = np.diag(_quadratic(change.d, Q)[2])
     return np.asarray(np.where(position, precision[position].mean(), precision[~position].mean()))

@@ -18,9 +18,10 @@ from adjust.distributions import chi2
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
-from adjust.precision.pose_networks import rotations_only
+from adjust.precision.precision import rotations_only
 from adjust.relay.motions import right_jacobian_inverse
 from adjust.spatial.rotation_forms import euler_cov_from_tangent, euler_from_matrix
+from adjust.statistics.criteria import sidak
 
 # smallest eigenvalue of the correlation matrix that still counts as determined; joint covariances lose about ten digits
 _DETERMINED = 1e-9
@@ -107,7 +108,7 @@ def station_deformations(
     factors = [_factor(x, s) for x, s in zip((first, second), scale, strict=True)]
     found = [_deformation(first, second, a, b, factors) for a, b in chosen]
     tested = max(1, sum(d.test.freedom > 0 for d in found))
-    level = -np.expm1(np.log1p(-alpha) / tested)
+    level = sidak(alpha, tested)
     return tuple(replace(d, significant=bool(d.test.p < level)) for d in found)
 
 

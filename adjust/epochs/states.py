@@ -9,9 +9,9 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
-from adjust.precision.pose_networks import NamedPrecision, rotations_only
-from adjust.precision.precision import Precision
-from adjust.spatial.motions import point_motions, skew
+from adjust.precision.precision import Precision, rotations_only
+from adjust.spatial.motions import point_motions
+from adjust.spatial.rigid import skew
 
 MOTIONS = ("tx", "ty", "tz", "rx", "ry", "rz", "scale")
 _POINT = np.array([3, 4, 5])
@@ -102,9 +102,6 @@ def datum_carriers(adjustment: Adjustment) -> tuple[ParameterName, ...]:
     if isinstance(precision, Precision):
         datum, by_key = precision.solved.datum, precision.graph.unknowns.by_key
         return () if datum is None else tuple(by_key[k].name for k in datum.keys)
-    if isinstance(precision, NamedPrecision) and adjustment.datum_defect:
-        network = precision.solution.network
-        return tuple(("world_from_station", network.station_ids[int(i)]) for i in network.inner)
     return ()
 
 
@@ -114,9 +111,7 @@ def open_directions(adjustment: Adjustment) -> FloatArray:
     if isinstance(precision, Precision):
         datum = precision.solved.datum
         return np.zeros((7, 0)) if datum is None else np.asarray(datum.directions)
-    if adjustment.datum_defect == 0:
-        return np.zeros((7, 0))
-    return np.eye(7)[:, 3:6] if adjustment.datum_defect == 3 else np.eye(7)[:, :6]
+    return np.zeros((7, 0))
 
 
 def gauge_rows(state: EpochState) -> FloatArray:

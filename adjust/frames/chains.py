@@ -38,9 +38,12 @@ def evaluate_chains(
         some = np.flatnonzero(lengths > step)
         link = link_ptr[some + 1] - 1 - step
         inverse, Ra = link_inverse[link], both_R[pose_of[link]]
-        before_R, before_t = R[some], t[some]
-        R[some] = now_R = Ra @ before_R
-        t[some] = now_t = (Ra @ before_t[:, :, None])[:, :, 0] + both_t[pose_of[link]]
+        before_R, before_t, now_t = R[some], t[some], both_t[pose_of[link]]
+        if step:
+            now_R, now_t = Ra @ before_R, (Ra @ before_t[:, :, None])[:, :, 0] + now_t
+        else:
+            now_R = Ra
+        R[some], t[some] = now_R, now_t
         before_R[inverse], before_t[inverse] = now_R[inverse], now_t[inverse]
         by = adjoint_of_inverse(before_R, before_t)
         by[inverse] *= -1.0

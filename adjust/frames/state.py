@@ -1,6 +1,7 @@
 """The current values of all slots, lenses and warps as plain arrays, for the compiled kernels."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 import gtsam
 import numpy as np
@@ -16,6 +17,10 @@ from adjust.native.lenses import MAX_LENS
 
 class State:
     """Arrays that the kernels read. :meth:`load` fills them from GTSAM values; nothing else changes them.
+
+    What batches compute from them is of the last evaluation, whose number is ``evaluation``: a new load is a new one.
+    GTSAM is served with it only inside :meth:`serving`, by which a caller says that it asks at the values of that
+    evaluation; asked at any other time, a factor evaluates itself.
 
     slot_R (S, 3, 3), slot_t (S, 3): poses of all slots. D (table slots, 6, 6): derivative of a table's motion by its
     free angles and free geometry, ``angles`` columns first. lenses: see LensArrays. warp (targets, 2) m.
@@ -43,8 +48,8 @@ class State:
             if key is not None and slot not in unknowns.table_slots
         ]
         self._pose_keys = {key for _, key in self._free_slots}
-        self.loaded: gtsam.Values | None = None
-        """The values that everything here is of; None while some of it is of others."""
+        self.evaluation = 0
+        self.served = False
         self._slots_by_key = np.array([s for s, _ in sorted(self._free_slots, key=lambda x: x[1])], dtype=np.int64)
 
     def _lens_arrays(self, survey: Survey) -> LensArrays:
@@ -71,14 +76,27 @@ class State:
         matrix = pose.matrix()
         self.slot_R[slot], self.slot_t[slot] = matrix[:3, :3], matrix[:3, 3]
 
+    @contextmanager
+    def serving(self) -> Iterator[None]:
+        """Factors serve what was evaluated last, for GTSAM will ask at these values only."""
+        self.served = True
+        try:
+            yield
+        finally:
+            self.served = False
+
+    def outdate(self) -> None:
+        """What was evaluated last is overwritten, or no longer right."""
+        if not self.served:
+            self.evaluation += 1
+
     def load(self, values: gtsam.Values, slots: Iterable[int] | None = None, lenses: bool = True) -> None:
         """Read everything, or only these slots (and the lenses and warps unless told otherwise), from ``values``."""
+        self.outdate()
         if slots is None:
             self._load_poses(values)
             self._move_tables(values, self.unknowns.table_slots.values())
-            self.loaded = values if lenses else None
         else:
-            self.loaded = self.loaded if values is self.loaded else None
             asked = list(slots)
             self._move_tables(values, [t for s, t in self.unknowns.table_slots.items() if s in asked])
             for slot in asked:

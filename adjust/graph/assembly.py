@@ -1,9 +1,9 @@
 """From a survey and its start values to one GTSAM factor graph."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import gtsam
 import numpy as np
@@ -13,8 +13,8 @@ from adjust.frames.state import State, collect_vectors
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef
-from adjust.model.result import ParameterName
-from adjust.model.survey import BoolArray, FloatArray, Survey, VectorPrior
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorPrior
 from adjust.observations.factors import (
     ChainPose,
     Position,
@@ -36,6 +36,9 @@ from adjust.observations.terrestrial.batch import TerrestrialBatch
 from adjust.observations.terrestrial.building import build_batch, reading_refs
 from adjust.observations.terrestrial.parameters import collect_terrestrial, full_start
 
+if TYPE_CHECKING:
+    from adjust.observations.pairs import PairArrays, PairBatch
+
 _Rows = TypeVar("_Rows", FloatArray, BoolArray)
 
 
@@ -49,14 +52,41 @@ class StartValues:
     vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
 
 
-@dataclass(eq=False)
+def values_of(adjustment: Adjustment) -> StartValues:
+    """Adjusted values as start values."""
+    estimates = adjustment.estimates
+    poses = {n: e.value for n, e in estimates.items() if isinstance(e.value, Pose3)}
+    arrays = {n: np.asarray(e.value) for n, e in estimates.items() if not isinstance(e.value, Pose3)}
+    return StartValues(
+        {n[1]: v for n, v in arrays.items() if n[0] == "lens"},
+        poses,
+        {n[1]: v for n, v in arrays.items() if n[0] == "point"},
+        {n: v for n, v in arrays.items() if n[0] not in ("lens", "point")},
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A graph evaluated at ``values``, with ``damping`` of what is reduced there.
+
+    reduction: of the poses that only image points touch; None where nothing is reduced. number: as long as it is that
+    of the graph's state, what the batches have computed is this evaluation.
+    """
+
+    values: gtsam.Values
+    damping: float
+    reduction: PoseReduction | None
+    number: int
+
+
+@dataclass(frozen=True, eq=False)
 class AdjustmentGraph:
     """The graph, its start and the batches that serve it. Held together with the survey only by the solver.
 
     ``graph`` has every observation as a factor on its unknowns and nothing else; ``system`` is a view of it for the
     solver, in which points and poses that nothing else touches are reduced.
-    reduction: of the poses that only image points touch, while ``system`` is without them; None where nothing is
-    reduced, or no longer.
+    reduction: of the poses that only image points touch; None where it would not pay. pairs: those between two fixed
+    stations, ``others[first_pair + pairs.rows[e]]`` the e-th; singles: the others that are in no batch.
     """
 
     survey: Survey
@@ -66,10 +96,21 @@ class AdjustmentGraph:
     images: ImageBatch
     bundle: BundleBatch | None
     image_order: list[tuple[int, bool]]
-    others: list[ObservationFactor]
+    singles: list[ObservationFactor]
     others_graph: gtsam.NonlinearFactorGraph
     terrestrial: TerrestrialBatch | None = None
     reduction: PoseReduction | None = None
+    pairs: "PairBatch | None" = None
+    first_pair: int = 0
+
+    @cached_property
+    def others(self) -> list[ObservationFactor]:
+        """Every observation that is neither an image point nor a reading, in the order of the survey."""
+        if self.pairs is None:
+            return self.singles
+        items, rest = self.pairs.items(self.survey.pairs), iter(self.singles)
+        within = dict(zip((self.first_pair + self.pairs.rows).tolist(), items, strict=True))
+        return [within[i] if i in within else next(rest) for i in range(len(within) + len(self.singles))]
 
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -98,11 +139,15 @@ class AdjustmentGraph:
 
     @property
     def system(self) -> gtsam.NonlinearFactorGraph:
-        """What the solver linearises, after :meth:`prepare` at the same values: a view of ``graph``.
+        """What the solver linearises, as long as :attr:`reduction` finds inverses: a view of ``graph``.
 
         Of the same chi-square, with what :attr:`reduction` and :attr:`bundle` reduce eliminated already.
         """
-        return self._unreduced if self.reduction is None else self._reduced
+        return self.view(self.reduction)
+
+    def view(self, reduction: PoseReduction | None) -> gtsam.NonlinearFactorGraph:
+        """``system``, or where ``reduction`` is None what it is with all poses in sight."""
+        return self._unreduced if reduction is None else self._reduced
 
     def _factors(self, reduction: PoseReduction | None) -> gtsam.NonlinearFactorGraph:
         """All factors but those of a bundle, and of the image blocks that ``reduction`` takes."""
@@ -112,29 +157,51 @@ class AdjustmentGraph:
             self.terrestrial.add_factors(graph)
         return graph
 
-    def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
-        """Evaluate all batches at ``values``. Where the reduction finds no inverse, it is given up: all is shown."""
+    def prepare(
+        self, values: gtsam.Values, jacobians: bool, damping: float = 0.0, reduced: bool = True
+    ) -> Evaluation:  # fmt: skip
+        """Evaluate all batches at ``values``, which nobody may change while the evaluation is used.
+
+        reduced: with :attr:`reduction`; where that finds no inverse, all is in sight.
+        """
         self.state.load(values)
-        self.images.prepare(values, jacobians)
+        self.images.prepare(jacobians)
+        reduction = self._reduced_here(damping) if reduced and jacobians else None
         if jacobians:
-            if self.reduction is not None and not self.reduction.reduce(damping):
-                self.reduction = None
-            self.images.serve(None if self.reduction is None else self.reduction.others)
+            self.images.serve(None if reduction is None else reduction.others)
         if self.terrestrial is not None:
             self.terrestrial.prepare(values, jacobians)
         if self.bundle is not None:
             self.bundle.prepare(values, jacobians, damping)
+        return Evaluation(values, damping, reduction, self.state.evaluation)
 
-    def objective(self, values: gtsam.Values) -> float:
-        """Weighted square sum v'Pv at ``values``, at which everything is prepared."""
+    def _reduced_here(self, damping: float) -> PoseReduction | None:
+        return self.reduction if self.reduction is not None and self.reduction.reduce(damping) else None
+
+    def linearized(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
+        """The solver's system, linearised with what was evaluated, once more where something else was in between."""
+        if at.number != self.state.evaluation:
+            at = self.prepare(at.values, True, at.damping, at.reduction is not None)
+        with self.state.serving():
+            return self.view(at.reduction).linearize(at.values)
+
+    def objective(self, at: Evaluation) -> float:
+        """Weighted square sum v'Pv of the last evaluation."""
         images = float(self.images.chi.sum()) + (self.bundle.chi_square if self.bundle is not None else 0.0)
         readings = self.terrestrial.chi_square if self.terrestrial is not None else 0.0
-        return images + readings + 2.0 * float(self.others_graph.error(values))
+        with self.state.serving():
+            return images + readings + 2.0 * float(self.others_graph.error(at.values))
 
     def omega(self, values: gtsam.Values) -> float:
         """Weighted square sum v'Pv at ``values``."""
-        self.prepare(values, jacobians=False)
-        return self.objective(values)
+        return self.objective(self.prepare(values, jacobians=False))
+
+    def with_sigmas_at(self, values: gtsam.Values) -> tuple["AdjustmentGraph", float]:
+        """The graph with sigmas of readings that follow the distances at ``values``; their largest relative change."""
+        if self.terrestrial is None:
+            return self, 0.0
+        readings, change = self.terrestrial.with_sigmas_at(values)
+        return (self if readings is self.terrestrial else replace(self, terrestrial=readings)), change
 
     def _split(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rows (N, ...) in the order of ``Survey.image_blocks``, for the image batch and for the bundle."""
@@ -193,8 +260,11 @@ class AdjustmentGraph:
 class GraphBuilder:
     """Builds an :class:`AdjustmentGraph`; one use."""
 
-    def __init__(self, survey: Survey, lenses: Mapping[str, FloatArray]) -> None:
-        self.survey, self.unknowns = survey, Unknowns()
+    def __init__(
+        self, survey: Survey, lenses: Mapping[str, FloatArray], measured: "PairArrays | None" = None
+    ) -> None:
+        """measured: the pairs of the survey as arrays, where these and :attr:`simple` are known."""
+        self.survey, self.unknowns, self.measured = survey, Unknowns(), measured
         collect_vectors(survey, self.unknowns, dict(lenses))
         self.terrestrial = collect_terrestrial(survey, self.unknowns)
         self.frames = FrameTree(survey, self.unknowns)
@@ -203,6 +273,8 @@ class GraphBuilder:
         self.targets = {t.target_id: t for t in survey.targets}
         self.others: list[ObservationFactor] = []
         self.vector_starts: dict[ParameterName, FloatArray] = {}
+        self.simple: tuple[IntArray, ...] = ()
+        """Pairs between fixed stations: their rows in ``Survey.pairs``, and the slots of both ends."""
 
     def build(self, start: StartValues) -> AdjustmentGraph:
         """The whole graph. Raises SurveyError naming what is missing or contradictory."""
@@ -213,21 +285,24 @@ class GraphBuilder:
         geometry = GeometryFactors(self.survey, self.unknowns, self.frames)
         self.vector_starts |= geometry.starts
         state = State(self.survey, self.unknowns)
+        pairs = self._pair_batch(state)
         at = {ref: self._position(state, ref, chain) for ref, chain in positions.items()}
         values = self._values(start)
         readings = build_batch(self.survey, self.unknowns, self.terrestrial, self.frames, state, at)
         if readings is not None:
             turned = {s: u.key for s, n in self.terrestrial.repeated.items() if (u := self.unknowns.by_name.get(n))}
             readings.orient(values, {name[1] for name in start.vectors if name[0] == "orientation"}, turned)
-            readings.update_sigmas(values)
+            readings, _ = readings.with_sigmas_at(values)
         survey = geometry.find_starts(state, at, values, start.vectors)
-        self._other_factors(state, at, pair_chains)
+        first_pair = self._other_factors(state, at, pair_chains)
         self.others += geometry.factors(state, at, values)
         self._priors()
         others = gtsam.NonlinearFactorGraph()
         for item in self.others:
             if item.used:
                 others.add(item.factor)
+        if pairs is not None:
+            pairs.add_factors(others)
         for factor in self._holds():
             others.add(factor)
         known = [(i, b) for i, free, b in split if not free]
@@ -238,6 +313,7 @@ class GraphBuilder:
         )
         # unused observations too: they are predicted with the joint covariance of their unknowns
         outside = {k for item in self.others for k in list(item.factor.keys())} | set(self.unknowns.held)
+        outside |= set() if pairs is None else pairs.keys()
         outside |= readings.keys if readings is not None else set()
         of_images = set(images.of_blocks.key.tolist())
         unknown = [(i, b) for i, free, b in split if free]
@@ -253,6 +329,7 @@ class GraphBuilder:
         order = [(i, free) for i, free, _ in split]
         return AdjustmentGraph(
             survey, self.unknowns, state, values, images, bundle, order, self.others, others, readings, reduced,
+            pairs, first_pair,
         )  # fmt: skip
 
     def _register_points(self) -> None:
@@ -300,12 +377,31 @@ class GraphBuilder:
             return None
         return self.frames.relative(ref.frame, FrameRef("world"))
 
-    def _chains_of_others(self) -> tuple[dict[PositionRef, Chain | None], list[Chain]]:
+    def _chains_of_others(self) -> tuple[dict[PositionRef, Chain | None], dict[int, Chain]]:
         refs = [r for d in self.survey.distances for r in (d.a, d.b)]
         refs += [r for c in self.survey.coordinates for r in c.positions]
         refs += position_refs(self.survey) + reading_refs(self.survey)
         positions = {ref: self._position_chain(ref) for ref in refs}
-        return positions, [self.frames.relative(p.a, p.b) for p in self.survey.pairs]
+        if not self.survey.pairs:
+            return positions, {}
+        from adjust.observations.pairs import simple_pairs  # here: a survey without pairs starts without it
+
+        if self.measured is None:
+            self.simple = simple_pairs(self.survey, self.frames)
+        elif len(self.simple[0]) == len(self.survey.pairs):
+            return positions, {}
+        alone = set(range(len(self.survey.pairs))).difference(self.simple[0].tolist())
+        return positions, {i: self.frames.relative((p := self.survey.pairs[i]).a, p.b) for i in sorted(alone)}
+
+    def _pair_batch(self, state: State) -> "PairBatch | None":
+        """The pairs between fixed stations."""
+        if not self.simple or not len(self.simple[0]):
+            return None
+        from adjust.observations.pairs import PairBatch, pair_arrays  # here: as above
+
+        rows, a_slot, b_slot = self.simple
+        measured = self.measured or pair_arrays([self.survey.pairs[i] for i in rows.tolist()])
+        return PairBatch(measured, rows, a_slot, b_slot, self.unknowns, state)
 
     def _position(self, state: State, ref: PositionRef, chain: Chain | None) -> Position:
         if chain is None:
@@ -324,16 +420,18 @@ class GraphBuilder:
         return Position(pose, target.x_in_target[i], None, warp, (float(sag[0]), float(sag[1])))
 
     def _other_factors(
-        self, state: State, at: Mapping[PositionRef, Position], pair_chains: list[Chain]
-    ) -> None:
+        self, state: State, at: Mapping[PositionRef, Position], pair_chains: Mapping[int, Chain]
+    ) -> int:
+        """All that are in no batch; the place of the first pair among them."""
         for reading in self.survey.table_readings:
             unknown = self.unknowns.by_name.get(("table_angles", reading.table_id, reading.epoch_id))
             if unknown is not None:
                 factor = gtsam.PriorFactorVector(unknown.key, reading.angles, gaussian(reading.cov))
                 self._other(factor, "table", reading.group, (reading.table_id, reading.epoch_id), unknown.components,
                             unknown.units, reading.angles, reading.used)  # fmt: skip
-        for pair, chain in zip(self.survey.pairs, pair_chains, strict=True):
-            self._pair(state, pair, chain)
+        first_pair = len(self.others)
+        for i, chain in pair_chains.items():
+            self._pair(state, self.survey.pairs[i], chain)
         for d in self.survey.distances:
             if not at[d.a].keys and not at[d.b].keys:
                 raise SurveyError(f"distance {d.distance_id!r} joins two held positions; it can adjust nothing")
@@ -347,6 +445,7 @@ class GraphBuilder:
             owners = tuple(position_text(p) for p in c.positions)
             self._other(coordinates_factor(c, [at[p] for p in c.positions]), "coordinates", c.group, owners, names,
                         ("m",) * len(names), c.values.ravel()[known], c.used)  # fmt: skip
+        return first_pair
 
     def _pair(self, state: State, pair: Pair, chain: Chain) -> None:
         factor = pair_factor(pair, self.unknowns, state, chain)
@@ -465,5 +564,6 @@ def inner_datum_keys(survey: Survey, unknowns: Unknowns) -> list[int]:
     stations = datum.stations
     if not datum.points and not datum.stations and not keys:
         stations = tuple(s.station_id for s in survey.stations)
-    keys += [u.key for name, u in by_name.items() if name[0] == "world_from_station" and name[1] in stations]
+    named = set(stations)
+    keys += [u.key for name, u in by_name.items() if name[0] == "world_from_station" and name[1] in named]
     return keys

@@ -15,7 +15,7 @@ from gtsam import Pose3
 from scipy import sparse
 
 from adjust.frames.unknowns import Unknown
-from adjust.graph.assembly import AdjustmentGraph, inner_datum_keys
+from adjust.graph.assembly import AdjustmentGraph, Evaluation, inner_datum_keys
 from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray
@@ -44,9 +44,9 @@ def in_world(graph: AdjustmentGraph, name: ParameterName) -> bool:
     return name[0] in ("world_from_station", "world_from_table")
 
 
-def visible_keys(graph: AdjustmentGraph) -> list[int]:
-    """The unknowns of the system that GTSAM solves, in a fixed order."""
-    seen = set(graph.system.keyVector())
+def visible_keys(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph) -> list[int]:
+    """The unknowns of a linearised system of the graph, in a fixed order."""
+    seen = set(linear.keyVector())
     return [u.key for u in graph.unknowns.by_name.values() if u.key in seen]
 
 
@@ -163,7 +163,7 @@ def survey_motions(graph: AdjustmentGraph, values: gtsam.Values, directions: Flo
 
 def defects(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> FloatArray:
     """Directions (7, k) of the whole-survey motions that the observations do not see."""
-    keys = visible_keys(graph)
+    keys = visible_keys(graph, linear)
     stack = stacking(graph, keys)
     B = np.concatenate([gauge(graph, graph.unknowns.by_key[k], values) for k in keys])
     d = np.sqrt(normal_diagonal(linear, stack))
@@ -177,8 +177,8 @@ def defects(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: g
     return out
 
 
-def inner_datum(graph: AdjustmentGraph, base: gtsam.Values) -> InnerDatum | None:
-    """The inner constraints about ``base`` that the survey asks for, or None where its datum is given.
+def inner_datum(graph: AdjustmentGraph, at: Evaluation) -> InnerDatum | None:
+    """The inner constraints about the values evaluated that the survey asks for, or None where its datum is given.
 
     Raises SurveyError where nothing named can carry them.
     """
@@ -187,9 +187,8 @@ def inner_datum(graph: AdjustmentGraph, base: gtsam.Values) -> InnerDatum | None
     keys = inner_datum_keys(graph.survey, graph.unknowns)
     if not keys:
         raise SurveyError("datum kind 'inner' needs free points or free fixed stations; name some, or hold something")
-    graph.prepare(base, jacobians=True)
-    linear = graph.system.linearize(base)
-    stack = stacking(graph, visible_keys(graph))
+    base, linear = at.values, graph.linearized(at)
+    stack = stacking(graph, visible_keys(graph, linear))
     weights = normal_diagonal(linear, stack)
     directions = defects(graph, linear, base)
     if directions.shape[1] == 0:

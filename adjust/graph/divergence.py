@@ -28,12 +28,11 @@ class Misfit:
     square: float
 
 
-def describe_divergence(graph: AdjustmentGraph, values: gtsam.Values) -> list[str]:
+def describe_divergence(graph: AdjustmentGraph, start: gtsam.Values, values: gtsam.Values) -> list[str]:
     """Lines for people: chi-square, what moved farthest from the start, the worst observations there and here.
 
     The start is named first: a group that is wrong stands out there, before the adjustment has spread its error.
     """
-    start = graph.start
     before, after = misfits(graph, start), misfits(graph, values)
     n = max(1, len(after))
     first = _stands_out(before)

@@ -81,7 +81,7 @@ def describe_null_space(
     graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, values: gtsam.Values
 ) -> IndeterminateError | None:
     """The error that names what is undetermined, or None where everything is determined (though perhaps weakly)."""
-    keys = visible_keys(graph)
+    keys = visible_keys(graph, linear)
     stack = stacking(graph, keys)
     if stack.n > _MOST_DIMS:
         return IndeterminateError(

@@ -10,12 +10,13 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.graph.datum import InnerDatum, inner_datum, normal_diagonal, stacking, visible_keys
 from adjust.graph.divergence import describe_divergence
+from adjust.graph.elimination import Elimination
 from adjust.graph.rank import describe_null_space, unobserved_unknowns
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
-from adjust.precision.tree import Leaves
+from adjust.observations.images.reduction import Leaves
 
 _SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
 """Sigmas that depend on distances (target centring) follow the solution until they change by no more than this."""
@@ -38,21 +39,29 @@ Progress = Callable[[int, float], None]
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """max_step: convergence, what is left to go for any unknown in its own sigmas. max_iterations: steps tried."""
+    """max_step: convergence, what is left to go for any unknown in its own sigmas. max_iterations: steps tried.
+
+    patience: whole steps that may fail to lower chi-square, one after the other, before the search goes back to where
+    it was least. On long corridors of pairs the first ones raise it before it falls (watchdog technique: Chamberlain,
+    Lemarechal, Pedersen and Powell 1982; Nocedal and Wright 2006, section 15.6). determined: what the observations
+    determine was judged before; where GTSAM's Cholesky refuses, QR solves.
+    """
 
     max_step: float = 1e-6
     max_iterations: int = 200
     first_damping: float = 1e-4
+    patience: int = 0
+    determined: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The minimum and how it was reached. linear: GTSAM's linearised graph there, eliminated in ``ordering``."""
+    """The minimum and how it was reached. linear: GTSAM's graph linearised there; tree: what it was eliminated to."""
 
     values: gtsam.Values
     linear: gtsam.GaussianFactorGraph
-    ordering: gtsam.Ordering
-    use_qr: bool
+    tree: gtsam.GaussianBayesTree
+    elimination: Elimination
     omega: float
     iterations: int
     max_step: float
@@ -68,23 +77,34 @@ class _Loop:
     solution is only damped: a state on the way out says nothing about the survey.
     """
 
-    def __init__(self, graph: AdjustmentGraph, options: SolveOptions, progress: Progress | None) -> None:
-        self.graph, self.options, self.progress = graph, options, progress
-        self.values = graph.start
-        self._set_datum()
+    def __init__(
+        self, graph: AdjustmentGraph, start: gtsam.Values, options: SolveOptions, progress: Progress | None
+    ) -> None:
+        self.graph, self.start, self.options, self.progress = graph, start, options, progress
         self.damping, self.length = 0.0, 1.0
-        self.use_qr = False
+        self.reduced, self.use_qr = True, False
         self.moved = self.before = np.inf
         self.judging = True
-        self.behind: frozenset[tuple[str, str, str | None]] = frozenset()
-        self._ordering: tuple[gtsam.NonlinearFactorGraph, gtsam.Ordering] | None = None
+        self._orderings: dict[bool, gtsam.Ordering] = {}
+        self.at = self._evaluated(start)
+        self.omega = graph.objective(self.at)
+        if not np.isfinite(self.omega) and graph.terrestrial is not None:
+            graph.terrestrial.require_directions()
+        self.behind = self._images_behind()
+        self.datum = inner_datum(graph, self.at)
+        self._linearize()
+        self.best, self.waited = (self.at, self.omega), 0
+        self.steps: list[float] = []
 
-    def _set_datum(self) -> None:
-        self.datum = inner_datum(self.graph, self.values)
+    def _evaluated(self, values: gtsam.Values) -> Evaluation:
+        """Everything at ``values``, ready to be linearised there. A reduction without inverse is given up for good."""
+        at = self.graph.prepare(values, True, self.damping, self.reduced)
+        self.reduced = at.reduction is not None
+        return at
 
-    def linearize(self) -> None:
+    def _linearize(self) -> None:
         """``linear``: the system at the present values, with the minimal datum where the survey has an inner one."""
-        self.linear = self.graph.system.linearize(self.values)
+        self.linear = self.graph.linearized(self.at)
         if self.datum is not None:
             self.datum.add_to(self.linear)
 
@@ -94,87 +114,88 @@ class _Loop:
         Also by how much what was hidden lowers chi-square (to first order) beside what the visible step does.
         """
         decrease = 0.0
-        if self.graph.reduction is not None:
-            decrease += self.graph.reduction.complete(delta)
+        if self.at.reduction is not None:
+            decrease += self.at.reduction.complete(delta)
         if self.graph.bundle is not None:
             self.graph.bundle.complete(delta)
             decrease += self.graph.bundle.hidden_decrease
         if self.datum is not None:
-            delta = self.datum.completed(self.graph, self.values, delta)
+            delta = self.datum.completed(self.graph, self.at.values, delta)
         return delta, decrease
 
-    def evaluate(self, values: gtsam.Values) -> float:
-        """Weighted square sum at ``values``; everything is ready to be linearised there, since most steps are good."""
-        try:
-            self.graph.prepare(values, True, self.damping)
-        except IndeterminateError:
-            if values is self.values:
-                raise
-            return np.inf  # a step that made a point undetermined is no step
-        return self.graph.objective(values)
-
     @property
-    def ordering(self) -> gtsam.Ordering:
-        """In which GTSAM eliminates the system as it is now."""
-        system = self.graph.system
-        if self._ordering is None or self._ordering[0] is not system:
-            last = self._last_keys()
-            self._ordering = system, gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(system, last)
-        return self._ordering[1]
+    def elimination(self) -> Elimination:
+        """How GTSAM eliminates the system as it is now."""
+        reduced = self.at.reduction is not None
+        if reduced not in self._orderings:
+            system, last = self.graph.view(self.at.reduction), self._last_keys()
+            self._orderings[reduced] = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(system, last)
+        return Elimination(self._orderings[reduced], self.use_qr)
 
     def step(self) -> gtsam.VectorValues:
         """The (damped) step. Raises IndeterminateError where there is none, by name where that is judged."""
         system = self.linear if self.damping == 0.0 else damped(self.graph, self.linear, self.damping)
-        try:
-            how = (self.ordering, gtsam.EliminateQR) if self.use_qr else (self.ordering,)
-            delta = system.optimize(*how)
-        except RuntimeError as error:
-            if "ndetermin" not in str(error):
-                raise
-            if self.use_qr or not self.judging:
-                raise IndeterminateError("the normal equations have no solution here") from None
-            if self.graph.reduction is not None:  # what is weak is judged, and named, with all unknowns in sight
-                self.graph.reduction = None
-                self.graph.prepare(self.values, True, self.damping)
-                self.linearize()
-                return self.step()
-            names = describe_null_space(self.graph, self.linear, self.values)
-            if names is not None:
-                raise names from None
-            self.use_qr = True  # weak, but determined: GTSAM's Cholesky refuses pivots that QR still resolves
-            return self.step()
+        delta = self.elimination.solution(system)
+        if delta is None:
+            return self._weak_step()
         if not np.isfinite(delta.norm()):
             raise SurveyError("the normal equations have no finite solution; check the sigmas and start values")
         return delta
 
+    def _weak_step(self) -> gtsam.VectorValues:
+        """The step of a system that GTSAM finds indeterminate; raises where it is."""
+        if self.use_qr or not self.judging:
+            raise IndeterminateError("the normal equations have no solution here")
+        if self.at.reduction is not None:  # what is weak is judged, and named, with all unknowns in sight
+            self.reduced = False
+            self.at = self._evaluated(self.at.values)
+            self._linearize()
+            return self.step()
+        names = None
+        if not self.options.determined:
+            names = describe_null_space(self.graph, self.linear, self.at.values)
+        if names is not None:
+            raise names
+        self.use_qr = True  # weak, but determined: GTSAM's Cholesky refuses pivots that QR still resolves
+        return self.step()
+
     def _last_keys(self) -> list[int]:
-        by_key, all_keys = self.graph.unknowns.by_key, list(self.graph.system.keyVector())
+        by_key, all_keys = self.graph.unknowns.by_key, list(self.graph.view(self.at.reduction).keyVector())
         keys = [k for k in all_keys if k in by_key and by_key[k].name[0] in _LATE]
+        if self.options.determined and self.graph.pairs is not None:
+            # far stations eliminated last would have lost nearly all of their information by then
+            keys += sorted(self.graph.pairs.next_to_held() | self._with_prior())
         keys += [k for k in (self.datum.minimal if self.datum is not None else ()) if k not in keys]
         return keys if len(keys) < len(all_keys) else []
 
+    def _with_prior(self) -> set[int]:
+        by_name = self.graph.unknowns.by_name
+        return {by_name[item.ids].key for item in self.graph.singles if item.kind == "prior"}
+
     def run(self) -> Solved:
-        omega = self.evaluate(self.values)
-        self.behind = self._images_behind()
-        self.linearize()
         for iteration in range(1, self.options.max_iterations + 1):
             try:
                 delta, promised = self._proposed()
             except IndeterminateError:
                 if self.judging:
                     raise
+                self.at, self.omega = self.best
                 self._damp(iteration)
                 continue
             self.before, self.moved = self.moved, np.sqrt(max(0.0, promised))
-            found = self._along(delta, omega, promised)
+            watched = self.options.patience > 0 and self.damping == 0.0
+            found = self._watched(delta, promised) if watched else self._along(delta, promised)
             if found is None:
+                self.at, self.omega = self.best
                 self._damp(iteration)
                 continue
-            self.values, omega, gain = found
+            self.at, self.omega, gain = found
+            if self.omega < self.best[1] or not watched:
+                self.best, self.waited = (self.at, self.omega), 0
             if self.progress:
-                self.progress(iteration, omega)
+                self.progress(iteration, self.omega)
             if self._arrived():
-                return self._finish(omega, iteration)
+                return self._finish(iteration)
             self._relax(gain)
         raise self._stuck(self.options.max_iterations)
 
@@ -185,26 +206,39 @@ class _Loop:
         delta, hidden = self.completed(delta)
         return delta, decrease + hidden
 
-    def _along(
-        self, delta: gtsam.VectorValues, omega: float, promised: float
-    ) -> tuple[gtsam.Values, float, float] | None:
-        """Where the step leads: values, their chi-square and the share of the promised decrease; None if nowhere.
+    def _along(self, delta: gtsam.VectorValues, promised: float) -> tuple[Evaluation, float, float] | None:
+        """Where the step leads: evaluated, its chi-square and the share of the promised decrease; None if nowhere.
 
         An undamped step is halved down to ``_SHORTEST``, until it keeps a part of its promise: the quadratic model
         falls by a (2 - a) of the whole at the length a. Source: Dennis and Schnabel 1996, section 6.3.
         """
         length = self.length
         while length >= (_SHORTEST if self.damping == 0.0 else 1.0):
-            trial = self.values.retract(delta if length == 1.0 else delta.scale(length))
-            new = self.evaluate(trial)
-            behind = self._images_behind()
+            try:
+                at = self._evaluated(self.at.values.retract(delta if length == 1.0 else delta.scale(length)))
+            except IndeterminateError:
+                new, behind = np.inf, self.behind  # a step that made a point undetermined is no step
+            else:
+                new, behind = self.graph.objective(at), self._images_behind()
             if np.isfinite(new) and behind <= self.behind:
-                gain = (omega - new) / max(length * (2.0 - length) * promised, 1e-300)
-                if gain > _LEAST_GAIN or self._at_the_bottom(new, omega):
+                gain = (self.omega - new) / max(length * (2.0 - length) * promised, 1e-300)
+                if gain > _LEAST_GAIN or self._at_the_bottom(new, self.omega):
                     self.length, self.behind = length, behind
-                    return trial, new, gain
+                    return at, new, gain
             length *= 0.5
         return None
+
+    def _watched(self, delta: gtsam.VectorValues, promised: float) -> tuple[Evaluation, float, float] | None:
+        """The whole step, whether chi-square falls or not; None where it has not fallen for too long."""
+        try:
+            at = self._evaluated(self.at.values.retract(delta))
+        except IndeterminateError:
+            return None
+        new = self.graph.objective(at)
+        self.waited += 1
+        if not np.isfinite(new) or (self.waited >= self.options.patience and self.moved > 1e-3):
+            return None
+        return at, new, (self.omega - new) / max(promised, 1e-300)
 
     def _at_the_bottom(self, new: float, old: float) -> bool:
         """Where rounding decides whether chi-square falls."""
@@ -218,6 +252,10 @@ class _Loop:
         """Whether what is left to go is small: steps shrink at least linearly near the minimum."""
         if self.damping > 0.0:
             return False
+        self.steps.append(self.moved)
+        last = self.steps[-4:]
+        if self.options.patience and len(self.steps) > 4 and max(last) < 1e-3 and last[-1] > 0.1 * last[0]:
+            return True  # where rounding alone moves the unknowns the steps stay small
         ratio = min(1.0, self.moved / self.before) if np.isfinite(self.before) else 1.0
         return self.moved * max(ratio, 1.0 - self.length) < self.options.max_step
 
@@ -232,7 +270,7 @@ class _Loop:
         elif gain < 0.1:
             self.damping = 4.0 * used
         if self.damping == used:
-            self.linearize()
+            self._linearize()
         elif not self._prepared_here():
             self.damping = used
             self._prepared_here()
@@ -240,17 +278,17 @@ class _Loop:
     def _prepared_here(self) -> bool:
         """Linearise at the present values with the damping of now; False where that has no solution, which is none."""
         try:
-            self.graph.prepare(self.values, True, self.damping)
+            self.at = self._evaluated(self.at.values)
         except IndeterminateError:
             if self.judging and self.damping == 0.0:
                 raise
             return False
-        self.linearize()
+        self._linearize()
         return True
 
     def _damp(self, iteration: int) -> None:
         """From the present values once more, with shorter steps."""
-        self.length = 1.0
+        self.length, self.waited, self.steps = 1.0, 0, []
         while True:
             self.damping = max(self.damping * 10.0, self.options.first_damping)
             if self.damping > 1e8:
@@ -265,28 +303,33 @@ class _Loop:
             f"the adjustment did not converge in {iteration} steps: the last step moved an unknown by "
             f"{self.moved:.2g} sigma{what}; look for gross errors in the observations or a wrong start value"
         )
-        return NotConvergedError("\n  - ".join([head, *describe_divergence(self.graph, self.values)]))
+        return NotConvergedError("\n  - ".join([head, *describe_divergence(self.graph, self.start, self.at.values)]))
 
-    def _finish(self, omega: float, iteration: int) -> Solved:
+    def _finish(self, iteration: int) -> Solved:
         if self.behind:
             raise self._stuck(iteration)
         self.judging = True
         if self.datum is not None:
-            self._set_datum()  # about the solution, where the covariances belong; the solution stays
-            self.graph.prepare(self.values, True)
-        self.linearize()
+            self.datum = inner_datum(self.graph, self.at)  # about the solution, where the covariances belong
+        self._linearize()
         # the covariances need this linearisation anyway: its step costs one elimination and brings the last digits
-        delta, _ = self.completed(self.step())
-        self.values = self.values.retract(delta)
-        leaves = None if self.graph.reduction is None else self.graph.reduction.leaves()
+        try:
+            tree = self.elimination.tree(self.linear)
+            step = tree.optimize()
+        except RuntimeError:  # judged by the next elimination
+            step = self.step()
+            tree = self.elimination.tree(self.linear)
+        delta, _ = self.completed(step)
+        leaves = None if self.at.reduction is None else self.at.reduction.leaves()
         return Solved(
-            self.values, self.linear, self.ordering, self.use_qr, omega, iteration, self.moved, self.datum, leaves
-        )
+            self.at.values.retract(delta), self.linear, tree, self.elimination, self.omega, iteration, self.moved,
+            self.datum, leaves,
+        )  # fmt: skip
 
 
 def damped(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.GaussianFactorGraph:
     """The graph with Marquardt's damping: every unknown held with ``damping`` times its own diagonal."""
-    stack = stacking(graph, visible_keys(graph))
+    stack = stacking(graph, visible_keys(graph, linear))
     root = np.sqrt(damping * np.maximum(normal_diagonal(linear, stack), 1e-12))
     out = linear.clone()
     for key, place in stack.at.items():
@@ -295,17 +338,30 @@ def damped(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, damping: f
     return out
 
 
-def solve(graph: AdjustmentGraph, options: SolveOptions = SolveOptions(), progress: Progress | None = None) -> Solved:
-    """Adjust. Raises IndeterminateError (named), NotConvergedError, SurveyError."""
+def solve(
+    graph: AdjustmentGraph, options: SolveOptions = SolveOptions(), progress: Progress | None = None,
+    start: gtsam.Values | None = None,
+) -> Solved:  # fmt: skip
+    """Least squares on a graph, with its weights as they are, from its start or another one; neither is changed.
+
+    Raises IndeterminateError (named), NotConvergedError, SurveyError.
+    """
     nothing = unobserved_unknowns(graph)
     if nothing:
         raise IndeterminateError(
             "nothing observes " + ", ".join(nothing) + "; leave them out or hold them", tuple(nothing)
         )
-    found = _Loop(graph, options, progress).run()
+    return _Loop(graph, graph.start if start is None else start, options, progress).run()
+
+
+def settled(
+    graph: AdjustmentGraph, options: SolveOptions = SolveOptions(), progress: Progress | None = None
+) -> tuple[AdjustmentGraph, Solved]:
+    """The same with sigmas that depend on distances: the graph with those of the solution, and the solution."""
+    found = solve(graph, options, progress)
     for _ in range(_SIGMA_ROUNDS):
-        if graph.terrestrial is None or graph.terrestrial.update_sigmas(found.values) < _SIGMA_CHANGE:
+        graph, change = graph.with_sigmas_at(found.values)
+        if change < _SIGMA_CHANGE:
             break
-        graph.start = found.values
-        found = _Loop(graph, options, progress).run()
-    return found
+        found = solve(graph, options, progress, found.values)
+    return graph, found

@@ -22,6 +22,8 @@ PIXEL_TOLERANCE = 1e-7
 """What a solved point may miss its equation by, px: far above rounding, far below any measurement."""
 BEYOND_LIMIT = 1.02
 """Tangential terms move the fold of the image a little off the radius where the radial function turns back."""
+WELL_INSIDE = 0.9
+"""Share of that radius up to which a solution is the one on this side of the fold, wherever it was started."""
 MAX_ITERATIONS = 50
 
 
@@ -274,7 +276,7 @@ def _affine_inverse(values: FloatArray, uv: FloatArray) -> FloatArray:
 
 
 def _forward_rays(model: LensModel, values: FloatArray, constants: FloatArray, uv: FloatArray) -> FloatArray:
-    """Tangents (n, 2) by Newton on the projection, from the inverse of its radial part."""
+    """Tangents (n, 2) by Newton on the projection, from the distorted ones or else the inverse of its radial part."""
     profile = radial_profile(model.kind, values, constants)
     if model.kind == kernels.BROWN:
         scale, distorted = 1.0, _affine_inverse(values, uv)
@@ -282,14 +284,24 @@ def _forward_rays(model: LensModel, values: FloatArray, constants: FloatArray, u
         s, centre_u, centre_v, _ = constants
         scale = values[0]
         distorted = np.column_stack([(uv[:, 0] - centre_u) * s - values[1], (uv[:, 1] - centre_v) * s + values[2]])
-    tangents = np.ascontiguousarray(_without_distortion(profile, distorted) / scale)
-    solved = np.zeros(len(uv), dtype=np.bool_)
     lens, constants, _, uv = _arrays(values, constants, np.zeros((0, 3)), uv)
-    run_split(
-        kernels.tangents_of, split_blocks(np.arange(len(uv) + 1)), model.kind, lens, constants, uv, MAX_ITERATIONS,
-        RAY_TOLERANCE, PIXEL_TOLERANCE, tangents, solved,
-    )  # fmt: skip
-    found = solved & (np.hypot(tangents[:, 0], tangents[:, 1]) * scale <= profile.limit * BEYOND_LIMIT)
+
+    def solved(tangents: FloatArray, uv: FloatArray, most: float) -> BoolArray:
+        found = np.zeros(len(uv), dtype=np.bool_)
+        run_split(
+            kernels.tangents_of, split_blocks(np.arange(len(uv) + 1)), model.kind, lens, constants, uv, MAX_ITERATIONS,
+            RAY_TOLERANCE, PIXEL_TOLERANCE, tangents, found,
+        )  # fmt: skip
+        if np.isfinite(profile.limit):
+            found &= np.hypot(tangents[:, 0], tangents[:, 1]) * scale <= profile.limit * most
+        return found
+
+    tangents = np.ascontiguousarray(distorted / scale)
+    found = solved(tangents, uv, WELL_INSIDE)
+    if not found.all():  # Newton went astray from the distorted point, or near the fold perhaps to its other side
+        again = np.ascontiguousarray(_without_distortion(profile, distorted[~found]) / scale)
+        better = solved(again, uv[~found], BEYOND_LIMIT)
+        tangents[~found], found[~found] = again, better
     _require_invertible(model, values, constants, uv, found)
     return tangents
 

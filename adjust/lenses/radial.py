@@ -101,6 +101,8 @@ def _first_root(coefficients: FloatArray) -> float:
     """
     if coefficients[0] <= 0:
         return 0.0
+    if np.all(coefficients >= 0.0):  # Descartes' rule of signs
+        return float("inf")
     reciprocals = np.roots(coefficients)
     real = reciprocals.real[np.abs(reciprocals.imag) <= 1e-9 * np.abs(reciprocals)]
     largest = float(np.max(real, initial=0.0))

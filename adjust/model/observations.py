@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.model.arrays import BoolArray, FloatArray, IntArray
 
 FrameKind = Literal["world", "station", "camera", "target", "table", "mount"]
 ReadingKind = Literal[
@@ -236,3 +236,10 @@ class OnSurface:
     offset: float = 0.0
     group: str = "surface"
     used: bool = True
+
+
+Observation = (
+    TableReading | Pair | Distance | Coordinates | Reading | CoordinateDifferences | Level | Alignment | LaserSpot
+    | OnSurface
+)  # fmt: skip
+"""One observation that is no image point."""

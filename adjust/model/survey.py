@@ -7,15 +7,31 @@ first pixel is (0, 0). Tangents of poses are GTSAM's: rotation (rad) then transl
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from gtsam import Pose3
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
+from adjust.model.arrays import BoolArray as BoolArray
+from adjust.model.arrays import FloatArray as FloatArray
+from adjust.model.arrays import IntArray as IntArray
+from adjust.model.observations import (
+    Alignment,
+    Closure,
+    CoordinateDifferences,
+    Coordinates,
+    Distance,
+    ImageBlock,
+    LaserSpot,
+    Level,
+    Observation,
+    OnSurface,
+    Pair,
+    Reading,
+    ReadingCovariance,
+    TableReading,
+)
+
 Treatment = Literal["free", "held", "prior"]
 
 
@@ -312,11 +328,11 @@ class Survey:
     tables: tuple[Table, ...] = ()
     targets: tuple[Target, ...] = ()
     points: tuple[Point, ...] = ()
-    image_blocks: tuple[Any, ...] = ()
-    table_readings: tuple[Any, ...] = ()
-    pairs: tuple[Any, ...] = ()
-    distances: tuple[Any, ...] = ()
-    coordinates: tuple[Any, ...] = ()
+    image_blocks: tuple[ImageBlock, ...] = ()
+    table_readings: tuple[TableReading, ...] = ()
+    pairs: tuple[Pair, ...] = ()
+    distances: tuple[Distance, ...] = ()
+    coordinates: tuple[Coordinates, ...] = ()
     datum: Datum = Datum()
     vertical: Vertical = field(default_factory=Vertical)
     bearings: Bearings = Bearings()
@@ -324,14 +340,38 @@ class Survey:
     setups: tuple[Setup, ...] = ()
     beams: tuple[Beam, ...] = ()
     surfaces: tuple[Surface, ...] = ()
-    readings: tuple[Any, ...] = ()
-    reading_covariances: tuple[Any, ...] = ()
-    coordinate_differences: tuple[Any, ...] = ()
-    levels: tuple[Any, ...] = ()
-    alignments: tuple[Any, ...] = ()
-    laser_spots: tuple[Any, ...] = ()
-    on_surfaces: tuple[Any, ...] = ()
+    readings: tuple[Reading, ...] = ()
+    reading_covariances: tuple[ReadingCovariance, ...] = ()
+    coordinate_differences: tuple[CoordinateDifferences, ...] = ()
+    levels: tuple[Level, ...] = ()
+    alignments: tuple[Alignment, ...] = ()
+    laser_spots: tuple[LaserSpot, ...] = ()
+    on_surfaces: tuple[OnSurface, ...] = ()
     pair_form: Literal["poses", "closed"] = "poses"
     """Pairs by the poses of their frames, or every loop of them closed; set by :mod:`adjust.relay.closed`."""
-    closures: tuple[Any, ...] = ()
+    closures: tuple[Closure, ...] = ()
     """Mounts (``adjust.model.observations.Closure``) whose play the covariances of their pairs already contain."""
+
+    @property
+    def others(self) -> Mapping[str, tuple[Observation, ...]]:
+        """All observations that are no image points, by the field that holds them."""
+        return {
+            "table_readings": self.table_readings, "pairs": self.pairs, "distances": self.distances,
+            "coordinates": self.coordinates, "coordinate_differences": self.coordinate_differences,
+            "readings": self.readings, "levels": self.levels, "alignments": self.alignments,
+            "laser_spots": self.laser_spots, "on_surfaces": self.on_surfaces,
+        }  # fmt: skip
+
+    @property
+    def n_others_used(self) -> int:
+        """How many of them are in use."""
+        return sum(o.used for kind in self.others.values() for o in kind)
+
+    @property
+    def is_pose_network(self) -> bool:
+        """Whether it observes nothing but pairs between stations that stay where they are."""
+        if self.cameras or self.image_blocks or any(v for k, v in self.others.items() if k != "pairs"):
+            return False
+        fixed = {s.station_id for s in self.stations if s.motion == "fixed"}
+        ends = [ref for p in self.pairs for ref in (p.a, p.b)]
+        return bool(ends) and all(r.kind == "station" and r.frame_id in fixed for r in ends)

@@ -82,30 +82,31 @@ template <int N, class Row> inline void add_pixels(const Pixels &w, const Row &r
     out.cost = sums[N][N];
 }
 
-// The first n_free of N parameters p, in place, with the normal equations there; false without convergence. The first two
-// are the place (px), which may be off by tolerance; steps shrink at least as the damping does. evaluate(p, out) makes
-// the normal equations, clamp(p) keeps parameters where they mean something.
+// The first n_free of N parameters p, in place, with the normal equations at, which are those of the start and then of a
+// place as near the end as the last step is short; false without convergence. The first two are the place (px), which may
+// be off by tolerance; steps shrink at least as the damping does. evaluate(p, out) makes the normal equations, clamp(p)
+// keeps parameters where they mean something.
 template <int N, class Evaluate, class Clamp>
 inline bool levenberg_marquardt(double (&p)[N], int n_free, double tolerance, const Evaluate &evaluate, const Clamp &clamp, Normals<N> &at) {
     double damping = 1e-3, trial[N], step[N][1];
     Normals<N> there;
-    evaluate(p, at);
     for (int iteration = 0; iteration < 40; ++iteration) {
         for (int i = 0; i < N; ++i) trial[i] = p[i], step[i][0] = at.g[i];
         if (!scaled_solve(at.H, n_free, damping, step)) {
             damping = larger(damping * 10.0, 1e-6);
             continue;
         }
-        for (int i = 0; i < n_free; ++i) trial[i] += step[i][0];
+        double gain = 0.0;  // of the squares, as the equations foretell it
+        for (int i = 0; i < n_free; ++i) trial[i] += step[i][0], gain += step[i][0] * at.g[i];
         clamp(trial);
-        evaluate(trial, there);
         const bool small = magnitude(trial[0] - p[0]) + magnitude(trial[1] - p[1]) < tolerance;
-        if (there.cost <= at.cost) {
-            const double gain = at.cost - there.cost;
+        const bool last = small && gain <= 0.05 * tolerance * at.cost + 1e-12;
+        if (!last) evaluate(trial, there);
+        if (last || there.cost <= at.cost) {
             std::memcpy(p, trial, sizeof p);
+            if (last) return true;
             at = there;
             damping *= 0.2;
-            if (small && gain <= 0.05 * tolerance * at.cost + 1e-12) return true;
         } else {
             if (small) return true;
             damping *= 6.0;

@@ -1,6 +1,7 @@
-// What Python calls of lenses, image points, views, trees, reduced poses and simulated networks.
+// What Python calls of lenses, image points, views, planes, trees, reduced poses and simulated networks.
+#include "calibration.h"
+#include "planes.h"
 #include "reduction.h"
-#include "views.h"
 
 extern "C" __attribute__((visibility("default"))) const Entry *images() {
     static constexpr Entry table[] = {
@@ -11,6 +12,8 @@ extern "C" __attribute__((visibility("default"))) const Entry *images() {
         entry<covariance_room>("covariance_room"), entry<covariance_rows>("covariance_rows"),
         entry<joint_blocks>("joint_blocks"), entry<solve_cliques>("solve_cliques"),
         entry<refine_views>("refine_views"), entry<errors_of_views>("errors_of_views"),
-        entry<offsets_of_views>("offsets_of_views"), entry<row_influences>("row_influences"), {nullptr, nullptr, nullptr}};
+        entry<offsets_of_views>("offsets_of_views"), entry<homographies>("homographies"),
+        entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<turns_by>("turns_by"),
+        entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), {nullptr, nullptr, nullptr}};
     return table;
 }

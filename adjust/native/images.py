@@ -84,6 +84,35 @@ class SegmentArrays(NamedTuple):
     place: IntArray
 
 
+class BlocksAt(NamedTuple):
+    """Blocks where they are evaluated: their points with square root information W (3, N): w00 w01 w11, the lenses.
+
+    R (B, 3, 3), t (B, 3) m: ``camera_from_target``. warp (targets, 2) m.
+    """
+
+    blocks: BlockArrays
+    points: PointArrays
+    W: FloatArray
+    lenses: LensArrays
+    R: FloatArray
+    t: FloatArray
+    warp: FloatArray
+
+    @property
+    def arrays(self) -> tuple[FloatArray | IntArray, ...]:
+        """All of them, as the core takes them."""
+        return *self.blocks, *self.points, self.W, *self.lenses, self.R, self.t, self.warp
+
+
+class ByKeys(NamedTuple):
+    """How local unknowns follow from keys: links C (links, 6, 6), tables D (slots, 6, 6), width (B,) all columns."""
+
+    segments: SegmentArrays
+    C: FloatArray
+    D: FloatArray
+    width: IntArray
+
+
 class KeyArrays(NamedTuple):
     """Block b has the keys ``key[ptr[b]:ptr[b + 1]]``, numbered as a tree does, at columns ``place``; -1 is known."""
 
@@ -92,62 +121,50 @@ class KeyArrays(NamedTuple):
     place: IntArray
 
 
-def normal_equations(
-    which: IntArray, blocks: BlockArrays, points: PointArrays, W: FloatArray, lenses: LensArrays, R: FloatArray,
-    t: FloatArray, warp: FloatArray, H: FloatArray, chi: FloatArray, depth: FloatArray,
-) -> None:  # fmt: skip
+def normal_equations(which: IntArray, at: BlocksAt, H: FloatArray, chi: FloatArray, depth: FloatArray) -> None:
     """For each listed block: normal matrix H[b] (symmetric) of its local unknowns and, last, the residual.
 
-    Its last diagonal element is chi-square, also in ``chi``; depth: the least one (m), infinite without points. W:
-    square root information (3, N): w00 w01 w11; a point of weight zero gives rows of zeros and no depth.
+    Its last diagonal element is chi-square, also in ``chi``; depth: the least one (m), infinite without points. A point
+    of weight zero gives rows of zeros and no depth.
     """
-    _normal_equations(which, *blocks, *points, W, *lenses, R, t, warp, H, chi, depth)
+    _normal_equations(which, *at.arrays, H, chi, depth)
 
 
-def errors(
-    which: IntArray, blocks: BlockArrays, points: PointArrays, W: FloatArray, lenses: LensArrays, R: FloatArray,
-    t: FloatArray, warp: FloatArray, chi: FloatArray, depth: FloatArray,
-) -> None:  # fmt: skip
+def errors(which: IntArray, at: BlocksAt, chi: FloatArray, depth: FloatArray) -> None:
     """Chi-square (whitened) and least depth of each listed block."""
-    _errors(which, *blocks, *points, W, *lenses, R, t, warp, chi, depth)
+    _errors(which, *at.arrays, chi, depth)
 
 
-def block_rows(
-    b: int, blocks: BlockArrays, points: PointArrays, W: FloatArray, lenses: LensArrays, R: FloatArray, t: FloatArray,
-    warp: FloatArray, out: FloatArray,
-) -> None:  # fmt: skip
+def block_rows(b: int, at: BlocksAt, out: FloatArray) -> None:
     """Whitened rows (2 n, n_lens + 6 + n_warp + 1) of block b over its local unknowns, residual last."""
-    _block_rows(b, *blocks, *points, W, *lenses, R, t, warp, out)
+    _block_rows(b, *at.arrays, out)
 
 
 def serve(
-    which: IntArray, blocks: BlockArrays, lenses: LensArrays, segments: SegmentArrays, C: FloatArray, D: FloatArray,
-    width: IntArray, at: IntArray, H: FloatArray, flat: FloatArray, r_out: FloatArray,
+    which: IntArray, at: BlocksAt, keys: ByKeys, begin: IntArray, H: FloatArray, flat: FloatArray, r_out: FloatArray
 ) -> None:  # fmt: skip
-    """For each listed block: its condensed rows, chained to its keys, into ``flat`` from ``at[b]``, and r_out (B, n).
+    """For each listed block: its condensed rows, chained to its keys, into ``flat`` from begin[b], and r_out (B, n).
 
-    Keys one after the other, each (n, its width); ``segments.place`` counts columns, width (B,) all of a block.
+    Keys one after the other, each (n, its width); ``segments.place`` counts columns.
     """
-    _serve(which, *blocks, *lenses, *segments, C, D, width, at, H, flat, r_out)
+    segments, C, D, width = keys
+    _serve(which, *at.blocks, *at.lenses, *segments, C, D, width, begin, H, flat, r_out)
 
 
-def local_by_keys(b: int, n_lens: int, segments: SegmentArrays, C: FloatArray, D: FloatArray, G: FloatArray) -> None:
+def local_by_keys(b: int, n_lens: int, keys: ByKeys, G: FloatArray) -> None:
     """Derivative G (n_lens + 6 + n_warp, sum of key dims) of a block's local unknowns by its keys."""
-    _local_by_keys(b, n_lens, *segments, C, D, G)
+    _local_by_keys(b, n_lens, *keys.segments, keys.C, keys.D, G)
 
 
 def all_statistics(
-    which: IntArray, blocks: BlockArrays, points: PointArrays, W: FloatArray, lenses: LensArrays, R: FloatArray,
-    t: FloatArray, warp: FloatArray, segments: SegmentArrays, C: FloatArray, D: FloatArray, width: IntArray,
-    keys: KeyArrays, tree: TreeArrays, residual: FloatArray, influence: FloatArray, lost: IntArray,
+    which: IntArray, at: BlocksAt, by_keys: ByKeys, keys: KeyArrays, tree: TreeArrays, residual: FloatArray,
+    influence: FloatArray, lost: IntArray,
 ) -> None:  # fmt: skip
     """Residuals (N, 2) px of the listed blocks and the whitened covariance A Q A' (N, 3: 00, 01, 11) of their points.
 
-    W: that of all points, used or not. lost[b] becomes 1 where two keys of a block share no clique of the tree.
+    at.W: that of all points, used or not. lost[b] becomes 1 where two keys of a block share no clique of the tree.
     """
-    widest = int(width.max(initial=0))
+    widest = int(by_keys.width.max(initial=0))
     work = np.empty(widest * (widest + 2 * MAX_LOCAL))
-    _all_statistics(
-        which, *blocks, *points, W, *lenses, R, t, warp, *segments, C, D, width, *keys, *tree, residual, influence,
-        lost, work,
-    )  # fmt: skip
+    segments, C, D, width = by_keys
+    _all_statistics(which, *at.arrays, *segments, C, D, width, *keys, *tree, residual, influence, lost, work)

@@ -4,6 +4,7 @@ Every model has a number (its kind), a parameter vector in a fixed order and a v
 centre_u, centre_v, r0_mm]`` of which it uses what it needs; ``adjust.lenses.models`` names them all. The formulas,
 each written once for values and derivatives, are in ``lenses.h``. A point on or behind the camera's plane gives
 finite numbers without meaning; the caller tests the depth. The fisheye alone sees behind that plane, and means it.
+The fit of a lens together with the poses of what its camera sees is in ``calibration.h``.
 """
 
 import numpy as np
@@ -24,6 +25,11 @@ N_COLUMNS = MAX_LENS + 3
 _lens_rows = Function("lens_rows", "kind lens[*] constants[4] q[n,3] uv[n,2] residuals[n,2] rows[*,2,17]")
 _tangents_of = Function(
     "tangents_of", "first last kind lens[*] constants[4] uv[n,2] iterations small pixels tangents[n,2] solved[n]"
+)
+_fit_lens = Function(
+    "fit_lens",
+    "kind values[n] constants[4] directions[n,p] ptr[B+1] x[N,3] uv[N,2] iterations poses[B,4,4] squares[N] cov[p,p] "
+    "work[*]",
 )
 _NO_ROWS = np.zeros((0, 2, N_COLUMNS))
 
@@ -67,3 +73,23 @@ def tangents_of(
     ``pixels`` of their image point, where the lens does not turn the image over.
     """
     _tangents_of(int(run[0]), int(run[-1]) + 1, kind, lens, constants, uv, iterations, small, pixels, tangents, solved)
+
+
+def fit_lens(
+    kind: int, values: FloatArray, constants: FloatArray, directions: FloatArray, ptr: IntArray, x: FloatArray,
+    uv: FloatArray, iterations: int, poses: FloatArray,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Least squares over ``values + directions @ p`` and the poses camera_from_target (B, 4, 4), both in place.
+
+    directions: (n, p), what of the lens may move. x: (N, 3) m, uv: (N, 2) px, view after view by ``ptr`` (B + 1,).
+    Huber weights at three times the median. Returns the squares (N,) px^2 of what is left, and the covariance (p, p) of
+    the free components for residuals of variance one, infinite where they are not determined.
+    """
+    _check(kind, values)
+    p, N, B = directions.shape[1], len(x), len(poses)
+    if max(directions.shape) > MAX_LENS:
+        raise ValueError(f"fit_lens: directions must be at most ({MAX_LENS}, {MAX_LENS}), not {directions.shape}")
+    squares, cov = np.empty(N), np.empty((p, p))
+    work = np.empty(3 * N + B * (16 + 12 * (p + 7)))
+    _fit_lens(kind, values, constants, directions, ptr, x, uv, iterations, poses, squares, cov, work)
+    return squares, cov

@@ -36,7 +36,7 @@ def split_blocks(ptr: IntArray) -> list[IntArray]:
     return [run.astype(np.int64) for run in np.split(np.arange(n), edges) if len(run)]
 
 
-def run_split(kernel: Callable[..., None], runs: list[IntArray], *arguments: object) -> None:
+def run_split(kernel: Callable[..., object], runs: list[IntArray], *arguments: object) -> None:
     """Call ``kernel(run, *arguments)`` for every run, side by side."""
     if len(runs) <= 1:
         for run in runs:

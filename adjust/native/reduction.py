@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.images import BLOCKS, CHAINED, LENSES, MAX_LOCAL, SEGMENTS, BlockArrays, LensArrays, SegmentArrays
+from adjust.native.images import BLOCKS, CHAINED, LENSES, MAX_LOCAL, SEGMENTS, BlocksAt, ByKeys
 from adjust.native.library import Function
 
 WEAKEST_PIVOT = 2.0**-24
@@ -39,9 +39,8 @@ class ReductionArrays(NamedTuple):
 
 
 def reduce_poses(
-    run: IntArray, a: ReductionArrays, blocks: BlockArrays, lenses: LensArrays, segments: SegmentArrays,
-    width: IntArray, C: FloatArray, D: FloatArray, damping: float, H: FloatArray, L: FloatArray, T: FloatArray,
-    diagonal: FloatArray, rest: FloatArray, bad: IntArray,
+    run: IntArray, a: ReductionArrays, at: BlocksAt, keys: ByKeys, damping: float, H: FloatArray, L: FloatArray,
+    T: FloatArray, diagonal: FloatArray, rest: FloatArray, bad: IntArray,
 ) -> None:  # fmt: skip
     """Reduce the poses in run[1:]: L (J, 6, 6) upper and T stay for what follows; the sums are those of turn = run[0].
 
@@ -49,9 +48,12 @@ def reduce_poses(
     before anything was reduced. damping: share of its own diagonal that is added to a pose's. bad[turn]: a pose without
     an inverse, else left alone.
     """
+    segments, C, D, width = keys
     size = max(int(np.diff(a.col_ptr)[run[1:]].max(initial=0)) + 7, int(width.max(initial=0)) + 1)
     work, to = np.empty(size * (2 * size + 6 + MAX_LOCAL)), np.empty(size, dtype=np.int64)
-    _reduce_poses(run, *a, *blocks, *lenses, *segments, width, C, D, damping, H, L, T, diagonal, rest, bad, work, to)
+    _reduce_poses(
+        run, *a, *at.blocks, *at.lenses, *segments, width, C, D, damping, H, L, T, diagonal, rest, bad, work, to
+    )
 
 
 def pose_steps(a: ReductionArrays, L: FloatArray, T: FloatArray, d: FloatArray, out: FloatArray) -> float:

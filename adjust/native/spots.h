@@ -75,6 +75,7 @@ inline void fit_spots(In<float, 2> gray, In<int64_t, 2> labels, double saturatio
                 const int n_free = profile == GAUSSIAN ? 6 : 7;
                 Normals<SPOT> at;
                 const auto evaluate = [&](const double *q, Normals<SPOT> &o) { add_pixels(w, SpotProfile(q, profile), o); };
+                evaluate(p, at);
                 if (!levenberg_marquardt(p, n_free, 2e-5, evaluate, clamp, at)) continue;
                 const double variance = at.cost / (n - n_free);
                 double here[4];

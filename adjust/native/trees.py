@@ -5,7 +5,8 @@ children. Row-major blocks of front x width numbers begin at ``at[c]``: in ``dat
 in ``cov`` the rows of the covariance that belong to the frontal keys.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -44,6 +45,24 @@ class TreeArrays(NamedTuple):
         """A tree without unknowns."""
         none = np.zeros(0, dtype=np.int64)
         return TreeArrays(none, np.zeros(1, dtype=np.int64), none, none, none, none, none, np.zeros(0))
+
+
+class KeyCovariances(Protocol):
+    """Covariances of keys from a tree, as observations look them up; ``arrays`` count the keys as ``number`` says."""
+
+    @property
+    def number(self) -> Mapping[int, int]:
+        """Of every key."""
+        ...
+
+    @property
+    def arrays(self) -> TreeArrays:
+        """The tree with its covariances."""
+        ...
+
+    def joint(self, keys: Sequence[int]) -> FloatArray:
+        """Joint covariance of these keys, stacked."""
+        ...
 
 
 def row_influences(

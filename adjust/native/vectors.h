@@ -64,6 +64,12 @@ inline void turn_of(const Mat &r, double *out) {
     const double sine = root(x * x + y * y + z * z), factor = sine < 1e-12 ? 2.0 : 2.0 * std::atan2(sine, w) / sine;
     out[0] = factor * x, out[1] = factor * y, out[2] = factor * z;
 }
+inline void turns_by(In<double, 2> w, Out<double, 3> out) {
+    for (int64_t i = 0; i < w.n[0]; ++i) turn_by(&w(i, 0), *reinterpret_cast<Mat *>(&out(i, 0, 0)));
+}
+inline void turns_of(In<double, 3> r, Out<double, 2> out) {
+    for (int64_t i = 0; i < r.n[0]; ++i) turn_of(*reinterpret_cast<const Mat *>(&r(i, 0, 0)), &out(i, 0));
+}
 // The step with retracted(a, step) = b.
 inline void step_between(const Pose &a, const Pose &b, double *out) {
     Mat r;

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr
 
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.library import Function
@@ -22,14 +21,12 @@ ENOUGH_FOR_SLOPES = 45
 GAUSSIAN, DISC = 0, 1
 _LANES, _BAND = 8, 8  # of the widest vectors; rows that spread_and_sum makes together
 
-_NODES = np.arange(-384, 385) / 64.0  # of the normal distribution, as corners.h expects them
-_TABLE = ndtr(_NODES), np.exp(-0.5 * _NODES**2) / np.sqrt(2.0 * np.pi)
 _fit_corners = Function(
     "fit_corners",
-    "image[*,*] start[n,2] angles[n,2] blur[n] shapes[n,4] crossing max_shift tolerance enough phi[769] density[769] "
+    "image[*,*] start[n,2] angles[n,2] blur[n] shapes[n,4] crossing max_shift tolerance enough "
     "p[n,9] cov[n,2,2] pixels[n] rms[n] status[n]",
 )
-_corner_rows = Function("corner_rows", "xy[n,2] p[9] crossing phi[769] density[769] value[n] rows[n,9]")
+_corner_rows = Function("corner_rows", "xy[n,2] p[9] crossing value[n] rows[n,9]")
 _fit_spots = Function(
     "fit_spots",
     "gray[h,w] labels[h,w] saturation start[n,2] label[n] diameter[n] peak[n] background[n] p[n,7] best[n] cov[n,2,2] "
@@ -77,15 +74,15 @@ def fit_corners(
     p, cov, rms = np.zeros((n, CORNER_PARAMETERS)), np.zeros((n, 2, 2)), np.zeros(n)
     pixels, status = np.zeros(n, np.int64), np.zeros(n, np.int64)
     given = (np.ascontiguousarray(a, dtype=np.float64) for a in (start, angles, blur, shapes))
-    _fit_corners(np.ascontiguousarray(image), *given, crossing, max_shift, tolerance, ENOUGH_FOR_SLOPES, *_TABLE, p,
-                 cov, pixels, rms, status)  # fmt: skip
+    _fit_corners(np.ascontiguousarray(image), *given, crossing, max_shift, tolerance, ENOUGH_FOR_SLOPES, p, cov,
+                 pixels, rms, status)  # fmt: skip
     return p, cov, pixels, rms, status
 
 
 def corner_rows(xy: FloatArray, p: FloatArray, crossing: bool) -> tuple[FloatArray, FloatArray]:
     """Grey values (n,) at places xy (n, 2) px from a window's centre, and derivatives (n, 9) by the parameters p."""
     value, rows = np.empty(len(xy)), np.empty((len(xy), CORNER_PARAMETERS))
-    _corner_rows(xy, p, crossing, *_TABLE, value, rows)
+    _corner_rows(xy, p, crossing, value, rows)
     return value, rows
 
 

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.distributions import chi2
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import DONE, SpotArrays, gauss_newton
 from adjust.navigation.system import Sightings, System
 from adjust.relay.motions import right_jacobian_inverse
 from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log
-from adjust.statistics.criteria import cautious
+from adjust.statistics.gross_errors import Search, State, Verdicts, one_group
 
 _NO_B: FloatArray = np.zeros((0, 0))
 _NO_ROWS: IntArray = np.zeros(0, dtype=np.int64)
@@ -151,19 +150,19 @@ def fit_without_outliers(
 
     None is taken out where the residuals of all are together far smaller than their sigmas say.
     """
-    rejected: list[int] = []
-    fit = fit_pose(system, seen, used, beacon, start, prior)
-    while fit is not None and fit.redundancy > 0:
-        values = spot_tests(fit)
-        if np.isnan(values).all() or (not rejected and cautious(values, np.full(len(values), 2))):
-            break
-        worst = int(np.nanargmax(values))
-        if values[worst] < chi2.isf(alpha / len(values), 2):
-            break
-        keep = np.arange(len(used)) != worst
-        again = fit_pose(system, seen, used[keep], beacon[keep], fit.pose, prior)
-        if again is None:
-            break
-        rejected.append(int(used[worst]))
-        used, beacon, fit = used[keep], beacon[keep], again
-    return fit, tuple(rejected)
+
+    def solve(kept: BoolArray, before: State[PoseFit] | None) -> tuple[PoseFit, Verdicts] | None:
+        at = start if before is None else before.solution.pose
+        fit = fit_pose(system, seen, used[kept], beacon[kept], at, prior)
+        if fit is None:
+            return None
+        values = np.full(len(used), np.nan)
+        values[kept] = spot_tests(fit) if fit.redundancy > 0 else np.nan
+        return fit, one_group(values, np.where(np.isnan(values), 0, 2), kept)
+
+    search = Search(solve, alpha, many=np.inf)
+    first = search.state(np.ones(len(used), dtype=np.bool_))
+    if first is None or first.tests.cautious[0]:
+        return (None if first is None else first.solution), ()
+    last = search.settled(first)
+    return last.solution, tuple(used[~last.tests.used].tolist())

@@ -82,33 +82,15 @@ def predicted(state: MotionState, time_s: float, motion: Motion) -> MotionState:
     """The state at another time (later or earlier), under white accelerations."""
     dt = time_s - state.time_s
     step = state.rate * dt
-    move = Pose3.Expmap(step)
+    right = np.zeros((6, 6), order="F")
+    move = Pose3.Expmap(step, right)
     A = np.eye(12)
     A[:6, :6] = move.inverse().AdjointMap()
-    A[:6, 6:] = dt * _right_jacobian(step)
+    A[:6, 6:] = dt * right
     S = np.diag([motion.sigma_angular_acceleration**2] * 3 + [motion.sigma_acceleration**2] * 3)
     span = abs(dt)
     Q = np.block([[S * span**3 / 3, S * span * dt / 2], [S * span * dt / 2, S * span]])
     return MotionState(time_s, state.pose @ move.matrix(), state.rate, A @ state.P @ A.T + Q, A @ state.B)
-
-
-def _right_jacobian(step: FloatArray) -> FloatArray:
-    """Derivative (6, 6) of ``Exp(step + d)`` on the right: the series of ad (Chirikjian 2012, section 10.7)."""
-    w, v = step[:3], step[3:]
-    ad = np.zeros((6, 6))
-    ad[:3, :3] = ad[3:, 3:] = _skew(w)
-    ad[3:, :3] = _skew(v)
-    out, term = np.eye(6), np.eye(6)
-    for k in range(1, 25):
-        term = term @ -ad / (k + 1)
-        out += term
-        if np.abs(term).max() < 1e-15:
-            break
-    return out
-
-
-def _skew(w: FloatArray) -> FloatArray:
-    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
 
 
 def updated(state: MotionState, fit: PoseFit, spot_noise: FloatArray) -> MotionState:

@@ -15,6 +15,7 @@ from adjust.frames.unknowns import Chain, Unknown, Unknowns, VectorMap
 from adjust.model.observations import Coordinates, Distance, Pair
 from adjust.model.survey import FloatArray, PoseParameter, VectorPrior
 from adjust.observations.images.batch import Chains
+from adjust.spatial.rigid import skew
 
 Jacobians = list[tuple[int, FloatArray]]
 Residual = Callable[[gtsam.Values], tuple[FloatArray, Jacobians]]
@@ -97,8 +98,7 @@ class Position:
         x = self.x_in_frame
         if self.warp is not None:
             x = x + np.array([0.0, 0.0, np.asarray(self.sag) @ self.warp.full(values)])
-        cross = np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
-        by_pose = np.hstack([-R @ cross, R])
+        by_pose = np.hstack([-R @ skew(x), R])
         out = [(key, by_pose @ J) for key, J in jacobians]
         if self.warp is not None and self.warp.key is not None:
             out.append((self.warp.key, np.outer(R[:, 2], np.asarray(self.sag) @ self.warp.matrix)))
@@ -228,6 +228,8 @@ def hold_factor(unknown: Unknown, held: Sequence[int], value: Pose3 | FloatArray
     cov = np.eye(len(rows)) * HOLD**2
     key = unknown.key
     if isinstance(value, Pose3):
+        if rows == [3, 4, 5]:
+            return gtsam.PoseTranslationPrior3D(key, value, gaussian(cov))
 
         def pose_residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
             D = np.zeros((6, 6), order="F")

@@ -6,11 +6,14 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from gtsam import Pose3, Rot3
 from scipy.sparse import coo_array
 
 from adjust.model.errors import IndeterminateError, SurveyError
-from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.relay.graphs import loop_labels
+from adjust.model.observations import FrameRef, Pair
+from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Station, Survey, Treatment
+from adjust.observations.pairs import PairArrays
+from adjust.relay.cycles import loop_labels
 from adjust.spatial.rigid import nearest_rotation
 
 _FEW = 8
@@ -25,6 +28,7 @@ class PoseNetwork:
     and tested only. station_rotations (N, 3, 3), station_translations (N, 3): ``world_from_station`` of the held ones
     and of those with a prior, start of the others, nan where nothing is known. prior_cov: (6, 6) by station position.
     inner: positions of the stations that carry inner constraints (free network), empty where the datum is given.
+    survey: that it is of, None where there is only the network.
     """
 
     station_ids: tuple[str, ...]
@@ -40,6 +44,7 @@ class PoseNetwork:
     held: IntArray
     prior_cov: Mapping[int, FloatArray] = field(default_factory=dict)
     inner: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    survey: Survey | None = None
 
     @property
     def n_stations(self) -> int:
@@ -52,9 +57,14 @@ class PoseNetwork:
         return len(self.pair_ids)
 
     @cached_property
+    def arrays(self) -> PairArrays:
+        """The pairs alone."""
+        return PairArrays(self.rotations, self.translations, self.cov, self.used)
+
+    @property
     def is_pose(self) -> BoolArray:
         """Which pairs (E,) measured a translation too."""
-        return np.isfinite(self.cov[:, 3, 3])
+        return self.arrays.is_pose
 
     @cached_property
     def rotation_only(self) -> bool:
@@ -66,27 +76,15 @@ class PoseNetwork:
         """Unknowns of a station: 6, or 3 in a network of rotations."""
         return 3 if self.rotation_only else 6
 
-    @cached_property
+    @property
     def whitening(self) -> FloatArray:
         """W (E, dim, dim), upper triangular, with W'W the inverse covariance; zero rows where nothing was measured."""
-        d = self.dim
-        out = np.zeros((self.n_pairs, d, d))
-        for rows, n in ((self.is_pose, 6), (~self.is_pose, 3)):
-            if rows.any():
-                info = np.linalg.inv(self.cov[rows][:, :n, :n])
-                W = np.swapaxes(np.linalg.cholesky(0.5 * (info + np.swapaxes(info, 1, 2))), 1, 2)
-                out[np.ix_(rows, np.arange(n), np.arange(n))] = W
-        return out
+        return self.arrays.whitening[:, : self.dim, : self.dim]
 
     @cached_property
     def index_of(self) -> dict[str, int]:
         """Position of every station id."""
         return {s: i for i, s in enumerate(self.station_ids)}
-
-    @cached_property
-    def pair_index_of(self) -> dict[str, int]:
-        """Position of every pair id."""
-        return {p: i for i, p in enumerate(self.pair_ids)}
 
     @cached_property
     def anchor(self) -> int | None:
@@ -96,20 +94,32 @@ class PoseNetwork:
         return int(self.inner[0])
 
     @cached_property
-    def constants(self) -> BoolArray:
-        """Stations (N,) that are no unknowns of the solution: the held ones, or the anchor."""
+    def as_survey(self) -> Survey:
+        """What is solved, all pairs as they were when it was first asked for."""
+        return _as_survey(self)
+
+    @cached_property
+    def is_held(self) -> BoolArray:
+        """Which stations (N,) are held."""
         out = np.zeros(self.n_stations, dtype=np.bool_)
         out[self.held] = True
+        return out
+
+    @cached_property
+    def constants(self) -> BoolArray:
+        """Stations (N,) that are no unknowns of the solution: the held ones, or the anchor."""
+        out = self.is_held.copy()
         if self.anchor is not None:
             out[self.anchor] = True
         return out
 
     def with_used(self, used: BoolArray) -> "PoseNetwork":
-        """The same network with other pairs in use; whitening is not computed again."""
+        """The same network with other pairs in use; nothing else is computed again."""
         out = replace(self, used=np.asarray(used, dtype=np.bool_))
-        for name in ("whitening", "is_pose", "rotation_only", "index_of", "pair_index_of"):
+        for name in ("rotation_only", "index_of", "as_survey"):
             if name in self.__dict__:
                 out.__dict__[name] = self.__dict__[name]
+        out.__dict__["arrays"] = self.arrays.with_used(out.used)
         return out
 
     def components(self, used: BoolArray | None = None, poses_only: bool = False) -> IntArray:
@@ -129,7 +139,7 @@ def pose_network(
     rotations: FloatArray, translations: FloatArray | None, cov: FloatArray, *,
     held: Mapping[int, FloatArray] | None = None, start: Mapping[int, FloatArray] | None = None,
     prior: Mapping[int, tuple[FloatArray, FloatArray]] | None = None,
-    inner: Sequence[int] | None = None, used: BoolArray | None = None,
+    inner: Sequence[int] | None = None, used: BoolArray | None = None, survey: Survey | None = None,
 ) -> PoseNetwork:  # fmt: skip
     """A checked network from arrays.
 
@@ -152,7 +162,7 @@ def pose_network(
         tuple(station_ids), tuple(pair_ids), a, b, np.array(rotations, dtype=float).reshape(n_pairs, 3, 3), t, Q,
         np.ones(n_pairs, dtype=np.bool_) if used is None else np.asarray(used, dtype=np.bool_), R, T,
         np.array(sorted(held), dtype=np.int64), {k: np.asarray(c, dtype=float) for k, (_, c) in prior.items()},
-        np.array(sorted(inner), dtype=np.int64),
+        np.array(sorted(inner), dtype=np.int64), survey,
     )  # fmt: skip
     check_network(network)
     return network
@@ -252,3 +262,54 @@ def loop_marks(network: PoseNetwork, used: BoolArray) -> tuple[BoolArray, IntArr
     mark = np.zeros(network.n_pairs, dtype=np.int64)
     mark[rows] = loop_labels(network.n_stations, a, b)
     return mark != 0, mark
+
+
+def survey_of(network: PoseNetwork) -> Survey:
+    """The stations and pairs of a network as the survey that is solved: its datum, and the pairs in use of now.
+
+    Where nothing but rotations was measured, all stations are held in one place.
+    """
+    survey = network.as_survey
+    pairs, given = list(survey.pairs), np.array([p.used for p in survey.pairs], dtype=np.bool_)
+    for e in np.flatnonzero(given != network.used).tolist():
+        pairs[e] = replace(pairs[e], used=bool(network.used[e]))
+    return replace(survey, pairs=tuple(pairs))
+
+
+def _as_survey(network: PoseNetwork) -> Survey:
+    """All stations and pairs of a network, in the datum that it is solved in."""
+    inner = network.anchor is not None
+    whole = len(network.inner) == network.n_stations
+    datum = Datum("inner", (), () if whole else tuple(network.station_ids[i] for i in network.inner.tolist()))
+    known = network.survey or Survey(stations=_stations(network), pairs=_pairs(network))
+    stations = known.stations
+    if network.rotation_only:
+        stations = tuple(replace(s, world_from_station=_turning_only(s.world_from_station)) for s in stations)
+    return replace(known, stations=stations, datum=datum if inner else Datum())
+
+
+def _turning_only(given: PoseParameter) -> PoseParameter:
+    """With its position held, which nothing tells; at the origin, for all turn about it."""
+    if given.treatment == "held":
+        return given
+    turn = Rot3() if given.value is None else given.value.rotation()
+    return replace(given, value=Pose3(turn, np.zeros(3)), held=("tx", "ty", "tz"))
+
+
+def _stations(network: PoseNetwork) -> tuple[Station, ...]:
+    out = []
+    for i, station in enumerate(network.station_ids):
+        R, t = network.station_rotations[i], network.station_translations[i]
+        value = Pose3(Rot3(R), t) if np.isfinite(t).all() else None
+        prior = network.prior_cov.get(i)
+        treatment: Treatment = "held" if network.is_held[i] else "free" if prior is None else "prior"
+        out.append(Station(station, world_from_station=PoseParameter(value, treatment, prior)))
+    return tuple(out)
+
+
+def _pairs(network: PoseNetwork) -> tuple[Pair, ...]:
+    frames = [FrameRef("station", s) for s in network.station_ids]
+    rows = zip(network.pair_ids, network.a_idx.tolist(), network.b_idx.tolist(), network.arrays.poses,
+               network.is_pose.tolist(), network.cov, network.used.tolist(), strict=True)  # fmt: skip
+    return tuple(Pair(i, frames[a], frames[b], motion if pose else motion.rotation(), cov if pose else cov[:3, :3],
+                      used=used) for i, a, b, motion, pose, cov, used in rows)  # fmt: skip

@@ -2,15 +2,13 @@
 
 Rotations first, then positions, each by a solver that needs no start, with the truncated least squares weights of Yang,
 Antonante, Tzoumas and Carlone (Graduated non-convexity for robust spatial perception, RA-L 2020). What that sorts out
-is only a proposal: a clean least squares over the rest decides, pair by pair, by the chi-square test of the pair
-against all others, at one level for the whole network (Sidak 1967). Where the residuals are far smaller than the
-sigmas say, nothing is looked for; where sigmas that are too small throughout explain them better than wrong pairs, the
-limits grow.
+is only a proposal: a clean least squares over the rest decides (:mod:`adjust.statistics.gross_errors`), pair by pair,
+by the chi-square test of the pair against all others.
 """
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +16,7 @@ from adjust.distributions import chi2
 from adjust.model.errors import IndeterminateError, NotConvergedError
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.pose_network.network import PoseNetwork, loop_marks
-from adjust.pose_network.precision import NetworkPrecision, PairStatistics
+from adjust.pose_network.precision import NetworkPrecision
 from adjust.pose_network.solve import Minimum, NetworkOptions, Progress, minimize
 from adjust.pose_network.start import (
     rotation_residuals,
@@ -27,16 +25,8 @@ from adjust.pose_network.start import (
     translation_misfits,
     translation_sigmas,
 )
-from adjust.statistics.criteria import (
-    CAUTIOUS,
-    MANY,
-    cautious,
-    cost_of_leaving_out,
-    explanation_cost,
-    sidak,
-    typical_factor,
-    widening,
-)
+from adjust.statistics.criteria import CAUTIOUS, MANY
+from adjust.statistics.gross_errors import Search, State, Verdicts, one_group
 
 _TRUNCATION = float(chi2.isf(1e-4, 3))
 _SLACK = 4.0  # positions inherit what is left in the rotations of the first stage
@@ -69,41 +59,12 @@ class RejectedPair:
 
 @dataclass(frozen=True, eq=False)
 class Cleaned:
-    """Least squares over the pairs that hold together, with the statistics of all. variance_factor: see below."""
+    """Least squares over the pairs that hold together, with the statistics of all."""
 
     network: PoseNetwork
     minimum: Minimum
     precision: NetworkPrecision
-    rejected: tuple[RejectedPair, ...]
-    variance_factor: float
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """Least squares of some pairs. limit: (E,) of the tests, at variance factor 1; factor: what these are widened by.
-
-    over: (E,) tests over their limits, 0 where untested. cost: of this explanation. supposed: the factor of
-    the limits that goes with it.
-    """
-
-    network: PoseNetwork
-    minimum: Minimum
-    precision: NetworkPrecision
-    limit: FloatArray
-    factor: float
-    over: FloatArray
-    cost: float
-    supposed: float
-
-
-def variance_factor(pairs: PairStatistics, used: BoolArray) -> float:
-    """How much larger than claimed the typical pair's test is, at least 1: median over chi-square's median.
-
-    With sigmas that are too small throughout every pair would fail; a pair is wrong only beside the others. Of few
-    pairs the median is no measure, for a wrong one shows in most of the others.
-    """
-    rows = used & (pairs.freedom > 0)
-    return max(1.0, typical_factor(pairs.test[rows], pairs.freedom[rows])) if int(rows.sum()) >= MANY else 1.0
+    rejected: tuple[RejectedPair, ...] = ()
 
 
 def _graduated(
@@ -154,95 +115,58 @@ def clean(
     progress: Progress | None = None,
 ) -> Cleaned:  # fmt: skip
     """Least squares over the pairs that pass their tests. Raises as :func:`adjust.pose_network.solve.minimize`."""
-    search = _Search(network, options, progress)
-    first: _State | None = None
+
+    def solve(used: BoolArray, before: State[Cleaned] | None) -> tuple[Cleaned, Verdicts]:
+        here = None if before is None else before.solution.minimum
+        return _solved(network, used, options, progress, None if here is None else (here.rotations, here.translations))
+
+    search = Search(solve, options.alpha, _step, MANY)
+    first: State[Cleaned] | None = None
     if options.robust == "auto":
         with contextlib.suppress(NotConvergedError):  # by wrong pairs; without them the next attempt says more
-            first = search.state(network.used, start)
-        if first is not None and (not (first.over > 1.0).any() or _far_below(first)):
-            return search.cleaned(first)
-    weights = graduated_weights(network, 1.0 if first is None else first.factor)
+            first = search.judged(*_solved(network, network.used, options, progress, start))
+        if first is not None and (not first.failing.any() or _far_below(first.tests)):
+            return _listed(first.solution, network.used)
+    weights = graduated_weights(network, 1.0 if first is None else float(first.factor[0]))
     try:
-        last = search.settled(_connected(network, weights))
-        if first is not None and int(network.used.sum()) < MANY:
-            search.descend(first)
-            best = min(search.states, key=lambda state: state.cost)
-            if best.cost < last.cost:
-                last = search.settled(best.network.used, best.supposed)
+        last = search.settled(search.judged(*solve(_connected(network, weights), None)), _ROUNDS)
+        few = first is not None and int(network.used.sum()) < MANY
+        best = search.likeliest(first, np.ones(1, dtype=np.bool_)) if first is not None and few else None
+        if best is not None and best.cost < last.cost:
+            wider = replace(search, factor=best.supposed)
+            last = wider.settled(wider.judged(best.solution, best.tests), _ROUNDS)
     except (IndeterminateError, NotConvergedError):
         if first is None:
             raise
         last = first  # what contradicts is in its tests
-    return search.cleaned(last)
+    return _listed(last.solution, network.used)
 
 
-def _far_below(state: _State) -> bool:
+def _far_below(tests: Verdicts) -> bool:
     """Whether residuals are together far smaller than their sigmas say, by v'Pv or by the tests of the pairs."""
-    pairs, used = state.precision.pairs, state.network.used
+    return bool(tests.omega[0] < CAUTIOUS**2 * tests.redundancy[0] or tests.cautious[0])
+
+
+def _solved(
+    network: PoseNetwork, used: BoolArray, options: NetworkOptions, progress: Progress | None,
+    start: tuple[FloatArray, FloatArray] | None,
+) -> tuple[Cleaned, Verdicts]:  # fmt: skip
+    """Least squares of the pairs in ``used`` (E,), and the tests of all that the network uses."""
+    part = network.with_used(used)
+    minimum = minimize(part, start, options, progress=progress)
+    precision = NetworkPrecision(part, minimum)
+    pairs = precision.pairs
+    freedom = np.where(network.used, pairs.freedom, 0)
     redundancy = float(pairs.redundancy[used].sum())
-    return state.minimum.omega < CAUTIOUS**2 * redundancy or cautious(pairs.test[used], pairs.freedom[used])
+    tests = one_group(pairs.test, freedom, used, minimum.omega, redundancy)
+    return Cleaned(part, minimum, precision), replace(tests, possible=network.used)
 
 
-class _Search:
-    """The search in one network, and all states that it came through."""
-
-    def __init__(self, network: PoseNetwork, options: NetworkOptions, progress: Progress | None) -> None:
-        self.network, self.options, self.progress = network, options, progress
-        self.candidates = network.used
-        self.states: list[_State] = []
-
-    def state(
-        self, used: BoolArray, start: tuple[FloatArray, FloatArray] | None, least_factor: float = 1.0
-    ) -> _State:
-        """Least squares of the pairs in ``used`` (E,), judged."""
-        network = self.network.with_used(used)
-        minimum = minimize(network, start, self.options, progress=self.progress)
-        precision = NetworkPrecision(network, minimum)
-        pairs = precision.pairs
-        tested = self.candidates & (pairs.freedom > 0)
-        level = sidak(self.options.alpha, int(tested.sum()))
-        limit = np.asarray(chi2.isf(level, np.maximum(pairs.freedom, 1)))
-        factor = max(least_factor, variance_factor(pairs, used))
-        over = np.where(tested, np.nan_to_num(pairs.test) / (factor * limit), 0.0)
-        omega, redundancy = minimum.omega, float(pairs.redundancy[used].sum())
-        gone = tested & ~used
-        left_out = cost_of_leaving_out(pairs.test[gone], pairs.freedom[gone], limit[gone])
-        cost = explanation_cost([(omega, redundancy)], left_out)
-        supposed = widening(omega, redundancy, pairs.test[used], pairs.freedom[used])
-        found = _State(network, minimum, precision, limit, factor, over, cost, supposed)
-        self.states.append(found)
-        return found
-
-    def settled(self, used: BoolArray, least_factor: float = 1.0) -> _State:
-        """From these pairs on: what fails goes, what fits comes back, until neither is left."""
-        taken_back = np.zeros(self.network.n_pairs, dtype=np.bool_)
-        poses: tuple[FloatArray, FloatArray] | None = None
-        for _ in range(_ROUNDS):
-            now = self.state(used, poses, least_factor)
-            poses = now.minimum.rotations, now.minimum.translations
-            back = self.candidates & ~used & (now.over <= 1.0) & ~taken_back
-            out = _worst_around(now.network, np.where(used, now.over, 0.0))
-            if not back.any() and not out.any():
-                return now
-            taken_back |= back
-            used = (used | back) & ~out
-        raise NotConvergedError(f"no set of pairs that agree was found in {_ROUNDS} rounds; the pairs contradict")
-
-    def descend(self, state: _State) -> None:
-        """One pair after the other, the worst first, down to half of them: every state is an explanation."""
-        while (state.over[state.network.used] > 1.0).any():
-            used = state.network.used.copy()
-            over = np.where(used, state.over, 0.0)
-            over[over < over.max()] = 0.0
-            used &= ~_worst_around(state.network, over)
-            if used.sum() == state.network.used.sum() or 2 * used.sum() < self.candidates.sum():
-                return
-            state = self.state(used, (state.minimum.rotations, state.minimum.translations))
-
-    def cleaned(self, state: _State) -> Cleaned:
-        """As the result."""
-        rejected = _listed(state.network, state.precision, self.candidates)
-        return Cleaned(state.network, state.minimum, state.precision, rejected, state.factor)
+def _step(state: State[Cleaned], returned: BoolArray) -> tuple[BoolArray, BoolArray]:
+    """The worst all over the network go at once, and all that fit, or that nothing checks, come back."""
+    used = state.tests.used
+    back = state.tests.possible & ~used & (state.over <= 1.0) & ~returned
+    return _worst_around(state.solution.network, np.where(used, state.over, 0.0)), back
 
 
 def _worst_around(network: PoseNetwork, over: FloatArray) -> BoolArray:
@@ -293,9 +217,9 @@ def _connected(network: PoseNetwork, weights: FloatArray) -> BoolArray:
     return used
 
 
-def _listed(network: PoseNetwork, precision: NetworkPrecision, candidates: BoolArray) -> tuple[RejectedPair, ...]:
-    out = []
-    pairs = precision.pairs
+def _listed(found: Cleaned, candidates: BoolArray) -> Cleaned:
+    """With the pairs that were left out, worst first."""
+    out, network, pairs = [], found.network, found.precision.pairs
     for e in np.flatnonzero(candidates & ~network.used):
         loops, mark = loop_marks(network, network.used | (np.arange(network.n_pairs) == e))
         same = np.flatnonzero((mark == mark[e]) & (loops > 0)) if loops[e] else np.zeros(0, dtype=np.int64)
@@ -304,4 +228,4 @@ def _listed(network: PoseNetwork, precision: NetworkPrecision, candidates: BoolA
             RejectedPair(network.pair_ids[e], float(pairs.test[e]), int(pairs.freedom[e]), float(pairs.p_value[e]),
                          pairs.residual[e], alike)
         )  # fmt: skip
-    return tuple(sorted(out, key=lambda r: -r.test))
+    return replace(found, rejected=tuple(sorted(out, key=lambda r: -r.test)))

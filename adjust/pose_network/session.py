@@ -15,8 +15,10 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair
-from adjust.model.survey import FloatArray
-from adjust.pose_network.graph import NoiseCache, pair_factors, prior_factors
+from adjust.model.survey import FloatArray, PoseParameter, Survey
+from adjust.observations.factors import pose_prior_factor
+from adjust.observations.pairs import NoiseCache, native_factor
+from adjust.pose_network.from_survey import network_from_survey
 from adjust.pose_network.growth import Batch, Growth, Tree, moved_over
 from adjust.pose_network.network import PoseNetwork, pose_network
 from adjust.pose_network.solution import NetworkSolution, as_solution, solve_network
@@ -76,9 +78,15 @@ class NetworkSession:
     """A solved network that takes additions; not a value, but the state of one piece of work."""
 
     def __init__(
-        self, network: PoseNetwork | NetworkSolution, options: SessionOptions = SessionOptions(),
+        self, network: Survey | PoseNetwork | NetworkSolution, options: SessionOptions = SessionOptions(),
         solve: NetworkOptions = DEFAULTS,
     ) -> None:  # fmt: skip
+        """network: fixed stations and pairs of poses between them, solved here where they are not.
+
+        Raises SurveyError for a survey of anything else, and for rotations alone.
+        """
+        if isinstance(network, Survey):
+            network = network_from_survey(network)
         solution = network if isinstance(network, NetworkSolution) else solve_network(network, options=solve)
         self.options, self.solve_options = options, solve
         self._base = solution.network
@@ -106,14 +114,15 @@ class NetworkSession:
         R, t = solution.rotations, solution.translations
         self._last = {i: Pose3(Rot3(R[i]), t[i]) for i in range(network.n_stations)}
         graph, values, self._factor_of = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}
-        for factor in prior_factors(network, self._noise):
-            graph.push_back(factor)
-        rows = [e for e in np.flatnonzero(network.used).tolist()
-                if not (network.constants[network.a_idx[e]] and network.constants[network.b_idx[e]])]  # fmt: skip
-        first = graph.size()
-        for n, factor in enumerate(pair_factors(network, np.array(rows, dtype=np.int64), R, t, noise=self._noise)):
-            graph.push_back(factor)
-            self._factor_of[network.pair_ids[rows[n]]] = first + n
+        for i, cov in network.prior_cov.items():
+            mean = Pose3(Rot3(network.station_rotations[i]), network.station_translations[i])
+            graph.push_back(pose_prior_factor(PoseParameter(mean, "prior", cov), i))
+        poses, W = network.arrays.poses, network.arrays.whitening
+        for e in np.flatnonzero(network.used).tolist():
+            factor = self._native(int(network.a_idx[e]), int(network.b_idx[e]), poses[e], W[e])
+            if factor is not None:
+                self._factor_of[network.pair_ids[e]] = graph.size()
+                graph.push_back(factor)
         for i in np.flatnonzero(~network.constants).tolist():
             values.insert(i, self._last[i])
         self._growth: Growth = Tree(self.options.relinearize, self.options.wildfire, self.options.section)
@@ -223,15 +232,10 @@ class NetworkSession:
         info = np.linalg.inv(cov)
         W = np.zeros((6, 6))
         W[:k, :k] = np.linalg.cholesky(0.5 * (info + info.T)).T
-        z = measured if isinstance(measured, Pose3) else Pose3(measured, np.zeros(3))
-        if a in self._constant and b in self._constant:
-            return None
-        if b in self._constant:
-            return gtsam.PriorFactorPose3(a, self._constant[b].compose(z), self._noise(W))
-        if a in self._constant:
-            turned = np.asarray(np.linalg.qr(W @ z.inverse().AdjointMap(), mode="r"))
-            return gtsam.PriorFactorPose3(b, self._constant[a].compose(z.inverse()), self._noise(turned))
-        return gtsam.BetweenFactorPose3(b, a, z, self._noise(W))
+        return self._native(a, b, measured if isinstance(measured, Pose3) else Pose3(measured, np.zeros(3)), W)
+
+    def _native(self, a: int, b: int, b_from_a: Pose3, W: FloatArray) -> gtsam.NonlinearFactor | None:
+        return native_factor(self._constant.get(a, a), self._constant.get(b, b), b_from_a, W, self._noise)
 
     def _moved(self, ends: list[int], new: set[int]) -> dict[str, tuple[float, float]]:
         """Stations that moved since last asked, found by spreading from the ends of the added pairs."""
@@ -288,11 +292,6 @@ class NetworkSession:
         table = moved_over(self._growth, growth)
         self._factor_of = {pair: table[n] for pair, n in self._factor_of.items()}
         self._growth, self._shares, self._switched_at = growth, [], len(self._ids)
-
-    @property
-    def in_batches(self) -> bool:
-        """Whether additions are solved by batch iterations."""
-        return isinstance(self._growth, Batch)
 
     def network(self) -> PoseNetwork:
         """The whole network as it stands."""

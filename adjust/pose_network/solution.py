@@ -8,13 +8,11 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray
-from adjust.pose_network.graph import prior_whitening
 from adjust.pose_network.network import PoseNetwork
-from adjust.pose_network.precision import NetworkPrecision, pair_jacobians
+from adjust.pose_network.precision import NetworkPrecision
 from adjust.pose_network.robust import RejectedPair, clean
 from adjust.pose_network.solve import DEFAULTS, Minimum, NetworkOptions, Progress, minimize
 from adjust.precision.precision import global_test
-from adjust.relay.motions import Motions
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +20,7 @@ class NetworkSolution:
     """``world_from_station`` of all stations: rotations (N, 3, 3), translations (N, 3) m, zero in rotation networks.
 
     network: as solved; its ``used`` leaves out what was rejected. omega: v'Pv of the pairs in use and the priors.
-    redundancy: observations less unknowns. iterations, max_step, history: of the last least squares.
+    redundancy: observations less unknowns. iterations, max_step: of the last least squares.
     """
 
     network: PoseNetwork
@@ -32,7 +30,6 @@ class NetworkSolution:
     redundancy: int
     iterations: int
     max_step: float
-    history: tuple[float, ...]
     rejected: tuple[RejectedPair, ...]
     minimum: Minimum
 
@@ -60,12 +57,6 @@ class NetworkSolution:
         index = self.network.index_of
         return self.precision.relative(index[a_id], index[b_id])
 
-    def reinstated(self, pair_ids: tuple[str, ...]) -> PoseNetwork:
-        """The network with these rejected pairs in use again, to be solved anew."""
-        used = self.network.used.copy()
-        used[[self.network.pair_index_of[p] for p in pair_ids]] = True
-        return self.network.with_used(used)
-
 
 def solve_network(
     network: PoseNetwork, start: tuple[FloatArray, FloatArray] | None = None,
@@ -85,18 +76,12 @@ def solve_network(
 
 def as_solution(network: PoseNetwork, minimum: Minimum, rejected: tuple[RejectedPair, ...] = ()) -> NetworkSolution:
     """The minimum with its counts."""
-    rows = network.used
-    flat = network.rotation_only
-    here = Motions(minimum.rotations, None if flat else minimum.translations)
-    omega = float(np.sum(np.einsum("nij,nj->ni", network.whitening, pair_jacobians(network, here)[0])[rows] ** 2))
-    n_observations = int((np.where(network.is_pose, 6, 3) if not flat else np.full(network.n_pairs, 3))[rows].sum())
-    for i, W in prior_whitening(network).items():
-        given = Motions(network.station_rotations[i : i + 1], None if flat else network.station_translations[i : i + 1])
-        e = (given.inverse() @ here[slice(i, i + 1)]).log()[0]
-        omega += float(np.sum((W @ e) ** 2))
-        n_observations += int(np.count_nonzero(np.abs(W).max(axis=1)))
-    n_unknowns = network.dim * int((~network.constants).sum())
+    used, graph, solved = network.used, minimum.graph, minimum.solved
+    sizes = np.where(network.is_pose, 6, 3)[used]
+    n_observations = int(sizes.sum()) + sum(len(i.components) for i in graph.singles if i.kind == "prior")
+    defect = 0 if solved.datum is None else solved.datum.defect
+    redundancy = n_observations - graph.unknowns.n_unknowns + defect
     return NetworkSolution(
-        network, minimum.rotations, minimum.translations, omega, n_observations - n_unknowns, minimum.iterations,
-        minimum.max_step, minimum.history, rejected, minimum,
+        network, minimum.rotations, minimum.translations, minimum.omega, redundancy, solved.iterations,
+        solved.max_step, rejected, minimum,
     )  # fmt: skip

@@ -1,22 +1,21 @@
-"""Least squares over a pose network: Gauss-Newton over native factors, in our own loop.
-
-On long corridors the first steps raise the weighted square sum before it falls, so steps are not tested one by one;
-damping comes in only where the sum stays up.
-"""
+"""Least squares over a pose network: its stations and pairs as the one graph, solved as every survey is."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
-import gtsam
 import numpy as np
+from gtsam import Pose3, Rot3
 
+from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.datum import inner_datum
+from adjust.graph.solver import Solved, SolveOptions, solve
 from adjust.model.errors import IndeterminateError, NotConvergedError
+from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray
-from adjust.pose_network.graph import network_graph, network_ordering, network_values, values_arrays
-from adjust.pose_network.network import PoseNetwork, check_determined
+from adjust.pose_network.network import PoseNetwork, check_determined, survey_of
 from adjust.pose_network.start import find_network_start
 
-_MOST_DAMPED = 1e10
 Progress = Callable[[int, float], None]
 
 
@@ -41,134 +40,85 @@ DEFAULTS = NetworkOptions()
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where least squares ended: poses (N, 3, 3), (N, 3), v'Pv, steps taken, last step in sigmas, and GTSAM's graph.
-
-    history: v'Pv before the first and after every step.
-    """
+    """Where least squares ended: poses (N, 3, 3), (N, 3) of all stations, and the graph with its solution."""
 
     rotations: FloatArray
     translations: FloatArray
-    omega: float
-    iterations: int
-    max_step: float
-    linear: gtsam.GaussianFactorGraph
-    ordering: gtsam.Ordering
-    use_qr: bool
-    history: tuple[float, ...]
+    graph: AdjustmentGraph
+    solved: Solved
 
-
-class GaussNewton:
-    """The loop, its order of elimination and its way out of weak systems."""
-
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering) -> None:
-        self.graph, self.values, self.ordering = graph, values, ordering
-        self.use_qr = False
-        self.damping = 0.0
-
-    def solve(self, linear: gtsam.GaussianFactorGraph) -> gtsam.VectorValues:
-        """The step. Raises IndeterminateError where there is none."""
-        system = linear if self.damping == 0.0 else self._damped(linear)
-        if not self.use_qr:
-            try:
-                return system.optimize(self.ordering)
-            except RuntimeError as error:
-                if "ndetermin" not in str(error):
-                    raise
-                self.use_qr = True  # weak, but determined: GTSAM's Cholesky refuses pivots that QR still resolves
-        try:
-            delta = system.optimize(self.ordering, gtsam.EliminateQR)
-        except RuntimeError as error:
-            if "ndetermin" not in str(error):
-                raise
-            delta = None
-        if delta is None or not np.isfinite(delta.norm()):
-            raise IndeterminateError("the pairs do not determine the stations; look for pairs with absurd covariances")
-        return delta
-
-    def _damped(self, linear: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:
-        """Marquardt's damping with the block diagonal of the normal matrix."""
-        diagonal: dict[int, FloatArray] = {}
-        for i in range(linear.size()):
-            factor = linear.at(i)
-            A = factor.jacobian()[0]
-            square, at = (A * A).sum(axis=0), 0
-            width = len(square) // len(factor.keys())
-            for key in list(factor.keys()):
-                diagonal[key] = diagonal.get(key, 0.0) + square[at : at + width]
-                at += width
-        out = linear.clone()
-        for key, d in diagonal.items():
-            unit = gtsam.noiseModel.Unit.Create(len(d))
-            out.add(key, np.diag(np.sqrt(self.damping * np.maximum(d, 1e-12))), np.zeros(len(d)), unit)
-        return out
-
-    def run(self, options: NetworkOptions, progress: Progress | None = None) -> tuple[int, float, list[float]]:
-        """Iterate to the minimum: steps, last step in sigmas, v'Pv before and after every step."""
-        history = [2.0 * float(self.graph.error(self.values))]
-        best, best_values, waited = history[0], self.values, 0
-        steps: list[float] = []
-        for iteration in range(1, options.max_iterations + 1):
-            linear = self.graph.linearize(self.values)
-            try:
-                delta = self.solve(linear)
-            except IndeterminateError:
-                if iteration == 1:
-                    raise
-                # what the pairs determine was judged at the start: on the way out it is the place that is bad
-                self.values, steps = best_values, []
-                self.damping = max(10.0 * self.damping, 1e-5)
-                if self.damping > _MOST_DAMPED:
-                    break
-                continue
-            moved = float(np.sqrt(max(0.0, -delta.dot(linear.gradientAtZero()))))
-            self.values = self.values.retract(delta)
-            history.append(2.0 * float(self.graph.error(self.values)))
-            if progress:
-                progress(iteration, history[-1])
-            steps.append(moved)
-            if self.damping == 0.0 and self._arrived(steps, options):
-                return iteration, moved, history
-            if history[-1] < best:
-                best, best_values, waited = history[-1], self.values, 0
-                self.damping = self.damping / 10.0 if self.damping > 1e-7 else 0.0
-                continue
-            waited += 1
-            if (self.damping > 0.0 or waited >= options.patience) and not moved < 1e-3:
-                self.values, steps = best_values, []
-                self.damping = max(10.0 * self.damping, 1e-5)
-            if not np.isfinite(history[-1]) or self.damping > _MOST_DAMPED:
-                break
-        raise NotConvergedError(
-            f"the network did not converge in {iteration} steps (the last moved {moved:.2g} sigma); "
-            "look for wrong pairs, or let the program look for them (robust)"
-        )
-
-    @staticmethod
-    def _arrived(steps: list[float], options: NetworkOptions) -> bool:
-        """Steps shrink at least linearly near the minimum; where rounding alone moves the unknowns they stay small."""
-        ratio = min(1.0, steps[-1] / steps[-2]) if len(steps) > 1 and steps[-2] > 0.0 else 1.0
-        if steps[-1] * ratio < options.max_step:
-            return True
-        return len(steps) > 4 and max(steps[-4:]) < 1e-3 and steps[-1] > 0.1 * steps[-4]
+    @cached_property
+    def omega(self) -> float:
+        """V'Pv of the pairs in use and the priors."""
+        batch, values = self.graph.pairs, self.solved.values
+        if batch is None:
+            raise ValueError("a network has pairs")
+        omega = 2.0 * float(self.graph.others_graph.error(values))
+        between_held = np.flatnonzero(batch.arrays.used & batch.both_held)
+        if len(between_held):  # these have no factor
+            white = batch.arrays.whitening[between_held] @ batch.jacobians(values)[0][between_held, :, None]
+            omega += float(np.sum(white**2))
+        return omega
 
 
 def minimize(
     network: PoseNetwork, start: tuple[FloatArray, FloatArray] | None = None,
-    options: NetworkOptions = DEFAULTS, weights: FloatArray | None = None, progress: Progress | None = None,
+    options: NetworkOptions = DEFAULTS, progress: Progress | None = None,
 ) -> Minimum:  # fmt: skip
-    """Least squares over the pairs in use, weighted (E,) if asked, from a start or from nothing.
+    """Least squares over the pairs in use, from a start (N, 3, 3), (N, 3) or from nothing.
 
-    Raises IndeterminateError naming the stations that float, NotConvergedError.
+    A free network stays where its first datum station starts; its covariances have the inner datum. Raises
+    IndeterminateError naming the stations that float, NotConvergedError.
     """
-    check_determined(network, None if weights is None else network.used & (weights > 0.0))
-    R, t = find_network_start(network, weights) if start is None else (start[0].copy(), start[1].copy())
+    check_determined(network)
+    R, t = find_network_start(network) if start is None else (start[0].copy(), start[1].copy())
     held = network.held
     R[held], t[held] = network.station_rotations[held], np.nan_to_num(network.station_translations[held])
-    graph = network_graph(network, R, t, weights)
-    values = network_values(network, R, t)
-    used = network.used if weights is None else network.used & (weights > 0.0)
-    loop = GaussNewton(graph, values, network_ordering(network, graph, used))
-    iterations, moved, history = loop.run(options, progress)
-    R, t = values_arrays(network, loop.values, R, t)
-    linear = graph.linearize(loop.values)
-    return Minimum(R, t, history[-1], iterations, moved, linear, loop.ordering, loop.use_qr, tuple(history))
+    survey = survey_of(network)
+    builder = GraphBuilder(survey, {}, network.arrays)
+    given = {s.station_id: s.world_from_station for s in survey.stations}
+    names: list[ParameterName] = [("world_from_station", s) for s in network.station_ids]
+    # in this order they are eliminated where nothing else tells, and listed
+    slots = np.array([builder.unknowns.slot(name, given[name[1]]) for name in names], dtype=np.int64)
+    builder.simple = np.arange(network.n_pairs), slots[network.a_idx], slots[network.b_idx]
+    at = np.zeros_like(t) if network.rotation_only else t
+    graph = builder.build(StartValues({}, {n: Pose3(Rot3(a), b) for n, a, b in zip(names, R, at, strict=True)}, {}))
+    try:
+        solved = solve(
+            graph, SolveOptions(options.max_step, options.max_iterations, 1e-5, options.patience, True), progress
+        )
+    except NotConvergedError as error:
+        raise NotConvergedError(
+            f"{str(error).splitlines()[0].split(';')[0].replace('adjustment', 'network')}; look for wrong pairs, or "
+            "let the program look for them (robust)"
+        ) from error
+    except IndeterminateError as error:  # what the pairs join was seen before
+        raise IndeterminateError(
+            "the pairs do not determine the stations; look for pairs with absurd covariances", error.parameters
+        ) from error
+    if network.anchor is not None:
+        solved = _anchored(graph, solved, names[network.anchor], Pose3(Rot3(R[network.anchor]), at[network.anchor]))
+    _take(R, t, network, graph, solved)
+    return Minimum(R, t, graph, solved)
+
+
+def _anchored(graph: AdjustmentGraph, solved: Solved, anchor: ParameterName, place: Pose3) -> Solved:
+    """The free network moved as a whole so that its anchor is where it was; its pairs do not see that."""
+    values = solved.values
+    motion = place.compose(values.atPose3(graph.unknowns.by_name[anchor].key).inverse())
+    moved = type(values)()
+    for key in values.keys():  # noqa: SIM118  # no mapping, but GTSAM's values
+        moved.insert(key, motion.compose(values.atPose3(key)))
+    return replace(solved, values=moved, datum=inner_datum(graph, graph.prepare(moved, jacobians=True)))
+
+
+def _take(R: FloatArray, t: FloatArray, network: PoseNetwork, graph: AdjustmentGraph, solved: Solved) -> None:
+    """The solution into the arrays, by station; what is held or in no pair stays."""
+    graph.state.load(solved.values)
+    slots = graph.unknowns.slot_of
+    index = {i: slots[name] for i, s in enumerate(network.station_ids)
+             if (name := ("world_from_station", s)) in slots and not network.is_held[i]}  # fmt: skip
+    rows = list(index)
+    R[rows] = graph.state.slot_R[list(index.values())]
+    if not network.rotation_only:
+        t[rows] = graph.state.slot_t[list(index.values())]

@@ -8,7 +8,6 @@ import gtsam
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.pose_network.graph import rotations_of
 from adjust.pose_network.network import PoseNetwork
 from adjust.spatial.rigid import nearest_rotation, rotation_log
 
@@ -53,7 +52,7 @@ def start_rotations(network: PoseNetwork, weights: FloatArray | None = None) -> 
     out = np.tile(np.eye(3), (network.n_stations, 1, 1))
     found = gtsam.fastSyncRot3(graph, gtsam.Ordering.ColamdNonlinearFactorGraph(graph))
     keys = np.array(list(found.keys()), dtype=np.int64)
-    out[keys] = rotations_of(found, keys)
+    out[keys] = np.array([found.atRot3(k).matrix() for k in keys.tolist()]).reshape(-1, 3, 3)
     datum = datum_stations(network)
     if len(datum):
         turn = nearest_rotation(np.einsum("nij,nkj->ik", network.station_rotations[datum], out[datum]))

@@ -12,12 +12,12 @@ import numpy as np
 from gtsam import Pose3, Rot3
 from scipy.linalg import block_diag
 
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, values_of
 from adjust.graph.datum import InnerDatum, datum_rows, in_world, inner_datum, survey_motions
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import Datum, FloatArray, Point, PoseParameter, Survey, Target
-from adjust.precision.precision import Precision
+from adjust.precision.precision import Precision, rotations_only
 from adjust.precision.s_transformation import STransformation, s_transformation
 
 _ROUNDS, _SETTLED = 20, 1e-13
@@ -70,11 +70,13 @@ def in_datum(result: Adjustment, datum: Datum, reference: Mapping[str, FloatArra
         raise SurveyError("a solution can be moved to a datum of kind 'inner' only; to hold points, adjust again")
     if not isinstance(result.precision, Precision):
         raise SurveyError("only a solution with its covariances can be moved to another datum; adjust the survey again")
+    if rotations_only(result):
+        raise SurveyError("nothing but rotations was measured: there are no coordinates to be moved to another datum")
     precision = result.precision
     survey = replace(released(result.survey), datum=datum)
-    start = _values_of(result)
+    start = values_of(result)
     graph = GraphBuilder(survey, start.lenses).build(start)
-    inner = inner_datum(graph, graph.start)
+    inner = inner_datum(graph, graph.prepare(graph.start, jacobians=True))
     if inner is None:
         raise SurveyError("the observations define position, orientation and scale: no datum is left to choose")
     values, blocks = graph.start, {u.key: np.eye(u.dim) for u in graph.unknowns.by_name.values()}
@@ -126,20 +128,6 @@ def _released_target(target: Target) -> Target:
         return target
     epochs = {e: _free(q) for e, q in target.epochs.items()}
     return replace(target, carrier_from_target=_free(target.carrier_from_target), epochs=epochs)
-
-
-def _values_of(result: Adjustment) -> StartValues:
-    lenses, poses, points, vectors = {}, {}, {}, {}
-    for name, estimate in result.estimates.items():
-        if isinstance(estimate.value, Pose3):
-            poses[name] = estimate.value
-        elif name[0] == "lens":
-            lenses[name[1]] = estimate.value
-        elif name[0] == "point":
-            points[name[1]] = estimate.value
-        else:
-            vectors[name] = estimate.value
-    return StartValues(lenses, poses, points, vectors)
 
 
 def _fitted(

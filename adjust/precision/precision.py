@@ -5,7 +5,9 @@ Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, ch
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
@@ -16,6 +18,7 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import stacking, survey_motions
 from adjust.graph.solver import Solved
 from adjust.model.result import (
+    Adjustment,
     GlobalTest,
     GroupSummary,
     ImageResiduals,
@@ -23,15 +26,33 @@ from adjust.model.result import (
     ParameterName,
     ReadingResiduals,
 )
-from adjust.model.survey import BoolArray, FloatArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.observations.images.batch import whitened_squares
 from adjust.observations.images.bundle_hidden import BundleHidden
 from adjust.observations.listed import ObservationFactor
 from adjust.precision.s_transformation import STransformation, s_transformation
 from adjust.precision.tree import TreeCovariance
 
+if TYPE_CHECKING:
+    from adjust.observations.pairs import PairStatistics
+
 _AT_A_TIME = 8192
 """Image points tested together: what is computed on the way stays in the second cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationRows:
+    """An observation over its keys: A (k, n) and its residual e (k,), both whitened, A Q A' (k, k).
+
+    W: square root information (k, k), of which root is the inverse.
+    """
+
+    keys: list[int]
+    A: FloatArray
+    e: FloatArray
+    influence: FloatArray
+    W: FloatArray
+    root: FloatArray
 
 
 class Precision:
@@ -39,17 +60,16 @@ class Precision:
 
     def __init__(self, graph: AdjustmentGraph, solved: Solved) -> None:
         self.graph, self.solved = graph, solved
+        self._rows: dict[ObservationFactor, ObservationRows] = {}
         dims = {key: unknown.dim for key, unknown in graph.unknowns.by_key.items()}
-        if solved.use_qr:
-            tree = solved.linear.eliminateMultifrontal(solved.ordering, gtsam.EliminateQR)
-        else:
-            tree = solved.linear.eliminateMultifrontal(solved.ordering)
-        self.tree = TreeCovariance(tree, dims, solved.leaves)
+        self.tree = TreeCovariance(solved.tree, dims, solved.leaves)
         self.hidden: dict[int, FloatArray] = {}
         self.bundle_influence = np.zeros((0, 3))
         self._hidden = None if graph.bundle is None else BundleHidden(graph.bundle)
         if self._hidden is not None:
             self._add_hidden(self._hidden)
+        self.by_conditions: Mapping[str, FloatArray] = {}
+        """Covariances (k, k) of adjusted pairs by id, where they are from the conditions of their loops."""
         self.transformation: STransformation | None = None
         if solved.datum is not None:
             motions = survey_motions(graph, solved.values, solved.datum.directions)
@@ -130,12 +150,75 @@ class Precision:
             L[place.index(seen), at.index(seen)] = 1.0
         return self._in_datum(keys, L @ Q @ L.T + scatter)
 
+    def rows(self, item: ObservationFactor) -> ObservationRows:
+        """An observation that is neither image point nor reading, linearised at the solution: built once, and kept."""
+        found = self._rows.get(item)
+        if found is None:
+            linear = item.factor.linearize(self.solved.values)
+            (A, b), keys = linear.jacobian(), list(linear.keys())
+            M = A @ self._in_datum(keys, self.tree.joint(keys)) @ A.T
+            W = np.asarray(noise_of(item).R())
+            found = self._rows[item] = ObservationRows(keys, A, -b, M, W, np.asarray(np.linalg.inv(W)))
+        return found
+
+    @cached_property
+    def pairs(self) -> "PairStatistics":
+        """Statistics of the pairs between fixed stations. Raises ValueError where there are none."""
+        if self.graph.pairs is None:
+            raise ValueError("the survey has no pairs between fixed stations")
+        return self.graph.pairs.statistics(self.tree, self.solved.values)
+
+    @cached_property
+    def single(self) -> list[int]:
+        """Which of the other observations are in no batch, by number."""
+        batch, first = self.graph.pairs, self.graph.first_pair
+        within = set() if batch is None else set((first + batch.rows).tolist())
+        return [i for i in range(len(self.graph.others)) if i not in within]
+
+    def covs(self, keys: IntArray, dim: int) -> FloatArray:
+        """Covariances (n, dim, dim) of many unknowns of the same dimension, none of them hidden."""
+        Q = self.tree.pairs(keys, np.full(len(keys), -1), dim)[:, :dim, :dim]
+        t = self.transformation
+        if t is not None:
+            G, W = (np.array([of[k] for k in keys.tolist()]) for of in (t.motions, t.spread))
+            across = G @ np.swapaxes(W, 1, 2)
+            Q += G @ t.core @ np.swapaxes(G, 1, 2) - across - np.swapaxes(across, 1, 2)
+        for i, key in enumerate(keys.tolist()):
+            if held := list(self.graph.unknowns.held.get(key, ())):
+                Q[i, held], Q[i, :, held] = 0.0, 0.0
+        return Q
+
+    def pair_covariances(self) -> dict[str, FloatArray]:
+        """Covariances (k, k) of the adjusted pairs by id, a priori, in the tangent in frame a."""
+        graph, out = self.graph, dict[str, FloatArray]()
+        if graph.pairs is not None:
+            cov, sizes = self.pairs.adjusted_cov, np.where(graph.pairs.arrays.is_pose, 6, 3).tolist()
+            out = {graph.survey.pairs[row].pair_id: cov[e, :k, :k]
+                   for e, (row, k) in enumerate(zip(graph.pairs.rows.tolist(), sizes, strict=True))}  # fmt: skip
+        for item in graph.singles:
+            if item.kind == "pair":
+                _, M, root = self.influence(item)
+                out[item.ids[0]] = root @ M @ root.T
+        return out | dict(self.by_conditions)
+
     def influence(self, item: ObservationFactor) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Whitened residual (k,), whitened A Q A' (k, k), and the square root information's inverse (k, k)."""
-        linear = item.factor.linearize(self.solved.values)
-        A, b = linear.jacobian()
-        Q = self._in_datum(list(linear.keys()), self.tree.joint(list(linear.keys())))
-        return -b, A @ Q @ A.T, np.asarray(np.linalg.inv(noise_of(item).R()))
+        rows = self.rows(item)
+        return rows.e, rows.influence, rows.root
+
+
+def rotations_only(adjustment: Adjustment) -> bool:
+    """Whether nothing but rotations was measured, so that nothing is where it seems to be."""
+    found = adjustment.precision
+    if not isinstance(found, Precision) or found.graph.pairs is None or found.graph.pairs.arrays.is_pose.any():
+        return False
+    unknowns = found.graph.unknowns
+    return all(unknowns.held.get(key) == (3, 4, 5) for key in unknowns.by_key)
+
+
+def in_conditions(adjustment: Adjustment) -> bool:
+    """Whether what the adjustment says of pairs is from the conditions of their loops, not from the poses of frames."""
+    return isinstance(adjustment.precision, Precision) and bool(adjustment.precision.by_conditions)
 
 
 def noise_of(item: ObservationFactor) -> gtsam.noiseModel.Gaussian:
@@ -208,8 +291,13 @@ def _merge(graph: AdjustmentGraph, parts: list[tuple[Any, ...]]) -> ImageResidua
 
 def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
     """The same for every observation that is neither an image point nor a reading."""
-    out = []
-    for item in precision.graph.others:
+    graph, out = precision.graph, dict[int, ObservationResidual]()
+    if graph.pairs is not None:
+        places = (graph.first_pair + graph.pairs.rows).tolist()
+        found = graph.pairs.residuals(precision.pairs, [graph.others[i] for i in places])
+        out |= dict(zip(places, found, strict=True))
+    for i in precision.single:
+        item = graph.others[i]
         e, M, root = precision.influence(item)
         n = len(e)
         Q = np.eye(n) - M if item.used else np.eye(n) + M
@@ -222,11 +310,9 @@ def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:
         test = float(e @ np.linalg.pinv(Q, rcond=1e-9) @ e)
         redundancy = np.diag(Q) if item.used else np.zeros(n)
         adjusted = adjusted_motion(item.observed, v) if item.kind == "pair" else np.asarray(item.observed + v)
-        out.append(
-            ObservationResidual(item.kind, item.group, item.ids, item.components, item.units, item.observed,
-                                adjusted, v, sigma, redundancy, standardized, test, item.used)
-        )  # fmt: skip
-    return tuple(out)
+        out[i] = ObservationResidual(item.kind, item.group, item.ids, item.components, item.units, item.observed,
+                                     adjusted, v, sigma, redundancy, standardized, test, item.used)  # fmt: skip
+    return tuple(out[i] for i in range(len(graph.others)))
 
 
 def adjusted_motion(observed: FloatArray, v: FloatArray) -> FloatArray:

@@ -40,3 +40,24 @@ def s_transformation(
     spread = {key: H @ inverse.T for key, H in found.items()}
     core = inverse @ np.sum([row @ spread[key] for key, row in rows.items()], axis=0)
     return STransformation(motions, spread, 0.5 * (core + core.T))
+
+
+def transformation_matrix(motions: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+    """``S = I - G (G'EG)^-1 G'E`` (n, n) of motions G (n, k) to the datum of weights E (n,), all the same if not given.
+
+    Raises numpy's LinAlgError where the weighted components do not carry the motions.
+    """
+    EG = motions if weights is None else weights[:, None] * motions
+    return np.asarray(np.eye(len(motions)) - motions @ np.linalg.solve(motions.T @ EG, EG.T))
+
+
+def without_datum_rows(
+    product: FloatArray, motions: FloatArray, seen: FloatArray, right: FloatArray | None = None
+) -> FloatArray:  # fmt: skip
+    """Covariance in the datum of rows R, times ``right`` (n, m), from the inverse of a normal matrix with R'R times it.
+
+    product: (n, m); of the identity where ``right`` is not given. motions: G (n, k). seen: R G (k, k). What the rows
+    add to the inverse is ``G (G'R'RG)^-1 G'``.
+    """
+    by_motion = motions.T if right is None else motions.T @ right
+    return np.asarray(product - motions @ np.linalg.solve(seen.T @ seen, by_motion))

@@ -6,7 +6,6 @@ lie together in one clique, so all redundancy numbers follow from it.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -14,19 +13,7 @@ import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.trees import TreeArrays, covariance_rows, fill_block, invert_cliques, joint_blocks, solve_cliques
-
-
-@dataclass(frozen=True)
-class Leaves:
-    """Cliques of one frontal key each, eliminated before a tree: those of S, the others, lie in one of its cliques.
-
-    width: columns of the blocks [R S], one after the other and row by row in ``data``.
-    """
-
-    keys: list[list[int]]
-    front: IntArray
-    width: IntArray
-    data: FloatArray
+from adjust.observations.images.reduction import Leaves
 
 
 class TreeCovariance:
@@ -197,9 +184,10 @@ class TreeCovariance:
 
         Raises KeyError for a pair that shares none.
         """
-        table = np.full(max(self.number, default=0) + 2, -1, dtype=np.int64)
-        table[np.array(list(self.number), dtype=np.int64)] = np.arange(len(self.number))
-        a, b = table[first], table[second]
+        known = np.array(list(self.number), dtype=np.int64)
+        order = np.argsort(known)
+        a, b = (np.where(keys < 0, -1, order[np.searchsorted(known, np.maximum(keys, known.min()), sorter=order)])
+                for keys in (first, second))  # fmt: skip
         out = np.empty((len(a), 2 * dim, 2 * dim))
         lost = joint_blocks(self.arrays, a, b, out)
         if lost >= 0:

@@ -12,6 +12,7 @@ one with C + S, in the condition form as in the parametric one; of the residual 
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
@@ -22,8 +23,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import Closure, FrameRef, Pair
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
-from adjust.precision.pose_networks import NamedPrecision
-from adjust.precision.precision import adjusted_motion, global_test
+from adjust.precision.precision import Precision, adjusted_motion, global_test
 from adjust.relay.conditions import adjust_loops
 from adjust.relay.network import network_from_pairs
 from adjust.relay.result import AdjustedPairs, whitening
@@ -212,7 +212,7 @@ def in_condition_form(result: Adjustment) -> Adjustment:
         return result
     found = adjust_loops(network_from_pairs(used))
     pairs, precision = found.pairs, result.precision
-    if not len(found.basis) or not isinstance(precision, NamedPrecision):
+    if not len(found.basis) or not isinstance(precision, Precision):
         return result
     residuals, apart = _residuals(result, pairs)
     warnings = result.warnings
@@ -224,11 +224,13 @@ def in_condition_form(result: Adjustment) -> Adjustment:
         mine = np.array([p.group == g.group for p in used])
         groups.append(replace(g, redundancy=float(pairs.redundancy[mine].sum()), omega=float(omegas[mine].sum())))
     alpha = result.global_test.alpha if result.global_test is not None else 0.05
+    precision = copy(precision)
+    precision.by_conditions = dict(zip(pairs.network.topology.pair_ids, pairs.cov, strict=True))
     return replace(
         result, other_residuals=residuals, groups=tuple(groups), omega=pairs.omega, sigma0=pairs.sigma0,
         redundancy=pairs.redundancy_total, global_test=global_test(pairs.omega, pairs.redundancy_total, alpha),
         iterations=pairs.iterations, warnings=warnings,
-        precision=NamedPrecision(precision.solution, pairs),
+        precision=precision,
     )  # fmt: skip
 
 

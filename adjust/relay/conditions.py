@@ -7,21 +7,26 @@ tangent's cofactors are Q_e = Jr C_e Jr', and with misclosures w and their deriv
     N = B Q B',   lambda = N^-1 (w - B r),   d = -r - Q B' lambda,   cov = Q - Q B' N^-1 B Q
 
 (Koch 1999, section 3.2; Jr(r) r = r). At a fixed point the loops close and r = -Q B' lambda, so it is the constrained
-minimum, the same as that of :mod:`adjust.relay.parametric`.
+minimum, the same as that by the poses of the stations in the one graph.
+
+As a graph of GTSAM: a prior factor per pair, a hard closure factor per loop, and our own loop. GTSAM's optimisers stop
+on such graphs without a word, and its elimination takes the constraints in an order that knows nothing of their size,
+so it loses them in large sets: the loop here takes full steps, checks the closure itself, and refuses more loops than
+were found safe.
 """
 
 from dataclasses import dataclass
 from typing import Literal
 
+import gtsam
 import numpy as np
 
-from adjust.model.errors import NotConvergedError
+from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
-from adjust.relay.condition_factors import MAX_HARD_LOOPS, FactorSolution, solve_factors
 from adjust.relay.counts import parts
 from adjust.relay.loops import LoopBasis, evaluate_loops, loop_basis, loop_misclosures
 from adjust.relay.motions import Motions, right_jacobian
-from adjust.relay.network import Network
+from adjust.relay.network import Network, gtsam_motion, motions_from_values, prior_factor, station_values
 from adjust.relay.normal_equations import (
     NormalEquations,
     SparseNormals,
@@ -31,6 +36,8 @@ from adjust.relay.normal_equations import (
 )
 from adjust.relay.result import AdjustedPairs, Joint, adjusted_pairs, whitening
 
+# complete networks were exact far beyond; grids of loops went wrong from about 300 on
+MAX_HARD_LOOPS = 200
 # side of the dense matrix that the spanning tree's way may need
 MAX_TREE_SIDE = 3000
 
@@ -92,7 +99,7 @@ def adjust_condition_factors(network: Network, options: ConditionOptions = Condi
     """
     basis = loop_basis(network.topology, _loop_kind(network, options))
     limit = options.closure * max(1.0, _reach(network))
-    found: FactorSolution = solve_factors(network, basis, limit, options.max_step, options.max_iterations)
+    found = _solve_factors(network, basis, limit, options.max_step, options.max_iterations)
     joint = _precision(network, basis, found.b_from_a)[1]
     total = network.dim * len(basis)
     pairs = adjusted_pairs(network, found.b_from_a, found.cov, total, found.iterations, joint)
@@ -164,3 +171,83 @@ def _precision(network: Network, basis: LoopBasis, X: Motions) -> tuple[NormalEq
     _, blocks, _, Q = _linearise(network, basis, X)
     B, normals = condition_matrix(basis, blocks), _normals(basis, blocks, Q)
     return normals, lambda pair_idx: joint_covariance(normals, B, Q, pair_idx)
+
+
+# -- the conditions as factors of GTSAM's graph -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _FactorSolution:
+    """Adjusted pairs, their covariances (E, dim, dim), the largest misclosure left."""
+
+    b_from_a: Motions
+    cov: FloatArray
+    closure: float
+    iterations: int
+
+
+def _solve_factors(
+    network: Network, basis: LoopBasis, limit: float, max_step: float, max_iterations: int
+) -> _FactorSolution:
+    """Full Gauss-Newton steps until all loops close and nothing moves. Raises SurveyError, NotConvergedError."""
+    if len(basis) > MAX_HARD_LOOPS:
+        raise SurveyError(
+            f"{len(basis)} loops are too many hard constraints (at most {MAX_HARD_LOOPS}); use the normal equations of "
+            "the conditions, or the parametric form"
+        )
+    graph, values = condition_graph(network, basis), station_values(network.b_from_a)
+    n, dim, root = network.topology.n_pairs, network.dim, whitening(network.cov)
+    step = closure = np.inf
+    for iteration in range(1, max_iterations + 1):
+        delta = graph.linearize(values).optimize()
+        values = values.retract(delta)
+        d = np.array([delta.at(e) for e in range(n)])
+        X = motions_from_values(values, n, dim)
+        step = float(np.abs(root @ d[..., None]).max())
+        closure = float(np.abs(evaluate_loops(basis, X)[0]).max()) if len(basis) else 0.0
+        if closure < limit and step < max_step:
+            marginals = gtsam.Marginals(graph, values)
+            cov = np.array([marginals.marginalCovariance(e) for e in range(n)])
+            return _FactorSolution(X, cov, closure, iteration)
+        if not np.isfinite(step):
+            break
+    raise NotConvergedError(
+        f"the hard loop closures did not settle in {max_iterations} steps (misclosure left {closure:.2g}, last step "
+        f"{step:.2g} sigma); use the normal equations of the conditions, which name the loop that closes worst"
+    )
+
+
+def condition_graph(network: Network, basis: LoopBasis) -> gtsam.NonlinearFactorGraph:
+    """Priors on the pairs (keys are their positions) and hard closures of the loops."""
+    graph = gtsam.NonlinearFactorGraph()
+    for e in range(network.topology.n_pairs):
+        graph.add(prior_factor(e, gtsam_motion(network.b_from_a, e), network.cov[e]))
+    for k in range(len(basis)):
+        graph.add(_closure_factor(basis, k, network.dim))
+    return graph
+
+
+def _closure_factor(basis: LoopBasis, loop: int, dim: int) -> gtsam.CustomFactor:
+    """The misclosure of one loop, to be zero. Its noise is a constraint, which no covariance can say."""
+    rows = slice(basis.ptr[loop], basis.ptr[loop + 1])
+    keys = [int(e) for e in basis.pair_idx[rows]]
+    n = len(keys)
+    alone = LoopBasis(
+        basis.topology, np.array([0, n]), np.arange(n), basis.sense[rows], basis.start_idx[loop : loop + 1], False, ""
+    )
+
+    def call(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
+        if dim == 3:
+            motions = Motions(np.array([values.atRot3(key).matrix() for key in keys]))
+        else:
+            poses = [values.atPose3(key) for key in keys]
+            motions = Motions(
+                np.array([p.rotation().matrix() for p in poses]), np.array([p.translation() for p in poses])
+            )
+        w, blocks = evaluate_loops(alone, motions)
+        if jacobians is not None:
+            for i in range(n):
+                jacobians[i] = blocks[i]
+        return w[0]
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Constrained.All(dim), keys, call)

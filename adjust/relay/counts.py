@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from adjust.model.survey import IntArray
-from adjust.relay.graphs import loop_labels
+from adjust.relay.cycles import loop_labels
 from adjust.relay.network import Topology
 
 

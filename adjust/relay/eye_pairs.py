@@ -10,6 +10,7 @@ import scipy.linalg
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray
+from adjust.relay.conditions import ConditionAdjustment, adjust_conditions
 from adjust.relay.eyes import (
     EyeAdjustment,
     EyeOptions,
@@ -19,8 +20,9 @@ from adjust.relay.eyes import (
     adjust_eyes,
     symmetric,
 )
+from adjust.relay.loops import evaluate_loops
 from adjust.relay.network import network_from_pairs
-from adjust.relay.parametric import ParametricAdjustment, ParametricOptions, adjust_parametric
+from adjust.relay.normal_equations import condition_matrix
 
 _EYES = EyeOptions()
 
@@ -46,7 +48,7 @@ class LoopedPairs:
     one eye share its errors.
     """
 
-    adjusted: ParametricAdjustment
+    adjusted: ConditionAdjustment
     claimed_cov: FloatArray
     actual_cov: FloatArray
 
@@ -90,19 +92,12 @@ def _two(a: PoseSequence | MotionSequence, b: PoseSequence | MotionSequence, opt
 def close_loops(found: EyePairs) -> LoopedPairs:
     """Adjust the pairs with their loops as a network, each pair independent of the others, as measured pairs are."""
     network = network_from_pairs(found.pairs)
-    adjusted = adjust_parametric(network, ParametricOptions(max_step=1e-8))
-    top, X = network.topology, adjusted.world_from_station
-    p, n = top.n_pairs, top.n_stations
-    D = np.zeros((p, 6, n, 6))
-    back = -(X[top.a_idx].inverse() @ X[top.b_idx]).adjoint()
-    D[np.arange(p), :, top.b_idx] += back
-    D[np.arange(p), :, top.a_idx] += np.eye(6)
-    A = D.reshape(6 * p, 6 * n)[:, 6:]  # the first station is the datum
-    P = np.linalg.inv(scipy.linalg.block_diag(*network.cov))
-    claimed = np.linalg.inv(A.T @ P @ A)
-    H = A @ claimed @ A.T @ P
+    adjusted = adjust_conditions(network)
+    p, Q = network.topology.n_pairs, scipy.linalg.block_diag(*network.cov)
+    B = condition_matrix(adjusted.basis, evaluate_loops(adjusted.basis, adjusted.pairs.b_from_a)[1]).toarray()
+    H = np.eye(6 * p) - Q @ B.T @ np.linalg.solve(B @ Q @ B.T, B)
     at = np.arange(p)
-    cut = [C.reshape(p, 6, p, 6)[at, :, at, :] for C in (A @ claimed @ A.T, H @ found.joint_cov @ H.T)]
+    cut = [C.reshape(p, 6, p, 6)[at, :, at, :] for C in (H @ Q, H @ found.joint_cov @ H.T)]
     return LoopedPairs(adjusted, cut[0], cut[1])
 
 

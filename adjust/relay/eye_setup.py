@@ -10,8 +10,8 @@ import scipy.linalg
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.relay.cycles import adjacency
 from adjust.relay.eye_solver import EyeConditions, EyeProblem, KnownMotion, stacked
-from adjust.relay.graphs import adjacency
 from adjust.relay.motions import Motions, identities
 from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from adjust.distributions import chi2
 from adjust.model.survey import FloatArray, IntArray
-from adjust.relay.cycles import bits_of, flat, forest_loops, shortest_loops
-from adjust.relay.graphs import adjacency, breadth_first
+from adjust.relay.cycles import adjacency, bits_of, breadth_first, flat, forest_loops, shortest_loops
 from adjust.relay.motions import Motions, identities, right_jacobian_inverse
 from adjust.relay.network import Network, Topology
+from adjust.statistics.criteria import sidak
 
 LoopKind = Literal["shortest", "tree"]
 
@@ -158,7 +158,7 @@ class LoopMisclosures:
 
     def failed(self, alpha: float = 0.001) -> IntArray:
         """Loops that do not close, worst first; ``alpha`` is for the whole network (Sidak)."""
-        single = -np.expm1(np.log1p(-alpha) / max(1, len(self.test)))
+        single = sidak(alpha, len(self.test))
         order = np.argsort(self.p_value, kind="stable")
         return np.asarray(order[self.p_value[order] < single], dtype=np.int64)
 

@@ -6,7 +6,7 @@ A station is here any frame that carries an eye: a camera, a marker block, a who
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -57,11 +57,6 @@ class Network:
         """3 for rotations, 6 for poses."""
         return self.b_from_a.dim
 
-    @property
-    def dispersion(self) -> FloatArray:
-        """Standard deviation (E,) rad of the measured rotations, over all directions."""
-        return np.asarray(np.sqrt(np.trace(self.cov[:, :3, :3], axis1=1, axis2=2) / 3.0))
-
 
 def topology(pairs: Iterable[tuple[str, str, str]], stations: Sequence[str] = ()) -> Topology:
     """From (pair id, a id, b id); ``stations`` names those that stand first, measured or not.
@@ -80,13 +75,6 @@ def topology(pairs: Iterable[tuple[str, str, str]], stations: Sequence[str] = ()
     ends = [index.setdefault(end, len(index)) for row in rows for end in row[1:]]
     a, b = np.array(ends, dtype=np.int64).reshape(-1, 2).T
     return Topology(tuple(index), tuple(row[0] for row in rows), a.copy(), b.copy())
-
-
-def complete_topology(station_ids: Sequence[str]) -> Topology:
-    """Every station measured with every other, in the order (1, 2), (1, 3), ..., (2, 3), ...; ids are ``a-b``."""
-    a, b = np.triu_indices(len(station_ids), 1)
-    ids = tuple(f"{station_ids[i]}-{station_ids[j]}" for i, j in zip(a.tolist(), b.tolist(), strict=True))
-    return Topology(tuple(station_ids), ids, a.astype(np.int64), b.astype(np.int64))
 
 
 def network_from_pairs(pairs: Sequence[Pair], rotations_only: bool = False) -> Network:
@@ -111,11 +99,6 @@ def network_from_pairs(pairs: Sequence[Pair], rotations_only: bool = False) -> N
     rotation = np.array([_rotation(p.b_from_a).matrix() for p in used])
     translation = np.array([p.b_from_a.translation() for p in used if isinstance(p.b_from_a, Pose3)])
     return Network(top, Motions(rotation, translation if dim == 6 else None), cov)
-
-
-def rotation_network(network: Network) -> Network:
-    """The rotations of a network of poses, with their share of the covariances."""
-    return replace(network, b_from_a=Motions(network.b_from_a.rotation), cov=network.cov[:, :3, :3])
 
 
 def gtsam_motion(motions: Motions, idx: int) -> Rot3 | Pose3:
@@ -145,13 +128,6 @@ def prior_factor(key: int, motion: Rot3 | Pose3, cov: FloatArray) -> gtsam.Nonli
     if isinstance(motion, Rot3):
         return gtsam.PriorFactorRot3(key, motion, gaussian(cov))
     return gtsam.PriorFactorPose3(key, motion, gaussian(cov))
-
-
-def between_factor(b: int, a: int, b_from_a: Rot3 | Pose3, cov: FloatArray) -> gtsam.NonlinearFactor:
-    """A measured relative rotation or pose of the stations under the keys b and a."""
-    if isinstance(b_from_a, Rot3):
-        return gtsam.BetweenFactorRot3(b, a, b_from_a, gaussian(cov))
-    return gtsam.BetweenFactorPose3(b, a, b_from_a, gaussian(cov))
 
 
 def _rotation(motion: Pose3 | Rot3) -> Rot3:

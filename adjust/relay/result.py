@@ -19,27 +19,6 @@ Joint = Callable[[Sequence[int]], FloatArray]
 _UNCONTROLLED = 1e-9
 
 
-@dataclass(frozen=True)
-class SuspectPair:
-    """A pair whose residual is too large: test = v' Q_vv^-1 v, chi-square with ``freedom`` degrees of freedom."""
-
-    pair_id: str
-    a_id: str
-    b_id: str
-    test: float
-    freedom: int
-    p_value: float
-    residual: FloatArray
-
-    def __str__(self) -> str:
-        turn = np.degrees(np.linalg.norm(self.residual[:3])) * 3600.0
-        shift = f" and {1e3 * np.linalg.norm(self.residual[3:]):.3f} mm" if len(self.residual) == 6 else ""
-        return (
-            f"pair {self.pair_id} ({self.a_id} to {self.b_id}): residual {turn:.1f} arcsec{shift}, "
-            f"test {self.test:.1f}, p {self.p_value:.2g}"
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class AdjustedPairs:
     """Adjusted pairs with their statistics (Baarda 1968), a priori sigma0 = 1.
@@ -73,22 +52,6 @@ class AdjustedPairs:
     def global_test(self, alpha: float = 0.05) -> GlobalTest | None:
         """Two-sided chi-square test of v'Pv."""
         return global_test(self.omega, self.redundancy_total, alpha)
-
-    def suspects(self, alpha: float = 0.001) -> tuple[SuspectPair, ...]:
-        """Pairs that do not fit, worst first; ``alpha`` is for the whole network (Sidak).
-
-        Only the first is surely meant: an error in it also shows in the residuals of its neighbours.
-        """
-        tested = self.freedom > 0
-        single = -np.expm1(np.log1p(-alpha) / max(1, int(tested.sum())))
-        order = np.argsort(np.where(tested, -self.test / np.maximum(self.freedom, 1), np.inf), kind="stable")
-        bad = [int(e) for e in order if tested[e] and self.p_value[e] < single]
-        top = self.network.topology
-        return tuple(
-            SuspectPair(top.pair_ids[e], *top.ends(e), float(self.test[e]), int(self.freedom[e]),
-                        float(self.p_value[e]), self.residual[e])
-            for e in bad
-        )  # fmt: skip
 
 
 def adjusted_pairs(

@@ -3,21 +3,18 @@
 import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
-from adjust.spatial.rigid import nearest_rotation, rigid, rotation_log
+from adjust.spatial.rigid import nearest_rotation, rigid
 
 _MEDOID_LIMIT = 150  # more candidates than this are thinned out for the quadratic search of the medoid
+_SETTLED = 1e-4  # of the scale: a further step tells nothing that the motions do
 
 
 def pose_distance(a: FloatArray, b: FloatArray, lever: float) -> FloatArray:
     """Distance in m between rigid motions (..., 4, 4): shift, and turn times ``lever`` m, added in squares."""
-    turn = np.linalg.norm(rotation_log(np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3]), axis=-1)
-    shift = np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1)
-    return np.asarray(np.hypot(shift, lever * turn))
-
-
-def mean_rotation(rotations: FloatArray, weights: FloatArray | None = None) -> FloatArray:
-    """Chordal L2 mean (3, 3) of rotations (n, 3, 3) (Hartley, Trumpf, Dai and Li, IJCV 103, 2013, sec. 5.3)."""
-    return nearest_rotation(rotations, np.ones(len(rotations)) if weights is None else weights)
+    squares = (a[..., :3, :] - b[..., :3, :]) ** 2
+    # half of the turn has the sine |A - B| / sqrt(8) (Hartley et al., IJCV 103, 2013, sec. 4)
+    turn = 2.0 * np.arcsin(np.minimum(np.sqrt(squares[..., :3].sum(axis=(-2, -1)) / 8.0), 1.0))
+    return np.asarray(np.hypot(np.sqrt(squares[..., 3].sum(axis=-1)), lever * turn))
 
 
 def mean_pose(
@@ -37,10 +34,10 @@ def mean_pose(
         scale = max(3.0 * float(np.median(distance[chosen])), 1e-12)
         weights = np.zeros(len(poses))
         weights[chosen] = 1.0 / (1.0 + (distance[chosen] / scale) ** 2) ** 2
-        r = mean_rotation(poses[:, :3, :3], weights)
+        r = nearest_rotation(poses[:, :3, :3], weights)
         step = rigid(r, weights @ poses[:, :3, 3] / weights.sum())
         moved, mean = float(pose_distance(step, mean, lever)), step
-        if moved < 1e-9 * max(scale, 1e-9) or moved < 1e-14:
+        if moved < _SETTLED * scale:
             break
     return mean, pose_distance(poses, mean, lever)
 

@@ -7,11 +7,7 @@ import numpy as np
 
 from adjust.frames.unknowns import Unknown
 from adjust.model.survey import BoolArray, FloatArray
-
-
-def skew(x: FloatArray) -> FloatArray:
-    """The matrix (3, 3) that multiplies a vector from the left to give ``x`` cross it."""
-    return np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
+from adjust.spatial.rigid import skew
 
 
 def point_motions(x: FloatArray) -> FloatArray:

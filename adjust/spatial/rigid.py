@@ -3,6 +3,7 @@
 import numpy as np
 
 from adjust.model.survey import FloatArray
+from adjust.native.views import turns_by, turns_of
 
 _TINY = 1e-12
 
@@ -16,38 +17,18 @@ def skew(w: FloatArray) -> FloatArray:
 
 def rotation_exp(w: FloatArray) -> FloatArray:
     """Rotations (..., 3, 3) of rotation vectors (..., 3) rad (Rodrigues)."""
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
-    small = angle < 1e-6
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 1.0 - angle**2 / 6.0, np.sin(safe) / safe)
-    b = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    k = skew(w)
-    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+    w = np.ascontiguousarray(w, dtype=np.float64)
+    out = np.empty((*w.shape, 3))
+    turns_by(w.reshape(-1, 3), out.reshape(-1, 3, 3))
+    return out
 
 
 def rotation_log(r: FloatArray) -> FloatArray:
     """Rotation vectors (..., 3) rad of rotations (..., 3, 3), through the quaternion: exact up to half a turn."""
-    r = np.asarray(r, dtype=float)
-    d0, d1, d2 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    squares = np.stack([1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], axis=-1)
-    ww = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
-    ss = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
-    rows = np.stack(
-        [
-            np.stack([squares[..., 0], *ww], axis=-1),
-            np.stack([ww[0], squares[..., 1], ss[0], ss[1]], axis=-1),
-            np.stack([ww[1], ss[0], squares[..., 2], ss[2]], axis=-1),
-            np.stack([ww[2], ss[1], ss[2], squares[..., 3]], axis=-1),
-        ],
-        axis=-2,
-    )
-    largest = np.argmax(squares, axis=-1)
-    q = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    q = np.where(q[..., :1] < 0, -q, q)
-    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
-    half = np.arctan2(sine, q[..., :1])
-    return np.asarray(np.where(sine < _TINY, 2.0, 2.0 * half / np.maximum(sine, _TINY)) * q[..., 1:])
+    r = np.ascontiguousarray(r, dtype=np.float64)
+    out = np.empty(r.shape[:-1])
+    turns_of(r.reshape(-1, 3, 3), out.reshape(-1, 3))
+    return out
 
 
 def nearest_rotation(m: FloatArray, weights: FloatArray | None = None) -> FloatArray:

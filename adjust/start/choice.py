@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.graph.assembly import StartValues
+from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
@@ -154,8 +154,6 @@ def _near_given(survey: Survey, result: Adjustment, run: Callable[[Begun], Adjus
 
 def _from_places(result: Adjustment, places: Mapping[str, FloatArray]) -> StartValues:
     """The adjusted values with other places of points; what is turned there is found anew."""
-    from adjust.statistics.pair_screen import values_of  # here: it stands above this module
-
     start = values_of(result)
     vectors = {n: v for n, v in start.vectors.items() if n[0] not in ("orientation", "centring")}
     return replace(start, points={**start.points, **places}, vectors=vectors)

@@ -1,14 +1,14 @@
 """Start values that came with a survey: which there are, the survey without them, and a start moved onto them."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.model.result import ParameterName
-from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Survey
+from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Station, Survey, Target
 from adjust.spatial.rigid import align
 from adjust.start.network import as_pose3, given_pose
 from adjust.start.result import Start
@@ -46,17 +46,7 @@ def _is_start(parameter: PoseParameter | PointParameter) -> bool:
 def _pose_parameters(survey: Survey) -> dict[ParameterName, PoseParameter]:
     """All poses by name; what holds for every epoch that is not listed goes without the epoch."""
     out: dict[ParameterName, PoseParameter] = {}
-    for c in survey.cameras:
-        out["station_from_camera", c.camera_id] = c.station_from_camera
-    for s in survey.stations:
-        out["world_from_station", s.station_id] = s.world_from_station
-        out["mount_from_station", s.station_id] = s.mount_from_station
-        out |= {("world_from_station", s.station_id, epoch): p for epoch, p in s.epochs.items()}
-    for t in survey.tables:
-        out["world_from_table", t.table_id] = t.world_from_table
-    for target in survey.targets:
-        out["carrier_from_target", target.target_id] = target.carrier_from_target
-        out |= {("carrier_from_target", target.target_id, epoch): p for epoch, p in target.epochs.items()}
+    _rewritten(survey, out.setdefault)
     return out
 
 
@@ -71,31 +61,53 @@ def without_starts(survey: Survey, points: bool, poses: bool) -> Survey:
     if points:
         kept = tuple(replace(p, x_in_world=_bare(p.x_in_world)) for p in survey.points)
         survey = replace(survey, points=kept)
-    if not poses:
-        return survey
-    return replace(
-        survey,
-        cameras=tuple(replace(c, station_from_camera=_bare(c.station_from_camera)) for c in survey.cameras),
-        stations=tuple(
-            replace(
-                s, world_from_station=_bare(s.world_from_station), mount_from_station=_bare(s.mount_from_station),
-                epochs={epoch: _bare(p) for epoch, p in s.epochs.items()},
-            )
-            for s in survey.stations
-        ),
-        tables=tuple(replace(t, world_from_table=_bare(t.world_from_table)) for t in survey.tables),
-        targets=tuple(
-            replace(
-                t, carrier_from_target=_bare(t.carrier_from_target),
-                epochs={epoch: _bare(p) for epoch, p in t.epochs.items()},
-            )
-            for t in survey.targets
-        ),
-    )  # fmt: skip
+    return _rewritten(survey, lambda name, parameter: _bare(parameter)) if poses else survey
 
 
 def _bare(parameter: _P) -> _P:
     return replace(parameter, value=None) if _is_start(parameter) else parameter
+
+
+def with_poses(survey: Survey, poses: Mapping[ParameterName, Pose3]) -> Survey:
+    """The survey with these poses as start values where it has none."""
+
+    def valued(name: ParameterName, parameter: PoseParameter) -> PoseParameter:
+        return replace(parameter, value=poses[name]) if parameter.value is None and name in poses else parameter
+
+    return _rewritten(survey, valued, [name for name in poses if len(name) == 3])
+
+
+def _rewritten(
+    survey: Survey, new: Callable[[ParameterName, PoseParameter], PoseParameter],
+    in_epochs: Sequence[ParameterName] = (),
+) -> Survey:  # fmt: skip
+    """The survey with ``new(name, parameter)`` for every pose, and for those in epochs that it did not list."""
+
+    def moved(owner: Station | Target, kind: str, owner_id: str) -> dict[str, Any]:
+        pose = getattr(owner, kind)
+        listed = dict.fromkeys(n[2] for n in in_epochs if n[:2] == (kind, owner_id))
+        epochs = {e: new((kind, owner_id, e), owner.epochs.get(e, pose)) for e in {**owner.epochs, **listed}}
+        return {kind: new((kind, owner_id), pose), "epochs": epochs}
+
+    return replace(
+        survey,
+        cameras=tuple(
+            replace(c, station_from_camera=new(("station_from_camera", c.camera_id), c.station_from_camera))
+            for c in survey.cameras
+        ),
+        stations=tuple(
+            replace(
+                s, **moved(s, "world_from_station", s.station_id),
+                mount_from_station=new(("mount_from_station", s.station_id), s.mount_from_station),
+            )
+            for s in survey.stations
+        ),
+        tables=tuple(
+            replace(t, world_from_table=new(("world_from_table", t.table_id), t.world_from_table))
+            for t in survey.tables
+        ),
+        targets=tuple(replace(t, **moved(t, "carrier_from_target", t.target_id)) for t in survey.targets),
+    )  # fmt: skip
 
 
 def moved_onto(start: Start, given: GivenStarts, survey: Survey) -> Start:

@@ -16,10 +16,11 @@ from adjust.lenses.models import (
 )
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Camera, FloatArray
+from adjust.native.lenses import fit_lens
+from adjust.native.views import homographies
 from adjust.start.closed_forms.absolute_pose import best_poses
-from adjust.start.closed_forms.planes import homographies, plane_misfits
 from adjust.start.closed_forms.zhang import pinhole_from_homographies
-from adjust.start.lens_refinement import LensFit, fit_lens
+from adjust.start.views import rays_of_images
 
 _MOST_IMAGES = 30
 _SCAN_IMAGES = 8
@@ -39,6 +40,16 @@ class Sighting:
     block_idx: int
     x: FloatArray
     uv: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A lens (n,) with the poses (B, 4, 4), the median error px, and the covariance (p, p) of what was free."""
+
+    values: FloatArray
+    poses: FloatArray
+    median_px: float
+    cov: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +92,7 @@ class _LensSearch:
     def __init__(self, camera: Camera, model: LensModel) -> None:
         self.camera, self.model, self.size = camera, model, camera.image_size
         self.constants = camera_constants(camera)
-        self._flat: dict[int, bool] = {}
+        self._plane: dict[int, FloatArray | None] = {}
         self.prior = {}
         if camera.lens.prior is not None:
             self.prior = dict(zip(camera.lens.prior.names, camera.lens.prior.mean, strict=True))
@@ -104,30 +115,35 @@ class _LensSearch:
                 " show it a target, or give lens values"
             )
         # the other images of a long series are screened by their poses
-        flat = _every([s for s in usable if self._is_flat(s)], _MOST_SCREENED)
-        good, excluded = self._screen(flat) if flat else ([], {})
-        chosen = spread_out(good) or [s for s in usable if s.block_idx not in excluded][:_MOST_IMAGES]
+        flat = _every([s for s in usable if self._on_plane(s) is not None], _MOST_SCREENED)
+        maps, excluded = self._screen(flat) if flat else ({}, {})
+        chosen = spread_out([s for s in flat if s.block_idx in maps])
+        chosen = chosen or [s for s in usable if s.block_idx not in excluded][:_MOST_IMAGES]
         if not chosen:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: none of its {len(flat)} images fits a plane; the first: "
                 + next(iter(excluded.values()))
             )
-        start, how = self._focal_length([s for s in chosen if self._is_flat(s)], chosen)
+        determined = [m for s in chosen if (m := maps.get(s.block_idx)) is not None]
+        start, how = self._focal_length(determined, chosen)
         return self._refine(start, how, chosen, excluded)
 
-    def _is_flat(self, sighting: Sighting) -> bool:
-        """Whether the points are a plane; asked once for all images that show the same array of points."""
+    def _on_plane(self, sighting: Sighting) -> FloatArray | None:
+        """Coordinates in the points' plane, asked for once for all images that show the same array of points."""
         key = id(sighting.x)
-        if key not in self._flat:
-            self._flat[key] = _is_plane(sighting.x)
-        return self._flat[key]
+        if key not in self._plane:
+            self._plane[key] = _plane_coordinates(sighting.x)
+        return self._plane[key]
 
-    def _screen(self, flat: Sequence[Sighting]) -> tuple[list[Sighting], dict[int, str]]:
-        """Images whose points lie as on a plane; a wrong point order misses by a good part of the image."""
-        ptr = np.cumsum([0] + [len(s.x) for s in flat])
-        misfit = plane_misfits(np.concatenate([s.x for s in flat]), np.concatenate([s.uv for s in flat]), ptr)
+    def _screen(self, flat: Sequence[Sighting]) -> tuple[dict[int, FloatArray | None], dict[int, str]]:
+        """Images that fit a plane, with their homographies where determined; a wrong point order misses by far."""
+        counts = [len(s.x) for s in flat]
+        ptr, uv = np.cumsum([0, *counts]), np.concatenate([s.uv for s in flat])
+        h, misses, found = homographies(np.concatenate([self._plane[id(s.x)] for s in flat]), uv, ptr, 1)
+        span = np.maximum.reduceat(uv, ptr[:-1]) - np.minimum.reduceat(uv, ptr[:-1])
+        misfit = misses[:, 1] / np.maximum(np.hypot(*span.T), 1e-9)
         limit = max(0.02, 6.0 * float(np.median(misfit)))
-        good = [s for s, m in zip(flat, misfit, strict=True) if m <= limit]
+        good = {s.block_idx: h[i] if found[i] else None for i, s in enumerate(flat) if misfit[i] <= limit}
         excluded = {
             s.block_idx: f"the points miss a plane by {100 * m:.0f} % of their extent (wrong order or mis-detected)"
             for s, m in zip(flat, misfit, strict=True)
@@ -135,22 +151,15 @@ class _LensSearch:
         }
         return good, excluded
 
-    def _focal_length(self, flat: Sequence[Sighting], chosen: Sequence[Sighting]) -> tuple[FloatArray, str]:
+    def _focal_length(self, maps: Sequence[FloatArray], chosen: Sequence[Sighting]) -> tuple[FloatArray, str]:
         trials: list[tuple[FloatArray, str]] = []
-        if flat and self.model.name != "fisheye":
-            plane = {id(s.x): s.x for s in flat}  # one for all images that show the same array of points
-            on_plane = {key: _unit(_plane_coordinates(x)) for key, x in plane.items()}
-            xy, ptr = [on_plane[id(s.x)] for s in flat], np.cumsum([0] + [len(s.x) for s in flat])
-            h, _, good = homographies(np.concatenate(xy), np.concatenate([s.uv for s in flat]), ptr)
-            for variants in (("full",), ("centred", "square")) if good.any() else ():
-                try:
-                    found = pinhole_from_homographies(h[good], self.size, variants)
-                except SurveyError:
-                    continue
-                values = self._values(
-                    found.values[0], found.values[1], found.values[2:] if found.variant == "full" else None
-                )
-                trials.append((values, f"Zhang, {found.variant}"))
+        for variants in (("full",), ("centred", "square")) if maps and self.model.name != "fisheye" else ():
+            try:
+                found = pinhole_from_homographies(np.array(maps), self.size, variants)
+            except SurveyError:
+                continue
+            centre = found.values[2:] if found.variant == "full" else None
+            trials.append((self._values(found.values[0], found.values[1], centre), f"Zhang, {found.variant}"))
         trial_images = _every(chosen, _SCAN_IMAGES)
         errors = [self._error_px(values, trial_images) for values, _ in trials]
         if errors and min(errors) < _GOOD_START * max(self.size):
@@ -183,58 +192,57 @@ class _LensSearch:
 
     def _error_px(self, values: FloatArray, images: Sequence[Sighting]) -> float:
         """Median over the images of the best pose's error, relative to the extent of the points, in px."""
-        rays = self._rays(values, images)
-        some = [(s.x, r) for s, r in zip(images, rays, strict=True) if r is not None]
-        errors = np.full(len(images), np.inf)
-        errors[: len(some)] = best_poses([x for x, _ in some], [r for _, r in some], 2)[1]
+        errors = self._poses(values, images, 2)[1]
         return float(np.median(errors)) * focal_length_px(self.model, values, self.constants)
+
+    def _poses(
+        self, values: FloatArray, images: Sequence[Sighting], refinements: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """The best pose (B, 4, 4) of every image and its error (B,) rad, infinite where there is none."""
+        rays = rays_of_images(self.camera, values, [s.uv for s in images])
+        some = [i for i, r in enumerate(rays) if not isinstance(r, SurveyError)]
+        poses, errors = np.tile(np.eye(4), (len(images), 1, 1)), np.full(len(images), np.inf)
+        found = best_poses([images[i].x for i in some], [np.asarray(rays[i]) for i in some], refinements)
+        poses[some], errors[some] = found
+        return poses, errors
 
     def _refine(self, start: FloatArray, how: str, chosen: Sequence[Sighting], excluded: dict[int, str]) -> LensStart:
         """The richest lens that the images determine, refined together with the poses."""
-        images, poses = self._poses(start, chosen)
+        poses, errors = self._poses(start, chosen, 3)
+        # images without a pose are left to the screening of all blocks, which reports them
+        images, poses = [s for s, e in zip(chosen, errors, strict=True) if np.isfinite(e)], poses[np.isfinite(errors)]
         if not images:
             raise SurveyError(
                 f"camera {self.camera.camera_id!r}: no image of known points gives a pose with the {how} lens"
             )
-        x, uv = np.concatenate([s.x for s in images]), np.concatenate([s.uv for s in images])
-        ptr = np.concatenate([[0], np.cumsum([len(s.x) for s in images])])
         for level in _LEVELS:
             directions = self._directions(level)
             if directions.shape[1] == 0 or ("centre" in level and len(images) < 3):
                 continue
-            fit = fit_lens(self.model, self.constants, start, directions, poses, x, uv, ptr)
+            fit = self._fit(start, directions, poses, images)
             if self._sane(fit, directions):
-                if level == _LEVELS[0] and _median(fit) > _SIMPLE_PX:  # a wide lens needs all its terms
+                if level == _LEVELS[0] and fit.median_px > _SIMPLE_PX:  # a wide lens needs all its terms
                     everything = self._directions("all")
-                    full = fit_lens(self.model, self.constants, fit.values, everything, fit.poses, x, uv, ptr, 60)
-                    if self._sane(full, everything) and _median(full) < 0.5 * _median(fit):
+                    full = self._fit(fit.values, everything, fit.poses, images, 60)
+                    if self._sane(full, everything) and full.median_px < 0.5 * fit.median_px:
                         fit, level = full, "all that is free"
-                median = _median(fit)
-                note = f"lens from {len(images)} images ({how}; refined: {level}), median error {median:.2f} px"
+                note = f"lens from {len(images)} images ({how}; refined: {level}), median error {fit.median_px:.2f} px"
                 return LensStart(fit.values, note, excluded)
         return LensStart(start, f"lens from {len(images)} images ({how}; too few to refine it)", excluded)
 
-    def _poses(self, values: FloatArray, chosen: Sequence[Sighting]) -> tuple[list[Sighting], FloatArray]:
-        some = [(s, r) for s, r in zip(chosen, self._rays(values, chosen), strict=True) if r is not None]
-        poses, error = best_poses([s.x for s, _ in some], [r for _, r in some], 3)
-        # images without a pose are left to the screening of all blocks, which reports them
-        good = np.isfinite(error)
-        return [s for (s, _), g in zip(some, good, strict=True) if g], poses[good]
-
-    def _rays(self, values: FloatArray, images: Sequence[Sighting]) -> list[FloatArray | None]:
-        """Unit rays of every image, None for one with pixels that the lens cannot have imaged."""
-        try:
-            rays = unit_rays(self.model, values, self.constants, np.concatenate([s.uv for s in images]))
-            return list(np.split(rays, np.cumsum([len(s.uv) for s in images])[:-1]))
-        except SurveyError:  # some pixel of some image: find out which
-            pass
-        found: list[FloatArray | None] = []
-        for s in images:
-            try:
-                found.append(unit_rays(self.model, values, self.constants, s.uv))
-            except SurveyError:
-                found.append(None)
-        return found
+    def _fit(
+        self, start: FloatArray, directions: FloatArray, poses: FloatArray, images: Sequence[Sighting],
+        iterations: int = 25,
+    ) -> _Fit:  # fmt: skip
+        """Least squares over ``start + directions @ p`` and the poses, with Huber weights."""
+        x, uv = (np.concatenate([getattr(s, name) for s in images]) for name in ("x", "uv"))
+        ptr = np.cumsum([0] + [len(s.x) for s in images])
+        values, poses = start.copy(), poses.copy()
+        squares, cov = fit_lens(
+            self.model.kind, values, self.constants, np.ascontiguousarray(directions), ptr, x, uv, iterations, poses
+        )
+        median = float(np.median(squares))  # of a 2-D normal's square it is s^2 ln 4
+        return _Fit(values, poses, float(np.sqrt(median)), cov * (median / np.log(4.0)))
 
     def _directions(self, level: str) -> FloatArray:
         """Columns (n, p) of the lens components that this level frees, with ties; fx, fy apart only with the centre."""
@@ -258,7 +266,7 @@ class _LensSearch:
             columns = [c for c in columns if not (c[0] or c[1])] + ([np.sum(both, axis=0)] if both else [])
         return np.array(columns).reshape(-1, len(names)).T
 
-    def _sane(self, fit: LensFit, directions: FloatArray) -> bool:
+    def _sane(self, fit: _Fit, directions: FloatArray) -> bool:
         """Whether the fit is determined (focal length to 10 %, centre to a tenth of the image) and possible."""
         focal = focal_length_px(self.model, fit.values, self.constants)
         width = max(self.size)
@@ -276,24 +284,15 @@ class _LensSearch:
         return bool(known and inside and 0.05 * width < focal < 50 * width)
 
 
-def _median(fit: LensFit) -> float:
-    return float(np.median(np.linalg.norm(fit.residuals, axis=1)))
-
-
-def _is_plane(x: FloatArray) -> bool:
+def _plane_coordinates(x: FloatArray) -> FloatArray | None:
+    """Coordinates (n, 2) of points in their plane, of unit size; None where they are no plane, or on a line."""
     centred = x - x.mean(axis=0)
-    s = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred), 0.0))
-    return bool(s[1] > 1e-3 * s[2] and s[0] < 1e-2 * s[1])
-
-
-def _plane_coordinates(x: FloatArray) -> FloatArray:
-    centred = x - x.mean(axis=0)
-    _, vectors = np.linalg.eigh(centred.T @ centred)
-    return np.asarray(centred @ vectors[:, :0:-1])
-
-
-def _unit(xy: FloatArray) -> FloatArray:
-    return np.asarray(xy / np.max(np.linalg.norm(xy, axis=1)))
+    squares, vectors = np.linalg.eigh(centred.T @ centred)
+    thin, middle, long = np.sqrt(np.maximum(squares, 0.0))
+    if not (middle > 1e-3 * long and thin < 1e-2 * middle):
+        return None
+    xy = centred @ vectors[:, :0:-1]
+    return np.asarray(xy / np.sqrt((xy**2).sum(axis=1).max()))
 
 
 def _every(images: Sequence[Sighting], n: int) -> list[Sighting]:

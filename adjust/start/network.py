@@ -102,15 +102,8 @@ class PoseNetwork:
         """Positions in the chain of the links that are unknown."""
         return [i for i, link in enumerate(chain) if link.slot not in self.known]
 
-    def isolate(self, observation: ChainObservation, position: int) -> FloatArray:
-        """What the observation says of the slot at a position of its chain, (k, 4, 4), all other links being known."""
-        chain = observation.chain
-        before, after = self.product(chain[:position]), self.product(chain[position + 1 :])
-        value = inverse(before) @ observation.poses @ inverse(after)
-        return inverse(value) if chain[position].inverse else value
-
-    def isolate_all(self, items: Sequence[tuple[ChainObservation, int]]) -> list[FloatArray]:
-        """:meth:`isolate` of many at once."""
+    def isolate(self, items: Sequence[tuple[ChainObservation, int]]) -> list[FloatArray]:
+        """What observations say of the slot at a position of their chain, (k, 4, 4), all other links being known."""
         before = inverse(self.products([o.chain[:i] for o, i in items]))
         after = inverse(self.products([o.chain[i + 1 :] for o, i in items]))
         counts = [len(o.poses) for o, _ in items]
@@ -158,7 +151,7 @@ class PoseNetwork:
             (o, next(i for i, link in enumerate(o.chain) if link.slot == slot))
             for o, slot in ((self.observations[n], slot) for n, slot in wanted)
         ]
-        return dict(zip((n for n, _ in wanted), self.isolate_all(items), strict=True))
+        return dict(zip((n for n, _ in wanted), self.isolate(items), strict=True))
 
     def _queue(self, n: int, missing: set[int], waiting: dict[int, list[int]], rotation_only: bool) -> None:
         if len(missing) == 1 and -1 not in missing and self.observations[n].rotation_only <= rotation_only:
@@ -196,7 +189,8 @@ class PoseNetwork:
                     by_slot.setdefault(slot, []).append((observation, i))
         for _ in range(rounds):
             for slot in sorted(by_slot):
-                self.known[slot] = self._mean([(o, self.isolate(o, i)) for o, i in by_slot[slot]])
+                offers = self.isolate(by_slot[slot])
+                self.known[slot] = self._mean([(o, x) for (o, _), x in zip(by_slot[slot], offers, strict=True)])
 
 
 def given_pose(parameter: PoseParameter) -> FloatArray | None:

@@ -2,7 +2,6 @@
 
 from gtsam import Pose3, Rot3
 
-from adjust.model.kinds import is_pose_network
 from adjust.model.result import ParameterName
 from adjust.model.survey import Survey
 from adjust.start.result import Start
@@ -14,7 +13,7 @@ def network_start(survey: Survey) -> Start | None:
     Surveys of rotations alone, whose positions stay open, are left to the general search, too. Raises
     IndeterminateError naming the stations that no pair ties to the others.
     """
-    if not is_pose_network(survey) or not any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
+    if not survey.is_pose_network or not any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
         return None
     # here: a survey without pairs starts without it
     from adjust.pose_network.from_survey import network_from_survey

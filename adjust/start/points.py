@@ -1,7 +1,7 @@
 """World points and the cameras that see them: resection from known points and intersection from known cameras."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from adjust.spatial.rigid import inverse
 from adjust.start import views as single
 from adjust.start.closed_forms.triangulation import intersect
 from adjust.start.network import ChainObservation, PoseNetwork
-from adjust.start.views import View, block_text, make_views, refine_views, used_rows
+from adjust.start.views import View, block_text, make_views, used_rows
 
 PARALLAX = (np.deg2rad(3.0), np.deg2rad(0.3), 0.0)
 """What an intersection needs, rad; the next only where nothing goes on with the first."""
@@ -99,31 +99,27 @@ def point_field(survey: Survey) -> PointField:
 
 def resect(network: PoseNetwork, points: PointField) -> bool:
     """Give a pose to the blocks that see enough known points and have none yet; whether there were any."""
-    have = {o.block_idx for o in network.observations}
-    known = points.known
-    views = _views(
-        [s for s in points.sights
-         if s.block_idx not in have and network.unknown_links(s.chain) and known[s.rows].sum() >= 3],
-        points,
-    )  # fmt: skip
-    sights = {s.block_idx: s for s in points.sights}
+    have, known = {o.block_idx for o in network.observations}, points.known
+    sights = {s.block_idx: s for s in points.sights if s.block_idx not in have and network.unknown_links(s.chain)}
+    seen = {i: int(known[s.rows].sum()) for i, s in sights.items()}
     # three points fit up to four poses exactly: they count only where nothing better is left
-    strong = [v for v in views if len(v.x) >= 4]
-    if not strong and _resect_together(network, points):
+    views = _views([s for i, s in sights.items() if seen[i] >= 4], points)
+    if not views and _resect_together(network, points):
         return True
-    for view in refine_views(strong or views):
+    views = views or _views([s for i, s in sights.items() if seen[i] == 3], points)
+    for view in views:
         sight = sights[view.block_idx]
         network.observations.append(ChainObservation(sight.chain, view.poses, sight.text, view.block_idx))
     return bool(views)
 
 
-def _views(sights: Sequence[Sight], points: PointField) -> list[View]:
+def _views(sights: Sequence[Sight], points: PointField, present: Sequence[FloatArray] | None = None) -> list[View]:
     """Views of the known points; not those on a line, or none in front: other blocks may do."""
     seen = []
     for s in sights:
         rows = points.known[s.rows]
         seen.append(single.Sight(s.block_idx, points.x[s.rows][rows], s.rays[rows], s.focal_px))
-    return make_views(seen)[0]
+    return make_views(seen, present)[0]
 
 
 def _resect_together(network: PoseNetwork, points: PointField) -> bool:
@@ -205,12 +201,10 @@ def improve(network: PoseNetwork, points: PointField, movable: set[int]) -> None
     known = points.known
     placed = [s for s in points.sights if not network.unknown_links(s.chain) and known[s.rows].sum() >= 4]
     sights = {s.block_idx: s for s in placed}
-    found = _views(placed, points)
-    present = network.products([sights[v.block_idx].chain for v in found])
-    views = [replace(v, poses=np.concatenate([at[None], v.poses])) for v, at in zip(found, present, strict=True)]
+    views = _views(placed, points, list(network.products([s.chain for s in placed])))
     renewed = {
         v.block_idx: ChainObservation(sights[v.block_idx].chain, v.poses, sights[v.block_idx].text, v.block_idx)
-        for v in refine_views(views)
+        for v in views
     }
     network.observations = [renewed.pop(o.block_idx, o) for o in network.observations] + list(renewed.values())
     touched = {link.slot for view in views for link in sights[view.block_idx].chain}

@@ -9,7 +9,6 @@ from scipy.sparse import csc_array
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log, skew
-from adjust.start.closed_forms.views import tangent_axes
 from adjust.start.network import ChainObservation, PoseNetwork
 from adjust.start.views import View
 
@@ -83,9 +82,19 @@ def _root_information(lever: float, observation: ChainObservation, view: View | 
     pose = observation.poses[0]
     p = view.x @ pose[:3, :3].T + pose[:3, 3]
     depth = np.maximum(np.sum(p * view.rays, axis=1), 1e-9)
-    by_point = tangent_axes(view.rays) / depth[:, None, None]
+    by_point = _tangent_axes(view.rays) / depth[:, None, None]
     j = np.concatenate([-by_point @ skew(p), by_point], axis=2).reshape(-1, 6) * view.focal_px
     return np.asarray(np.linalg.qr(j / np.sqrt(len(p)), mode="r"))
+
+
+def _tangent_axes(rays: FloatArray) -> FloatArray:
+    """Two unit vectors (..., 2, 3) across each unit ray (..., 3) (Duff et al., J. Comput. Graph. Techn. 6(1), 2017)."""
+    x, y, z = np.moveaxis(rays, -1, 0)
+    sign = np.where(z >= 0, 1.0, -1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first, second = (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+    return np.stack([np.stack(first, axis=-1), np.stack(second, axis=-1)], axis=-2)
 
 
 def _minimise(chains: _Chains, poses: FloatArray, places: IntArray, lever: float, iterations: int) -> FloatArray:

@@ -11,11 +11,11 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock, PositionRef
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, Survey
+from adjust.native.views import view_offsets
 from adjust.observations.geometry.building import frame_refs, position_refs
 from adjust.observations.terrestrial.building import reading_refs
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import align, rigid
-from adjust.start.closed_forms.views import view_offsets
 from adjust.start.gauge import fix_one_gauge, frames_of, world_is_free
 from adjust.start.lenses import Sighting, start_lens
 from adjust.start.motion import solve_motion
@@ -33,7 +33,6 @@ from adjust.start.views import (
     block_text,
     focal_px,
     make_views,
-    refine_views,
     target_points,
     untrustworthy,
     used_rows,
@@ -174,10 +173,9 @@ class _Search:
                 x, mine = self._seen_of_target(block, rays[i])
                 if len(x) >= 3:  # fewer give no pose, but may well serve in the adjustment
                     sights.append(Sight(i, x, mine, focal[block.camera_id]))
-        views, without = make_views(sights)
+        refined, without = make_views(sights)
         for i, reason in without.items():
             self.reasons.setdefault(i, f"{block_text(self.survey.image_blocks[i])}: {reason}")
-        refined = refine_views(views)
         reasons, notes = untrustworthy([v for v in refined if v.block_idx not in self.reasons], self.survey)
         self.reasons = {**reasons, **self.reasons}
         self.notes += notes
@@ -224,6 +222,8 @@ class _Search:
     def _advance(self) -> bool:
         """One step, the first of the list that is possible; whether there was one."""
         network, points = self.network, self.points
+        if network.known.keys() >= network.names.keys() and points.known.all():
+            return False
         if network.propagate():
             return True
         for parallax in PARALLAX:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations
 
 import numpy as np
 
@@ -11,29 +10,30 @@ from adjust.lenses.models import camera_constants, focal_length_px, lens_model, 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray, Survey, Target
-from adjust.start.closed_forms.absolute_pose import pose_solutions
-from adjust.start.closed_forms.planes import plane_poses
-from adjust.start.closed_forms.views import refine_poses, view_errors, view_offsets
+from adjust.native.views import refine_poses, view_errors, view_offsets
+from adjust.start.closed_forms.absolute_pose import view_poses
 
 _RIVAL = 4.0  # a second pose whose error is within this factor of the best stays a candidate
 _NOISE_PX = 0.3  # ... or within this much of it
 _ENOUGH = 36  # points of a view from which its pose is found before all of them refine it
-_ALL_STEPS = 2  # of refinement with all points of a view
-_FEW = 4, 5  # points of a view, not in a plane, that have poses from each three of them too
+_STEPS = 8, 2  # of refinement with these, and with all points of a view
 _GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustworthy
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """One block as rays. x: (n, 3) m in the target. rays: (n, 3) unit in the camera. focal_px: turns angles into px.
-
-    poses: (k, 4, 4) camera_from_target, likeliest first; error_px: (k,).
-    """
+class Sight:
+    """One block as rays. x: (n, 3) m in the target. rays: (n, 3) unit in the camera. focal_px: turns angles into px."""
 
     block_idx: int
     x: FloatArray
     rays: FloatArray
     focal_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class View(Sight):
+    """A block with what explains it. poses: (k, 4, 4) camera_from_target, likeliest first; error_px: (k,)."""
+
     poses: FloatArray
     error_px: FloatArray
 
@@ -79,69 +79,26 @@ def all_rays(survey: Survey, lenses: dict[str, FloatArray]) -> tuple[dict[int, F
     failed: dict[int, str] = {}
     cameras = {c.camera_id: c for c in survey.cameras}
     for camera_id, values in lenses.items():
-        mine = [i for i, b in enumerate(survey.image_blocks) if b.camera_id == camera_id and len(b.uv)]
-        if not mine:
-            continue
-        camera, blocks = cameras[camera_id], [survey.image_blocks[i] for i in mine]
-        try:
-            found = rays_of(camera, values, np.concatenate([b.uv for b in blocks]))
-            ends = np.cumsum([len(b.uv) for b in blocks])
-            rays.update(zip(mine, np.split(found, ends[:-1]), strict=True))
-        except SurveyError:  # some pixel of some block: find out which
-            for i, block in zip(mine, blocks, strict=True):
-                try:
-                    rays[i] = rays_of(camera, values, block.uv)
-                except SurveyError as error:
-                    failed[i] = str(error)
+        mine = {i: b.uv for i, b in enumerate(survey.image_blocks) if b.camera_id == camera_id and len(b.uv)}
+        found = rays_of_images(cameras[camera_id], values, list(mine.values()))
+        for i, of_block in zip(mine, found, strict=True):
+            if isinstance(of_block, SurveyError):
+                failed[i] = str(of_block)
+            else:
+                rays[i] = of_block
     return rays, failed
 
 
-@dataclass(frozen=True, eq=False)
-class Sight:
-    """One block to make a view of: the same fields."""
-
-    block_idx: int
-    x: FloatArray
-    rays: FloatArray
-    focal_px: float
-
-
-def make_views(sights: Sequence[Sight]) -> tuple[list[View], dict[int, str]]:
-    """Views with their unrefined candidate poses, and for every block that has none the reason."""
-    if not sights:
-        return [], {}
-    rows, ptr = _samples(sights)
-    x, rays = np.concatenate([s.x for s in sights])[rows], np.concatenate([s.rays for s in sights])[rows]
-    both, planar = plane_poses(x, rays, ptr)
-    candidates, failed = list(both), {}
-    for i in np.flatnonzero(~planar).tolist():
-        part = slice(ptr[i], ptr[i + 1])
-        try:
-            candidates[i] = _solutions(x[part], rays[part])
-            if not len(candidates[i]):
-                n = len(sights[i].x)
-                raise SurveyError(f"no camera pose explains its {n} points; check their order and coordinates")
-        except SurveyError as reason:
-            candidates[i], failed[sights[i].block_idx] = np.zeros((0, 4, 4)), str(reason)
-    of, poses = np.repeat(np.arange(len(sights)), [len(c) for c in candidates]), np.concatenate(candidates)
-    return _with_poses(sights, poses, *view_errors(poses, x, rays, ptr, of), of), failed
-
-
-def _solutions(x: FloatArray, rays: FloatArray) -> FloatArray:
-    """Poses (k, 4, 4) from all points, and where these are four or five from each three of them too.
-
-    The square sum of so few points has several minima, and SQPnP may end in one that is not the least.
-    """
-    every = pose_solutions(x, rays)
-    if not _FEW[0] <= len(x) <= _FEW[1]:
-        return every
-    found = [every]
-    for three in combinations(range(len(x)), 3):
-        try:
-            found.append(pose_solutions(x[list(three)], rays[list(three)]))
-        except SurveyError:  # on a line
-            continue
-    return np.concatenate(found)
+def rays_of_images(
+    camera: Camera, values: FloatArray, images: Sequence[FloatArray]
+) -> Sequence[FloatArray | SurveyError]:
+    """Unit rays (n, 3) of every image (n, 2) px, or why it has none."""
+    if not images:
+        return []
+    try:
+        return np.split(rays_of(camera, values, np.concatenate(images)), np.cumsum([len(uv) for uv in images])[:-1])
+    except SurveyError as error:  # some pixel of some image: find out which
+        return [error] if len(images) == 1 else [rays_of_images(camera, values, [uv])[0] for uv in images]
 
 
 @lru_cache(maxsize=256)
@@ -150,67 +107,60 @@ def _sample(n: int) -> IntArray:
     return np.arange(n) if n <= _ENOUGH else np.sort(np.random.default_rng(n).permutation(n)[:_ENOUGH])
 
 
-def _samples(views: Sequence[View | Sight]) -> tuple[IntArray, IntArray]:
-    """Rows of all views' points, one after the other, that :func:`_sample` takes, and where each view's begin."""
-    sizes = [len(v.x) for v in views]
-    starts = np.cumsum([0, *sizes[:-1]])
-    few = [_sample(n) for n in sizes]
-    ptr = np.cumsum([0] + [len(r) for r in few])
-    return np.concatenate(few) + np.repeat(starts, np.diff(ptr)), ptr
+def make_views(
+    sights: Sequence[Sight], present: Sequence[FloatArray] | None = None
+) -> tuple[list[View], dict[int, str]]:
+    """Views with the likeliest poses that explain each by itself, and for every block that has none the reason.
 
-
-def refine_views(views: Sequence[View], iterations: int = 8) -> list[View]:
-    """All candidates of all views refined in one go, robustly; implausible candidates dropped.
-
-    First on a sample of each view's points, then in two more steps on all of them.
+    present: poses (4, 4) that are to be tried beside those found. All are refined in one go, robustly, first on a
+    sample of each view's points, then in a few more steps on all of them.
     """
-    if not views:
-        return []
-    ptr = np.cumsum([0] + [len(v.x) for v in views])
-    of = np.repeat(np.arange(len(views)), [len(v.poses) for v in views])
-    poses = np.concatenate([v.poses for v in views])
-    x, rays = np.concatenate([v.x for v in views]), np.concatenate([v.rays for v in views])
-    rows, few_ptr = _samples(views)
-    poses = refine_poses(poses, x[rows], rays[rows], few_ptr, iterations, True, of)
-    error, in_front = view_errors(poses, x[rows], rays[rows], few_ptr, of)
-    kept = _likeliest(views, error, in_front, of)
+    if not sights:
+        return [], {}
+    sizes, focal = [len(s.x) for s in sights], np.array([s.focal_px for s in sights])
+    x, rays = (np.concatenate([getattr(s, name) for s in sights]) for name in ("x", "rays"))
+    ptr = np.cumsum([0, *sizes])
+    few = [_sample(n) for n in sizes]
+    few_ptr = np.cumsum([0] + [len(r) for r in few])
+    rows = np.concatenate(few) + np.repeat(ptr[:-1], np.diff(few_ptr))
+    sample = x[rows], rays[rows], few_ptr
+    poses, of, failed = view_poses(*sample)
+    error, in_front = view_errors(poses, *sample, of)
+    kept = _likeliest(focal, error, in_front, of)
+    poses, of = poses[kept], of[kept]
+    if present is not None and len(of):
+        beside = np.unique(of)
+        poses, of = np.concatenate([np.array(present)[beside], poses]), np.concatenate([beside, of])
+    poses = refine_poses(poses, *sample, _STEPS[0], True, of)
+    error, in_front = view_errors(poses, *sample, of)
+    kept = _likeliest(focal, error, in_front, of)
     poses, error, in_front, of = poses[kept], error[kept], in_front[kept], of[kept]
-    more = (np.diff(few_ptr) < np.diff(ptr))[of]
+    more = (np.diff(few_ptr) < sizes)[of]
     if more.any():
-        poses[more] = refine_poses(poses[more], x, rays, ptr, _ALL_STEPS, True, of[more])
+        poses[more] = refine_poses(poses[more], x, rays, ptr, _STEPS[1], True, of[more])
         error[more], in_front[more] = view_errors(poses[more], x, rays, ptr, of[more])
-    return _with_poses(views, poses, error, in_front, of)
-
-
-def _with_poses(
-    seen: Sequence[View | Sight], poses: FloatArray, error: FloatArray, in_front: BoolArray, of: IntArray
-) -> list[View]:
-    """Views with the likeliest of their candidate poses; those without any are left out."""
-    kept = _likeliest(seen, error, in_front, of)
-    poses, error_px = poses[kept], error[kept] * _focal(seen)[of[kept]]
-    ends = np.cumsum(np.bincount(of[kept], minlength=len(seen))).tolist()
-    return [
+        kept = _likeliest(focal, error, in_front, of)
+        poses, error, of = poses[kept], error[kept], of[kept]
+    error_px, ends = error * focal[of], np.searchsorted(of, np.arange(len(sights) + 1)).tolist()
+    views = [
         View(s.block_idx, s.x, s.rays, s.focal_px, poses[a:b], error_px[a:b])
-        for s, a, b in zip(seen, [0, *ends], ends, strict=False)
+        for s, a, b in zip(sights, ends, ends[1:], strict=False)
         if b > a
     ]
+    return views, {sights[i].block_idx: reason for i, reason in failed.items()}
 
 
-def _likeliest(seen: Sequence[View | Sight], error: FloatArray, in_front: BoolArray, of: IntArray) -> IntArray:
+def _likeliest(focal: FloatArray, error: FloatArray, in_front: BoolArray, of: IntArray) -> IntArray:
     """Of candidates (K,) of the views ``of`` (K,) the best, and those in front that come near it, if it is.
 
-    View by view, the best first. error: (K,) rad.
+    View by view, the best first. focal: (B,) px. error: (K,) rad.
     """
     order = np.lexsort((error, ~in_front, of))
     of, error, in_front = of[order], error[order], in_front[order]
     first = np.diff(of, prepend=-1) > 0
     best = np.flatnonzero(first)[np.cumsum(first) - 1]
-    limit = np.maximum(_RIVAL * error[best], error[best] + _NOISE_PX / _focal(seen)[of])
+    limit = np.maximum(_RIVAL * error[best], error[best] + _NOISE_PX / focal[of])
     return np.asarray(order[first | (in_front & (error <= limit))])
-
-
-def _focal(seen: Sequence[View | Sight]) -> FloatArray:
-    return np.array([s.focal_px for s in seen])
 
 
 def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str], list[str]]:
@@ -227,7 +177,7 @@ def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str]
         np.array([v.poses[0] for v in views]), np.concatenate([v.x for v in views]),
         np.concatenate([v.rays for v in views]), ptr,
     )  # fmt: skip
-    focal = _focal(views)
+    focal = np.array([v.focal_px for v in views])
     worst = np.maximum.reduceat(offsets, ptr[:-1]) * focal
     by_camera: dict[str, list[int]] = {}
     for i, view in enumerate(views):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph
-from adjust.model.observations import ReadingCovariance
+from adjust.model.observations import ImageBlock, ReadingCovariance
 from adjust.model.survey import BoolArray, Survey
 
 _FIELD = {
@@ -38,10 +38,10 @@ class Candidates:
         return out
 
 
-def candidates(graph: AdjustmentGraph) -> Candidates:
-    """Of a graph; priors stay, for they are part of what is asked for."""
+def candidates(graph: AdjustmentGraph, images: bool = True) -> Candidates:
+    """Of a graph; priors stay, for they are part of what is asked for. images: image points are counted, and first."""
     survey = graph.survey
-    ptr = np.cumsum([0] + [len(b.uv) for b in survey.image_blocks])
+    ptr = np.cumsum([0] + [len(b.uv) for b in survey.image_blocks if images])
     tables: dict[tuple[str, ...], int] = {(r.table_id, r.epoch_id): i for i, r in enumerate(survey.table_readings)}
     n_image, count = int(ptr[-1]), dict.fromkeys(_FIELD, 0)
     place: dict[int, tuple[str, int]] = {}
@@ -81,6 +81,8 @@ def without(survey: Survey, found: Candidates, rejected: Iterable[int]) -> Surve
 
 
 def _blocks(survey: Survey, found: Candidates, out: BoolArray) -> tuple[Any, ...]:
+    if not found.n_image:
+        return survey.image_blocks
     blocks = []
     for b, block in enumerate(survey.image_blocks):
         mine = out[found.image_ptr[b] : found.image_ptr[b + 1]]
@@ -100,3 +102,18 @@ def _parts(c: ReadingCovariance, lost: set[str]) -> list[ReadingCovariance]:
         return [c]
     parts = [np.flatnonzero(~gone), np.flatnonzero(gone)]
     return [ReadingCovariance(tuple(ids[p].tolist()), c.cov[np.ix_(p, p)]) for p in parts if len(p)]
+
+
+def as_given(survey: Survey, given: Survey) -> Survey:
+    """The survey with those image points in use that are so in the one it was made of: to be screened anew."""
+    used = {_place(b): b for b in given.image_blocks}
+    blocks = []
+    for b in survey.image_blocks:
+        before = used.get(_place(b))
+        same = before is not None and np.array_equal(before.point_idx, b.point_idx)
+        blocks.append(replace(b, used=before.used) if before is not None and same else b)
+    return replace(survey, image_blocks=tuple(blocks))
+
+
+def _place(block: ImageBlock) -> tuple[str, str, str | None, str]:
+    return block.camera_id, block.epoch_id, block.target_id, block.group

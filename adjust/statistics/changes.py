@@ -69,17 +69,10 @@ class _Candidates:
 
 @dataclass(frozen=True, eq=False)
 class _Chosen:
-    """What was found: B (m, q) over all rows, g (q,), X = A'B and Y = Q A'B (n, q)."""
+    """What was found, less what was found before it: B (m, q) over all rows, X = A'B (n, q).
 
-    B: FloatArray
-    g: FloatArray
-    X: FloatArray
-    Y: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """All that was found: B (m, q) over all rows, X (n, q), the inverse (q, q) of their M, and that times their g."""
+    inverse: (q, q) of its M; amounts: (q,) that times its g.
+    """
 
     B: FloatArray
     X: FloatArray
@@ -124,19 +117,19 @@ class ChangeSearch:
         """Changes significant at this level of one test, the clearest first, each given those before."""
         out: list[Change] = []
         chosen: list[_Chosen] = []
+        candidates = self.candidates  # M and g are given what was found, step by step
         omega, left = self.adjustment.omega, self.adjustment.redundancy
         while len(out) < _MOST:
             best: tuple[float, _Candidates, int, FloatArray, FloatArray] | None = None
-            known, named = _joint(chosen), Counter((x.kind, x.name, x.what) for x in out)
-            for c in self.candidates:
+            named = Counter((x.kind, x.name, x.what) for x in out)
+            for c in candidates:
                 if named[c.unit.kind, c.unit.name, c.unit.what] >= _MOST_OF_ONE:
                     continue
-                M, g = _given(c, known)
-                T, q = _statistics(M, g)
+                T, q = _statistics(c.M, c.g)
                 z = np.where(q > 0, _normal_score(T, np.maximum(q, 1)), -np.inf)
                 j = int(z.argmax()) if len(z) else -1
                 if j >= 0 and z[j] > (best[0] if best is not None else -np.inf):
-                    best = float(z[j]), c, j, M[j], g[j]
+                    best = float(z[j]), c, j, c.M[j], c.g[j]
             if best is None:
                 break
             _, c, j, M, g = best
@@ -148,7 +141,8 @@ class ChangeSearch:
                 break
             spread = (omega - T) / (left - q) if relative and left > q and omega > T else 1.0
             out.append(_change(c, j, M, g, float(T), int(q), p, max(spread, 1.0)))
-            chosen.append(self._chosen(c, j))
+            chosen.append(self._chosen(c, j, chosen))
+            candidates = [_given(x, chosen[-1]) for x in candidates]
             omega, left = omega - float(T), left - int(q)
         return tuple(out)
 
@@ -236,14 +230,19 @@ class ChangeSearch:
         M = (P - X.transpose(0, 2, 1) @ Y) * scale[:, :, None] * scale[:, None, :]
         return _Candidates(u, 0.5 * (M + M.transpose(0, 2, 1)), g * scale, scale, Y)
 
-    def _chosen(self, c: _Candidates, j: int) -> _Chosen:
-        """Its directions that show, with columns of unit length."""
+    def _chosen(self, c: _Candidates, j: int, before: Sequence[_Chosen]) -> _Chosen:
+        """Its directions that show, less what they have in common with those before."""
         u, B = c.unit, np.zeros((len(self.e), c.unit.B.shape[1]))
         mine = u.run >= (j + 1 if len(u.epochs) > 1 else 0)
         B[u.rows[mine]] = u.B[mine] * c.scale[j]
-        values, vectors = np.linalg.eigh(c.M[j])
+        X, Y = np.asarray(self.A.T @ B), c.Y[j] * c.scale[j]
+        shares = [x.inverse @ (x.B.T @ B - x.X.T @ Y) for x in before]
+        for x, share in zip(before, shares, strict=True):
+            B, X = B - x.B @ share, X - x.X @ share
+        values, vectors = np.linalg.eigh(next(x.M[j] for x in self.candidates if x.unit is u))
         V = vectors[:, values > _SEEN]
-        return _Chosen(B @ V, V.T @ c.g[j], np.asarray(self.A.T @ (B @ V)), c.Y[j] * c.scale[j] @ V)
+        inverse = np.linalg.pinv(V.T @ c.M[j] @ V, rcond=1e-12, hermitian=True)
+        return _Chosen(B @ V, X @ V, inverse, inverse @ (V.T @ c.g[j]))
 
 
 def _by_runs(u: Unit) -> Unit:
@@ -269,24 +268,13 @@ def _by_run(u: Unit, other: FloatArray) -> FloatArray:
     return np.array([u.B[i:j].T @ other[i:j] for i, j in pairwise(first.tolist())])
 
 
-def _joint(chosen: Sequence[_Chosen]) -> _Known | None:
-    """All that was found, together."""
-    if not chosen:
-        return None
-    B, X, Y = (np.hstack([getattr(x, name) for x in chosen]) for name in ("B", "X", "Y"))
-    inverse = np.linalg.pinv(B.T @ B - X.T @ Y, rcond=1e-12, hermitian=True)
-    return _Known(B, X, inverse, inverse @ np.concatenate([x.g for x in chosen]))
-
-
-def _given(c: _Candidates, known: _Known | None) -> tuple[FloatArray, FloatArray]:
-    """M and g of candidates where the chosen changes are part of the model."""
-    if known is None:
-        return c.M, c.g
+def _given(c: _Candidates, known: _Chosen) -> _Candidates:
+    """Candidates with M and g where one more change is part of the model."""
     u, J = c.unit, len(c.unit.epochs)
     direct = np.cumsum(_by_run(u, known.B[u.rows])[::-1], axis=0)[::-1][1 if J > 1 else 0 :]
     K = (direct - c.Y.transpose(0, 2, 1) @ known.X) * c.scale[:, :, None]
     M = c.M - K @ known.inverse @ K.transpose(0, 2, 1)
-    return 0.5 * (M + M.transpose(0, 2, 1)), c.g - K @ known.amounts
+    return replace(c, M=0.5 * (M + M.transpose(0, 2, 1)), g=c.g - K @ known.amounts)
 
 
 def _statistics(M: FloatArray, g: FloatArray) -> tuple[FloatArray, IntArray]:

@@ -14,11 +14,11 @@ from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.images import block_rows
 from adjust.native.lenses import MAX_LENS
 from adjust.observations.images.batch import warp_shape
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
+from adjust.spatial.rigid import skew
 from adjust.statistics.system import Entries, ImageRows, KeyColumns, LinearSystem, assembled, bundle_order, bundle_rows
 
 N_SHAPE = 4
@@ -58,7 +58,7 @@ class CondensedSystem:
             columns = np.unique(A.indices)
             return columns, A[:, columns].toarray()
         b = known.index(i)
-        local = _block_rows(graph, b)[2 * point : 2 * point + 2, :-1]
+        local = graph.images.rows(b)[2 * point : 2 * point + 2, :-1]
         columns = np.concatenate([self.key_columns[key] for key in graph.images.keys[b]])
         kept = columns >= 0
         return columns[kept], (local @ graph.images.local_from_keys(b))[:, kept]
@@ -127,7 +127,7 @@ def _condensed_rows(
 ) -> FloatArray:
     """Rows (g, k, lens + pose + warp + shape + 1) of g blocks with equally many points and columns."""
     images = graph.images
-    local = np.array([_block_rows(graph, int(b)) for b in mine])
+    local = np.array([graph.images.rows(int(b)) for b in mine])
     n = local.shape[1] // 2
     none = np.zeros((0, N_SHAPE))
     factors = np.zeros((len(mine), n, N_SHAPE))
@@ -163,24 +163,12 @@ def _keep(
     kept["shape"].append(rows[:, :, width:-1].reshape(-1, N_SHAPE))
 
 
-def _block_rows(graph: AdjustmentGraph, b: int) -> FloatArray:
-    """Whitened rows (2 n, local unknowns and 1) of all points of the b-th block of known targets, residual last."""
-    images = graph.images
-    s, c = images.state, images.chains
-    local = np.zeros((2 * int(images.ptr[b + 1] - images.ptr[b]), int(images.n_rows[b])))
-    block_rows(b, images.arrays, images.points, images.W_all_columns, s.lenses, c.R, c.t, s.warp, local)
-    return local
-
-
 def _of_cameras(R: FloatArray, t: FloatArray) -> FloatArray:
     """Motions (B, 6, 6) in the target of a motion d of the camera: Exp(d) T = T Exp(Ad(inv T) d), T = (R, t)."""
     out = np.zeros((len(R), 6, 6))
     turned = R.transpose(0, 2, 1)
     out[:, :3, :3] = out[:, 3:, 3:] = turned
-    cross = np.zeros((len(R), 3, 3))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        cross[:, i, j], cross[:, j, i] = -t[:, k], t[:, k]
-    out[:, 3:, :3] = -turned @ cross
+    out[:, 3:, :3] = -turned @ skew(t)
     return out
 
 

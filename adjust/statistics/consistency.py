@@ -1,13 +1,31 @@
-"""All parts of a survey and all changes within it, tested together at one error probability."""
+"""All parts of a survey and all changes within it, tested together at one error probability.
 
+Parts are groups, cameras, epochs, targets, tables, set-ups and instruments. The weighted squares of a part are a
+quadratic form in normal residuals: with R_g its part of the redundancy matrix they have the mean tr R_g, its
+redundancy, and the variance 2 tr R_g R_g (Koch 1999, 2.7). A fault that a large survey dilutes below the limit of the
+global test stands out in its own part.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.distributions import chi2, fisher
 from adjust.model.result import Adjustment
-from adjust.precision.pose_networks import NamedPrecision
+from adjust.model.survey import FloatArray, IntArray
+from adjust.observations.images.batch import whitened_squares
 from adjust.statistics.changes import ChangeSearch
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.criteria import sidak
-from adjust.statistics.parts import parts_of, parts_of_network, tested_parts
-from adjust.statistics.result import Consistency
+from adjust.statistics.quadratic_forms import upper_tail, upper_tail_bound
+from adjust.statistics.result import Consistency, PartTest
+from adjust.statistics.system import LinearSystem
 
+_LEAST = 1e-3
+"""Redundancy below which the squares of a part are rounding."""
+_EXACT = 400
+"""Rows up to which the eigenvalues of a part are found."""
 _ESTIMATED = ("estimated", "unseparable")
 
 
@@ -16,17 +34,16 @@ def consistency(
 ) -> Consistency:
     """Test every part, and look for changes; ``alpha`` is the error probability of all of it together.
 
-    condensed: the system of this adjustment; None where it was solved as a pose network, of which the groups are
-    tested. Where the global test fails because residuals are too large, every part is tested against the rest: else
-    wrong sigmas would make everything suspect. Groups whose variance was estimated from these residuals are not tested
-    for it.
+    condensed: the system of this adjustment; None for a network of pairs, of which the groups are tested. Where the
+    global test fails because residuals are too large, every part is tested against the rest: else wrong sigmas would
+    make everything suspect. Groups whose variance was estimated from these residuals are not tested for it.
     """
     test = adjustment.global_test
     if test is None:
         return Consistency(alpha, alpha, 0, (), (), False, 0)
     relative = test.status == "failed"
     system = None if condensed is None else condensed.system
-    if condensed is None or isinstance(adjustment.precision, NamedPrecision):
+    if condensed is None or adjustment.survey.is_pose_network:
         parts = parts_of_network(adjustment) if len(adjustment.groups) > 1 else ()
     else:
         parts = parts_of(adjustment, condensed.system, condensed.numbers)
@@ -44,3 +61,132 @@ def consistency(
         search.found(level, relative) if search is not None else (), relative, n_changes,
         search.left_out() if search is not None else (),
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Contributions:
+    """Of every observation of a condensed system (M,): components in use, redundancy, weighted square sum."""
+
+    n: FloatArray
+    redundancy: FloatArray
+    omega: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part: the observations (k,) of the condensed system that belong to it; none where only its sums are known."""
+
+    kind: str
+    name: str
+    members: IntArray
+    n: float
+    redundancy: float
+    omega: float
+
+
+def parts_of_network(adjustment: Adjustment) -> tuple[Part, ...]:
+    """The groups of an adjustment, from their sums."""
+    none = np.zeros(0, dtype=np.int64)
+    return tuple(Part("group", g.group, none, g.n_observations, g.redundancy, g.omega) for g in adjustment.groups)
+
+
+def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> tuple[Part, ...]:
+    """All parts that are neither the whole nor without redundancy. blocks: the image block of each observation."""
+    found = contributions(adjustment, system, blocks)
+    members: dict[tuple[str, str], list[int]] = {}
+    for i, labels in enumerate(_labels(adjustment, system, blocks)):
+        if found.n[i]:
+            for label in labels:
+                members.setdefault(label, []).append(i)
+    total, out = int(np.count_nonzero(found.n)), []
+    for (kind, name), listed in members.items():
+        index = np.array(listed, dtype=np.int64)
+        n, r, omega = (float(x[index].sum()) for x in (found.n, found.redundancy, found.omega))
+        if r > _LEAST and len(index) < total:
+            out.append(Part(kind, name, index, n, r, omega))
+    return tuple(out)
+
+
+def contributions(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> Contributions:
+    """What every observation of a condensed system contributes."""
+    images, graph = adjustment.image_residuals, system.precision.graph
+    k, M = len(blocks), len(system.used)
+    n, r, omega = np.zeros(M), np.zeros(M), np.zeros(M)
+    if k:
+        number = np.repeat(np.arange(len(images.block_ptr) - 1), np.diff(images.block_ptr))
+        squares = whitened_squares(images.residuals, graph.square_roots())
+        for out, values in ((n, np.full(len(squares), 2.0)), (r, images.redundancy.sum(axis=1)), (omega, squares)):
+            out[:k] = np.bincount(number, np.where(images.used, values, 0.0), len(images.block_ptr) - 1)[blocks]
+    np.add.at(omega, system.row_of, np.where(system.row_of >= k, system.e**2, 0.0))
+    others = adjustment.other_residuals[: len(graph.others)]
+    first = k + len(others)
+    n[k:first] = [len(o.residual) for o in others]
+    r[k:first] = [o.redundancy.sum() for o in others]
+    readings = adjustment.reading_residuals
+    if readings is not None:
+        n[first:], r[first:], omega[first:] = 1.0, readings.redundancy, readings.weighted_square
+    return Contributions(*(np.where(system.used, x, 0.0) for x in (n, r, omega)))
+
+
+def _labels(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> Iterator[list[tuple[str, str]]]:
+    """The parts that every observation belongs to."""
+    survey = adjustment.survey
+    for i in blocks.tolist():
+        b = survey.image_blocks[i]
+        target = [("target", b.target_id)] if b.target_id is not None else []
+        yield [("group", b.group), ("camera", b.camera_id), ("epoch", b.epoch_id), *target]
+    for o in system.precision.graph.others:
+        more = [("table", o.ids[0]), ("epoch", o.ids[1])] if o.kind == "table" else []
+        yield [("group", o.group), *more]
+    instrument = {s.setup_id: s.instrument_id for s in survey.setups}
+    for reading in survey.readings:
+        setup = [("set-up", reading.setup_id)] if reading.setup_id else []
+        used = instrument.get(reading.setup_id, "")
+        yield [("group", reading.group), *setup, *([("instrument", used)] if used else [])]
+
+
+def tested_parts(
+    adjustment: Adjustment, parts: Sequence[Part], level: float, relative: bool, system: LinearSystem | None
+) -> tuple[PartTest, ...]:
+    """Every part at this level of one test, smallest p first.
+
+    relative: against all others (F), where the survey as a whole does not fit its sigmas.
+    """
+    out = []
+    for part in parts:
+        p = _p_relative(adjustment, part) if relative else _p(part, level, system)
+        factor = part.omega / part.redundancy
+        out.append(PartTest(part.kind, part.name, round(part.n), part.redundancy, part.omega, factor, p, p < level))
+    return tuple(sorted(out, key=lambda x: (x.p, -x.factor, x.kind, x.name)))
+
+
+def _p_relative(adjustment: Adjustment, part: Part) -> float:
+    """Of the factor of a part over that of the rest."""
+    left, rest = adjustment.redundancy - part.redundancy, adjustment.omega - part.omega
+    if left < 1.0 or rest <= 0.0:
+        return 1.0
+    return float(fisher.sf(part.omega / part.redundancy / (rest / left), part.redundancy, left))
+
+
+def _p(part: Part, level: float, system: LinearSystem | None) -> float:
+    """The probability, or a bound of it where both the bound and what could be better say the same."""
+    bound = upper_tail_bound(part.omega, part.redundancy)
+    if bound < level or system is None or not len(part.members):
+        return bound
+    rows = np.flatnonzero(np.isin(system.row_of, part.members))
+    k = min(len(rows), part.n)
+    lost = part.n - part.redundancy  # degrees of freedom that the unknowns take; evenly, the variance is least
+    squares = part.n - k + k * (1.0 - lost / k) ** 2
+    scale = max(squares, 1e-12) / part.redundancy
+    best = float(chi2.sf(part.omega / scale, part.redundancy / scale))
+    if best > level or len(rows) > _EXACT:
+        return bound
+    return min(bound, upper_tail(part.omega, eigenvalues(system, rows, round(part.n))))
+
+
+def eigenvalues(system: LinearSystem, rows: IntArray, n: int) -> FloatArray:
+    """Eigenvalues (n,) of I - A Q A' of the n components that stand in these rows (condensed: in fewer)."""
+    A = system.A[rows]
+    influence = A @ system.normal.solve(A.T.toarray())
+    taken = np.sort(np.linalg.eigvalsh(0.5 * (influence + influence.T)))[::-1][:n]
+    return np.concatenate([np.clip(1.0 - taken, 0.0, 1.0), np.ones(n - len(taken))])

@@ -95,6 +95,11 @@ def sidak(family_alpha: float, n_tests: int) -> float:
     return float(-np.expm1(np.log1p(-family_alpha) / max(1, n_tests)))
 
 
+def limits(family_alpha: float, freedom: IntArray, n_tests: int) -> FloatArray:
+    """What one of ``n_tests`` chi-square tests of these degrees of freedom (n,) exceeds at Sidak's level."""
+    return np.asarray(chi2.isf(sidak(family_alpha, n_tests), np.maximum(freedom, 1)))
+
+
 @lru_cache(maxsize=1024)
 def noncentrality(alpha: float, power: float, q: int) -> float:
     """lambda0: chi-square (q, lambda0) exceeds the critical value of level ``alpha`` with probability ``power``."""

@@ -8,7 +8,7 @@ Knight, Wang and Rizos 2010 for sets of errors). ``exp(-J/2)`` is the likelihood
 size: two of nearly the same J cannot be told apart.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 
@@ -28,6 +28,8 @@ _EVEN = 2.0 * float(np.log(20.0))
 """Difference of J up to which an explanation is less than 20 times as likely as another one."""
 _MOST = 600
 """Rejected components beyond which sets are not compared any more: the survey itself is wrong then."""
+_ROOM = 1e8
+"""Numbers that these may put into the residuals of all observations."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +52,9 @@ class _Near:
     at: list[IntArray]
 
 
-def better_set(snooping: Snooping) -> Exchange | None:
-    """The exchange that lowers J most at the first rejected observation that has one."""
-    state = _state(snooping)
+def better_set(snooping: Snooping, limits: FloatArray) -> Exchange | None:
+    """The exchange that lowers J most at the first rejected observation that has one. limits: (M,) of the tests."""
+    state = _state(snooping, limits)
     if state is None:
         return None
     for o in snooping.out:
@@ -62,9 +64,9 @@ def better_set(snooping: Snooping) -> Exchange | None:
     return None
 
 
-def equal_sets(snooping: Snooping) -> list[Exchange]:
+def equal_sets(snooping: Snooping, limits: FloatArray) -> list[Exchange]:
     """Other explanations that the data hardly tell from what is out now, the likeliest first; none in another."""
-    state = _state(snooping)
+    state = _state(snooping, limits)
     if state is None:
         return []
     found: dict[tuple[frozenset[int], frozenset[int]], Exchange] = {}
@@ -84,10 +86,12 @@ class _State:
     """A search with r rejected components. K: (r, r) covariance of their errors, bias: (r,) these themselves.
 
     rows: of every rejected observation among the r. U: (m, r) its columns; B: (m, r) what an error of each puts into
-    the residuals of all observations. possible: (M,) may go out. link: (M, r) correlation of tests, 0 where it may not.
+    the residuals of all observations. limits: (M,) of the tests. possible: (M,) may go out. link: (M, r) correlation of
+    tests, 0 where it may not.
     """
 
     snooping: Snooping
+    limits: FloatArray
     rows: dict[int, IntArray]
     K: FloatArray
     bias: FloatArray
@@ -97,16 +101,16 @@ class _State:
     link: FloatArray
 
 
-def _state(snooping: Snooping) -> _State | None:
-    out, ptr = snooping.out, snooping.system.ptr
+def _state(snooping: Snooping, limits: FloatArray) -> _State | None:
+    out, ptr = snooping.out, snooping.ptr
     index = [np.arange(int(ptr[x]), int(ptr[x + 1])) for x in out]
     ends = np.cumsum([0] + [len(r) for r in index])
-    if not out or ends[-1] > _MOST:
+    if not out or ends[-1] > _MOST or ends[-1] * len(snooping.g) > _ROOM:
         return None
     U = np.hstack([snooping.columns[x][0] for x in out])
     inverse = np.linalg.inv(U[np.concatenate(index)])  # of the Cholesky factor of their own R
     K, B = inverse.T @ inverse, U @ inverse
-    possible = snooping.system.used & snooping.candidates  # also what only the others left in place cannot check
+    possible = snooping.used & snooping.candidates  # also what only the others left in place cannot check
     possible[out] = False
     bias = inverse.T @ np.concatenate([snooping.columns[x][1] for x in out])
     link = np.zeros((len(possible), len(K)))
@@ -115,22 +119,16 @@ def _state(snooping: Snooping) -> _State | None:
         grown = np.einsum("nii->ni", R)[..., None] + shared
         seen = grown > CONTROLLED
         link[members] = np.sqrt(np.where(seen, shared, 0.0) / np.where(seen, grown, 1.0)).max(axis=1)
-    return _State(snooping, {x: np.arange(*ends[i : i + 2]) for i, x in enumerate(out)}, K, bias, U, B, possible, link)
+    rows = {x: np.arange(*ends[i : i + 2]) for i, x in enumerate(out)}
+    return _State(snooping, limits, rows, K, bias, U, B, possible, link)
 
 
 def _by_size(snooping: Snooping, wanted: BoolArray) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:
     """Observations (n,), their rows (n, k) and R (n, k, k), of each size k."""
-    for k, R in zip(np.unique(snooping.sizes), snooping.R, strict=True):
-        members = np.flatnonzero(snooping.sizes == k)
+    for members, R in zip(snooping.alike, snooping.R, strict=True):
         mine = wanted[members]
-        yield members[mine], snooping.system.ptr[members[mine]][:, None] + np.arange(k), R[mine]
-
-
-def limits_of(snooping: Snooping, observations: Sequence[int]) -> FloatArray:
-    """What a statistic may be (k,) in the tests as they stand."""
-    rows = np.array(observations, dtype=np.int64)
-    T = np.ones(len(rows))
-    return np.asarray(T / snooping.excess_outside(T, snooping.sizes[rows], rows))
+        if mine.any():
+            yield members[mine], snooping.rows(members[mine]), R[mine]
 
 
 def _exchanges(state: _State, o: int) -> list[Exchange]:
@@ -140,7 +138,7 @@ def _exchanges(state: _State, o: int) -> list[Exchange]:
 
 
 def _exchanges_among(state: _State, near: _Near) -> list[Exchange]:
-    limits = limits_of(state.snooping, near.pool)
+    limits = state.limits[near.pool]
     here = tuple(i for i, x in enumerate(near.pool) if x in near.mine)
     J = {s: v for size in range(len(near.pool) + 1) for s, v in _criteria(near, limits, size)}
     if here not in J:
@@ -216,7 +214,7 @@ def _suspects(state: _State, mine: list[int], N: IntArray, of_N: FloatArray, lin
 
 def _joined(state: _State, mine: list[int], free: list[int], N: IntArray, of_N: FloatArray) -> _Near:
     """G and R of all of them, with those that are out taken back."""
-    snooping, ptr = state.snooping, state.snooping.system.ptr
+    snooping, ptr = state.snooping, state.snooping.ptr
     rows = [np.arange(int(ptr[x]), int(ptr[x + 1])) for x in free]
     F = np.concatenate([np.zeros(0, dtype=np.int64), *rows])
     cross = state.B[np.ix_(F, N)] @ of_N

@@ -1,8 +1,10 @@
 """Gross errors among observations of every kind: found by tests, each decision logged, taken back where it was wrong.
 
 A robust solution says what most observations agree on, and whom to suspect first; tests with the error probability of
-the whole family decide (see :mod:`adjust.statistics.snooping`); the survey is solved again without what they leave
-out, and the search repeated there, until nothing changes. The result is a plain least squares.
+the whole family decide (:mod:`adjust.statistics.gross_errors`, on a linear system, :mod:`adjust.statistics.snooping`);
+the survey is solved again without what they leave out, and the search repeated there, until nothing changes. The result
+is a plain least squares. Where image points are not searched they stand condensed, and are screened anew at every
+solution.
 """
 
 from collections.abc import Callable, Iterable
@@ -13,36 +15,33 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.distributions import chi2
-from adjust.graph.assembly import StartValues
+from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import IndeterminateError, NotConvergedError
-from adjust.model.result import Adjustment
-from adjust.model.survey import BoolArray, IntArray, Survey
-from adjust.statistics.candidates import Candidates, candidates, without
-from adjust.statistics.criteria import criteria, sidak
-from adjust.statistics.exchange import better_set, equal_sets
-from adjust.statistics.pair_screen import values_of
+from adjust.model.result import Adjustment, ObservationResidual
+from adjust.model.survey import BoolArray, FloatArray, Survey
+from adjust.statistics.candidates import as_given, candidates, without
+from adjust.statistics.condensed import condensed_system
+from adjust.statistics.criteria import MANY, limits
+from adjust.statistics.exchange import Exchange, better_set, equal_sets
+from adjust.statistics.gross_errors import Search, State, Verdicts, best_back_first
 from adjust.statistics.reliability import observation_name
-from adjust.statistics.result import Alternative, Decision, LevelOptions
-from adjust.statistics.snooping import Snooping, robust_squares
-from adjust.statistics.supposed import cautious_groups, group_factors
-from adjust.statistics.system import LinearSystem, linear_system
+from adjust.statistics.result import Alternative, Decision
+from adjust.statistics.snooping import Snooping
+from adjust.statistics.system import linear_system, precision_of
+
+_ROUNDS = 12
 
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """levels: of the tests; with method "sidak" the family is all tested observations.
+    """family_alpha: error probability of all tests together.
 
     kinds: which may be left out (kinds as in ``ObservationResidual``, "image" for image points); None for all but
-    priors. robust: begin with a robust solution. posterior: test with sigma0 of the other
-    observations. typical: where the sigmas of a whole group are plainly too small, widen its limits.
+    priors.
     """
 
-    levels: LevelOptions = field(default_factory=lambda: LevelOptions(family_alpha=0.001))
+    family_alpha: float = 0.001
     kinds: tuple[str, ...] | None = None
-    robust: bool = True
-    posterior: bool = False
-    typical: bool = True
-    max_rounds: int = 12
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
 
 
@@ -75,7 +74,9 @@ class OutlierSearch:
     @property
     def notes(self) -> tuple[str, ...]:
         """For people, worst first."""
-        notes = tuple(d.text() for d in self.rejected) + tuple(a.text() for a in self.alternatives)
+        pairs = {o.ids: o for o in self.adjustment.other_residuals if o.kind == "pair" and not o.used}
+        notes = tuple(_said_of_pair(pairs[d.ids], d) if d.ids in pairs else d.text() for d in self.rejected)
+        notes += tuple(a.text() for a in self.alternatives)
         notes += tuple(
             f"group {g}: its typical observation contradicts the rest; sigmas {np.sqrt(f):.1f} times as large explain "
             "that better than wrong observations do, and none was left out for it; check its sigmas, and those of what "
@@ -92,6 +93,13 @@ class OutlierSearch:
         return "cannot be left out"
 
 
+def _said_of_pair(o: ObservationResidual, d: Decision) -> str:
+    """In degrees and metres."""
+    turn = np.degrees(np.linalg.norm(o.residual[:3]))
+    shift = f" and {np.linalg.norm(o.residual[3:]):.4g} m" if len(o.residual) == 6 else ""
+    return f"left out: pair {o.ids[0]}: off by {turn:.4g} deg{shift}, test {d.statistic:.1f}, p {d.p:.2g}"
+
+
 def search_outliers(
     survey: Survey, start: StartValues | None = None, options: SearchOptions = DEFAULT_SEARCH,
     progress: Callable[[int, float], None] | None = None, first: Adjustment | None = None,
@@ -101,179 +109,178 @@ def search_outliers(
     What the survey does not use stays out. Raises as :func:`adjust.adjustment.adjust`.
     """
     now = first or adjust(survey, start, options.adjust, progress)
-    survey = now.survey
-    found: Candidates | None = None
-    out: tuple[int, ...] = ()
+    images = options.kinds is None or "image" in options.kinds
+    survey = as_given(now.survey, survey) if options.adjust.reject_points and not images else now.survey
+    round_ = _Round(now, options, images)
+    found, given = round_.found, round_.snooping.used
     log: list[Decision] = []
     seen: set[frozenset[int]] = {frozenset()}
     needed: set[int] = set()
-    converged, rounds = False, 0
-    while not converged and rounds < options.max_rounds:
-        rounds += 1
-        system = linear_system(now)
-        if found is None:
-            given, found = system.used.copy(), candidates(system.precision.graph)
-        snooping = _searched(replace_used(system, given), found, now, options, out, rounds, log, needed)
-        new = tuple(snooping.out)
-        converged = set(new) == set(out)
-        if converged:
-            break
+    out: tuple[int, ...] = ()
+    while True:
+        state = round_.searched((*out, *sorted(needed)), log)
+        new = tuple(o for o in state.solution.out if o not in needed)
         if frozenset(new) in seen:
-            new = tuple(sorted(set(new) | set(out)))  # turning in circles: the cautious choice
-            converged = set(new) == set(out)
+            new = tuple(sorted({*new, *out}))  # turning in circles: the cautious choice
+        converged = set(new) == set(out)
+        if converged or round_.number == _ROUNDS:
+            return round_.result(state, out, needed, log, converged, now)
         seen.add(frozenset(new))
-        try:
-            now = adjust(without(survey, found, new), values_of(now), options.adjust, progress)
-            out = new
-        except (IndeterminateError, NotConvergedError):
-            # without all of these there is no solution: the last good one stays, and they take part in it
-            converged = set(new) <= set(out)
-            needed |= set(new) - set(out)
-    snooping.take_back([o for o in snooping.out if o not in out])
-    rejected = _decisions("rejected", out, snooping, now, rounds, "test")
-    names, factors = snooping.system.group_names, snooping.factors
-    few = factors if options.typical else np.ones(len(names))
-    return OutlierSearch(
-        now, now.survey, tuple(sorted(rejected, key=lambda d: -d.statistic / d.limit)), tuple(log),
-        _suspects(snooping, now, rounds), rounds, converged, _alternatives(snooping, now),
-        tuple(np.array(names)[cautious_groups(snooping, len(names))].tolist()),
-        tuple((n, float(f)) for n, f in zip(names, few, strict=True) if f > 1.0 and n in _kinds_groups(snooping)),
-    )  # fmt: skip
+        before, (now, out) = out, _left_out(now, out, new, lambda these, now: adjust(
+            without(survey, found, these), values_of(now), options.adjust, progress))  # fmt: skip
+        needed |= set(new) - set(out)
+        if out == before and set(new) <= set(out):  # what should come back has no solution either
+            return round_.result(state, out, needed, log, True, now)
+        round_ = _Round(now, options, images, given, round_.number + 1)
 
 
-def _kinds_groups(snooping: Snooping) -> set[str]:
-    """Groups of which something may be left out."""
-    names = snooping.system.group_names
-    return {names[int(g)] for g in snooping.system.group[snooping.candidates]}
+def _left_out(
+    now: Adjustment, out: tuple[int, ...], new: tuple[int, ...],
+    leave: Callable[[tuple[int, ...], Adjustment], Adjustment],
+) -> tuple[Adjustment, tuple[int, ...]]:  # fmt: skip
+    """Adjusted without ``new``; where there is no such solution, without those before and as many more as can go."""
+    try:
+        return leave(new, now), new
+    except (IndeterminateError, NotConvergedError):
+        if len(set(new) - set(out)) > 1:
+            for o in new:
+                if o not in out:
+                    now, out = _left_out(now, out, (*out, o), leave)
+        return now, out
 
 
-def replace_used(system: LinearSystem, used: BoolArray) -> LinearSystem:
-    """The system with other observations in use."""
-    return replace(system, used=used.copy())
+class _Round:
+    """The search in one solution, linearised there. given: (M,) what the survey uses, which the solution may not."""
 
+    def __init__(
+        self, now: Adjustment, options: SearchOptions, images: bool, given: BoolArray | None = None, number: int = 1
+    ) -> None:
+        self.now, self.options, self.images, self.number = now, options, images, number
+        system = linear_system(now) if images else condensed_system(precision_of(now)).system
+        first = 0 if images else system.n_image
+        if given is not None:
+            system = replace(system, used=np.concatenate([system.used[:first], given]))
+        self.found = candidates(system.precision.graph, images)
+        points = int(now.image_residuals.used.sum())
+        allowed = self.found.mask() & system.used[first:]
+        if options.kinds is not None:
+            allowed &= [self._name(o)[0] in options.kinds for o in range(len(allowed))]
+        self.snooping = Snooping(system, allowed, first, 0 if images else 2 * points)
+        tests = self.snooping.tests()
+        self.cautious, self.factor = tests.cautious, np.ones(len(tests.omega))
+        self.snooping.candidates = allowed & ~self.cautious[tests.group]
+        self.n_tests = int(np.count_nonzero(tests.freedom > 0)) + (0 if images else points)
 
-def _searched(
-    system: LinearSystem, found: Candidates, now: Adjustment, options: SearchOptions, out: Iterable[int], round_: int,
-    log: list[Decision], needed: set[int],
-) -> Snooping:  # fmt: skip
-    """The system without its gross errors; ``out`` are those of the round before, ``needed`` stay."""
-    G = len(system.group_names)
-    snooping = Snooping(system, _allowed(system, found, now, options), 1.0, np.ones(G), options.posterior)
-    snooping.candidates[list(needed)] = False
-    snooping.candidates &= ~cautious_groups(snooping, G)[system.group]
-    _, freedom, _ = snooping.statistics()
-    snooping.level = _level(options, int(np.count_nonzero((freedom > 0) & system.used)))
-    begin = list(out)
-    if options.typical:
-        snooping.factors = group_factors(snooping, G)
-    if not begin and options.robust and _anything_fails(snooping):
-        begin = _suspected(system, snooping, freedom, log, now, round_)
-    for o in begin:
-        if snooping.failing()[1][o]:
-            snooping.leave_out(o)
-    if options.typical and begin:
-        snooping.factors = group_factors(snooping, G)
-    _settle(snooping, log, now, round_)
-    for _ in range(2 * len(snooping.sizes) + 2):
-        if not _exchanged(snooping, log, now, round_):
-            break
-        _settle(snooping, log, now, round_)
-    return snooping
+    def _name(self, o: int) -> tuple[str, tuple[str, ...]]:
+        """Kind and ids."""
+        if self.images:
+            return observation_name(self.now, o)
+        found = self.now.other_residuals[o]
+        return found.kind, found.ids
 
+    def searched(self, out: Iterable[int], log: list[Decision]) -> State[Snooping]:
+        """The state without gross errors; ``out`` are those of the round before."""
+        now, begin, how = self.snooping, list(out), ""
+        self.factor = self._factor(now)
+        state = self._search().judged(now, now.tests())
+        if not begin and (state.tests.used & (state.over > 1.0)).any():
+            begin, how = self._suspected(state), "robust"
+        now = now.using(now.used)
+        for o in begin:
+            if now.possible(o):
+                if how:
+                    log.append(self._decision("rejected", o, now, how))
+                now.leave_out(o)
+        if begin:
+            self.factor = self._factor(now)
 
-def _exchanged(snooping: Snooping, log: list[Decision], now: Adjustment, round_: int) -> bool:
-    """Put good observations back in place of bad ones; whether there were any."""
-    found = better_set(snooping)
-    if found is None:
-        return False
-    log += _decisions("readmitted", found.kept, snooping, now, round_, "exchange")
-    snooping.take_back(found.kept)
-    for o in found.instead:
-        log.append(_decision("rejected", o, snooping, now, round_, "exchange"))
-        snooping.leave_out(o)
-    return True
+        def said(state: State[Snooping], goes: BoolArray, back: BoolArray) -> None:
+            log.extend(self._decision("rejected", o, state.solution, "test") for o in np.flatnonzero(goes).tolist())
+            log.extend(self._decision("readmitted", o, state.solution, "test") for o in np.flatnonzero(back).tolist())
 
+        search = replace(self._search(), said=said)
+        state = search.settled(search.judged(now, now.tests()))
+        for _ in range(2 * len(now.sizes) + 2):
+            found = better_set(state.solution, self._limits())
+            if found is None:
+                break
+            log += [self._decision("readmitted", o, state.solution, "exchange") for o in found.kept]
+            used = state.tests.used.copy()
+            used[list(found.kept)] = True
+            now = state.solution.using(used)
+            for o in found.instead:
+                log.append(self._decision("rejected", o, now, "exchange"))
+                now.leave_out(o)
+            state = search.settled(search.judged(now, now.tests()))
+        return state
 
-def _alternatives(snooping: Snooping, now: Adjustment) -> tuple[Alternative, ...]:
-    def names(observations: Iterable[int]) -> tuple[tuple[str, ...], ...]:
-        return tuple((kind, *ids) for kind, ids in (observation_name(now, o) for o in observations))
+    def _search(self) -> Search[Snooping]:
+        def solve(used: BoolArray, before: State[Snooping] | None) -> tuple[Snooping, Verdicts]:
+            now = (self.snooping if before is None else before.solution).using(used)
+            return now, now.tests()
 
-    return tuple(
-        Alternative(names(x.kept), names(x.instead), float(np.exp(0.5 * x.more))) for x in equal_sets(snooping)
-    )
+        return Search(solve, self.options.family_alpha, best_back_first, np.inf, self.n_tests, self.factor)
 
+    def _factor(self, now: Snooping) -> FloatArray:
+        """By how much the sigmas (squared) of every group (G,) are too small, where that cannot be chance; else 1."""
+        tests = now.tests()
+        self.factor = np.ones(len(tests.omega))
+        n = np.bincount(tests.group[tests.used & (tests.freedom > 0)], minlength=len(self.factor))
+        for g in np.flatnonzero(n >= MANY).tolist():
+            mine = tests.used & (tests.group == g) & (tests.freedom > 0)
+            ratio = tests.statistic[mine] / chi2.ppf(0.5, tests.freedom[mine])
+            if np.mean(ratio > 1.0) > 0.5 + 1.5 / np.sqrt(n[g]):  # three sigmas of a fair coin
+                self.factor[g] = max(1.0, float(np.median(ratio)))
+        few, search = (n > 0) & (n < MANY), self._search()
+        state = search.judged(now, tests)
+        if not few[tests.group[tests.used & (state.over > 1.0)]].any():
+            return self.factor
+        best = search.likeliest(state, few)
+        if best is None or not best.failing.any():
+            return self.factor
+        return np.maximum(self.factor, np.where(few, best.supposed, 1.0))
 
-def _allowed(system: LinearSystem, found: Candidates, now: Adjustment, options: SearchOptions) -> BoolArray:
-    mask = found.mask() & system.used
-    if options.kinds is not None:
-        for row in np.flatnonzero(mask).tolist():
-            mask[row] = observation_name(now, row)[0] in options.kinds
-    return mask
+    def _suspected(self, state: State[Snooping]) -> list[int]:
+        """Whom a robust solution suspects, worst first."""
+        squares = self.snooping.robust_squares(state.tests.freedom, self.factor)
+        limit = limits(self.options.family_alpha, state.tests.freedom, self.n_tests)
+        ratio = np.where(state.tests.used & self.snooping.candidates, squares / limit, 0.0)
+        return [int(o) for o in np.argsort(-ratio, kind="stable")[: int(np.count_nonzero(ratio > 1.0))]]
 
+    def _limits(self) -> FloatArray:
+        """Of the tests (M,) of whole observations."""
+        s = self.snooping
+        return limits(self.options.family_alpha, s.sizes, self.n_tests) * self.factor[s.group]
 
-def _level(options: SearchOptions, n_tests: int) -> float:
-    if options.levels.method == "sidak":
-        return sidak(options.levels.family_alpha, n_tests)
-    return float(criteria(options.levels, n_tests).alpha[0])
+    def _decision(self, action: Action, o: int, now: Snooping, how: str) -> Decision:
+        (kind, ids), v, g = self._name(o), now.verdict(o), int(now.group[o])
+        factor = float(self.factor[g])
+        limit = float(limits(self.options.family_alpha, np.array(v.freedom), self.n_tests)) * factor
+        p = float(chi2.sf(v.statistic / factor, max(v.freedom, 1)))
+        group = now.system.group_names[g]
+        return Decision(action, kind, group, ids, v.statistic, v.freedom, p, limit, v.error, self.number, how)
 
+    def result(
+        self, state: State[Snooping], out: Iterable[int], needed: Iterable[int], log: list[Decision], converged: bool,
+        adjustment: Adjustment,
+    ) -> OutlierSearch:  # fmt: skip
+        """With ``out`` left out, and what is ``needed`` in use, though it fails."""
+        used = self.snooping.used.copy()
+        used[[*out, *needed]] = False
+        now = state.solution.using(used)
+        last, names = self._search().judged(now, now.tests()), now.system.group_names
+        rejected = [self._decision("rejected", o, now, "test") for o in out]
+        suspects = [*np.flatnonzero(last.tests.used & (last.over > 1.0)).tolist(), *needed]
+        suspects.sort(key=lambda o: -float(last.over[o]))
+        mine = {names[g] for g in np.unique(now.group[now.candidates]).tolist()}
+        return OutlierSearch(
+            adjustment, adjustment.survey, tuple(sorted(rejected, key=lambda d: -d.statistic / d.limit)), tuple(log),
+            tuple(self._decision("rejected", o, now, "test") for o in suspects), self.number, converged,
+            tuple(self._alternative(x) for x in equal_sets(now, self._limits())),
+            tuple(n for n, timid in zip(names, self.cautious, strict=False) if timid),
+            tuple((n, float(f)) for n, f in zip(names, self.factor, strict=False) if f > 1.0 and n in mine),
+        )  # fmt: skip
 
-def _anything_fails(snooping: Snooping) -> bool:
-    excess, _ = snooping.failing()
-    return bool(excess.max(initial=0.0) > 1.0)
-
-
-def _suspected(
-    system: LinearSystem, snooping: Snooping, freedom: IntArray, log: list[Decision],
-    now: Adjustment, round_: int,
-) -> list[int]:  # fmt: skip
-    """Whom a robust solution suspects, worst first."""
-    squares = robust_squares(system, freedom, snooping.factors)
-    limits = chi2.isf(snooping.level, np.maximum(freedom, 1))
-    ratio = np.where(system.used & snooping.candidates, squares / limits, 0.0)
-    order = np.argsort(-ratio, kind="stable")
-    suspects = [int(o) for o in order[: int(np.count_nonzero(ratio > 1.0))]]
-    for o in suspects:
-        if snooping.failing()[1][o]:
-            log.append(_decision("rejected", o, snooping, now, round_, "robust"))
-            snooping.leave_out(o)
-    snooping.take_back(list(snooping.out))
-    return suspects
-
-
-def _settle(snooping: Snooping, log: list[Decision], now: Adjustment, round_: int) -> None:
-    """Take back what fits, leave out what fails worst, until neither is left; each comes back once in a round."""
-    returned: set[int] = set()
-    for _ in range(2 * len(snooping.sizes) + 2):
-        back = [o for o in snooping.fitting() if o not in returned]
-        if back:
-            best = min(back, key=lambda o: snooping.verdict(o).statistic)
-            log.append(_decision("readmitted", best, snooping, now, round_, "test"))
-            returned.add(best)
-            snooping.take_back([best])
-            continue
-        excess, possible = snooping.failing()
-        excess = np.where(possible, excess, 0.0)
-        worst = int(excess.argmax()) if len(excess) else 0
-        if not len(excess) or excess[worst] <= 1.0:
-            return
-        log.append(_decision("rejected", worst, snooping, now, round_, "test"))
-        snooping.leave_out(worst)
-
-
-def _decision(action: Action, o: int, snooping: Snooping, now: Adjustment, round_: int, how: str) -> Decision:
-    kind, ids = observation_name(now, o)
-    v = snooping.verdict(o)
-    group = snooping.system.group_names[int(snooping.system.group[o])]
-    return Decision(action, kind, group, ids, v.statistic, v.freedom, v.p, v.limit, v.error, round_, how)
-
-
-def _decisions(
-    action: Action, rows: Iterable[int], snooping: Snooping, now: Adjustment, round_: int, how: str
-) -> list[Decision]:
-    return [_decision(action, o, snooping, now, round_, how) for o in rows]
-
-
-def _suspects(snooping: Snooping, now: Adjustment, round_: int) -> tuple[Decision, ...]:
-    excess, _ = snooping.failing()
-    rows = np.argsort(-excess, kind="stable")[: int(np.count_nonzero(excess > 1.0))]
-    return tuple(_decisions("rejected", [int(r) for r in rows], snooping, now, round_, "test"))
+    def _alternative(self, x: Exchange) -> Alternative:
+        kept, instead = (tuple((kind, *ids) for kind, ids in map(self._name, part)) for part in (x.kept, x.instead))
+        return Alternative(kept, instead, float(np.exp(0.5 * x.more)))

@@ -7,14 +7,13 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.distributions import chi2, fisher
-from adjust.graph.assembly import GraphBuilder
+from adjust.graph.assembly import GraphBuilder, values_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.observations.factors import ChainPose
-from adjust.precision.pose_networks import rotations_only
-from adjust.statistics.pair_screen import values_of
+from adjust.precision.precision import rotations_only
 from adjust.statistics.result import Ellipsoid, RelativePrecision
 
 _HELD = 1e-16

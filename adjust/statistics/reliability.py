@@ -8,12 +8,10 @@ import numpy as np
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.terrestrial.statistics import influences as influences_of_readings
-from adjust.precision.pose_networks import NamedPrecision
-from adjust.precision.precision import Precision, noise_of
+from adjust.precision.precision import Precision
 from adjust.statistics.condensed import CondensedSystem, condensed_system
 from adjust.statistics.criteria import criteria
 from adjust.statistics.influence import influences
-from adjust.statistics.pose_networks import network_whitening
 from adjust.statistics.result import (
     Criteria,
     ImageEllipses,
@@ -67,7 +65,7 @@ def reliability(
     n_tests = int(sum(np.count_nonzero(b.x.freedom) for b in batches))
     found = criteria(options, n_tests, int(sizes.max(initial=1)))
     tests = _table(adjustment, batches, ptr, found)
-    if isinstance(adjustment.precision, NamedPrecision) and len(ptr) > LARGEST_NETWORK:
+    if adjustment.survey.is_pose_network and len(ptr) > LARGEST_NETWORK:
         most_influences = 0
     return Reliability(
         found, tests, _ellipses(batches[0], found),
@@ -78,13 +76,6 @@ def reliability(
 
 def _batches(adjustment: Adjustment, system: CondensedSystem | None) -> list[_Batch]:
     """Image points first."""
-    if isinstance(adjustment.precision, NamedPrecision):
-        none = np.zeros((0, 2, 2))
-        first = _Batch(np.zeros(0, dtype=np.int64), whitened(none[:, 0], none, np.zeros(0, dtype=np.bool_)), none, none)
-        found = network_whitening(adjustment, adjustment.precision)
-        backs = [np.asarray(np.linalg.inv(W), dtype=float) for _, _, _, W, _ in found]
-        return [first, *(_Batch(rows, whitened(e, M, used), W, back)
-                         for (rows, e, M, W, used), back in zip(found, backs, strict=True))]  # fmt: skip
     precision = system.system.precision if system is not None else precision_of(adjustment)
     return [_images(precision), *_others(precision), *_readings(precision)]
 
@@ -148,14 +139,31 @@ def _others(precision: Precision) -> list[_Batch]:
     """All other observations, those with the same number of components together."""
     n_image = sum(len(b.uv) for b in precision.graph.survey.image_blocks)
     found: dict[int, list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]]] = {}
-    for i, item in enumerate(precision.graph.others):
-        e, M, back = precision.influence(item)
-        found.setdefault(len(e), []).append((n_image + i, e, M, np.asarray(noise_of(item).R()), back))
+    for i in precision.single:
+        x = precision.rows(precision.graph.others[i])
+        found.setdefault(len(x.e), []).append((n_image + i, x.e, x.influence, x.W, x.root))
     out = []
     for same in found.values():
         rows, e, M, W, back = (np.array([x[i] for x in same]) for i in range(5))
         used = np.array([precision.graph.others[i - n_image].used for i in rows], dtype=np.bool_)
         out.append(_Batch(rows, whitened(e, M, used), W, back))
+    return out + _pairs(precision, n_image)
+
+
+def _pairs(precision: Precision, n_image: int) -> list[_Batch]:
+    """Pairs between fixed stations, poses and rotations."""
+    batch, out = precision.graph.pairs, list[_Batch]()
+    if batch is None:
+        return out
+    stats, arrays = precision.pairs, batch.arrays
+    for k, kind in ((6, arrays.is_pose), (3, ~arrays.is_pose)):
+        chosen = np.flatnonzero(kind)
+        if len(chosen):
+            W = arrays.whitening[chosen, :k, :k]
+            M = W @ stats.adjusted_cov[chosen, :k, :k] @ W.transpose(0, 2, 1)
+            x = whitened(stats.whitened[chosen, :k], M, np.asarray(arrays.used[chosen], dtype=np.bool_))
+            rows = n_image + precision.graph.first_pair + batch.rows[chosen]
+            out.append(_Batch(rows, x, W, np.asarray(np.linalg.inv(W))))
     return out
 
 

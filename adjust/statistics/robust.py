@@ -14,10 +14,9 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.solver import Solved, SolveOptions, solve
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.precision.precision import Precision, image_residuals
-from adjust.statistics.criteria import cautious
+from adjust.statistics.criteria import cautious, limits, typical_factor
 
 _CAUCHY = 2.385**2
-_MEDIAN = 2.0 * np.log(2.0)  # of chi-square with two degrees of freedom
 _FAMILY = 0.001
 _ROUNDS = 6
 
@@ -33,13 +32,12 @@ class Screened:
 
 def limit(n: int) -> float:
     """Chi-square (2) that one of n good image points exceeds with probability 0.001."""
-    return float(-2.0 * np.log(-np.expm1(np.log1p(-_FAMILY) / max(1, n))))
+    return float(limits(_FAMILY, np.array(2), n))
 
 
 def scale(test: FloatArray) -> float:
     """Variance factor of most points, not below the a priori 1."""
-    test = test[np.isfinite(test)]
-    return max(1.0, float(np.median(test)) / _MEDIAN) if test.size else 1.0
+    return float(np.fmax(1.0, typical_factor(test, np.full(len(test), 2))))
 
 
 def screen(graph: AdjustmentGraph, solved: Solved, options: SolveOptions) -> Screened:
@@ -49,18 +47,18 @@ def screen(graph: AdjustmentGraph, solved: Solved, options: SolveOptions) -> Scr
     precision = Precision(graph, solved)
     test = image_residuals(precision).test
     if not cautious(test[used], np.full(int(used.sum()), 2)) and _suspects(test, used).any():
-        graph.start = _reweighted(graph, solved, used, options)
+        start = _reweighted(graph, solved, used, options)
         for _ in range(_ROUNDS):
-            solved = solve(graph, options)
+            solved = solve(graph, options, start=start)
             precision = Precision(graph, solved)
             now = given & ~_suspects(image_residuals(precision).test, given)
             if (now == used).all():
                 break
             used = now
             graph.set_weights(used.astype(np.float64))
-            graph.start = solved.values
+            start = solved.values
         else:  # still changing its mind: what is returned is the least squares of what it says is used
-            solved = solve(graph, options)
+            solved = solve(graph, options, start=start)
             precision = Precision(graph, solved)
     return Screened(solved, precision, used)
 
@@ -77,8 +75,8 @@ def _reweighted(graph: AdjustmentGraph, solved: Solved, used: BoolArray, options
     for _ in range(15):
         factor = scale(e[used])
         graph.set_weights(used / (1.0 + e / (_CAUCHY * factor)))
-        graph.start = values
-        values = solve(graph, SolveOptions(max_step=1e-2, max_iterations=options.max_iterations)).values
+        roughly = SolveOptions(max_step=1e-2, max_iterations=options.max_iterations)
+        values = solve(graph, roughly, start=values).values
         before, e = e, graph.whitened_squares(values)
         if np.abs(np.sqrt(e[used]) - np.sqrt(before[used])).max() < 0.05 * np.sqrt(factor):
             break

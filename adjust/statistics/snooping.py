@@ -1,177 +1,174 @@
-"""Gross errors of a linear system, found one after the other: data snooping by elimination.
+"""A linear system from which observations are left out one after the other, and to which they come back.
 
 With an observation's own directions C (whitened), ``g = C' e`` and ``R = C' (I - A Q A') C`` decide: T = g' R^-1 g. To
 leave it out is to give it a bias of its own, which takes its share off the R and g of all others: one step of a
-Cholesky factorisation of R with pivots chosen by the test (Baarda 1968; Kok 1984 for the iteration). Nothing is solved
-again. What is out is tested with the others out, and comes back where it fits.
+Cholesky factorisation of R with pivots chosen by the test (Baarda 1968). Nothing is solved again. What is out is tested
+with the others out.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from copy import copy
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
-from adjust.distributions import chi2, fisher
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.observations.terrestrial.statistics import influences as influences_of_readings
+from adjust.precision.precision import Precision
+from adjust.statistics.gross_errors import Verdicts
 from adjust.statistics.single_tests import CONTROLLED, eigen2
 from adjust.statistics.system import LinearSystem
 
+_CAUCHY = 2.385**2
 
-@dataclass(frozen=True)
-class Verdict:
-    """Test of one observation: statistic with freedom over its variance factor, its limit, p, error in sigmas."""
+
+class Verdict(NamedTuple):
+    """Test of one observation: statistic with its degrees of freedom, estimated error in sigmas."""
 
     statistic: float
     freedom: int
-    limit: float
-    p: float
     error: float
 
 
-@dataclass(eq=False)
 class Snooping:
-    """A linear system from which observations are left out, and to which they come back.
+    """The tests of a linear system's observations from ``first`` on, which are counted from there, as their rows are.
 
-    candidates: (M,) may be left out. level: error probability of one test. factors: (G,) by which the typical test of
-    a group is too large, 1 or more. posterior: tests with sigma0 of the remaining observations.
+    Those before it are all kept, and may stand condensed; n_kept: their components. candidates: (M,) may be left out.
+    out: what is, in order; columns: of each U (m, k), what its error shows elsewhere, and its share (k,). left:
+    redundancy; omega: v'Pv of all that is in use.
     """
 
-    system: LinearSystem
-    candidates: BoolArray
-    level: float
-    factors: FloatArray
-    posterior: bool = False
-    out: list[int] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        s = self.system
-        self.A, self.e = s.A, s.e.copy()
-        if s.joint:
-            self._turn_joint()
-        self.sizes = np.diff(s.ptr)
-        self.g, self.R = self._start()
+    def __init__(self, system: LinearSystem, candidates: BoolArray, first: int = 0, n_kept: int = 0) -> None:
+        s, at = system, int(system.ptr[first])
+        self.system, self.candidates = system, candidates
+        self.ptr, self.row_of = s.ptr[first:] - at, s.row_of[at:] - first
+        self.used, self.group, self.sizes = s.used[first:], s.group[first:], np.diff(self.ptr)
+        self.joint = [(j.rows - at, j.W / np.linalg.norm(j.W, axis=0)) for j in s.joint]
+        self.joint_of = {o - first: x for o, x in s.joint_of.items()}
+        rows = s.used[s.row_of]
+        # at the solution of the system itself, which is not where it was linearised if others are used
+        e = s.e - s.A @ s.normal.solve(np.asarray(s.A[rows].T @ s.e[rows]))
+        self.A, self.g = self._turned(s.A[at:], e[at:])
+        self.alike = [np.flatnonzero(self.sizes == k) for k in np.unique(self.sizes)]
+        self.R = self._own_blocks(first)
+        self.out: list[int] = []
         self.columns: dict[int, tuple[FloatArray, FloatArray]] = {}
-        self.omega = float(np.sum(s.e[s.used[s.row_of]] ** 2))
-        self.left = int(s.used[s.row_of].sum()) - len(s.columns) + s.datum.shape[0]
+        self.omega = float(e[rows] @ e[rows])
+        self.left = n_kept + int(self.used[self.row_of].sum()) - len(s.columns) + s.datum.shape[0]
 
-    def _turn_joint(self) -> None:
+    def _turned(self, A: sparse.csr_matrix, e: FloatArray) -> tuple[sparse.csr_matrix, FloatArray]:
         """Rows of joint readings by their own directions: W' over its lengths."""
-        m = self.A.shape[0]
+        if not self.joint:
+            return A, e
+        m = A.shape[0]
         kept = np.ones(m)
-        kept[np.concatenate([j.rows for j in self.system.joint])] = 0.0
+        kept[np.concatenate([rows for rows, _ in self.joint])] = 0.0
         turn = sparse.diags(kept).tocoo()
         parts = [(turn.row, turn.col, turn.data)]
-        for joint in self.system.joint:
-            C = joint.W / np.linalg.norm(joint.W, axis=0)
-            k = len(joint.rows)
-            parts.append((np.repeat(joint.rows, k), np.tile(joint.rows, k), C.T.ravel()))
+        for rows, C in self.joint:
+            k = len(rows)
+            parts.append((np.repeat(rows, k), np.tile(rows, k), C.T.ravel()))
         r, c, v = (np.concatenate(x) for x in zip(*parts, strict=True))
         turned = sparse.csr_matrix((v, (r, c)), shape=(m, m))
-        self.A, self.e = (turned @ self.A).tocsr(), turned @ self.e
+        return (turned @ A).tocsr(), turned @ e
 
-    def _start(self) -> tuple[FloatArray, list[FloatArray]]:
-        """G (m,) and the own blocks of R by observation size.
+    def rows(self, observations: IntArray) -> IntArray:
+        """Rows (n, k) of observations (n,) of the same size."""
+        return np.asarray(self.ptr[observations][:, None] + np.arange(int(self.sizes[observations[0]])))
 
-        At the solution of the system itself, which is not where it was linearised if others are used.
-        """
-        s, A = self.system, self.A
-        step = s.normal.solve(np.asarray(s.A[s.used[s.row_of]].T @ s.e[s.used[s.row_of]]))
-        return self.e - A @ step, self._own_blocks()
+    def _own_blocks(self, first: int) -> list[FloatArray]:
+        """Own blocks of R: from the covariances of the tree, but for image points and joint readings."""
+        known = np.zeros(len(self.used), dtype=np.bool_)
+        blocks = [np.tile(np.eye(int(self.sizes[members[0]])), (len(members), 1, 1)) for members in self.alike]
+        if first == self.system.n_image:
+            known[[o for o in range(len(known)) if o not in self.joint_of]] = True
+            influence, before = _influences(self.system.precision)
+            more = np.flatnonzero(self.used != before)  # in use here alone
+            index = np.concatenate([np.arange(self.ptr[o], self.ptr[o + 1]) for o in more] or [more])
+            U = -np.asarray(self.A @ self.system.normal.solve(self.A[index].T.toarray()))
+            inverse = np.linalg.inv(np.eye(len(index)) + U[index])
+            for members, R in zip(self.alike, blocks, strict=True):
+                own = U[self.rows(members)]
+                R -= np.array([influence[o] for o in members]) - own @ inverse @ own.transpose(0, 2, 1)
+        for members, R in zip(self.alike, blocks, strict=True):
+            if not known[members].all():
+                R[~known[members]] = self._solved_blocks(members[~known[members]])
+        return blocks
 
-    def _own_blocks(self) -> list[FloatArray]:
-        s, out = self.system, []
-        for k in np.unique(self.sizes):
-            members = np.flatnonzero(self.sizes == k)
-            blocks = np.tile(np.eye(int(k)), (len(members), 1, 1))
-            for first in range(0, len(members), 512):
-                part = members[first : first + 512]
-                rows = (s.ptr[part][:, None] + np.arange(k)).ravel()
-                A = self.A[rows]
-                x = s.normal.solve(A.T.toarray()).T.reshape(len(part), int(k), -1)
-                full = A.toarray().reshape(len(part), int(k), -1)
-                blocks[first : first + 512] -= np.einsum("nij,nkj->nik", full, x)
-            out.append(blocks)
-        return out
+    def _solved_blocks(self, members: IntArray) -> FloatArray:
+        """The same from the normal matrix, of observations of the same size."""
+        k, normal = int(self.sizes[members[0]]), self.system.normal
+        blocks = np.tile(np.eye(k), (len(members), 1, 1))
+        for first in range(0, len(members), 512):
+            part = members[first : first + 512]
+            A = self.A[self.rows(part).ravel()]
+            x = normal.solve(A.T.toarray()).T.reshape(len(part), k, -1)
+            blocks[first : first + 512] -= np.einsum("nij,nkj->nik", A.toarray().reshape(len(part), k, -1), x)
+        return blocks
 
     # -- tests -------------------------------------------------------------------------------------------------------
 
-    def statistics(self) -> tuple[FloatArray, IntArray, BoolArray]:
-        """T, freedom and whether all directions are controlled, of all observations (M,)."""
-        T, freedom = np.zeros(len(self.sizes)), np.zeros(len(self.sizes), dtype=np.int64)
-        whole = np.zeros(len(self.sizes), dtype=np.bool_)
-        for k, R in zip(np.unique(self.sizes), self.R, strict=True):
-            members = np.flatnonzero(self.sizes == k)
-            g = self.g[(self.system.ptr[members][:, None] + np.arange(k))]
-            if k == 2:
-                values, vectors = eigen2(R)
-            else:
-                values, vectors = np.linalg.eigh(R)
+    def tests(self) -> Verdicts:
+        """Of all observations (M,), with what is kept as the last of the groups."""
+        M, n_groups = len(self.sizes), len(self.system.group_names) + 1
+        T, freedom, whole, own = np.zeros(M), np.zeros(M, dtype=np.int64), np.zeros(M, dtype=np.bool_), np.zeros(M)
+        for members, R in zip(self.alike, self.R, strict=True):
+            g = self.g[self.rows(members)]
+            values, vectors = eigen2(R) if R.shape[1] == 2 else np.linalg.eigh(R)
             seen = values > CONTROLLED
             along = np.einsum("nij,ni->nj", vectors, g)
             T[members] = np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0).sum(axis=1)
             freedom[members], whole[members] = seen.sum(axis=1), seen.all(axis=1)
-        return T, freedom, whole
-
-    def _factor(self, rows: IntArray) -> FloatArray:
-        return np.asarray(self.factors[self.system.group[rows]])
-
-    def _excess(self, T: FloatArray, freedom: IntArray, rows: IntArray, inside: bool = True) -> FloatArray:
-        """Tests over their limits, above 1 where they fail."""
-        q = np.maximum(freedom, 1)
-        if not self.posterior:
-            return np.asarray(np.where(freedom > 0, T / (chi2.isf(self.level, q) * self._factor(rows)), 0.0))
-        left = np.maximum(self.left - q if inside else np.full(len(q), self.left), 1)
-        rest = np.maximum(self.omega - T if inside else np.full(len(T), self.omega), 1e-300)
-        F = (T / q) / (rest / left)
-        return np.asarray(np.where(freedom > 0, F / fisher.isf(self.level, q, left), 0.0))
-
-    def excess_outside(self, T: FloatArray, freedom: IntArray, rows: IntArray) -> FloatArray:
-        """Tests (k,) of observations that are out over their limits, above 1 where they fail."""
-        return self._excess(T, freedom, rows, inside=False)
-
-    def failing(self) -> tuple[FloatArray, BoolArray]:
-        """Excess (M,) of all observations in use, and which of them (M,) can be left out."""
-        T, freedom, whole = self.statistics()
-        used = self.system.used.copy()
+            own[members] = np.einsum("nii->n", R)
+        used = self.used.copy()
         used[self.out] = False
-        excess = np.where(used, self._excess(T, freedom, np.arange(len(T))), 0.0)
-        return excess, used & whole & self.candidates
+        for o, (statistic, _) in self._outside().items():
+            T[o], freedom[o] = statistic, self.sizes[o]
+        freedom[~self.used] = 0
+        rows = used[self.row_of]
+        omega, redundancy = np.zeros(n_groups), np.zeros(n_groups)
+        np.add.at(omega, self.group[self.row_of[rows]], self.g[rows] ** 2)
+        np.add.at(redundancy, self.group[used], own[used])
+        omega[-1], redundancy[-1] = max(0.0, self.omega - omega.sum()), max(0.0, self.left - redundancy.sum())
+        return Verdicts(T, freedom, used, used & whole & self.candidates, self.group, omega, redundancy)
 
     def verdict(self, observation: int) -> Verdict:
-        """Of an observation that is out: its test with all others out. Of one in use: its test now."""
-        k = int(self.sizes[observation])
-        if observation in self.out:
-            T, error = self._outside()[observation]
-            freedom, inside = k, False
-        else:
-            number = int(np.flatnonzero(np.unique(self.sizes) == k)[0])
-            at = int(np.searchsorted(np.flatnonzero(self.sizes == k), observation))
-            R = self.R[number][at]
-            g = self.g[self.system.ptr[observation] : self.system.ptr[observation + 1]]
-            inverse = np.linalg.pinv(R, rcond=CONTROLLED, hermitian=True)
-            T, error = float(g @ inverse @ g), float(np.linalg.norm(inverse @ g))
-            freedom, inside = int(np.linalg.matrix_rank(R, tol=CONTROLLED, hermitian=True)), True
-        rows, q = np.array([observation]), np.array([freedom])
-        excess = float(self._excess(np.array([T]), q, rows, inside)[0])
-        factor = float(self._factor(rows)[0])
-        limit = T / excess if excess > 0.0 else float("nan")
-        if self.posterior:
-            left, rest = (self.left - freedom, self.omega - T) if inside else (self.left, self.omega)
-            p = float(fisher.sf(T / freedom / (max(rest, 1e-300) / max(left, 1)), freedom, max(left, 1)))
-        else:
-            p = float(chi2.sf(T / factor, max(freedom, 1)))
-        return Verdict(T, freedom, limit, p, error)
+        """Of an observation that is out: with all others out. Of one in use: now."""
+        if observation in self.columns:
+            statistic, error = self._outside()[observation]
+            return Verdict(statistic, int(self.sizes[observation]), error)
+        R, g = self._own(observation), self.g[self.ptr[observation] : self.ptr[observation + 1]]
+        bias = np.linalg.pinv(R, rcond=CONTROLLED, hermitian=True) @ g
+        freedom = int(np.linalg.matrix_rank(R, tol=CONTROLLED, hermitian=True))
+        return Verdict(float(g @ bias), freedom, float(np.linalg.norm(bias)))
+
+    def possible(self, observation: int) -> bool:
+        """Whether an observation in use may be left out, and leaves nothing open."""
+        mine = self.used[observation] and self.candidates[observation] and observation not in self.columns
+        return bool(mine and np.linalg.eigvalsh(self._own(observation))[0] > CONTROLLED)
+
+    def _own(self, observation: int) -> FloatArray:
+        kind = int(np.searchsorted(np.array([self.sizes[m[0]] for m in self.alike]), self.sizes[observation]))
+        return np.asarray(self.R[kind][int(np.searchsorted(self.alike[kind], observation))])
 
     # -- leaving out and taking back ---------------------------------------------------------------------------------
 
+    def using(self, used: BoolArray) -> "Snooping":
+        """The same with other observations (M,) in use."""
+        new = copy(self)
+        new.R, new.out, new.columns = list(self.R), list(self.out), dict(self.columns)
+        new.take_back([o for o in self.out if used[o]])
+        for o in np.flatnonzero(self.used & ~used).tolist():
+            if o not in new.columns:
+                new.leave_out(o)
+        return new
+
     def leave_out(self, observation: int) -> None:
         """Give the observation a bias of its own."""
-        s = self.system
-        rows = np.arange(int(s.ptr[observation]), int(s.ptr[observation + 1]))
+        rows = np.arange(int(self.ptr[observation]), int(self.ptr[observation + 1]))
         column = self.start_column(rows)
-        for before in self.out:
-            U = self.columns[before][0]
+        for U, _ in self.columns.values():
             column -= U @ U[rows].T
         own = column[rows]
         L = np.linalg.cholesky(0.5 * (own + own.T))
@@ -183,6 +180,8 @@ class Snooping:
 
     def take_back(self, observations: Sequence[int]) -> None:
         """As if these had never been left out."""
+        if not observations:
+            return
         kept = [o for o in self.out if o not in set(observations)]
         for o in reversed(self.out):
             self._take(*self.columns.pop(o), -1.0)
@@ -192,29 +191,26 @@ class Snooping:
 
     def start_column(self, rows: IntArray) -> FloatArray:
         """Columns (m, k) of R at the start."""
-        s = self.system
-        right = self.A[rows].T.toarray()
-        out = -np.asarray(self.A @ s.normal.solve(right))
-        joint = s.joint_of.get(int(s.row_of[rows[0]]))
+        out = -np.asarray(self.A @ self.system.normal.solve(self.A[rows].T.toarray()))
+        joint = next(((at, C) for at, C in self.joint if rows[0] in at), None)
         if joint is None:
             out[rows, np.arange(len(rows))] += 1.0
         else:
-            C = joint[0].W / np.linalg.norm(joint[0].W, axis=0)
-            out[joint[0].rows, 0] += C.T @ C[:, joint[1]]
+            at, C = joint
+            out[at, 0] += C.T @ C[:, int(np.flatnonzero(at == rows[0])[0])]
         return out
 
     def _take(self, U: FloatArray, share: FloatArray, sign: float) -> None:
         self.g = self.g - sign * (U @ share)
-        for number, k in enumerate(np.unique(self.sizes)):
-            members = np.flatnonzero(self.sizes == k)
-            own = U[self.system.ptr[members][:, None] + np.arange(k)]
+        for number, members in enumerate(self.alike):
+            own = U[self.rows(members)]
             self.R[number] = self.R[number] - sign * np.einsum("nia,nja->nij", own, own)
         self.omega -= sign * float(share @ share)
         self.left -= int(sign) * len(share)
 
     def _outside(self) -> dict[int, tuple[float, float]]:
         """T of every observation that is out, with the others out, and its estimated error in sigmas."""
-        rows = [np.arange(int(self.system.ptr[o]), int(self.system.ptr[o + 1])) for o in self.out]
+        rows = [np.arange(int(self.ptr[o]), int(self.ptr[o + 1])) for o in self.out]
         if not rows:
             return {}
         index = np.concatenate(rows)
@@ -229,43 +225,39 @@ class Snooping:
             found[o] = float(bias[k] @ np.linalg.solve(cov[k, k], bias[k])), float(np.linalg.norm(bias[k]))
         return found
 
-    def fitting(self) -> list[int]:
-        """Observations that are out, and fit."""
-        found = self._outside()
-        if not found:
-            return []
-        rows = np.array(list(found))
-        T = np.array([found[int(r)][0] for r in rows])
-        excess = self.excess_outside(T, self.sizes[rows], rows)
-        return [int(r) for r, x in zip(rows, excess, strict=True) if x <= 1.0]
+    def robust_squares(self, freedom: IntArray, factors: FloatArray, rounds: int = 20) -> FloatArray:
+        """Weighted squares (M,), over the factors (G,) of the groups, where Cauchy weights settle (Huber 1981, 7.8).
+
+        The constant is that of Zhang (1997). What is kept keeps its weight.
+        """
+        s, q, at = self.system, np.maximum(freedom, 1), self.system.A.shape[0] - len(self.row_of)
+        used, weights = s.used[s.row_of].astype(float), np.ones(len(self.used))
+
+        def of(e: FloatArray) -> FloatArray:
+            return np.bincount(self.row_of, weights=e[at:] ** 2, minlength=len(q)) / factors[self.group]
+
+        squares = of(s.e)
+        for _ in range(rounds):
+            new = 1.0 / (1.0 + squares / (_CAUCHY * q))
+            for rows, _ in self.joint:  # one weight for what is whitened together
+                mine = self.row_of[rows]
+                new[mine] = new[mine].min()
+            if np.abs(new - weights).max() < 1e-2:
+                break
+            weights = new
+            of_rows = used.copy()
+            of_rows[at:] *= (weights / factors[self.group])[self.row_of]
+            step = s.normal_of(of_rows).solve(np.asarray(s.A.T @ (of_rows * s.e)))
+            squares = of(s.e - s.A @ step)
+        return squares
 
 
-def robust_squares(system: LinearSystem, freedom: IntArray, factors: FloatArray, rounds: int = 20) -> FloatArray:
-    """Weighted squares (M,), over the factors (G,) of the groups, where Cauchy weights settle (Huber 1981, 7.8).
-
-    The constant is that of Zhang (1997).
-    """
-    used_rows, q = system.used[system.row_of], np.maximum(freedom, 1)
-    weights = np.ones(len(system.used))
-    squares = _squares(system, system.e, factors)
-    for _ in range(rounds):
-        new = 1.0 / (1.0 + squares / (_CAUCHY * q))
-        for joint in system.joint:  # one weight for what is whitened together
-            mine = system.row_of[joint.rows]
-            new[mine] = new[mine].min()
-        if np.abs(new - weights).max() < 1e-2:
-            break
-        weights = new
-        of_rows = np.where(used_rows, (weights / factors[system.group])[system.row_of], 0.0)
-        step = system.normal_of(of_rows).solve(np.asarray(system.A.T @ (of_rows * system.e)))
-        squares = _squares(system, system.e - system.A @ step, factors)
-    return squares
-
-
-_CAUCHY = 2.385**2
-
-
-def _squares(system: LinearSystem, e: FloatArray, factors: FloatArray) -> FloatArray:
-    out = np.zeros(len(system.used))
-    np.add.at(out, system.row_of, e**2)
-    return out / factors[system.group]
+def _influences(precision: Precision) -> tuple[list[FloatArray], BoolArray]:
+    """Whitened A Q A' (k, k) of everything but image points in the solution, and which of it that uses (M,)."""
+    graph, readings = precision.graph, precision.graph.terrestrial
+    found = [precision.influence(item)[1] for item in graph.others]
+    used = np.array([item.used for item in graph.others], dtype=np.bool_)
+    if readings is None:
+        return found, used
+    found += list(influences_of_readings(readings, precision.tree)[:, None, None])
+    return found, np.concatenate([used, readings.used])

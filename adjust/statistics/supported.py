@@ -18,7 +18,7 @@ from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName
 from adjust.model.survey import Survey
 from adjust.observations.geometry.building import carrier_of
-from adjust.statistics.lost_points import without_named_points
+from adjust.statistics.undetermined_points import without_named_points
 
 Needs = frozenset[ParameterName]
 _NOTHING: Needs = frozenset()
@@ -41,9 +41,8 @@ def supported(survey: Survey) -> tuple[Survey, tuple[ParameterName, ...]]:
 
 
 def _all_used(survey: Survey) -> bool:
-    kinds = (survey.table_readings, survey.pairs, survey.distances, survey.coordinates, survey.readings, survey.levels,
-             survey.coordinate_differences, survey.alignments, survey.laser_spots, survey.on_surfaces)  # fmt: skip
-    return all(b.used is None or b.used.all() for b in survey.image_blocks) and all(o.used for k in kinds for o in k)
+    images = all(b.used is None or b.used.all() for b in survey.image_blocks)
+    return images and all(o.used for kind in survey.others.values() for o in kind)
 
 
 class _Needs:
@@ -145,7 +144,7 @@ class _Needs:
                     used |= self.of_point(index)
                 unused += [self.of_point(index) for index in np.unique(block.point_idx[~taking]).tolist()]
         for name, all_needs in others.items():
-            for item, needs in zip(getattr(self.survey, name), all_needs, strict=True):
+            for item, needs in zip(self.survey.others[name], all_needs, strict=True):
                 if item.used:
                     used |= needs
                 else:
@@ -164,7 +163,7 @@ class _Needs:
                     reduced.add(name)
         few = {n for n in reduced if 0 < points[n] < _OF_A_POSE and not self._unknowns.parameters[n].held}
         for kind, all_needs in others.items() if few else ():
-            for item, needs in zip(getattr(self.survey, kind), all_needs, strict=True):
+            for item, needs in zip(self.survey.others[kind], all_needs, strict=True):
                 few -= needs if item.used else _NOTHING
         return frozenset(few)
 
@@ -179,7 +178,7 @@ def _without(survey: Survey, needs: _Needs, lost: Needs) -> Survey:
     def left(items: Iterable[Any], of_each: Iterable[Needs]) -> tuple[Any, ...]:
         return tuple(item for item, mine in zip(items, of_each, strict=True) if not mine & lost)
 
-    others: dict[str, Any] = {name: left(getattr(survey, name), of_each) for name, of_each in needs.others().items()}
+    others: dict[str, Any] = {name: left(survey.others[name], of_each) for name, of_each in needs.others().items()}
     kept = replace(survey, image_blocks=left(survey.image_blocks, needs.of_blocks), **others)
     points = {name[1] for name in lost if name[0] == "point"}
     kept = without_named_points(kept, points) if points else kept

@@ -5,25 +5,23 @@ influences, the search for outliers) needs them apart. Rows are linearised at th
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import scipy
-from gtsam import Pose3, Rot3, Values
+from gtsam import Values
 from scipy import sparse
 
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import gauge
-from adjust.graph.solver import solve
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
-from adjust.native.images import block_rows
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
 from adjust.observations.images.bundles import BundleBatch
-from adjust.precision.precision import Precision, noise_of
-from adjust.statistics.pair_screen import values_of
+from adjust.precision.precision import Precision
+from adjust.precision.s_transformation import without_datum_rows
 
 DENSE = 3000
 """Unknowns up to which the normal matrix is factored as a full one."""
@@ -229,8 +227,7 @@ class Normal:
         """Covariance (n, n) of the unknowns: the inverse less what the datum's own rows add (S-transformation)."""
         if self.motions.shape[1] == 0:
             return self.inverse
-        seen = datum @ self.motions
-        return np.asarray(self.inverse - self.motions @ np.linalg.inv(seen.T @ seen) @ self.motions.T)
+        return without_datum_rows(self.inverse, self.motions, datum @ self.motions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +249,7 @@ KeyColumns = dict[int, IntArray]
 
 
 def linear_system(adjustment: Adjustment) -> LinearSystem:
-    """The system of an adjustment; one that was solved as a pose network is built anew. Raises SurveyError."""
+    """The system of an adjustment. Raises SurveyError for one without covariances."""
     return assembled(precision_of(adjustment), _points_apart)
 
 
@@ -315,30 +312,11 @@ def mixed_blocks(system: LinearSystem) -> list[tuple[IntArray, tuple[str, ...], 
 
 
 def precision_of(adjustment: Adjustment) -> Precision:
-    """The precision with its graph; solved once more from the adjusted values where the adjustment has none."""
+    """The precision with its graph. Raises SurveyError where the adjustment has none."""
     found = adjustment.precision
     if isinstance(found, Precision):
         return found
-    survey, start = adjustment.survey, values_of(adjustment)
-    if all(isinstance(p.b_from_a, Rot3) for p in survey.pairs):  # nothing tells where the stations are
-        survey, start = _turning_only(survey, start)
-    graph = GraphBuilder(survey, start.lenses).build(start)
-    if [o.ids for o in graph.others] != [o.ids for o in adjustment.other_residuals[: len(graph.others)]]:
-        raise SurveyError("the adjustment does not fit its survey; adjust the survey again")
-    return Precision(graph, solve(graph))
-
-
-def _turning_only(survey: Survey, start: StartValues) -> tuple[Survey, StartValues]:
-    """A network of rotations with its stations held at the origin."""
-    poses = {n: Pose3(p.rotation(), np.zeros(3)) for n, p in start.poses.items()}
-    stations = []
-    for s in survey.stations:
-        given = s.world_from_station
-        held = given.held if given.treatment == "held" else ("tx", "ty", "tz")
-        own = poses.get(("world_from_station", s.station_id), given.value)
-        pose = given.value if given.treatment == "prior" else own
-        stations.append(replace(s, world_from_station=replace(given, value=pose, held=held)))
-    return replace(survey, stations=tuple(stations)), replace(start, poses=poses)
+    raise SurveyError("the adjustment has no covariances; adjust the survey again")
 
 
 def _columns(graph: AdjustmentGraph) -> Columns:
@@ -419,12 +397,10 @@ def _image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns, values:
 
 def _known_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows:
     images, entries = graph.images, Entries()
-    s, c = images.state, images.chains
     e = np.zeros(2 * images.n_points)
     for b, keys in enumerate(images.keys):
         rows = np.arange(2 * int(images.ptr[b]), 2 * int(images.ptr[b + 1]))
-        local = np.zeros((len(rows), int(images.n_rows[b])))
-        block_rows(b, images.arrays, images.points, images.W_all_columns, s.lenses, c.R, c.t, s.warp, local)
+        local = images.rows(b)
         e[rows] = local[:, -1]
         if keys:
             columns = np.concatenate([key_columns[k] for k in keys])
@@ -472,13 +448,12 @@ def _other_rows(
 ) -> tuple[sparse.csr_matrix, FloatArray, IntArray]:
     entries, residuals, lengths, at = Entries(), [np.zeros(0)], [], 0
     for item in precision.graph.others:
-        linear = item.factor.linearize(precision.solved.values)
-        A, b = linear.jacobian()
-        columns = np.concatenate([key_columns[k] for k in list(linear.keys())])
-        entries.add(np.arange(at, at + len(b)), columns, A)
-        residuals.append(-b)
-        lengths.append(len(b))
-        at += len(b)
+        rows = precision.rows(item)
+        n_rows = len(rows.e)
+        entries.add(np.arange(at, at + n_rows), np.concatenate([key_columns[k] for k in rows.keys]), rows.A)
+        residuals.append(rows.e)
+        lengths.append(n_rows)
+        at += n_rows
     return entries.matrix((at, n)), np.concatenate(residuals), np.array(lengths, dtype=np.int64)
 
 
@@ -504,8 +479,3 @@ def _datum(precision: Precision, n: int, key_columns: KeyColumns) -> tuple[spars
         moved = gauge(precision.graph, precision.graph.unknowns.by_key[key], precision.solved.values) @ datum.directions
         motions[columns[columns >= 0]] = moved[columns >= 0]
     return entries.matrix((datum.defect, n)), motions
-
-
-def root_of(precision: Precision, row: int) -> FloatArray:
-    """Inverse (k, k) of the square root information of the ``row``-th of the graph's other observations."""
-    return np.asarray(np.linalg.inv(noise_of(precision.graph.others[row]).R()))

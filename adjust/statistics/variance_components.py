@@ -12,12 +12,11 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.distributions import chi2
-from adjust.graph.assembly import StartValues
+from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.statistics.group_sums import GroupSums, Moments, group_sums, moments
-from adjust.statistics.pair_screen import values_of
 from adjust.statistics.result import Component, VarianceComponents
 from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.system import DENSE, LinearSystem, linear_system, mixed_blocks, precision_of

@@ -6,6 +6,7 @@ import numpy as np
 
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
+from adjust.precision.s_transformation import without_datum_rows
 from adjust.statistics.result import Correlation, PrincipalComponent, WeakDirection, WeakPart
 from adjust.statistics.system import DENSE, FEW, LinearSystem, linear_system
 
@@ -27,10 +28,9 @@ def covariance_columns(system: LinearSystem, columns: IntArray) -> FloatArray:
 def times_covariance(system: LinearSystem, right: FloatArray) -> FloatArray:
     """The covariance matrix of all unknowns, a priori, in the survey's datum, times (n,) or (n, k)."""
     out = system.normal.solve(right)
-    if system.motions.shape[1]:
-        seen = system.datum @ system.motions
-        out = out - system.motions @ np.linalg.solve(seen.T @ seen, system.motions.T @ right)
-    return out
+    if not system.motions.shape[1]:
+        return out
+    return without_datum_rows(out, system.motions, system.datum @ system.motions, right)
 
 
 def compared_columns(system: LinearSystem) -> IntArray:

@@ -1,7 +1,6 @@
 """The section [table] of a capture plan, and the table that it describes."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -179,8 +178,3 @@ def _zeros(plan: TablePlan) -> list[float]:
 
 
 _MAKERS = {"ascii": _ascii, "standa": _standa, "epics": _epics, "simulated": _simulated}
-
-
-def axis_names(plan: TablePlan | None) -> Mapping[str, int]:
-    """Position of every axis by name."""
-    return {} if plan is None else {axis.axis.name: i for i, axis in enumerate(plan.axes)}

@@ -7,7 +7,6 @@ copied from the plan's template where there is none yet; capture/journal.jsonl, 
 import csv
 import hashlib
 import io
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from adjust.model.survey import FloatArray
 from capture.devices.camera import GrayImage
 from capture.session.journal import Record
 from survey.folder.locking import SESSION_LOCK, FileLock, holder_of
-from survey.folder.text import atomic_write, decode, read_bytes, sync_folder
+from survey.folder.text import atomic_write, decode, read_bytes
 from survey.project.project import DEFINITION_FILE, IMAGES_FOLDER, OBSERVATIONS_FOLDER
 from survey.project.tables.writing import write_table
 
@@ -52,7 +51,7 @@ def write_image(folder: Path, camera_id: str, epoch_id: str, image: GrayImage) -
         raise ValueError(f"image of {camera_id} at {epoch_id}: {image.dtype} {image.shape} is no grey image")
     data = png.tobytes()
     path = folder / IMAGES_FOLDER / camera_id / f"{epoch_id}.png"
-    write_through(path, data)
+    atomic_write(path, data, lasting=True)
     return {
         "path": path.relative_to(folder).as_posix(),
         "sha256": hashlib.sha256(data).hexdigest(),
@@ -60,24 +59,6 @@ def write_image(folder: Path, camera_id: str, epoch_id: str, image: GrayImage) -
         "width": image.shape[1],
         "height": image.shape[0],
     }
-
-
-def write_through(path: Path, data: bytes) -> None:
-    """Temporary name, fsync, rename, fsync of the folder: after it even a cut of the power leaves all or nothing."""
-    if not path.parent.is_dir():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        sync_folder(path.parent.parent)
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with temporary.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.replace(path)
-        sync_folder(path.parent)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def damaged(folder: Path, record: Record) -> str | None:
@@ -99,7 +80,7 @@ def remove_unrecorded(folder: Path, camera_ids: list[str], epoch_ids: set[str]) 
         if not images.is_dir():
             continue
         for path in images.iterdir():
-            is_half = path.name.startswith(".") and path.name.endswith(".png.tmp")
+            is_half = path.name.startswith(".") and ".png." in path.name and path.name.endswith(".tmp")
             if is_half or (path.suffix == ".png" and path.stem in epoch_ids):
                 path.unlink()
                 removed.append(path.relative_to(folder).as_posix())

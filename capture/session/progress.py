@@ -13,6 +13,7 @@ from tqdm import tqdm
 from capture.session.folder import CAPTURE_FOLDER
 from capture.session.quality_thread import quality_text
 from capture.session.run_session import Taken
+from survey.folder.text import atomic_write
 
 
 def status_path(folder: Path) -> Path:
@@ -61,13 +62,8 @@ class Progress:
         """Write the status; a full disk does not matter here."""
         path = status_path(self._folder)
         text = json.dumps({"state": state, "message": message, **self._last})
-        temporary = path.with_name(f".{path.name}.tmp")
-        try:
-            temporary.write_text(text, encoding="utf-8")
-            temporary.replace(path)
-        except OSError:
-            with suppress(OSError):
-                temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            atomic_write(path, text)
 
     def close(self) -> None:
         """End the line."""

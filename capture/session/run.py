@@ -8,11 +8,11 @@ import os
 import signal
 import sys
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 
-from adjust.model.errors import SurveyError
 from capture.devices.turntables.moving import MovingTable
 from capture.plan.plan import CapturePlan, check_plan_limits
 from capture.plan.table import make_table
@@ -26,6 +26,7 @@ from capture.session.run_session import CameraSet, Outcome, Session, Taken
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 _LOOK_S = 0.05
+_noted: deque[int] = deque()
 
 
 def run_plan(plan: CapturePlan, *, shown: bool = True) -> Outcome:
@@ -97,9 +98,9 @@ def run_session(
 
 def _look(control: Control, progress: Progress, pressed: Callable[[], str]) -> None:
     """Wait for a signal for a moment, then for a key."""
-    heard = signal.sigtimedwait(_SIGNALS, _LOOK_S)
-    if heard is not None and heard.si_signo != signal.SIGUSR1:
-        control.stop(f"{signal.Signals(heard.si_signo).name} received")
+    heard = _heard(_LOOK_S)
+    if heard is not None and heard != signal.SIGUSR1:
+        control.stop(f"{signal.Signals(heard).name} received")
         return
     if heard is not None or pressed() in ("p", " "):
         control.toggle_pause()
@@ -107,14 +108,35 @@ def _look(control: Control, progress: Progress, pressed: Callable[[], str]) -> N
         progress.note("pausing before the next set; p goes on" if control.paused else "going on")
 
 
+def _heard(seconds: float) -> int | None:
+    """The next signal, waited for."""
+    if hasattr(signal, "sigtimedwait"):
+        heard = signal.sigtimedwait(_SIGNALS, seconds)
+        return None if heard is None else heard.si_signo
+    time.sleep(seconds)
+    return _noted.popleft() if _noted else None
+
+
 @contextmanager
 def _signals_blocked(control: Control) -> Iterator[Control]:
-    """Signals wait to be fetched, in this thread and in all that are started from now on."""
+    """Signals wait to be fetched, in this thread and in all that are started from now on.
+
+    Without ``sigtimedwait`` (macOS) a handler notes them: only a thread that waits for a signal is sure to get it.
+    """
+    if not hasattr(signal, "sigtimedwait"):
+        handlers = {number: signal.signal(number, lambda heard, _: _noted.append(heard)) for number in _SIGNALS}
+        try:
+            yield control
+        finally:
+            _noted.clear()
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         yield control
     finally:
-        while signal.sigtimedwait(_SIGNALS, 0) is not None:
+        while _heard(0) is not None:
             pass  # a second Ctrl-C while everything is being closed has done its work
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
@@ -140,12 +162,3 @@ def _keys() -> Iterator[Callable[[], str]]:
         yield pressed
     finally:
         termios.tcsetattr(handle, termios.TCSADRAIN, before)
-
-
-def require_free(folder: Path) -> None:
-    """Raise SurveyError while a session works on the folder."""
-    from capture.session.folder import lock_holder
-
-    holder = lock_holder(folder)
-    if holder is not None:
-        raise SurveyError(f"{folder}: a session works on this folder ({holder}); wait for it or stop it")

@@ -3,18 +3,19 @@
 from collections.abc import Sequence
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.model.survey import FloatArray
 from survey.batch.control import WIDTH, Chart
 from survey.report import drawing as d
-from survey.report.language import localised, t
-from survey.report.markup import MINUS, esc, value_text
+from survey.report.language import esc, localised, t
+from survey.report.markup import MINUS, value_text
 
 _WIDE, _HIGH = 540.0, 178.0
 _LEFT, _RIGHT, _TOP, _BASE = 58.0, 8.0, 22.0, 26.0
 
 
-def control_chart(c: Chart, names: Sequence[str], failed: Sequence[int], title: str) -> str:
+def control_chart(c: Chart, names: Sequence[str], failed: Sequence[int], title: str) -> Markup:
     """Values as deviations from the mean, limits from sigmas (band) and from the scatter (dashed), alarms in red.
 
     names: of all epochs of the batch. failed: positions of epochs that have no result, crossed at the bottom.
@@ -53,7 +54,7 @@ def _reach(c: Chart, deviation: FloatArray) -> float:
 def _heading(c: Chart, title: str) -> str:
     mean = value_text(c.mean, c.mean_sigma)
     said = t("mean {mean} {unit}", mean=mean, unit=c.series.unit)
-    return d.text(0, 12, title, colour=d.INK, size=11.5) + d.text(_WIDE - _RIGHT, 12, said, "end")
+    return d.heading(title) + d.text(_WIDE - _RIGHT, 12, said, "end")
 
 
 def _band(x: FloatArray, middle: float, half: FloatArray, step: float) -> str:
@@ -66,17 +67,15 @@ def _band(x: FloatArray, middle: float, half: FloatArray, step: float) -> str:
 
 def _lines(c: Chart, middle: float, unit: float, reach: float) -> list[str]:
     right = _WIDE - _RIGHT
-    parts = [d.line(_LEFT, middle, right, middle, d.GREY, 0.9), d.text(_LEFT - 5, middle + 3.5, "0", "end", 9.5)]
+    parts = [d.line(_LEFT, middle, right, middle, d.GREY, 0.9), d.text(_LEFT - 5, middle + 4, "0", "end", 10)]
     if np.isfinite(c.by_scatter) and 0.0 < c.by_scatter <= reach:
         for sign in (1.0, -1.0):
             at = middle - sign * unit * c.by_scatter
             parts.append(d.line(_LEFT, at, right, at, d.ORANGE, 0.9, ' stroke-dasharray="5 4"'))
     tick = d.round_below(0.8 * reach)
-    for sign in (1.0, -1.0):
-        at, shown = middle - sign * unit * tick, localised(f"{tick:.4g}")
-        parts.append(d.line(_LEFT - 3, at, _LEFT, at))
-        parts.append(d.text(_LEFT - 5, at + 3.5, ("+" if sign > 0 else MINUS) + shown, "end", 9.5))
-    return [*parts, d.text(_LEFT - 5, _TOP + 1, c.series.unit, "end", 9.5)]
+    shown = localised(f"{tick:.4g}")
+    marks = ((middle - unit * tick, "+" + shown), (middle + unit * tick, MINUS + shown))
+    return [*parts, *d.axis_left(_LEFT, marks), d.text(_LEFT - 5, _TOP + 1, c.series.unit, "end", 10)]
 
 
 def _runs(c: Chart, x: FloatArray, y: FloatArray) -> list[str]:
@@ -118,10 +117,5 @@ def _cross(x: float, y: float) -> str:
 def _ticks(names: Sequence[str], step: float) -> list[str]:
     """Names of a few epochs below."""
     n = len(names)
-    base = _HIGH - _BASE
-    parts = [d.line(_LEFT, base, _WIDE - _RIGHT, base, d.FAINT)]
-    for k in sorted({0, n // 2, n - 1} if n > 2 else set(range(n))):
-        at = _LEFT + (k + 0.5) * step
-        side = "start" if k == 0 and n > 2 else "end" if k == n - 1 and n > 2 else "middle"
-        parts += [d.line(at, base, at, base + 3), d.text(at, base + 17, names[k], side, 9.5)]
-    return parts
+    marks = ((_LEFT + (k + 0.5) * step, names[k]) for k in sorted({0, n // 2, n - 1} if n > 2 else set(range(n))))
+    return d.axis_below(_HIGH - _BASE, _LEFT, _WIDE - _RIGHT, marks, ends=n > 2)

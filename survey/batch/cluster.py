@@ -6,7 +6,7 @@ from typing import Any
 
 from adjust.model.errors import SurveyError
 from survey.batch.record import FAILED, Record, record_from
-from survey.batch.worker import Worker
+from survey.batch.worker import Worker, attempts
 
 _own = threading.local()
 _WAIT_SECONDS = 20
@@ -14,8 +14,6 @@ _WAIT_SECONDS = 20
 
 def run_on_worker(task: Mapping[str, Any], retries: int) -> dict[str, Any]:
     """What a worker of the cluster does: every thread of it has a process of ours, which stays for the next folder."""
-    from survey.batch.run import attempts
-
     if not hasattr(_own, "worker"):
         _own.worker = Worker()
     return attempts(_own.worker, task, retries).plain()

@@ -24,7 +24,7 @@ from adjust.distributions import chi2
 from adjust.epochs.states import differences_of, moved_value, origin, value_motions
 from adjust.model.survey import FloatArray
 from adjust.statistics.criteria import sidak
-from survey.report.results import read_covariances
+from survey.solution.covariances import read_covariances
 from survey.solution.quantities import ARCSEC_PER_RAD
 
 _TURNED = 1e-6

@@ -2,26 +2,32 @@
 
 import os
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
+from markupsafe import Markup
 
 from survey.batch.causes import CAUSES
 from survey.batch.charts import control_chart
 from survey.batch.control import ONE_SIDE, TREND, Chart
 from survey.batch.record import FAILED, TEST_FAILED, Record
 from survey.batch.run import counts
-from survey.batch.tables import short_names
+from survey.batch.tables import folders_csv, overview_json, short_names, trends_csv
 from survey.batch.trends import LEVEL, Trends
-from survey.report.document import document
+from survey.folder.replacing import write_set
 from survey.report.language import group_name, known, message, speaking, t
 from survey.report.markup import (
     MISSING,
     count,
-    esc,
+    document,
+    element,
+    figures,
     fixed,
     general,
+    joined,
+    part,
     pill,
     section,
     sigma_text,
@@ -46,12 +52,12 @@ def overview_html(
             ("numbers", "All numbers", _numbers(trends, records)),
             ("folders", "Folders", _folders(records, place)),
         )
-        nav = "".join(f'<a href="#{anchor}">{esc(t(name))}</a>' for anchor, name, body in made if body)
-        shown = f"{_header(records, trends, date)}<nav>{nav}</nav>" + "\n".join(body for _, _, body in made)
+        nav = part("nav", [(anchor, t(name)) for anchor, name, body in made if body])
+        shown = _header(records, trends, date) + nav + joined((body for _, _, body in made), "\n")
         return document(t("Overview of {n} surveys", n=count(len(records))), shown)
 
 
-def _header(records: Sequence[Record], trends: Trends, date: str) -> str:
+def _header(records: Sequence[Record], trends: Trends, date: str) -> Markup:
     n = counts(records)
     alarming = [c for c in trends.charts if trends.is_alarming(c)]
     if n["failed"]:
@@ -73,25 +79,21 @@ def _header(records: Sequence[Record], trends: Trends, date: str) -> str:
         (count(n["not_adjusted_again"]), t("unchanged, not adjusted again")),
         (t("{n} s", n=fixed(seconds, 1)), t("time of all adjustments")),
     )  # fmt: skip
-    shown = "".join(f"<div><b>{value}</b><span>{esc(name)}</span></div>" for value, name in cards)
-    return (
-        f'<header><p class="meta">{t("Overview of a batch")}</p>'
-        f"<h1>{t('Overview of {n} surveys', n=count(len(records)))}</h1>"
-        f'<p class="meta">{esc(date)}</p></header><div class="verdict {kind}"><b>{word}</b><span>{said}</span></div>'
-        f'<div class="cards">{shown}</div>'
-    )
+    title = t("Overview of {n} surveys", n=count(len(records)))
+    head = part("header", t("Overview of a batch"), title, date)
+    return joined((head, part("verdict", kind, word, said), part("cards", cards)))
 
 
-def _link(record: Record, name: str, place: Path) -> str:
+def _link(record: Record, name: str, place: Path) -> Markup:
     report = record.written.get("report.html")
     if not report:
-        return f"<b>{esc(name)}</b>"
-    return f'<a href="{esc(quote(os.fsencode(Path(os.path.relpath(report, place)).as_posix())))}">{esc(name)}</a>'
+        return element("b", name)
+    return part("link", quote(os.fsencode(Path(os.path.relpath(report, place)).as_posix())), name)
 
 
-def _failures(records: Sequence[Record], place: Path) -> str:
+def _failures(records: Sequence[Record], place: Path) -> Markup:
     rows = [
-        (_link(r, name, place), pill("bad", t(CAUSES[r.cause])), _wrapped(esc(message(r.error))), str(r.tries))
+        (_link(r, name, place), pill("bad", t(CAUSES[r.cause])), _wrapped(message(r.error).split("\n")), str(r.tries))
         for r, name in zip(records, short_names(records), strict=True)
         if r.state == FAILED
     ]
@@ -100,18 +102,18 @@ def _failures(records: Sequence[Record], place: Path) -> str:
     return section("failures", "Failures", table(columns, rows) if rows else "", note)
 
 
-def _wrapped(text: str) -> str:
-    return f'<div class="words">{text.replace(chr(10), "<br>")}</div>'
+def _wrapped(lines: Sequence[str]) -> Markup:
+    return element("div", part("lines", lines), "words")
 
 
-def _tests(records: Sequence[Record], place: Path) -> str:
+def _tests(records: Sequence[Record], place: Path) -> Markup:
     rows = []
     for r, name in zip(records, short_names(records), strict=True):
         if r.state == TEST_FAILED:
             test = r.summary["global_test"]
             interval = f"{fixed(test['lower'], 0)} – {fixed(test['upper'], 0)}"
             rows.append((_link(r, name, place), fixed(r.summary["sigma0"], 3), fixed(test["omega"], 1), interval,
-                         esc(_worst_group(r)), _wrapped(_why(r))))  # fmt: skip
+                         _worst_group(r), _wrapped(_why(r))))  # fmt: skip
     columns = ("<Survey", "sigma0", "v'Pv", "expected", "<Worst group", "<Why")
     note = t(
         "Solved, but the residuals are larger than the sigmas say. Worst group: the one whose weighted square sum is "
@@ -128,17 +130,17 @@ def _worst_group(record: Record) -> str:
     return f"{group_name(name)} × {fixed(scale, 2)}"
 
 
-def _why(record: Record) -> str:
+def _why(record: Record) -> list[str]:
     warnings = [w for w in record.warnings if not w.startswith("global test failed")]  # which the reason says
     said = [record.summary.get("reason", ""), *warnings[:_MOST_WARNINGS]]
     more = len(warnings) - _MOST_WARNINGS
-    lines = [esc(message(s)) for s in said if s]
-    return "<br>".join(lines + ([t("{n} more warnings in solution.json.", n=count(more))] if more > 0 else []))
+    lines = [line for s in said if s for line in message(s).split("\n")]
+    return lines + ([t("{n} more warnings in solution.json.", n=count(more))] if more > 0 else [])
 
 
-def _control(records: Sequence[Record], trends: Trends) -> str:
+def _control(records: Sequence[Record], trends: Trends) -> Markup:
     if not trends.charts:
-        return ""
+        return Markup()
     alarming = [c for c in trends.charts if trends.is_alarming(c)]
     quality = [c for c in trends.charts if c.series.name == "sigma0" and c not in alarming]
     shown = [*quality, *alarming[:_MOST_CHARTS]]
@@ -155,16 +157,15 @@ def _control(records: Sequence[Record], trends: Trends) -> str:
     body = _figures(shown, records)
     if calm:
         rest = t("{n} more charts", n=count(len(calm[:_MOST_MORE])))
-        body += f"<details><summary>{rest}</summary>{_figures(calm[:_MOST_MORE], records)}</details>"
-    said = "".join(f"<p>{esc(message(n))}</p>" for n in trends.notes)
+        body += part("details", rest, _figures(calm[:_MOST_MORE], records), False)
+    said = joined(element("p", message(n)) for n in trends.notes)
     return section("control", "Control charts", said + body, note)
 
 
-def _figures(charts: Sequence[Chart], records: Sequence[Record]) -> str:
+def _figures(charts: Sequence[Chart], records: Sequence[Record]) -> Markup:
     names = short_names(records)
     failed = [i for i, r in enumerate(records) if r.state == FAILED]
-    drawn = (f"<figure>{control_chart(c, names, failed, _title(c))}</figure>" for c in charts)
-    return f'<div class="figures">{"".join(drawn)}</div>'
+    return figures(control_chart(c, names, failed, _title(c)) for c in charts)
 
 
 def _title(c: Chart) -> str:
@@ -172,7 +173,7 @@ def _title(c: Chart) -> str:
     return " · ".join((known(kind.replace("_", " ")).rstrip(":"), *rest))
 
 
-def _numbers(trends: Trends, records: Sequence[Record]) -> str:
+def _numbers(trends: Trends, records: Sequence[Record]) -> Markup:
     names = short_names(records)
     rows, classes = [], []
     for c in trends.charts:
@@ -180,7 +181,7 @@ def _numbers(trends: Trends, records: Sequence[Record]) -> str:
         classes.append("suspect" if alarming else "")
         spread = c.by_scatter / 3.0
         rows.append((
-            f"<b>{esc(_title(c))}</b>", esc(c.series.unit), str(len(c.series.value)), value_text(c.mean, c.mean_sigma),
+            element("b", _title(c)), c.series.unit, str(len(c.series.value)), value_text(c.mean, c.mean_sigma),
             sigma_text(c.mean_sigma), sigma_text(float(np.median(c.series.sigma))), sigma_text(spread),
             fixed(c.ratio, 2), general(c.p, 2), _slope(c), general(c.p_slope, 2), _alarm(trends, c, names),
         ))  # fmt: skip
@@ -194,12 +195,12 @@ def _numbers(trends: Trends, records: Sequence[Record]) -> str:
     return section("numbers", "All numbers", table(columns, rows, "", classes) if rows else "", note)
 
 
-def _slope(c: Chart) -> str:
-    return f'{value_text(c.slope, c.slope_sigma)}<span class="s">± {sigma_text(c.slope_sigma)}</span>'
+def _slope(c: Chart) -> Markup:
+    return part("below", value_text(c.slope, c.slope_sigma), f"± {sigma_text(c.slope_sigma)}")
 
 
-def _alarm(trends: Trends, c: Chart, names: Sequence[str]) -> str:
-    out = []
+def _alarm(trends: Trends, c: Chart, names: Sequence[str]) -> Markup:
+    out: list[str] = []
     if trends.disagrees(c):
         out.append(pill("bad", t("epochs disagree")))
     if trends.drifts(c):
@@ -207,15 +208,15 @@ def _alarm(trends: Trends, c: Chart, names: Sequence[str]) -> str:
     outside = [names[int(c.series.epoch[i])] for i in np.flatnonzero(c.outside)]
     if outside:
         listed = ", ".join(outside[:4]) + (" …" if len(outside) > 4 else "")
-        out.append(f"{t('outside:')} {esc(listed)}")
+        out.append(f"{t('outside:')} {listed}")
     for run in c.runs:
-        first, last = (esc(names[int(c.series.epoch[i])]) for i in (run.first, run.last))
+        first, last = (names[int(c.series.epoch[i])] for i in (run.first, run.last))
         word = {"one_side": t("on one side"), "rising": t("rising"), "falling": t("falling")}[run.kind]
-        out.append(f"{pill('soft', word)} {first} – {last}")
-    return _wrapped(" ".join(out)) if out else ""
+        out.append(joined((pill("soft", word), f"{first} – {last}"), " "))
+    return _wrapped([joined(out, " ")]) if out else Markup()
 
 
-def _folders(records: Sequence[Record], place: Path) -> str:
+def _folders(records: Sequence[Record], place: Path) -> Markup:
     rows, classes = [], []
     for r, name in zip(records, short_names(records), strict=True):
         s = r.summary
@@ -226,11 +227,24 @@ def _folders(records: Sequence[Record], place: Path) -> str:
         numbers = [count(s[k]) if k in s else MISSING for k in ("n_observations", "n_unknowns", "redundancy")]
         not_used = s.get("suspects", {}).get("n_not_used")
         seconds = fixed(r.seconds, 2) if r.origin == "adjusted" else MISSING
-        said = esc(message(r.error or s.get("reason", "")).splitlines()[0]) if (r.error or s.get("reason")) else ""
+        said = message(r.error or s.get("reason", "")).splitlines()[0] if (r.error or s.get("reason")) else ""
         classes.append("suspect" if r.state == FAILED else "")
-        title = f'<span class="s">{esc(s["title"])}</span>' if s.get("title") else ""
-        rows.append((_link(r, name, place) + title, pill(kind, word), _wrapped(said), fixed(s.get("sigma0"), 3),
+        title = element("span", s["title"], "s") if s.get("title") else Markup()
+        rows.append((_link(r, name, place) + title, pill(kind, word), _wrapped([said]), fixed(s.get("sigma0"), 3),
                      *numbers, MISSING if not_used is None else count(not_used), origin, seconds))  # fmt: skip
     columns = ("<Survey", "<", "<Reason", "sigma0", "n", "u", "Redundancy", "Not used", "<", "s")
     note = t("n observations, u unknowns. A name leads to the survey's own report.")
     return section("folders", "Folders", table(columns, rows, "", classes), note)
+
+
+def write_overview(place: Path, records: Sequence[Record], trends: Trends, language: str = "en") -> dict[str, Path]:
+    """Write overview.html, overview.json, folders.csv and trends.csv into ``place``; the paths by name."""
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    place = Path(place).absolute()
+    texts = {
+        "folders.csv": folders_csv(records),
+        "trends.csv": trends_csv(records, trends),
+        "overview.html": overview_html(records, trends, place, date, language),
+        "overview.json": overview_json(records, trends),
+    }
+    return write_set(place, texts)

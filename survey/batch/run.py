@@ -15,9 +15,10 @@ from adjust.model.errors import SurveyError
 from adjust.native.parallel import cores
 from survey.batch.cache import fingerprint, unchanged_solution
 from survey.batch.causes import MAY_PASS
+from survey.batch.cluster import on_cluster
 from survey.batch.journal import Journal, entry_of, read_journal
 from survey.batch.record import DONE, FAILED, TEST_FAILED, Record, record_from, solved_record
-from survey.batch.worker import Worker, WorkerDiedError
+from survey.batch.worker import Worker, attempts
 
 Told = Callable[[Record], None]
 
@@ -63,7 +64,7 @@ def run_batch(folders: Sequence[Path], options: BatchOptions, told: Told = lambd
         journal = stack.enter_context(Journal(options.report, kept)) if options.report is not None else None
         bar = stack.enter_context(_bar(len(paths), len(records), options))
         tasks = {i: _task(str(folders[i]), paths[i], options) for i in left}
-        for i, record in (_on_cluster if options.scheduler else _here)(tasks, options):
+        for i, record in _run(tasks, options):
             records[i] = record
             if journal is not None:
                 journal.add(paths[i], fingerprint(paths[i]), record)
@@ -107,18 +108,10 @@ def _counts(records: Any) -> str:
     return ", ".join(f"{n} {word}" for n, word in words if n)
 
 
-def attempts(worker: Worker, task: Mapping[str, Any], retries: int) -> Record:
-    """Run a task, again where a second try may mend it; the record counts the tries."""
-    tries = 0
-    while True:
-        tries += 1
-        try:
-            record = worker.run(task)
-        except WorkerDiedError as error:
-            text = f"{task['path']}: the process that adjusted it ended abruptly, {error}; where that was memory, "
-            record = Record(task["folder"], FAILED, cause="process", error=text + "run with fewer jobs")
-        if record.cause not in MAY_PASS or tries > retries:
-            return replace(record, tries=tries)
+def _run(tasks: Mapping[int, Mapping[str, Any]], options: BatchOptions) -> Iterator[tuple[int, Record]]:
+    if options.scheduler:
+        return on_cluster(tasks, options.scheduler, options.retries)
+    return _here(tasks, options)
 
 
 def _here(tasks: Mapping[int, Mapping[str, Any]], options: BatchOptions) -> Iterator[tuple[int, Record]]:
@@ -143,12 +136,6 @@ def _here(tasks: Mapping[int, Mapping[str, Any]], options: BatchOptions) -> Iter
         for worker in workers:
             worker.stop()
         pool.shutdown()
-
-
-def _on_cluster(tasks: Mapping[int, Mapping[str, Any]], options: BatchOptions) -> Iterator[tuple[int, Record]]:
-    from survey.batch.cluster import on_cluster
-
-    return on_cluster(tasks, str(options.scheduler), options.retries)
 
 
 def exit_code(records: Sequence[Record]) -> int:

@@ -9,7 +9,8 @@ from typing import Any
 from adjust.model.errors import SurveyError
 from survey.batch.causes import cause_of
 from survey.batch.record import FAILED, Record, solved_record
-from survey.commands.common import message, require_project
+from survey.folder.kept import require_project
+from survey.folder.messages import message
 
 
 def adjust_task(task: Mapping[str, Any]) -> Record:

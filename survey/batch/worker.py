@@ -15,9 +15,11 @@ import sys
 import threading
 import weakref
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
-from survey.batch.record import Record, record_from
+from survey.batch.causes import MAY_PASS
+from survey.batch.record import FAILED, Record, record_from
 
 _START = "import sys; sys.path[:] = sys.argv[1:]; from survey.batch.worker import main; main()"
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS")
@@ -87,6 +89,20 @@ class Worker:
             process.wait()
             if not self._busy:  # else the thread that waits for an answer sees the end of it
                 _waited(process)
+
+
+def attempts(worker: Worker, task: Mapping[str, Any], retries: int) -> Record:
+    """Run a task, again where a second try may mend it; the record counts the tries."""
+    tries = 0
+    while True:
+        tries += 1
+        try:
+            record = worker.run(task)
+        except WorkerDiedError as error:
+            text = f"{task['path']}: the process that adjusted it ended abruptly, {error}; where that was memory, "
+            record = Record(task["folder"], FAILED, cause="process", error=text + "run with fewer jobs")
+        if record.cause not in MAY_PASS or tries > retries:
+            return replace(record, tries=tries)
 
 
 def _ended(process: "subprocess.Popen[bytes]") -> None:

@@ -106,7 +106,7 @@ def _adjust_batch(arguments: argparse.Namespace) -> int:
     trends = trends_of(records)
     paths = {}
     if arguments.report is not None:
-        from survey.batch.overview import write_overview
+        from survey.batch.page import write_overview
 
         paths = write_overview(arguments.report, records, trends, arguments.language)
     if is_set(arguments, "json"):

@@ -9,38 +9,17 @@ import json
 import os
 import re
 import sys
-import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
-from pathlib import Path
 from typing import Any, NoReturn, TextIO, cast
 
 from adjust.model.errors import SurveyError
+from survey.folder.kept import require_project as require_project
+from survey.folder.messages import message, shown
 
 DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
 _OBJECTS = 100_000  # new ones before Python looks for cycles: loading modules makes many and no cycles
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # writing does not say which file
-
-
-def message(error: SurveyError | OSError) -> str:
-    """An error as its reader should see it."""
-    if isinstance(error, OSError):
-        where = "" if error.filename is None else f"{error.filename}: "
-        text = f"{where}{error.strerror}; check the name, the permissions and the free space"
-    else:
-        text = str(error)
-    return shown(text)
-
-
-def shown(text: str) -> str:
-    """A text with escapes for what is no letter: names and titles out of a file must not drive a terminal."""
-    if text.isprintable():
-        return text
-    return "".join(c if _is_harmless(c) else c.encode("unicode_escape").decode() for c in text)
-
-
-def _is_harmless(sign: str) -> bool:
-    return sign.isprintable() or sign in "\n\t" or unicodedata.category(sign) == "Zs"  # narrow spaces
 
 
 class _Shown:
@@ -156,54 +135,6 @@ def say(arguments: argparse.Namespace, *lines: str) -> None:
 def print_json(value: Mapping[str, Any]) -> None:
     """The summary as one JSON object on stdout."""
     print(json.dumps(value, indent=1, allow_nan=False))
-
-
-def require_project(folder: Path, out: Path | None = None) -> None:
-    """Raises SurveyError where a folder is no project; there and in ``out`` undoes what was killed half way."""
-    for place in (folder, *([out] if out is not None else [])):
-        undo_killed(place)
-    if folder.is_file():
-        raise SurveyError(f"{folder}: is a file; give the folder that holds survey.toml, here {_holder(folder)}")
-    if not folder.is_dir():
-        meant = _nearest(folder)
-        raise SurveyError(f"{folder}: no such folder; {meant}'labsurvey example full-lab lab' writes a ready one")
-    if not (folder / "survey.toml").is_file():
-        inside = _projects(folder)
-        hint = f", as {inside[0]} does" if inside else ""
-        raise SurveyError(f"{folder}: there is no survey.toml in it; give the folder that holds one{hint}")
-
-
-def _holder(file: Path) -> str:
-    """The nearest folder above a file that is a project, or where to look."""
-    return next((str(p) for p in file.parents if (p / "survey.toml").is_file()), "none above it does")
-
-
-def _nearest(folder: Path) -> str:
-    """The project beside a folder that is not there whose name is the most like its own."""
-    from survey.folder.text import suggestion
-
-    by_name = {p.name: str(p) for p in _projects(folder.parent)}
-    near = suggestion(folder.name, by_name)
-    found = next((by_name[name] for name in by_name if near == f"did you mean {name!r}?"), None)
-    return "" if found is None else f"did you mean {found!r}? "
-
-
-def _projects(place: Path) -> list[Path]:
-    """The folders in ``place`` that hold a survey.toml."""
-    try:
-        return sorted(p.parent for p in place.glob("*/survey.toml"))
-    except OSError:
-        return []
-
-
-def undo_killed(folder: Path) -> None:
-    """A mixture of old and new must not be taken for a project."""
-    if (folder / ".before").is_dir():
-        from survey.folder.replacing import recover_killed
-
-        if recover_killed(folder):
-            print(f"labsurvey: {folder}: a command that was killed while it replaced files has been undone",
-                  file=sys.stderr)  # fmt: skip
 
 
 def tested(summary: Mapping[str, Any]) -> int:

@@ -15,14 +15,7 @@ Next: open a new shell, type {program} and press Tab
 """
 
 
-def declare_completion(commands: Any, shaped: dict[str, Any]) -> None:
-    """Add ``completion`` to the commands of ``labsurvey``."""
-    from survey.cli import build_parser
-
-    declare_completion_of("labsurvey", build_parser, commands, shaped)
-
-
-def declare_completion_of(
+def declare_completion(
     program: str, build_parser: Callable[[], argparse.ArgumentParser], commands: Any, shaped: dict[str, Any]
 ) -> None:
     """Add ``completion`` to the commands of a program whose parser ``build_parser`` makes."""

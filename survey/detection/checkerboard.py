@@ -1,5 +1,7 @@
 """Finding a checkerboard's inner corners, in an order that its colours define."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -7,11 +9,14 @@ from adjust.model.survey import BoolArray, FloatArray
 from survey.detection.bent_edges import unbent
 from survey.detection.corners import CornerFit, refine_corners
 from survey.detection.extent import grown, is_of_neighbours
-from survey.detection.gray import Gray8, Gray32, reduced
+from survey.detection.gray import Gray8, Gray32, halved, reduced
 from survey.detection.results import Detection, nothing_found
 from survey.project.targets import Checkerboard
 
-_COARSE_PX = 900  # longer side of the image in which the board is looked for first
+_SQUARE_PX = 32  # longer side of the image in which the board is looked for first, for each of its corners at least
+_REGULAR = 0.25  # squares by which what is found there may bend from one to the next: more is a corner beside its place
+_COARSE_PX = 900  # that of the image in which it is then looked for by all finders
+_CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _MAX_DECOYS = 3
 
 
@@ -96,25 +101,35 @@ def _measured(gray: Gray32, gray8: Gray8, rough: FloatArray) -> tuple[Detection,
 
 
 def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
-    """Corners (n, 2) px to about a pixel: classic and sector finder on a reduced image, then the full one.
+    """Corners (n, 2) px to about a pixel: classic and sector finder on reduced images, then the full one.
 
-    On an image without a board the classic finder follows the noise at every threshold for half a second, unless a look
-    at the squares beforehand stops it, which now and then overlooks a board: without that look it has a smoothed image.
+    The classic finder first binarises by the histogram, which is enough for most boards and fast in a small image. On
+    an image without a board its other thresholds follow the noise for half a second, unless a look at the squares
+    beforehand stops it, which now and then overlooks a board: without that look it has a smoothed image.
     """
-    coarse, factor = reduced(gray8, _COARSE_PX)
-    classic = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    looking = classic | cv2.CALIB_CB_FAST_CHECK
     pattern = (columns, rows)
-    ok, corners = cv2.findChessboardCorners(coarse, pattern, flags=looking)
+    small, factor = halved(gray8, _SQUARE_PX * max(pattern))
+    ok, corners = cv2.findChessboardCorners(small, pattern, flags=0)
+    if not ok or _off_grid(np.reshape(corners, (rows, columns, 2))).max() > _REGULAR:
+        small, factor = reduced(gray8, _COARSE_PX)
+        ok, corners = _found_in(small, pattern)
+    if ok:
+        return np.asarray((np.reshape(corners, (-1, 2)).astype(float) + 0.5) * factor - 0.5)
+    if small is not gray8:
+        ok, corners = cv2.findChessboardCorners(gray8, pattern, flags=_CLASSIC | cv2.CALIB_CB_FAST_CHECK)
+    return np.reshape(corners, (-1, 2)).astype(float) if ok else None
+
+
+def _found_in(coarse: Gray8, pattern: tuple[int, int]) -> tuple[bool, Any]:
+    """What one finder after the other finds."""
+    ok, corners = cv2.findChessboardCorners(coarse, pattern, flags=0)
+    if not ok:
+        ok, corners = cv2.findChessboardCorners(coarse, pattern, flags=_CLASSIC | cv2.CALIB_CB_FAST_CHECK)
     if not ok:
         ok, corners = cv2.findChessboardCornersSB(coarse, pattern, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not ok:
-        ok, corners = cv2.findChessboardCorners(cv2.GaussianBlur(coarse, (3, 3), 0.0), pattern, flags=classic)
-    if ok:
-        return np.asarray((np.reshape(corners, (-1, 2)).astype(float) + 0.5) * factor - 0.5)
-    if coarse is not gray8:
-        ok, corners = cv2.findChessboardCorners(gray8, pattern, flags=looking)
-    return np.reshape(corners, (-1, 2)).astype(float) if ok else None
+        ok, corners = cv2.findChessboardCorners(cv2.GaussianBlur(coarse, (3, 3), 0.0), pattern, flags=_CLASSIC)
+    return ok, corners
 
 
 def _ordered(gray: Gray32, grid: FloatArray) -> tuple[FloatArray, bool]:
@@ -166,12 +181,15 @@ def _settle(gray8: Gray8, grid: FloatArray, edges: FloatArray) -> FloatArray:
 
 def _on_grid(fit: CornerFit, shape: tuple[int, int]) -> BoolArray:
     """Which corners lie where their neighbours in the row and the column put them, to a fifth of a square."""
-    grid = np.where(fit.good[:, None], fit.uv, np.nan).reshape(*shape, 2)
+    return _off_grid(np.where(fit.good[:, None], fit.uv, np.nan).reshape(*shape, 2)).ravel() <= 0.4
+
+
+def _off_grid(grid: FloatArray) -> FloatArray:
+    """Second differences (rows, columns) of a grid (rows, columns, 2) px, the larger of both ways, in squares."""
     steps = np.linalg.norm(np.diff(grid, axis=1), axis=2)
     spacing = float(np.median(steps[np.isfinite(steps)])) if np.isfinite(steps).any() else np.inf
-    off = np.zeros(shape, bool)
+    off = np.zeros(grid.shape[:2])
     for axis in (0, 1):
-        g = np.moveaxis(grid, axis, 0)
-        bend = np.linalg.norm(g[2:] - 2.0 * g[1:-1] + g[:-2], axis=2)
-        np.moveaxis(off, axis, 0)[1:-1] |= bend > 0.4 * spacing
-    return ~off.ravel()
+        g, o = np.moveaxis(grid, axis, 0), np.moveaxis(off, axis, 0)
+        o[1:-1] = np.fmax(o[1:-1], np.linalg.norm(g[2:] - 2.0 * g[1:-1] + g[:-2], axis=2) / spacing)
+    return off

@@ -17,6 +17,7 @@ CROSSING_BENT_PX, MARKER_BENT_PX = 0.002, 0.003
 CROSSING_FLOOR_PX, MARKER_FLOOR_PX = 0.0002, 0.0005
 _PIXEL_VARIANCE = 1.0 / 12.0
 _ROUGH_PX, _FINE_PX = 1e-2, 2e-5  # where the first and the second fit may stop
+_NEAR_PX = 5.0  # from a crossing, as far as the first fit looks where the edges' blur ends before that
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,13 @@ def refine_corners(
     blur = np.full(len(start), 1.0)
     # a second pass from the first one's result: its window is centred and turned to the corner itself
     shapes = _window_shapes(edges, free, crossing, blur)
-    first, _, _, _, status = fit_corners(gray, start, angles, blur, shapes, crossing, 3.0, _ROUGH_PX)
+    strips = shapes[:, 1].any()
+    near = shapes if strips else np.minimum(shapes, _NEAR_PX)
+    first, _, _, _, status = fit_corners(gray, start, angles, blur, near, crossing, 3.0, _ROUGH_PX)
+    unsure = np.flatnonzero(((status != 0) | (first[:, 6] > np.log(_NEAR_PX / 3.5))) & (not strips))
+    if len(unsure):
+        given = (start[unsure], angles[unsure], blur[unsure], shapes[unsure])
+        first[unsure], _, _, _, status[unsure] = fit_corners(gray, *given, crossing, 3.0, _ROUGH_PX)
     again = status == 0
     centred = np.where(again[:, None], first[:, :2], start)
     angles = np.where(again[:, None], first[:, 2:4], angles)

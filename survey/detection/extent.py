@@ -61,14 +61,19 @@ def _next_row(gray: Gray32, grid: FloatArray, contrast: float) -> FloatArray | N
     inside = np.all((place > 3.0) & (place < np.array(gray.shape[::-1]) - 4.0), axis=1)
     if inside.sum() < max(2.0, _SEEN * columns):
         return None
-    spacing = np.linalg.norm(edges, axis=2).min(axis=1)
-    fit = refine_corners(gray, place, edges)
-    there = fit.good & inside & (np.linalg.norm(fit.uv - place, axis=1) < np.maximum(_NEAR * spacing, 1.5))
     step = _CONTRAST * contrast
-    there &= (fit.contrast > step) & _squares_follow(gray, grid, place, edges, step)
+    # colours first: most boards end here, and edges that are not there are the slowest to fit
+    likely = np.flatnonzero(inside & _squares_follow(gray, grid, place, edges, step))
+    if len(likely) < _SEEN * columns:
+        return None
+    spacing = np.linalg.norm(edges[likely], axis=2).min(axis=1)
+    fit = refine_corners(gray, place[likely], edges[likely])
+    near = np.linalg.norm(fit.uv - place[likely], axis=1) < np.maximum(_NEAR * spacing, 1.5)
+    there = fit.good & near & (fit.contrast > step)
     if there.sum() < _SEEN * columns:
         return None
-    return np.asarray(np.where(there[:, None], fit.uv, place))
+    place[likely[there]] = fit.uv[there]
+    return place
 
 
 def _extrapolated(grid: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -76,10 +76,10 @@ def for_finding(gray: Gray32 | Gray8) -> Gray8:
     return np.asarray(cv2.addWeighted(gray, scale, gray, 0.0, -low * scale, dtype=cv2.CV_8U), np.uint8)
 
 
-def reduced(gray8: Gray8, longest_px: int) -> tuple[Gray8, FloatArray]:
-    """The image with at most so many pixels along its longer side, itself where it has, and the factor (2,) back.
+def halved(gray8: Gray8, longest_px: int) -> tuple[Gray8, FloatArray]:
+    """The image halved while its longer side keeps at least so many pixels, and the factor (2,) back.
 
-    ``u = (u_reduced + 0.5) * factor - 0.5``. Halving is fast, so as much as can be is done by it.
+    ``u = (u_reduced + 0.5) * factor - 0.5``.
     """
     factor = np.ones(2)
     while max(gray8.shape) >= 2 * longest_px:
@@ -87,6 +87,15 @@ def reduced(gray8: Gray8, longest_px: int) -> tuple[Gray8, FloatArray]:
         # an odd row or column is cut off: every pixel is the mean of four, and the factor is two
         gray8 = np.asarray(cv2.resize(gray8[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA), np.uint8)
         factor *= 2.0
+    return gray8, factor
+
+
+def reduced(gray8: Gray8, longest_px: int) -> tuple[Gray8, FloatArray]:
+    """The image with at most so many pixels along its longer side, itself where it has, and the factor as `halved`.
+
+    Halving is fast, so as much as can be is done by it.
+    """
+    gray8, factor = halved(gray8, longest_px)
     scale = max(gray8.shape) / longest_px
     if scale <= 1.0:
         return gray8, factor

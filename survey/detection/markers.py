@@ -5,6 +5,7 @@ the same pixel origin, the centre of the first pixel, whatever their finder's ow
 """
 
 from collections import Counter
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -25,19 +26,24 @@ class SeenMarkers:
 
     def __init__(self, gray8: Gray8) -> None:
         self._full = gray8
-        self._coarse, self._factor = reduced(gray8, _COARSE_PX)
         self._found: dict[tuple[str, bool], tuple[IntArray, FloatArray]] = {}
+
+    @cached_property
+    def _reduced(self) -> tuple[Gray8, FloatArray]:
+        """The image in which markers are looked for first, and the factor back to the full one."""
+        return reduced(self._full, _COARSE_PX)
 
     def of(self, dictionary: str, wanted: set[int]) -> tuple[IntArray, FloatArray]:
         """Ids (n,) and corners (n, 4, 2) px in ascending id, those of the full image where some wanted ones lack."""
         markers, quads = self._in(dictionary, False)
-        if self._coarse is not self._full and not wanted.issubset(markers.tolist()):
+        coarse, factor = self._reduced
+        if coarse is not self._full and not wanted.issubset(markers.tolist()):
             return self._in(dictionary, True)
-        return markers, (quads + 0.5) * self._factor - 0.5
+        return markers, (quads + 0.5) * factor - 0.5
 
     def _in(self, dictionary: str, full: bool) -> tuple[IntArray, FloatArray]:
         if (dictionary, full) not in self._found:
-            self._found[dictionary, full] = _markers_in(self._full if full else self._coarse, dictionary)
+            self._found[dictionary, full] = _markers_in(self._full if full else self._reduced[0], dictionary)
         return self._found[dictionary, full]
 
 

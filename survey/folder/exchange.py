@@ -9,7 +9,7 @@ from pathlib import Path
 from survey.folder.locking import holder_of
 
 MARK = ".placed"
-_HERE, _EXCHANGE = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of <linux/fs.h>
+_HERE, _EXCHANGE = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of <linux/fs.h>; RENAME_SWAP of macOS is 2, too
 
 
 class CannotTradeError(Exception):
@@ -24,11 +24,16 @@ def trade(new: Path, there: Path) -> None:
 
 
 def _renameat2(new: Path, there: Path) -> int:
+    """The number of the error, 0 where they have traded places: by Linux' call of this name, or by macOS' own."""
+    names = os.fsencode(new), os.fsencode(there)
     try:
-        call = ctypes.CDLL(None, use_errno=True).renameat2
+        system = ctypes.CDLL(None, use_errno=True)
+        if hasattr(system, "renameat2"):
+            failed = system.renameat2(_HERE, names[0], _HERE, names[1], _EXCHANGE)
+        else:
+            failed = system.renamex_np(*names, _EXCHANGE)
     except (AttributeError, OSError, TypeError):
         return errno.ENOSYS
-    failed = call(_HERE, os.fsencode(new), _HERE, os.fsencode(there), _EXCHANGE)
     return ctypes.get_errno() if failed else 0
 
 
@@ -37,7 +42,7 @@ def complete_from(old: Path, new: Path) -> None:
     (old / MARK).unlink(missing_ok=True)
     try:
         _take(old, new)
-    except OSError as error:  # second names are not everywhere, and not of everybody's files
+    except (OSError, NotImplementedError) as error:  # second names are not everywhere, and not of everybody's files
         raise CannotTradeError(str(error)) from error
     (new / MARK).touch()
 

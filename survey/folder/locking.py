@@ -1,6 +1,7 @@
 """Locks: one command or session at a time may write a folder, and nobody reads it in the middle of a change.
 
-The system frees them when their process ends, however it ends; what is left then is a file that nobody holds.
+The system frees them when their process ends, however it ends; what is left then is a file that nobody holds. The
+package ``filelock`` would lock the files, but has no shared locks, none of folders, and does not say who holds one.
 """
 
 import errno
@@ -20,11 +21,14 @@ try:
 except ImportError:  # no such locks on this system
     fcntl = None  # type: ignore[assignment]
 
+OBSERVATIONS_FOLDER, RESULTS = "observations", "results"
+"""In a project folder: what is given, what is found."""
 LOCK, SESSION_LOCK = ".labsurvey.lock", "capture/lock"
 """In a project folder: held by the command that writes it, by the session that takes its images."""
 BEFORE, LIST = ".before", "entries.json"
 """In a project folder: what is being replaced; in there the list of it, while that is neither done nor undone."""
 _HELD = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
+_NO_FILE = (errno.ELOOP, errno.EMLINK, errno.EISDIR, errno.ENXIO)  # a link, a folder, a pipe
 _LOOK_S, _PATIENCE_S, _TRIES = 0.01, 60.0, 5
 
 
@@ -58,9 +62,9 @@ class FileLock:
 
     def _opened(self) -> int:
         try:
-            handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+            handle = _opened(self.path, os.O_RDWR | os.O_CREAT)
         except OSError as error:
-            if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
+            if error.errno in _NO_FILE:
                 raise SurveyError(f"{self.path}: is no lock of labsurvey; remove it") from error
             raise OSError(error.errno, error.strerror, str(self._folder)) from error
         if not stat.S_ISREG(os.fstat(handle).st_mode):
@@ -108,7 +112,7 @@ class FileLock:
 def holder_of(path: Path) -> str | None:
     """Who holds a lock; None where nobody does, whatever a dead process has left behind."""
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        handle = _opened(path, os.O_RDONLY)
     except OSError:
         return None
     try:
@@ -130,7 +134,7 @@ def hold(handle: int, path: Path) -> bool:
 def remove_unheld(path: Path) -> None:
     """Remove a file that no process holds."""
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        handle = _opened(path, os.O_RDONLY)
     except OSError:
         return
     try:
@@ -150,7 +154,7 @@ def folder_held(folder: Path, shared: bool) -> Iterator[None]:
     possible at all, or somebody sits on it, this goes on without.
     """
     try:
-        handle = os.open(folder, os.O_RDONLY | os.O_NONBLOCK)
+        handle = os.open(folder, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     except OSError:
         yield  # the reader that follows says what is wrong
         return
@@ -203,6 +207,14 @@ def _flocked(handle: int, shared: bool) -> bool:
             return False
         raise
     return True
+
+
+def _opened(path: Path, flags: int) -> int:
+    """Open a file that may be anything: no link is followed, no pipe waited for. Raises OSError."""
+    follow_no = getattr(os, "O_NOFOLLOW", 0)
+    if not follow_no and path.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+    return os.open(path, flags | follow_no | getattr(os, "O_NONBLOCK", 0), 0o666)
 
 
 def _is_at(handle: int, path: Path) -> bool:

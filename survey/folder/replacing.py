@@ -23,6 +23,8 @@ from survey.folder.locking import (
     BEFORE,
     LIST,
     LOCK,
+    OBSERVATIONS_FOLDER,
+    RESULTS,
     SESSION_LOCK,
     BusyError,
     FileLock,
@@ -32,7 +34,6 @@ from survey.folder.locking import (
 )
 from survey.folder.text import atomic_write, read_bytes, remove_leftovers, sync_folder
 from survey.folder.whole import whole_folder
-from survey.project.project import OBSERVATIONS_FOLDER, RESULTS
 
 ADDING = ".adding"
 
@@ -182,7 +183,7 @@ def _link(source: Path, target: Path) -> None:
     """A second name, so that the first is never missing; a copy where the file system has no second names."""
     try:
         os.link(source, target, follow_symlinks=False)
-    except OSError:
+    except (OSError, NotImplementedError):
         shutil.copy2(source, target, follow_symlinks=False)
 
 
@@ -190,15 +191,19 @@ def _move(new: Path, there: Path) -> None:
     if not os.path.lexists(new):
         there.unlink(missing_ok=True)
         return
+    _put(new, there)
+
+
+def _put(source: Path, there: Path) -> None:
+    """Move a file; its content where a folder in between is mounted."""
     there.parent.mkdir(parents=True, exist_ok=True)
     try:
-        os.rename(new, there)
+        os.replace(source, there)
     except OSError as error:
         if error.errno != errno.EXDEV:
             raise
-        moving = new.with_name(f".{new.name}.moving")  # a folder in between is mounted
-        os.rename(new, moving)  # from here on the old one is to come back
-        atomic_write(there, moving.read_bytes())
+        atomic_write(there, source.read_bytes())
+        source.unlink()
 
 
 def recover(folder: Path) -> bool:
@@ -241,19 +246,8 @@ def _restore(folder: Path, entry: str, was_there: bool) -> None:
     there, old, new = folder / entry, folder / BEFORE / entry, folder / ADDING / entry
     if (there / MARK).is_file() and new.is_dir():
         trade(new, there)
-    elif os.path.lexists(new):
-        return  # was not moved yet
-    elif old.is_dir() and not old.is_symlink():
-        _remove(there)
-        os.rename(old, there)
     elif os.path.lexists(old):
-        there.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            os.replace(old, there)
-        except OSError as error:
-            if error.errno != errno.EXDEV:
-                raise
-            atomic_write(there, old.read_bytes())
+        _put(old, there)  # the same file where it was not moved yet
     elif not was_there:
         _remove(there)
 

@@ -21,12 +21,13 @@ _LONGEST_ID = 120  # bytes: an id with a prefix and an ending is still the name 
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{i}" for port in ("COM", "LPT") for i in range(1, 10))}
 
 
-def atomic_write(path: Path, content: bytes | str) -> None:
+def atomic_write(path: Path, content: bytes | str, lasting: bool = False) -> None:
     """Write ``content`` (text as UTF-8) under a temporary name beside ``path``, then rename: all of it or nothing.
 
-    What killed runs left of the same file goes.
+    What killed runs left of the same file goes. lasting: on return even a cut of the power leaves the new file.
     """
-    data = _utf8(content) if isinstance(content, str) else content
+    data = utf8(content) if isinstance(content, str) else content
+    made = not path.parent.is_dir()
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path.parent, path.name)
     handle, temporary = _temporary(path)
@@ -37,6 +38,8 @@ def atomic_write(path: Path, content: bytes | str) -> None:
             os.fsync(handle)
         os.chmod(temporary, 0o666 & ~_umask())  # mkstemp makes files that only their owner can read
         os.replace(temporary, path)
+        for folder in (path.parent, *([path.parent.parent] if made else [])) if lasting else ():
+            sync_folder(folder)
     except BaseException as error:
         Path(temporary).unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename is None:  # writing does not say which file
@@ -44,7 +47,7 @@ def atomic_write(path: Path, content: bytes | str) -> None:
         raise
 
 
-def _utf8(text: str) -> bytes:
+def utf8(text: str) -> bytes:
     """Where the system knows no UTF-8, names of files in a text stand for their bytes."""
     try:
         return text.encode("utf-8")

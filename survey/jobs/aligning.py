@@ -2,22 +2,27 @@
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import decode, read_bytes
-from survey.jobs.adjusting.job import adjust_project
-from survey.jobs.working_sheet import ARCSEC, Sheet, working_sheets
+from survey.jobs.adjusting.steps import adjust_project
+from survey.jobs.working_sheet import ARCSEC, STATES, Sheet, angle_text, sheet_text, steps, working_sheets
 from survey.project import atomic_write, read
 from survey.project.project import RESULTS
-from survey.report.working_sheet import ROUND_COLUMNS, sheet_html, sheet_text, steps
+from survey.report import drawing as d
+from survey.report.markup import document, part
 
 PAGE, ROUNDS = "alignment.html", "alignment_rounds.csv"
+ROUND_COLUMNS = ("date", "task", "state", "x_arcsec", "y_arcsec", "z_arcsec", "sigma_x", "sigma_y", "sigma_z")
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,3 +114,53 @@ def _with_round(rounds: list[list[str]], sheets: tuple[Sheet, ...], date: str) -
         if not before or before[-1][2:] != row[2:]:
             out.append(row)
     return out
+
+
+def sheet_html(sheets: Sequence[Sheet], title: str, date: str, rounds: Sequence[Sequence[str]] = ()) -> str:
+    """One page that needs nothing but itself; ``rounds`` are rows of ``ROUND_COLUMNS``, oldest first."""
+    shown = [
+        part("sheet", s, STATES, angle_text, steps(s), drawing(s), [row for row in rounds if row[1] == s.task.task_id],
+             of="working_sheet.html") for s in sheets
+    ]  # fmt: skip
+    head = f"{title}: alignment"
+    return document(head, part("page", head, date, shown, of="working_sheet.html"))
+
+
+def drawing(sheet: Sheet) -> Markup:
+    """The body seen from its front with what each foot has to move, and the turn about z."""
+    if not sheet.feet:
+        return Markup()
+    at = {foot.name: (foot.x, foot.y) for foot in sheet.task.feet}
+    xs, ys = [x for x, _ in at.values()], [y for _, y in at.values()]
+    size = max(max(xs) - min(xs), max(ys) - min(ys))
+    scale, margin = 300.0 / size, 70.0
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        return margin + (x - min(xs)) * scale, margin + (max(ys) - y) * scale
+
+    width, height = 2 * margin + (max(xs) - min(xs)) * scale, 2 * margin + (max(ys) - min(ys)) * scale
+    outline = " ".join(f"{u:.1f},{v:.1f}" for u, v in (place(*at[name]) for name in at))
+    parts = [
+        '<defs><marker id="tip" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" markerHeight="7" orient="auto">'
+        f'<path d="M0 0L10 5L0 10z" fill="{d.RED}"/></marker></defs>'
+        f'<polygon points="{outline}" fill="{d.EMPTY}" stroke="{d.GREY}"/>'
+    ]
+    for foot in sheet.feet:
+        u, v = place(*at[foot.name])
+        text_v = v + 26 if v > height / 2 else v - 16  # beside the body, not on it
+        label = "stays" if foot.stays else f"{1e3 * foot.move:+.2f} mm"
+        colour = d.GREY if foot.stays else d.RED
+        parts.append(
+            d.dot(u, v, 9, colour) + d.text(u, text_v, f"{foot.name}: {label}", "middle", 15, d.INK)
+        )
+    z = next(axis for axis in sheet.axes if axis.axis == "z")
+    if z.state == "turn":
+        u, v, r = width / 2, height / 2, 45.0
+        ends = ((u - r, v), (u + r, v)) if z.angle > 0 else ((u + r, v), (u - r, v))
+        sweep = 1 if z.angle > 0 else 0  # in the picture y points down: 1 is clockwise
+        parts.append(
+            f'<path d="M{ends[0][0]:.1f} {ends[0][1]:.1f}A{r} {r} 0 0 {sweep} {ends[1][0]:.1f} {ends[1][1]:.1f}" '
+            f'fill="none" stroke="{d.RED}" stroke-width="3" marker-end="url(#tip)"/>'
+            + d.text(u, v + 5, angle_text(abs(z.angle)), "middle", 15, d.INK)
+        )
+    return d.svg(width, height, parts, "feet and moves")

@@ -22,7 +22,7 @@ from survey.interop.cameras import formats as camera_formats
 from survey.interop.cameras.aicon import ENDINGS as AICON_ENDINGS
 from survey.interop.cameras.aicon import read_aicon
 from survey.interop.cameras.dbat import read_dbat
-from survey.interop.cameras.values import camera_values
+from survey.interop.cameras.values import CameraValues, camera_values
 from survey.interop.names import with_safe_ids
 from survey.interop.networks.foreign import ForeignNetwork, is_utf8
 from survey.interop.networks.g2o import Information
@@ -34,11 +34,10 @@ from survey.interop.networks.lgc import read_lgc
 from survey.interop.networks.plain_csv import correlated, plain_csv, read_plain_csv
 from survey.interop.networks.sinex import sinex_text
 from survey.interop.networks.values import NetworkValues, left_out, require_network
-from survey.jobs.adjusting.job import adjust_project
+from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.converting_g2o import AS_IN_THE_FILE, project_to_g2o, survey_from_g2o
 from survey.project import AdjustmentOptions, Project, atomic_write, read, write_project
-from survey.project.project import DEFINITION_FILE
-from survey.report.results import RESULTS
+from survey.project.project import DEFINITION_FILE, RESULTS
 from survey.solution.previous import read_previous
 from survey.solution.quantities import scale_of
 
@@ -190,6 +189,13 @@ def _encoding(source: Path, format: str) -> tuple[str, ...]:
     return ("the text is not UTF-8; unless the file names its encoding it was read as Latin-1",)
 
 
+def adjusted_values(project: Project) -> CameraValues:
+    """The values of a project. One with results is adjusted again, because its files do not hold every covariance."""
+    if not (project.folder / RESULTS / "solution.json").is_file():
+        return camera_values(project)
+    return camera_values(project, adjust_project(project, progress=False))
+
+
 def _to_file(
     source: Path, target: Path, format: str, information: Information, station: str | None
 ) -> ConvertOutcome:
@@ -200,7 +206,7 @@ def _to_file(
         return ConvertOutcome(source, target, "g2o", {"stations": n_stations, "pairs": n_pairs}, poses, rest)
     project = read(source)
     if format in camera_formats.WRITERS:
-        values = camera_values(project)
+        values = adjusted_values(project)
         counts, notes = camera_formats.write_cameras(values, target, format, station)
         said = "adjusted" if values.adjusted else "start values, not adjusted"
         return ConvertOutcome(source, target, format, counts, said, notes)

@@ -10,7 +10,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import PoseParameter, Station, Survey
 from adjust.pose_network.from_survey import network_from_survey
-from adjust.statistics.pair_screen import is_pure
+from adjust.statistics.pair_networks import is_pure
 from survey.folder.text import id_problem
 from survey.interop.networks.g2o import Information, read_g2o_file, write_g2o
 from survey.jobs.adjusting.warm_start import network_start

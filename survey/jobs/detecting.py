@@ -32,8 +32,8 @@ from survey.project.detected import (
     read_detected,
 )
 from survey.project.exclusions import EXCLUSIONS_FILE, Exclusion, Name, Row, appended, in_force, read_exclusions
+from survey.project.images import Sought, sought_in
 from survey.project.project import IMAGES_FOLDER, OBSERVATIONS_FOLDER
-from survey.project.sought import Sought, sought_in
 from survey.project.tables.image_points import IMAGE_POINTS, SPOTS
 from survey.project.tables.observation_columns import image_point_columns, spot_columns
 from survey.project.tables.rows import RowTable, row_table
@@ -141,12 +141,6 @@ class _State:
     def rows_digest(self, key: ImageKey) -> str:
         """A hash of the rows of an image that belong to detection."""
         return self.points.digest(key) + self.spots.digest(key)
-
-    def is_given(self, key: ImageKey) -> bool:
-        """Whether the points of an image were there before it was ever looked at."""
-        entry = self.known.get(key)
-        has_rows = key in self.points.images or key in self.spots.images
-        return has_rows and (entry is None or entry.status == "given")
 
 
 def _state(folder: Path) -> _State:

@@ -12,13 +12,15 @@ from gtsam import Pose3, Rot3
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair
 from survey.folder.replacing import complete, place_for, replace_parts
-from survey.jobs.adjusting.job import AdjustOutcome, Clock, adjust_project, command_line, made
+from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, made
+from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.adjusting.warm_start import warm_adjustment
 from survey.project import Definition, Project, read, read_definition
 from survey.project.merging import Merged, merge, read_copy
 from survey.project.project import OBSERVATIONS_FOLDER
+from survey.project.tables.files import read_table
 from survey.project.tables.pairs import COVARIANCE_COLUMNS, EULER, PAIRS, QUATERNION, SIGMA_COLUMNS, TRANSLATION
-from survey.project.tables.reading import Table, read_table
+from survey.project.tables.reading import Table
 from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame
 from survey.report.results import RESULTS
 from survey.solution.loops import network_dict, pair_network
@@ -190,16 +192,17 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
 
     The project is as before whatever goes wrong.
     """
-    begin = time.perf_counter()
+    begin, clock = time.perf_counter(), Clock()
     folder, new = Path(folder), Path(new)
     with place_for(folder, out) as place:
-        project = read(folder)
-        before = read_previous(project)
-        merged = merge(folder, new, place)
-        grown = _read_merged(merged, project, out or folder)
-        adjustment, start = warm_adjustment(grown, before, lambda p: adjust_project(p, progress), progress)
-        said = command_line("add", folder, new, out=out)
-        outcome = made(grown, adjustment, place, Clock({"adjust": time.perf_counter() - begin}), command=said)
+        with clock.step("read"):
+            project = read(folder)
+            before = read_previous(project)
+            merged = merge(folder, new, place)
+            grown = _read_merged(merged, project, out or folder)
+        with clock.step("adjust"):
+            adjustment, start = warm_adjustment(grown, before, lambda p: adjust_project(p, progress), progress)
+        outcome = made(grown, adjustment, place, clock, command=command_line("add", folder, new, out=out))
         if out is None:
             replace_parts(folder, [*merged.entries, RESULTS])
         else:

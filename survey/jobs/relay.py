@@ -24,7 +24,7 @@ from adjust.relay.eyes import EyeAdjustment, EyeOptions, adjust_eyes
 from adjust.relay.motions import Motions
 from adjust.spatial.rigid import rotation_log
 from survey.folder.text import decode, read_bytes
-from survey.jobs.adjusting.less_observations import in_use
+from survey.jobs.adjusting.subnetwork import in_use
 from survey.project import read
 from survey.project.tables.observation_columns import pair_columns
 from survey.project.tables.writing import write_table

@@ -20,7 +20,8 @@ from adjust.model.survey import Survey
 from adjust.statistics.supported import supported
 from survey.folder.replacing import complete, copy_folder, place_for, replace_parts
 from survey.folder.text import atomic_write
-from survey.jobs.adjusting.job import AdjustOutcome, Clock, adjust_project, command_line, made
+from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, made
+from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.adjusting.warm_start import COLD, warm_adjustment
 from survey.jobs.excluding import FILE, new_rows
 from survey.project import Project, read

@@ -6,6 +6,7 @@ aligns it: a foot at (x, y) of the body, which stands too high by ``(w x p)_z = 
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,6 +25,9 @@ from survey.solution.quantities import SigmaKind, scale_of
 
 State = Literal["aligned", "turn", "measure", "held"]
 ARCSEC = math.pi / 648000.0
+STATES: Mapping[State, str] = {
+    "aligned": "aligned", "turn": "to be turned", "measure": "not told well enough", "held": "held, not measured",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -168,3 +172,71 @@ def _reach(adjustment: Adjustment, task: AlignmentTask) -> float:
         if not len(xy) and task.body.kind == "target" and target.target_id == task.body.frame_id:
             xy = np.asarray(target.x_in_target)[:, :2]
     return float(np.linalg.norm(xy, axis=1).max()) if len(xy) else 0.0
+
+
+def angle_text(angle: float) -> str:
+    """A small angle as people read it: arcseconds, beyond a tenth of a degree degrees."""
+    return f"{angle / ARCSEC:.1f}″" if abs(angle) < math.radians(0.1) else f"{math.degrees(angle):.4f}°"
+
+
+def steps(sheet: Sheet) -> list[str]:
+    """What the operator is to do, in order; nothing where the body is aligned."""
+    out = []
+    by_axis = {axis.axis: axis for axis in sheet.axes}
+    name = f"{sheet.task.body.kind} {sheet.task.body.frame_id}"
+    if any(by_axis[a].state == "turn" for a in "xy"):
+        if sheet.feet:
+            fixed = next(foot.name for foot in sheet.feet if foot.stays)
+            out.append(f"Leave the foot {fixed} as it is.")
+            out += [_foot_text(sheet, foot) for foot in sheet.feet if not foot.stays]
+        else:
+            out += [_axis_text(name, by_axis[a], sheet) for a in "xy" if by_axis[a].state == "turn"]
+    if by_axis["z"].state == "turn":
+        out.append(_axis_text(name, by_axis["z"], sheet))
+    for axis in sheet.axes:
+        if axis.state == "measure":
+            tolerance = angle_text(sheet.task.tolerance or 0.0)
+            out.append(
+                f"Measure better about the {axis.axis} axis: {angle_text(axis.angle)} ± {angle_text(axis.uncertainty)} "
+                f"can neither be told from zero nor from the tolerance of {tolerance}."
+            )
+    if any(axis.state == "turn" for axis in sheet.axes):
+        out.append("Measure again and call labsurvey align once more.")
+    return out
+
+
+def _foot_text(sheet: Sheet, foot: FootMove) -> str:
+    verb = "Raise" if sheet.upwards > 0.7 else "Lower" if sheet.upwards < -0.7 else "Move along +z"
+    turns = "" if foot.turns is None else f", {foot.turns:.2f} turns of its screw"
+    if abs(foot.move) < 2.0 * foot.sigma:
+        return f"Leave the foot {foot.name}: {1e3 * foot.move:.3f} ± {1e3 * foot.sigma:.3f} mm is not significant."
+    return f"{verb} the foot {foot.name} by {1e3 * foot.move:.3f} mm (± {1e3 * foot.sigma:.3f} mm){turns}."
+
+
+def _axis_text(name: str, axis: AxisState, sheet: Sheet) -> str:
+    """Turning back what is too much: seen against the axis, a positive angle too much means clockwise."""
+    way = "clockwise" if axis.angle > 0 else "counter-clockwise"
+    seen = {
+        "x": "looking against its x axis (which points at you)",
+        "y": "looking against its y axis (which points at you)",
+        "z": "seen from its front (its z axis points at you)",
+    }[axis.axis]
+    reach = abs(axis.angle) * sheet.reach
+    edge = f": {1e3 * reach:.2f} mm at {1e3 * sheet.reach:.0f} mm from its origin" if reach and axis.axis == "z" else ""
+    size = f"{angle_text(abs(axis.angle))} (± {angle_text(axis.sigma)})"
+    return f"Turn {name} {way} by {size}, {seen}{edge}."
+
+
+def sheet_text(sheets: Sequence[Sheet]) -> str:
+    """For the terminal."""
+    lines = []
+    for sheet in sheets:
+        task = sheet.task
+        head = f"{task.task_id}: {task.body.kind} {task.body.frame_id} onto {task.onto.kind} {task.onto.frame_id}"
+        lines.append(f"{head}: {STATES[sheet.state]}")
+        lines.append(f"  {'axis':<5}{'off':>12}{'sigma':>10}{f'{sheet.level:.0%} ±':>10}")
+        for axis in sheet.axes:
+            values = (angle_text(axis.angle), angle_text(axis.sigma), angle_text(axis.uncertainty))
+            lines.append(f"  {axis.axis:<5}{values[0]:>12}{values[1]:>10}{values[2]:>10}  {STATES[axis.state]}")
+        lines += [f"  {i}. {step}" for i, step in enumerate(steps(sheet), 1)]
+    return "\n".join(lines)

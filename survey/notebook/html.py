@@ -2,28 +2,25 @@
 
 from collections.abc import Iterable, Sequence
 
-from survey.report.markup import esc
+from markupsafe import Markup
 
-_CELL = "padding:2px 9px;text-align:{side};white-space:nowrap;{more}"
+from survey.report.markup import part
+
 Cell = str | tuple[str, str]
+_OF = "notebook.html"
 
 
-def heading(title: str, said: str = "") -> str:
+def heading(title: str, said: str = "") -> Markup:
     """A title with a remark; both are escaped."""
-    return f'<div style="margin:4px 0"><b>{esc(title)}</b> <span style="opacity:.7">{esc(said)}</span></div>'
+    return part("heading", title, said, of=_OF)
 
 
-def html_table(columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
+def verdict(colour: str, said: str) -> Markup:
+    """What an adjustment comes to, in a colour of CSS."""
+    return part("verdict", colour, said, of=_OF)
+
+
+def html_table(columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> Markup:
     """A table of texts, first column left, others right; a cell may be a text with its style. Texts are escaped."""
-    head = "".join(f'<th style="{_style(i)}">{esc(c)}</th>' for i, c in enumerate(columns))
-    body = "".join(f"<tr>{''.join(_td(i, cell) for i, cell in enumerate(row))}</tr>" for row in rows)
-    return f'<table style="border-collapse:collapse"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
-
-
-def _style(i: int, more: str = "") -> str:
-    return _CELL.format(side="left" if i == 0 else "right", more=more)
-
-
-def _td(i: int, cell: Cell) -> str:
-    text, more = cell if isinstance(cell, tuple) else (cell, "")
-    return f'<td style="{_style(i, more)}">{esc(text)}</td>'
+    cells = [[cell if isinstance(cell, tuple) else (cell, "") for cell in row] for row in rows]
+    return part("table", columns, cells, of=_OF)

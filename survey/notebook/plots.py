@@ -6,22 +6,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.folder.text import atomic_write, choice_hint, suggestion
-from survey.report import camera_plots, picture
-from survey.report.scene import scene_of
-from survey.report.statistics import heat_map, quantiles
+from survey.report import charts, picture
+from survey.report.drawing import ON_WHITE, standalone
+from survey.report.scene import enlargement, scene_of
+from survey.report.statistics import standardized_by_group
 from survey.solution.quantities import Scale
 from survey.solution.residual_tables import image_rows
 from survey.solution.statistics import correlation_matrix
 from survey.solution.verdict import suspects
 
 if TYPE_CHECKING:
-    from survey.report.camera_plots import CameraResiduals
+    from survey.report.charts import CameraResiduals
 
-_FONT = '"Inter", "Segoe UI", "Helvetica Neue", "Liberation Sans", Arial, sans-serif'
 
 
 @dataclass(frozen=True)
@@ -47,12 +48,6 @@ class Plot:
         return f"Plot({self.name!r}, {len(self.svg)} bytes of SVG)"
 
 
-def standalone(svg: str) -> str:
-    """As a file of its own: a name space, a font and a white ground, also in a dark notebook."""
-    look = f"background:#fff;font-family:{_FONT}".replace('"', "'")
-    return svg.replace("<svg ", f'<svg xmlns="http://www.w3.org/2000/svg" style="{look}" ', 1)
-
-
 def _camera(adjustment: Adjustment, camera: str | None) -> "CameraResiduals":
     ids = [c.camera_id for c in adjustment.survey.cameras]
     if camera is None and len(ids) == 1:
@@ -65,69 +60,62 @@ def _camera(adjustment: Adjustment, camera: str | None) -> "CameraResiduals":
     of_block = np.array([b.camera_id == camera for b in adjustment.survey.image_blocks], dtype=bool)
     mine = of_block[rows.block] if len(of_block) else np.zeros(0, dtype=bool)
     suspect = found_residuals.used & (found_residuals.test > suspects(adjustment).image_limit)
-    return camera_plots.CameraResiduals(
+    return charts.CameraResiduals(
         camera, adjustment.survey.cameras[ids.index(camera)].image_size, rows.uv[mine],
         found_residuals.residuals[mine], found_residuals.standardized[mine], found_residuals.used[mine],
         suspect[mine],
     )  # fmt: skip
 
 
-def _residuals(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> str:
-    return camera_plots.vector_field(_camera(adjustment, camera))
+def _residuals(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> Markup:
+    return charts.vector_field(_camera(adjustment, camera))
 
 
-def _mean_residuals(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> str:
-    return camera_plots.mean_field(_camera(adjustment, camera))
+def _mean_residuals(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> Markup:
+    return charts.mean_field(_camera(adjustment, camera))
 
 
-def _histogram(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> str:
-    return camera_plots.histogram(_camera(adjustment, camera))
+def _histogram(adjustment: Adjustment, _scale: Scale, camera: str | None = None) -> Markup:
+    return charts.histogram(_camera(adjustment, camera))
 
 
-def _view(adjustment: Adjustment, scale: Scale, make: Callable[[Any], picture.View]) -> str:
+def _view(adjustment: Adjustment, scale: Scale, make: Callable[[Any], picture.View]) -> Markup:
     scene = scene_of(adjustment, scale)
     everything = scene.positions()
     if not len(everything):
         raise SurveyError("there is nothing with a place in this survey to draw a map of")
-    enlarged = picture.enlargement(scene, scale.ellipsoid, float(np.linalg.norm(np.ptp(everything, axis=0))))
+    enlarged = enlargement(scene, scale.ellipsoid, float(np.linalg.norm(np.ptp(everything, axis=0))))
     return picture.draw(scene, make(everything), everything, enlarged, scale.ellipsoid)
 
 
-def _map(adjustment: Adjustment, scale: Scale) -> str:
+def _map(adjustment: Adjustment, scale: Scale) -> Markup:
     return _view(adjustment, scale, picture.plan)
 
 
-def _perspective(adjustment: Adjustment, scale: Scale) -> str:
+def _perspective(adjustment: Adjustment, scale: Scale) -> Markup:
     return _view(adjustment, scale, picture.perspective)
 
 
-def _correlations(adjustment: Adjustment, _scale: Scale) -> str:
+def _correlations(adjustment: Adjustment, _scale: Scale) -> Markup:
     found = correlation_matrix(adjustment)
     if found is None:
         raise SurveyError("there are not two unknowns whose correlation could be shown")
-    return heat_map(found)
+    return charts.heat_map(found)
 
 
-def _quantiles(adjustment: Adjustment, _scale: Scale, group: str | None = None) -> str:
+def _quantiles(adjustment: Adjustment, _scale: Scale, group: str | None = None) -> Markup:
     names = [g.group for g in adjustment.groups]
     group = names[0] if group is None and len(names) == 1 else group
     if group not in names:
         hint = suggestion(group, names) if group else f"groups are {', '.join(names)}"
         raise SurveyError(f"{'no group is named' if group is None else f'there is no group {group!r}'}; {hint}")
-    found, parts = adjustment.image_residuals, []
-    for i, block in enumerate(adjustment.survey.image_blocks):
-        rows = slice(found.block_ptr[i], found.block_ptr[i + 1])
-        if block.group == group:
-            parts.append(found.standardized[rows][found.used[rows]].ravel())
-    parts += [o.standardized for o in adjustment.other_residuals if o.used and o.group == group]
-    w = np.concatenate([*parts, np.empty(0)])
-    w = np.sort(w[np.isfinite(w)])
+    w = standardized_by_group(adjustment).get(group, np.empty(0))
     if len(w) < 8:
         raise SurveyError(f"group {group!r} has {len(w)} residuals that can be tested; quantiles need 8 or more")
-    return quantiles(group, w)
+    return charts.quantiles(group, w)
 
 
-PLOTS: Mapping[str, Callable[..., str]] = {
+PLOTS: Mapping[str, Callable[..., Markup]] = {
     "residuals": _residuals,
     "mean_residuals": _mean_residuals,
     "histogram": _histogram,
@@ -148,4 +136,4 @@ def plot(name: str, adjustment: Adjustment, scale: Scale, **chosen: str) -> Plot
         if key != allowed.get(name):
             takes = f"it takes {allowed[name]}=" if name in allowed else "it takes nothing more"
             raise SurveyError(f"plot {name!r} knows no {key}=; {takes}")
-    return Plot(name, standalone(PLOTS[name](adjustment, scale, **chosen)))
+    return Plot(name, standalone(PLOTS[name](adjustment, scale, **chosen), ON_WHITE))

@@ -13,7 +13,7 @@ from adjust.model.result import Adjustment
 from survey.jobs.adjusting.published_methods import published_dict
 from survey.notebook import frames
 from survey.notebook.covariance import Covariance
-from survey.notebook.html import heading, html_table
+from survey.notebook.html import heading, html_table, verdict
 from survey.notebook.names import components, rows_in_joint
 from survey.notebook.plots import Plot
 from survey.notebook.plots import plot as plot_by_name
@@ -197,4 +197,4 @@ class Solution:
                  for g in a.groups]  # fmt: skip
         warned = html_table(("warnings",), [(w,) for w in self.warnings[:10]]) if self.warnings else ""
         title = heading(f"Solution {self.run.title or self.run.folder}")
-        return f'{title}<div style="color:{colour}"><b>{said}</b></div>{html_table(("", ""), rows)}{warned}'
+        return title + verdict(colour, said) + html_table(("", ""), rows) + warned

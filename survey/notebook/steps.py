@@ -1,6 +1,5 @@
 """The five steps over frozen values: read -> problem -> solve -> precision -> report. Each step returns a new value."""
 
-from collections import Counter
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -8,20 +7,15 @@ from typing import Any
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey
 from survey.folder.text import suggestion
-from survey.jobs.adjusting.job import adjust_project, run_info
+from survey.jobs.adjusting.job import run_info
+from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.detecting import DetectOutcome, detect_job
 from survey.jobs.excluding import ExcludeOutcome, exclude_job, include_job
 from survey.notebook.html import heading, html_table
 from survey.notebook.solution import Solution
 from survey.project import AdjustmentOptions, Project
 from survey.project import read as read_project
-
-_SEVERAL = {"table_readings": "table readings", "reading_covariances": "covariances of readings",
-            "coordinate_differences": "coordinate differences", "laser_spots": "laser spots",
-            "on_surfaces": "points on surfaces"}  # fmt: skip
-_OBSERVED = ("table_readings", "pairs", "distances", "coordinates", "readings", "coordinate_differences", "levels",
-             "alignments", "laser_spots", "on_surfaces")  # fmt: skip
-_OWNERS = ("cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces")
+from survey.project.project import lines_text, observed, owners
 
 
 def read(folder: str | Path) -> Project:
@@ -79,39 +73,26 @@ class Problem:
     @property
     def observed(self) -> dict[str, int]:
         """How many observations of each kind there are."""
-        s = self.survey
-        found = {"image points": sum(len(b.uv) for b in s.image_blocks), "images": len(
-            {(b.camera_id, b.epoch_id) for b in s.image_blocks})}  # fmt: skip
-        found |= {_SEVERAL.get(name, name): len(getattr(s, name)) for name in _OBSERVED}
-        found["spots to identify"] = sum(len(b.uv) for b in self.project.spots)
-        return {name: n for name, n in found.items() if n}
+        return observed(self.survey, sum(len(b.uv) for b in self.project.spots))
 
     @property
     def owners(self) -> dict[str, int]:
         """How many cameras, stations, points ... there are."""
-        return {name: len(getattr(self.survey, name)) for name in _OWNERS if getattr(self.survey, name)}
+        return owners(self.survey)
 
     def solve(self, *, progress: bool = False) -> Solution:
         """The next step; see :func:`solve`."""
         return solve(self, progress=progress)
 
-    def _lines(self) -> list[tuple[str, str]]:
-        return [("observed", _counted(self.observed)), ("of", _counted(self.owners)),
-                ("datum", self.survey.datum.kind)]  # fmt: skip
-
     def __repr__(self) -> str:
         """Counts for people."""
-        return "\n".join([f"Problem {self.project.title or self.project.folder.name}",
-                          *(f"  {name:<9} {said}" for name, said in self._lines())])  # fmt: skip
+        head = f"Problem {self.project.title or self.project.folder.name}"
+        return "\n".join((head, *lines_text(self.project.contents)))
 
     def _repr_html_(self) -> str:
         return heading("Problem", self.project.title or self.project.folder.name) + html_table(
-            ("", ""), [(name, (said, "text-align:left")) for name, said in self._lines()]
+            ("", ""), [(name, (said, "text-align:left")) for name, said in self.project.contents]
         )
-
-
-def _counted(found: dict[str, int]) -> str:
-    return ", ".join(f"{n} {name if n != 1 else name.removesuffix('s')}" for name, n in found.items()) or "nothing"
 
 
 def problem(project: Project | str | Path) -> Problem:
@@ -133,13 +114,3 @@ def solve(problem: Problem, *, progress: bool = False) -> Solution:
 def adjust(project: Project | Problem | str | Path, *, progress: bool = False) -> Solution:
     """Problem and solution in one step, of a project or its folder; nothing is written. Raises SurveyError."""
     return solve(project if isinstance(project, Problem) else problem(project), progress=progress)
-
-
-def project_text(project: Project) -> str:
-    """A project as its owner knows it; used where it is printed."""
-    kinds = Counter(type(k).__name__ for k in project.target_kinds.values())
-    targets = f", targets {', '.join(f'{n} {kind}' for kind, n in kinds.items())}" if kinds else ""
-    images = f", {len(project.images)} images" if project.images else ""
-    return f"Project {project.title or project.folder.name!r} in {project.folder}{images}{targets}\n" + "\n".join(
-        f"  {name:<9} {said}" for name, said in Problem(project)._lines()
-    )

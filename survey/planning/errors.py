@@ -6,16 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.design.error_analysis import BeaconField, tolerance
 from adjust.design.error_figures import ErrorFigure, error_figures
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import write_set
 from survey.planning.page import html_page
-from survey.planning.plots import Series, chart
 from survey.planning.summary import number
 from survey.report import drawing as d
-from survey.report.markup import esc, fixed, general, section, table
+from survey.report.charts import Series, chart
+from survey.report.markup import figures, fixed, general, section, table
 
 PAPER = BeaconField()
 BOUNDED = BeaconField(nearest_m=0.1)
@@ -114,10 +115,10 @@ def error_analysis_job(
 
 
 def _picture(f: ErrorFigure) -> str:
-    return _drawn(f).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+    return d.standalone(_drawn(f))
 
 
-def _drawn(f: ErrorFigure) -> str:
+def _drawn(f: ErrorFigure) -> Markup:
     unit, factor = _unit(f)
     x = factor * f.sigmas
     title = f"Figure {_NUMBERS[f.kind]}: {f.kind} error"
@@ -140,7 +141,7 @@ def _page(a: ErrorAnalysis) -> str:
         unit, factor = _unit(f)
         three = factor * tolerance(a.rms_px / np.sqrt(3.0), f.slope)
         rows.append((
-            f"{_NUMBERS[f.kind]}", esc(f.kind), fixed(f.slope / factor, 4),
+            f"{_NUMBERS[f.kind]}", f.kind, fixed(f.slope / factor, 4),
             f"{fixed(f.slope_monte_carlo / factor, 4)} ± {fixed(f.slope_se / factor, 4)}",
             fixed(100 * float(np.abs(f.deviation).max()), 2) + " %",
             fixed(100 * float(np.abs(f.rms / f.analytic - 1).max()), 2) + " %",
@@ -149,23 +150,21 @@ def _page(a: ErrorAnalysis) -> str:
         ))  # fmt: skip
     columns = ("Figure", "<Error of", "Analytic slope", "Monte Carlo slope", "Worst point", "Plain worst",
                "Its s.e. up to", f"Alone for {a.rms_px:g} px", "One of three")  # fmt: skip
-    pictures = "".join(f"<figure>{_drawn(f)}</figure>" for f in a.bounded)
     note = (
         f"Table 1 of the paper: alpha = 1600 px, principal point (640, 512), {a.n_trials:,} trials a point. Beacons "
         f"uniform over what the camera sees from {1e3 * a.bounded[0].field.nearest_m:.0f} to 1000 mm. Slopes in px per "
         "mm or degree. Worst point: largest deviation of the Monte Carlo with control variate from the analytic RMS; "
         "plain: of the RMS of the trials as they are, which is uncertain by its standard error."
     )
-    body = f'<div class="figures">{pictures}</div>' + table(columns, rows)
+    body = figures(map(_drawn, a.bounded)) + table(columns, rows)
     first = section("bounded", "Figures 4 to 6, beacons not nearer than 100 mm", body, note)
-    paper = "".join(f"<figure>{_drawn(f)}</figure>" for f in a.paper)
     lines = []
     for f in a.paper:
         unit, factor = _unit(f)
         slope = float(np.median(f.rms / f.sigmas))
         allowed = f"{general(factor * tolerance(a.rms_px, slope), 3)} {unit}"
         carried = f"{np.median(f.effective):,.0f}"
-        lines.append((_NUMBERS[f.kind], esc(f.kind), general(slope / factor, 3), carried, allowed))
+        lines.append((_NUMBERS[f.kind], f.kind, general(slope / factor, 3), carried, allowed))
     said = (
         "As the paper has it, beacons may be anywhere from depth 0 on. The mean of 1/Z² is then infinite: the RMS of "
         "position errors has no expectation, and a handful of near beacons decides it. Effective: how many of the "
@@ -173,6 +172,6 @@ def _page(a: ErrorAnalysis) -> str:
         "last column."
     )
     few = ("Figure", "<Error of", "Median slope", "Effective trials", f"Tolerance for {a.rms_px:g} px")
-    second = section("paper", "As printed, beacons from depth 0", f'<div class="figures">{paper}</div>'
-                     + table(few, lines), said)  # fmt: skip
+    pictures = figures(map(_drawn, a.paper))
+    second = section("paper", "As printed, beacons from depth 0", pictures + table(few, lines), said)
     return html_page("Error analysis", "Pixel error by errors of beacons and cameras", [first, second])

@@ -27,7 +27,7 @@ from adjust.design.selection import Component, Criterion
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
-from survey.jobs.adjusting.job import adjust_project
+from survey.jobs.adjusting.steps import adjust_project
 from survey.planning.building import Planned, build_plan
 from survey.planning.navigation import NavigationOutcome, plan_navigation
 from survey.planning.plan_file import Plan, read_plan

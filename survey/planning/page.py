@@ -4,14 +4,31 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from gtsam import Pose3
+from markupsafe import Markup
 
 from adjust.design import group_redundancy
-from survey.planning.plots import Series, bars, chart, seen_map
 from survey.planning.summary import meets, people, pose_sigmas, tolerance_values
 from survey.report import drawing as d
-from survey.report.document import document
-from survey.report.markup import count, definition, esc, fixed, general, pill, section, sigma_text, table
-from survey.report.picture import pictures
+from survey.report.charts import Series, bars, chart, seen_map
+from survey.report.language import esc
+from survey.report.markup import (
+    count,
+    definition,
+    document,
+    element,
+    figures,
+    fixed,
+    general,
+    joined,
+    listed,
+    note,
+    part,
+    pill,
+    section,
+    sigma_text,
+    table,
+)
+from survey.report.picture import draw, perspective, pictures
 from survey.report.scene import Scene, Spot, scene_of
 from survey.solution.quantities import scale_of
 
@@ -23,9 +40,10 @@ _MOST_CANDIDATES = 30
 _COLOURS = {"epoch": d.BLUE, "beacon": d.RED, "distance": d.GREEN, "pair": d.ORANGE, "coordinates": d.PURPLE}
 
 
-def html_page(title: str, heading: str, sections: list[str]) -> str:
+def html_page(title: str, heading: str, sections: list[Markup]) -> str:
     """A page in the style of the reports."""
-    return document(title, f'<p class="meta">{esc(heading)}</p><h1>{esc(title)}</h1>' + "\n".join(sections))
+    head = element("p", heading, "meta") + element("h1", title)
+    return document(title, head + joined(sections, "\n"))
 
 
 def plan_page(o: "PlanningOutcome") -> str:
@@ -33,47 +51,44 @@ def plan_page(o: "PlanningOutcome") -> str:
     title = o.title or o.folder.resolve().name
     parts = [
         _summary(o), _picture(o), _seen(o), _sigmas(o), _weak(o), _selection(o), _tolerances(o), _trials(o),
-        _navigation(o.navigation) if o.navigation is not None else "",
+        _navigation(o.navigation) if o.navigation is not None else Markup(),
     ]  # fmt: skip
     return html_page(f"{title} – plan", "Plan: expected precision before measuring", [p for p in parts if p])
 
 
-def _summary(o: "PlanningOutcome") -> str:
+def _summary(o: "PlanningOutcome") -> Markup:
     e = o.expected
-    cards = [("observations", count(e.n_observations)), ("unknowns", count(e.n_unknowns)),
-             ("redundancy", count(e.redundancy)), ("planned epochs", count(o.planned.n_planned_epochs)),
-             ("images measured already", count(o.planned.n_existing_blocks))]  # fmt: skip
-    body = '<div class="cards">' + "".join(f"<div><b>{v}</b><span>{k}</span></div>" for k, v in cards) + "</div>"
-    notes = [*o.planned.notes, *e.warnings]
-    if notes:
-        body = '<ul class="problems">' + "".join(f"<li>{esc(n)}</li>" for n in notes) + "</ul>" + body
+    cards = [(count(e.n_observations), "observations"), (count(e.n_unknowns), "unknowns"),
+             (count(e.redundancy), "redundancy"), (count(o.planned.n_planned_epochs), "planned epochs"),
+             (count(o.planned.n_existing_blocks), "images measured already")]  # fmt: skip
+    body = listed([*o.planned.notes, *e.warnings]) + part("cards", cards)
     rows = [
-        (esc(g), count(n), fixed(r, 1), fixed(q[0], 3), fixed(q[1], 3), fixed(q[2], 3))
+        (g, count(n), fixed(r, 1), fixed(q[0], 3), fixed(q[1], 3), fixed(q[2], 3))
         for g, (n, r, q) in group_redundancy(e).items()
     ]
     columns = ("<Group", "Observations", "Redundancy", "Smallest", "Median", "Largest number")
-    note = (
+    said = Markup(
         "No observation has a value yet: all sigmas on this page are <b>a priori</b>, from the planned sigmas of the "
         "observations and the geometry alone. A redundancy number tells how well an observation is checked by the "
         "others: an error in one near 0 would not be noticed."
     )
-    return section("summary", "Summary", body + table(columns, rows), note)
+    return section("summary", "Summary", body + table(columns, rows), said)
 
 
-def _picture(o: "PlanningOutcome") -> str:
+def _picture(o: "PlanningOutcome") -> Markup:
     scale = scale_of(o.expected, "a_priori")
     drawn, enlarged = pictures(scene_of(o.expected, scale), scale.ellipsoid)
-    note = (
+    said = (
         f"95 % confidence ellipsoids of points (red) and stations (green), enlarged {general(enlarged, 3)} times. "
         "Cameras are drawn at the first epoch; thin lines are their axes at others."
     )
-    return section("picture", "The survey", f'<div class="figures">{drawn}</div>' if drawn else "", note)
+    return section("picture", "The survey", figures(drawn), said)
 
 
-def _seen(o: "PlanningOutcome") -> str:
+def _seen(o: "PlanningOutcome") -> Markup:
     blocks = o.planned.survey.image_blocks
     if not blocks:
-        return ""
+        return Markup()
     epochs = list(dict.fromkeys(b.epoch_id for b in blocks))
     rows = list(dict.fromkeys((b.camera_id, b.target_id or "points") for b in blocks))
     rows.sort()
@@ -82,10 +97,10 @@ def _seen(o: "PlanningOutcome") -> str:
         counts[rows.index((b.camera_id, b.target_id or "points")), epochs.index(b.epoch_id)] += len(b.point_idx)
     title = "Points seen, by camera and target over epochs (darker: more)"
     drawn = seen_map([f"{c}: {t}" for c, t in rows], epochs, counts, title)
-    return section("seen", "What will be seen", f"<figure>{drawn}</figure>")
+    return section("seen", "What will be seen", element("figure", drawn))
 
 
-def _sigmas(o: "PlanningOutcome") -> str:
+def _sigmas(o: "PlanningOutcome") -> Markup:
     by_name = o.expected.precision.graph.unknowns.by_name
     rows = []
     for name in (n for n in by_name if len(n) < 3):
@@ -94,72 +109,72 @@ def _sigmas(o: "PlanningOutcome") -> str:
         cells = []
         for c, unit in zip(unknown.components, unknown.units, strict=True):
             label, factor = people(unit)
-            cells.append(f"{esc(c)} {sigma_text(factor * float(s[estimate.components.index(c)]))} {esc(label)}".strip())
-        rows.append((esc(".".join(name)), " &nbsp; ".join(cells)))
-    note = "One standard deviation, all others unknown too; poses in the tangent, in the frame on the right."
-    return section("sigmas", "Expected sigmas", table(("<Unknown", "<Sigmas"), rows), note)
+            cells.append(f"{c} {sigma_text(factor * float(s[estimate.components.index(c)]))} {label}".strip())
+        rows.append((".".join(name), " \u00a0 ".join(cells)))
+    said = "One standard deviation, all others unknown too; poses in the tangent, in the frame on the right."
+    return section("sigmas", "Expected sigmas", table(("<Unknown", "<Sigmas"), rows), said)
 
 
-def _weak(o: "PlanningOutcome") -> str:
+def _weak(o: "PlanningOutcome") -> Markup:
     rows = [
-        (fixed(w.factor, 0), "<br>".join(esc(f"{s:+.2f}  {a}: {c}") for a, c, s in w.parts)) for w in o.weak
+        (fixed(w.factor, 0), part("lines", [f"{s:+.2f}  {a}: {c}" for a, c, s in w.parts])) for w in o.weak
     ]  # fmt: skip
-    note = (
+    said = (
         "Combinations of unknowns that the observations hardly tell apart. Factor: how many times less precise the "
         "combination is than its parts would be if the rest were known; shares in sigmas of each."
     )
-    return section("weak", "Weak directions", table(("Factor", "<What moves together"), rows) if rows else "", note)
+    return section("weak", "Weak directions", table(("Factor", "<What moves together"), rows) if rows else "", said)
 
 
-def _selection(o: "PlanningOutcome") -> str:
+def _selection(o: "PlanningOutcome") -> Markup:
     s = o.selection
     if s is None:
-        return ""
+        return Markup()
     shown = s.first[:_MOST_CANDIDATES]
     names = [f"{g.kind} {g.name}" for g in shown]
     label = "gain in ln det" if s.criterion == "D" else "decrease of the mean variance"
     drawn = bars(names, np.array([g.value(s.criterion) for g in shown]), f"Every candidate alone: {label}",
                  [_COLOURS.get(g.kind, d.GREY) for g in shown])  # fmt: skip
     steps = [
-        (str(i + 1), esc(g.kind), esc(g.name), fixed(g.ln_det, 3), fixed(g.ln_det_all, 3),
+        (str(i + 1), g.kind, g.name, fixed(g.ln_det, 3), fixed(g.ln_det_all, 3),
          fixed(100 * g.mean_variance, 2) + " %")
         for i, g in enumerate(s.steps)
     ]  # fmt: skip
     columns = ("", "<Kind", "<Measure next", "Gain ln det", "Of all unknowns", "Mean variance falls by")
-    body = f'<div class="figures"><figure>{drawn}</figure></div>' + table(columns, steps)
+    body = figures([drawn]) + table(columns, steps)
     rows = []
     for c, a, b in zip(s.wanted, s.sigmas.tolist(), s.after.tolist(), strict=True):
         unit, factor = people(c.unit)
         drop = fixed(100 * (1 - b / a), 1) + " %" if a > 0 else ""
-        rows.append((esc(c.text), sigma_text(factor * a), sigma_text(factor * b), esc(unit), drop))
-    body += "<details><summary>Sigmas of everything wanted, before and after</summary>"
-    body += table(("<Component", "Before", "After all", "<Unit", "Smaller by"), rows) + "</details>"
-    note = (
+        rows.append((c.text, sigma_text(factor * a), sigma_text(factor * b), unit, drop))
+    wanted = table(("<Component", "Before", "After all", "<Unit", "Smaller by"), rows)
+    body += part("details", "Sigmas of everything wanted, before and after", wanted, False)
+    said = (
         f"{len(s.first)} candidates; {s.criterion}-optimal choice of {len(s.steps)}, one after the other, each beside "
         "those taken. ln det: of the covariance of what is wanted; the mean variance counts every component in units "
         "of its variance now."
     )
-    return section("next", "What to add next", body, note)
+    return section("next", "What to add next", body, said)
 
 
-def _tolerances(o: "PlanningOutcome") -> str:
+def _tolerances(o: "PlanningOutcome") -> Markup:
     if o.budget is None:
-        return ""
+        return Markup()
     rows, share = [], o.budget.variances / o.budget.variances.sum(axis=0)
     for k, (c, r) in enumerate(o.required.items()):
         unit, factor = people(c.unit)
         s = float(o.budget.sigmas[k])
         word = pill("good", "met") if s <= r * (1 + 1e-9) else pill("bad", "not met")
         parts = [fixed(100 * v, 0) + " %" for v in share[:, k]]
-        rows.append((esc(c.text), sigma_text(factor * r), sigma_text(factor * s), esc(unit), word, *parts))
+        rows.append((c.text, sigma_text(factor * r), sigma_text(factor * s), unit, word, *parts))
     body = table(("<Component", "Required", "Planned", "<Unit", "<", *map(esc, o.budget.groups)), rows)
-    lines = [(esc(t.group), _factor(t.alone), _factor(t.together), esc(t.limiting)) for t in o.tolerances]
+    lines = [(t.group, _factor(t.alone), _factor(t.together), t.limiting) for t in o.tolerances]
     body += table(("<Group", "Alone", "Together", "<Limited by"), lines, "Sigmas may be so many times the planned ones")
-    note = (
+    said = (
         "The variance of each component by group of observations, weights as planned. Alone: this group is changed, "
         "the others stay; together: every group takes an equal share of what is allowed."
     )
-    return section("tolerances", "Required precision and tolerances", body, note)
+    return section("tolerances", "Required precision and tolerances", body, said)
 
 
 def _factor(value: float) -> str:
@@ -168,10 +183,10 @@ def _factor(value: float) -> str:
     return "any" if value > 1e6 else general(value, 3)
 
 
-def _trials(o: "PlanningOutcome") -> str:
+def _trials(o: "PlanningOutcome") -> Markup:
     t = o.trials
     if t is None:
-        return ""
+        return Markup()
     word = pill("good", "agrees") if t.passed else pill("bad", "does not agree")
     facts = definition([
         ("Surveys simulated and adjusted", f"{count(len(t.errors))}, {len(t.failed)} failed"),
@@ -187,23 +202,23 @@ def _trials(o: "PlanningOutcome") -> str:
              Series("± 2 standard errors", np.array([0.0, k]), np.ones(2) + 2 * se, d.GREY, line=True, dashed=True),
              Series("", np.array([0.0, k]), np.ones(2) - 2 * se, d.GREY, line=True, dashed=True)]  # fmt: skip
     drawn = chart(lines, "Scatter over prediction", "component", "ratio", 620, 260, None)
-    return section("trials", "Monte Carlo", facts + f"<figure>{drawn}</figure>")
+    return section("trials", "Monte Carlo", facts + element("figure", drawn))
 
 
-def _navigation(n: "NavigationOutcome") -> str:
+def _navigation(n: "NavigationOutcome") -> Markup:
     turn, shift = pose_sigmas(n)
     x = np.arange(1.0, len(turn) + 1)
     limits = np.degrees(n.plan.required_rotation), 1e3 * n.plan.required_translation
-    figures = []
+    drawn = []
     for what, values, limit, unit in (("rotation", turn, limits[0], "deg"), ("translation", shift, limits[1], "mm")):
         good = np.isfinite(values)
         if not good.any():
             continue
         lines = [Series("required", np.array([0.0, len(x)]), np.full(2, limit), d.RED, line=True, dashed=True),
                  Series(f"largest sigma of {what}", x[good], values[good], d.BLUE)]  # fmt: skip
-        figures.append(f"<figure>{chart(lines, f'Expected {what} of every pose', 'pose', unit)}</figure>")
-    figures.append(f"<figure>{_room(n)}</figure>" if n.placement is None else "")
-    body = f'<div class="figures">{"".join(figures)}</div>'
+        drawn.append(chart(lines, f"Expected {what} of every pose", "pose", unit))
+    drawn += [_room(n)] if n.placement is None else []
+    body = part("figures", drawn, "figures")
     good = meets(n)
     open_poses = [i + 1 for i, e in enumerate(n.precision) if e.undetermined]
     facts = [("Poses as precise as required", f"{int(good.sum())} of {len(good)}")]
@@ -216,23 +231,21 @@ def _navigation(n: "NavigationOutcome") -> str:
         rows = []
         for t in n.tolerances:
             unit, *sigmas = tolerance_values(t)
-            rows.append((esc(t.source), *("never" if np.isnan(v) else general(v, 3) for v in sigmas), unit))
+            rows.append((t.source, *("never" if np.isnan(v) else general(v, 3) for v in sigmas), unit))
         caption = "Sigma per component that each source may have for every determined pose to be as required"
         body += table(("<Source", "Alone", "Beside the planned", "Equal shares", "<Unit"), rows, caption)
-        body += (
-            f'<p class="note">With equal shares simulated and solved anew: RMS errors are {n.simulated.min():.3f} to '
-            f"{n.simulated.max():.3f} of their predictions.</p>"
+        body += note(
+            f"With equal shares simulated and solved anew: RMS errors are {n.simulated.min():.3f} to "
+            f"{n.simulated.max():.3f} of their predictions."
         )
-    note = (
-        f"Station {esc(n.station_id)} with its calibration as planned, {len(n.beacons.beacon_ids)} beacons; required: "
+    said = (
+        f"Station {n.station_id} with its calibration as planned, {len(n.beacons.beacon_ids)} beacons; required: "
         f"{limits[0]:.3g} deg and {limits[1]:.3g} mm per component."
     )
-    return section("navigation", "Navigation", body, note)
+    return section("navigation", "Navigation", body, said)
 
 
-def _room(n: "NavigationOutcome") -> str:
-    from survey.report.picture import draw, perspective
-
+def _room(n: "NavigationOutcome") -> Markup:
     scene = Scene()
     beacons = np.asarray(n.beacons.x_in_world)
     for name, x in zip(n.beacons.beacon_ids, beacons, strict=True):
@@ -245,10 +258,10 @@ def _room(n: "NavigationOutcome") -> str:
     return draw(scene, perspective(everything), everything, 1.0, 1.0)
 
 
-def _placement(n: "NavigationOutcome") -> str:
+def _placement(n: "NavigationOutcome") -> Markup:
     p = n.placement
     if p is None:
-        return ""
+        return Markup()
     measure = p.measure
     x = np.arange(1.0, len(measure) + 1)
     good = measure < 1e4
@@ -257,16 +270,16 @@ def _placement(n: "NavigationOutcome") -> str:
         lines.append(Series("greedy", x[good], np.sqrt(measure[good]), d.BLUE, line=True))
         lines.append(Series("after exchanges", x[-1:], np.sqrt([p.final]), d.RED))
     what = "worst pose" if n.plan.criterion == "worst" else "mean pose"
-    drawn = chart(lines, f"{what.capitalize()} over beacons placed", "beacons", "sigma / required") if lines else ""
+    title = f"{what.capitalize()} over beacons placed"
+    drawn = chart(lines, title, "beacons", "sigma / required") if lines else Markup()
     rows = [
         (f"N{i + 1}", *(fixed(1e3 * v, 0) for v in place), str(sum(f"N{i + 1}" in e.beacon_ids for e in n.precision)))
         for i, place in enumerate(n.places)
     ]
-    body = "<h3>Where to put beacons</h3>"
-    body += f'<div class="figures"><figure>{_room(n)}</figure><figure>{drawn}</figure></div>'
-    note = (
-        f'<p class="note">{len(n.places)} of {len(n.plan.places)} places on the walls (small dots), chosen one by one '
+    body = element("h3", "Where to put beacons") + figures((_room(n), drawn))
+    said = (
+        f"{len(n.places)} of {len(n.plan.places)} places on the walls (small dots), chosen one by one "
         f"for the {what}, {p.exchanged} then exchanged; red: beacons, green: where the head will be. Every pose sees "
-        f"at least {min(p.seen)} beacons.</p>"
+        f"at least {min(p.seen)} beacons."
     )
-    return body + note + table(("<Beacon", "x mm", "y mm", "z mm", "Poses that see it"), rows)
+    return body + note(said) + table(("<Beacon", "x mm", "y mm", "z mm", "Poses that see it"), rows)

@@ -4,7 +4,6 @@ A hash is trusted as long as size and time of the file are those it was made of;
 same costs one look at their directory entries, and reading them only where that tells nothing.
 """
 
-import hashlib
 import json
 import time
 from collections.abc import Iterable, Mapping
@@ -172,8 +171,3 @@ def image_news(
             found["sought"].append(key)
     gone = tuple(key for key in known if key not in images and key in pointed)
     return ImageNews(**{name: tuple(keys) for name, keys in found.items()}, gone=gone, same=same)
-
-
-def digest_of(*texts: str) -> str:
-    """One hash of several texts."""
-    return hashlib.sha256("\n".join(texts).encode()).hexdigest()

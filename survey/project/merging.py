@@ -15,13 +15,12 @@ from adjust.model.errors import SurveyError
 from survey.folder.replacing import copy_folder
 from survey.folder.text import atomic_write, decode, read_bytes, suggestion
 from survey.project.declared.node import read_toml
-from survey.project.declared.toml_lines import KeyPath, key_lines
-from survey.project.declared.toml_text import toml_text
+from survey.project.declared.toml_text import KeyPath, key_lines, toml_text
 from survey.project.detected import ImageKey, file_of
 from survey.project.exclusions import EXCLUSIONS_FILE, appended, read_exclusions
 from survey.project.project import DEFINITION_FILE, FORMAT, IMAGES_FOLDER, OBSERVATIONS_FOLDER, Project
 from survey.project.reading import LAYOUTS, read
-from survey.project.tables.reading import read_table
+from survey.project.tables.files import read_table
 
 _KINDS = ("cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces")
 Origin = tuple[Path, int]

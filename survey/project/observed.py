@@ -187,7 +187,7 @@ class Observed:
     def is_used(self, name: Name) -> bool:
         """Whether any observation of a name is in use."""
         hit, blocks = self.hits(name), self.survey.image_blocks
-        images = (mask if blocks[i].used is None else mask & blocks[i].used for i, mask in hit.images.items())
+        images = (mask if (used := blocks[i].used) is None else mask & used for i, mask in hit.images.items())
         others = (getattr(self.survey, which)[i].used for which, rows in hit.others.items() for i in rows)
         members = (getattr(self.survey, which)[i].used for which, i in hit.members)
         return bool(hit.spots) or any(m.any() for m in images) or any(others) or any(members)

@@ -1,25 +1,74 @@
 """What a project folder holds, as frozen values."""
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from gtsam import Rot3
 
 from adjust.model.observations import Closure, FrameRef
 from adjust.model.survey import FloatArray, IntArray, Survey
+from survey.folder.locking import OBSERVATIONS_FOLDER as OBSERVATIONS_FOLDER
+from survey.folder.locking import RESULTS as RESULTS
 from survey.project.detected import DetectedImage
 from survey.project.exclusions import Exclusion
 from survey.project.targets import TargetKind
-from survey.solution.quantities import SigmaKind
-from survey.solution.tolerances import Tolerance
+
+_SEVERAL = {"table_readings": "table readings", "reading_covariances": "covariances of readings",
+            "coordinate_differences": "coordinate differences", "laser_spots": "laser spots",
+            "on_surfaces": "points on surfaces"}  # fmt: skip
+_OBSERVED = ("table_readings", "pairs", "distances", "coordinates", "readings", "coordinate_differences", "levels",
+             "alignments", "laser_spots", "on_surfaces")  # fmt: skip
+_OWNERS = ("cameras", "stations", "tables", "targets", "points", "instruments", "setups", "beams", "surfaces")
+
+
+def observed(survey: Survey, n_spots: int) -> dict[str, int]:
+    """How many observations of each kind there are; n_spots: those that are still to be identified."""
+    found = {"image points": sum(len(b.uv) for b in survey.image_blocks), "images": len(
+        {(b.camera_id, b.epoch_id) for b in survey.image_blocks})}  # fmt: skip
+    found |= {_SEVERAL.get(name, name): len(getattr(survey, name)) for name in _OBSERVED}
+    found["spots to identify"] = n_spots
+    return {name: n for name, n in found.items() if n}
+
+
+def owners(survey: Survey) -> dict[str, int]:
+    """How many cameras, stations, points ... there are."""
+    return {name: len(getattr(survey, name)) for name in _OWNERS if getattr(survey, name)}
+
+
+def contents(survey: Survey, n_spots: int) -> list[tuple[str, str]]:
+    """What is observed, of what, in which datum: names and texts of a table."""
+    return [("observed", _counted(observed(survey, n_spots))), ("of", _counted(owners(survey))),
+            ("datum", survey.datum.kind)]  # fmt: skip
+
+
+def _counted(found: dict[str, int]) -> str:
+    return ", ".join(f"{n} {name if n != 1 else name.removesuffix('s')}" for name, n in found.items()) or "nothing"
+
+
+def lines_text(lines: Iterable[tuple[str, str]]) -> list[str]:
+    """The table as lines of a text."""
+    return [f"  {name:<9} {said}" for name, said in lines]
+
 
 FORMAT = 1
 DEFINITION_FILE = "survey.toml"
-OBSERVATIONS_FOLDER = "observations"
 IMAGES_FOLDER = "images"
-RESULTS = "results"
+SigmaKind = Literal["a_priori", "a_posteriori"]
+SIGMA_KINDS: tuple[SigmaKind, ...] = get_args(SigmaKind)
+DEMANDED = {
+    "points": ("point",),
+    "stations": ("world_from_station", "mount_from_station"),
+    "cameras": ("station_from_camera",),
+    "lenses": ("lens",),
+    "tables": ("world_from_table",),
+    "table_geometry": ("table_geometry",),
+    "targets": ("carrier_from_target",),
+}
+"""Of what a tolerance may be demanded, and the names of those estimates."""
+POSITION, ROTATION = "position", "rotation"
 
 
 @dataclass(frozen=True)
@@ -45,6 +94,25 @@ class SpotBlock:
     spot_ids: tuple[str, ...]
     uv: FloatArray
     cov: FloatArray
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """One demand. of: a key of ``DEMANDED``; ids: whose (all where empty).
+
+    quantity: "position", "rotation", or the name of a component (of a lens, a table's geometry).
+    expanded: largest expanded uncertainty allowed, in the worst direction; None where only the value matters.
+    nominal, within: the value must be proven to lie within +- ``within`` of ``nominal``; of components only. SI units,
+    px for those in pixels.
+    """
+
+    name: str
+    of: str
+    ids: tuple[str, ...]
+    quantity: str
+    expanded: float | None = None
+    nominal: float | None = None
+    within: float | None = None
 
 
 @dataclass(frozen=True)
@@ -200,8 +268,15 @@ class Project(Definition):
     notes: tuple[str, ...] = ()
     image_notes: tuple[str, ...] = ()
 
+    @property
+    def contents(self) -> list[tuple[str, str]]:
+        """What is observed, of what, in which datum: names and texts of a table."""
+        return contents(self.survey, sum(len(b.uv) for b in self.spots))
+
     def __repr__(self) -> str:
         """What is in the folder, in a few lines: a notebook prints it."""
-        from survey.notebook.steps import project_text  # the adjustment is not needed to read a folder
-
-        return project_text(self)
+        kinds = Counter(type(k).__name__ for k in self.target_kinds.values())
+        targets = f", targets {', '.join(f'{n} {kind}' for kind, n in kinds.items())}" if kinds else ""
+        images = f", {len(self.images)} images" if self.images else ""
+        head = f"Project {self.title or self.folder.name!r} in {self.folder}{images}{targets}"
+        return "\n".join((head, *lines_text(self.contents)))

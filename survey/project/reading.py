@@ -11,26 +11,29 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import Datum, FloatArray, Point, PointParameter, Survey
 from survey.folder.locking import settled
 from survey.folder.text import id_problem, natural_key, suggestion
-from survey.project.declared.alignment_tasks import read_alignment_tasks
-from survey.project.declared.bodies import read_beams, read_surfaces
-from survey.project.declared.closures import read_closures
 from survey.project.declared.declarations import keys_of
-from survey.project.declared.instruments import read_bearings, read_instruments, read_setups, read_vertical
+from survey.project.declared.instruments import (
+    read_beams,
+    read_bearings,
+    read_instruments,
+    read_setups,
+    read_surfaces,
+    read_vertical,
+)
 from survey.project.declared.node import Node, read_toml
+from survey.project.declared.options import read_alignment_tasks, read_options
 from survey.project.declared.owners import read_cameras, read_stations, read_tables
 from survey.project.declared.poses import flat_point, read_point
 from survey.project.declared.targets import read_targets
-from survey.project.declared.tolerances import read_tolerances
 from survey.project.detected import DetectedImage, ImageKey, ImageNews, image_news, read_detected
 from survey.project.exclusions import EXCLUSIONS, EXCLUSIONS_FILE, Exclusion, in_force, read_exclusions
-from survey.project.images import find_images
+from survey.project.images import find_images, sought_in
 from survey.project.observed import Observed, union, without
 from survey.project.project import (
     DEFINITION_FILE,
     FORMAT,
     IMAGES_FOLDER,
     OBSERVATIONS_FOLDER,
-    AdjustmentOptions,
     Definition,
     ImagePointsWhere,
     LeftOut,
@@ -38,8 +41,15 @@ from survey.project.project import (
     Sigmas,
     SpotsRequest,
 )
-from survey.project.sought import sought_in
-from survey.project.tables.differences import DIFFERENCES, DIFFERENCES_COVARIANCE, read_differences
+from survey.project.tables.coordinates import (
+    COORDINATES,
+    COORDINATES_COVARIANCE,
+    DIFFERENCES,
+    DIFFERENCES_COVARIANCE,
+    read_coordinates,
+    read_differences,
+)
+from survey.project.tables.files import read_table
 from survey.project.tables.geometric import (
     ALIGNMENTS,
     LASER_SPOTS,
@@ -51,17 +61,9 @@ from survey.project.tables.geometric import (
     read_on_surfaces,
 )
 from survey.project.tables.image_points import IMAGE_POINTS, SPOTS, read_image_blocks, read_spots, world_names
-from survey.project.tables.measurements import (
-    ANGLES,
-    COORDINATES,
-    COORDINATES_COVARIANCE,
-    DISTANCES,
-    read_angles,
-    read_coordinates,
-    read_distances,
-)
+from survey.project.tables.measurements import ANGLES, DISTANCES, read_angles, read_distances
 from survey.project.tables.pairs import PAIRS, read_pairs
-from survey.project.tables.reading import Layout, Table, read_table
+from survey.project.tables.reading import Layout, Table
 from survey.project.tables.references import Names
 from survey.project.tables.terrestrial import (
     KINDS,
@@ -70,7 +72,6 @@ from survey.project.tables.terrestrial import (
     read_reading_covariances,
     read_readings,
 )
-from survey.solution.quantities import SIGMA_KINDS
 
 LAYOUTS = {
     layout.name: layout
@@ -259,7 +260,7 @@ def _read_definition(folder: Path) -> tuple[Definition, Node]:
         target_kinds=kinds,
         images=find_images(folder / IMAGES_FOLDER, camera_ids),
         spots_request=_read_spots_request(root.table("spots"), camera_ids) if root.has("spots") else None,
-        options=_read_options(root),
+        options=read_options(root),
         sigmas=dataclasses.replace(_read_sigmas(root.table("sigmas"), table_sigmas), instruments=accuracies),
         inputs=inputs,
         target_cameras=seen_by,
@@ -302,25 +303,6 @@ def _read_spots_request(node: Node, camera_ids: tuple[str, ...]) -> SpotsRequest
     if not 0 < smallest <= largest:
         raise node.error(f"found [{smallest:g}, {largest:g}]; expected [smallest, largest]", "diameter_px")
     return SpotsRequest(cameras, epochs, (smallest, largest), node.number("gate_px", 15.0, positive=True))
-
-
-def _read_options(root: Node) -> AdjustmentOptions:
-    """The tables [adjustment], [closures], [tolerances] and [identification]."""
-    node, said = root.table("adjustment"), root.table("identification")
-    node.allow(*keys_of("adjustment"))
-    alpha = node.number("alpha", 0.05, positive=True)
-    if alpha >= 1:
-        raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
-    flags = {name: node.flag(name, True) for name in ("reject_blocks", "reject_points", "reject_pairs")}
-    identification = tuple((key, said.text(key)) for key in said.values)
-    flags["variance_components"] = node.flag("variance_components", False)
-    asked = node.choice("sigmas", SIGMA_KINDS) if node.has("sigmas") else ""
-    sigmas = next((kind for kind in SIGMA_KINDS if kind == asked), None)
-    form, closures = read_closures(root)
-    return AdjustmentOptions(
-        alpha, **flags, sigmas=sigmas, pairs=form, closures=closures, tolerances=read_tolerances(root),
-        identification=identification,
-    )  # fmt: skip
 
 
 def _read_sigmas(node: Node, tables: dict[str, FloatArray]) -> Sigmas:

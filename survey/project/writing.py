@@ -11,7 +11,7 @@ from adjust.model.observations import ImageBlock
 from adjust.model.survey import Survey
 from survey.folder.text import atomic_write
 from survey.folder.units import from_si
-from survey.project.declared.alignment_tasks import task_sections
+from survey.project.declared.options import task_sections
 from survey.project.declared.sections import head_section, option_sections, points_file, survey_sections
 from survey.project.declared.toml_text import toml_text
 from survey.project.project import (
@@ -32,8 +32,9 @@ from survey.project.tables.observation_columns import (
     pair_columns,
     spot_columns,
 )
+from survey.project.tables.reading import Columns
 from survey.project.tables.terrestrial_columns import new_tables
-from survey.project.tables.writing import Columns, write_table
+from survey.project.tables.writing import write_table
 from survey.project.targets import PointList, TargetKind
 
 

@@ -1,10 +1,12 @@
-"""What every section of a report is made from."""
+"""What every section of a report is made from, and the choice of what it shows."""
 
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from adjust.model.result import Adjustment
-from adjust.model.survey import BoolArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from survey.solution.dictionary import RunInfo
 from survey.solution.quantities import Scale
 from survey.solution.residual_tables import ImageRows
@@ -25,3 +27,20 @@ class Context:
     rows: ImageRows
     suspect: BoolArray
     statistics: Statistics | None = None
+
+
+def worst(values: FloatArray, most: int) -> IntArray:
+    """Positions of the largest absolute values, largest first, equal ones in their order; NaN comes last."""
+    size = np.nan_to_num(np.abs(values), nan=-1.0)
+    if len(size) > most:  # sorting a million to show a few takes longer than all else
+        among = np.flatnonzero(size >= np.partition(size, len(size) - most)[len(size) - most])
+        return among[np.argsort(-size[among], kind="stable")][:most]
+    return np.argsort(-size, kind="stable")
+
+
+def other_components(adjustment: Adjustment) -> tuple[IntArray, IntArray, FloatArray]:
+    """Of everything but image points, row by row: position of the observation, component, standardized residual."""
+    counts = np.array([len(o.components) for o in adjustment.other_residuals], dtype=np.int64)
+    observation = np.repeat(np.arange(len(counts)), counts)
+    component = np.arange(len(observation)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return observation, component, np.concatenate([np.empty(0), *(o.standardized for o in adjustment.other_residuals)])

@@ -1,11 +1,13 @@
-"""Pieces of SVG: lines, labels, ellipses, scale bars with round numbers, in coordinates of the picture, y down."""
+"""Pieces of SVG: lines, labels, ellipses, axes, legends, scale bars, in coordinates of the picture, y down."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.model.survey import FloatArray
-from survey.report.markup import esc
+from survey.report.language import esc
 
 # every colour of a picture has its counterpart on a dark page; a picture names no other one
 INK, GREY, FAINT, PAPER, FRAME = "#1c2733", "#66727f", "#d5dbe1", "#ffffff", "#fbfcfd"
@@ -22,24 +24,25 @@ DARK = {
     X_AXIS: "#f08080", Z_AXIS: "#8ea8f5",
     "#b2560d": "#f0985a", "#a8324a": "#ee7f97", "#00798c": "#4fc3d6", "#6b6b00": "#c9c95a", "#4a4a8a": "#a5a5ee",
 }  # fmt: skip
-"""What each colour becomes where the reader's screen is dark."""
+"""What each colour becomes where the reader's screen is dark: attributes of pictures stay those of paper."""
 
 
-def dark_rules() -> str:
-    """Rules of a style sheet that bring pictures to a dark page: their attributes stay those of paper."""
-    return "".join(
-        f'svg [{attribute}="{light}"]{{{attribute}:{dark}}}'
-        for light, dark in DARK.items()
-        for attribute in ("fill", "stroke")
-    )
-
-
-def svg(width: float, height: float, parts: Iterable[str], title: str) -> str:
+def svg(width: float, height: float, parts: Iterable[str], title: str) -> Markup:
     """A picture with its accessible title."""
-    return (
+    return Markup(
         f'<svg viewBox="0 0 {width:g} {height:g}" width="{width:g}" height="{height:g}" role="img" '
         f'aria-label="{esc(title)}">{"".join(parts)}</svg>'
     )
+
+
+ON_WHITE = "background:#fff;font-family:'Inter', 'Segoe UI', 'Helvetica Neue', 'Liberation Sans', Arial, sans-serif"
+"""A font and a white ground for a picture by itself, also in a dark notebook."""
+
+
+def standalone(picture: Markup, style: str = "") -> str:
+    """A picture as a file of its own."""
+    look = f' style="{style}"' if style else ""
+    return str(picture).replace("<svg ", f'<svg xmlns="http://www.w3.org/2000/svg"{look} ', 1)
 
 
 def text(
@@ -117,3 +120,67 @@ def scale_bar(x: float, y: float, length: float, words: str) -> str:
     """A bar of ``length`` with its meaning to the right."""
     ends = line(x, y - 3, x, y + 3, INK) + line(x + length, y - 3, x + length, y + 3, INK)
     return line(x, y, x + length, y, INK, 1.4) + ends + text(x + length + 6, y + 3.8, words, colour=INK)
+
+
+def heading(words: str) -> str:
+    """The title of a picture, in its upper left corner."""
+    return text(0, 12, words, colour=INK, size=11.5)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A linear axis: values from ``low`` to ``high`` stand at ``start`` to ``end`` of the picture."""
+
+    low: float
+    high: float
+    start: float
+    end: float
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        """Where values stand."""
+        return self.start + (values - self.low) / (self.high - self.low) * (self.end - self.start)
+
+    def ticks(self, most: int = 5) -> list[tuple[float, str]]:
+        """Round values on the axis, at most so many or one more: where they stand, and in words."""
+        marks = ticks(self.low, self.high, most)
+        return list(zip(self(marks).tolist(), (f"{v:g}" for v in marks), strict=True))
+
+
+def ticks(low: float, high: float, most: int = 5) -> FloatArray:
+    """Round numbers between two values."""
+    step = round_below((high - low) / max(most - 1, 1))
+    while (high - low) / step > most:
+        step = round_below(step * 2.6)
+    marks = np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step
+    return np.asarray(marks + 0.0)  # adding zero takes the sign off a negative one
+
+
+def axis_below(
+    y: float, left: float, right: float, marks: Iterable[tuple[float, str]], ends: bool = False
+) -> list[str]:
+    """A horizontal axis with words below its marks; ``ends``: those of the first and last stay between the marks."""
+    marks = list(marks)
+    parts = [line(left, y, right, y)]
+    for i, (x, words) in enumerate(marks):
+        side = "middle" if not ends or 0 < i < len(marks) - 1 else "end" if i else "start"
+        parts += [line(x, y, x, y + 4), text(x, y + 16, words, side, 10)]
+    return parts
+
+
+def axis_left(x: float, marks: Iterable[tuple[float, str]], right: float | None = None) -> list[str]:
+    """Words to the left of a vertical axis, beside short marks or, up to ``right``, lines of a grid."""
+    parts = []
+    for y, words in marks:
+        parts.append(line(x - 3, y, x, y) if right is None else line(x, y, right, y, FAINT, 0.8))
+        parts.append(text(x - 5, y + 4, words, "end", 10))
+    return parts
+
+
+def legend(x: float, y: float, entries: Sequence[tuple[str, str, str | None]]) -> list[str]:
+    """Words with their colours, one below the other; the third is the look of a line, None for a dot."""
+    parts = []
+    for i, (words, colour, look) in enumerate(entries):
+        at = y + 14 * i
+        mark = dot(x + 8, at - 4, 2.6, colour) if look is None else line(x, at - 4, x + 16, at - 4, colour, 1.6, look)
+        parts += [mark, text(x + 21, at, words, size=10, colour=INK)]
+    return parts

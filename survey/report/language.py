@@ -1,28 +1,56 @@
-"""The language of a report: English words are the keys, other languages say them their own way.
+"""The language of a report: English words are the keys, catalogues beside this module say them in other languages.
 
 The language holds for everything made inside :func:`speaking`, numbers included (a German report has decimal commas).
+A language is one file, ``catalogues/<language>.toml``.
 """
 
 import re
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any
 
-from adjust.model.errors import SurveyError
-from survey.report.german import GERMAN, GERMAN_MESSAGES
+from markupsafe import Markup, escape
 
-LANGUAGES = ("en", "de")
+from adjust.model.errors import SurveyError
+
+_CATALOGUES = Path(__file__).with_name("catalogues")
+LANGUAGES = ("en", *sorted(path.stem for path in _CATALOGUES.glob("*.toml")))
 GROUPS_BY_KIND = frozenset((
     "image", "table", "pair", "closure", "distance", "coordinates", "coordinate_difference", "level", "alignment",
     "laser", "surface", "reading", "direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance",
     "height_difference",
 ))  # fmt: skip
+TURNING = {ord(sign): f"\\u{ord(sign):04x}" for sign in "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e"
+           "\u2066\u2067\u2068\u2069"}  # fmt: skip
+"""Signs that let what follows them be shown in another order, with what stands for them on a page."""
 _current: ContextVar[str] = ContextVar("language", default="en")
 
 
 class MissingTranslationError(KeyError):
     """A text of the report that a language does not know: a bug, found by the tests."""
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """A language: its decimal sign, ``texts`` by their English form, ``messages`` as patterns with what they become."""
+
+    decimal: str
+    texts: Mapping[str, str]
+    messages: tuple[tuple[str, str], ...]
+
+
+@cache
+def catalogue(language: str) -> Catalogue:
+    """The catalogue of a language; English needs no texts."""
+    if language == "en":
+        return Catalogue(".", {}, ())
+    found = tomllib.loads((_CATALOGUES / f"{language}.toml").read_text(encoding="utf-8"))
+    return Catalogue(found["decimal"], found["texts"], tuple((m["pattern"], m["text"]) for m in found["messages"]))
 
 
 @contextmanager
@@ -42,21 +70,27 @@ def language() -> str:
     return _current.get()
 
 
-def t(text: str, **values: Any) -> str:
-    """A text of the program in the report's language, with ``{name}`` filled in.
+def esc(value: object) -> Markup:
+    """Text that cannot be taken for markup, and shows its characters in the order in which they stand."""
+    return value if isinstance(value, Markup) else escape(str(value).translate(TURNING))
+
+
+def t(text: str, **values: Any) -> Markup:
+    """A text of the program in the report's language, with ``{name}`` filled in; values that are no markup escaped.
 
     Raises MissingTranslationError where the language does not have it.
     """
-    if _current.get() == "de":
-        if text not in GERMAN:
+    if _current.get() != "en":
+        texts = catalogue(_current.get()).texts
+        if text not in texts:
             raise MissingTranslationError(text)
-        text = GERMAN[text]
-    return text.format(**values) if values else text
+        text = texts[text]
+    return Markup(text).format(**values) if values else Markup(text)
 
 
 def known(text: str) -> str:
     """A heading or word that may be data: translated where the language has it, else as it is."""
-    return GERMAN.get(text, text) if _current.get() == "de" else text
+    return catalogue(_current.get()).texts.get(text, text)
 
 
 def group_name(name: str) -> str:
@@ -66,16 +100,15 @@ def group_name(name: str) -> str:
 
 def message(text: str) -> str:
     """A message that the adjustment has made, translated where its pattern is known, else as it is."""
-    if _current.get() == "de":
-        for pattern, german in GERMAN_MESSAGES:
-            found = re.fullmatch(pattern, text, re.DOTALL)
-            if found:
-                numeric = re.findall(r"(?<!\\)\(([^()]*)\)", pattern)
-                values = zip(found.groups(), numeric, strict=True)
-                return german.format(*(localised(x) if kind == r"[\d.]+" else x for x, kind in values))
+    for pattern, said in catalogue(_current.get()).messages:
+        found = re.fullmatch(pattern, text, re.DOTALL)
+        if found:
+            numeric = re.findall(r"(?<!\\)\(([^()]*)\)", pattern)
+            values = zip(found.groups(), numeric, strict=True)
+            return said.format(*(localised(x) if kind == r"[\d.]+" else x for x, kind in values))
     return text
 
 
 def localised(number: str) -> str:
     """A number with the decimal sign of the language."""
-    return number.replace(".", ",") if _current.get() == "de" else number
+    return number.replace(".", catalogue(_current.get()).decimal)

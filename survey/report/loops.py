@@ -3,16 +3,23 @@
 from collections.abc import Sequence
 from typing import Any
 
+from markupsafe import Markup
+
 from survey.report.context import Context
 from survey.report.language import t
 from survey.report.markup import (
     MISSING,
+    code,
     count,
     decimals_for,
     definition,
-    esc,
+    element,
     fixed,
     general,
+    joined,
+    listed,
+    p_text,
+    part,
     pill,
     section,
     sigma_text,
@@ -26,11 +33,11 @@ _MOST_PAIRS = 150
 _MOST_NAMES = 30
 
 
-def network(c: Context) -> str:
+def network(c: Context) -> Markup:
     """The counts of theorem 1, and what is weak by name."""
     n = c.solution.get("network")
     if n is None:
-        return ""
+        return Markup()
     each = t("poses") if n["equations_per_condition"] == 6 else t("rotations")
     measured = t("{n} of {most} measurable", n=count(n["measured_pairs"]), most=count(n["measurable_pairs"]))
     facts = [
@@ -45,20 +52,18 @@ def network(c: Context) -> str:
     ]
     if n["conditions_through_given_stations"]:
         facts.insert(6, (t("of these through given stations"), count(n["conditions_through_given_stations"])))
-    weak = _weak(n)
-    listed = f'<ul class="problems">{"".join(f"<li>{w}</li>" for w in weak)}</ul>' if weak else ""
     note = t(
         "n stations have n − 1 independent relative poses; every independent loop of pairs adds a condition. A pair "
         "that closes no loop cannot be checked. Pairs that share all their loops: an error in one is seen, but not "
         "told from one in the others."
     )
-    return section("network", "Network of measured pairs", definition(facts) + listed, note)
+    return section("network", "Network of measured pairs", definition(facts) + listed(_weak(n)), note)
 
 
-def _weak(n: dict[str, Any]) -> list[str]:
+def _weak(n: dict[str, Any]) -> list[Markup]:
     out = []
-    for i, part in enumerate(n["parts"][:10]):
-        out.append(t("Part {i}: {names}", i=i + 1, names=_named(part)))
+    for i, names in enumerate(n["parts"][:10]):
+        out.append(t("Part {i}: {names}", i=i + 1, names=_named(names)))
     if n["uncontrolled_pairs"]:
         out.append(t("Close no loop: {names}", names=_named(n["uncontrolled_pairs"])))
     groups = n["inseparable_pairs"]
@@ -68,16 +73,16 @@ def _weak(n: dict[str, Any]) -> list[str]:
     return out
 
 
-def _named(ids: Sequence[str]) -> str:
+def _named(ids: Sequence[str]) -> Markup:
     more = t(" and {n} more", n=count(len(ids) - _MOST_NAMES)) if len(ids) > _MOST_NAMES else ""
-    return ", ".join(f"<code>{esc(i)}</code>" for i in ids[:_MOST_NAMES]) + more
+    return joined(map(code, ids[:_MOST_NAMES]), ", ") + more
 
 
-def loops(c: Context) -> str:
+def loops(c: Context) -> Markup:
     """Misclosures from the measured pairs alone, before any adjustment, and what is left of them after it."""
     found = c.solution.get("loops")
     if found is None or not found["n_loops"]:
-        return ""
+        return Markup()
     entries = found["worst_first"][:_MOST_LOOPS]
     poses = any("misclosure_mm" in e for e in entries)
     rows = [_loop_row(e, poses) for e in entries]
@@ -93,7 +98,7 @@ def loops(c: Context) -> str:
         "of the misclosure, along its direction, from the covariances of the pairs. Test: w′C⁻¹w, chi-square with "
         "{freedom} degrees of freedom; a loop is open where its p is too small for chance at {alpha} % for all loops "
         "together ({failed} are).",
-        shown=shown, note=esc(found["note"]), freedom=6 if poses else 3, alpha=general(100 * found["alpha"]),
+        shown=shown, note=found["note"], freedom=6 if poses else 3, alpha=general(100 * found["alpha"]),
         failed=count(found["n_failed"]),
     )  # fmt: skip
     note += " " + t(
@@ -105,18 +110,18 @@ def loops(c: Context) -> str:
     return section("loops", "Loop closures", table(columns, rows, "", classes), note) + _mounts(c)
 
 
-def _mounts(c: Context) -> str:
+def _mounts(c: Context) -> Markup:
     """Loops that a mechanical mount closes."""
     entries = c.solution.get("closures", {})
     if not entries:
-        return ""
+        return Markup()
     rows = []
     for name, e in entries.items():
         measured = _both(e["misclosure_arcsec"], e.get("misclosure_mm"))
         given = _both(e["sigma_arcsec"], e["sigma_mm"] if "misclosure_mm" in e else None)
         play = _both(e["play_arcsec"], e.get("play_mm")) if "play_arcsec" in e else ""
-        rows.append([esc(name), measured, given, play, general(e["test"], 4), p_text(e["p_value"]),
-                     f"<small>{', '.join(esc(p) for p in _shortened(e['pairs']))}</small>"])  # fmt: skip
+        rows.append([name, measured, given, play, general(e["test"], 4), p_text(e["p_value"]),
+                     element("small", ", ".join(_shortened(e["pairs"])))])  # fmt: skip
     columns = ["<Mount", "Misclosure", "σ of the mount", "Its play", "Test", "p", "<Pairs"]
     note = t("Loops through a mount close as well as it repeats: σ as given, about and along each axis; its play is "
              "what the adjustment leaves of the misclosure to it.")  # fmt: skip
@@ -135,18 +140,18 @@ def _left(value: float | None, unit: str) -> str:
 
 
 def _loop_row(e: dict[str, Any], poses: bool) -> list[str]:
-    stations = " → ".join(esc(s) for s in _shortened([*e["stations"], e["stations"][0]]))
+    stations = " → ".join(_shortened([*e["stations"], e["stations"][0]]))
     left_out = set(e["pairs_not_used"])
-    pairs = ", ".join(f"<s>{esc(p)}</s>" if p in left_out else esc(p) for p in _shortened(e["pairs"]))
-    flag = "" if e["closes"] else pill("bad", t("open"))
+    pairs = joined((element("s", p) if p in left_out else p for p in _shortened(e["pairs"])), ", ")
+    flag = Markup() if e["closes"] else pill("bad", t("open"))
     flag += " " + pill("soft", t("pair not used")) if left_out else ""
     sigma = e["sigma_misclosure_arcsec"]
-    cells = [stations, flag, angle_text(e["misclosure_arcsec"], sigma), sigma_text(sigma)]
+    cells: list[str] = [stations, flag, angle_text(e["misclosure_arcsec"], sigma), sigma_text(sigma)]
     if poses:
         cells += [value_text(e["misclosure_mm"], e["sigma_misclosure_mm"]), sigma_text(e["sigma_misclosure_mm"])]
     cells += [general(e["test"], 4), p_text(e["p_value"]), _left(e.get("misclosure_after_arcsec"), "″")]
     cells += [_left(e.get("misclosure_after_mm"), "")] if poses else []
-    return [*cells, f"<small>{pairs}</small>"]
+    return [*cells, element("small", pairs)]
 
 
 def _shortened(names: Sequence[str], most: int = 12) -> list[str]:
@@ -167,18 +172,18 @@ def angle_text(arcsec: float, sigma: float | None) -> str:
     return f"{minutes}′ {rest:0{3 + decimals if decimals else 2}.{decimals}f}″"
 
 
-def pairs(c: Context) -> str:
+def pairs(c: Context) -> Markup:
     """Adjusted pairs: value with sigma, residual, redundancy, test."""
     every = c.solution["pairs"]
     if not every:
-        return ""
+        return Markup()
     order = sorted(every, key=lambda p: -_size(every[p]))[:_MOST_PAIRS]
     poses = any("translation_mm" in every[p]["measured"] for p in order)
     rows = [_pair_row(p, every[p], poses) for p in order]
     columns = ["<Pair, from a to b", "Residual", *(["[mm]"] if poses else []), "Redundancy", "Largest std."]
     columns += ["Test", "p", "<", "x [°]", "y [°]", "z [°]", *(["x [mm]", "y [mm]", "z [mm]"] if poses else [])]
     more = " " + t("The worst {shown} of {n}", shown=count(len(rows)), n=count(len(every))) + "."
-    more = more if len(every) > len(rows) else ""
+    more = more if len(every) > len(rows) else Markup()
     note = t(
         "Adjusted b_from_a: quaternion w x y z, Euler angles of R = Rz(z) Ry(y) Rx(x) with the σ of small rotations "
         "about the axes of a, translation with its σ along the axes of b. Residual: length of the rotation and of the "
@@ -197,8 +202,8 @@ def _size(entry: dict[str, Any]) -> float:
 def _pair_row(pair_id: str, e: dict[str, Any], poses: bool) -> list[str]:
     value = e.get("adjusted", {})
     quaternion = " ".join(fixed(q, 7) for q in value.get("rotation_quaternion_wxyz", ()))
-    ends = " → ".join(esc(e[end].removeprefix("station:")) for end in "ab")
-    cells = [f'<b>{esc(pair_id)}</b> {ends}<span class="s">{quaternion}</span>']
+    ends = " → ".join(e[end].removeprefix("station:") for end in "ab")
+    cells: list[str] = [part("below", joined((element("b", pair_id), ends), " "), quaternion)]
     cells.append(angle_text(e["misfit_arcsec"], None) if e.get("misfit_arcsec") is not None else MISSING)
     cells += [general(e.get("misfit_mm"), 4)] if poses else []
     redundancy = [r for r in e.get("redundancy", ()) if r is not None]
@@ -208,17 +213,12 @@ def _pair_row(pair_id: str, e: dict[str, Any], poses: bool) -> list[str]:
     sigmas = value.get("sigma_rotation_arcsec", [None] * 3)
     for angle, sigma in zip(value.get("rotation_euler_xyz_deg", [None] * 3), sigmas, strict=True):
         shown = value_text(angle, None if not sigma else sigma / 3600.0)
-        cells.append(f'{shown}<span class="s">± {sigma_text(sigma)}″</span>')
+        cells.append(part("below", shown, f"± {sigma_text(sigma)}″"))
     if poses:
         shift = value.get("translation_mm", [None] * 3)
         along = value.get("sigma_translation_mm", [None] * 3)
         cells += [with_sigma(x, s) if s else value_text(x, None) for x, s in zip(shift, along, strict=True)]
     return cells
-
-
-def p_text(p: float | None) -> str:
-    """A probability; what underflows is not zero."""
-    return "&lt; 1e−300" if p is not None and p < 1e-300 else general(p, 2)
 
 
 def _pair_flag(e: dict[str, Any]) -> str:

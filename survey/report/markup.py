@@ -1,24 +1,75 @@
-"""Pieces of HTML: escaped text, numbers as people read them, tables."""
+"""What pages are made of: numbers as people read them, and the components of the templates as functions of values.
 
-import html
+Every text that is not markup already is escaped on its way into a page; the HTML stands in ``templates/`` alone.
+"""
+
+import json
 import math
 from collections.abc import Iterable, Sequence
+from functools import cache
+from pathlib import Path
 from typing import Any
 
-from survey.report.language import known, localised, t
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
+from markupsafe import Markup
+
+from survey.report.drawing import DARK
+from survey.report.language import TURNING, esc, known, language, localised, t
 
 MISSING = "–"
 MINUS = "−"
+_HERE = Path(__file__).parent
 
 
-TURNING = {ord(sign): f"\\u{ord(sign):04x}" for sign in "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e"
-           "\u2066\u2067\u2068\u2069"}  # fmt: skip
-"""Signs that let what follows them be shown in another order, with what stands for them on a page."""
+@cache
+def _environment() -> Environment:
+    made = Environment(
+        loader=FileSystemLoader(_HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True, finalize=esc,
+    )  # fmt: skip
+    made.globals |= {"t": t, "language": language}
+    made.globals["parts"] = made.get_template("parts.html").module
+    return made
 
 
-def esc(value: object) -> str:
-    """Text that cannot be taken for markup, and shows its characters in the order in which they stand."""
-    return html.escape(str(value).translate(TURNING), quote=True)
+@cache
+def _module(template: str) -> Any:
+    return _environment().get_template(template).module
+
+
+def part(name: str, *values: Any, of: str = "parts.html") -> Markup:
+    """A piece of a page by its macro in the template ``of``."""
+    return Markup(getattr(_module(of), name)(*values))
+
+
+def element(tag: str, body: object, kind: str = "") -> Markup:
+    """``body`` as an element, of class ``kind`` where one is given."""
+    return part("element", tag, body, kind)
+
+
+def joined(pieces: Iterable[object], between: object = "") -> Markup:
+    """Pieces one after the other; what is no markup is escaped."""
+    return esc(between).join(esc(x) for x in pieces)
+
+
+def document(title: str, body: Markup, after: Markup | str = "") -> str:
+    """A page: one HTML file that needs nothing but itself, on paper, on a phone, on a dark screen.
+
+    On a dark screen the pictures follow the page; ``after`` follows the body's main part.
+    """
+    style = Markup((_HERE / "style.css").read_text(encoding="utf-8"))
+    page: Template = _environment().get_template("document.html")
+    values = {"title": title, "style": style, "colours": tuple(DARK.items()), "body": body, "after": after}
+    return page.render(values).translate(TURNING) + "\n"
+
+
+def json_script(anchor: str, value: Any) -> Markup:
+    """Plain values as a JSON block with an id, in a form that cannot end the script or become markup."""
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for sign in "<>&\u2028\u2029":
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    text = text.translate({sign: f"\\{shown}" for sign, shown in TURNING.items()})  # the script shows the escape
+    return part("data", anchor, Markup(text))
 
 
 def fixed(value: float | None, decimals: int) -> str:
@@ -58,14 +109,19 @@ def sigma_text(sigma: float | None) -> str:
     return MISSING if decimals is None else fixed(sigma, decimals)
 
 
-def with_sigma(value: float | None, sigma: float | None, typical: float | None = None) -> str:
+def p_text(p: float | None) -> str:
+    """A probability; what underflows is not zero."""
+    return "< 1e−300" if p is not None and p < 1e-300 else general(p, 2)
+
+
+def with_sigma(value: float | None, sigma: float | None, typical: float | None = None) -> Markup:
     """A cell of two lines: the value, and its sigma below; ``typical`` sets the decimals of a column or row."""
     decimals = decimals_for(sigma)
     if decimals is None:
-        return f'{value_text(value, typical)}<span class="s">{t("held")}</span>'
+        return part("below", value_text(value, typical), t("held"))
     decimals = max(decimals_for(typical) or 0, 0 if typical else decimals)
     below = fixed(sigma, decimals) if sigma and sigma >= 2 * 10.0**-decimals else sigma_text(sigma)
-    return f'{fixed(value, decimals)}<span class="s">± {below}</span>'
+    return part("below", fixed(value, decimals), f"± {below}")
 
 
 def count(value: int) -> str:
@@ -73,36 +129,51 @@ def count(value: int) -> str:
     return f"{value:,}".replace(",", "\u2009")
 
 
-def pill(kind: str, text: str) -> str:
-    """A word on a coloured ground; ``kind`` is good, warn, bad or quiet."""
-    return f'<span class="pill {kind}">{esc(text)}</span>'
+def code(text: object) -> Markup:
+    """A name as it stands in files."""
+    return element("code", text)
+
+
+def note(body: object) -> Markup:
+    """A paragraph of small print."""
+    return element("p", body, "note")
+
+
+def pill(kind: str, text: str) -> Markup:
+    """A word on a coloured ground; ``kind`` is good, warn, bad, soft, plain or quiet."""
+    return element("span", text, f"pill {kind}")
+
+
+def heads(columns: Iterable[str]) -> list[tuple[str, str]]:
+    """Headings in the language with their side: one that starts with ``<`` is of text and set left, others right."""
+    return [(known(c.removeprefix("<")), "l" if c.startswith("<") else "r") for c in columns]
 
 
 def table(
-    columns: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "", row_classes: Sequence[str] = ()
-) -> str:
-    """A table of ready cells. A column whose heading starts with ``<`` holds text and is set left, the others right."""
-    left = [c.startswith("<") for c in columns]
-    heads = "".join(
-        f'<th class="{"l" if a else "r"}">{known(c.removeprefix("<"))}</th>' for c, a in zip(columns, left, strict=True)
-    )
-    body = []
-    for i, row in enumerate(rows):
-        cells = "".join(f'<td class="{"l" if a else "r"}">{c}</td>' for c, a in zip(row, left, strict=True))
-        kind = f' class="{row_classes[i]}"' if i < len(row_classes) and row_classes[i] else ""
-        body.append(f"<tr{kind}>{cells}</tr>")
-    note = f"<caption>{caption}</caption>" if caption else ""
-    return f'<div class="t"><table>{note}<thead><tr>{heads}</tr></thead><tbody>{"".join(body)}</tbody></table></div>'
+    columns: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "", row_classes: Sequence[str] = ()
+) -> Markup:
+    """A table with columns as of :func:`heads`; a heading that is data is escaped first."""
+    rows = list(rows)
+    return part("table", heads(columns), rows, caption, [*row_classes, *[""] * (len(rows) - len(row_classes))])
 
 
-def section(anchor: str, title: str, body: str, note: str = "") -> str:
-    """A section of the page; empty where there is nothing to show. ``title`` is English, ``note`` ready."""
-    if not body:
-        return ""
-    lead = f'<p class="note">{note}</p>' if note else ""
-    return f'<section id="{anchor}"><h2>{esc(t(title))}</h2>{lead}{body}</section>'
+def section(anchor: str, title: str, body: Markup | str, note: str = "") -> Markup:
+    """A section of the page; empty where there is nothing to show. ``title`` is English."""
+    return part("section", anchor, t(title), body, note) if body else Markup()
 
 
-def definition(pairs: Iterable[tuple[str, Any]]) -> str:
-    """A list of names and ready values."""
-    return "<dl>" + "".join(f"<div><dt>{esc(k)}</dt><dd>{v}</dd></div>" for k, v in pairs) + "</dl>"
+def listed(items: Iterable[object], kind: str = "problems") -> Markup:
+    """A list of points; nothing where there is none."""
+    items = list(items)
+    return part("listed", items, kind) if items else Markup()
+
+
+def definition(pairs: Iterable[tuple[object, object]]) -> Markup:
+    """A list of names and values."""
+    return part("definition", list(pairs))
+
+
+def figures(drawn: Iterable[Markup], kind: str = "figures") -> Markup:
+    """Pictures side by side; nothing where there is none."""
+    drawn = list(drawn)
+    return part("figures", drawn, kind) if drawn else Markup()

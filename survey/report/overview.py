@@ -2,13 +2,29 @@
 
 from typing import Any
 
+from markupsafe import Markup
+
 from survey.report import drawing as d
 from survey.report.context import Context
 from survey.report.language import group_name, known, message, t
-from survey.report.markup import count, definition, esc, fixed, general, pill, section, table
+from survey.report.markup import (
+    code,
+    count,
+    definition,
+    element,
+    figures,
+    fixed,
+    general,
+    joined,
+    listed,
+    note,
+    part,
+    pill,
+    section,
+    table,
+)
 from survey.report.picture import pictures
-from survey.report.scene import scene_of
-from survey.report.space import space
+from survey.report.scene import scene_of, space
 from survey.solution.quantities import sigma_unit_for_people
 from survey.solution.tolerances import Verdict, coverage
 
@@ -16,19 +32,20 @@ _WORDS = {"passed": "Passed", "check": "Needs a look", "failed": "Failed"}
 _MOST_WARNINGS = 25
 _MOST_VERDICTS = 200
 _MOST_PARTS = 20
+_MOST_IMAGES = 500
 _KINDS = {"group": "Group", "camera": "Camera", "epoch": "Epoch", "target": "Target", "table": "Table",
           "set-up": "Set-up", "instrument": "Instrument"}  # fmt: skip
 _CLEAR = 3.0  # deviations of a group beyond this many sigmas are marked
 
 
-def header(c: Context) -> str:
+def header(c: Context) -> Markup:
     """Title, verdict and, before anything else, what is wrong."""
     s = c.solution["summary"]
     version = c.run.versions.get("labsurvey", "")
-    meta = " · ".join(esc(x) for x in (c.run.folder, c.run.date, f"labsurvey {version}".strip()) if x)
+    meta = " · ".join(x for x in (c.run.folder, c.run.date, f"labsurvey {version}".strip()) if x)
     found = s["suspects"]
     warnings = c.solution["warnings"]
-    problems = [esc(message(w)) for w in warnings[:_MOST_WARNINGS]]
+    problems: list[str] = [message(w) for w in warnings[:_MOST_WARNINGS]]
     if len(warnings) > _MOST_WARNINGS:
         problems.append(t("{n} more warnings in solution.json.", n=count(len(warnings) - _MOST_WARNINGS)))
     if found["n_image_points"]:
@@ -49,35 +66,24 @@ def header(c: Context) -> str:
         n = count(len(unmet))
         said = t('<a href="#tolerances">{n} of {most} demands</a> on the results are not met.', n=n, most=most)
         problems.insert(0, said)
-    items = "".join(f"<li>{p}</li>" for p in problems)
-    listed = (
-        f'<ul class="problems">{items}</ul>'
-        if items
-        else f'<p class="calm">{t("No warnings, nothing suspect, nothing left out.")}</p>'
-    )
-    return (
-        f'<header><p class="meta">{t("Adjustment report")}</p><h1>{esc(s["title"] or c.run.folder)}</h1>'
-        f'<p class="meta">{meta}</p></header>'
-        f'<div class="verdict {s["verdict"]}"><b>{t(_WORDS[s["verdict"]])}</b>'
-        f"<span>{esc(message(s['reason']))}</span></div>"
-        f"{listed}"
-    )
+    calm = element("p", t("No warnings, nothing suspect, nothing left out."), "calm")
+    return joined((
+        part("header", t("Adjustment report"), s["title"] or c.run.folder, meta),
+        part("verdict", s["verdict"], t(_WORDS[s["verdict"]]), message(s["reason"])), listed(problems) or calm,
+    ))  # fmt: skip
 
 
-def summary(c: Context) -> str:
+def summary(c: Context) -> Markup:
     """Key figures and the global test."""
     s = c.solution["summary"]
-    figures = (
+    values = (
         (t("sigma0 (a priori 1)"), fixed(s["sigma0"], 3)),
         (t("observations"), count(s["n_observations"])),
         (t("unknowns"), count(s["n_unknowns"])),
         (t("redundancy"), count(s["redundancy"])),
         (t("iterations"), f"{s['iterations']}" + ("" if s["converged"] else t(" (not converged)"))),
         (t("last step"), f"{general(s['last_step_sigmas'], 2)} σ"),
-        (t("datum"), t("{kind}, defect {n}", kind=esc(t(s["datum"])), n=s["datum_defect"])),
-    )
-    cards = (
-        '<div class="cards">' + "".join(f"<div><b>{v}</b><span>{esc(k)}</span></div>" for k, v in figures) + "</div>"
+        (t("datum"), t("{kind}, defect {n}", kind=t(s["datum"]), n=s["datum_defect"])),
     )
     if s["sigmas"] == "a_posteriori":
         factor = fixed(s["sigma_factor"], 4)
@@ -87,12 +93,13 @@ def summary(c: Context) -> str:
     said += " " + t(
         "Sigmas of observations, standardized residuals and tests are a priori. Residuals are adjusted minus observed."
     )
-    return section("summary", "Summary", cards + _global_test(s["global_test"]) + f'<p class="note">{said}</p>')
+    cards = part("cards", [(value, name) for name, value in values])
+    return section("summary", "Summary", cards + _global_test(s["global_test"]) + note(said))
 
 
-def _global_test(test: dict[str, Any] | None) -> str:
+def _global_test(test: dict[str, Any] | None) -> Markup:
     if test is None:
-        return f'<p class="note">{t("No global test: there is no redundancy.")}</p>'
+        return note(t("No global test: there is no redundancy."))
     width, height, left = 700.0, 58.0, 20.0
     r = test["redundancy"]
     # the scale is the variance factor omega / r; its interval and the value always fit
@@ -122,116 +129,116 @@ def _global_test(test: dict[str, Any] | None) -> str:
         word=word, omega=general(test["omega"], 6), r=count(r), lower=general(test["lower"], 6),
         upper=general(test["upper"], 6), level=general(100 * (1 - test["alpha"])),
     )  # fmt: skip
-    return f'<p class="lead">{sentence}</p><div class="wide">{d.svg(width, height, parts, t("Global test"))}</div>'
+    drawn = d.svg(width, height, parts, t("Global test"))
+    return element("p", sentence, "lead") + element("div", drawn, "wide")
 
 
-def groups(c: Context) -> str:
+def groups(c: Context) -> Markup:
     """Redundancy and variance factor of every group, the worst first."""
     rows = []
     for name, g in sorted(c.solution["groups"].items(), key=lambda x: -abs(x[1]["deviation"] or 0.0)):
-        deviation = fixed(g["deviation"], 1)
+        deviation: str = fixed(g["deviation"], 1)
         if g["deviation"] is not None and abs(g["deviation"]) > _CLEAR:
             deviation = pill("warn", deviation)
         numbers = (fixed(g["variance_factor"], 3), fixed(g["sigma_scale"], 3), deviation)
         sums = (count(g["n_observations"]), fixed(g["redundancy"], 1), general(g["omega"], 6))
-        rows.append((esc(group_name(name)), *sums, *numbers))
-    note = t(
+        rows.append((group_name(name), *sums, *numbers))
+    said = t(
         "The variance factor is the weighted square sum omega over the redundancy of the group; its root is the number "
         "by which the sigmas given for the group would have to be multiplied to agree with its residuals. Deviation: "
         "of omega from the redundancy, in sigmas of chi-square."
     )
     columns = ("<Group", "Observations", "Redundancy", "Omega", "Variance factor", "Scale of sigmas", "Deviation [σ]")
-    return section("groups", "Groups of observations", table(columns, rows) if rows else "", note)
+    return section("groups", "Groups of observations", table(columns, rows) if rows else "", said)
 
 
-def parts(c: Context) -> str:
+def parts(c: Context) -> Markup:
     """Every part of the survey tested for itself, the least likely first; what the statistics leave out."""
     s = c.statistics
     if s is None:
-        return ""
-    tested, out = s.consistency, ""
+        return Markup()
+    tested, out = s.consistency, Markup()
     if tested is not None and tested.parts:
         rows = [
-            (esc(f"{t(_KINDS[x.kind])} {x.name}"), count(x.n), fixed(x.redundancy, 1), fixed(x.factor, 3),
+            (f"{t(_KINDS[x.kind])} {x.name}", count(x.n), fixed(x.redundancy, 1), fixed(x.factor, 3),
              general(x.p, 2), pill("bad", t("does not fit")) if x.fails else pill("good", t("fits")))
             for x in tested.parts[:_MOST_PARTS]
         ]  # fmt: skip
         classes = ["suspect" if x.fails else "" for x in tested.parts[:_MOST_PARTS]]
         columns = ("<Part", "Observations", "Redundancy", "Factor", "p", "<")
-        note = t(
+        said = t(
             "Every group, camera, epoch, target, table, set-up and instrument tested for itself, and {n} changes and "
             "shapes of cameras, targets and tables: {all} tests at {level} % together. The {most} with the smallest p "
             "are listed.",
             n=count(tested.n_changes), all=count(tested.n_tests), level=general(100 * tested.alpha),
             most=count(len(rows)),
         )  # fmt: skip
-        out = section("parts", "Parts of the survey", table(columns, rows, "", classes), note)
+        out = section("parts", "Parts of the survey", table(columns, rows, "", classes), said)
     if s.left_out:
-        listed = "".join(f"<li>{esc(message(x))}</li>" for x in s.left_out)
-        out += section("not-computed", "Not computed", f"<ul>{listed}</ul>")
+        out += section("not-computed", "Not computed", listed(map(message, s.left_out), ""))
     return out
 
 
-def identification(c: Context) -> str:
+def identification(c: Context) -> Markup:
     """Who measured what, as the project says it."""
-    rows = [(name, esc(value)) for name, value in c.run.identification]
-    return section("identification", "Identification", definition(rows) if rows else "")
+    said = c.run.identification
+    return section("identification", "Identification", definition(said) if said else "")
 
 
-def tolerances(c: Context) -> str:
+def tolerances(c: Context) -> Markup:
     """What the project demands of its results, the hardest to meet first."""
     if c.statistics is None or not c.statistics.verdicts:
-        return ""
+        return Markup()
     found = sorted(c.statistics.verdicts, key=lambda v: -v.found / v.allowed)
     rows = [_verdict_row(v) for v in found[:_MOST_VERDICTS]]
     columns = ("<Demand", "<Result", "<Quantity", "<", "Found", "Allowed", "<Unit", "Used [%]", "<")
     classes = ["" if v.met else "suspect" for v in found[:_MOST_VERDICTS]]
-    note = t(
+    said = t(
         "U: expanded uncertainty at 95 % (k = {k}), in the worst direction. |Δ| + U: deviation from nominal with its "
         "uncertainty; what is not proven is not met (ISO 14253-1).",
         k=fixed(coverage(c.adjustment, c.scale), 2),
     )
-    return section("tolerances", "Tolerances", table(columns, rows, "", classes), note)
+    return section("tolerances", "Tolerances", table(columns, rows, "", classes), said)
 
 
 def _verdict_row(v: Verdict) -> tuple[str, ...]:
     unit, factor = sigma_unit_for_people(v.unit)
     said = pill("good", t("met")) if v.met else pill("bad", t("not met"))
     return (
-        esc(v.tolerance), esc(" ".join(v.result[1:])), esc(known(v.quantity)), "|Δ| + U" if v.of_value else "U",
-        general(v.found * factor, 3), general(v.allowed * factor, 3), esc(unit), fixed(100 * v.found / v.allowed, 0),
+        v.tolerance, " ".join(v.result[1:]), known(v.quantity), "|Δ| + U" if v.of_value else "U",
+        general(v.found * factor, 3), general(v.allowed * factor, 3), unit, fixed(100 * v.found / v.allowed, 0),
         said,
     )  # fmt: skip
 
 
-def picture(c: Context) -> str:
+def picture(c: Context) -> Markup:
     """Plan and perspective."""
     scene = scene_of(c.adjustment, c.scale)
     drawn, enlarged = pictures(scene, c.scale.ellipsoid)
     n = count(scene.n_left_out)
-    left_out = " " + t("{n} points are left out for clarity.", n=n) if scene.n_left_out else ""
-    note = t(
+    left_out = " " + t("{n} points are left out for clarity.", n=n) if scene.n_left_out else Markup()
+    said = t(
         "95 % confidence ellipsoids of points (red) and stations (green), enlarged {n} times. "
         "Cameras are drawn at the first epoch; thin lines are their axes at others, dash-dotted lines those of tables.",
         n=general(enlarged, 3),
     ) + left_out
-    turning = space(scene, c.scale.ellipsoid)
-    return section("picture", "The survey", f'<div class="figures">{drawn}</div>{turning}' if drawn else "", note)
+    return section("picture", "The survey", figures(drawn) + space(scene, c.scale.ellipsoid), said)
 
 
-def inputs(c: Context) -> str:
+def inputs(c: Context) -> Markup:
     """What went in: files with their hashes, options, versions."""
     i = c.solution["inputs"]
-    files = table(("<File", "<Hash"), [(esc(k), f"<code>{esc(v)}</code>") for k, v in i["hashes"].items()])
-    parts = [definition([(t("Command"), f"<code>{esc(i['command'])}</code>")])] if i["command"] else []
+    files = table(("<File", "<Hash"), [(k, code(v)) for k, v in i["hashes"].items()])
+    parts = [definition([(t("Command"), code(i["command"]))])] if i["command"] else []
     parts += [files] if i["hashes"] else []
     if i["images"]:
-        rows = [(esc(e["file"]), f"<code>{esc(e['sha256'])}</code>", count(e["n_image_points"] + e["n_spots"]))
-                for e in i["images"].values()]  # fmt: skip
-        listed = table(("<Image", "<Hash", "Points"), rows)
-        said = t("{n} images, each with the hash of the file that its points come from", n=count(len(rows)))
-        parts.append(f"<details><summary>{said}</summary>{listed}</details>")
+        shown = list(i["images"].values())[:_MOST_IMAGES]
+        rows = [(e["file"], code(e["sha256"]), count(e["n_image_points"] + e["n_spots"])) for e in shown]
+        images, left_out = table(("<Image", "<Hash", "Points"), rows), len(i["images"]) - len(rows)
+        images += note(t("{n} more in solution.json.", n=count(left_out))) if left_out else Markup()
+        said = t("{n} images, each with the hash of the file that its points come from", n=count(len(i["images"])))
+        parts.append(part("details", said, images, False))
     for title, entries in (("Options", i["options"]), ("Versions", i["versions"])):
         if entries:
-            parts.append(f"<h3>{t(title)}</h3>" + definition((k, esc(v)) for k, v in entries.items()))
-    return section("inputs", "Inputs", "".join(parts))
+            parts.append(element("h3", t(title)) + definition(entries.items()))
+    return section("inputs", "Inputs", joined(parts))

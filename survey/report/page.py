@@ -1,16 +1,21 @@
-"""The report as one HTML page that needs nothing but itself."""
+"""The report as one HTML page that needs nothing but itself, and printed from it as PDF."""
 
+import os
+import shutil
+import subprocess
+import tempfile
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
+from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
-from survey.report import every, instruments, left_out, loops, observations, overview, published, statistics, unknowns
+from survey.report import loops, observations, overview, published, statistics, unknowns
 from survey.report.context import Context
-from survey.report.document import document
 from survey.report.drawing import DARK
-from survey.report.embedding import json_script
 from survey.report.language import localised, speaking, t
-from survey.report.markup import esc
+from survey.report.markup import document, element, joined, json_script, part
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.quantities import scale_of
 from survey.solution.residual_tables import image_rows
@@ -29,15 +34,15 @@ _SECTIONS = (
     ("Turntables", "tables", unknowns.tables),
     ("Targets", "targets", unknowns.targets),
     ("Points", "points", unknowns.points),
-    ("Instruments and surfaces", "instruments", instruments.instruments),
+    ("Instruments and surfaces", "instruments", unknowns.instruments),
     ("Network", "network", loops.network),
     ("Loops", "loops", loops.loops),
     ("Pairs", "pairs", loops.pairs),
     ("Published methods", "published", published.published),
-    ("Excluded by people", "excluded", left_out.excluded),
+    ("Excluded by people", "excluded", observations.excluded),
     ("Observations", "observations", observations.others),
     ("Image points", "image-points", observations.image_points),
-    ("All observations", "all-observations", every.every_observation),
+    ("All observations", "all-observations", observations.every_observation),
     ("Distribution", "normality", statistics.normality),
     ("Reliability", "reliability", statistics.reliability),
     ("Relative precision", "relative", statistics.relative),
@@ -71,11 +76,11 @@ def report_html(
 
 def _page(c: Context) -> str:
     made = [(name, anchor, make(c)) for name, anchor, make in _SECTIONS]
-    nav = "".join(f'<a href="#{anchor}">{esc(t(name))}</a>' for name, anchor, body in made if body)
+    nav = part("nav", [(anchor, t(name)) for name, anchor, body in made if body])
     script = Path(__file__).with_name("script.js").read_text(encoding="utf-8")
     title = f"{c.solution['summary']['title'] or c.run.folder} – {t('Adjustment report')}"
-    shown = f"{overview.header(c)}<nav>{nav}</nav>" + "\n".join(body for _, _, body in made)
-    return document(title, shown, f"{json_script('words', _words())}<script>{script}</script>")
+    shown = overview.header(c) + nav + joined((body for _, _, body in made), "\n")
+    return document(title, shown, json_script("words", _words()) + element("script", Markup(script)))
 
 
 def _words() -> dict[str, Any]:
@@ -87,3 +92,47 @@ def _words() -> dict[str, Any]:
         "flags": ["", t("suspect"), t("not used")],
         "where": t("page {{page}} of {{pages}}, {{n}} rows").replace("{{", "{").replace("}}", "}"),
     }
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
+_TIMEOUT_S = 180.0
+
+
+def report_pdf(html: str) -> bytes:
+    """The page printed by a browser that is there, or by WeasyPrint (extra ``pdf``).
+
+    Raises SurveyError where nothing that prints is installed, or the browser fails.
+    """
+    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if browser is not None:
+        return _by_browser(browser, html)
+    try:
+        from weasyprint import HTML
+    except (ImportError, OSError) as error:  # OSError: its system libraries are missing
+        raise SurveyError(
+            "a PDF needs a browser (Chromium, Chrome or Edge on the path) or WeasyPrint: install Chromium, or "
+            f"'pip install labsurvey[pdf]' ({error})"
+        ) from error
+    return bytes(HTML(string=html).write_pdf())
+
+
+def _by_browser(browser: str, html: str) -> bytes:
+    with tempfile.TemporaryDirectory() as scratch:
+        page, out = Path(scratch) / "report.html", Path(scratch) / "report.pdf"
+        page.write_text(html, encoding="utf-8")
+        command = [
+            browser, "--headless", "--disable-gpu", "--no-first-run", "--disable-background-networking",
+            "--disable-component-update", "--disable-sync", "--disable-quic", "--no-pdf-header-footer",
+            f"--user-data-dir={scratch}/profile", f"--print-to-pdf={out}", page.as_uri(),
+        ]  # fmt: skip
+        if hasattr(os, "geteuid") and os.geteuid() == 0:
+            command.insert(1, "--no-sandbox")  # a browser refuses its sandbox to root
+        try:
+            done = subprocess.run(command, capture_output=True, timeout=_TIMEOUT_S, check=False)
+        except subprocess.TimeoutExpired as error:
+            late = f"{browser} did not finish the PDF within {_TIMEOUT_S:g} s; print report.html by hand"
+            raise SurveyError(late) from error
+        if not out.is_file():
+            said = done.stderr.decode(errors="replace").strip().splitlines()
+            raise SurveyError(f"{browser} made no PDF: {said[-1] if said else 'no message'}; print report.html by hand")
+        return out.read_bytes()

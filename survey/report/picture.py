@@ -4,11 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from markupsafe import Markup
 
 from adjust.model.survey import FloatArray
 from survey.report import drawing as d
 from survey.report.language import localised, t
-from survey.report.scene import Scene, Shot
+from survey.report.scene import Scene, Shot, enlargement
 
 WIDTH, HEIGHT, MARGIN = 540.0, 450.0, 36.0
 _MOST_LABELS = 60
@@ -73,15 +74,6 @@ def perspective(everything: FloatArray) -> View:
         return np.asarray(flat_x * (distance / np.maximum(depth, 0.1 * distance))[:, None])
 
     return _placed(flat, np.concatenate([everything, floor]), t("Perspective (world z up)"), stands=True)
-
-
-def enlargement(scene: Scene, ellipsoid: float, extent: float) -> float:
-    """How much ellipsoids are enlarged, a round number: a typical one to 3.5 %, the largest to 20 % of the extent."""
-    semi_axes = [ellipsoid * float(np.sqrt(max(np.linalg.eigvalsh(s.cov)[-1], 0.0))) for s in scene.spots]
-    positive = [a for a in semi_axes if a > 0.0]
-    if not positive:
-        return 1.0
-    return d.round_below(extent * min(0.035 / float(np.median(positive)), 0.2 / max(positive)))
 
 
 def _ground(view: View, everything: FloatArray) -> list[str]:
@@ -164,11 +156,11 @@ def _world_axes(view: View, reach: float) -> list[str]:
     return parts
 
 
-def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, ellipsoid: float) -> str:
+def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, ellipsoid: float) -> Markup:
     """One view of the scene as SVG."""
     extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
     parts = [
-        d.text(0, 12, view.name, colour=d.INK, size=11.5),
+        d.heading(view.name),
         *_ground(view, everything),
         *_world_axes(view, 0.07 * extent),
     ]
@@ -215,12 +207,12 @@ def _labels(view: View, scene: Scene, ahead: float) -> list[str]:
     return parts
 
 
-def pictures(scene: Scene, ellipsoid: float) -> tuple[str, float]:
-    """Both views side by side, and the factor by which ellipsoids are enlarged; nothing for an empty scene."""
+def pictures(scene: Scene, ellipsoid: float) -> tuple[tuple[Markup, ...], float]:
+    """Both views, and the factor by which ellipsoids are enlarged; nothing for an empty scene."""
     everything = scene.positions()
     if not len(everything):
-        return "", 1.0
+        return (), 1.0
     extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
     enlarged = enlargement(scene, ellipsoid, extent)
     views = (plan(everything), perspective(everything))
-    return "".join(f"<figure>{draw(scene, v, everything, enlarged, ellipsoid)}</figure>" for v in views), enlarged
+    return tuple(draw(scene, v, everything, enlarged, ellipsoid) for v in views), enlarged

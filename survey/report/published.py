@@ -4,37 +4,46 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from survey.report.context import Context
 from survey.report.language import t
-from survey.report.markup import count, esc, fixed, general, section, sigma_text, table, value_text
+from survey.report.markup import (
+    count,
+    element,
+    fixed,
+    general,
+    joined,
+    listed,
+    section,
+    sigma_text,
+    table,
+    value_text,
+)
 
 _MOST_PAIRS = 150
 
 
-def published(c: Context) -> str:
+def published(c: Context) -> Markup:
     """Every number both ways, with both sigmas."""
     found = c.solution.get("published")
     if found is None:
-        return ""
-    body = "".join(
-        [_head(found["head"]) if "head" in found else "", _pairs(found["pairs"]) if "pairs" in found else ""]
-    )
-    said = [esc(n) for part in ("head", "pairs") for n in found.get(part, {}).get("notes", ())]
-    said += [f"{esc(t(_TITLES[name]))}: {t('not run')}: {esc(why)}" for name, why in found["not_run"].items()]
-    listed = f'<ul class="problems">{"".join(f"<li>{x}</li>" for x in said)}</ul>' if said else ""
+        return Markup()
+    body = joined(make(found[part]) for part, make in (("head", _head), ("pairs", _pairs)) if part in found)
+    said = [n for part in ("head", "pairs") for n in found.get(part, {}).get("notes", ())]
+    said += [f"{t(_TITLES[name])}: {t('not run')}: {why}" for name, why in found["not_run"].items()]
     note = t(
         "The published step-by-step methods on the same observations. Claimed: the sigma as its step states it, with "
         "all steps before taken as free of error. Published: the sigma that the observations cause, through all "
         "steps. Difference: published minus joint, rotations as small turns about the axes on the right."
     )
-    return section("published", "Published methods", body + listed, note)
+    return section("published", "Published methods", body + listed(said), note)
 
 
 _TITLES = {"head": "Calibration of the head, step by step", "pairs": "Iteration of measured pairs over their loops"}
 
 
-def _head(found: Mapping[str, Any]) -> str:
+def _head(found: Mapping[str, Any]) -> Markup:
     columns = ["<Pose", "<", "Published", "Claimed σ", "Published σ", "Joint", "Joint σ", "Difference", "σ ratio"]
     rows = []
     for pose, component, unit, entry in head_rows(found):
@@ -42,15 +51,15 @@ def _head(found: Mapping[str, Any]) -> str:
         per, mark = (3600.0, "″") if unit == "deg" else (1.0, "")
         sigma, joint = entry[f"published_sigma_{small}"], entry[f"joint_sigma_{small}"]
         rows.append([
-            esc(pose), f"{component} [{'°' if unit == 'deg' else 'mm'}]",
+            pose, f"{component} [{'°' if unit == 'deg' else 'mm'}]",
             value_text(entry[f"published_{unit}"], sigma / per), sigma_text(entry[f"claimed_sigma_{small}"]) + mark,
             sigma_text(sigma) + mark, value_text(entry[f"joint_{unit}"], joint / per if joint else None),
             sigma_text(joint) + mark, general(entry[f"difference_{small}"], 3) + mark, fixed(entry["sigma_ratio"], 1),
         ])  # fmt: skip
-    return f"<h3>{esc(t(_TITLES['head']))}</h3>" + table(columns, rows)
+    return element("h3", t(_TITLES["head"])) + table(columns, rows)
 
 
-def _pairs(found: Mapping[str, Any]) -> str:
+def _pairs(found: Mapping[str, Any]) -> Markup:
     columns = ["<Pair", "<", "Published", "Published σ", "Equal weights σ", "Joint", "Joint σ", "Difference"]
     rows = []
     for pair_id in worst_pairs(found)[:_MOST_PAIRS]:
@@ -61,20 +70,20 @@ def _pairs(found: Mapping[str, Any]) -> str:
                 (entry["joint"][k] or [None] * 3)[i] for k in ("rotation_euler_xyz_deg", "sigma_rotation_arcsec")
             )
             rows.append([
-                esc(pair_id) if i == 0 else "", f"{axis} [°]",
+                pair_id if i == 0 else "", f"{axis} [°]",
                 value_text(entry["weighted"]["rotation_euler_xyz_deg"][i], sigma / 3600.0), sigma_text(sigma) + "″",
                 sigma_text(entry["equal_weights"]["sigma_rotation_arcsec"][i]) + "″",
                 value_text(joint, joint_sigma / 3600.0 if joint_sigma else None), sigma_text(joint_sigma) + "″",
                 general(entry["weighted"].get("difference_arcsec", [None] * 3)[i], 3) + "″",
             ])  # fmt: skip
-    said = "".join(
-        f"<p>{_steps(t(text), found['steps'][name])}</p>"
+    said = joined(
+        element("p", _steps(t(text), found["steps"][name]))
         for name, text in (("weighted", "Weighted"), ("equal_weights", "Equal weights"))
     )
-    return f"<h3>{esc(t(_TITLES['pairs']))}</h3>{said}" + table(columns, rows)
+    return element("h3", t(_TITLES["pairs"])) + said + table(columns, rows)
 
 
-def _steps(name: str, steps: Mapping[str, Any]) -> str:
+def _steps(name: Markup, steps: Mapping[str, Any]) -> Markup:
     left = general(steps["misclosure_left_arcsec"], 2)
     return t("{name}: {n} iterations, misclosure left {left}″", name=name, n=count(steps["iterations"]), left=left)
 

@@ -1,18 +1,26 @@
-"""What a picture of a survey shows, in world coordinates: cameras, stations, tables, targets, points."""
+"""What a picture of a survey shows, in world coordinates: cameras, stations, tables, targets, points.
+
+Also the view in space, to be turned around on the screen: lines, points and ellipsoids as plain values for the page.
+"""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from gtsam import Pose3
+from markupsafe import Markup
 
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Target
+from survey.report import drawing as d
+from survey.report.markup import json_script, part
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import Scale
 
 _MOST_EPOCHS = 24
 _MOST_POINTS = 500
+_MOST_NAMES = 80
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,3 +145,98 @@ def _add_targets(scene: Scene, adjustment: Adjustment, frames: AdjustedFrames, e
 def _corners(target: Target) -> FloatArray:
     (x0, y0, z0), (x1, y1, _) = target.x_in_target.min(axis=0), target.x_in_target.max(axis=0)
     return np.array([(x0, y0, z0), (x1, y0, z0), (x1, y1, z0), (x0, y1, z0)])
+
+
+def enlargement(scene: Scene, ellipsoid: float, extent: float) -> float:
+    """How much ellipsoids are enlarged, a round number: a typical one to 3.5 %, the largest to 20 % of the extent."""
+    semi_axes = [ellipsoid * float(np.sqrt(max(np.linalg.eigvalsh(s.cov)[-1], 0.0))) for s in scene.spots]
+    positive = [a for a in semi_axes if a > 0.0]
+    if not positive:
+        return 1.0
+    return d.round_below(extent * min(0.035 / float(np.median(positive)), 0.2 / max(positive)))
+
+
+def space(scene: Scene, ellipsoid: float) -> Markup:
+    """Canvas, slider and data; nothing for an empty scene. ``ellipsoid``: semi-axes of the region, in sigmas."""
+    everything = scene.positions()
+    if not len(everything):
+        return Markup()
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    reach = max(float(np.linalg.norm(high - low)) / 2.0, 1e-3)
+    data = {
+        "middle": rounded(0.5 * (low + high)),
+        "reach": reach,
+        "enlarged": enlargement(scene, ellipsoid, 2.0 * reach),
+        "lines": _ground(low, high) + _lines(scene, reach),
+        "spots": [_spot(s.x, s.cov, ellipsoid, s.kind) for s in scene.spots],
+        "labels": _names(scene),
+    }
+    return part("space", of="report.html") + json_script("space-data", data)
+
+
+def rounded(x: FloatArray) -> Any:
+    """Coordinates to a hundredth of a millimetre: enough for a picture."""
+    return np.round(x, 5).tolist()
+
+
+def _spot(x: FloatArray, cov: FloatArray, ellipsoid: float, kind: str) -> dict[str, Any]:
+    variances, vectors = np.linalg.eigh(cov)
+    axes = (vectors * (ellipsoid * np.sqrt(np.clip(variances, 0.0, None)))).T
+    # seven significant digits: enlarged ellipsoids stay round, and equal input gives equal bytes
+    shown = [[float(f"{a:.7g}") for a in axis] for axis in axes]
+    return {"x": rounded(x), "axes": shown, "colour": d.RED if kind == "point" else d.GREEN}
+
+
+def _line(x: FloatArray, colour: str, width: float, alpha: float = 1.0) -> dict[str, Any]:
+    return {"x": rounded(x), "colour": colour, "width": width, "alpha": alpha}
+
+
+def _ground(low: FloatArray, high: FloatArray) -> list[dict[str, Any]]:
+    step = d.round_below(float((high - low)[:2].max()) / 4.0)
+    out = []
+    for axis in (0, 1):
+        other = 1 - axis
+        for at in np.arange(np.ceil(low[axis] / step), np.floor(high[axis] / step) + 1) * step:
+            ends = np.array([low, low])
+            ends[:, axis], ends[1, other] = at, high[other]
+            out.append(_line(ends, d.GRID, 1.0))
+    return out
+
+
+def _lines(scene: Scene, reach: float) -> list[dict[str, Any]]:
+    out = [_line(np.vstack([x, x[:1]]), d.INK, 1.2) for _, x in scene.outlines]
+    for i, colour in enumerate((d.X_AXIS, d.Y_AXIS, d.Z_AXIS)):
+        out.append(_line(np.array([np.zeros(3), 0.14 * reach * np.eye(3)[i]]), colour, 2.0))
+    for _, pose, axes in scene.tables:
+        for axis in axes:
+            end = 0.12 * reach * np.eye(3)["xyz".index(axis)]
+            out.append(_line(pose.transformFrom(np.column_stack([-end, end])).T, d.INK, 1.2))
+    for shot in scene.shots:
+        colour = d.CAMERA_COLOURS[shot.camera_idx % len(d.CAMERA_COLOURS)]
+        out += [_line(x, colour, 1.1 if shot.main else 0.8, 1.0 if shot.main else 0.4) for x in _frustum(shot, reach)]
+    cross = 0.006 * reach * np.eye(3)
+    for _, cloud in scene.clouds:
+        out += [_line(np.array([x - c, x + c]), d.INK, 1.0) for x in cloud for c in cross]
+    return out
+
+
+def _frustum(shot: Shot, reach: float) -> list[FloatArray]:
+    depth = 0.15 * reach
+    if not shot.main:
+        return [shot.pose.transformFrom(np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 1.3 * depth)]).T).T]
+    tx, ty = np.tan(shot.half_angles)
+    rim = depth * np.array([(-tx, -ty, 1.0), (tx, -ty, 1.0), (tx, ty, 1.0), (-tx, ty, 1.0), (-tx, -ty, 1.0)])
+    corners = shot.pose.transformFrom(rim.T).T
+    eye = np.asarray(shot.pose.translation())
+    return [corners, *(np.array([eye, corner]) for corner in corners[:4])]
+
+
+def _names(scene: Scene) -> list[dict[str, Any]]:
+    out = [(label, x.mean(axis=0), d.INK) for label, x in scene.outlines + scene.clouds if label]
+    for shot in scene.shots:
+        if shot.main:
+            colour = d.CAMERA_COLOURS[shot.camera_idx % len(d.CAMERA_COLOURS)]
+            out.append((shot.label, np.asarray(shot.pose.translation()), colour))
+    out += [(table_id, np.asarray(pose.translation()), d.INK) for table_id, pose, _ in scene.tables]
+    out += [(s.label, s.x, d.RED if s.kind == "point" else d.GREEN) for s in scene.spots if s.label]
+    return [{"text": text, "x": rounded(x), "colour": colour} for text, x, colour in out[:_MOST_NAMES]]

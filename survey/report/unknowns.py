@@ -1,18 +1,23 @@
-"""Sections on what was estimated: cameras, stations, tables, targets, points."""
+"""Sections on what was estimated: cameras, stations, tables, targets, points, instruments and surfaces."""
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
+from markupsafe import Markup
 
-from survey.report import camera_plots
+from survey.report import charts
 from survey.report.context import Context
 from survey.report.language import known, t
 from survey.report.markup import (
+    code,
     count,
-    esc,
+    element,
     fixed,
     general,
+    joined,
+    note,
+    part,
     pill,
     section,
     sigma_text,
@@ -21,8 +26,11 @@ from survey.report.markup import (
     with_sigma,
 )
 
-_MOST_ROWS = 250
+_MOST_ROWS, _MOST_CAMERAS, _MOST_BLOCKS = 250, 40, 100
 _MANY_EPOCHS = 12
+T = TypeVar("T")
+_Pose = tuple[str, str, str, dict[str, Any]]
+"""Thing, name of its pose, epoch or nothing, entry."""
 _POSE_COLUMNS = ("<Pose", "<Epoch", "x [mm]", "y [mm]", "z [mm]", "rx [°]", "ry [°]", "rz [°]", "<Status")
 _POSE_NOTE = (
     "A pose a_from_b is the origin of b in a and R = Rz Ry Rx. Below each coordinate its sigma along the axes of a in "
@@ -30,10 +38,10 @@ _POSE_NOTE = (
 )
 
 
-def status_pill(status: Any) -> str:
+def status_pill(status: Any) -> Markup:
     """The status of a component, or of a whole parameter."""
     if isinstance(status, dict):
-        return " ".join(f"{esc(k)} {status_pill(v)}" for k, v in status.items())
+        return joined((joined((k, status_pill(v)), " ") for k, v in status.items()), " ")
     return pill({"free": "quiet", "held": "plain", "prior": "soft", "tied": "soft"}.get(status, "quiet"), known(status))
 
 
@@ -52,29 +60,29 @@ def _value_in(unit: str, value: float | None, sigma: float | None, sigma_unit: s
     return value_text(value, same)
 
 
-def vector_table(entry: dict[str, Any], ratios: dict[str, float] | None = None) -> str:
+def vector_table(entry: dict[str, Any], ratios: dict[str, float] | None = None) -> Markup:
     """Components of a lens, a table or a warp; ``ratios`` adds the column of significance."""
-    rows = []
-    idle = []
+    rows, idle = [], []
     for name, value, unit, sigma, sigma_unit, status in _components(entry):
         if status == "held" and not value:
-            idle.append(f"<code>{esc(name)}</code>")
+            idle.append(code(name))
             continue
-        row = [f"<code>{esc(name)}</code>", _value_in(unit, value, sigma, sigma_unit), sigma_text(sigma)]
+        row: list[str] = [code(name), _value_in(unit, value, sigma, sigma_unit), sigma_text(sigma)]
         shown = unit if unit == sigma_unit else f"{unit} (σ {sigma_unit})"
-        row += [esc(shown.replace("_", " ")), status_pill(status)]
+        row += [shown.replace("_", " "), status_pill(status)]
         if ratios is not None:
             ratio = ratios.get(name)
             weak = name in entry.get("not_significant", ())
             row.append(pill("warn", fixed(ratio, 1)) if weak else fixed(ratio, 1))
         rows.append(row)
     columns = ["<Parameter", "Value", "σ", "<Unit", "<Status"] + ([] if ratios is None else ["|value| / σ"])
-    note = f'<p class="note">{t("Held at zero: {names}.", names=", ".join(idle))}</p>' if idle else ""
-    return (table(columns, rows) if rows else "") + note
+    at_zero = note(t("Held at zero: {names}.", names=joined(idle, ", "))) if idle else Markup()
+    return (table(columns, rows) if rows else Markup()) + at_zero
 
 
-def pose_row(name: str, epoch: str, entry: dict[str, Any]) -> list[str]:
+def _pose_row(pose: _Pose) -> list[str]:
     """A row of the table of poses."""
+    thing_id, name, epoch, entry = pose
     smallest = min((s for s in entry["sigma_translation_mm"] if s), default=None)
     cells = [
         with_sigma(v, s, smallest) for v, s in zip(entry["translation_mm"], entry["sigma_translation_mm"], strict=True)
@@ -82,176 +90,207 @@ def pose_row(name: str, epoch: str, entry: dict[str, Any]) -> list[str]:
     least = min((s for s in entry["sigma_rotation_arcsec"] if s), default=None)
     for angle, sigma in zip(entry["rotation_euler_xyz_deg"], entry["sigma_rotation_arcsec"], strict=True):
         below = f"± {sigma_text(sigma)}″" if sigma else t("held")
-        cells.append(f'{_value_in("deg", angle, least, "arcsec")}<span class="s">{below}</span>')
-    return [name, esc(epoch), *cells, status_pill(entry["status"])]
+        cells.append(part("below", _value_in("deg", angle, least, "arcsec"), below))
+    return [joined((element("b", thing_id), code(name)), " "), epoch, *cells, status_pill(entry["status"])]
 
 
-def _pose_rows(thing_id: str, entry: dict[str, Any]) -> Iterator[list[str]]:
+def _poses(thing_id: str, entry: dict[str, Any]) -> Iterator[_Pose]:
     """All poses of a thing, also those per epoch."""
     for key, value in entry.items():
         if key == "epochs":
             for epoch, poses in value.items():
                 for name, pose in poses.items():
                     if "_from_" in name and isinstance(pose, dict):
-                        yield pose_row(f"<b>{esc(thing_id)}</b> <code>{esc(name)}</code>", epoch, pose)
+                        yield thing_id, name, epoch, pose
         elif "_from_" in key:
-            yield pose_row(f"<b>{esc(thing_id)}</b> <code>{esc(key)}</code>", "", value)
+            yield thing_id, key, "", value
 
 
-def _limited(columns: tuple[str, ...], rows: list[list[str]]) -> str:
-    if not rows:
-        return ""
-    n = count(len(rows) - _MOST_ROWS)
-    more = f'<p class="note">{t("{n} more in solution.json.", n=n)}</p>' if len(rows) > _MOST_ROWS else ""
-    return table(columns, rows[:_MOST_ROWS]) + more
+def _limited(columns: Sequence[str], things: Sequence[T], row: Callable[[T], list[str]]) -> Markup:
+    """A table with a row for each of the first things, and how many more there are."""
+    if not things:
+        return Markup()
+    return table(columns, map(row, things[:_MOST_ROWS])) + _more(len(things) - _MOST_ROWS)
 
 
-def cameras(c: Context) -> str:
+def _more(n: int) -> Markup:
+    return note(t("{n} more in solution.json.", n=count(n))) if n > 0 else Markup()
+
+
+def cameras(c: Context) -> Markup:
     """Every camera: lens, pose, residuals."""
     found = c.adjustment.image_residuals
     blocks = c.adjustment.survey.image_blocks
     camera_of_block = np.array([b.camera_id for b in blocks], dtype=object)
-    parts = []
+    entries, parts = c.solution["cameras"], []
+    # of very many cameras those with the largest residuals are shown whole
+    by_size = sorted(entries, key=lambda k: -(entries[k]["rms_residual_px"] or 0.0))
+    shown, others = set(by_size[:_MOST_CAMERAS]), by_size[_MOST_CAMERAS:]
     for camera in c.adjustment.survey.cameras:
-        entry = c.solution["cameras"][camera.camera_id]
+        if camera.camera_id not in shown:
+            continue
         mine = (camera_of_block == camera.camera_id)[c.rows.block] if len(blocks) else np.zeros(0, dtype=bool)
-        residuals = camera_plots.CameraResiduals(
+        residuals = charts.CameraResiduals(
             camera.camera_id, camera.image_size, c.rows.uv[mine], found.residuals[mine], found.standardized[mine],
             found.used[mine], c.suspect[mine],
         )  # fmt: skip
-        parts.append(_camera(camera.camera_id, entry, residuals))
-    note = t(
+        parts.append(_camera(camera.camera_id, entries[camera.camera_id], residuals))
+    if others:
+        n = count(len(others))
+        title = t("{n} more cameras, with smaller residuals; their lenses and poses in solution.json", n=n)
+        columns = ("<Camera", "Images", "Points", "RMS residual [px]")
+        parts.append(part("details", title, _limited(columns, others, lambda k: _camera_row(k, entries[k])), True))
+    said = t(
         "Residual vectors point from the observed to the adjusted position. Red: suspect, orange: not used. "
         "A pattern in the mean per cell is what the lens model leaves over; empty cells hold no points."
     )
-    return section("cameras", "Cameras", "".join(parts), note)
+    return section("cameras", "Cameras", joined(parts), said)
 
 
-def _camera(camera_id: str, entry: dict[str, Any], residuals: camera_plots.CameraResiduals) -> str:
+def _camera_row(camera_id: str, entry: dict[str, Any]) -> list[str]:
+    numbers = (count(entry["n_images"]), count(entry["n_image_points"]), fixed(entry["rms_residual_px"], 3))
+    return [camera_id, *numbers]
+
+
+def _camera(camera_id: str, entry: dict[str, Any], residuals: charts.CameraResiduals) -> Markup:
     width, height = entry["image_size_px"]
     facts = t(
         "{width} × {height} px on station {station} · {images} images, {points} points", width=width, height=height,
-        station=esc(entry["station"]), images=count(entry["n_images"]), points=count(entry["n_image_points"]),
+        station=entry["station"], images=count(entry["n_images"]), points=count(entry["n_image_points"]),
     )  # fmt: skip
-    facts += " · " + t("lens model {model}", model=esc(entry["lens"]["model"])) if "lens" in entry else ""
+    facts += " · " + t("lens model {model}", model=entry["lens"]["model"]) if "lens" in entry else ""
     facts += " · " + t("RMS residual {rms} px", rms=fixed(entry["rms_residual_px"], 3))
-    parts = [f'<h3>{t("Camera")} {esc(camera_id)}</h3><p class="note">{facts}</p><div class="panes">']
-    if "lens" in entry:
-        lens = entry["lens"]
-        parts.append('<div class="pane">' + vector_table(lens, lens["value_over_sigma"]) + _remarks(lens) + "</div>")
-    if len(residuals.uv):
-        drawn = (
-            camera_plots.vector_field(residuals),
-            camera_plots.mean_field(residuals),
-            camera_plots.histogram(residuals),
-        )
-        parts.append('<div class="pane figures">' + "".join(f"<figure>{x}</figure>" for x in drawn) + "</div>")
-    parts.append("</div>")
-    rows = [row[:1] + row[2:] for row in _pose_rows(camera_id, entry)]
-    columns = _POSE_COLUMNS[:1] + _POSE_COLUMNS[2:]
-    return f'<div class="camera">{"".join(parts)}{table(columns, rows) if rows else ""}</div>'
+    lens = entry.get("lens")
+    shown = Markup() if lens is None else vector_table(lens, lens["value_over_sigma"]) + _remarks(lens)
+    makers = (charts.vector_field, charts.mean_field, charts.histogram)
+    drawn = [make(residuals) for make in makers] if len(residuals.uv) else []
+    rows = [row[:1] + row[2:] for row in map(_pose_row, _poses(camera_id, entry))]
+    poses = table(_POSE_COLUMNS[:1] + _POSE_COLUMNS[2:], rows) if rows else ""
+    return part("camera", camera_id, facts, shown, drawn, poses, of="report.html")
 
 
-def _remarks(lens: dict[str, Any]) -> str:
+def _remarks(lens: dict[str, Any]) -> Markup:
     """What is weak about a lens: parameters that could as well be zero, correlations."""
     strong, weak = lens["correlations_over_95_percent"], lens["not_significant"]
-    named = ", ".join(
-        f"<code>{esc(p['a'])}</code> {t('with')} <code>{esc(p['b'])}</code> {fixed(100 * p['correlation'], 1)} %"
-        for p in strong
+    pairs = (
+        joined((code(p["a"]), t("with"), code(p["b"]), fixed(100 * p["correlation"], 1), "%"), " ") for p in strong
     )
     # fx and fy of a camera always go together; alone they are no warning
     kind = "warn" if any({p["a"], p["b"]} != {"fx", "fy"} for p in strong) else "quiet"
     correlation = (
-        f"{pill(kind, t('correlated above 95 %'))} {named}"
+        joined((pill(kind, t("correlated above 95 %")), joined(pairs, ", ")), " ")
         if strong
         else t("No correlation above 95 % within the lens.")
     )
     remarks = [correlation]
     if weak:
-        names = ", ".join(f"<code>{esc(name)}</code>" for name in weak)
-        said = t("{names}: not distinguishable from zero at 95 %.", names=names)
-        remarks.append(f"{pill('warn', t('not significant'))} {said}")
-    return "".join(f'<p class="note">{r}</p>' for r in remarks)
+        said = t("{names}: not distinguishable from zero at 95 %.", names=joined(map(code, weak), ", "))
+        remarks.append(joined((pill("warn", t("not significant")), said), " "))
+    return joined(map(note, remarks))
 
 
-def stations(c: Context) -> str:
+def stations(c: Context) -> Markup:
     """Poses of stations, of their mounts, of tables and targets."""
-    rows = [
-        row
-        for kind in ("stations", "tables", "targets")
-        for i, e in c.solution[kind].items()
-        for row in _pose_rows(i, e)
-    ]
-    by_epoch = [row for row in rows if row[1]]
-    body = _limited(_POSE_COLUMNS, rows)
-    if len(by_epoch) > _MANY_EPOCHS:
-        body = _limited(_POSE_COLUMNS, [row for row in rows if not row[1]])
+    kinds = (c.solution[kind] for kind in ("stations", "tables", "targets"))
+    poses = [pose for entries in kinds for i, e in entries.items() for pose in _poses(i, e)]
+    by_epoch = [pose for pose in poses if pose[2]]
+    many = len(by_epoch) > _MANY_EPOCHS
+    body = _limited(_POSE_COLUMNS, [pose for pose in poses if not pose[2]] if many else poses, _pose_row)
+    if many:
         title = t("{n} poses by epoch", n=count(len(by_epoch)))
-        body += f"<details><summary>{title}</summary>{_limited(_POSE_COLUMNS, by_epoch)}</details>"
+        body += part("details", title, _limited(_POSE_COLUMNS, by_epoch, _pose_row), False)
     return section("poses", "Poses of stations, tables and targets", body, t(_POSE_NOTE))
 
 
-def tables(c: Context) -> str:
+def tables(c: Context) -> Markup:
     """Geometry and angles of every table."""
     parts = []
     for table_id, entry in c.solution["tables"].items():
         axes = t(" then ").join(entry["axes"])
-        body = f"<h3>{esc(table_id)}, {t('axes {axes}', axes=esc(axes))}</h3>"
+        body = element("h3", joined((table_id, t("axes {axes}", axes=axes)), ", "))
         if "geometry" in entry:
             body += vector_table(entry["geometry"])
         if entry["epochs"]:
             names = list(next(iter(entry["epochs"].values()))["status"])
-            columns = ("<Epoch", *(x for n in names for x in (f"{esc(n)} [°]", "σ [″]")))
-            rows = [
-                [esc(epoch)]
-                + [x for _, v, u, s, su, _ in _components(angles) for x in (_value_in(u, v, s, su), sigma_text(s))]
-                for epoch, angles in entry["epochs"].items()
-            ]
-            opened = " open" if len(rows) <= _MANY_EPOCHS else ""
-            title = t("{n} epochs: adjusted angles", n=count(len(rows)))
-            body += f"<details{opened}><summary>{title}</summary>{_limited(columns, rows)}</details>"
+            columns = ("<Epoch", *(x for n in names for x in (f"{n} [°]", "σ [″]")))
+            epochs = list(entry["epochs"].items())
+            title = t("{n} epochs: adjusted angles", n=count(len(epochs)))
+            body += part("details", title, _limited(columns, epochs, _angles_row), len(epochs) <= _MANY_EPOCHS)
         parts.append(body)
-    return section("tables", "Turntables", "".join(parts))
+    return section("tables", "Turntables", joined(parts))
 
 
-def targets(c: Context) -> str:
+def _angles_row(epoch: tuple[str, dict[str, Any]]) -> list[str]:
+    name, angles = epoch
+    parts = ((_value_in(unit, v, s, s_unit), sigma_text(s)) for _, v, unit, s, s_unit, _ in _components(angles))
+    return [name, *(x for both in parts for x in both)]
+
+
+def targets(c: Context) -> Markup:
     """What the targets are; their poses are listed with those of the stations."""
-    rows = []
-    warps = ""
-    for target_id, entry in c.solution["targets"].items():
-        carrier = t("station {name}", name=esc(entry["station"])) if "station" in entry else t("the world")
-        rows.append(
-            [
-                esc(target_id),
-                count(entry["n_points"]),
-                carrier,
-                esc(known(entry["motion"])),
-                count(len(entry.get("epochs", {}))),
-            ]
-        )
-        if "warp" in entry:
-            warps += f"<h3>{t('Warp of {name}', name=esc(target_id))}</h3>" + vector_table(entry["warp"])
+    entries = list(c.solution["targets"].items())
     columns = ("<Target", "Points", "<Stands on", "<Motion", "Poses per epoch")
-    return section("targets", "Targets", table(columns, rows) + warps if rows else "")
+    bent = [(k, e["warp"]) for k, e in entries if "warp" in e]
+    warps = [element("h3", t("Warp of {name}", name=k)) + vector_table(warp) for k, warp in bent[:_MOST_BLOCKS]]
+    body = joined((_limited(columns, entries, _target_row), *warps, _more(len(bent) - _MOST_BLOCKS)))
+    return section("targets", "Targets", body)
 
 
-def points(c: Context) -> str:
+def _target_row(target: tuple[str, dict[str, Any]]) -> list[str]:
+    target_id, entry = target
+    carrier = t("station {name}", name=entry["station"]) if "station" in entry else t("the world")
+    return [target_id, count(entry["n_points"]), carrier, known(entry["motion"]), count(len(entry.get("epochs", {})))]
+
+
+def points(c: Context) -> Markup:
     """Coordinates of points, least precise first."""
     entries = sorted(c.solution["points"].items(), key=lambda x: -x[1]["ellipsoid_95_semi_axes_mm"][0])
     worst = entries[0][1]["ellipsoid_95_semi_axes_mm"][0] if entries else 0.0
-    rows = []
     every = [p[f"sigma_{a}_mm"] for _, p in entries for a in "xyz" if p[f"sigma_{a}_mm"]]
     typical = float(np.median(every)) if every else None
-    for point_id, p in entries:
+
+    def row(point: tuple[str, dict[str, Any]]) -> list[str]:
+        point_id, p = point
         axes = p["ellipsoid_95_semi_axes_mm"]
-        length = 100.0 * axes[0] / worst if worst else 0.0
-        bar = f'<span class="bar"><i style="width:{length:.0f}%"></i></span>'
-        row = [f"<b>{esc(point_id)}</b>", *(with_sigma(p[f"{a}_mm"], p[f"sigma_{a}_mm"], typical) for a in "xyz")]
-        rows.append([*row, *(sigma_text(a) for a in axes), bar, status_pill(p["status"])])
+        bar = part("bar", f"{100.0 * axes[0] / worst if worst else 0.0:.0f}")
+        cells = [element("b", point_id), *(with_sigma(p[f"{a}_mm"], p[f"sigma_{a}_mm"], typical) for a in "xyz")]
+        return [*cells, *(sigma_text(a) for a in axes), bar, status_pill(p["status"])]
+
     columns = ("<Point", "x [mm]", "y [mm]", "z [mm]", "a [mm]", "b [mm]", "c [mm]", "<", "<Status")
-    note = t(
+    said = t(
         "World coordinates with sigmas below; a, b, c: semi-axes of the 95 % confidence ellipsoid ({k} sigmas). "
         "Least precise first.",
         k=general(c.scale.ellipsoid, 4),
     )
-    return section("points", "Points", _limited(columns, rows), note)
+    return section("points", "Points", _limited(columns, entries, row), said)
+
+
+def instruments(c: Context) -> Markup:
+    """The vertical, instruments, their setups, laser beams and surfaces: what they were found to be."""
+    parts: list[Markup] = []
+    vertical = c.solution.get("vertical")
+    if vertical is not None:
+        parts += [element("h3", t("Vertical")), _vector(t("upwards in the world"), vertical["up_in_world"])]
+        parts += [vector_table(vertical["tilt"])] if "tilt" in vertical else []
+    for instrument_id, entry in c.solution.get("instruments", {}).items():
+        parts += [element("h3", joined((t("Instrument"), instrument_id), " ")), vector_table(entry)]
+    setups = list(c.solution.get("setups", {}).items())
+    for setup_id, entry in setups[:_MOST_BLOCKS]:
+        of = f" ({entry['instrument']})" if "instrument" in entry else ""
+        parts += [element("h3", joined((t("Setup"), f"{setup_id}{of}"), " "))]
+        parts += [vector_table(entry[kind]) for kind in ("orientation", "centring") if kind in entry]
+    parts += [_more(len(setups) - _MOST_BLOCKS)]
+    for beam_id, entry in c.solution.get("beams", {}).items():
+        carrier = next(f"{kind} {entry[kind]}" for kind in ("mount", "station") if kind in entry)
+        head = f"{t('Laser beam')} {beam_id} ({carrier}, {t('along')} {entry['axis']})"
+        parts += [element("h3", head), vector_table(entry["parameters"])]
+    for surface_id, entry in c.solution.get("surfaces", {}).items():
+        key = next((k for k in ("normal", "direction") if k in entry), None)
+        parts += [element("h3", joined((t(entry["kind"]), surface_id), " "))]
+        parts += [_vector(t(key), entry[key])] if key else []
+        parts += [vector_table(entry["parameters"])]
+    return section("instruments", "Instruments and surfaces", joined(parts))
+
+
+def _vector(what: str, components: list[Any]) -> Markup:
+    return note(f"{what}: ({', '.join(fixed(x, 6) for x in components)})")

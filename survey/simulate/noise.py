@@ -73,12 +73,13 @@ def resample(survey: Survey, truth: Truth, seed: int) -> Survey:
 
 def _ideal(scene: Scene) -> _Ideal:
     survey = scene.survey
-    images, factors = [np.zeros((0, 2))], [np.zeros((0, 2, 2))]
+    images: list[FloatArray] = [np.zeros((0, 2))]
+    factors: list[FloatArray] = [np.zeros((0, 2, 2))]
     for block in survey.image_blocks:
         name, epoch_id = block.target_id, block.epoch_id
         x = scene.world_points() if name is None else scene.target_points(name, epoch_id)
         images.append(scene.project(block.camera_id, block.epoch_id, x[block.point_idx]))
-        factors.append(np.linalg.cholesky(block.cov))
+        factors.append(np.asarray(np.linalg.cholesky(block.cov), dtype=np.float64))
     uv = np.concatenate(images)
     if np.isnan(uv).any():
         raise ValueError("the survey has image points that its truth puts behind the camera")

@@ -12,7 +12,7 @@ from adjust.distributions import norm
 from adjust.epochs.states import datum_carriers, open_directions
 from adjust.model.result import Adjustment, Estimate, GroupSummary
 from adjust.model.survey import FloatArray
-from adjust.precision.pose_networks import in_conditions
+from adjust.precision.precision import in_conditions
 from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
@@ -221,13 +221,14 @@ def _lens(estimate: Estimate, model: str, scale: Scale) -> dict[str, Any]:
 
 
 def _cameras(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+    moving = _of_epochs(adjustment)
     out: dict[str, Any] = {}
     for camera in adjustment.survey.cameras:
         entry: dict[str, Any] = {"station": camera.station_id, "image_size_px": list(camera.image_size)}
         lens = adjustment.estimates.get(("lens", camera.camera_id))
         if lens is not None:
             entry["lens"] = _lens(lens, camera.lens.model, scale)
-        entry |= _pose(adjustment, ("station_from_camera", camera.camera_id), "station_from_camera", scale)
+        entry |= _pose(adjustment, moving, ("station_from_camera", camera.camera_id), "station_from_camera", scale)
         out[camera.camera_id] = entry | _images(adjustment, camera.camera_id)
     return out
 
@@ -257,25 +258,34 @@ def _rms(squares: FloatArray) -> float:
     return float(np.sqrt(squares.mean())) if squares.size else float("nan")
 
 
-def _pose(adjustment: Adjustment, name: tuple[str, ...], key: str, scale: Scale) -> dict[str, Any]:
+def _of_epochs(adjustment: Adjustment) -> dict[tuple[str, ...], list[Estimate]]:
+    """What there is once at every epoch, by the first two parts of its name."""
+    out: dict[tuple[str, ...], list[Estimate]] = {}
+    for n, estimate in adjustment.estimates.items():
+        if len(n) == 3:
+            out.setdefault(n[:2], []).append(estimate)
+    return out
+
+
+def _pose(
+    adjustment: Adjustment, moving: Mapping[tuple[str, ...], list[Estimate]], name: tuple[str, ...], key: str,
+    scale: Scale,
+) -> dict[str, Any]:  # fmt: skip
     """The pose under ``key`` and, where it moves, under ``epochs``; empty where it is no unknown."""
-    epochs = {
-        n[2]: {key: pose_entry(estimate, scale)}
-        for n, estimate in adjustment.estimates.items()
-        if len(n) == 3 and n[:2] == name
-    }
+    epochs = {e.name[2]: {key: pose_entry(e, scale)} for e in moving.get(name, ())}
     single = adjustment.estimates.get(name)
     entry: dict[str, Any] = {} if single is None else {key: pose_entry(single, scale)}
     return entry | ({"epochs": epochs} if epochs else {})
 
 
 def _stations(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+    moving = _of_epochs(adjustment)
     out = {}
     for station in adjustment.survey.stations:
         name = station.station_id
         entry = {"motion": station.motion} | ({"table": station.table_id} if station.table_id else {})
-        entry |= _pose(adjustment, ("mount_from_station", name), "mount_from_station", scale)
-        out[name] = entry | _pose(adjustment, ("world_from_station", name), "world_from_station", scale)
+        entry |= _pose(adjustment, moving, ("mount_from_station", name), "mount_from_station", scale)
+        out[name] = entry | _pose(adjustment, moving, ("world_from_station", name), "world_from_station", scale)
     return out
 
 
@@ -284,10 +294,12 @@ def _points(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
 
 
 def _tables(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+    moving = _of_epochs(adjustment)
     out = {}
     for table in adjustment.survey.tables:
         name = table.table_id
-        entry = {"axes": list(table.axes)} | _pose(adjustment, ("world_from_table", name), "world_from_table", scale)
+        entry: dict[str, Any] = {"axes": list(table.axes)}
+        entry |= _pose(adjustment, moving, ("world_from_table", name), "world_from_table", scale)
         geometry = adjustment.estimates.get(("table_geometry", name))
         if geometry is not None:
             entry["geometry"] = vector_entry(geometry, scale)
@@ -297,13 +309,14 @@ def _tables(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
 
 
 def _targets(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
+    moving = _of_epochs(adjustment)
     out = {}
     for target in adjustment.survey.targets:
         name = target.target_id
         key = "station_from_target" if target.station_id else "world_from_target"
         entry: dict[str, Any] = {"n_points": len(target.point_ids), "motion": target.motion}
         entry |= {"station": target.station_id} if target.station_id else {}
-        entry |= _pose(adjustment, ("carrier_from_target", name), key, scale)
+        entry |= _pose(adjustment, moving, ("carrier_from_target", name), key, scale)
         warp = adjustment.estimates.get(("warp", name))
         out[name] = entry | ({"warp": vector_entry(warp, scale)} if warp is not None else {})
     return out

@@ -1,7 +1,9 @@
 """The measured pairs of a survey as a network: counts after theorem 1 of the relay paper, and its loops one by one.
 
-Frames are the eyes: stations, cameras, targets. What the datum gives (held stations, stations with a full prior, the
-world) closes loops too, where there is more than one of it: each is then joined to the world.
+Frames are the eyes: stations, cameras, targets. What is known without pairs closes loops too: of the datum (held
+stations, stations with a full prior, the world) where there is more than one, each joined to the world; of a calibrated
+rig the cameras and targets whose poses on their station are held or have a full prior, where pairs reach more than one
+of its frames, each joined to the station.
 """
 
 from collections.abc import Iterable, Sequence
@@ -12,7 +14,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.observations import FrameRef, Pair
-from adjust.model.result import Adjustment
+from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.relay.closed import play
 from adjust.relay.counts import Counts, count
@@ -25,7 +27,7 @@ from survey.solution.quantities import ARCSEC_PER_RAD
 ALPHA = 0.001
 """Error probability of the test of all loops together."""
 _MOST_LOOPS = 1000
-_GIVEN = "given:"  # no id holds a colon
+_GIVEN = "given:"  # no station's id holds a colon
 _WORLD = "world"
 
 
@@ -65,6 +67,7 @@ def pair_network(survey: Survey) -> PairNetwork:
     counts = count(whole, dim)
     tied = _tied(survey, used, bare, 6 if poses else 3)
     closed = count(tied, dim)
+    real = set(whole.station_ids) - {_WORLD}
     conditions, redundancy, shifts = closed.independent_conditions, closed.redundancy, None
     if dim == 3 and poses:
         shifts = count(topology(_ends(poses), bare), 3)
@@ -72,7 +75,7 @@ def pair_network(survey: Survey) -> PairNetwork:
     return PairNetwork(
         counts, shifts, _given(survey, used, 6 if poses else 3),
         _ordered(_real(closed.uncontrolled_pairs)), _groups(_real(g) for g in closed.inseparable_pairs),
-        tuple(real for part in closed.parts if (real := _ordered(s for s in part if s != _WORLD))),
+        tuple(found for part in closed.parts if (found := _ordered(s for s in part if s in real))),
         conditions, redundancy,
     )  # fmt: skip
 
@@ -116,13 +119,42 @@ def _given(survey: Survey, pairs: Sequence[Pair], dim: int) -> tuple[str, ...]:
 
 
 def _tied(survey: Survey, pairs: Sequence[Pair], bare: tuple[str, ...], dim: int) -> Topology:
-    """The pairs, and what is given joined to the world where that closes loops."""
-    return topology(_ends(pairs) + [(_GIVEN + s, s, _WORLD) for s in _joined(survey, pairs, dim)], bare)
+    """The pairs, and what is known without them where that closes loops."""
+    links = [(link.link_id, link.frame, link.carrier) for link in _links(survey, pairs, dim)]
+    return topology(_ends(pairs) + links, bare)
 
 
-def _joined(survey: Survey, pairs: Sequence[Pair], dim: int) -> tuple[str, ...]:
-    given = _given(survey, pairs, dim)
-    return tuple(s for s in given if s != _WORLD) if len(given) > 1 else ()
+@dataclass(frozen=True, eq=False)
+class _Link:
+    """A frame whose pose in another one is known without pairs, and the name of the parameter that it is."""
+
+    frame: str
+    carrier: str
+    parameter: ParameterName
+    given: PoseParameter
+
+    @property
+    def link_id(self) -> str:
+        return _GIVEN + self.frame
+
+
+def _links(survey: Survey, pairs: Sequence[Pair], dim: int) -> list[_Link]:
+    """What is known without pairs, where it closes loops."""
+    given, stations = _given(survey, pairs, dim), {s.station_id: s for s in survey.stations}
+    fixed = [s for s in given if s != _WORLD] if len(given) > 1 else []
+    out = [_Link(s, _WORLD, ("world_from_station", s), stations[s].world_from_station) for s in fixed]
+    frames, rig = {frame_name(r): r for p in pairs for r in (p.a, p.b)}, dict[str, list[_Link]]()
+    on = {("camera", c.camera_id): (c.station_id, c.station_from_camera) for c in survey.cameras}
+    on |= {("target", t.target_id): (t.station_id, t.carrier_from_target)
+           for t in survey.targets if t.station_id is not None and t.motion != "epoch"}  # fmt: skip
+    for name, ref in frames.items():
+        station_id, known = on.get((ref.kind, ref.frame_id), ("", None))
+        if station_id and known is not None and _is_given(known, dim):
+            epoch = None if stations[station_id].motion == "fixed" else ref.epoch_id
+            carrier = frame_name(FrameRef("station", station_id, epoch))
+            kind = "station_from_camera" if ref.kind == "camera" else "carrier_from_target"
+            rig.setdefault(carrier, []).append(_Link(name, carrier, (kind, ref.frame_id), known))
+    return out + [link for carrier, links in rig.items() if len(links) > 1 or carrier in frames for link in links]
 
 
 def pair_loops(survey: Survey) -> LoopMisclosures | None:
@@ -134,12 +166,10 @@ def pair_loops(survey: Survey) -> LoopMisclosures | None:
     if not pairs:
         return None
     dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3
-    joined = _joined(survey, pairs, dim)
     motions = [p.b_from_a for p in pairs]
     covs = [np.asarray(p.cov)[:dim, :dim] for p in pairs]
-    stations = {s.station_id: s.world_from_station for s in survey.stations}
-    for station in joined:
-        given = stations[station]
+    for link in _links(survey, pairs, dim):
+        given = link.given
         motions.append(given.value or Pose3())
         held = given.treatment == "held" or given.prior_cov is None
         covs.append(np.zeros((dim, dim)) if held else np.asarray(given.prior_cov)[:dim, :dim])
@@ -156,16 +186,15 @@ def loops_after(adjustment: Adjustment, loops: LoopMisclosures) -> FloatArray:
     top, dim = basis.topology, loops.vector.shape[1]
     by_id = {p.pair_id: p for p in survey.pairs}
     found = {o.ids[0]: np.asarray(o.residual) for o in adjustment.other_residuals if o.kind == "pair"}
-    stations = {s.station_id: s.world_from_station for s in survey.stations}
+    links = {link.link_id: link for link in _links(survey, survey.pairs, dim)}
     motions: list[Pose3 | Rot3] = []
     moved, lost = np.zeros((top.n_pairs, dim)), np.zeros(top.n_pairs, dtype=np.bool_)
     for e, pair_id in enumerate(top.pair_ids):
         pair = by_id.get(pair_id)
         if pair is None:  # what is given: its adjusted pose, where it is known no better than that
-            given = stations[pair_id.removeprefix(_GIVEN)]
-            estimate = adjustment.estimates.get(("world_from_station", pair_id.removeprefix(_GIVEN)))
+            estimate = adjustment.estimates.get(links[pair_id].parameter)
             now = None if estimate is None else estimate.value
-            motions.append(now if isinstance(now, Pose3) else given.value or Pose3())
+            motions.append(now if isinstance(now, Pose3) else links[pair_id].given.value or Pose3())
             continue
         motions.append(pair.b_from_a)
         v = found.get(pair_id)

@@ -9,7 +9,6 @@ from adjust.distributions import chi2
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray
-from adjust.precision.pose_networks import NamedPrecision
 from adjust.precision.precision import Precision
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import ARCSEC_PER_RAD, Scale, pose_dict
@@ -25,7 +24,8 @@ def pairs_dict(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
     the axes of a. ``misfit``: lengths of the residuals.
     """
     frames, out = AdjustedFrames(adjustment), {}
-    covs = _covariances(adjustment)
+    precision = adjustment.precision
+    covs = precision.pair_covariances() if isinstance(precision, Precision) else {}
     found = {o.ids[0]: o for o in adjustment.other_residuals if o.kind == "pair"}
     for pair in adjustment.survey.pairs:
         a, b = frames.world_from(pair.a), frames.world_from(pair.b)
@@ -48,21 +48,6 @@ def pairs_dict(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
 def _frame_text(frame: FrameRef) -> str:
     text = frame.kind + (f":{frame.frame_id}" if frame.frame_id else "")
     return f"{text}@{frame.epoch_id}" if frame.epoch_id else text
-
-
-def _covariances(adjustment: Adjustment) -> dict[str, FloatArray]:
-    """A priori covariances (k, k) of the adjusted pairs by id, in the tangent in frame a."""
-    precision = adjustment.precision
-    if isinstance(precision, NamedPrecision):
-        return precision.pair_covariances()
-    if not isinstance(precision, Precision):
-        return {}
-    out = {}
-    for item in precision.graph.others:
-        if item.kind == "pair":
-            _, M, root = precision.influence(item)
-            out[item.ids[0]] = root @ M @ root.T
-    return out
 
 
 def pair_sigmas(adjusted: Pose3, cov: FloatArray | None, factor: float = 1.0) -> dict[str, Any]:

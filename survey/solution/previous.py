@@ -16,7 +16,8 @@ from survey.folder.locking import settled
 from survey.folder.text import read_bytes
 from survey.project import Project
 from survey.project.declared.poses import rotation_from_quaternion
-from survey.report.results import RESULTS, read_covariances
+from survey.project.project import RESULTS
+from survey.solution.covariances import read_covariances
 from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind, key_of, unit_for_people
 
 # what damaged or foreign content makes the readers below raise

@@ -5,7 +5,7 @@ Everything that a report or a result file says about the precision of an unknown
 
 import re
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from gtsam import Pose3
@@ -14,9 +14,9 @@ from adjust.distributions import chi2, fisher
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate
 from adjust.model.survey import FloatArray
+from survey.project.project import SIGMA_KINDS
+from survey.project.project import SigmaKind as SigmaKind
 
-SigmaKind = Literal["a_priori", "a_posteriori"]
-SIGMA_KINDS: tuple[SigmaKind, ...] = get_args(SigmaKind)
 USUAL: SigmaKind = "a_posteriori"
 """Of results, where the project does not say."""
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi

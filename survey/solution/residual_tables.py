@@ -1,11 +1,12 @@
 """Residuals as CSV: one row per image point, one row per component of every other observation.
 
-Rows are assembled as matrices of bytes, not line by line: a million image points take about two seconds.
+Rows are assembled as matrices of bytes, not line by line: a million image points take about a second.
 """
 
 import csv
 import io
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy.typing as npt
 
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.native.parallel import workers
 from survey.folder.text import cell_text
 from survey.solution.quantities import sigma_unit_for_people, unit_for_people
 
@@ -25,7 +27,7 @@ OTHER_COLUMNS = (
     "kind,group,ids,component,value_unit,observed,adjusted,residual_unit,residual,sigma,redundancy,standardized,test,"
     "used"
 )
-_CHUNK = 100_000
+_CHUNK = 50_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +82,15 @@ def image_residuals_csv(adjustment: Adjustment) -> bytes:
         (rows.uv, 4), (found.residuals, 6), (rows.sigmas, 6), (found.redundancy, 5), (found.standardized, 4),
         (found.test[:, None], 4), (found.used[:, None].astype(float), 0),
     )  # fmt: skip
-    parts = [IMAGE_COLUMNS.encode() + b"\n"]
-    for first in range(0, rows.block.size, _CHUNK):
+
+    def text(first: int) -> bytes:
         part = slice(first, first + _CHUNK)
         columns = [names[rows.block[part]] for names in by_block] + [points[rows.point[part]]]
         columns += [_fixed(values[part, j], decimals) for values, decimals in numbers for j in range(values.shape[1])]
-        parts.append(_join(columns))
-    return b"".join(parts)
+        return _join(columns)
+
+    with ThreadPoolExecutor(workers()) as pool:
+        return b"".join([IMAGE_COLUMNS.encode() + b"\n", *pool.map(text, range(0, rows.block.size, _CHUNK))])
 
 
 def _text(words: Sequence[str]) -> Bytes:

@@ -7,7 +7,6 @@ from gtsam import Pose3
 
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray, IntArray
-from adjust.precision.pose_networks import NamedPrecision
 from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.consistency import consistency
@@ -25,8 +24,9 @@ from adjust.statistics.result import (
 )
 from adjust.statistics.system import LinearSystem, precision_of
 from adjust.statistics.weakness import compared_columns, correlations, weak_directions
+from survey.project.project import Tolerance
 from survey.solution.quantities import PROBABILITY, Scale
-from survey.solution.tolerances import Tolerance, Verdict, verdicts
+from survey.solution.tolerances import Verdict, verdicts
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ _LARGE_NETWORK = (
 
 
 def _is_large_network(adjustment: Adjustment) -> bool:
-    return isinstance(adjustment.precision, NamedPrecision) and len(adjustment.other_residuals) > LARGEST_NETWORK
+    return adjustment.survey.is_pose_network and len(adjustment.other_residuals) > LARGEST_NETWORK
 
 
 def _left_out(adjustment: Adjustment, system: LinearSystem, n_budgets: int) -> tuple[str, ...]:

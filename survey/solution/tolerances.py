@@ -13,37 +13,8 @@ from gtsam import Pose3
 from adjust.distributions import norm, student
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate
+from survey.project.project import DEMANDED, POSITION, ROTATION, Tolerance
 from survey.solution.quantities import PROBABILITY, Scale
-
-OWNERS = {
-    "points": ("point",),
-    "stations": ("world_from_station", "mount_from_station"),
-    "cameras": ("station_from_camera",),
-    "lenses": ("lens",),
-    "tables": ("world_from_table",),
-    "table_geometry": ("table_geometry",),
-    "targets": ("carrier_from_target",),
-}
-POSITION, ROTATION = "position", "rotation"
-
-
-@dataclass(frozen=True)
-class Tolerance:
-    """One demand. of: a key of ``OWNERS``; ids: whose (all where empty).
-
-    quantity: "position", "rotation", or the name of a component (of a lens, a table's geometry).
-    expanded: largest expanded uncertainty allowed, in the worst direction; None where only the value matters.
-    nominal, within: the value must be proven to lie within +- ``within`` of ``nominal``; of components only. SI units,
-    px for those in pixels.
-    """
-
-    name: str
-    of: str
-    ids: tuple[str, ...]
-    quantity: str
-    expanded: float | None = None
-    nominal: float | None = None
-    within: float | None = None
 
 
 @dataclass(frozen=True)
@@ -93,7 +64,7 @@ def verdicts(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], scale: S
 def _about(adjustment: Adjustment, tolerance: Tolerance) -> Iterator[Estimate]:
     seen = set()
     for name, estimate in adjustment.estimates.items():
-        if name[0] in OWNERS[tolerance.of] and (not tolerance.ids or name[1] in tolerance.ids):
+        if name[0] in DEMANDED[tolerance.of] and (not tolerance.ids or name[1] in tolerance.ids):
             seen.add(name[1])
             yield estimate
     missing = [i for i in tolerance.ids if i not in seen]

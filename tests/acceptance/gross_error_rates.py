@@ -15,7 +15,6 @@ from adjust.distributions import chi2
 from adjust.statistics.criteria import sidak
 from adjust.statistics.outlier_search import SearchOptions, search_outliers
 from adjust.statistics.reliability import observation_name, reliability
-from adjust.statistics.result import LevelOptions
 from tests.adjust import statistics_networks as net
 from tests.adjust.test_outlier_search import planted
 
@@ -39,7 +38,7 @@ def one(seed):
     limit = chi2.isf(sidak(FAMILY, len(tests.used)), 1)
     fails = np.flatnonzero(tests.used & (tests.statistic > limit))
     nominal = {observation_name(right, int(i))[1][0] for i in fails}
-    found = search_outliers(wrong, start, SearchOptions(LevelOptions(family_alpha=FAMILY)))
+    found = search_outliers(wrong, start, SearchOptions(FAMILY))
     out = {d.ids[0] for d in found.rejected}
     named = {key[1] for a in found.alternatives for key in (*a.kept, *a.instead)}
     return counts, counts - out, counts - out - named, out - set(sizes), nominal

@@ -201,7 +201,6 @@ def measured(case: Case, number: int, turns: int | None) -> str:
     """One row of the table."""
     rng, runs, seconds, all_epochs = np.random.default_rng(100 + number), [], 0.0, 0
     head, beacons = case.head(), case.beacons()
-    one_turn(head, beacons, EVERY_3_DEG[:6], case.sight, case.options, np.random.default_rng(0))  # compiles
     for _ in range(turns or case.turns):
         more, took = one_turn(
             head, beacons, EVERY_3_DEG, case.sight, case.options, rng, case.gaps, case.start

@@ -19,6 +19,7 @@ from adjust.model.observations import FrameRef, LaserSpot, Level, TableReading
 from adjust.model.survey import TILT, Beam, PoseParameter, Survey, VectorParameter, Vertical
 from adjust.spatial.rigid import rotation_log
 from tests.acceptance.mfns_replica import ARCSEC, joint_graph, laboratory, noisy, replica, rotation, true_poses
+from tests.sizes import size
 
 LEVEL_SIGMA, SPOT_SIGMA, TAPE_SIGMA = 15 * ARCSEC, 2e-4, 1e-3
 TRACE_DEG = np.linspace(-12.0, 12.0, 9)  # about the table's outer axis
@@ -87,7 +88,7 @@ def test_levels_and_laser_alone_give_the_alignment_without_images() -> None:
 
 def test_alignment_scatters_as_its_covariance_says() -> None:
     """d' inv(C) d of the rotation over fresh noise, chi-square with three degrees of freedom each."""
-    runs, total = 50, 0.0
+    runs, total = size(50, 10), 0.0
     for seed in range(runs):
         estimate = adjust(aligned(seed)).estimates[TABLE]
         d = turn_error(estimate.value)

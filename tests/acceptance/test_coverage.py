@@ -24,8 +24,9 @@ from adjust.precision.precision import Precision
 from survey import simulate
 from survey.simulate.scene import Truth
 from tests.adjust import helpers as h
+from tests.sizes import size
 
-REPLICAS = int(os.environ.get("LABSURVEY_REPLICAS", "150"))  # more is better, and slower
+REPLICAS = size(150)
 LEVEL = 1e-3  # of all tests of one survey together
 SURVEYS: dict[str, Callable[[], tuple[Survey, Truth]]] = {
     "single_camera": lambda: simulate.single_camera(11),
@@ -163,7 +164,7 @@ def test_scatter_of_every_class_is_what_its_covariance_says(scatter: tuple[str, 
         mean = T.mean() / k
         # components of one replica are correlated: no more than the replicas count for certain
         few = binom.ppf([level / 2, 1 - level / 2], REPLICAS, 0.95) / REPLICAS
-        band = (0.93, 0.97) if trials >= 10 * REPLICAS else (min(0.93, few[0]), max(0.97, few[1]))
+        band = (0.93, 0.97) if trials >= max(10 * REPLICAS, 1500) else (min(0.93, few[0]), max(0.97, few[1]))
         report.append(
             f"{name:14s} {kind:18s} n={k:4d} mean/n={mean:.4f} [{low:.4f}, {high:.4f}] "
             f"covered={100 * share:.2f} % [{100 * band[0]:.1f}, {100 * band[1]:.1f}] of {trials}"

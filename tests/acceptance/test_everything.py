@@ -30,11 +30,12 @@ from adjust.model.survey import (
     Vertical,
 )
 from survey.simulate import beacons, resample
+from tests.sizes import size
 
 ARCSEC = np.pi / 648000
 TABLE = ("world_from_table", "turntable")
 UP = np.array([0.05, -0.99, 0.1]) / np.linalg.norm([0.05, -0.99, 0.1])
-RUNS = 60
+RUNS = size(60)
 
 
 def laboratory() -> tuple[Survey, dict]:

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from survey.cli import main
 from survey.examples.beacons import beacon_files
-from survey.jobs.adjusting.job import adjust_project
+from survey.jobs.adjusting.steps import adjust_project
 from survey.project import read
 
 BEACONS = [f"B{i + 1:02d}" for i in range(12)]

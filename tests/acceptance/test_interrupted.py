@@ -412,15 +412,15 @@ def test_observations_do_not_change_under_a_capture_session(lab: Path) -> None:
 def test_files_that_belong_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The overview of a batch, for one: all of its files or none."""
     write_set(tmp_path / "report", {"a": "1", "b": "1"})
-    real, calls = os.rename, []
+    real, calls = os.replace, []
 
     def failing(source: Path, target: Path) -> None:
-        calls.append(target)
-        if len(calls) == 2:
+        calls.extend([target] if Path(target).parent == tmp_path / "report" else [])
+        if len(calls) == 2 and calls[-1] == target:
             raise OSError(errno.ENOSPC, "No space left on device", str(target))
         real(source, target)
 
-    monkeypatch.setattr(os, "rename", failing)
+    monkeypatch.setattr(os, "replace", failing)
     with pytest.raises(OSError, match="No space left"):
         write_set(tmp_path / "report", {"a": "2", "b": "2"})
     assert {p.name: p.read_text() for p in (tmp_path / "report").iterdir()} == {"a": "1", "b": "1"}

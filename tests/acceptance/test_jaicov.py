@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from survey.cli import main
-from survey.report.results import read_covariances
+from survey.solution.covariances import read_covariances
 from tests.data import data_folder
 
 # 0.657275451718 times the a priori variance of (0.5 micrometre)^2

@@ -37,8 +37,9 @@ from tests.acceptance.mfns_replica import (
     stepwise,
     stepwise_errors,
 )
+from tests.sizes import size
 
-REPLICAS = 200
+REPLICAS = size(200, 40)
 JOINT = (("world_from_table", "turntable"), ("mount_from_station", "head"),
          *(("station_from_camera", k) for k in CAMERAS), *(("lens", k) for k in CAMERAS))  # fmt: skip
 PRINTED = np.concatenate([PRINTED_SIGMAS[name] for name in QUANTITIES])
@@ -213,7 +214,7 @@ def test_the_stepwise_method_does_not(bound, scatter):
                  "joint": np.sqrt(np.mean(joint**2, axis=0)), "bound": bound, "factor": factor,
                  "printed/b": PRINTED / bound})  # fmt: skip
     by_name = {name: factor[3 * i : 3 * i + 3] for i, name in enumerate(QUANTITIES)}
-    assert factor.min() > 0.85  # none is better
+    assert factor.min() > 1.0 - 3.0 / np.sqrt(2 * REPLICAS)  # none is better
     caliper = 3 * QUANTITIES.index("r_wb^w") + 2
     assert rms[caliper] == pytest.approx(np.sqrt(np.mean(joint[:, caliper] ** 2)), rel=1e-3)  # the same for both
     # gamma and psi hang on the small turns about the auxiliary axis alone (A10), and X and Y inherit them (A11, A12)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from adjust.pose_network import NetworkOptions, solve_network
-from adjust.pose_network.chordal import chordal_cost, minimize_chordal
 from adjust.pose_network.solve import minimize
 from survey.interop.networks.g2o import read_g2o
+from tests.adjust.chordal import chordal_cost, minimize_chordal
 from tests.adjust.pose_networks import exp6, simulate
 from tests.benchmarks.networks import batch, gradient, grow
 from tests.data import data_folder

@@ -33,6 +33,12 @@ def solved(recorded):
     return adjust(positioner_survey(*recorded))
 
 
+@pytest.fixture(scope="module")
+def weighted(recorded):
+    """The adjustment with the sigmas that its residuals tell, and these."""
+    return weights_from_residuals(*recorded)
+
+
 def turn(axis, angles):
     return Rotation.from_rotvec(np.outer(angles, np.eye(3)["xz".index(axis) * 2])).as_matrix()
 
@@ -85,8 +91,8 @@ def test_published_figures(recorded, solved):
     assert solved.n_observations - solved.redundancy == 14 + recorded[0].size
 
 
-def test_both_defects_of_the_axes_are_significant(recorded):
-    result, weights = weights_from_residuals(*recorded)
+def test_both_defects_of_the_axes_are_significant(recorded, weighted):
+    result, weights = weighted
     assert result.sigma0 == pytest.approx(1.0, abs=2e-3)
     # one component has a third of the square, and the fourteen parameters take little of 1230 observations
     v = np.array([o.residual for o in result.other_residuals if o.kind == "pair"])
@@ -104,8 +110,8 @@ def test_both_defects_of_the_axes_are_significant(recorded):
     assert perfect.omega - result.omega == pytest.approx(2.0 * both.statistic, rel=0.02)
 
 
-def test_they_stay_so_although_neighbouring_poses_err_alike(recorded):
-    result, weights = weights_from_residuals(*recorded)
+def test_they_stay_so_although_neighbouring_poses_err_alike(recorded, weighted):
+    result, weights = weighted
     v = np.array([o.residual / o.sigma for o in result.other_residuals if o.kind == "pair"])
     alike = [np.corrcoef(v[:-1, i], v[1:, i])[0, 1] for i in range(6)]
     assert min(alike) > 0.4

@@ -23,6 +23,7 @@ from adjust.spatial.rigid import rotation_log
 from survey.cli import main
 from survey.project import write_project
 from tests.acceptance.mfns_replica import joint_graph, noisy, replica
+from tests.sizes import size
 
 
 def _json(capsys, *arguments, code=0):
@@ -88,7 +89,7 @@ def test_report_and_terminal_show_it(lab, tmp_path, capsys):
 
 def test_sigmas_through_all_steps_cover_the_truth(paper):
     survey, truth = paper
-    runs, squares, claimed = 6, [], []
+    runs, squares, claimed = size(6, 3), [], []
     for seed in range(runs):
         graph = joint_graph(noisy(survey, truth, 500 + seed), truth)
         found = compare_head(assemble(graph, solve(graph), AdjustOptions()))
@@ -229,7 +230,7 @@ def test_covariances_of_the_published_iteration_are_its_scatter():
             for (i, j), R, s in zip(ends, true, sigma, strict=True)
         ])  # fmt: skip
 
-    runs, total = 200, {"weighted": 0.0, "equal": 0.0}
+    runs, total = size(200, 40), {"weighted": 0.0, "equal": 0.0}
     for _ in range(runs):
         network = measured()
         weighted = PaperOptions(euler_cov=euler_covariances(network))

@@ -9,7 +9,7 @@ import pytest
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import NotConvergedError, SurveyError
-from survey.jobs.adjusting.job import adjust_project
+from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.navigating.job import NavigateRequest, navigate_job
 from survey.project import read
 from tests.data import data_folder

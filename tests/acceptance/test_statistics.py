@@ -18,6 +18,7 @@ from survey.interop.networks.gama import read_gama
 from survey.project import write_project
 from tests.adjust import statistics_networks as net
 from tests.data import data_folder
+from tests.sizes import size
 
 
 def test_w_and_tau_at_their_nominal_rates_over_10000_observations() -> None:
@@ -42,7 +43,7 @@ def test_the_detectable_bias_is_found_with_its_power() -> None:
     tests = reliability(adjust(clean, start), most_influences=0)
     first = len(tests.tests.used) - len(clean.readings)
     critical = tests.criteria.critical[0]
-    rng, found, n = np.random.default_rng(3), 0, 100
+    rng, found, n = np.random.default_rng(3), 0, size(100, 30)
     for sample in range(n):
         noisy, _ = net.hall(1, factors=None, noise=True, sample=sample)
         i = int(rng.integers(len(noisy.readings)))

@@ -98,10 +98,7 @@ def _images() -> None:
     names = list(graph.unknowns.by_name)
     precision.joint([names[0], names[-1]])
     batch = graph.images
-    rows = np.zeros((2 * int(batch.ptr[1]), int(batch.n_rows[0])))
-    state, chains = batch.state, batch.chains
-    images.block_rows(0, batch.arrays, batch.points, batch.W_all_columns, state.lenses, chains.R, chains.t, state.warp,
-                      rows)  # fmt: skip
+    batch.rows(0)
     batch.local_from_keys(0)
     solve_network(pose_networks.simulate(3, 2).network)
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)

@@ -6,7 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from adjust.model.survey import FloatArray
+from adjust.observations.pairs import pair_jacobians
 from adjust.pose_network import PoseNetwork, pose_network
+from adjust.relay.motions import Motions
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,3 +70,12 @@ def simulate(
         np.tile(cov[:3, :3] if rotations_only else cov, (len(a), 1, 1)), held=None if free else {0: first},
     )  # fmt: skip
     return Simulated(network, R, t, tuple(names[e] for e in bad))
+
+
+def network_jacobians(
+    network: PoseNetwork, world_from_station: Motions
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Residuals (E, dim) of all pairs, their derivatives (E, dim, dim) by b and by a, and Ad(b_from_a^-1)."""
+    here, measured = world_from_station, network.arrays.motions
+    b_from_a = here[network.b_idx].inverse() @ here[network.a_idx]
+    return pair_jacobians(measured if network.dim == 6 else Motions(measured.rotation), b_from_a)

@@ -7,7 +7,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.observations import FrameRef, Pair
 from adjust.relay.motions import Motions
-from adjust.relay.network import Network, complete_topology, topology
+from adjust.relay.network import Network, topology
 
 ARCMIN = np.pi / 180 / 60
 
@@ -31,7 +31,9 @@ def grid(nx, ny):
 
 
 def complete(n):
-    return complete_topology([f"C{i + 1}" for i in range(n)])
+    """Every camera measured with every other, in the order (1, 2), (1, 3), ..., (2, 3), ...; ids are ``a-b``."""
+    ids = [f"C{i + 1}" for i in range(n)]
+    return topology([(f"{a}-{b}", a, b) for i, a in enumerate(ids) for b in ids[i + 1 :]], ids)
 
 
 def chain_with_chords(n, chords, seed=0):
@@ -96,3 +98,11 @@ def pairs_of(simulated):
         )
         for e in range(top.n_pairs)
     )
+
+
+def suspects(pairs, alpha=0.001):
+    """Positions of the pairs that do not fit, worst first, at one level for the whole network (Sidak)."""
+    tested = np.flatnonzero(pairs.freedom > 0)
+    single = 1.0 - (1.0 - alpha) ** (1.0 / len(tested))
+    order = tested[np.argsort(-pairs.test[tested] / pairs.freedom[tested], kind="stable")]
+    return order[pairs.p_value[order] < single].tolist()

@@ -6,7 +6,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adjust.model.errors import SurveyError
-from adjust.start import closed_forms as cf
+from adjust.native.views import homographies, refine_poses, view_errors
+from adjust.spatial.averaging import mean_pose, pose_distance
+from adjust.spatial.rigid import align, rigid, rotation_exp, rotation_log, transform
+from adjust.start.closed_forms.absolute_pose import pose_solutions
+from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb, solve_ax_zb
+from adjust.start.closed_forms.triangulation import intersect
+from adjust.start.closed_forms.zhang import pinhole_from_homographies
 
 K = np.array([[1600.0, 0, 630.0], [0, 1590.0, 520.0], [0, 0, 1]])
 SIZE = (1280, 1024)
@@ -51,16 +57,16 @@ def angle_deg(a, b):
 def test_rotation_vectors_agree_with_scipy_up_to_half_a_turn():
     w = np.random.default_rng(1).normal(size=(50, 3))
     w *= np.linspace(0, np.pi - 1e-9, 50)[:, None] / np.linalg.norm(w, axis=1, keepdims=True)
-    r = cf.rotation_exp(w)
+    r = rotation_exp(w)
     np.testing.assert_allclose(r, Rotation.from_rotvec(w).as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(cf.rotation_log(r), w, atol=1e-7)
+    np.testing.assert_allclose(rotation_log(r), w, atol=1e-7)
 
 
 def test_align_recovers_a_motion_and_takes_the_smallest_turn_for_two_points():
     rng = np.random.default_rng(2)
     m, x = motion(rng), rng.normal(size=(6, 3))
-    np.testing.assert_allclose(cf.align(cf.transform(m, x), x), m, atol=1e-12)
-    two = cf.align(np.array([[0.0, 0, 0], [0, 1, 0]]), np.array([[1.0, 0, 0], [2, 0, 0]]))
+    np.testing.assert_allclose(align(transform(m, x), x), m, atol=1e-12)
+    two = align(np.array([[0.0, 0, 0], [0, 1, 0]]), np.array([[1.0, 0, 0], [2, 0, 0]]))
     np.testing.assert_allclose(two[:3, :3], Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix(), atol=1e-12)
 
 
@@ -72,7 +78,8 @@ def test_homography_of_a_known_map_and_of_noisy_points():
     noisy = uv + rng.normal(0, 0.5, uv.shape)
     n = len(xy)
     xys, uvs = np.concatenate([xy, xy, xy[:11], xy[:3]]), np.concatenate([uv, noisy, uv[:11], uv[:3]])
-    h, rms, good = cf.homographies(xys, uvs, np.array([0, n, 2 * n, 2 * n + 11, 2 * n + 14]))
+    h, misses, good = homographies(xys, uvs, np.array([0, n, 2 * n, 2 * n + 11, 2 * n + 14]))
+    rms = misses[:, 0]
     np.testing.assert_allclose(h[0] / h[0, 2, 2], true, rtol=1e-9)
     assert rms[0] < 1e-9
     reference = cv2.findHomography(xy, noisy)[0]
@@ -81,48 +88,49 @@ def test_homography_of_a_known_map_and_of_noisy_points():
     assert good.tolist() == [True, True, False, False]  # points on one line, and three
 
 
-def homographies(rng, n, tilt=0.4, noise=0.0):
+def seen_homographies(rng, n, tilt=0.4, noise=0.0):
     xy = board()[:, :2] / 0.2
     images = [pixels(board(), m) + rng.normal(0, noise, (88, 2)) for m in views(rng, n, tilt)]
-    return cf.homographies(np.tile(xy, (n, 1)), np.concatenate(images), 88 * np.arange(n + 1))[0]
+    return homographies(np.tile(xy, (n, 1)), np.concatenate(images), 88 * np.arange(n + 1))[0]
 
 
 def test_zhang_is_exact_without_noise_and_near_with_it():
-    start = cf.pinhole_from_homographies(homographies(np.random.default_rng(4), 6), SIZE)
+    start = pinhole_from_homographies(seen_homographies(np.random.default_rng(4), 6), SIZE)
     assert start.variant == "full"
     np.testing.assert_allclose(start.values, [1600, 1590, 630, 520], rtol=1e-6)
-    noisy = cf.pinhole_from_homographies(homographies(np.random.default_rng(5), 15, noise=0.2), SIZE)
+    noisy = pinhole_from_homographies(seen_homographies(np.random.default_rng(5), 15, noise=0.2), SIZE)
     np.testing.assert_allclose(noisy.values, [1600, 1590, 630, 520], atol=30)
 
 
 def test_zhang_falls_back_to_the_centre_for_one_image_and_refuses_frontal_ones():
-    start = cf.pinhole_from_homographies(homographies(np.random.default_rng(7), 1, tilt=0.6), SIZE)
+    start = pinhole_from_homographies(seen_homographies(np.random.default_rng(7), 1, tilt=0.6), SIZE)
     assert start.variant != "full"
     np.testing.assert_allclose(start.values[:2], 1595, rtol=0.1)
     np.testing.assert_allclose(start.values[2:], [639.5, 511.5])
     with pytest.raises(SurveyError, match="tilt the target"):
-        cf.pinhole_from_homographies(homographies(np.random.default_rng(8), 4, tilt=0.0), SIZE)
+        pinhole_from_homographies(seen_homographies(np.random.default_rng(8), 4, tilt=0.0), SIZE)
 
 
-def test_radial_distortion_is_recovered_from_known_poses():
-    rng = np.random.default_rng(9)
-    true = np.array([-0.15, 0.1, 0, 0])
-    ms = views(rng, 5)
-    xy = np.concatenate([(lambda p: p[:, :2] / p[:, 2:])(board() @ m[:3, :3].T + m[:3, 3]) for m in ms])
-    uv = np.concatenate([pixels(board(), m, true) for m in ms])
-    np.testing.assert_allclose(cf.radial_distortion(xy, uv, np.array([1600, 1590, 630, 520.0])), true[:2], atol=1e-9)
+def all_poses(x, rays):
+    """Refined poses (k, 4, 4) with the points in front, each once, the best first, and their errors (k,) rad."""
+    poses = pose_solutions(x, rays)
+    ptr, of = np.array([0, len(x)]), np.zeros(len(poses), dtype=int)
+    poses = refine_poses(poses, x, rays, ptr, 5, of=of)
+    error, in_front = view_errors(poses, x, rays, ptr, of)
+    order = np.argsort(np.where(in_front, error, np.inf))[: in_front.sum()]
+    kept = [i for n, i in enumerate(order) if not any(np.allclose(poses[i], poses[j], atol=1e-6) for j in order[:n])]
+    return poses[kept], error[kept]
 
 
 def test_planar_pose_gives_the_truth_first_and_the_second_solution_with_its_error():
     rng = np.random.default_rng(10)
     for m in views(rng, 10):
-        found = cf.absolute_pose(board(), rays_of(board(), m))
-        np.testing.assert_allclose(found.camera_from_target[0], m, atol=1e-8)
-        assert np.all(np.diff(found.error) >= 0)
+        found, error = all_poses(board(), rays_of(board(), m))
+        np.testing.assert_allclose(found[0], m, atol=1e-8)
+        assert np.all(np.diff(error) >= 0)
     far = m.copy()
     far[:3, 3] *= 20
-    ambiguous = cf.absolute_pose(board(3, 3), rays_of(board(3, 3), far))
-    assert len(ambiguous.error) == 2
+    assert len(all_poses(board(3, 3), rays_of(board(3, 3), far))[0]) == 2
 
 
 @pytest.mark.parametrize("n", [4, 5, 8])
@@ -135,18 +143,18 @@ def test_pose_from_points_in_space_with_rays_beyond_ninety_degrees(n):
     x = rng.normal(0, 0.5, (n, 3))
     rays = rays_of(x, m)
     assert np.all(rays @ m[:3, 3] > 0)
-    found = cf.absolute_pose(x, rays)
-    assert min(np.abs(found.camera_from_target - m).max(axis=(1, 2))) < 1e-7
+    found, _ = all_poses(x, rays)
+    assert min(np.abs(found - m).max(axis=(1, 2))) < 1e-7
 
 
 def test_three_points_leave_several_poses_among_them_the_true_one():
     rng = np.random.default_rng(11)
     m = views(rng, 1)[0]
     x = rng.normal(0, 0.1, (3, 3))
-    found = cf.absolute_pose(x, rays_of(x, m))
-    assert min(np.abs(p - m).max() for p in found.camera_from_target) < 1e-7
+    found, _ = all_poses(x, rays_of(x, m))
+    assert min(np.abs(p - m).max() for p in found) < 1e-7
     with pytest.raises(SurveyError, match="one line"):
-        cf.absolute_pose(np.outer(np.arange(4.0), [1, 2, 3]), rays_of(np.outer(np.arange(4.0), [1, 2, 3]), m))
+        pose_solutions(np.outer(np.arange(4.0), [1, 2, 3]), rays_of(np.outer(np.arange(4.0), [1, 2, 3]), m))
 
 
 def test_refinement_of_ragged_views_ignores_a_gross_error_when_robust():
@@ -157,9 +165,9 @@ def test_refinement_of_ragged_views_ignores_a_gross_error_when_robust():
     rays[1][3] = rays_of(xs[1][:1] + [0.05, 0, 0], ms[1])[0]
     ptr = np.cumsum([0, *map(len, xs)])
     start = np.array([m @ motion(rng, 0.02, 0.005) for m in ms])
-    found = cf.refine_poses(start, np.concatenate(xs), np.concatenate(rays), ptr, 30, robust=True)
+    found = refine_poses(start, np.concatenate(xs), np.concatenate(rays), ptr, 30, robust=True)
     np.testing.assert_allclose(found[[0, 2]], np.array(ms)[[0, 2]], atol=1e-8)
-    plain = cf.refine_poses(start, np.concatenate(xs), np.concatenate(rays), ptr, 30)
+    plain = refine_poses(start, np.concatenate(xs), np.concatenate(rays), ptr, 30)
     assert angle_deg(found[1], ms[1]) < 0.1 * angle_deg(plain[1], ms[1])
 
 
@@ -174,11 +182,11 @@ def hand_eye_data(rng, n, noise_deg=0.0):
 def test_robot_world_is_exact_and_survives_a_bad_pair():
     rng = np.random.default_rng(13)
     x, z, a, b = hand_eye_data(rng, 12)
-    found_x, found_z, _ = cf.solve_ax_zb(a, b)
+    found_x, found_z, _ = solve_ax_zb(a, b)
     np.testing.assert_allclose(found_x, x, atol=1e-9)
     np.testing.assert_allclose(found_z, z, atol=1e-9)
     b[4] = b[4] @ motion(rng, 0.7, 0.2)
-    found_x, found_z, weights = cf.solve_ax_zb(a, b)
+    found_x, found_z, weights = solve_ax_zb(a, b)
     np.testing.assert_allclose(found_x, x, atol=1e-6)
     np.testing.assert_allclose(found_z, z, atol=1e-6)
     assert np.argmin(weights) == 4
@@ -188,19 +196,19 @@ def test_robot_world_is_exact_and_survives_a_bad_pair():
 def test_hand_eye_is_exact_and_survives_a_bad_pair():
     rng = np.random.default_rng(14)
     x, _, a, b = hand_eye_data(rng, 12)
-    motions_a, motions_b = cf.relative_motions(a, b)
+    motions_a, motions_b = relative_motions(a, b)
     # a_i x = z b_i gives (a_j^-1 a_i) x = x (b_j^-1 b_i)
-    found, _ = cf.solve_ax_xb(motions_a, motions_b)
+    found, _ = solve_ax_xb(motions_a, motions_b)
     np.testing.assert_allclose(found, x, atol=1e-8)
     motions_b[5] = motions_b[5] @ motion(rng, 0.7, 0.2)
-    found, weights = cf.solve_ax_xb(motions_a, motions_b)
+    found, weights = solve_ax_xb(motions_a, motions_b)
     np.testing.assert_allclose(found, x, atol=1e-6)
     assert weights[5] < 0.01
 
 
 def test_noisy_hand_eye_is_as_good_as_its_data():
     x, _, a, b = hand_eye_data(np.random.default_rng(15), 40, noise_deg=0.05)
-    for found in (cf.solve_ax_zb(a, b)[0], cf.solve_ax_xb(*cf.relative_motions(a, b))[0]):
+    for found in (solve_ax_zb(a, b)[0], solve_ax_xb(*relative_motions(a, b))[0]):
         assert angle_deg(found, x) < 0.06
         assert np.linalg.norm(found[:3, 3] - x[:3, 3]) < 5e-4
 
@@ -213,14 +221,14 @@ def test_turns_about_one_axis_are_refused_by_name_or_solved_consistently():
     a[:, :3, :3] = Rotation.from_rotvec(np.linspace(-1, 1, 8)[:, None] * axis).as_matrix()
     b = np.linalg.inv(z) @ a @ x
     with pytest.raises(SurveyError, match=r"0\.600, \+0\.800|-0\.600, -0\.800"):
-        cf.solve_ax_zb(a, b)
-    motions = cf.relative_motions(a, b)
+        solve_ax_zb(a, b)
+    motions = relative_motions(a, b)
     with pytest.raises(SurveyError, match="one direction"):
-        cf.solve_ax_xb(*motions)
-    found, _ = cf.solve_ax_xb(*motions, minimum_norm=True)
+        solve_ax_xb(*motions)
+    found, _ = solve_ax_xb(*motions, minimum_norm=True)
     np.testing.assert_allclose(motions[0] @ found, found @ motions[1], atol=1e-8)
     with pytest.raises(SurveyError, match="largest of"):
-        cf.solve_ax_zb(a[:1].repeat(5, 0), b[:1].repeat(5, 0))
+        solve_ax_zb(a[:1].repeat(5, 0), b[:1].repeat(5, 0))
 
 
 def test_intersection_with_gross_ray_and_without_parallax():
@@ -231,14 +239,14 @@ def test_intersection_with_gross_ray_and_without_parallax():
     o = np.tile(origins, (3, 1))
     d = truth[point_of] - o
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    d[2] = cf.rotation_exp(np.array([0.05, 0.02, 0])) @ d[2]
+    d[2] = rotation_exp(np.array([0.05, 0.02, 0])) @ d[2]
     o = np.vstack([o, [[0, 0, 0], [0, 0, 0.0]]])
     d = np.vstack([d, [[0, 0, 1], [0, 0, 1.0]]])
-    found = cf.intersect(o, d, np.append(point_of, [3, 3]), 5, iterations=30)
+    found = intersect(o, d, np.append(point_of, [3, 3]), 5, iterations=30)
     np.testing.assert_allclose(found.x[:3], truth[:3], atol=1e-5)
     assert found.residual[2] > 0.04
     assert np.all(np.isnan(found.x[3:]))
-    two = cf.intersect(np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[0, 0, 1.0], [-0.6, 0, 0.8]]), np.zeros(2, int), 1)
+    two = intersect(np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[0, 0, 1.0], [-0.6, 0, 0.8]]), np.zeros(2, int), 1)
     assert two.parallax[0] == pytest.approx(np.arctan2(0.6, 0.8))
 
 
@@ -246,15 +254,29 @@ def test_mean_pose_ignores_a_minority_and_picks_among_alternatives():
     rng = np.random.default_rng(18)
     truth = motion(rng)
     poses = np.array([truth @ motion(rng, 1e-3, 1e-3) for _ in range(9)] + [motion(rng) for _ in range(6)])
-    mean, distance = cf.mean_pose(poses, lever=1.0)
-    assert cf.pose_distance(mean, truth, 1.0) < 2e-3
+    mean, distance = mean_pose(poses, lever=1.0)
+    assert pose_distance(mean, truth, 1.0) < 2e-3
     assert distance[9:].min() > 20 * distance[:9].max()
     # each observation offers the truth and something else, in either order
     both = np.array([m for i in range(8) for m in ((poses[i], motion(rng))[:: 1 if i % 2 else -1])])
-    mean, _ = cf.mean_pose(both, lever=1.0, members=np.repeat(np.arange(8), 2))
-    assert cf.pose_distance(mean, truth, 1.0) < 2e-3
+    mean, _ = mean_pose(both, lever=1.0, members=np.repeat(np.arange(8), 2))
+    assert pose_distance(mean, truth, 1.0) < 2e-3
 
 
 def test_zhang_does_not_take_one_view_seen_three_times_for_three():
-    one = homographies(np.random.default_rng(7), 1, tilt=0.6, noise=0.05)
-    assert cf.pinhole_from_homographies(np.repeat(one, 3, axis=0), SIZE).variant != "full"
+    one = seen_homographies(np.random.default_rng(7), 1, tilt=0.6, noise=0.05)
+    assert pinhole_from_homographies(np.repeat(one, 3, axis=0), SIZE).variant != "full"
+
+
+def test_four_points_in_space_have_the_true_pose_among_their_solutions():
+    """Their square sum has several minima, of which one solution from all of them may be a wrong one."""
+    rng = np.random.default_rng(5)
+    for _ in range(100):
+        m = rigid(rotation_exp(rng.normal(0.0, 0.5, 3)), np.array([0.0, 0.0, 3.0]))
+        x = rng.uniform(-1.2, 1.2, (4, 3))
+        p = transform(m, x)
+        rays = np.column_stack([p[:, :2] / p[:, 2:] + rng.normal(0.0, 1.5e-4, (4, 2)), np.ones(4)])
+        rays /= np.linalg.norm(rays, axis=1)[:, None]
+        for order in ([0, 1, 2, 3], [0, 2, 3, 1], [3, 0, 1, 2], [1, 3, 2, 0]):
+            found, _ = all_poses(x[order], rays[order])
+            assert np.linalg.norm(found[:, :3, 3] - m[:3, 3], axis=1).min() < 0.05

@@ -43,6 +43,7 @@ def drawn(state: EpochState, rng: np.random.Generator, factor: float = 1.0) -> E
 KNOWN = (1.0, float("inf"), float("nan"))
 
 
+@pytest.mark.slow
 def test_error_rate_of_the_global_test_and_of_the_single_ones() -> None:
     state, _ = states()
     rng = np.random.default_rng(1)
@@ -59,6 +60,7 @@ def test_error_rate_of_the_global_test_and_of_the_single_ones() -> None:
     assert single <= high
 
 
+@pytest.mark.slow
 def test_power_of_the_smallest_motion() -> None:
     """A point that moves by ``smallest`` in its worst direction is significant in 80 % of the samples."""
     state, ids = states()

@@ -11,9 +11,8 @@ from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray, Survey
 from adjust.statistics.changes import ChangeSearch, natural
 from adjust.statistics.condensed import condensed_system
-from adjust.statistics.consistency import consistency
+from adjust.statistics.consistency import consistency, eigenvalues, parts_of
 from adjust.statistics.criteria import sidak
-from adjust.statistics.parts import eigenvalues, parts_of
 from adjust.statistics.quadratic_forms import upper_tail, upper_tail_bound
 from adjust.statistics.result import Change, Consistency
 from adjust.statistics.system import linear_system, precision_of
@@ -34,6 +33,7 @@ def consistent(survey: Survey, start: h.StartValues) -> Consistency:
     return consistency(adjustment, condensed_system(precision_of(adjustment)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "weights",
     [np.r_[1.0, np.full(20, 0.1)], np.array([0.9, 0.5, 0.45, 0.2, 0.05]), np.r_[np.ones(40), np.linspace(0, 1, 20)]],
@@ -68,6 +68,7 @@ def test_mean_and_variance_of_a_part_are_those_of_its_quadratic_form() -> None:
         assert part.omega == pytest.approx(float(full.e[rows] @ full.e[rows]), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_false_alarms_stay_within_the_level_of_the_family() -> None:
     """Of 60 networks without a fault 5 % fail one of their seven parts; 9 or more do with a probability of 0.3 %."""
     found = [consistent(*net.hall(seed)) for seed in range(60)]
@@ -108,6 +109,7 @@ def test_where_the_whole_does_not_fit_parts_are_tested_against_the_rest() -> Non
     assert found.fits
 
 
+@pytest.mark.slow
 def test_a_lens_that_changes_is_named_with_its_epoch() -> None:
     """One camera's image 1 px to the right in the second half of its table epochs, as after another crop."""
     survey, start = lab()
@@ -128,6 +130,7 @@ def test_a_lens_that_changes_is_named_with_its_epoch() -> None:
     assert u0.amount == pytest.approx(1.0, abs=4 * u0.sigma)
 
 
+@pytest.mark.slow
 def test_a_table_that_slips_and_one_whose_circle_is_eccentric() -> None:
     survey, start = lab()
     wave = tuple(

@@ -45,6 +45,7 @@ def held_epochs(survey: Survey, truth: Truth) -> Survey:
     return replace(survey, stations=(replace(survey.stations[0], epochs=epochs),))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "reduced", "tied"),
     [
@@ -67,6 +68,7 @@ def test_bundle_equals_the_dense_adjustment(options: dict[str, object], reduced:
     assert len(bundle.hidden_poses) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n_cameras", "alone"), [(1, True), (2, False)])
 def test_cameras_fixed_to_their_stations(n_cameras: int, alone: bool) -> None:
     """A hidden pose behind one image alone takes the short way, one behind several images the general one."""
@@ -109,6 +111,7 @@ def test_intersection_goes_on_until_every_point_stands_still() -> None:
     np.testing.assert_allclose(x, y, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_bundle_beside_boards_and_a_table() -> None:
     """Beacons without coordinates, seen from the table: nine kinds of unknowns on the interface."""
     survey, truth = beacons(1, n_table_epochs=3, n_free_epochs=2, n_night_epochs=5)
@@ -160,6 +163,7 @@ def test_back_substitution_gives_the_dense_step() -> None:
         np.testing.assert_allclose(mine, expected[place], rtol=1e-6, atol=1e-8, err_msg=str(name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{"distances": 2}, {"distances": 0}, {"distances": 2, "n_cameras": 1}])
 @pytest.mark.parametrize(
     "datum",
@@ -173,6 +177,7 @@ def test_free_network_equals_the_dense_one(options: dict[str, int], datum: Datum
     assert precision.solved.datum.defect == (6 if options["distances"] else 7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pivot", [1e-11, 1e-15])
 def test_the_defects_of_a_larger_free_network_are_all_found(pivot: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Condensed to a few unknowns, the seven motions drown in rounding unless they are taken out exactly.
@@ -222,6 +227,7 @@ def test_an_epoch_with_too_few_points_is_named(which: slice) -> None:
         h.solved(replace(survey, image_blocks=tuple(blocks)), near(truth))
 
 
+@pytest.mark.slow
 def test_beacons_that_only_a_turning_head_sees_with_free_lenses() -> None:
     """The table moves with all beacons it sees: reduced, nothing but rounding is left of it, and that is no weight."""
     survey, truth = beacons(4, n_table_epochs=4, n_free_epochs=3, n_night_epochs=6)

@@ -73,6 +73,7 @@ def test_station_frame_of_cameras_without_a_held_one() -> None:
     assert "the frame of station bar" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("zero", "what"), [("zero_1", "table turntable"), ("zero_2", "table turntable")])
 def test_free_encoder_zero_beside_a_free_base_and_head(zero: str, what: str) -> None:
     """An encoder's zero cannot be told from the azimuth of the base, nor the inner one's from that of the head."""
@@ -140,6 +141,7 @@ def test_no_scale() -> None:
     assert "rotation" not in text
 
 
+@pytest.mark.slow
 def test_a_point_that_nothing_observes() -> None:
     survey, truth = beacons(1, n_table_epochs=3, n_free_epochs=2, n_night_epochs=4)
     lonely = replace(survey, points=(*survey.points, Point("B99")))
@@ -207,6 +209,7 @@ def test_a_large_survey_is_not_called_undetermined_for_weak_geometry() -> None:
 # -- inner constraints -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "datum", [Datum("inner"), Datum("inner", points=("P0", "P4", "P7", "P9")), Datum("inner", stations=("head",))]
 )

@@ -67,6 +67,7 @@ ALL_LINKS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", LENSES)
 def test_condensed_blocks_hold_the_normal_equations_of_plain_residuals(model: str) -> None:
     """All lens models; all links of a chain; full covariances; unused points."""
@@ -74,6 +75,7 @@ def test_condensed_blocks_hold_the_normal_equations_of_plain_residuals(model: st
     check_images(survey, start, ALL_LINKS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [("x", "z"), ("z", "x"), ("y", "x"), ("y", "z"), ("z",), ("x",)])
 def test_condensed_blocks_on_tables_of_all_kinds(axes: tuple[str, ...]) -> None:
     survey, start = h.everything(2, axes=axes)
@@ -157,6 +159,7 @@ def others(survey: Survey, start: StartValues) -> tuple[Survey, StartValues]:
     return survey, replace(start, points={"A": np.array([0.5, 0.1, 0.9]), "B": np.array([-0.4, 0.3, 0.7])})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [("x", "z"), ("z",)])
 def test_every_other_factor(axes: tuple[str, ...]) -> None:
     """Residual against plain lines, Jacobian against differences, whitening against the covariance."""

@@ -72,6 +72,7 @@ def test_stereo_with_tied_lens_priors_and_a_relative_pose() -> None:
     assert sigma[0] > 0
 
 
+@pytest.mark.slow
 def test_head_on_a_table_with_warped_board_priors_and_distances() -> None:
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=4, n_free_epochs=2)
     board = survey.targets[0]
@@ -94,6 +95,7 @@ def test_head_on_a_table_with_warped_board_priors_and_distances() -> None:
     h.check_against_dense(resample(thinned(survey, 3, unused=0.1), truth, 3), near(truth))
 
 
+@pytest.mark.slow
 def test_relay_station_and_free_network_of_targets() -> None:
     survey, truth = relay(1, n_epochs=5)
     thin = resample(thinned(survey, 3), truth, 2)
@@ -104,6 +106,7 @@ def test_relay_station_and_free_network_of_targets() -> None:
     assert precision.solved.datum.defect == 6
 
 
+@pytest.mark.slow
 def test_joint_covariances() -> None:
     """Of unknowns in one clique and far apart, hidden ones refused, in the order asked for."""
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
@@ -118,6 +121,7 @@ def test_joint_covariances() -> None:
         assert h.relative(precision.joint(chosen), Q[np.ix_(index, index)]) < 1e-7
 
 
+@pytest.mark.slow
 def test_redundancy_numbers_add_up() -> None:
     survey, truth = beacons(3, n_table_epochs=4, n_free_epochs=3, n_night_epochs=5)
     result = adjusted(survey, near(truth))
@@ -151,6 +155,7 @@ def with_gross_error(kind: str, survey: Survey, rng: np.random.Generator) -> tup
     return replace(survey, table_readings=tuple(readings)), i, 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("kind", ["image", "distance", "table"])
 def test_a_gross_error_is_found_where_it_is(kind: str, seed: int) -> None:

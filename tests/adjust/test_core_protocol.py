@@ -1,18 +1,16 @@
-"""The batches behind GTSAM's factors: right at any values, in any algorithm, on any number of threads."""
+"""The batches behind GTSAM's factors: right at any values, in any algorithm."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 import pytest
 
 from adjust.graph.assembly import AdjustmentGraph
-from adjust.graph.solver import solve
+from adjust.graph.solver import settled, solve
 from survey.simulate import head_on_table
 from tests.adjust import helpers as h
+from tests.adjust.terrestrial_networks import measured, polar_network, start_near
 
 
 def rows_of(graph: AdjustmentGraph, values: gtsam.Values) -> list[tuple[np.ndarray, np.ndarray]]:  # type: ignore[type-arg]  # plain floats
@@ -62,6 +60,49 @@ def test_errors_without_jacobians_then_with() -> None:
         np.testing.assert_array_equal(b, expected_b)
 
 
+@pytest.mark.parametrize("which", ["everything", "network"])
+def test_values_that_change_in_place_are_evaluated_anew(which: str) -> None:
+    """What was prepared is known by its evaluation, not by the object that held the values."""
+    survey, truth = h.network(1)
+    graph = h.build(*h.everything(1)) if which == "everything" else h.build(survey, h.start_at(truth))
+    values = gtsam.Values(graph.start)
+    moved = h.disturbed(graph.start, graph, 3, 0.3)
+    expected = graph.omega(moved)
+    at = graph.prepare(values, jacobians=True)
+    values.update(moved)
+    for factors in (graph.graph, graph.system):
+        assert 2.0 * factors.error(values) == pytest.approx(expected, rel=1e-9)
+    assert graph.objective(graph.prepare(values, jacobians=True)) == pytest.approx(expected, rel=1e-9)
+    assert graph.prepare(values, jacobians=True).number != at.number
+
+
+@pytest.mark.parametrize("kind", ["reduced", "readings"])
+def test_the_solver_changes_nothing_that_it_was_given(kind: str) -> None:
+    """Start, reduction, weights and sigmas stay, though sigmas with centring follow the distances of the solution."""
+    if kind == "reduced":
+        survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=12, n_free_epochs=9)
+        graph = h.build(survey, h.shaken(h.start_at(truth), 2, 0.005))
+        assert graph.reduction is not None
+    else:
+        survey, truth = polar_network(2, plane=True)
+        survey = measured(survey, truth, 1)
+        survey = replace(survey, readings=tuple(replace(r, target_centring_sigma=0.001) for r in survey.readings))
+        begin = start_near(survey, truth, 1, points=0.3)
+        graph = h.build(survey, replace(begin, points={k: x * (1.0, 1.0, 0.0) for k, x in begin.points.items()}))
+    before, start, reduction = gtsam.Values(graph.start), graph.start, graph.reduction
+    sigma = None if graph.terrestrial is None else graph.terrestrial.sigma.copy()
+    following, done = settled(graph)
+    assert graph.start is start
+    assert graph.start.equals(before, 0.0)
+    assert graph.reduction is reduction
+    assert not done.values.equals(before, 1e-6)
+    if graph.terrestrial is not None and following.terrestrial is not None and sigma is not None:
+        np.testing.assert_array_equal(graph.terrestrial.sigma, sigma)
+        assert np.abs(following.terrestrial.sigma / sigma - 1.0).max() > 1e-4
+    again = settled(graph)[1]
+    assert again.omega == pytest.approx(done.omega, rel=1e-12)
+
+
 def test_gtsams_own_optimiser_reaches_the_same_optimum() -> None:
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
     start = h.shaken(h.start_at(truth), 2, 0.005)
@@ -76,31 +117,3 @@ def test_gtsams_own_optimiser_reaches_the_same_optimum() -> None:
     for name, unknown in graph.unknowns.by_name.items():
         step = theirs.localCoordinates(ours.values).at(unknown.key)
         assert np.all(np.abs(step) < 1e-4 * np.sqrt(np.diag(h.covariance_of(precision, name)))), name
-
-
-PROGRAM = """
-import hashlib, sys
-from survey.simulate import head_on_table
-from tests.adjust import helpers as h
-survey, truth = head_on_table(1, n_cameras=3, n_table_epochs=16, n_free_epochs=10)
-assert sum(len(b.uv) for b in survey.image_blocks) > 5000, "not worth a second thread"
-graph, done = h.solved(survey, h.shaken(h.start_at(truth), 2, 0.005), tight=False)
-assert len(graph.images._all) == int(sys.argv[1])
-digest = hashlib.sha256()
-for unknown in graph.unknowns.by_name.values():
-    x = done.values.atPose3(unknown.key).matrix() if unknown.kind == "pose" else done.values.atVector(unknown.key)
-    digest.update(x.tobytes())
-print(digest.hexdigest(), done.omega.hex(), done.iterations)
-"""
-
-
-def test_threads_do_not_change_a_bit() -> None:
-    root = Path(__file__).parents[2]
-    found = set()
-    for threads in ("1", "2"):
-        environment = {**os.environ, "LABSURVEY_THREADS": threads, "OPENBLAS_NUM_THREADS": "1",
-                       "PYTHONPATH": str(root)}  # fmt: skip
-        done = subprocess.run([sys.executable, "-c", PROGRAM, threads], env=environment, cwd=root, check=True,
-                              capture_output=True, text=True)  # fmt: skip
-        found.add(done.stdout)
-    assert len(found) == 1

@@ -13,6 +13,7 @@ from adjust.published import CpcInput, TableImages, body_on_main_axis, calibrate
 from adjust.published.method import difference
 from adjust.published.steps import lateral_offset, table_and_main_camera
 from adjust.spatial.rotation_forms import matrix_from_euler
+from tests.sizes import size
 
 MAIN = np.radians([(0, 0), (0, -80), (0, -30), (0, 25), (0, 60), (-20, 0), (-11, 0), (9, 0), (18, 0)])
 X_ANGLES = np.radians([(80, 85), (95, 95), (-85, -90), (-95, -80)])
@@ -109,17 +110,20 @@ def test_our_frames():
     )
 
 
+@pytest.mark.slow
 def test_propagated_sigmas_are_the_scatter():
     item = replace(given(head(0.3), with_cov=True), angle_sigma_rad=3e-4)  # as much as the images
     names, cov = propagate(item)
+    n = size(400, 60)
     rng, at = np.random.default_rng(1), calibrate(item)
-    d = np.array([difference(at, calibrate(disturbed(item, rng)))[1] for _ in range(400)])
+    d = np.array([difference(at, calibrate(disturbed(item, rng)))[1] for _ in range(n)])
     known = np.diag(cov) > 1e-20  # the body's x and y on the main axis are zero by definition
     assert [n for n, k in zip(names, known, strict=True) if not k] == [("r_tb^b", "x"), ("r_tb^b", "y")]
     ratio = d.std(axis=0)[known] / np.sqrt(np.diag(cov))[known]
-    np.testing.assert_allclose(ratio, 1.0, atol=4.5 / np.sqrt(800))
+    np.testing.assert_allclose(ratio, 1.0, atol=4.5 / np.sqrt(2 * n))
 
 
+@pytest.mark.slow
 def test_each_step_judges_white_noise_rightly():
     """With the noise it supposes (equal, independent, nothing wrong before) the paper's sigma is the scatter."""
     truth, rng = head(0.0), np.random.default_rng(2)

@@ -244,6 +244,7 @@ def ln_det(adjustment, wanted):
     return np.linalg.slogdet(Q)[1], np.diag(Q)
 
 
+@pytest.mark.slow
 def test_updates_are_what_solving_again_gives(choices):
     base, start, candidates = choices
     planned = expect(base, start)
@@ -263,6 +264,7 @@ def test_updates_are_what_solving_again_gives(choices):
     assert [g.ln_det for g in found.first] == sorted((g.ln_det for g in found.first), reverse=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("criterion", ["D", "A"])
 def test_greedy_choice_beside_exhaustive_search(choices, criterion):
     base, start, candidates = choices
@@ -339,6 +341,7 @@ def scaled(survey, group, factor):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_budget_adds_up_and_tolerances_keep_the_requirement(walls):
     survey, start, _ = walls
     planned = expect(survey, start)
@@ -364,6 +367,7 @@ def test_budget_adds_up_and_tolerances_keep_the_requirement(walls):
         tolerances(shares, {})
 
 
+@pytest.mark.slow
 def test_scatter_of_simulated_surveys_is_the_predicted_covariance(walls):
     survey, start, _ = walls
     ideal = exact(survey, start)
@@ -381,6 +385,7 @@ def test_scatter_of_simulated_surveys_is_the_predicted_covariance(walls):
     assert not loud.passed
 
 
+@pytest.mark.slow
 def test_trials_are_the_same_whoever_shares_them():
     survey, truth = single_camera(1, n_images=4)
     start = start_at(truth)
@@ -393,6 +398,7 @@ def test_trials_are_the_same_whoever_shares_them():
     assert not np.array_equal(one.errors, other.errors)
 
 
+@pytest.mark.slow
 def test_trials_that_cannot_be_adjusted_are_said():
     survey, truth = single_camera(1, n_images=3)
     start = start_at(truth)

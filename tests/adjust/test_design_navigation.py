@@ -171,6 +171,7 @@ def test_figures_agree_within_one_percent_at_every_point(kind, seed):
     assert figure.slope_monte_carlo == pytest.approx(figure.slope, rel=4 * figure.slope_se / figure.slope)
 
 
+@pytest.mark.slow
 def test_standard_errors_are_the_scatter_of_repeated_figures():
     for kind, near in (("camera attitude", 0.1), ("beacon position", 0.3)):
         field = BeaconField(nearest_m=near)

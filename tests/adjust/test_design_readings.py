@@ -15,6 +15,7 @@ from adjust.model.observations import CoordinateDifferences, OnSurface, Position
 from adjust.model.survey import INSTRUMENT, Datum, Setup, Surface, Survey, VectorParameter, VectorPrior
 from tests.adjust.terrestrial_networks import P, Truth, measured, polar_network, start_near, wrapped
 from tests.adjust.test_geometry import geometric
+from tests.sizes import size
 
 
 def hall(seed: int = 4) -> tuple[Survey, Truth, StartValues]:
@@ -80,17 +81,19 @@ def test_expectation_is_the_covariance_of_an_adjustment_of_simulated_readings() 
         np.testing.assert_allclose(Q[dense.at[name], dense.at[name]] / scale, C, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_scatter_of_simulated_readings_is_the_predicted_covariance() -> None:
     survey, _, start = hall()
     planned, ideal = expect(survey, start), exact(survey, start)
-    found = run_trials(ideal, start, planned, 40, seed=2, n_workers=1)
+    n = size(40, 8)
+    found = run_trials(ideal, start, planned, n, seed=2, n_workers=1)
     assert not found.failed
     assert not [n for n in found.names if n[0] == "centring"]
     assert found.passed, (found.mean_square, found.band)
-    assert np.mean(found.omega) == pytest.approx(planned.redundancy, abs=4 * np.sqrt(2 * planned.redundancy / 40))
+    assert np.mean(found.omega) == pytest.approx(planned.redundancy, abs=4 * np.sqrt(2 * planned.redundancy / n))
     # readings that are worse than planned are noticed
     loud = replace(ideal, readings=tuple(replace(r, sigma=1.6 * r.sigma) for r in ideal.readings))
-    assert not run_trials(loud, start, planned, 30, seed=2, n_workers=1).passed
+    assert not run_trials(loud, start, planned, size(30, 6), seed=2, n_workers=1).passed
 
 
 def test_sights_are_chosen_by_what_measuring_them_brings() -> None:

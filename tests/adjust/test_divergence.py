@@ -34,9 +34,14 @@ def far_start() -> AdjustmentGraph:
     return h.build(survey, h.shaken(h.start_at(truth), 1, 0.1))
 
 
+def stumbling() -> Stumbling:
+    graph = far_start()
+    return Stumbling(graph, graph.start, SolveOptions(), None)
+
+
 def test_a_system_without_solution_on_the_way_says_nothing() -> None:
     best = solve(far_start()).omega
-    loop = Stumbling(far_start(), SolveOptions(), None)
+    loop = stumbling()
     loop.stumbles = (2, 3)
     found = loop.run()
     assert loop.calls > 3
@@ -44,7 +49,7 @@ def test_a_system_without_solution_on_the_way_says_nothing() -> None:
 
 
 def test_a_system_without_solution_at_the_start_is_judged() -> None:
-    loop = Stumbling(far_start(), SolveOptions(), None)
+    loop = stumbling()
     loop.stumbles = (1,)
     with pytest.raises(IndeterminateError, match="here"):
         loop.run()
@@ -52,7 +57,7 @@ def test_a_system_without_solution_at_the_start_is_judged() -> None:
 
 def test_a_system_without_solution_at_the_end_is_judged() -> None:
     """The state stands still, and the undamped system still has no solution: that is the survey's."""
-    loop = Stumbling(far_start(), SolveOptions(), None)
+    loop = stumbling()
     loop.stumbles = tuple(range(2, 200))
     with pytest.raises(IndeterminateError, match="here"):
         loop.run()
@@ -117,5 +122,5 @@ def test_what_fits_worst_is_named_first() -> None:
 def test_where_all_fit_nobody_is_named() -> None:
     survey, truth = stereo(1, n_pairs=5)
     graph = h.build(survey, h.start_at(truth))
-    lines = describe_divergence(graph, graph.start)
+    lines = describe_divergence(graph, graph.start, graph.start)
     assert not any("look first" in line or "group" in line or "farthest" in line for line in lines)

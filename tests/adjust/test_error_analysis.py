@@ -62,6 +62,7 @@ def test_beacons_are_uniform_over_what_the_camera_sees():
     assert uv.max(axis=0) == pytest.approx((1280.0, 1024.0), abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ERROR_KINDS)
 def test_the_simulation_is_the_first_order_within_a_percent(kind):
     curve = error_curve(kind, SIZES[kind], FAR, n_trials=100_000, seed=7)
@@ -83,6 +84,7 @@ def test_integrals_by_quadrature():
         assert expected_slope(kind, FAR) == pytest.approx(np.sqrt(square), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_large_errors_need_the_second_order():
     sizes = np.array([10, 15, 20]) * MM
     curve = error_curve("beacon position", sizes, FAR, n_trials=1_000_000, seed=11)
@@ -100,6 +102,7 @@ def test_large_errors_need_the_second_order():
     assert np.isinf(second_order("camera position", BeaconField(), sizes)).all()
 
 
+@pytest.mark.slow
 def test_the_papers_figures_meet_its_conclusion():
     """Several pixels (five) for 1 mm and for 0.17 deg: the scale of figures 4 to 6, which beacons anywhere would miss.
 

@@ -87,6 +87,19 @@ def test_a_point_imaged_beyond_the_fold_gets_the_ray_of_the_inner_branch():
     np.testing.assert_allclose(project(model, values, constants, np.array([[*inner[0], 1.0]])), beyond)
 
 
+@pytest.mark.parametrize(
+    "terms", [(0.787, -0.433, 0.0, 0.001, -0.515), (0.132, -0.314, 0.002, 0.002, 1.021, 0.658, 0.179, -0.604)]
+)
+def test_rays_up_to_the_fold_where_newton_from_the_distorted_point_goes_astray(terms):
+    model, constants = MODELS["brown"], lens_constants("brown", IMAGE_SIZE)
+    values = default_start(model, IMAGE_SIZE, 800.0)
+    values[5 : 5 + len(terms)] = terms
+    radius = np.linspace(0.0, 0.98 * radial_profile(model.kind, values, constants).limit, 300)
+    tangents = np.column_stack([0.8 * radius, 0.6 * radius])
+    uv = project(model, values, constants, np.column_stack([tangents, np.ones(300)]))
+    np.testing.assert_allclose(rays(model, values, constants, uv), tangents, atol=1e-11)
+
+
 @pytest.mark.parametrize("name", ["brown_backward", "brown_backward_dbat"])
 def test_a_ray_beyond_the_fold_of_a_correction_has_no_image_point(name):
     model, values, constants = lens(name)

@@ -15,6 +15,7 @@ def constants_of(name, r0_mm=R0_MM):
     return lens_constants(MODELS[name], IMAGE_SIZE, PIXEL_SIZE_MM, r0_mm)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_lens_converted_to_its_own_model_is_itself(name):
     model, values, constants = lens(name)
@@ -25,6 +26,7 @@ def test_a_lens_converted_to_its_own_model_is_itself(name):
     assert converted.largest_difference_px < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "allowed_px"),
     [("brown_backward", 0.02), ("brown_backward_dbat", 0.15), ("aicon", 0.02), ("fisheye", 0.25)],
@@ -88,6 +90,7 @@ def test_aicon_that_cannot_be_balanced_says_so():
         rebalance_aicon(values * [1, 1, 1, 1e3, 0, 0, 1, 1, 1, 1], R0_MM, 30.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["brown_backward", "aicon", "fisheye"])
 def test_jacobian_is_the_change_of_the_converted_values(name):
     constants = constants_of(name)

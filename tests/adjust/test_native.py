@@ -24,8 +24,11 @@ _WORK = ("work", "row")  # scratch, of which nothing is expected afterwards
 _BY_LANES = ("covariance_room",)  # answers with the padded size of scratch
 _SUMS_THAT_CANCEL = ("influence",)
 """Shares of a point in large covariances that cancel: what is left is compared, what was summed is larger."""
+_CONDITIONED = {("fit_lens", "cov"): 1e-9}
+"""Inverses of matrices of unknowns that are hard to tell apart, which multiplies rounding."""
 
 
+@pytest.mark.slow
 def test_every_function_of_the_library_has_a_face_and_is_called() -> None:
     assert set(opened("base")) == set(FUNCTIONS)
     assert {call.function.name for call in calls()} == set(FUNCTIONS)
@@ -45,6 +48,7 @@ def test_a_declaration_that_differs_from_the_library_is_refused() -> None:
             Function("fill_upper", arguments)(np.zeros((6, 6)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("instructions", RUNNABLE[1:])
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_vector_instructions_change_nothing(name: str, instructions: str) -> None:
@@ -67,7 +71,7 @@ def test_vector_instructions_change_nothing(name: str, instructions: str) -> Non
                 np.testing.assert_array_equal(x, y)
                 continue
             scale = max(np.abs(x[finite]).max(), 1.0 if argument in ("residual", "residuals") else 0.0)  # px
-            tolerance = 1e-11 if argument in _SUMS_THAT_CANCEL else 1e-12
+            tolerance = _CONDITIONED.get((name, argument), 1e-11 if argument in _SUMS_THAT_CANCEL else 1e-12)
             if x.dtype == np.float32:
                 tolerance = 1e-6
             assert np.abs(x[finite] - y[finite]).max() <= tolerance * scale, argument
@@ -108,9 +112,11 @@ def _solution(monkeypatch: pytest.MonkeyPatch, threads: int) -> str:
             digest.update(value.tobytes() + h.covariance_of(precision, name).tobytes())
         residuals = image_residuals(precision)
         digest.update(residuals.residuals.tobytes() + residuals.redundancy.tobytes())
+        digest.update(f"{done.omega.hex()} {done.iterations}".encode())
     return digest.hexdigest()
 
 
+@pytest.mark.slow
 def test_threads_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[int] = []
     pool = parallel._pool
@@ -202,6 +208,7 @@ def _told(**environment: str) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_version_tells_which_instructions_run() -> None:
     assert instruction_set() in RUNNABLE
     assert _told()[1].strip().endswith(f"(native core: {instruction_set()})")

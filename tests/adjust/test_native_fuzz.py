@@ -7,12 +7,14 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("seed", [1])
 def test_damaged_arguments_are_refused_or_answered(seed: int) -> None:
     """``LABSURVEY_FUZZ_SECONDS`` for longer."""
     root = Path(__file__).parents[2]
-    seconds = os.environ.get("LABSURVEY_FUZZ_SECONDS", "3")
+    seconds = os.environ.get("LABSURVEY_FUZZ_SECONDS", "1")
     command = [sys.executable, "-m", "tests.adjust.native_fuzz", "--seconds", seconds, "--seed", str(seed)]
     done = subprocess.run(command, cwd=root, env=os.environ | {"PYTHONPATH": str(root)}, capture_output=True, text=True,
                           check=False, timeout=float(seconds) + 120.0)  # fmt: skip

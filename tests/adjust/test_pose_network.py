@@ -6,18 +6,19 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from adjust.adjustment import adjust
+from adjust.graph.solver import _Loop
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Datum, FloatArray, PoseParameter, Station, Survey
 from adjust.pose_network import NetworkOptions, pose_network, solve_network
-from adjust.pose_network.chordal import chordal_cost, minimize_chordal
-from adjust.pose_network.from_survey import network_adjustment, network_from_survey
+from adjust.pose_network.from_survey import network_from_survey
 from adjust.pose_network.network import PoseNetwork, loop_marks
-from adjust.pose_network.precision import pair_jacobians
 from adjust.pose_network.robust import _worst_around, graduated_weights
-from adjust.pose_network.solve import GaussNewton, minimize
+from adjust.pose_network.solve import minimize
 from adjust.relay.motions import Motions
-from tests.adjust.pose_networks import exp6, simulate
+from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs
+from tests.adjust.chordal import chordal_cost, minimize_chordal
+from tests.adjust.pose_networks import exp6, network_jacobians, simulate
 
 PLAIN = NetworkOptions(robust="off")
 
@@ -28,7 +29,7 @@ def motions_of(solution) -> Motions:
 
 def dense(network: PoseNetwork, here: Motions) -> np.ndarray:
     """Whitened Jacobian of the pairs in use by all stations, dense."""
-    _, by_b, by_a, _ = pair_jacobians(network, here)
+    _, by_b, by_a, _ = network_jacobians(network, here)
     d = network.dim
     A = np.zeros((network.n_pairs * d, network.n_stations * d))
     for e in np.flatnonzero(network.used):
@@ -65,8 +66,8 @@ def test_jacobians_away_from_zero_error(rotations_only: bool) -> None:
     net, rng = sim.network, np.random.default_rng(1)
     turned = sim.rotations @ Rotation.from_rotvec(rng.normal(size=(6, 3)) * 0.2).as_matrix()
     here = Motions(turned, None if rotations_only else sim.translations + rng.normal(size=(6, 3)))
-    _, by_b, by_a, _ = pair_jacobians(net, here)
-    assert np.abs(pair_jacobians(net, here)[0]).max() > 0.3
+    _, by_b, by_a, _ = network_jacobians(net, here)
+    assert np.abs(network_jacobians(net, here)[0]).max() > 0.3
     h = 1e-6
     for k in range(net.dim):
         for station, J in ((net.b_idx, by_b), (net.a_idx, by_a)):
@@ -79,7 +80,7 @@ def test_jacobians_away_from_zero_error(rotations_only: bool) -> None:
                     t = None if here.translation is None else (
                         here.translation + np.einsum("nij,nj->ni", here.rotation, dt)
                     )
-                    r.append(pair_jacobians(net, Motions(here.rotation @ dR, t))[0][e])
+                    r.append(network_jacobians(net, Motions(here.rotation @ dR, t))[0][e])
                 assert (r[0] - r[1]) / (2 * h) == pytest.approx(J[e, :, k], abs=1e-7)
 
 
@@ -95,7 +96,7 @@ def test_minimum_is_stationary_and_the_same_from_another_start() -> None:
     for m in (first, second):
         here = Motions(m.rotations, m.translations)
         A = dense(net, here)[:, 6:]
-        e = np.einsum("nij,nj->ni", net.whitening, pair_jacobians(net, here)[0]).ravel()
+        e = np.einsum("nij,nj->ni", net.whitening, network_jacobians(net, here)[0]).ravel()
         # gradient in units of the largest it could be
         assert np.abs(A.T @ e).max() < 1e-6 * np.linalg.norm(A, axis=0).max() * np.linalg.norm(e)
 
@@ -126,7 +127,7 @@ def test_covariances_and_statistics_equal_dense_algebra(rotations_only: bool) ->
     assert P.joint(apart) == pytest.approx(Q[np.ix_(rows, rows)], rel=1e-6, abs=1e-13)
     uncontrolled = np.flatnonzero(used & (loop_marks(net, used)[0] == 0))
     everything = dense(net.with_used(np.ones_like(used)), here)
-    e = np.einsum("nij,nj->ni", net.whitening, pair_jacobians(net, here)[0])
+    e = np.einsum("nij,nj->ni", net.whitening, network_jacobians(net, here)[0])
     for k in range(net.n_pairs):
         J = everything[k * d : k * d + d]
         M = J @ Q @ J.T
@@ -172,6 +173,7 @@ def test_covariance_equals_the_scatter_of_repeated_networks() -> None:
     assert chi2.ppf(1e-4, n) < total < chi2.ppf(1 - 1e-4, n)
 
 
+@pytest.mark.slow
 def test_wrong_pairs_are_found_and_named_in_a_small_network() -> None:
     for seed in range(6):
         sim = simulate(6, 5, seed=seed, wrong=3, extra=25)
@@ -182,7 +184,7 @@ def test_wrong_pairs_are_found_and_named_in_a_small_network() -> None:
         test = solution.global_test(1e-4)
         assert test is not None
         assert test.passed
-        again = solve_network(solution.reinstated(tuple(sim.wrong)), options=PLAIN)
+        again = solve_network(solution.network.with_used(np.ones(sim.network.n_pairs, dtype=bool)), options=PLAIN)
         assert again.network.used.all()
         assert again.omega > 100 * solution.omega
 
@@ -220,6 +222,7 @@ def _with_sigmas(net: PoseNetwork, factor: float, **changes: FloatArray) -> Pose
                         held={0: np.eye(4)})  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_sigmas_that_are_too_small_throughout_make_no_pair_of_a_few_wrong(seed: int) -> None:
     net = simulate(3, 2, seed=seed, extra=9).network
@@ -229,6 +232,7 @@ def test_sigmas_that_are_too_small_throughout_make_no_pair_of_a_few_wrong(seed: 
     assert solution.sigma0 == pytest.approx(5.0, rel=0.4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_a_wrong_pair_of_a_few_is_found_with_sigmas_right_and_too_small(seed: int) -> None:
     sim = simulate(3, 2, seed=seed, extra=9, wrong=1)
@@ -267,6 +271,7 @@ def test_wrong_turns_are_found_among_rotations() -> None:
     assert "deg" in str(solution.rejected[0])
 
 
+@pytest.mark.slow
 def test_false_alarms_stay_at_their_rate() -> None:
     alarms = sum(bool(solve_network(simulate(4, 3, seed=s, extra=8).network).rejected) for s in range(100, 220))
     # alpha = 0.01 a network: 1.2 expected in 120
@@ -352,7 +357,7 @@ def survey_of(sim, inner: bool) -> Survey:
 def test_a_survey_of_pairs_is_adjusted_alike_both_ways(inner: bool) -> None:
     survey = survey_of(simulate(5, 4, extra=6, sigma_rad=0.01, sigma_m=0.1), inner)
     general = adjust(survey)
-    network = network_adjustment(survey, solve_network(network_from_survey(survey), options=PLAIN))
+    network = adjust_with_pairs(survey, PairOptions(reject_pairs=False))
     assert network.omega == pytest.approx(general.omega, rel=1e-9)
     for field in ("n_observations", "n_unknowns", "datum_defect", "redundancy"):
         assert getattr(network, field) == getattr(general, field)
@@ -426,15 +431,15 @@ def test_our_least_squares_equals_gtsams_optimiser() -> None:
 def test_a_place_without_a_step_on_the_way_is_no_verdict_on_the_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     """The step that cannot be taken is damped from the best place; only at the start it speaks of what is measured."""
     sim = simulate(4, 3)
-    plain, solve, calls = minimize(sim.network), GaussNewton.solve, []
+    plain, step, calls = minimize(sim.network), _Loop.step, []
 
-    def failing(loop: GaussNewton, linear: gtsam.GaussianFactorGraph) -> gtsam.VectorValues:
+    def failing(loop: _Loop) -> gtsam.VectorValues:
         calls.append(loop.damping)
         if len(calls) == at:
-            raise IndeterminateError("the pairs do not determine the stations")
-        return solve(loop, linear)
+            raise IndeterminateError("the normal equations have no solution here")
+        return step(loop)
 
-    monkeypatch.setattr(GaussNewton, "solve", failing)
+    monkeypatch.setattr(_Loop, "step", failing)
     at = 2
     found = minimize(sim.network)
     assert found.omega == pytest.approx(plain.omega, rel=1e-9)

@@ -20,6 +20,7 @@ def grown(sim: Simulated, group: int = 1, **options) -> NetworkSession:
     return session
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("nx", "ny", "group"), [(60, 2, 1), (30, 4, 7), (9, 9, 1)])
 def test_a_grown_network_equals_its_batch_solution(nx: int, ny: int, group: int) -> None:
     sim = simulate(nx, ny, seed=nx)
@@ -35,6 +36,7 @@ def test_a_grown_network_equals_its_batch_solution(nx: int, ny: int, group: int)
     assert finished.omega == pytest.approx(batch.omega, rel=1e-10)
 
 
+@pytest.mark.slow
 def test_settled_stations_wake_when_they_are_needed() -> None:
     sim = simulate(100, 2, seed=9)
     session = grown(sim, section=30)
@@ -82,7 +84,7 @@ def test_additions_say_what_is_new_and_what_moved() -> None:
     session.remove(["wrong"])
     batch = solve_network(sim.network, options=PLAIN)
     finished = session.finish()
-    assert not finished.network.used[finished.network.pair_index_of["wrong"]]
+    assert not finished.network.used[finished.network.pair_ids.index("wrong")]
     assert finished.omega == pytest.approx(batch.omega, rel=1e-9)
     assert finished.pose("s40").translation() == pytest.approx(before.translation(), abs=1e-2)
 

@@ -11,9 +11,8 @@ from adjust.model.observations import Closure, FrameRef, Pair
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, LensParameter, PoseParameter, Station, Survey, Target
 from adjust.relay.closed import closed, play
-from adjust.relay.condition_factors import MAX_HARD_LOOPS
-from adjust.relay.conditions import adjust_condition_factors, adjust_conditions, adjust_loops
-from adjust.statistics.pair_screen import PairOptions, adjust_with_pairs
+from adjust.relay.conditions import MAX_HARD_LOOPS, adjust_condition_factors, adjust_conditions, adjust_loops
+from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs
 from survey.simulate import resample, stereo
 from tests.adjust import helpers as h
 from tests.adjust.relay_networks import grid, simulate
@@ -72,8 +71,8 @@ def test_eyes_that_are_no_stations_close_their_loops(rotations: bool) -> None:
     survey = eyes(1, rotations)
     found = adjust_with_pairs(closed(survey), UNSCREENED)
     expected = adjust_with_pairs(as_stations(survey), UNSCREENED)
-    assert found.precision.closed is not None
-    assert expected.precision.closed is None
+    assert found.precision.by_conditions
+    assert not expected.precision.by_conditions
     assert found.redundancy == (3 if rotations else 6) * (9 - 5 + 1)
     check_equal(found, expected)
     covs = found.precision.pair_covariances()
@@ -82,6 +81,7 @@ def test_eyes_that_are_no_stations_close_their_loops(rotations: bool) -> None:
     assert not any("differ" in w for w in found.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [4, 16])
 def test_few_loops_by_closure_factors_many_by_normal_equations(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same from both, and from the normal equations where the factors give up or lose a constraint."""

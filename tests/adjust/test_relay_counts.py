@@ -140,6 +140,7 @@ def test_pair_measured_twice_is_a_loop_of_two():
     assert count(top).measurable_pairs == 1
 
 
+@pytest.mark.slow
 def test_hundred_thousand_stations_take_about_a_second():
     n = 100_000
     rng = np.random.default_rng(0)

@@ -29,6 +29,7 @@ from adjust.relay.eyes import (
 )
 from adjust.relay.motions import Motions
 from tests.adjust.relay_station import EYES, Station4, Trackers, motions, poses, random_rigid
+from tests.sizes import size
 
 
 def exact(sequence: PoseSequence, trackers: Trackers, eye: int) -> PoseSequence:
@@ -73,6 +74,7 @@ def test_motions_without_noise_give_the_truth() -> None:
     assert np.abs(error(found.station_from_eye, trackers.station_from_eye)).max() < 1e-10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scaled", [False, True])
 def test_derivatives_away_from_zero_error(scaled: bool) -> None:
     trackers = Trackers(5, n=4)
@@ -158,8 +160,8 @@ def test_minimum_is_that_of_all_true_poses_as_unknowns() -> None:
 
 def test_covariance_is_the_scatter() -> None:
     trackers = Trackers(7)
-    tests, omegas, pair_tests = [], [], []
-    for _ in range(60):
+    tests, omegas, pair_tests, n = [], [], [], size(60, 10)
+    for _ in range(n):
         found = adjust_eyes(trackers.measured())
         d = error(found.station_from_eye, trackers.station_from_eye)[1:].ravel()
         tests.append(d @ np.linalg.solve(found.cov[6:, 6:], d))
@@ -170,17 +172,17 @@ def test_covariance_is_the_scatter() -> None:
         e = Pose3.Logmap(true.between(pair.b_from_a))
         pair_tests.append(e @ np.linalg.solve(pair.cov, e))
     for values, freedom in ((tests, 12), (omegas, found.redundancy), (pair_tests, 6)):
-        assert chi2.ppf(0.0005, 60 * freedom) < np.sum(values) < chi2.ppf(0.9995, 60 * freedom)
+        assert chi2.ppf(0.0005, n * freedom) < np.sum(values) < chi2.ppf(0.9995, n * freedom)
 
 
 def test_motions_covariance_is_the_scatter() -> None:
-    tests = []
-    for seed in range(40):
+    tests, n = [], size(40, 10)
+    for seed in range(n):
         trackers = Trackers(100 + seed)
         found = adjust_eye_motions(motion_sequences(trackers, 1e-3, 2e-3))
         d = error(found.station_from_eye, trackers.station_from_eye)[1:].ravel()
         tests.append(d @ np.linalg.solve(found.cov[6:, 6:], d))
-    assert chi2.ppf(0.0005, 40 * 12) < np.sum(tests) < chi2.ppf(0.9995, 40 * 12)
+    assert chi2.ppf(0.0005, n * 12) < np.sum(tests) < chi2.ppf(0.9995, n * 12)
 
 
 def test_joint_covariance_given_as_a_whole_is_the_same() -> None:
@@ -198,8 +200,8 @@ def test_joint_covariance_given_as_a_whole_is_the_same() -> None:
 
 def test_eyes_that_see_several_worlds_and_not_at_all_epochs() -> None:
     """Eye a is blind at first, so that eye b leads there; eye c looks at another target from the middle on."""
-    tests = []
-    for seed in range(30):
+    tests, n = [], size(30, 8)
+    for seed in range(n):
         trackers = Trackers(200 + seed, n=14)
         a, b, c = trackers.measured()
         late = slice(5, None)
@@ -219,7 +221,7 @@ def test_eyes_that_see_several_worlds_and_not_at_all_epochs() -> None:
         tests.append(d @ np.linalg.solve(found.cov[6:, 6:], d))
         between = found.room_from_world["wd"].inverse().compose(found.room_from_world["wc"])
         assert between.equals(poses(other)[0], 0.02)
-    assert chi2.ppf(0.0005, 30 * 12) < np.sum(tests) < chi2.ppf(0.9995, 30 * 12)
+    assert chi2.ppf(0.0005, n * 12) < np.sum(tests) < chi2.ppf(0.9995, n * 12)
 
 
 def test_influence_is_the_derivative() -> None:
@@ -355,6 +357,7 @@ def _joint_pair(result: object, a: str, b: str) -> tuple[Pose3, FloatArray]:
     return b_from_a, J @ C @ J.T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", [(), ("fx", "u0", "v0")])
 def test_what_condensing_costs(free: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     """Pairs one by one lose what they share; poses with their joint covariance lose nothing."""
@@ -388,6 +391,7 @@ def test_what_condensing_costs(free: tuple[str, ...], capsys: pytest.CaptureFixt
         print("\n" + "\n".join(lines))
 
 
+@pytest.mark.slow
 def test_condensing_costs_nothing_in_the_limit_of_small_noise() -> None:
     off = []
     for sigma_px in (5e-2, 5e-4, 5e-5):
@@ -404,11 +408,12 @@ def test_condensing_costs_nothing_in_the_limit_of_small_noise() -> None:
     assert off[1] < 0.03 * off[0]
 
 
+@pytest.mark.slow
 def test_actual_covariance_of_closed_loops_is_the_scatter() -> None:
     """The covariance claimed by the loops is too small, the one that counts shared errors is right."""
-    actual, claimed = [], []
+    actual, claimed, n = [], [], size(20, 6)
     station = Station4(5, n_epochs=8)
-    for seed in range(20):
+    for seed in range(n):
         closed = close_loops(pairs_of(eye_sequences(station.survey(seed, 0.05))))
         adjusted = closed.adjusted.pairs
         for i in (0, 4):
@@ -418,8 +423,8 @@ def test_actual_covariance_of_closed_loops_is_the_scatter() -> None:
             d = Pose3.Logmap(true.between(value))
             actual.append(d @ np.linalg.solve(closed.actual_cov[i], d))
             claimed.append(d @ np.linalg.solve(closed.claimed_cov[i], d))
-    # the two pairs of a draw are correlated: the band is that of 20 draws
-    low, high = (2 * chi2.ppf(p, 20 * 6) for p in (0.0005, 0.9995))
+    # the two pairs of a draw are correlated: the band is that of one
+    low, high = (2 * chi2.ppf(p, n * 6) for p in (0.0005, 0.9995))
     assert low < np.sum(actual) < high
     assert np.sum(claimed) > 1.15 * np.sum(actual)
 

@@ -7,15 +7,13 @@ from scipy.stats import chi2
 
 from adjust.adjustment import adjust
 from adjust.graph.assembly import StartValues
-from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Datum, PoseParameter, Station, Survey
-from adjust.relay.condition_factors import MAX_HARD_LOOPS
-from adjust.relay.conditions import ConditionOptions, adjust_condition_factors, adjust_conditions
+from adjust.relay.conditions import MAX_HARD_LOOPS, ConditionOptions, adjust_condition_factors, adjust_conditions
 from adjust.relay.loops import evaluate_loops, loop_basis, loop_misclosures
 from adjust.relay.motions import Motions
-from adjust.relay.network import Network, network_from_pairs, rotation_network, topology
-from adjust.relay.parametric import ParametricOptions, adjust_parametric
+from adjust.relay.network import Network, network_from_pairs, topology
 from tests.adjust.relay_networks import (
     ARCMIN,
     as_gtsam,
@@ -26,7 +24,9 @@ from tests.adjust.relay_networks import (
     motions,
     pairs_of,
     simulate,
+    suspects,
 )
+from tests.adjust.relay_parametric import adjust_parametric
 
 NETWORKS = {"complete": complete(7), "grid": grid(4, 5), "chain": chain_with_chords(12, 9)}
 
@@ -76,6 +76,7 @@ def test_two_parallel_pairs_give_their_weighted_mean():
 # -- the two forms -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [3, 6])
 @pytest.mark.parametrize("name", NETWORKS)
 def test_all_forms_agree(name, dim):
@@ -158,8 +159,8 @@ def test_pairs_do_not_depend_on_the_datum_and_unmeasured_ones_have_their_covaria
     simulated = simulate(NETWORKS["grid"], 6, seed=3)
     network, top = simulated.network, simulated.network.topology
     first = adjust_parametric(network)
-    other = adjust_parametric(network, ParametricOptions(held=top.station_ids[7]))
-    inner = adjust_parametric(network, ParametricOptions(inner=True))
+    other = adjust_parametric(network, held=top.station_ids[7])
+    inner = adjust_parametric(network, inner=True)
     for solution in (other, inner):
         assert turned(first.pairs, solution.pairs) < 1e-10
         a, b = (s.pair(top.station_ids[0], top.station_ids[19]) for s in (first, solution))
@@ -185,7 +186,7 @@ def test_inner_datum_is_the_survey_cores():
     core = adjust(survey, StartValues({}, dict(zip(names, simulated.world, strict=True)), {}))
     # the core's inner constraints are about its solution
     about = motions([core.estimates[name].value for name in names])
-    found = adjust_parametric(simulated.network, ParametricOptions(inner=True, start=about))
+    found = adjust_parametric(simulated.network, inner=True, start=about)
     assert found.pairs.omega == pytest.approx(core.omega, rel=1e-9)
     for name in names:
         station, cov = found.station(name[1])
@@ -202,7 +203,7 @@ def test_inner_datum_is_the_survey_cores():
 
 def test_inner_datum_is_the_pseudo_inverse():
     simulated = simulate(NETWORKS["grid"], 3, seed=6, noise=1e-6)
-    found = adjust_parametric(simulated.network, ParametricOptions(inner=True, start=motions(simulated.world)))
+    found = adjust_parametric(simulated.network, inner=True, start=motions(simulated.world))
     top, dim = simulated.network.topology, 3
     A = np.zeros((top.n_pairs * dim, top.n_stations * dim))
     for e, (a, b) in enumerate(zip(top.a_idx, top.b_idx, strict=True)):
@@ -233,10 +234,8 @@ def test_parts_adjust_by_conditions_but_not_as_stations():
     rows = [("ab", "A", "B"), ("bc", "B", "C"), ("ca", "C", "A"), ("xy", "X", "Y"), ("yz", "Y", "Z"), ("zx", "Z", "X")]
     network = simulate(topology(rows), 3, seed=0).network
     assert adjust_conditions(network).pairs.redundancy_total == 6
-    with pytest.raises(SurveyError, match=r"2 parts: A, B, C \| X, Y, Z; measure a pair between them"):
+    with pytest.raises(IndeterminateError, match="no measured pair ties X, Y, Z to the datum"):
         adjust_parametric(network)
-    with pytest.raises(SurveyError, match="2 parts"):
-        adjust_parametric(network, ParametricOptions(start=network.b_from_a))
 
 
 def test_too_many_hard_loops_are_refused():
@@ -252,8 +251,6 @@ def test_failure_names_the_loop():
         adjust_conditions(network, options)
     with pytest.raises(NotConvergedError, match="did not settle in 1 steps"):
         adjust_condition_factors(network, options)
-    with pytest.raises(NotConvergedError, match=r"wrong pair in C\d -> C\d"):
-        adjust_parametric(network, ParametricOptions(max_iterations=1))
 
 
 def test_large_misclosures_still_agree():
@@ -265,7 +262,7 @@ def test_large_misclosures_still_agree():
     reference, *others = forms(network)
     for other in others:
         assert turned(reference, other) < 1e-9
-    assert reference.suspects()[0].pair_id == network.topology.pair_ids[7]
+    assert suspects(reference)[0] == 7
 
 
 # -- observations of a survey ------------------------------------------------------------------------------------------
@@ -280,7 +277,7 @@ def test_network_from_pairs():
     np.testing.assert_array_equal(network.b_from_a.translation, simulated.network.b_from_a.translation)
     rotations = network_from_pairs(pairs, rotations_only=True)
     assert rotations.dim == 3
-    np.testing.assert_array_equal(rotations.cov, rotation_network(network).cov)
+    np.testing.assert_array_equal(rotations.cov, network.cov[:, :3, :3])
 
 
 def pair(value, cov, pair_id="p"):
@@ -309,5 +306,5 @@ def test_truth_without_noise_is_found():
     simulated = simulate(NETWORKS["chain"], 6, seed=8, noise=0.0)
     for pairs in forms(simulated.network):
         assert np.abs(differences(pairs.b_from_a, simulated.true)).max() < 1e-12
-        assert pairs.suspects() == ()
-    assert adjust_parametric(simulated.network).pairs.global_test().redundancy == 54
+        assert suspects(pairs) == []
+    assert adjust_parametric(simulated.network).pairs.redundancy_total == 54

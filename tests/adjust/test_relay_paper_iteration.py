@@ -11,10 +11,10 @@ from adjust.relay.conditions import adjust_conditions
 from adjust.relay.loops import loop_basis
 from adjust.relay.motions import Motions
 from adjust.relay.network import Network
-from adjust.relay.parametric import adjust_parametric
 from adjust.spatial.rotation_forms import euler_cov_from_tangent, euler_from_matrix
 from tests.adjust.relay_monte_carlo import MonteCarloOptions, adjust_batch, simulate_complete
 from tests.adjust.relay_networks import ARCMIN, complete, simulate
+from tests.adjust.relay_parametric import adjust_parametric
 
 
 def rotation(angles):
@@ -145,6 +145,7 @@ def test_compiled_trials_are_the_same_estimator(n):
             assert batch.omega[trial] == pytest.approx(pairs.omega, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_monte_carlo_repeats_itself_and_counts_its_redundancy():
     options = MonteCarloOptions(n_cameras=5, n_trials=3000, seed=3, chunk=1000)
     first, again = simulate_complete(options), simulate_complete(options)

@@ -109,6 +109,7 @@ def test_start_values_that_are_good_are_not_mentioned() -> None:
     assert not any("start values" in w for w in result.warnings)
 
 
+@pytest.mark.slow
 def test_wrong_poses_are_found_anew_and_told() -> None:
     """Boards given on the other side of the room, upside down: without what was given the images tell."""
     survey, _ = head_on_table(1, n_cameras=2, n_table_epochs=6, n_free_epochs=3)
@@ -128,6 +129,7 @@ def test_wrong_poses_are_found_anew_and_told() -> None:
     assert any("start values: those given for poses" in w and "found anew" in w for w in result.warnings)
 
 
+@pytest.mark.slow
 def test_rough_coordinates_of_beacons_leave_the_boards_alone() -> None:
     """Beacons given to 30 mm at a few metres, boards exact: the same minimum as from good ones, without a word."""
     survey, truth = beacons(seed=4, n_table_epochs=5, n_free_epochs=4)

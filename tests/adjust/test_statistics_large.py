@@ -18,6 +18,8 @@ from survey.simulate import head_on_table
 from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net
 
+pytestmark = pytest.mark.slow
+
 
 def lab() -> Adjustment:
     survey, truth = head_on_table(2, n_cameras=2, n_table_epochs=12, n_free_epochs=8)

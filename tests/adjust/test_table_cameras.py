@@ -3,10 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from adjust.diagnosis.table import probable_causes
 from adjust.model.survey import Survey
 from survey.simulate import head_on_table
+
+pytestmark = pytest.mark.slow
 
 
 def mirrored(survey: Survey, camera_id: str) -> Survey:

@@ -64,6 +64,7 @@ def test_bearings_count_as_they_say() -> None:
     assert value_of("zenith", a, b, **heights) == pytest.approx(np.arctan2(10.0, -0.3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bearings", CONVENTIONS, ids=lambda b: f"{b.zero}-{b.clockwise}")
 @pytest.mark.parametrize("radius", [None, 400.0, 6.38e6])
 def test_predictions_are_those_of_plain_matrices(bearings: Bearings, radius: float | None) -> None:
@@ -97,6 +98,7 @@ def everything(bearings: Bearings, radius: float | None) -> tuple[Survey, dict]:
     return survey, truth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [None, 400.0])
 def test_jacobians_away_from_zero_error(radius: float | None) -> None:
     survey, truth = everything(Bearings("x", True), radius)

@@ -56,6 +56,7 @@ def pseudo_inverse(survey: Survey, result: Adjustment, datum: tuple[str, ...]) -
     return np.linalg.inv(bordered)[: len(null), : len(null)], full.place
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kinds", "options", "defect"),
     [
@@ -170,6 +171,7 @@ def test_whole_survey_motions_change_no_reading() -> None:
         assert np.abs(graph.terrestrial.residual).max() < 1e-9, i
 
 
+@pytest.mark.slow
 def test_inner_datum_over_points_that_only_images_see() -> None:
     """Points stay hidden in their batch, and have the covariances of the dense inverse all the same."""
     survey, truth = h.network(5, held=0, distances=2, n_points=20, n_epochs=8)
@@ -184,7 +186,7 @@ def test_inner_datum_over_points_that_only_images_see() -> None:
 def test_minimal_datum_is_as_large_as_the_defect() -> None:
     survey, truth = free_network(("direction", "zenith", "slope_distance"))
     graph = GraphBuilder(survey, {}).build(start_near(survey, truth, 1))
-    datum = inner_datum(graph, graph.start)
+    datum = inner_datum(graph, graph.prepare(graph.start, jacobians=True))
     assert datum is not None
     assert sum(len(components) for components, _ in datum.minimal.values()) == datum.defect == 4
     assert len(datum.rows) == 8

@@ -27,8 +27,11 @@ from adjust.precision.precision import Precision
 from survey.simulate import beacons
 from tests.adjust import helpers as h
 from tests.adjust.terrestrial_networks import P, Truth, measured, polar_network, start_near
+from tests.sizes import size
 
-TRIALS = 100
+pytestmark = pytest.mark.slow
+
+TRIALS = size(100, 20)
 POLAR = (("direction", 2e-5), ("zenith", 2e-5), ("slope_distance", 2e-4))
 
 

@@ -63,18 +63,22 @@ def why_no_mrcal() -> str:
 
 
 class Child:
-    """A worker process, ready to run."""
+    """A worker process, ready to run; that of another checkout in its folder ``root``."""
 
-    def __init__(self, kind: str, name: str, case: Path, warm: Path, threads: int) -> None:
-        self.out = case.with_name(f"{case.stem}.{abs(hash(name))}.out.npz")
+    def __init__(
+        self, kind: str, name: str, case: Path, warm: Path, threads: int, root: Path | None = None
+    ) -> None:  # fmt: skip
+        self.out = case.with_name(f"{case.stem}.{abs(hash((name, root)))}.out.npz")
         self.errors = tempfile.TemporaryFile(mode="w+")  # noqa: SIM115  # lives as long as the process
         command = [sys.executable, "-m", "tests.benchmarks.worker", kind, name, str(case), str(warm), str(self.out)]
         if name == MRCAL:
             script = Path(__file__).with_name("mrcal_worker.py")
             command = [SYSTEM_PYTHON, str(script), str(case), str(warm), str(self.out)]
         one = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": str(threads), "LABSURVEY_THREADS": str(threads)}
+        if root is not None:
+            one["PYTHONPATH"] = str(root)
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.errors,
-                                        text=True, env=os.environ | one)  # fmt: skip
+                                        text=True, env=os.environ | one, cwd=root)  # fmt: skip
 
     def answer(self) -> dict[str, Any] | str:
         """The next line of the worker, or the last line of its errors where it has ended."""

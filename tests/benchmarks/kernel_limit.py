@@ -42,8 +42,7 @@ def kernel_against_machine() -> str:
     graph.prepare(values, True)
 
     def kernel() -> None:
-        images.forget()
-        images.prepare(values, True)
+        images.prepare(True)
 
     a, big = np.random.default_rng(1).normal(size=(512, 512)), np.zeros(20_000_000)
     into = np.empty_like(big)

@@ -16,10 +16,9 @@ from gtsam import Pose3, Rot3
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import FloatArray
 from adjust.pose_network import NetworkOptions, NetworkSolution, PoseNetwork, pose_network, solve_network
-from adjust.pose_network.precision import pair_jacobians
 from adjust.pose_network.session import NetworkSession
 from adjust.relay.motions import Motions
-from tests.adjust.pose_networks import simulate
+from tests.adjust.pose_networks import network_jacobians, simulate
 
 PLAIN = NetworkOptions(robust="off")
 
@@ -145,7 +144,7 @@ def batch(nx: int, ny: int) -> Batch:
 def gradient(solution: NetworkSolution) -> float:
     """Largest component of the gradient over the norms of its column and of the residuals, by plain sums."""
     network = solution.network
-    r, by_b, by_a, _ = pair_jacobians(network, Motions(solution.rotations, solution.translations))
+    r, by_b, by_a, _ = network_jacobians(network, Motions(solution.rotations, solution.translations))
     W = network.whitening
     e = np.einsum("nij,nj->ni", W, r)
     g, size = np.zeros((2, network.n_stations, 6))

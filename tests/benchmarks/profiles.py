@@ -13,9 +13,8 @@ from adjust.frames.state import State
 from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.graph.solver import _Loop, solve
 from adjust.observations.images.reduction import PoseReduction
+from adjust.observations.pairs import PairBatch
 from adjust.pose_network import NetworkOptions, solve_network
-from adjust.pose_network import precision as pose_precision
-from adjust.pose_network import solution as pose_solution
 from adjust.pose_network import solve as pose_solve
 from adjust.precision.precision import Precision
 from adjust.precision.tree import TreeCovariance
@@ -46,18 +45,15 @@ PARTS: list[Part] = [
 POSE_PARTS: list[Part] = [
     ("start values", pose_solve, "find_network_start"),
     ("checks", pose_solve, "check_determined"),
-    ("graph", pose_solve, "network_graph"),
-    ("values", pose_solve, "network_values"),
-    ("order of elimination", pose_solve, "network_ordering"),
+    ("survey", pose_solve, "survey_of"),
+    ("graph", GraphBuilder, "build"),
     ("linearise", gtsam.NonlinearFactorGraph, "linearize"),
-    ("eliminate (GTSAM)", pose_solve.GaussNewton, "solve"),
-    ("v'Pv", gtsam.NonlinearFactorGraph, "error"),
+    ("eliminate (GTSAM)", _Loop, "step"),
+    ("v'Pv", AdjustmentGraph, "objective"),
     ("retract", gtsam.Values, "retract"),
-    ("eliminate for the covariances (GTSAM)", pose_precision, "_eliminated"),
     ("covariances of the tree", TreeCovariance, "__init__"),
-    ("Jacobians of pairs", pose_precision, "pair_jacobians"),
-    ("Jacobians of pairs", pose_solution, "pair_jacobians"),
-    ("quadratic forms of tests", pose_precision, "_quadratic"),
+    ("Jacobians of pairs", PairBatch, "jacobians"),
+    ("statistics of pairs", PairBatch, "statistics"),
 ]
 
 

@@ -80,6 +80,22 @@ def additions(session: Session) -> None:
              Line("95 %", sizes, np.array([np.quantile(p, 0.95) for p in parts[1:]]))]  # fmt: skip
     session.claim(f"{2 * rows} additions: exponent of time by stations before", shown[0].exponent, 0.15)
     session.picture("additions", shown, "One more station", "stations before", "ms")
+    _command(session, case, warm)
+
+
+def _command(session: Session, case: growth.Stations, warm: growth.Stations) -> None:
+    """What the command for additions takes, which reads and writes a project and tells all covariances and tests."""
+    m = session.compete("labsurvey add", case, warm, [growth.ADDED], budget=8.0, rounds=1)[growth.ADDED]
+    if m.failed:
+        session.say("", f"`labsurvey add` failed: {m.failed}.")
+        return
+    parts = [[name, f"{np.median(s):.2f}"] for name, s in m.stages.items()]
+    session.say(
+        "",
+        f"`labsurvey add` with the last {growth.LATE} of these stations, begun {m.note}: it solves all pairs again, "
+        "for it tells the covariances and tests of all. Seconds:", "", tables.table(("", "s"), parts), "",
+        f"Processor time {m.cpu[0]:.1f} s, {m.peak_mb:.0f} MB.",
+    )  # fmt: skip
 
 
 def large_networks(session: Session) -> None:

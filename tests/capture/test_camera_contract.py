@@ -20,10 +20,15 @@ from capture.devices.cameras import open_camera
 from capture.simulated.gige_server import GigeServer
 from tests.capture.camera_helpers import GIGE, PYLON, VIKY, gige_port, require_silence, set_up
 
+pytestmark = pytest.mark.slow
+
 TRIGGERED = ("simulated", "pylon", "gige")
 
 
-@pytest.fixture(scope="module", params=("simulated", "pylon", "gige", "gentl"))
+@pytest.fixture(
+    scope="module",
+    params=("simulated", *(pytest.param(name, marks=pytest.mark.hardware) for name in ("pylon", "gige", "gentl"))),
+)
 def address(request: pytest.FixtureRequest) -> Iterator[str]:
     if request.param == "gige":
         with gige_port(), GigeServer("gradient"):

@@ -17,6 +17,8 @@ from capture.session.trigger_set import TriggerSet
 from capture.simulated.gige_server import GigeServer
 from tests.capture.camera_helpers import GIGE, gige_port, number_in, open_camera, set_up
 
+pytestmark = [pytest.mark.hardware, pytest.mark.slow]
+
 
 @pytest.fixture
 def port() -> Iterator[None]:

@@ -136,6 +136,7 @@ def served(folder: Path) -> Iterator[dict[str, Camera]]:
         yield cameras
 
 
+@pytest.mark.slow
 def test_three_cameras_through_two_makers_stacks_see_the_table_as_it_stands(
     served: dict[str, Camera], folder: Path, lab: SimulatedLab
 ) -> None:
@@ -152,6 +153,7 @@ def test_three_cameras_through_two_makers_stacks_see_the_table_as_it_stands(
     cameras.disarm()
 
 
+@pytest.mark.slow
 def test_exposure_reaches_the_scene_through_every_stack(
     served: dict[str, Camera], folder: Path, lab: SimulatedLab
 ) -> None:

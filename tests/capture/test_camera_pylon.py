@@ -11,6 +11,7 @@ from capture.devices.camera import CameraError, DisconnectedError, IncompleteFra
 from capture.devices.cameras.pylon import PylonCamera
 from tests.capture.camera_helpers import PYLON, open_camera, require_silence, set_up
 
+pytestmark = pytest.mark.hardware
 RNG = np.random.default_rng(4)
 
 
@@ -29,6 +30,7 @@ def show(camera: PylonCamera, path: Path, image: np.ndarray) -> None:
     camera.set("ImageFilename", str(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pixel_format", "bits", "shift"), [("Mono8", 8, 0), ("Mono10", 10, 6), ("Mono12", 12, 4), ("Mono16", 16, 0)]
 )

@@ -22,6 +22,7 @@ def board(scale: int = 1, **imaging: float) -> np.ndarray:
     return render(camera, [PlacedTarget(BOARD, POSE)], imaging=Imaging(**imaging))  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blur_px", [0.8, 1.5, 3.0])
 @pytest.mark.parametrize("noise", [0.0, 4.0])
 @pytest.mark.parametrize("slope", [0.0, 0.3])
@@ -57,6 +58,7 @@ def test_light(bits: int, kind: type) -> None:
     assert quality.peak == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1, 2])
 def test_the_target_is_found_where_it_is(scale: int) -> None:
     other = Checkerboard(14, 10, 0.02)

@@ -47,6 +47,7 @@ def test_an_address_that_was_discovered_opens() -> None:
         assert camera.serial == info.serial
 
 
+@pytest.mark.slow
 def test_no_software_is_loaded_before_its_driver_is_named() -> None:
     code = (
         "import sys, capture.devices.cameras as c, capture.session.trigger_set; c.discover('opencv');"

@@ -18,12 +18,14 @@ from capture.simulated.folder import write_lab
 from capture.simulated.gige_server import GigeServer
 from capture.simulated.laboratory import LabSize
 from survey.jobs.adjusting.job import adjust_job
-from survey.report.results import read_covariances
+from survey.solution.covariances import read_covariances
 from tests.capture.camera_helpers import GIGE, gige_port
 from tests.capture.table_server import table_server
 
+pytestmark = pytest.mark.slow
+
 COMPARE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "compare_with_truth.py"))
-_AXIS = "{ limits_deg = [-180, 180], wraps = true, speed_deg_s = 100, acceleration_deg_s2 = 4000 }"
+_AXIS = "{ limits_deg = [-180, 180], wraps = true, speed_deg_s = 400, acceleration_deg_s2 = 4000 }"
 
 
 def _plan(home, lab, url, angles_file):
@@ -59,7 +61,7 @@ angles_deg = {json.dumps(poses)}
 def adjusted(tmp_path_factory):
     home = tmp_path_factory.mktemp("laboratory")
     lab = write_lab(home / "room", 1, LabSize(n_board=4))
-    noise = ("--noise", "8", "--backlash", "20", "--speed", "100")
+    noise = ("--noise", "8", "--backlash", "20", "--speed", "400")
     with gige_port(), table_server(home, *noise) as server, GigeServer(home / "room" / "X", angles=server.truth_file):
         assert main(["run", str(_plan(home, lab, server.url, server.truth_file)), "--quiet"]) == 0
     adjust_job(home / "lab", progress=False)

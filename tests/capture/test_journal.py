@@ -26,6 +26,7 @@ def test_records_come_back(tmp_path):
     assert [json.loads(line)["n"] for line in data.splitlines()] == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_every_cut_leaves_the_whole_lines(tmp_path):
     """The file cut after every single byte: the lines before the cut are there, and appending goes on behind them."""
     path = tmp_path / "journal.jsonl"

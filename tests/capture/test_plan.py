@@ -164,6 +164,7 @@ def _board_size(target):
     return columns, rows, float(np.linalg.norm(x[1] - x[0]))
 
 
+@pytest.mark.slow
 def test_board_covers_the_image(tmp_path, known_survey):
     """Every pose shows the whole board, by OpenCV's projection; together they reach nearly every part of the image."""
     survey, truth = known_survey

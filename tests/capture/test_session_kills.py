@@ -3,8 +3,12 @@
 import signal
 from itertools import count
 
+import pytest
+
 from tests.capture.session_runs import kill_runs, processes, require_complete, run_to_end, run_until_fsync, write_plan
 from tests.capture.table_server import table_server
+
+pytestmark = pytest.mark.slow
 
 
 def test_killed_at_random_instants(tmp_path):

@@ -18,6 +18,7 @@ from capture.devices.turntables.moving import MovingTable
 from capture.devices.turntables.standa import StandaController
 from tests.capture.table_server import table_server
 
+pytestmark = pytest.mark.hardware
 DEG = math.pi / 180
 QUICK = Settle(tolerance=0.05 * DEG, still=0.01 * DEG, window_s=0.05, stall_s=0.4, timeout_s=10.0, poll_s=0.005)
 AXES = (Axis("axis1", -60 * DEG, 60 * DEG), Axis("axis2", -170 * DEG, 170 * DEG))
@@ -34,6 +35,7 @@ def ascii_table(server, dialect="two-axis", signs=(1, 1), zeros=(0.0, 0.0), axes
         table.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dialect", ["two-axis", "newport-esp301"])
 def test_dialect_over_tcp(tmp_path, dialect):
     with table_server(tmp_path, "--language", dialect, "--noise", "1") as server, ascii_table(server, dialect) as table:
@@ -250,6 +252,7 @@ sys.stdout.flush()
 """
 
 
+@pytest.mark.slow
 def test_epics_motor_records(tmp_path):
     """An IOC and a client in processes of their own, on a port of their own."""
     port = str(20000 + os.getpid() % 20000)

@@ -155,6 +155,7 @@ def test_head_is_answered_without_a_body(tmp_path):
         assert ask(server, "HEAD", "/", {"Host": "evil.example"})[0] == 403
 
 
+@pytest.mark.slow
 def test_client_that_leaves_is_no_traceback(tmp_path, capsys):
     with served(FolderView(read_plan(write_plan(tmp_path)))) as server:
         for sent in (b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"GET /app.js HTTP/1.1\r\nHost: localhost\r\n\r\n"):

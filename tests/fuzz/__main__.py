@@ -105,7 +105,7 @@ def fuzz(name: str, arguments: argparse.Namespace) -> dict:
         place = Path(folder).resolve()
         read = reader.prepare(place)
         seeds = reader.seeds()
-        for good in seeds:  # warm: compiles kernels, imports what is imported late
+        for good in seeds:  # imports what is imported late
             read(good)
         called = functions_called(read, seeds) if arguments.called else []
         watch = Watch(place, arguments.limit_s)

@@ -16,8 +16,8 @@ _POINTS = 4  # of each block: what a mutation costs grows with the file
 def _samples() -> dict[str, dict[str, bytes]]:
     """The files of every format by name; a survey of two epochs and few points, projected by OpenCV."""
     from survey.interop.cameras.formats import COLMAP, FORMATS, READERS, write_cameras
-    from survey.interop.cameras.values import camera_values
     from survey.jobs.adjusting.job import adjust_job
+    from survey.jobs.converting import adjusted_values
     from survey.project import read
     from tests.survey.camera_lab import write_lab
 
@@ -26,7 +26,7 @@ def _samples() -> dict[str, dict[str, bytes]]:
         folder = Path(name)
         write_lab(folder / "lab")
         adjust_job(folder / "lab", progress=False)
-        values = camera_values(read(folder / "lab"))
+        values = adjusted_values(read(folder / "lab"))
         blocks = tuple(
             replace(b, point_idx=b.point_idx[:_POINTS], uv=b.uv[:_POINTS], cov=b.cov[:_POINTS], used=None)
             for b in values.survey.image_blocks if b.epoch_id in _EPOCHS

@@ -97,10 +97,37 @@ def _table(name: str, number: int) -> Callable[[Path], Read]:
 
 def _in_pieces(folder: Path) -> Read:
     """A table of quoted words, taken three rows at a time instead of tens of thousands."""
-    from survey.project.tables import csv_chunks
+    from survey.project.tables import files as table_reading
 
-    csv_chunks.CHUNK = 3
+    table_reading.CHUNK = 3
     return _table("table_angles.csv", 0)(folder)
+
+
+def _by_arrow(folder: Path) -> Read:
+    """A small table through the reader of large ones; the rows must say the same of it."""
+    from survey.project.tables import arrow as arrow_columns
+    from survey.project.tables import files as table_reading
+    from survey.project.tables.image_points import IMAGE_POINTS
+
+    arrow_columns.LARGE = 0
+    path = folder / "image_points.csv"
+
+    def run(data: bytes) -> object:
+        path.write_bytes(data)
+        found = arrow_columns.csv_columns(data, IMAGE_POINTS)
+        arrow_columns.LARGE = 2**60
+        try:
+            table = table_reading.read_table(path, IMAGE_POINTS)
+        finally:
+            arrow_columns.LARGE = 0
+        for name, column in (found or {}).items():
+            same = repr(column) if IMAGE_POINTS.is_text(name) else column.tobytes()  # type: ignore[union-attr]
+            other = repr(table.text(name)) if IMAGE_POINTS.is_text(name) else table.numbers(name).tobytes()
+            if same != other:
+                raise AssertionError(f"Arrow reads {name} in another way than row by row")
+        return table
+
+    return run
 
 
 def _quoted() -> bytes:
@@ -268,7 +295,7 @@ def _recover(folder: Path) -> Read:
 
 
 def _alignment_rounds() -> list[bytes]:
-    from survey.report.working_sheet import ROUND_COLUMNS
+    from survey.jobs.working_sheet import ROUND_COLUMNS
 
     return [",".join(ROUND_COLUMNS).encode() + b"\n2025-01-01,board,turn,1,2,3,0.1,0.1,0.1\n"]
 
@@ -286,6 +313,7 @@ READERS: dict[str, Reader] = {
     ),
     "points-file": Reader(lambda: [_projects()[0]["sheet_points.csv"]], _points),
     **_tables(),
+    "table-by-arrow": Reader(lambda: [_projects()[0]["observations/image_points.csv"]], _by_arrow),
     "table-in-pieces": Reader(lambda: [_quoted()], _in_pieces, dictionary=[b'"', b'""', b'"\n']),
     "image": Reader(_images, _image, is_text=False),
     "solution": Reader(lambda: [adjusted()["results/solution.json"]], _results("solution.json")),

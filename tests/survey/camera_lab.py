@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from adjust.lenses.models import MODELS, camera_constants, project
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.survey import Camera, LensParameter, Point, PointParameter, PoseParameter, Station, Survey, Target
-from survey.interop.cameras.values import camera_values
 from survey.jobs.adjusting.job import adjust_job
+from survey.jobs.converting import adjusted_values
 from survey.project import read, write_project
 from survey.project.targets import Checkerboard
 
@@ -85,7 +85,7 @@ def adjusted_lab(folder: Path):
     """The project's folder, adjusted, and its values."""
     write_lab(folder)
     adjust_job(folder)
-    return folder, camera_values(read(folder))
+    return folder, adjusted_values(read(folder))
 
 
 def pixels(values, camera, x_in_station):

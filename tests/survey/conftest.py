@@ -4,7 +4,7 @@ import pytest
 
 from survey.cli import main
 from survey.interop.cameras.formats import write_cameras
-from survey.interop.cameras.values import camera_values
+from survey.jobs.converting import adjusted_values
 from survey.project import read
 from tests.survey.camera_lab import adjusted_lab
 
@@ -22,6 +22,6 @@ def there_and_back(lab, tmp_path):
     def convert(format, name):
         write_cameras(lab[1], tmp_path / name, format, None)
         assert main(["convert", str(tmp_path / name), str(tmp_path / "back"), "--format", format, "--quiet"]) == 0
-        return camera_values(read(tmp_path / "back"))
+        return adjusted_values(read(tmp_path / "back"))
 
     return convert

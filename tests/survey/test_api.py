@@ -56,6 +56,7 @@ def test_importing_the_packages_loads_nothing_heavy() -> None:
     assert found.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_the_api_gives_what_the_command_line_writes(solution: survey.Solution, folder: Path, tmp_path: Path) -> None:
     from survey.cli import main
 
@@ -147,6 +148,7 @@ def test_covariances_by_name(solution: survey.Solution) -> None:
     assert list(cov.frame.columns) == list(cov.labels)
 
 
+@pytest.mark.slow
 def test_joint_covariance_agrees_with_the_scatter_of_solutions() -> None:
     """Two cameras' focal lengths over fresh noise: d' inv(C) d is chi-square with two degrees of freedom."""
     from survey.simulate import resample, stereo
@@ -259,6 +261,7 @@ def test_doctests_of_the_interface() -> None:
     assert found.failed == 0
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # of Jupyter
 def test_notebooks_run(tmp_path: Path) -> None:
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")

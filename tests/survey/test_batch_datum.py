@@ -63,6 +63,7 @@ def test_noise_raises_no_alarm_where_every_epoch_has_its_own_free_datum(records:
     assert len(alarming(as_they_are)) > 20
 
 
+@pytest.mark.slow
 def test_false_alarms_come_at_their_rate() -> None:
     """Many batches, epochs drawn from the covariance of one, without solving each again."""
     from survey.batch.common_datum import FreeDatum, Place
@@ -92,6 +93,7 @@ def test_false_alarms_come_at_their_rate() -> None:
     assert false <= 9
 
 
+@pytest.mark.slow
 def test_a_point_that_moved_is_found(tmp_path: Path) -> None:
     surveys = [night(k, {"P5": np.array([0.004, 0.0, 0.0])} if k == 8 else None) for k in range(N)]
     found = recorded(tmp_path, surveys)
@@ -155,6 +157,7 @@ def a_priori(record: Record) -> Record:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rotations", [False, True])
 def test_free_networks_of_pairs_are_calm_on_noise_too(tmp_path: Path, rotations: bool) -> None:
     rng = np.random.default_rng(21)

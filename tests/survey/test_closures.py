@@ -132,6 +132,7 @@ def test_options_are_written_as_they_are_read(tmp_path: Path) -> None:
     assert closure.translation_sigma == pytest.approx(MOUNT.translation_sigma, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_eyes_beside_cameras_with_images(tmp_path: Path) -> None:
     """One graph: a block and a camera that no image shows, between two cameras that see boards."""
     survey, _ = rig(True)

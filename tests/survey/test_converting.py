@@ -142,6 +142,7 @@ def tracker_files(folder, turns, levers):
     return paths
 
 
+@pytest.mark.slow
 def test_trackers_are_joined(tmp_path, capsys):
     turns = [Rotation.identity(), Rotation.from_rotvec([0.1, 0.5, -0.2]), Rotation.from_rotvec([0.9, 0.0, 0.3])]
     levers = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.05], [0.0, 0.15, -0.1]])

@@ -16,6 +16,8 @@ from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGri
 from survey.simulate.rendering import BrownCamera, Imaging, PlacedTarget, render
 from tests.data import data_folder
 
+pytestmark = pytest.mark.slow
+
 CAMERA = BrownCamera((960, 720), 1200.0, 1200.0, 479.5, 359.5, (-0.2, 0.05, 1e-3, -5e-4))
 BOARD = Checkerboard(8, 5, 0.02)
 CHARUCO = Charuco(9, 6, 0.02, 0.015, "4X4_50")

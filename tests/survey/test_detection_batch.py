@@ -1,10 +1,13 @@
 import cv2
 import numpy as np
+import pytest
 from gtsam import Pose3, Rot3
 
 from survey.detection import DetectionTask, SpotOptions, detect_images
 from survey.project.targets import Charuco, Checkerboard, MarkerGrid
 from survey.simulate.rendering import Beacons, BrownCamera, Imaging, PlacedTarget, render
+
+pytestmark = pytest.mark.slow
 
 CAMERA = BrownCamera((480, 360), 600.0, 600.0, 239.5, 179.5)
 BOARD = Checkerboard(6, 5, 0.02)

@@ -12,6 +12,8 @@ from survey.detection.corners import CornerFit
 from survey.project.targets import Charuco, Checkerboard, MarkerGrid
 from survey.simulate.rendering import Beacons, BrownCamera, Imaging, PlacedTarget, render
 
+pytestmark = pytest.mark.slow
+
 CAMERA = BrownCamera((640, 480), 800.0, 800.0, 319.5, 239.5, (-0.2, 0.05, 1e-3, -5e-4))
 BOARD = Checkerboard(8, 5, 0.02)
 CHARUCO = Charuco(8, 6, 0.02, 0.014, "4X4_50")

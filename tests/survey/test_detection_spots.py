@@ -24,6 +24,7 @@ def matched(spots):
 
 
 # limits: about 1.7 times what is measured now; a thresholded centroid reaches 0.012 to 0.034 px
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("diameter_m", "gray", "profile", "limit"),
     [

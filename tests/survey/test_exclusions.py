@@ -14,7 +14,8 @@ from adjust.adjustment import AdjustOptions
 from adjust.graph.solver import SolveOptions
 from adjust.model.errors import SurveyError
 from survey.cli import main
-from survey.jobs.adjusting.job import adjust_job, adjust_project
+from survey.jobs.adjusting.job import adjust_job
+from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.adjusting.warm_start import WARM, survey_start, warm_adjustment
 from survey.jobs.excluding import exclude_job, include_job
 from survey.jobs.navigating.task import NavigateRequest, observed_epoch
@@ -24,6 +25,8 @@ from survey.project.exclusions import Exclusion, Name
 from survey.project.observed import Observed
 from survey.project.reading import leaving_out, read_all
 from survey.solution.previous import read_previous
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture

@@ -28,8 +28,8 @@ from adjust.model.survey import (
 from adjust.model.survey import Point as WorldPoint
 from survey import project as files
 from survey.folder.units import from_si, to_si
-from survey.project.declared.toml_lines import key_lines
-from survey.project.tables import csv_chunks
+from survey.project.declared.toml_text import key_lines
+from survey.project.tables import files as table_reading
 from survey.project.tables import reading as tables
 from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList
 from survey.simulate import full_lab
@@ -243,6 +243,7 @@ def test_what_only_programs_write(tmp_path: Path) -> None:
     assert differences(survey, again) == []
 
 
+@pytest.mark.slow
 def test_simulated_lab_returns_in_canonical_order(tmp_path: Path) -> None:
     survey, _ = full_lab(1)
     files.write_project(tmp_path, survey)
@@ -322,11 +323,11 @@ def test_blank_lines_and_quotes_go_the_other_way(good: Path) -> None:
 @pytest.mark.parametrize("quote", ["", '"'])
 @pytest.mark.parametrize("n", [1, 2, 3, 7])
 def test_chunks_of_a_table_join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n: int, quote: str) -> None:
-    monkeypatch.setattr(csv_chunks, "CHUNK", 3)
+    monkeypatch.setattr(table_reading, "CHUNK", 3)
     layout = tables.Layout("t", ("id",), ("x",), (), ("y",))
     path = tmp_path / "t.csv"
     path.write_text("id,x,y\n" + "".join(f"{quote}i{i % 4}{quote},{i}.5,{'' if i % 2 else i}\n" for i in range(n)))
-    table = tables.read_table(path, layout)
+    table = table_reading.read_table(path, layout)
     assert table.lines.tolist() == list(range(2, n + 2))
     assert table.text("id").values() == [f"i{i % 4}" for i in range(n)]
     assert table.numbers("x").tolist() == [i + 0.5 for i in range(n)]
@@ -354,16 +355,6 @@ def test_parquet_faults(good: Path) -> None:
     path.write_bytes(b"not Parquet")
     with pytest.raises(SurveyError, match=r"distances\.parquet:1: not a Parquet file"):
         files.read(good)
-
-
-def test_missing_pyarrow_is_explained(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    project = files.read(good)
-    files.write_spots(good, project.spots, parquet=True)
-    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(SurveyError, match=r"spots\.parquet: Parquet needs pyarrow; install"):
-        files.read(good)
-    with pytest.raises(SurveyError, match=r"Parquet needs pyarrow"):
-        files.write_spots(good, project.spots, parquet=True)
 
 
 def test_atomic_write(tmp_path: Path) -> None:
@@ -416,6 +407,7 @@ def test_units_return_what_was_typed(unit: str) -> None:
     np.testing.assert_allclose(from_si(inside, unit), typed, rtol=3e-16)
 
 
+@pytest.mark.slow
 def test_large_table_is_read_in_blocks(good: Path, record_property: Any) -> None:
     """200 000 rows in random order; the time is recorded, not judged."""
     rng = np.random.default_rng(2)

@@ -8,6 +8,7 @@ import pytest
 
 from adjust.model.errors import SurveyError
 from survey import project as files
+from tests.sizes import size
 from tests.survey.faults import DEFINITION_FAULTS, FAULTS, Fault, named_line, write_good_project
 
 NEEDS_TABLES = "unknown group"  # only the tables say which groups there are
@@ -23,6 +24,7 @@ def test_names_of_faults_differ() -> None:
     assert len({fault.name for fault in FAULTS}) == len(FAULTS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
 def test_fault_is_named(fault: Fault, tmp_path: Path) -> None:
     write_good_project(tmp_path)
@@ -38,6 +40,7 @@ def test_fault_is_named(fault: Fault, tmp_path: Path) -> None:
         assert line.strip() in named or named.strip() in line, f"{message}\nnames: {named}\nexpected: {line}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", [f for f in DEFINITION_FAULTS if f.name != NEEDS_TABLES], ids=lambda f: f.name)
 def test_definition_alone_finds_its_faults(fault: Fault, tmp_path: Path) -> None:
     write_good_project(tmp_path)
@@ -52,7 +55,7 @@ def test_debris_gives_no_other_error(tmp_path: Path) -> None:
     paths = sorted(path for path in tmp_path.rglob("*") if path.suffix in (".csv", ".toml"))
     rng = random.Random(7)
     messages = []
-    for _ in range(300):
+    for _ in range(size(300)):
         path = rng.choice(paths)
         text = path.read_text(encoding="utf-8")
         start = rng.randrange(len(text))
@@ -62,5 +65,5 @@ def test_debris_gives_no_other_error(tmp_path: Path) -> None:
         except SurveyError as error:
             messages.append(str(error))
         path.write_text(text, encoding="utf-8")
-    assert len(messages) > 100
+    assert len(messages) > size(300) // 3 - 5
     assert [message for message in messages if not re.search(r":\d+: ", message)] == []

@@ -8,7 +8,7 @@ from adjust.model.errors import SurveyError
 from adjust.pose_network import NetworkOptions, solve_network
 from survey.cli import main
 from survey.interop.networks.g2o import read_g2o, read_g2o_file, write_g2o
-from survey.jobs.adjusting.job import adjust_project
+from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.converting import convert_job
 from survey.project import read
 from tests.adjust.pose_networks import simulate

@@ -17,14 +17,15 @@ import pytest
 from adjust.model.errors import SurveyError
 from survey import project as files
 from survey.cli import FAILED, main
-from survey.commands.common import message
 from survey.detection.gray import read_image
 from survey.detection.image_header import image_size
+from survey.folder.messages import message
 from survey.folder.replacing import recover
 from survey.folder.text import cell_text, id_problem, natural_key, read_bytes
 from survey.jobs.adjusting.job import adjust_job
 from survey.project.declared.node import read_toml
-from survey.project.tables.reading import Layout, group_names, read_table
+from survey.project.tables.files import read_table
+from survey.project.tables.reading import Layout, group_names
 from survey.project.tables.writing import write_table
 from survey.solution.previous import read_previous
 from survey.solution.residual_tables import other_residuals_csv
@@ -130,6 +131,7 @@ def test_more_rows_than_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         read_table(tmp_path / "t.csv", LAYOUT)
 
 
+@pytest.mark.slow
 def test_a_billion_equal_rows_of_parquet(tmp_path: Path) -> None:
     """Run lengths make them a small file; they are counted before they are unpacked."""
     pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
@@ -224,6 +226,7 @@ def head(shape: str, dtype: str = "<f8") -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arrays",
     [
@@ -258,6 +261,7 @@ def test_arrays_of_objects_are_never_unpickled(small: Path, tmp_path: Path) -> N
     assert not (tmp_path / "harmed").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["[]", "{}", "null", "[" * 100_000, '{"inputs": 1}', "\x00", '{"summary": NaN}'])
 def test_solutions_of_others(small: Path, text: str) -> None:
     adjust_job(small, progress=False)
@@ -292,6 +296,7 @@ def test_windows_line_ends_and_byte_order_marks(small: Path) -> None:
     assert adjust_job(small, progress=False).solution["summary"]["sigma0"] == plain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("locale", ["C", "tr_TR.UTF-8"])
 def test_odd_locales(small: Path, locale: str) -> None:
     """A folder with names of another alphabet, where the terminal knows ASCII alone."""

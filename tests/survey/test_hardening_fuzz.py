@@ -9,6 +9,9 @@ import pytest
 
 from tests.fuzz.called import reading_functions
 from tests.fuzz.mutate import Mutator
+from tests.sizes import size
+
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 CORPUS = ROOT / "tests" / "fuzz" / "corpus"
@@ -23,20 +26,16 @@ NO_READERS = {
     "survey/project/exclusions.py:_header_of": "read by read_exclusions before",
     "survey/project/tables/rows.py:row_table": "read by read_table before",
     "survey/project/merging.py:read_copy": "the copy of a project that was read before",
-    "survey/project/tables/csv_chunks.py:_last_start": "the line of what could not be read, for the message",
-    "survey/folder/locking.py:FileLock._opened": "a handle for the lock alone",
-    "survey/folder/locking.py:remove_unheld": "a handle for the lock alone",
+    "survey/project/tables/files.py:_last_start": "the line of what could not be read, for the message",
     "survey/interop/cameras/colmap.py:reconstruction": "an empty model of pycolmap, to be filled and written",
     "survey/report/page.py:_page": "the program's own script",
     "survey/report/pdf.py:_by_browser": "a PDF that was just printed",
-    "survey/folder/replacing.py:_move": "copies bytes that were just written",
     "capture/devices/cameras/opencv.py:discover": "the system's list of devices",
     "capture/devices/cameras/opencv.py:_serial": "the system's list of devices",
     "capture/devices/cameras/registry.py:open_camera": "a device",
     "capture/devices/turntables/moving.py:MovingTable.open": "a device",
     "capture/devices/turntables/moving.py:MovingTable.reopen": "a device",
     "capture/devices/turntables/moving.py:MovingTable.stop": "a device",
-    "capture/session/folder.py:write_through": "opens to write",
     "capture/session/folder.py:prepare": "copies a template, read by definition_of before",
     "capture/session/quality_thread.py:QualityWatch._judge_one": "opens to write",
     "capture/session/run.py:_open_table": "a device",
@@ -64,9 +63,10 @@ def test_what_was_found_is_found_no_more(tmp_path):
 
 def test_every_reader_is_listed_and_stands_new_inputs(tmp_path):
     """Whether a function reads files is seen in its source; whether it is in the list, by running the list."""
-    out = _fuzzed(tmp_path, "--count", "4", "--seed", "11", "--jobs", "2", "--called", str(tmp_path / "called.json"))
+    called = tmp_path / "called.json"
+    out = _fuzzed(tmp_path, "--count", str(size(4)), "--seed", "11", "--jobs", "1", "--called", str(called))
     assert " 0 findings" in out
-    missing = set(reading_functions()) - set(json.loads((tmp_path / "called.json").read_text()))
+    missing = set(reading_functions()) - set(json.loads(called.read_text()))
     assert sorted(missing - set(NO_READERS)) == []
     assert sorted(set(NO_READERS) - missing) == []
 

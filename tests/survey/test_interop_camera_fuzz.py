@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 
 from survey.interop.cameras.colmap import read_colmap
 from survey.interop.cameras.formats import COLMAP, KALIBR_TARGET, READERS, write_cameras
+from tests.sizes import size
 from tests.survey.test_interop_fuzz import _damaged, _message
 
 configuration.set_hypothesis_home_dir(tempfile.gettempdir())
 _QUICK = settings(
-    max_examples=40, deadline=None, database=None, derandomize=True,
+    max_examples=size(40, 15), deadline=None, database=None, derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
 )  # fmt: skip
 _PLAIN = sorted(set(READERS) - set(COLMAP))
@@ -35,6 +36,7 @@ def _try(read, path):
     assert message is None or str(path.parent) in message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", _PLAIN)
 def test_damaged_files_are_refused_or_read(samples, tmp_path, format):
     text = samples[format].read_text(encoding="utf-8")
@@ -77,6 +79,7 @@ def test_damaged_binary_models_are_refused_or_read(samples, tmp_path, name):
     run()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cameras.txt", "rigs.txt", "frames.txt", "images.txt", "points3D.txt"])
 def test_damaged_text_models_are_refused_or_read(samples, tmp_path, name):
     copy = tmp_path / "model"

@@ -13,7 +13,7 @@ from adjust.model.observations import FrameRef
 from survey.cli import main
 from survey.interop.cameras.colmap import pose3, reconstruction, rigid3d
 from survey.interop.cameras.colmap_model import read_model
-from survey.interop.cameras.values import camera_values
+from survey.jobs.converting import adjusted_values
 from survey.project import read
 from tests.survey.camera_lab import SIGMA_PX, world_pixels
 
@@ -44,6 +44,7 @@ def test_pycolmap_reads_the_model_and_projects_as_the_survey_does(lab, models, f
         np.testing.assert_allclose([xy - 0.5 for xy, _ in seen], np.concatenate(blocks), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", ["colmap", "colmap-text"])
 def test_a_full_disk_leaves_no_half_model(lab, tmp_path, format, capsys):
     """pycolmap alone would write what has room and say nothing."""
@@ -63,7 +64,7 @@ def test_a_full_disk_leaves_no_half_model(lab, tmp_path, format, capsys):
 @pytest.mark.parametrize("format", ["colmap", "colmap-text"])
 def test_back_again_the_reprojections_are_equal(lab, models, format, tmp_path):
     assert main(["convert", str(models / format), str(tmp_path / "back"), "--format", format, "--quiet"]) == 0
-    back = camera_values(read(tmp_path / "back"))
+    back = adjusted_values(read(tmp_path / "back"))
     ours, theirs = world_pixels(lab[1]), world_pixels(back)
     assert ours.keys() == theirs.keys()
     for key, uv in ours.items():

@@ -10,12 +10,15 @@ from hypothesis import strategies as st
 from adjust.model.errors import SurveyError
 from survey.interop.networks.krumm import read_adjusted
 from survey.jobs.converting import READERS
+from tests.sizes import size
 from tests.survey.interop_samples import AICON, CSV, DBAT, DBAT_FILES, GKF, KRUMM, LGC
+
+pytestmark = pytest.mark.slow
 
 # no folder of its own among the sources
 configuration.set_hypothesis_home_dir(tempfile.gettempdir())
 _QUICK = settings(
-    max_examples=80, deadline=None, database=None, derandomize=True,
+    max_examples=size(80, 20), deadline=None, database=None, derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )  # fmt: skip
 _SAMPLES = {"gama": GKF, "krumm": KRUMM, "lgc": LGC, "csv": CSV, "dbat": DBAT}

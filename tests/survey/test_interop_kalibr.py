@@ -80,6 +80,7 @@ def test_the_ending_yaml_alone_is_ambiguous_and_the_error_says_between_what(lab,
     assert all(f in said for f in ("kalibr", "opencv", "ros", "mc-calib"))
 
 
+@pytest.mark.slow
 def test_targets_both_ways(lab, tmp_path):
     path = tmp_path / "target.yaml"
     assert main(["convert", str(lab[0]), str(path), "--format", "kalibr-target", "--quiet"]) == 0

@@ -8,7 +8,7 @@ import pytest
 
 from adjust.model.errors import SurveyError
 from survey.interop.cameras.robots import fixed_links, read_sdf, read_urdf, sdf_files, urdf_files
-from survey.interop.cameras.values import camera_values
+from survey.jobs.converting import adjusted_values
 from survey.project import read, write_project
 from tests.survey.test_interop_trajectories import same_pose
 
@@ -94,7 +94,7 @@ def test_names_are_escaped(lab, tmp_path):
         encoding="utf-8",
     )
     write_project(tmp_path / "p", read_sdf(path).survey)
-    values = camera_values(read(tmp_path / "p"))
+    values = adjusted_values(read(tmp_path / "p"))
     links, _ = fixed_links(values, None)
     assert [link.name for link in links] == ["a&b"]
     for files, tag in ((urdf_files, "link"), (sdf_files, "model/link")):

@@ -5,9 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from tests.acceptance.interruptions import in_a_copy, wait
 from tests.fuzz.readers import READERS
+
+pytestmark = pytest.mark.slow
 
 MARK = b"\xef\xbb\xbf"
 OURS = {

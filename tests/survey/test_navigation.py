@@ -50,6 +50,7 @@ def _distances(outcome, lab):
     return np.array(out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use_table", [True, False])
 def test_named_spots(folder, lab, use_table):
     outcome = navigate_job(folder, NavigateRequest(use_table=use_table), progress=False)
@@ -149,6 +150,7 @@ def _poses(outcome):
     return np.array([e.world_from_station.matrix() for e in outcome.trajectory.epochs])
 
 
+@pytest.mark.slow
 def test_calibration_is_used_again_until_something_changes(folder, capsys):
     first = navigate_job(folder, progress=False)
     again = navigate_job(folder, progress=False)
@@ -190,6 +192,7 @@ def test_epochs_that_calibrate_all_the_same_are_named(lab, tmp_path):
     assert "epochs that were not asked for (n02, n03" in outcome.text()
 
 
+@pytest.mark.slow
 def test_damaged_calibration_is_made_anew(folder):
     navigate_job(folder, progress=False)
     path = folder / "results/navigation_calibration.npz"

@@ -10,16 +10,18 @@ from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
 from adjust.adjustment import AdjustOptions, adjust
+from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
-from adjust.model.survey import Datum, Point, PointParameter, PoseParameter, Station, Survey
-from adjust.statistics.pair_screen import PairOptions, adjust_with_pairs, is_pure
+from adjust.model.survey import Camera, Datum, LensParameter, Point, PointParameter, PoseParameter, Station, Survey
+from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs, is_pure
+from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from survey import problem, solve
 from survey.cli import main
 from survey.project import read, write_project
 from survey.project.merging import merge
 from survey.solution.dictionary import RunInfo, solution_dict
-from survey.solution.loops import loops_dict, network_dict, pair_loops, pair_network
+from survey.solution.loops import loops_after, loops_dict, network_dict, pair_loops, pair_network
 from survey.solution.quantities import ARCSEC_PER_RAD, scale_of
 
 HELD = PoseParameter(Pose3(), "held")
@@ -74,6 +76,64 @@ def test_a_ring_with_a_tail_names_the_tail():
     assert found.uncontrolled == ("p2-3", "p3-4")
     assert found.inseparable == (("p0-1", "p1-2", "p2-0"),)
     assert found.redundancy == 6
+
+
+def test_a_held_component_of_a_station_keeps_its_value_in_a_network_of_pairs():
+    survey, poses = _network(4, combinations(range(4), 2), noise=1.0)
+    held = PoseParameter(poses[2], held=("tz",))
+    stations = tuple(_station(s.station_id, held) if s.station_id == "S2" else s for s in survey.stations)
+    free, found = adjust_with_pairs(survey), adjust_with_pairs(replace(survey, stations=stations))
+    station = found.estimates["world_from_station", "S2"]
+    moved = Pose3.Logmap(poses[2].between(station.value))
+    assert abs(moved[5]) < 1e-11
+    assert np.abs(moved[:5]).min() > 1e-7
+    assert station.status == ("free",) * 5 + ("held",)
+    assert station.cov[5, 5] == 0.0
+    assert (found.n_unknowns, found.redundancy) == (free.n_unknowns - 1, free.redundancy + 1)
+    # the same numbers as beside observations of another kind, which the whole way of adjusting takes
+    general = adjust(replace(survey, stations=stations))
+    np.testing.assert_allclose(station.cov, general.estimates["world_from_station", "S2"].cov, atol=1e-12)
+
+
+def _rig(off):
+    """Two calibrated cameras and a target on one station, pairs from the cameras to a marker and one between them."""
+    poses = {"a": Pose3(Rot3.Ry(0.4), [0.1, 0, 0]), "b": Pose3(Rot3.Ry(-0.3), [-0.1, 0.02, 0]),
+             "m": Pose3(Rot3.Rx(0.2), [0.5, 0.4, 3.0])}  # fmt: skip
+    lens = LensParameter("brown", (), np.array([1000.0, 1000, 0, 640, 480, *[0.0] * 8]))
+    known = {"a": PoseParameter(poses["a"], "held"), "b": PoseParameter(poses["b"], "prior", 4.0 * COV)}
+    cameras = tuple(Camera(i, "head", (1280, 960), lens, known[i]) for i in "ab")
+
+    def measured(name, a, b, error):
+        ends = [FrameRef("camera", x) if x in "ab" else FrameRef("station", x) for x in (a, b)]
+        return Pair(name, *ends, (poses[b].inverse() * poses[a]).retract(error), COV)
+
+    pairs = (measured("ab", "a", "b", off), measured("am", "a", "m", 0 * off), measured("bm", "b", "m", -0.5 * off))
+    return Survey(cameras=cameras, stations=(_station("head", HELD), _station("m", PoseParameter(poses["m"]))),
+                  pairs=pairs), poses  # fmt: skip
+
+
+def test_loops_through_a_calibrated_rig_are_listed_and_close_after_the_adjustment():
+    off = np.array([3e-4, -2e-4, 1e-4, 1e-3, 2e-3, -1e-3])
+    survey, poses = _rig(off)
+    loops, counts = pair_loops(survey), network_dict(pair_network(survey))
+    through = [k for k in range(len(loops.test)) if "head" in loops.basis.stations(k)]
+    assert (len(loops.test), len(through)) == (2, 1)
+    alone = pair_loops(replace(survey, pairs=survey.pairs[:1]))
+    assert set(alone.basis.stations(0)) == {"camera:a", "camera:b", "head"}
+    # by hand: the pair against the way through the rig, whose second camera has a covariance of its own
+    back = (poses["b"].inverse() * poses["a"]).inverse().AdjointMap()
+    expected = off @ np.linalg.solve(COV + back @ (4.0 * COV) @ back.T, off)
+    np.testing.assert_allclose(alone.test, expected, rtol=2e-3)
+    assert counts["conditions_through_given_stations"] == 1
+    assert pair_network(replace(survey, pairs=survey.pairs[:1])).uncontrolled == ()
+    lenses = {c.camera_id: c.lens.values for c in survey.cameras}
+    start = StartValues(lenses, {("world_from_station", "m"): poses["m"], ("station_from_camera", "b"): poses["b"]}, {})
+    after = loops_after(adjust(survey, start), loops)
+    assert np.abs(loops.vector).max() > 1e-4
+    assert np.abs(after).max() < 1e-9
+    # a camera whose place only pairs tell closes no loop through its station
+    free = replace(survey.cameras[1], station_from_camera=PoseParameter(poses["b"]))
+    assert len(pair_loops(replace(survey, cameras=(survey.cameras[0], free))).test) == 1
 
 
 def test_two_held_stations_control_the_way_between_them():
@@ -178,11 +238,11 @@ def test_a_wrong_pair_in_a_survey_with_other_observations_is_left_out():
     length = float(np.linalg.norm(poses[1].translation() - poses[2].translation()))
     survey = replace(survey, pairs=pairs, distances=(Distance("d", origin[1], origin[2], length, 1e-3),))
     assert not is_pure(survey)
-    result = adjust_with_pairs(survey)
+    result = adjust_cleaned(survey)
     assert [p.pair_id for p in result.survey.pairs if not p.used] == [survey.pairs[3].pair_id]
     assert result.global_test.passed
     assert [w for w in result.warnings if w.startswith("left out: pair p0-4: off by ")]
-    kept = adjust_with_pairs(survey, PairOptions(reject_pairs=False))
+    kept = adjust_cleaned(survey, CleanOptions(PairOptions(reject_pairs=False)))
     assert all(p.used for p in kept.survey.pairs)
     assert not kept.global_test.passed
 
@@ -190,7 +250,7 @@ def test_a_wrong_pair_in_a_survey_with_other_observations_is_left_out():
 def test_sigmas_too_small_throughout_reject_no_pair():
     survey, _ = _network(12, combinations(range(12), 2), 5.0)
     for each in (survey, _mixed(survey)):
-        result = adjust_with_pairs(each)
+        result = adjust_cleaned(each)
         assert all(p.used for p in result.survey.pairs)
         assert result.sigma0 == pytest.approx(5.0, rel=0.15)
 
@@ -208,21 +268,22 @@ def test_sigmas_too_large_throughout_reject_no_pair():
     pairs = (replace(survey.pairs[30], b_from_a=survey.pairs[30].b_from_a.compose(off)),)
     survey = replace(survey, pairs=survey.pairs[:30] + pairs + survey.pairs[31:])
     for each in (survey, _mixed(survey)):
-        result = adjust_with_pairs(each)
+        result = adjust_cleaned(each)
         assert all(p.used for p in result.survey.pairs)
         assert result.sigma0 < 0.5
         assert max(o.test for o in result.other_residuals if o.kind == "pair") > 38.0  # the limit of a single pair
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_sigmas_too_small_throughout_reject_no_pair_of_a_few(seed):
     survey, _ = _network(6, combinations(range(6), 2), 5.0, seed=seed)
     for each in (survey, _mixed(survey)):
-        assert all(p.used for p in adjust_with_pairs(each).survey.pairs)
+        assert all(p.used for p in adjust_cleaned(each).survey.pairs)
     wrong = survey.pairs[4].b_from_a.compose(Pose3(Rot3.Rz(0.02), np.array([0.1, 0.0, 0.0])))
     pairs = survey.pairs[:4] + (replace(survey.pairs[4], b_from_a=wrong),) + survey.pairs[5:]
     for each in (replace(survey, pairs=pairs), _mixed(replace(survey, pairs=pairs))):
-        assert [p.pair_id for p in adjust_with_pairs(each).survey.pairs if not p.used] == [survey.pairs[4].pair_id]
+        assert [p.pair_id for p in adjust_cleaned(each).survey.pairs if not p.used] == [survey.pairs[4].pair_id]
 
 
 def test_a_pair_without_which_there_is_no_solution_stays(monkeypatch):
@@ -237,8 +298,8 @@ def test_a_pair_without_which_there_is_no_solution_stays(monkeypatch):
             raise IndeterminateError("2 directions are undetermined", ("S1",))
         return adjust(given, *arguments)
 
-    monkeypatch.setattr("adjust.statistics.pair_screen.adjust", fragile)
-    result = adjust_with_pairs(survey)
+    monkeypatch.setattr("adjust.statistics.outlier_search.adjust", fragile)
+    result = adjust_cleaned(survey)
     assert next(p for p in result.survey.pairs if p.pair_id == name).used
     assert [w for w in result.warnings if w.startswith(f"fails its test, but cannot be left out: pair {name}")]
 

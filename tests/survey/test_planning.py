@@ -14,9 +14,10 @@ from survey.planning.building import build_plan
 from survey.planning.errors import error_analysis_job
 from survey.planning.job import PlanRequest, planning_job
 from survey.planning.plan_file import read_plan
-from survey.planning.plots import Series, chart, ticks
 from survey.planning.wanted import wanted_components
 from survey.project import read, write_project
+from survey.report.charts import Series, chart
+from survey.report.drawing import ticks
 from survey.simulate import resample
 from survey.simulate.scene import Scene
 from tests.survey.planning_lab import PLAN, write_lab
@@ -166,6 +167,7 @@ def test_patterns_name_components(lab, outcome):
         wanted_components(e, ["lens.x"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
@@ -211,6 +213,7 @@ def test_what_a_plan_leaves_open_is_named(lab, tmp_path):
     assert caught.value.parameters
 
 
+@pytest.mark.slow
 def test_trials_of_a_plan(lab):
     found = planning_job(lab[0], PlanRequest(add=0, trials=24, workers=1), progress=False)
     t = found.summary()["monte_carlo"]

@@ -16,11 +16,11 @@ from survey.examples import EXAMPLES, write_example
 from survey.project.declared.declarations import DECLARATIONS, declared
 from survey.project.declared.keys import NOTHING, REQUIRED, Declared, Key
 from survey.project.exclusions import EXCLUSIONS
+from survey.project.project import DEMANDED
 from survey.project.reading import LAYOUTS, read_definition
 from survey.project.reference import reference_page
 from survey.project.schema import survey_schema
 from survey.project.tables.column_texts import COLUMN_TEXTS, column_text
-from survey.solution.tolerances import OWNERS
 
 jsonschema = pytest.importorskip("jsonschema")
 ROOT = Path(__file__).parents[2]
@@ -126,6 +126,7 @@ def test_a_project_with_everything_is_read_and_fits_the_schema(tmp_path: Path, v
     assert set(PLACES) == {d.name for d in DECLARATIONS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("table", "key"), KEYS, ids=_named)
 def test_every_declared_key_is_read_and_its_kind_checked_by_both(
     table: Declared, key: Key, tmp_path: Path, validator: Any
@@ -138,6 +139,7 @@ def test_every_declared_key_is_read_and_its_kind_checked_by_both(
     assert list(validator.iter_errors(values)) != []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLACES)
 def test_what_is_not_declared_is_refused_by_both(name: str, tmp_path: Path, validator: Any) -> None:
     if name in ("identification", "poses"):
@@ -149,6 +151,7 @@ def test_what_is_not_declared_is_refused_by_both(name: str, tmp_path: Path, vali
         assert list(validator.iter_errors(values)) != []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "key"), [(d, k) for d, k in KEYS if k.default not in (REQUIRED, NOTHING)], ids=_named
 )
@@ -174,7 +177,7 @@ def test_a_declared_default_is_what_its_absence_means(table: Declared, key: Key,
 
 def test_choices_are_those_of_the_program() -> None:
     assert declared("lens").keys[0].choices == tuple(MODELS)
-    assert next(k for k in declared("tolerance").keys if k.name == "of").choices == tuple(OWNERS)
+    assert next(k for k in declared("tolerance").keys if k.name == "of").choices == tuple(DEMANDED)
 
 
 def test_the_page_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
@@ -203,6 +206,7 @@ def test_a_demand_in_two_units_is_refused(tmp_path: Path) -> None:
         read_definition(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_every_example_fits_the_schema(
     name: str, tmp_path: Path, validator: Any, monkeypatch: pytest.MonkeyPatch

@@ -15,6 +15,7 @@ from tests.adjust.relay_station import Station4
 LINE = "{t}, 0.1, 0.2, 0.3, 0, 0, 0, 1\n"
 
 
+@pytest.mark.slow
 def test_project_folder_to_pairs_csv(tmp_path: Path) -> None:
     station = Station4(31)
     folder = tmp_path / "lab"

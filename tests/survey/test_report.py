@@ -1,10 +1,8 @@
-import ast
 import json
 import re
 import xml.etree.ElementTree as ET
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +11,14 @@ from gtsam import Pose3, Rot3
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ImageResiduals
 from adjust.model.survey import Survey
-from survey import report as report_package
-from survey.report import drawing, every, markup, report_html, summary_text
-from survey.report.camera_plots import CameraResiduals, histogram, mean_field, vector_field
-from survey.report.german import GERMAN
-from survey.report.picture import enlargement, perspective, pictures, plan
-from survey.report.scene import Scene, Spot, scene_of
-from survey.solution.dictionary import RunInfo
+from survey.project.detected import DetectedImage
+from survey.report import drawing, markup, observations, report_html, summary_text, unknowns
+from survey.report.charts import CameraResiduals, histogram, mean_field, vector_field
+from survey.report.context import worst
+from survey.report.language import esc
+from survey.report.picture import perspective, pictures, plan
+from survey.report.scene import Scene, Spot, enlargement, scene_of
+from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.quantities import scale_of
 from tests.survey.adjustments import Lab, correlate, lab_adjustment
 
@@ -171,12 +170,13 @@ def test_names_cannot_become_markup(adjustment: Adjustment) -> None:
     page = report_html(changed, RunInfo(evil, evil, {evil: evil}, {evil: evil}, {evil: evil}, evil, {evil: 1.0}))
     assert "<script>alert" not in page
     assert page.count("</script>") == 4
-    assert page.count(markup.esc(evil)) > 20
+    assert page.count(esc(evil)) > 20
     parsed(page)
     for picture in re.findall(r"<svg.*?</svg>", page, re.S):
         ET.fromstring(picture)
 
 
+@pytest.mark.slow
 def test_a_large_laboratory_stays_readable_and_small() -> None:
     made = lab_adjustment(Lab(n_epochs=100, n_beacons=60))
     page = report_html(made, RUN)
@@ -294,7 +294,7 @@ def test_scene_turns_station_covariances_into_the_world(adjustment: Adjustment) 
     np.testing.assert_allclose(spot.cov, np.diag([0, 1e-6, 0]), atol=1e-18)
     assert {s.label for s in scene.shots if s.main} == {"X", "Y", "Z"}
     assert [name for name, _ in scene.outlines] == ["board"]
-    assert pictures(Scene(), 2.8) == ("", 1.0)
+    assert pictures(Scene(), 2.8) == ((), 1.0)
 
 
 def camera(uv: np.ndarray, residuals: np.ndarray, standardized: np.ndarray | None = None) -> CameraResiduals:
@@ -356,7 +356,7 @@ def test_all_observations_are_in_the_page_with_what_was_observed(page: str, adju
     assert data["rows"] == n
     columns = [c["values"] if "values" in c else [c["names"][k] for k in c["codes"]] for c in data["columns"]]
     assert {len(c) for c in columns} == {n}
-    by_name = dict(zip(every.COLUMNS, columns, strict=True))
+    by_name = dict(zip(observations.COLUMNS, columns, strict=True))
     kind, where, point, component = (by_name[name] for name in ("Kind", "Where", "Point", "Component"))
     observed, sigma, adjusted, residual = (by_name[name] for name in ("Observed", "σ", "Adjusted", "Residual"))
     block = adjustment.survey.image_blocks[5]
@@ -387,44 +387,54 @@ def test_german_page_says_the_same_numbers(adjustment: Adjustment, page: str) ->
         report_html(adjustment, RUN, in_language="fr")
 
 
-def test_german_has_every_text_of_the_program() -> None:
-    """All literals that are translated, section titles and headings, read from the source."""
-    missing = []
-    for path in sorted(Path(report_package.__file__).parent.glob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name) or not node.args:
-                continue
-            at = {"t": 0, "section": 1}.get(node.func.id)
-            if at is not None and isinstance(node.args[at], ast.Constant):
-                missing += [node.args[at].value] if node.args[at].value not in GERMAN else []
-    assert missing == []
-    for english, german in GERMAN.items():
-        assert set(re.findall(r"\{(\w+)\}", english)) == set(re.findall(r"\{(\w+)\}", german)), english
+def test_the_largest_are_those_of_a_whole_sorting() -> None:
+    """Equal values in their order, what is no number last, whatever the number that is wanted."""
+    values = np.random.default_rng(3).integers(-9, 10, 500).astype(float)
+    values[[7, 80, 200]] = np.nan
+    order = sorted(range(len(values)), key=lambda k: -abs(values[k]) if np.isfinite(values[k]) else 1.0)
+    for most in (1, 20, 250, 499, 500, 900):
+        assert worst(values, most).tolist() == order[:most]
+    assert worst(np.empty(0), 5).tolist() == []
 
 
-def test_groups_named_after_their_kind_are_said_in_the_language_and_others_as_they_are() -> None:
-    from adjust.model import observations
-    from survey.project.tables.terrestrial import KINDS
-    from survey.report.language import GROUPS_BY_KIND, group_name, speaking
-
-    named = {
-        field.default
-        for kind in vars(observations).values() if is_dataclass(kind)
-        for field in fields(kind) if field.name == "group"
-    }  # fmt: skip
-    assert {"image", "distance", "coordinates"} <= named
-    assert named | set(KINDS) <= GROUPS_BY_KIND
-    with speaking("de"):
-        assert group_name("slope_distance") == "Schrägstrecke"
-        assert [x for x in GROUPS_BY_KIND if group_name(x) == x.replace("_", " ")] == []
-        assert group_name("points") == "points"  # a name that people gave
-    assert group_name("slope_distance") == "slope distance"
+def test_the_page_grows_no_further_with_the_observations() -> None:
+    small, large = (lab_adjustment(Lab(n_epochs=n, n_beacons=60)) for n in (150, 600))
+    assert 2 * len(small.image_residuals.test) > observations.MOST
+    pages = [report_html(made, RUN) for made in (small, large)]
+    assert len(pages[1]) < 1.1 * len(pages[0]) < 3e6
+    n = markup.count(2 * len(large.image_residuals.test) + sum(len(o.components) for o in large.other_residuals))
+    assert f"The worst 20\u2009000 of {n}; all in residuals.csv and residuals_other.csv." in pages[1]
 
 
-def test_german_messages_have_german_numbers() -> None:
-    from survey.report.language import message, speaking
+def test_rows_shown_are_the_same_with_and_without_the_others(adjustment: Adjustment, page: str) -> None:
+    """The worst rows of a page that is cut are the first of the one that is not."""
+    whole = json.loads(re.search(r'id="all-data">(.*?)</script>', page, re.S)[1])  # type: ignore[index]  # it is there
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(observations, "MOST", 40)
+        cut = report_html(adjustment, RUN)
+    part = json.loads(re.search(r'id="all-data">(.*?)</script>', cut, re.S)[1])  # type: ignore[index]  # it is there
+    assert part["rows"] == 40
+    assert part["flags"] == whole["flags"][:40]
+    for a, b in zip(part["columns"], whole["columns"], strict=True):
+        if "codes" in a:
+            assert [a["names"][k] for k in a["codes"]] == [b["names"][k] for k in b["codes"][:40]]
+        else:
+            assert a["values"] == b["values"][:40]
 
-    said = "Global test failed: residuals are 1.37 times what the sigmas of the observations allow. Look for errors."
-    with speaking("de"):
-        assert "das 1,37-fache" in message(said)
-        assert "Epoche 1.5" in message("camera X at epoch 1.5, target board: not used")
+
+def test_of_very_many_cameras_and_images_the_page_says_what_it_leaves_out(
+    adjustment: Adjustment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = {f"X/e{i}": DetectedImage(f"images/X/e{i}.png", "ab", 1, 1, 1, n_image_points=3) for i in range(510)}
+    monkeypatch.setattr(unknowns, "_MOST_CAMERAS", 1)
+    page = report_html(adjustment, replace(RUN, images=images))
+    rms = {k: e["rms_residual_px"] for k, e in solution_dict(adjustment, RUN)["cameras"].items()}
+    largest = max(rms, key=lambda k: rms[k])
+    assert re.findall("<h3>Camera (.)</h3>", page) == [largest]
+    words = " ".join(parsed(page).words)
+    assert "2 more cameras, with smaller residuals; their lenses and poses in solution.json" in words
+    assert all(f"{value:.3f}" in words for value in rms.values())
+    assert "510 images" in words
+    assert "images/X/e499.png" in words
+    assert "images/X/e500.png" not in words
+    assert "10 more in solution.json." in words

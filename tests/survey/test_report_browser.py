@@ -12,13 +12,15 @@ from typing import Any
 import pytest
 
 from adjust.model.errors import SurveyError
-from survey.report import every, pdf, report_html
+from survey.report import observations, report_html
+from survey.report import page as printing
 from survey.report.drawing import DARK
 from survey.solution.dictionary import RunInfo
 from tests.survey.adjustments import Lab, lab_adjustment
 
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 RUN = RunInfo("lab", "Full lab", {"survey.toml": "12ab"}, {"alpha": 0.05}, {"labsurvey": "0.1.0"}, "2026-01-02")
-COMPONENT, W, OBSERVED = (every.COLUMNS.index(name) for name in ("Component", "w", "Observed"))
+COMPONENT, W, OBSERVED = (observations.COLUMNS.index(name) for name in ("Component", "w", "Observed"))
 PHONE = 390
 # the smallest contrast of any text with what is behind it, by the formula of WCAG 2.1, with that text
 CONTRAST = """(() => {
@@ -44,7 +46,7 @@ CONTRAST = """(() => {
   }
   return worst;
 })()"""
-BROWSER = next((path for name in pdf.BROWSERS if (path := shutil.which(name))), None)
+BROWSER = next((path for name in printing.BROWSERS if (path := shutil.which(name))), None)
 
 
 def need_browser() -> str:
@@ -176,7 +178,7 @@ def test_a_camera_is_one_page_of_paper(german: str, tmp_path: Path) -> None:
     need_browser()
     pypdf = pytest.importorskip("pypdf")
     path = tmp_path / "report.pdf"
-    path.write_bytes(pdf.report_pdf(german))
+    path.write_bytes(printing.report_pdf(german))
     pages = [page.extract_text() for page in pypdf.PdfReader(path).pages]
     at = [next(i for i, text in enumerate(pages) if f"Kamera {name}" in text) for name in "XYZ"]
     assert at == list(range(at[0], at[0] + 3))
@@ -187,7 +189,7 @@ def test_a_camera_is_one_page_of_paper(german: str, tmp_path: Path) -> None:
 def test_report_on_paper_has_the_words_of_the_page(german: str, tmp_path: Path) -> None:
     need_browser()
     path = tmp_path / "report.pdf"
-    path.write_bytes(pdf.report_pdf(german))
+    path.write_bytes(printing.report_pdf(german))
     assert path.read_bytes().startswith(b"%PDF")
     pypdf = pytest.importorskip("pypdf")
     pages = [page.extract_text() for page in pypdf.PdfReader(path).pages]
@@ -199,7 +201,7 @@ def test_report_on_paper_has_the_words_of_the_page(german: str, tmp_path: Path) 
 
 
 def test_without_browser_and_weasyprint_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pdf, "BROWSERS", ())
+    monkeypatch.setattr(printing, "BROWSERS", ())
     monkeypatch.setitem(__import__("sys").modules, "weasyprint", None)
     with pytest.raises(SurveyError, match=r"install Chromium, or 'pip install labsurvey\[pdf\]'"):
-        pdf.report_pdf("<p>x</p>")
+        printing.report_pdf("<p>x</p>")

@@ -18,15 +18,16 @@ from survey.batch.trends import trends_of
 from survey.cli import main
 from survey.examples import write_example
 from survey.examples.alignment import alignment_files
-from survey.jobs.adjusting.job import adjust_project, run_info
+from survey.jobs.adjusting.job import run_info
+from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.aligning import align_job
 from survey.notebook.html import heading, html_table
 from survey.planning.job import PlanRequest, planning_job
 from survey.planning.page import plan_page
 from survey.project import AdjustmentOptions, Project, Sigmas, read
 from survey.report import report_html
-from survey.report.embedding import json_script
-from survey.report.markup import esc
+from survey.report.language import esc
+from survey.report.markup import json_script
 from survey.simulate import beacons
 from survey.solution.dictionary import RunInfo
 from survey.solution.quantities import scale_of
@@ -44,6 +45,7 @@ def pages(adjustment: Adjustment, run: RunInfo, project: Project | None = None) 
     return {language: report_html(adjustment, run, None, found, language) for language in LANGUAGES}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["total-station", "relay", "alignment"])
 def test_reports_of_whole_projects(name: str, tmp_path: Path) -> None:
     """Of one also with good names: the same page but for the text."""
@@ -64,6 +66,7 @@ def test_reports_of_whole_projects(name: str, tmp_path: Path) -> None:
         assert [tags_of(harmed[k]) ^ tags_of(plain[k]) for k in LANGUAGES] == [{group}, {group}]
 
 
+@pytest.mark.slow
 def test_report_of_cameras_table_beacons_and_spots(tmp_path: Path) -> None:
     made, truth = beacons(3, n_table_epochs=5, n_free_epochs=3, n_night_epochs=1)
     points = tuple(replace(p, x_in_world=PointParameter(truth["point", p.point_id])) for p in made.points)
@@ -101,6 +104,7 @@ def test_working_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert page.count("&lt;script") + page.count("&gt;") > 5
 
 
+@pytest.mark.slow
 def test_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_lab(tmp_path)
     project = read(tmp_path)

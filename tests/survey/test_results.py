@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, Estimate, GlobalTest
-from survey.report.results import covariance_npz, read_covariances, write_results
+from survey.report.results import write_results
+from survey.solution.covariances import covariance_npz, read_covariances
 from survey.solution.dictionary import RunInfo, correlated, solution_dict, solution_json
 from survey.solution.frames import AdjustedFrames, table_from_mount
 from survey.solution.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry

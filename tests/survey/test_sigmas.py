@@ -12,8 +12,8 @@ from survey.cli import main
 from survey.jobs.aligning import align_job
 from survey.jobs.navigating.job import NavigateRequest, navigate_job
 from survey.project import AdjustmentOptions, read, write_project
-from survey.report.results import read_covariances
 from survey.simulate import beacons
+from survey.solution.covariances import read_covariances
 from tests.adjust.test_deformation import chain, measured, small
 from tests.survey.test_working_sheet import definition, write
 
@@ -95,6 +95,7 @@ def test_compare_obeys_and_does_not_mix(tmp_path, capsys):
     assert "[adjustment] sigmas differ" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_how_far_things_moved_when_something_is_removed_obeys(tmp_path, capsys):
     most = {}
     for sigmas in KINDS:
@@ -106,6 +107,7 @@ def test_how_far_things_moved_when_something_is_removed_obeys(tmp_path, capsys):
     assert most["a_posteriori"] == pytest.approx(most[None] / sigma0, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_navigation_obeys(tmp_path):
     lab, _ = beacons(seed=4, n_table_epochs=5, n_free_epochs=4, n_night_epochs=3)
     found = {}
@@ -143,6 +145,7 @@ GKF = """<gama-local><network><parameters sigma-apr="10" conf-pr="0.99" sigma-ac
 </points-observations></network></gama-local>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("word", "kind"), [("apriori", "a_priori"), ("aposteriori", "a_posteriori")])
 def test_a_network_of_another_program_brings_its_kind_and_takes_it_along(tmp_path, word, kind):
     (tmp_path / "net.gkf").write_text(GKF.format(word), encoding="utf-8")

@@ -38,6 +38,7 @@ def test_solvepnp_finds_the_true_pose_of_a_hand_held_board():
         np.testing.assert_allclose(Pose3.Logmap(true.between(pose)), 0.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_station_carries_the_camera_through_the_whole_table_chain():
     survey, truth = head_on_table(2, n_table_epochs=3, n_free_epochs=1, axis_offset_mm=3.0)
     ideal = _noise_free(survey, truth)
@@ -81,6 +82,7 @@ def test_equal_seeds_give_equal_surveys_and_others_do_not():
     assert not np.array_equal(a.image_blocks[0].uv, c.image_blocks[0].uv)
 
 
+@pytest.mark.slow
 def test_noise_has_the_stated_covariance():
     survey, truth = head_on_table(1, n_table_epochs=2, n_free_epochs=0, sigma_px=0.2)
     cov = np.array([[0.04, 0.018], [0.018, 0.01]])
@@ -114,6 +116,7 @@ def test_pairs_distances_and_priors_are_drawn_around_the_truth():
     assert np.abs(error).max() > 1e-8
 
 
+@pytest.mark.slow
 def test_every_unknown_of_the_full_lab_has_a_truth_and_is_observed():
     survey, truth = full_lab(4)
     for camera in survey.cameras:

@@ -60,6 +60,7 @@ def test_turns_are_those_that_take_all_colours_to_themselves(columns, rows):
         assert np.cross(right, down)[2] > 0
 
 
+@pytest.mark.slow
 def test_a_camera_mounted_upside_down_is_named_and_resolved(tmp_path):
     folder = data_folder("calibration", "upside_down")
     outcome = adjust_job(folder, out=tmp_path / "out", progress=False)
@@ -79,6 +80,7 @@ def test_names_that_agree_stay_as_they_are(upside_down):
     assert notes == ()
 
 
+@pytest.mark.slow
 def test_single_images_named_from_the_other_end_are_resolved_too(upside_down):
     survey = upside_down.survey
     rng = np.random.default_rng(4)

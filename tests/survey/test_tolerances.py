@@ -9,9 +9,9 @@ from scipy.stats import norm, t
 
 from adjust.model.errors import SurveyError
 from survey.project import read, write_project
-from survey.project.project import AdjustmentOptions
+from survey.project.project import AdjustmentOptions, Tolerance
 from survey.solution.quantities import scale_of
-from survey.solution.tolerances import Tolerance, coverage, verdicts
+from survey.solution.tolerances import coverage, verdicts
 from tests.survey.adjustments import Lab, lab_adjustment
 
 TOML = """format = 1

@@ -11,7 +11,7 @@ from adjust.model.errors import SurveyError
 from survey.cli import main
 from survey.examples.alignment import FEET_MM, OFF, alignment_files
 from survey.jobs.aligning import align_job
-from survey.report.working_sheet import steps
+from survey.jobs.working_sheet import steps
 
 ARCSEC = np.pi / 648000
 
@@ -31,6 +31,7 @@ def definition(*pairs: tuple[str, str]) -> str:
     return text
 
 
+@pytest.mark.slow
 def test_what_is_off_is_found_with_an_honest_sigma(tmp_path: Path) -> None:
     """The rotation that the simulation gave the board, over noise: d' inv(C) d, three degrees of freedom each."""
     total, runs = 0.0, 12

@@ -12,17 +12,7 @@ from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Station, Survey, Table, Target
 from adjust.spatial.rigid import inverse, rigid, rotation_exp, skew
 from adjust.start.lenses import Sighting, start_lens
-from adjust.start.views import (
-    Sight,
-    View,
-    all_rays,
-    focal_px,
-    make_views,
-    refine_views,
-    target_points,
-    untrustworthy,
-    used_rows,
-)
+from adjust.start.views import Sight, View, all_rays, focal_px, make_views, target_points, untrustworthy, used_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +189,7 @@ def poses_of_views(survey: Survey) -> dict[int, View]:
             focal = focal_px(cameras[block.camera_id], lenses[block.camera_id])
             sights.append(Sight(i, x, rays[i][used], focal))
     # those without a pose are named by the search for start values
-    refined = refine_views(make_views(sights)[0])
+    refined = make_views(sights)[0]
     reasons, _ = untrustworthy(refined, survey)
     return {v.block_idx: v for v in refined if v.block_idx not in reasons}
 
@@ -218,7 +208,7 @@ def _gathered(
     seen = {b.epoch_id for b in blocks}
     epoch_ids = tuple(e for e in readings if e in seen)
     poses = np.array([v.poses[0] for v in views])
-    cov = np.array([_covariance(b, v) for b, v in zip(blocks, views, strict=True)])
+    cov = np.array([view_covariance(b, v) for b, v in zip(blocks, views, strict=True)])
     other_way = np.array(turned)
     poses[other_way] = inverse(poses[other_way])
     A = adjoint(poses[other_way])
@@ -231,7 +221,7 @@ def _gathered(
     )  # fmt: skip
 
 
-def _covariance(block: ImageBlock, view: View) -> FloatArray:
+def view_covariance(block: ImageBlock, view: View) -> FloatArray:
     """Covariance (6, 6) of camera_from_target, a small motion on its left, from the points' noise."""
     p = view.x @ view.poses[0][:3, :3].T + view.poses[0][:3, 3]
     depth = np.linalg.norm(p, axis=1)

@@ -1,4 +1,4 @@
-"""How the vertical, beams and surfaces move with the seven motions of a whole survey (:mod:`adjust.spatial.motions`)."""
+"""How the vertical, beams and surfaces move with the seven motions of a survey (``adjust.spatial.motions``)."""
 
 import gtsam
 import numpy as np
@@ -6,7 +6,8 @@ import numpy as np
 from adjust.frames.unknowns import Unknown, Unknowns
 from adjust.model.survey import FloatArray, Surface, Survey, tilt_axes
 from adjust.spatial.directions import tilted
-from adjust.spatial.motions import point_motions, skew
+from adjust.spatial.motions import point_motions
+from adjust.spatial.rigid import skew
 
 MOVED = ("vertical", "beam", "surface")
 

@@ -14,7 +14,7 @@ from adjust.model.observations import Alignment, CoordinateDifferences, LaserSpo
 from adjust.model.survey import BoolArray, FloatArray, Surface, tilt_axes
 from adjust.observations.factors import ChainPose, Jacobians, Position, Residual
 from adjust.spatial.directions import tilted_frame
-from adjust.spatial.motions import skew
+from adjust.spatial.rigid import skew
 from adjust.spatial.vertical import VerticalMap, up_at
 
 

@@ -18,18 +18,20 @@ from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.images import (
     BlockArrays,
+    BlocksAt,
+    ByKeys,
     KeyArrays,
     PointArrays,
     all_statistics,
+    block_rows,
     errors,
     local_by_keys,
     normal_equations,
     serve,
 )
 from adjust.native.parallel import run_split, split_blocks
-from adjust.native.trees import TreeArrays
+from adjust.native.trees import KeyCovariances, TreeArrays
 from adjust.observations.images.segments import block_keys
-from adjust.precision.tree import TreeCovariance
 
 
 def square_root_information(cov: FloatArray) -> FloatArray:
@@ -82,8 +84,8 @@ class Chains:
 class ImageBatch:
     """Image points of known targets (and of held world points), grouped per block.
 
-    ``prepare(values)`` evaluates everything; the factors serve what was prepared when they are asked at exactly these
-    values, and evaluate their own block otherwise, so the graph is correct in any GTSAM algorithm.
+    ``prepare`` evaluates everything; the factors serve that inside ``State.serving``, and evaluate their own block
+    otherwise, so the graph is correct in any GTSAM algorithm.
     """
 
     def __init__(
@@ -116,9 +118,6 @@ class ImageBatch:
         self.H = np.zeros((len(self.blocks), most, most))
         self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
         self._flat: FloatArray | None = None
-        self._served = np.zeros(len(self.blocks), dtype=np.bool_)
-        self._prepared: gtsam.Values | None = None
-        self._with_jacobians = False
         self._all = split_blocks(self.ptr)
 
     @cached_property
@@ -127,34 +126,29 @@ class ImageBatch:
         ptr, key = self.of_blocks.ptr.tolist(), self.of_blocks.key.tolist()
         return [key[a:b] for a, b in pairwise(ptr)]
 
-    def prepare(self, values: gtsam.Values, jacobians: bool) -> None:
-        """Evaluate all blocks at ``values``; ``state`` must have been loaded from the same values.
+    def at(self, W: FloatArray) -> BlocksAt:
+        """All blocks where the chains were last evaluated, weighted by W (3, N)."""
+        s, c = self.state, self.chains
+        return BlocksAt(self.arrays, self.points, W, s.lenses, c.R, c.t, s.warp)
+
+    @property
+    def by_keys(self) -> ByKeys:
+        """How the local unknowns of all blocks follow from their keys there."""
+        return ByKeys(self.of_blocks.segments, self.chains.C, self.state.D, self.of_blocks.columns)
+
+    def prepare(self, jacobians: bool) -> None:
+        """Evaluate all blocks at the values that ``state`` was loaded from.
 
         With ``jacobians`` the normal equations of every block, from which rows are served and poses are reduced.
         """
-        if values is self._prepared and self._with_jacobians >= jacobians:
-            return
         self.chains.evaluate(self.state)
         self._evaluate(self._all, jacobians)
-        self._prepared, self._with_jacobians = values, jacobians
-
-    @property
-    def prepared(self) -> gtsam.Values | None:
-        """The values at which everything was evaluated last."""
-        return self._prepared
-
-    def forget(self) -> None:
-        """Evaluate again when next asked, whatever the values."""
-        self._prepared = None
 
     def _evaluate(self, runs: list[IntArray], jacobians: bool) -> None:
-        s, c = self.state, self.chains
-        given = (self.arrays, self.points, self.W, s.lenses, c.R, c.t, s.warp)
         if jacobians:
-            run_split(normal_equations, runs, *given, self.H, self.chi, self.depth)
-            self._served[:] = False
+            run_split(normal_equations, runs, self.at(self.W), self.H, self.chi, self.depth)
         else:
-            run_split(errors, runs, *given, self.chi, self.depth)
+            run_split(errors, runs, self.at(self.W), self.chi, self.depth)
 
     def serve(self, which: IntArray | None = None) -> None:
         """Condense these blocks, or all, for their factors, as last prepared with Jacobians."""
@@ -163,10 +157,7 @@ class ImageBatch:
         if self._flat is None:
             self._make_room()
         runs = self._all if which is None else [which]
-        run_split(serve, runs, self.arrays, self.state.lenses, self.of_blocks.segments, self.chains.C,
-                  self.state.D, self.of_blocks.columns, self._at, self.H, self._flat, self.r)  # fmt: skip
-        for run in runs:
-            self._served[run] = True
+        run_split(serve, runs, self.at(self.W), self.by_keys, self._at, self.H, self._flat, self.r)
 
     def _make_room(self) -> None:
         """Where the rows of all factors are written, and views of them for GTSAM."""
@@ -186,29 +177,26 @@ class ImageBatch:
         self.state.load(values, self.chains.slots(b))
         c, links = self.chains, slice(self.chains.ptr[b], self.chains.ptr[b + 1])
         c.R[b : b + 1], c.t[b : b + 1], c.C[links] = c.one(self.state, b)
-        self._prepared = None
-        self._evaluate([np.array([b], dtype=np.int64)], jacobians)
+        alone: IntArray = np.array([b])
+        self._evaluate([alone], jacobians)
+        if jacobians:
+            self.serve(alone)
 
     def residual(self, b: int, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         """What GTSAM's custom factor of block ``b`` returns: its condensed residual, and its rows by key."""
-        alone = values is not self._prepared or (jacobians is not None and not self._with_jacobians)
-        if alone:
+        if not self.state.served:
             self._evaluate_alone(b, values, jacobians is not None)
         if jacobians is None:  # only the length of a residual is asked for: zeros, then the length
             length = np.zeros(int(self.n_rows[b]))
             length[-1] = np.sqrt(self.chi[b])
             return length
-        if not self._served[b]:
-            if not alone and self.state.loaded is not values:  # another factor was asked at other values in between
-                self.state.load(values)
-            self.serve(np.array([b], dtype=np.int64))
         for i, view in enumerate(self._views[b]):
             jacobians[i] = view
         return np.asarray(self.r[b, : self.n_rows[b]])
 
     def set_weights(self, weights: FloatArray) -> None:
         """Weights (N,) on top of the covariances; a point of weight zero is left out, the others are used."""
-        self.forget()
+        self.state.outdate()
         self.used = weights > 0.0
         self.W = self.W_all_columns * np.sqrt(weights)
 
@@ -224,26 +212,31 @@ class ImageBatch:
             if keys:
                 graph.add(gtsam.CustomFactor(noise[int(self.n_rows[b])], keys, _callback(self, b)))
 
+    def rows(self, b: int) -> FloatArray:
+        """Whitened rows (2 n, local unknowns and 1) of all points of block ``b``, used or not, the residual last."""
+        out = np.zeros((2 * int(self.ptr[b + 1] - self.ptr[b]), int(self.n_rows[b])))
+        block_rows(b, self.at(self.W_all_columns), out)
+        return out
+
     def local_from_keys(self, b: int) -> FloatArray:
         """Derivative (n_lens + 6 + n_warp, sum of key dims) of the block's local unknowns by its keys."""
         nl = int(self.state.lenses.n_free[self.camera[b]])
         G = np.zeros((int(self.n_rows[b]) - 1, int(self.of_blocks.columns[b])))
-        local_by_keys(b, nl, self.of_blocks.segments, self.chains.C, self.state.D, G)
+        local_by_keys(b, nl, self.by_keys, G)
         return G
 
-    def statistics(self, tree: TreeCovariance | None) -> tuple[FloatArray, FloatArray]:
+    def statistics(self, tree: KeyCovariances | None) -> tuple[FloatArray, FloatArray]:
         """Residuals (N, 2) px and whitened A Q A' (N, 3) of all points, where the chains were last evaluated.
 
         tree: covariances of the unknowns; without it, A Q A' is zero.
         """
         residual, influence = np.zeros((self.n_points, 2)), np.zeros((self.n_points, 3))
         number = tree.number if tree is not None else {}
-        s, c, k = self.state, self.chains, self.of_blocks
+        k = self.of_blocks
         keys = np.array([number.get(key, -1) for key in k.key.tolist()], dtype=np.int64)
         lost = np.zeros(len(self.blocks), dtype=np.int64)
         run_split(
-            all_statistics, self._all, self.arrays, self.points, self.W_all_columns, s.lenses, c.R, c.t, s.warp,
-            k.segments, c.C, s.D, k.columns, KeyArrays(k.ptr, keys, k.place),
+            all_statistics, self._all, self.at(self.W_all_columns), self.by_keys, KeyArrays(k.ptr, keys, k.place),
             tree.arrays if tree is not None else TreeArrays.nothing(), residual, influence, lost,
         )  # fmt: skip
         if lost.any() and tree is not None:

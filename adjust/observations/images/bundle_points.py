@@ -40,24 +40,14 @@ class PointFactor:
 
     def residual(self, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         """What GTSAM's custom factor returns: predicted minus observed (2,), whitened, and its derivatives by key."""
-        A, C = self._served(values) or self._alone(values)
+        A, C = self._alone(values)
         if jacobians is not None:
             for i, J in enumerate(self._by_keys(A, C)):
                 jacobians[i] = J
         return np.array(A[:, MAX_LENS + 6])
 
-    def _served(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray] | None:
-        """The row (2, MAX_LENS + 7) and the links' derivatives, where the batch has them of these values."""
-        b = self.batch
-        A = b.rows_at(values)
-        if A is None:
-            return None
-        if b.state.loaded is not values:  # the derivatives of tables are in the state
-            b.state.load(values)
-        return A[self.k], b.chains.C[b.chains.ptr[self.block] : b.chains.ptr[self.block + 1]]
-
     def _alone(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray]:
-        """The same at any values, from this image point alone."""
+        """The row (2, MAX_LENS + 7) and the links' derivatives, from this image point alone."""
         b, s = self.batch, self.batch.state
         s.load(values, b.chains.slots(self.block))
         R, t, C = b.chains.one(s, self.block)

@@ -71,11 +71,7 @@ class BundleBatch:
         self._sort_observations()
         self._place_local_unknowns()
         self._place_derivatives()
-        self._prepared: gtsam.Values | None = None
-        self._rows_at: tuple[gtsam.Values | None, FloatArray] = (None, self.W)
         self._blind_directions: FloatArray | None = None
-        self._damping = 0.0
-        self._with_jacobians = False
         self.chi_square = 0.0
         self.hidden_decrease = 0.0  # of chi-square, by the step of what is hidden
 
@@ -233,18 +229,13 @@ class BundleBatch:
 
     def evaluate_rows(self, values: gtsam.Values, W: FloatArray) -> None:
         """Fill A with the rows of all image points at ``values``, whitened by W (K, 3); chi-square and least depths."""
+        self.state.outdate()
         s, c = self.state, self.chains
         self._load_points(values)
         self.X[:] = self.world[self.point]
         rows(
             self.block, self.camera, s.lenses, c.R, c.t, self.X, self.uv, W, self.A, self.chi, self.depth,
         )  # fmt: skip
-        self._rows_at = (values, W)
-
-    def rows_at(self, values: gtsam.Values) -> FloatArray | None:
-        """The rows A as they are, where they and the chains are those of ``values`` and of the weights; else None."""
-        at, W = self._rows_at
-        return self.A if at is values and W is self.W else None
 
     def _load_points(self, values: gtsam.Values) -> None:
         """The free points: in one call where ``values`` hold no others, which it gives in the order of their keys."""
@@ -257,15 +248,11 @@ class BundleBatch:
 
     def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
         """Evaluate at ``values`` (already loaded into the state). Raises IndeterminateError for undetermined points."""
-        if values is self._prepared and damping == self._damping and self._with_jacobians >= jacobians:
-            return
-        self._prepared = None
         self.chains.evaluate(self.state)
         self.evaluate_rows(values, self.W)
         self.chi_square = float(self.chi.sum())
         if jacobians:
             self._condense(values, damping)
-        self._prepared, self._with_jacobians, self._damping = values, jacobians, damping
 
     def _condense(self, values: gtsam.Values, damping: float) -> None:
         S, g = np.zeros((self.n_local, self.n_local)), np.zeros(self.n_local)
@@ -431,10 +418,9 @@ class BundleBatch:
 
     def residual(self, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         """What GTSAM's custom factor returns."""
-        if values is not self._prepared or (jacobians is not None and not self._with_jacobians):
+        if not self.state.served:
             self.state.load(values)
             self.prepare(values, jacobians is not None)
-            self._prepared = None
         if jacobians is None:
             out = np.zeros(self.n_keys - self.n_hidden + 1)
             out[-1] = np.sqrt(self.chi_square)
@@ -445,7 +431,8 @@ class BundleBatch:
 
     def set_weights(self, weights: FloatArray) -> None:
         """Weights (N,), blocks in their order, on top of the covariances; a point of weight zero is left out."""
-        self._prepared = self._blind_directions = None
+        self.state.outdate()
+        self._blind_directions = None
         w = weights[self.sorted]
         self.used = w > 0.0
         self.W = self.W_all * np.sqrt(w)[:, None]
@@ -459,7 +446,6 @@ class BundleBatch:
     def whitened_squares(self, values: gtsam.Values) -> FloatArray:
         """Weighted squares v' inv(Q_ll) v (N,) of all image points at ``values``, blocks in their order."""
         self.evaluate_rows(values, self.W_all)
-        self._prepared = None
         return self.unsorted((self.A[:, :, MAX_LENS + 6] ** 2).sum(axis=1))
 
     def add_factor(self, graph: gtsam.NonlinearFactorGraph) -> None:

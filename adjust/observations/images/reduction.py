@@ -21,12 +21,24 @@ from adjust.native.parallel import run_split, split_blocks
 from adjust.native.reduction import WEAKEST_PIVOT, ReductionArrays, leaf_rows, pose_steps, reduce_poses
 from adjust.observations.images.batch import ImageBatch
 from adjust.observations.images.segments import first_seen, ranges
-from adjust.precision.tree import Leaves
 
 _FEWEST_POSES = 8
 _WIDEST_INTERFACE = 700
 """Components that the epochs may share: their normal matrix is dense here."""
 _AT_EPOCHS = ("world_from_station", "carrier_from_target")
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """Cliques of one frontal key each, eliminated before a tree: those of S, the others, lie in one of its cliques.
+
+    width: columns of the blocks [R S], one after the other and row by row in ``data``.
+    """
+
+    keys: list[list[int]]
+    front: IntArray
+    width: IntArray
+    data: FloatArray
 
 
 @dataclass(frozen=True)
@@ -80,7 +92,6 @@ class PoseReduction:
         runs = split_blocks(np.concatenate([[0], np.cumsum(np.diff(batch.ptr)[order])])[block_ptr])
         self._turns = [np.append(turn, run) for turn, run in enumerate(runs)]
         self._blocks = order
-        self._served: tuple[gtsam.Values | None, FloatArray] = (None, batch.W)
 
     def _place(
         self, at: IntArray, pose: IntArray, number: IntArray, widths: IntArray, order: IntArray, block_ptr: IntArray
@@ -108,16 +119,11 @@ class PoseReduction:
         batch, n, count = self.batch, self.interface.n, len(self._turns)
         rest, diagonal = np.zeros((count, n + 1, n + 1)), np.zeros((count, n))
         bad = np.full(count, -1, dtype=np.int64)
-        self._served = (None, batch.W)
         run_split(
-            reduce_poses, self._turns, self.arrays, batch.arrays, batch.state.lenses, batch.of_blocks.segments,
-            batch.of_blocks.columns, batch.chains.C, batch.state.D, damping, batch.H, self.L, self.T, diagonal, rest,
-            bad,
+            reduce_poses, self._turns, self.arrays, batch.at(batch.W), batch.by_keys, damping, batch.H, self.L, self.T,
+            diagonal, rest, bad,
         )  # fmt: skip
-        done = bool((bad < 0).all()) and self._serve(rest.sum(axis=0), diagonal.sum(axis=0))
-        if done:
-            self._served = (batch.prepared, batch.W)
-        return done
+        return bool((bad < 0).all()) and self._serve(rest.sum(axis=0), diagonal.sum(axis=0))
 
     def _serve(self, N: FloatArray, diagonal: FloatArray) -> bool:
         """Square root of what is left, as the rows of the factor."""
@@ -149,18 +155,15 @@ class PoseReduction:
 
     def _residual(self, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         batch = self.batch
+        if not batch.state.served:
+            batch.state.load(values)
+            batch.prepare(jacobians is not None)
+            if jacobians is not None and not self.reduce(0.0):
+                raise IndeterminateError("a pose that was reduced has no solution at these values")
         if jacobians is None:  # only the length of the residual is asked for
-            if values is not batch.prepared:
-                batch.state.load(values)
-                batch.prepare(values, False)
             length = np.zeros(self.interface.n + 1)
             length[-1] = np.sqrt(batch.chi[self._blocks].sum())
             return length
-        if values is not self._served[0] or batch.W is not self._served[1]:
-            batch.state.load(values)
-            batch.prepare(values, True)
-            if not self.reduce(0.0):
-                raise IndeterminateError("a pose that was reduced has no solution at these values")
         for i, view in enumerate(self._views):
             jacobians[i] = view
         return self._r

@@ -1,11 +1,13 @@
 """All readings of a survey: evaluated together, served to GTSAM chunk by chunk."""
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from typing import Any
 
 import gtsam
 import numpy as np
 
+from adjust.frames.state import State
 from adjust.frames.unknowns import VectorMap
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
@@ -24,8 +26,8 @@ class TerrestrialBatch:
     Arrays are in the order of ``Survey.readings``.
     """
 
-    def __init__(self, survey: Survey, parameters: TerrestrialParameters, layout: Layout) -> None:
-        self.parameters, self.layout = parameters, layout
+    def __init__(self, survey: Survey, state: State, parameters: TerrestrialParameters, layout: Layout) -> None:
+        self.state, self.parameters, self.layout = state, parameters, layout
         self.ids = [r.reading_id for r in survey.readings]
         self.sign = -1.0 if survey.bearings.clockwise else 1.0
         radius = survey.vertical.radius
@@ -58,8 +60,6 @@ class TerrestrialBatch:
         self._chained = [i for i, p in enumerate(layout.positions) if p.point_key is None and p.chain is not None]
         self.correlated = [c for c, chunk in enumerate(layout.chunks) if chunk.whitener is not None]
         self._views = [_blocks(chunk, self.J) for chunk in layout.chunks]
-        self._prepared: gtsam.Values | None = None
-        self._with_jacobians = False
         self.chi_square = 0.0
 
     @property
@@ -74,12 +74,13 @@ class TerrestrialBatch:
 
     def set_weights(self, weights: FloatArray) -> None:
         """Weights (N,) on top of the covariances; zero leaves a reading out."""
-        self._prepared = None
+        self.state.outdate()
         self.weights = np.array(weights, dtype=float)
 
     # -- evaluation --------------------------------------------------------------------------------------------------
 
     def _load(self, values: gtsam.Values, positions: IntArray | None, bodies: Sequence[int]) -> None:
+        self.state.outdate()
         plumb = self.parameters.vertical.at(values)
         for i, key in self._point_keys if positions is None else self._points_of(positions):
             self.X[i] = values.atPoint3(key)
@@ -112,20 +113,20 @@ class TerrestrialBatch:
         self.residual = k.wrapped(a.kind, self.predicted, a.observed)
 
     def prepare(self, values: gtsam.Values, jacobians: bool) -> None:
-        """Evaluate everything at ``values``. Raises SurveyError where the first values give a reading no direction."""
+        """Evaluate everything at ``values``; chi-square is infinite where these give a reading no direction."""
         self.evaluate(values)
-        self.chi_square = self._whiten(np.sqrt(self.weights))
-        if not np.isfinite(self.chi_square):
-            self.chi_square = np.inf
-            if self._prepared is None:
-                bad = int(np.flatnonzero(~np.isfinite(self.residual))[0])
-                raise SurveyError(
-                    f"reading {self.ids[bad]!r}: its positions coincide, or are one above the other, at the start "
-                    "values; give better coordinates"
-                )
+        chi_square = self._whiten(np.sqrt(self.weights))
+        self.chi_square = chi_square if np.isfinite(chi_square) else np.inf
         if jacobians:
             self._serve(np.sqrt(self.weights))
-        self._prepared, self._with_jacobians = values, jacobians
+
+    def require_directions(self) -> None:
+        """Raises SurveyError where the values that were evaluated last, those of the start, give a reading none."""
+        for bad in np.flatnonzero(~np.isfinite(self.residual))[:1].tolist():
+            raise SurveyError(
+                f"reading {self.ids[bad]!r}: its positions coincide, or are one above the other, at the start "
+                "values; give better coordinates"
+            )
 
     def _whiten(self, root: FloatArray) -> float:
         """Whitened residuals e (N,), of correlated readings jointly, times ``root``; returns their square sum."""
@@ -179,7 +180,6 @@ class TerrestrialBatch:
     def unweighted(self, values: gtsam.Values) -> FloatArray:
         """Whitened residuals (N,) of all readings at ``values``, whatever their weight; J holds rows to match."""
         self.evaluate(values)
-        self._prepared = None
         root = np.ones(len(self.weights))
         self._whiten(root)
         self._serve(root)
@@ -190,16 +190,16 @@ class TerrestrialBatch:
         views = self._views[c]
         return np.hstack(views) if views else np.zeros((len(self.layout.chunks[c].rows), 0))
 
-    def update_sigmas(self, values: gtsam.Values) -> float:
-        """Sigmas with the target's centring at these distances; returns the largest relative change."""
+    def with_sigmas_at(self, values: gtsam.Values) -> tuple["TerrestrialBatch", float]:
+        """The readings with sigmas that have the target's centring at these distances; the largest relative change."""
         if not self.layout.arrays.target_centring.any():
-            return 0.0
+            return self, 0.0
         self.evaluate(values)
-        self._prepared = None
         joint = [r for c in self.correlated for r in self.layout.chunks[c].rows]
-        before, self.sigma = self.sigma, sigmas(self.layout.arrays, self.horizon.axes, self.A)
-        self.sigma[joint] = before[joint]
-        return float(np.max(np.abs(self.sigma / before - 1.0)))
+        out = copy(self)  # its working memory is that of the last evaluation, whichever of them was evaluated
+        out.sigma = sigmas(self.layout.arrays, self.horizon.axes, self.A)
+        out.sigma[joint] = self.sigma[joint]
+        return out, float(np.max(np.abs(out.sigma / self.sigma - 1.0)))
 
     # -- GTSAM -------------------------------------------------------------------------------------------------------
 
@@ -217,7 +217,7 @@ class TerrestrialBatch:
     def residual_of(self, c: int, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         """What GTSAM's custom factor of chunk ``c`` returns."""
         rows = self.layout.chunks[c].rows
-        if values is not self._prepared or (jacobians is not None and not self._with_jacobians):
+        if not self.state.served:
             self._alone(c, values)
         if jacobians is not None:
             for i, block in enumerate(self._views[c]):
@@ -226,7 +226,6 @@ class TerrestrialBatch:
 
     def _alone(self, c: int, values: gtsam.Values) -> None:
         """Evaluate one chunk, for a caller that did not prepare the batch."""
-        self._prepared = None
         layout, a = self.layout, self.layout.arrays
         chunk = layout.chunks[c]
         rows = chunk.rows
@@ -259,7 +258,6 @@ class TerrestrialBatch:
         poses: keys of stations that are turned instead, by setup whose orientation is held for their sake.
         """
         self.evaluate(values)
-        self._prepared = None
         a = self.layout.arrays
         for i, (setup_id, vector) in enumerate(self.parameters.orientations.items()):
             rows = np.flatnonzero((a.orientation == i) & (a.kind == k.DIRECTION))

@@ -51,5 +51,5 @@ def build_batch(
     poses = [ChainPose(unknowns, state, frames.relative(ref.frame or FrameRef("world"), FrameRef("world")))
              for ref in bodies]  # fmt: skip
     layout = LayoutBuilder(survey, unknowns, parameters, arrays, [at[ref] for ref in refs], poses).build()
-    return TerrestrialBatch(survey, parameters, layout)
+    return TerrestrialBatch(survey, state, parameters, layout)
 

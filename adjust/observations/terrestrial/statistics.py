@@ -11,16 +11,15 @@ import gtsam
 import numpy as np
 
 from adjust.model.result import ObservationResidual, ReadingResiduals
-from adjust.model.survey import FloatArray, IntArray, Survey
-from adjust.native.trees import row_influences
+from adjust.model.survey import FloatArray, Survey
+from adjust.native.trees import KeyCovariances, row_influences
 from adjust.observations.listed import position_text
 from adjust.observations.terrestrial.batch import TerrestrialBatch
-from adjust.precision.tree import TreeCovariance
 
 _ANGLES = ("direction", "angle", "zenith", "azimuth")
 
 
-def influences(batch: TerrestrialBatch, tree: TreeCovariance) -> FloatArray:
+def influences(batch: TerrestrialBatch, tree: KeyCovariances) -> FloatArray:
     """Whitened a Q a' (N,) of all readings; the batch serves its rows unweighted. Order of ``Survey.readings``."""
     chunks = batch.layout.chunks
     rows, keys = np.array([(len(c.rows), len(c.keys)) for c in chunks], dtype=np.int64).reshape(-1, 2).T
@@ -36,7 +35,7 @@ def influences(batch: TerrestrialBatch, tree: TreeCovariance) -> FloatArray:
     return out
 
 
-def reading_residuals(batch: TerrestrialBatch, tree: TreeCovariance, values: gtsam.Values) -> ReadingResiduals:
+def reading_residuals(batch: TerrestrialBatch, tree: KeyCovariances, values: gtsam.Values) -> ReadingResiduals:
     """Residuals and their statistics of all readings at ``values``."""
     e = batch.unweighted(values)
     used = batch.used
@@ -51,12 +50,14 @@ def reading_residuals(batch: TerrestrialBatch, tree: TreeCovariance, values: gts
     for c in batch.correlated:
         chunk = batch.layout.chunks[c]
         if chunk.whitener is not None:
-            rows, W = chunk.rows, chunk.whitener
-            A = batch.jacobian(c)
+            rows, A = chunk.rows, batch.jacobian(c)
             M = A @ tree.joint(chunk.keys) @ A.T
-            Q = np.eye(len(rows)) - M if used[rows].all() else np.eye(len(rows)) + M
-            _correlated(W, Q, batch.residual[rows], e[rows], used[rows].all(),
-                        rows, redundancy, own, standardized, test)  # fmt: skip
+            in_use = bool(used[rows].all())
+            Q = np.eye(len(rows)) - M if in_use else np.eye(len(rows)) + M
+            own[rows], standardized[rows], test[rows], found = _correlated(
+                chunk.whitener, Q, batch.residual[rows], e[rows]
+            )
+            redundancy[rows] = found if in_use else 0.0
     observed = batch.layout.arrays.observed
     return ReadingResiduals(
         observed, observed + batch.residual, batch.residual.copy(), sigma, own * sigma, redundancy, standardized, test,
@@ -65,18 +66,20 @@ def reading_residuals(batch: TerrestrialBatch, tree: TreeCovariance, values: gts
 
 
 def _correlated(
-    W: FloatArray, Q: FloatArray, v: FloatArray, e: FloatArray, used: np.bool_, rows: IntArray, redundancy: FloatArray,
-    own: FloatArray, standardized: FloatArray, test: FloatArray,
-) -> None:  # fmt: skip
+    W: FloatArray, Q: FloatArray, v: FloatArray, e: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Of readings v with whitener W, e = W v of covariance Q: sigma of v over theirs, v standardized, w^2, redundancy.
+
+    Each (k,); nan where nothing controls a reading.
+    """
     root = np.linalg.inv(W)
     sigma = np.sqrt(np.diag(root @ root.T))
     sigma_v = np.sqrt(np.maximum(0.0, np.diag(root @ Q @ root.T)))
     scale = np.sqrt(np.maximum(0.0, np.diag(W.T @ Q @ W)))
     with np.errstate(divide="ignore", invalid="ignore"):
-        standardized[rows] = np.where(sigma_v > 1e-6 * sigma, v / sigma_v, np.nan)
-        test[rows] = np.where(scale * sigma > 1e-6, (W.T @ e) / scale, np.nan) ** 2
-    own[rows] = sigma_v / sigma
-    redundancy[rows] = np.diag(root @ Q @ W) if used else 0.0
+        standardized = np.where(sigma_v > 1e-6 * sigma, v / sigma_v, np.nan)
+        test = np.where(scale * sigma > 1e-6, (W.T @ e) / scale, np.nan) ** 2
+    return sigma_v / sigma, standardized, test, np.diag(root @ Q @ W)
 
 
 class JoinedResiduals(Sequence[ObservationResidual]):

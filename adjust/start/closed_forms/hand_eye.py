@@ -1,7 +1,5 @@
 """AX = XB and AX = ZB: what is rigidly fixed to something that moves by known motions."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from adjust.model.errors import SurveyError
@@ -70,35 +68,18 @@ def _turn_onto(alpha: FloatArray, beta: FloatArray, weights: FloatArray, axis: F
 def solve_ax_zb(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """``x``, ``z`` (4, 4) with a x = z b for poses a, b (n, 4, 4), and weights (n,) from 0 (a bad pair) to 1.
 
-    Source: Shah, J. Mechanisms and Robotics 5(3), 2013: vec(R_z) = (R_b kron R_a) vec(R_x), so R_x and R_z are the
-    right and left singular vectors of the summed Kronecker products; translations jointly by least squares. Reweighted.
-    Raises SurveyError for fewer than three poses, and naming the undetermined direction where all turns between the
-    poses are about one axis or too small.
+    Source: Shah, J. Mechanisms and Robotics 5(3), 2013, which is :func:`solve_views` of one thing from one. Raises
+    SurveyError for fewer than three poses, and naming the undetermined direction where all turns between the poses are
+    about one axis or too small.
     """
     if len(a) < 3:
         raise SurveyError(f"{len(a)} pose(s) cannot determine both transforms of AX = ZB: at least three are needed")
     axis = degenerate_direction(rotation_log(np.swapaxes(a[:1, :3, :3], -1, -2) @ a[1:, :3, :3]))
     if axis is not None:
         raise SurveyError(_undetermined(axis, len(a)))
-    weights = _consensus(a, b)
-    for _ in range(15):
-        r_x, r_z = _kronecker(a, b, weights)
-        miss = np.linalg.norm(rotation_log(np.swapaxes(r_z @ b[:, :3, :3], -1, -2) @ (a[:, :3, :3] @ r_x)), axis=1)
-        weights = _weights(miss, floor=1e-9)
-    n = len(a)
-    factor = np.concatenate([a[:, :3, :3], np.broadcast_to(-np.eye(3), (n, 3, 3))], axis=2)
-    right = b[:, :3, 3] @ r_z.T - a[:, :3, 3]
-    t, shift_weights = _robust_least_squares(factor, right, weights)
-    return rigid(r_x, t[:3]), rigid(r_z, t[3:]), weights * shift_weights
-
-
-def _kronecker(a: FloatArray, b: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    k = np.einsum("n,nij,nkl->ikjl", weights, b[:, :3, :3], a[:, :3, :3]).reshape(9, 9)
-    u, _, vt = np.linalg.svd(k)
-    x, z = vt[0].reshape(3, 3).T, u[:, 0].reshape(3, 3).T
-    if np.linalg.det(x) < 0:
-        x, z = -x, -z
-    return nearest_rotation(x), nearest_rotation(z)
+    one = np.zeros(len(a), dtype=np.int64)
+    x, z, weights, _ = _solved(a, inverse(b), one, one, _consensus(a, b))
+    return x[0], z[0], weights
 
 
 def solve_views(
@@ -112,11 +93,20 @@ def solve_views(
     all of 0 ... m - 1 and 0 ... k - 1. Raises SurveyError where the null vector is not the only one: too few views, or
     all turns about one axis.
     """
+    x, z, weights, (least, second_least) = _solved(a, b, first, second, np.ones(len(a)))
+    if not second_least > max(_ONE_NULL_VECTOR * max(least, 0.0), _SMALLEST_GAP):
+        raise SurveyError("the views leave rotations undetermined: more, or turns about a second axis, are needed")
+    return x, z, weights
+
+
+def _solved(
+    a: FloatArray, b: FloatArray, first: IntArray, second: IntArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """:func:`solve_views` from first weights (n,), and the two least eigenvalues of its last system."""
     m, k = int(first.max()) + 1, int(second.max()) + 1
-    weights = np.ones(len(a))
     blocks = np.einsum("nkl,nij->nkilj", np.swapaxes(b[:, :3, :3], 1, 2), a[:, :3, :3]).reshape(-1, 9, 9)
     for _ in range(_ROUNDS):
-        r_x, r_z = _all_rotations(blocks, first, second, weights, m, k)
+        r_x, r_z, smallest = _all_rotations(blocks, first, second, weights, m, k)
         turned = a[:, :3, :3] @ r_x[first] @ b[:, :3, :3]
         miss = np.linalg.norm(rotation_log(np.swapaxes(r_z[second], -1, -2) @ turned), axis=1)
         weights = _weights(miss, floor=1e-9)
@@ -125,16 +115,20 @@ def solve_views(
     for c in range(3):
         factor[np.arange(n), :, 3 * first + c] = a[:, :3, c]
         factor[np.arange(n), c, 3 * (m + second) + c] = -1.0
-    right = -a[:, :3, 3] - np.einsum("nij,nj->ni", a[:, :3, :3] @ r_x[first], b[:, :3, 3])
+    # R_z inv(R_b) instead of R_a R_x: one rotation from all views instead of each one's own
+    right = -a[:, :3, 3] + np.einsum("nij,nj->ni", r_z[second], inverse(b)[:, :3, 3])
     t, shift_weights = _robust_least_squares(factor, right, weights)
     shifts = t.reshape(-1, 3)
-    return rigid(r_x, shifts[:m]), rigid(r_z, shifts[m:]), weights * shift_weights
+    return rigid(r_x, shifts[:m]), rigid(r_z, shifts[m:]), weights * shift_weights, smallest
 
 
 def _all_rotations(
     blocks: FloatArray, first: IntArray, second: IntArray, weights: FloatArray, m: int, k: int
-) -> tuple[FloatArray, FloatArray]:
-    """Rotations (m, 3, 3), (k, 3, 3) from the null vector of blocks (n, 9, 9) vec(x) - vec(z) = 0, vec by columns."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rotations (m, 3, 3), (k, 3, 3) from the null vector of blocks (n, 9, 9) vec(x) - vec(z) = 0, vec by columns.
+
+    And the two least eigenvalues of the scaled system.
+    """
     N = np.zeros((m + k, m + k, 9, 9))
     np.add.at(N, (first, first), weights[:, None, None] * np.eye(9))  # the blocks are orthogonal
     np.add.at(N, (m + second, m + second), weights[:, None, None] * np.eye(9))
@@ -143,13 +137,11 @@ def _all_rotations(
     seen = np.sqrt(np.maximum(np.einsum("iijj->i", N) / 9.0, 1e-12))
     N = (N / seen[:, None, None, None] / seen[None, :, None, None]).swapaxes(1, 2).reshape(9 * (m + k), -1)
     w, v = np.linalg.eigh(N)
-    if not w[1] > max(_ONE_NULL_VECTOR * max(float(w[0]), 0.0), _SMALLEST_GAP):
-        raise SurveyError("the views leave rotations undetermined: more, or turns about a second axis, are needed")
     found = (v[:, 0].reshape(m + k, 9) / seen[:, None]).reshape(m + k, 3, 3).swapaxes(1, 2)
     if np.linalg.det(found / np.linalg.norm(found, axis=(1, 2), keepdims=True)).sum() < 0.0:
         found = -found
-    r = np.array([nearest_rotation(x) for x in found])
-    return r[:m], r[m:]
+    r = nearest_rotation(found)
+    return r[:m], r[m:], w[:2]
 
 
 def _consensus(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -189,27 +181,16 @@ def _undetermined(axis: FloatArray, n: int) -> str:
     )
 
 
-def screw_pairs(n: int, turns: Callable[[int], FloatArray], per_item: int = 4) -> list[tuple[int, int]]:
-    """Pairs of n poses with large turns between them: ``turns(i)`` gives the angle (n,) rad of each against pose i.
+def relative_motions(a: FloatArray, b: FloatArray, per_item: int = 4) -> tuple[FloatArray, FloatArray]:
+    """Motions between poses a, b (n, 4, 4) of ``a_i x = z b_i`` for :func:`solve_ax_xb`: a_j^-1 a_i and b_j^-1 b_i.
 
-    For every pose the ``per_item`` others nearest to a turn of 100 degrees, where the rotation axis is sharp and the
-    logarithm still unambiguous.
+    Of every pose with the ``per_item`` others nearest to a turn of 100 degrees, where the rotation axis is sharp and
+    the logarithm still unambiguous.
     """
     pairs: set[tuple[int, int]] = set()
-    for i in range(n):
-        order = np.argsort(np.abs(turns(i) - np.deg2rad(100.0)), kind="stable")
-        for j in [int(j) for j in order if j != i][:per_item]:
-            pairs.add((min(i, j), max(i, j)))
-    return sorted(pairs)
-
-
-def relative_motions(a: FloatArray, b: FloatArray, per_item: int = 4) -> tuple[FloatArray, FloatArray]:
-    """Motions between poses a, b (n, 4, 4) of ``a_i x = z b_i`` for :func:`solve_ax_xb`: a_j^-1 a_i and b_j^-1 b_i."""
-
-    def turns(i: int) -> FloatArray:
-        relative = np.swapaxes(a[i : i + 1, :3, :3], -1, -2) @ a[:, :3, :3]
-        return np.asarray(np.linalg.norm(rotation_log(relative), axis=1))
-
-    pairs = np.array(screw_pairs(len(a), turns, per_item), dtype=np.int64).reshape(-1, 2)
-    i, j = pairs[:, 0], pairs[:, 1]
-    return inverse(a[j]) @ a[i], inverse(b[j]) @ b[i]
+    for i in range(len(a)):
+        turns = np.linalg.norm(rotation_log(np.swapaxes(a[i, :3, :3], -1, -2) @ a[:, :3, :3]), axis=1)
+        order = np.argsort(np.abs(turns - np.deg2rad(100.0)), kind="stable")
+        pairs |= {(min(i, j), max(i, j)) for j in order[order != i][:per_item].tolist()}
+    first, second = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2).T
+    return inverse(a[second]) @ a[first], inverse(b[second]) @ b[first]

@@ -1,4 +1,4 @@
-"""Focal lengths and principal point from homographies of a plane, and radial distortion from known poses."""
+"""Focal lengths and principal point from homographies of a plane."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ def pinhole_from_homographies(
     width, height = image_size
     centre, scale = np.array([(width - 1) / 2.0, (height - 1) / 2.0]), max(width, height) / 2.0
     to_unit = np.array([[1 / scale, 0, -centre[0] / scale], [0, 1 / scale, -centre[1] / scale], [0, 0, 1]])
-    rows = np.concatenate([_constraints(to_unit @ h) for h in homographies])
+    rows = _constraints(to_unit @ homographies)
     for variant in variants:
         if variant == "full" and len(homographies) < 3:
             continue
@@ -44,14 +44,15 @@ def pinhole_from_homographies(
 
 
 def _constraints(h: FloatArray) -> FloatArray:
-    """Two rows in (B11, B22, B13, B23, B33), each of unit scale."""
-    h = h / np.sqrt(np.linalg.norm(h[:, 0]) * np.linalg.norm(h[:, 1]))
+    """Two rows for each of h (m, 3, 3) in (B11, B22, B13, B23, B33), each of unit scale."""
+    a, b = (h[:, :, i] / np.sqrt(np.linalg.norm(h[:, :, 0], axis=1) * np.linalg.norm(h[:, :, 1], axis=1))[:, None]
+            for i in (0, 1))  # fmt: skip
 
-    def v(i: int, j: int) -> FloatArray:
-        a, b = h[:, i], h[:, j]
-        return np.array([a[0] * b[0], a[1] * b[1], a[2] * b[0] + a[0] * b[2], a[2] * b[1] + a[1] * b[2], a[2] * b[2]])
+    def v(a: FloatArray, b: FloatArray) -> FloatArray:
+        a0, a1, a2, b0, b1, b2 = *a.T, *b.T
+        return np.column_stack([a0 * b0, a1 * b1, a2 * b0 + a0 * b2, a2 * b1 + a1 * b2, a2 * b2])
 
-    return np.stack([v(0, 1), v(0, 0) - v(1, 1)])
+    return np.concatenate([v(a, b), v(a, a) - v(b, b)])
 
 
 def _solve(rows: FloatArray, variant: str) -> FloatArray | None:
@@ -84,16 +85,3 @@ def _plausible(values: FloatArray, image_size: tuple[int, int], scale: float) ->
     fx, fy, u0, v0 = values
     inside = abs(u0) < 0.5 * image_size[0] / scale and abs(v0) < 0.5 * image_size[1] / scale
     return bool(0.1 < fx < 50 and 0.1 < fy < 50 and 0.5 < fx / fy < 2.0 and inside)
-
-
-def radial_distortion(xy: FloatArray, uv: FloatArray, pinhole: FloatArray, terms: int = 2) -> FloatArray:
-    """k1, k2 ... (terms,) from ideal normalised points (n, 2) and measured pixels (n, 2), pinhole = fx, fy, u0, v0.
-
-    Source: Zhang, PAMI 22(11), 2000, eq. 13: measured - ideal = (ideal - centre) (k1 r^2 + k2 r^4), least squares.
-    """
-    ideal = xy * pinhole[:2]
-    r2 = np.sum(xy**2, axis=1)
-    powers = np.stack([r2 ** (i + 1) for i in range(terms)], axis=1)
-    a = np.concatenate([ideal[:, :1] * powers, ideal[:, 1:] * powers])
-    d = uv - pinhole[2:] - ideal
-    return np.asarray(np.linalg.lstsq(a, np.concatenate([d[:, 0], d[:, 1]]), rcond=None)[0])

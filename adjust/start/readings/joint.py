@@ -12,9 +12,9 @@ from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, Survey
 from adjust.observations.terrestrial.building import reading_refs
 from adjust.start import Start, find_start
-from adjust.start.given import given_poses
+from adjust.start.given import given_poses, with_poses
 from adjust.start.readings.start import explain, find_points, given_points, lacking_points, with_start
-from adjust.start.readings.tilted import find_tilted, station_name, tilted_sights, with_poses
+from adjust.start.readings.tilted import find_tilted, station_name, tilted_sights
 
 
 def needs_points(survey: Survey) -> bool:

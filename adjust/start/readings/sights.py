@@ -61,6 +61,32 @@ def horizon_axes(survey: Survey) -> FloatArray:
     return np.array([line.zero, np.cross(line.up, line.zero), line.up])
 
 
+def ties(survey: Survey) -> list[tuple[PositionRef, PositionRef, FloatArray]]:
+    """Positions and the observed differences (3,) m from the first to the second, where used and whole."""
+    return [
+        (a, b, v)
+        for d in survey.coordinate_differences if d.used
+        for a, b, v, variances in zip(d.at, d.to, d.values, np.diag(d.cov).reshape(-1, 3), strict=True)
+        if np.isfinite(variances).all()
+    ]  # fmt: skip
+
+
+def spread_differences(survey: Survey, known: dict[Node, FloatArray]) -> bool:
+    """Add to ``known``, (3,) m in the world, what lies at the other end of observed differences; whether any does."""
+    edges = [(node_of(a), node_of(b), v) for a, b, v in ties(survey)]
+    first = before = len(known)
+    while edges:
+        for a, b, v in edges:
+            if a in known and b not in known:
+                known[b] = known[a] + v
+            elif b in known and a not in known:
+                known[a] = known[b] - v
+        if len(known) == before:
+            break
+        before = len(known)
+    return before > first
+
+
 def collect_sights(survey: Survey) -> Sights:
     """All used readings and distances of levelled setups."""
     out = Sights()

@@ -10,7 +10,7 @@ from adjust.model.observations import PositionRef
 from adjust.model.survey import FloatArray, Point, Survey
 from adjust.observations.listed import position_text
 from adjust.start.readings.plane import PlaneStart
-from adjust.start.readings.sights import Node, Sights, collect_sights, horizon_axes
+from adjust.start.readings.sights import Node, Sights, collect_sights, horizon_axes, node_of, spread_differences, ties
 from adjust.start.readings.space import spread_space
 from adjust.start.readings.tilted import tilted_sights
 
@@ -120,22 +120,15 @@ def spread_heights(
 
 
 def _baselines(survey: Survey, E: FloatArray, xy: dict[Node, complex], height: dict[Node, float]) -> None:
-    """Points at the other end of observed coordinate differences."""
-    pairs = [(a.point_id, b.point_id, E @ v) for d in survey.coordinate_differences if d.used
-             and np.isfinite(np.diag(d.cov)).all()
-             for a, b, v in zip(d.at, d.to, d.values, strict=True)
-             if a.frame is None and b.frame is None]  # fmt: skip
-    if pairs and not xy:
-        xy[str(pairs[0][0])], height[str(pairs[0][0])] = 0j, 0.0
-    grew = True
-    while grew:
-        grew = False
-        for a, b, v in pairs:
-            for p, q, sign in ((str(a), str(b), 1.0), (str(b), str(a), -1.0)):
-                if p in xy and p in height and (q not in xy or q not in height):
-                    xy[q] = xy[p] + sign * complex(v[0], v[1])
-                    height[q] = height[p] + sign * float(v[2])
-                    grew = True
+    """Points at the other end of observed coordinate differences, from the first of them where nothing is known."""
+    known = {n: E.T @ np.array([z.real, z.imag, height[n]]) for n, z in xy.items() if n in height}
+    between = [a for a, b, _ in ties(survey) if a.frame is None and b.frame is None]
+    if between and not xy:
+        known = {node_of(between[0]): np.zeros(3)}
+    if spread_differences(survey, known):
+        for n, x in known.items():
+            local = E @ x
+            xy[n], height[n] = complex(local[0], local[1]), float(local[2])
 
 
 def with_start(survey: Survey, found: Mapping[str, FloatArray]) -> Survey:

@@ -5,7 +5,7 @@ points that it sees and that are known, by resection or by fitting; points follo
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from gtsam import Pose3
@@ -14,11 +14,11 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, Survey
+from adjust.native.views import refine_poses, view_errors
 from adjust.spatial.rigid import align, inverse, rotation_exp
 from adjust.start.closed_forms.absolute_pose import pose_solutions
 from adjust.start.closed_forms.triangulation import intersect
-from adjust.start.closed_forms.views import refine_poses, view_errors
-from adjust.start.readings.sights import Node, node_of
+from adjust.start.readings.sights import Node, node_of, spread_differences
 
 _PARALLAX = np.deg2rad(0.3)
 _TOGETHER = np.deg2rad(75.0)
@@ -127,24 +127,10 @@ class _Search:
     def _advance(self) -> bool:
         """One step, the first of the list that is possible; whether there was one."""
         return (
-            self._ties() or self._targets() or self._turns() or self._stations(_SURE) or self._points()
-            or self._stations(_FEWEST) or self._untold_turns() or self._set_freely()
+            spread_differences(self.survey, self.start.known) or self._targets() or self._turns()
+            or self._stations(_SURE) or self._points() or self._stations(_FEWEST) or self._untold_turns()
+            or self._set_freely()
         )  # fmt: skip
-
-    def _ties(self) -> bool:
-        """Positions at the other end of observed coordinate differences."""
-        known, before = self.start.known, len(self.start.known)
-        for d in self.survey.coordinate_differences:
-            variances = np.diag(d.cov).reshape(-1, 3)
-            for a, b, v, var in zip(d.at, d.to, d.values, variances, strict=True):
-                if not d.used or not np.isfinite(var).all():
-                    continue
-                p, q = node_of(a), node_of(b)
-                if p in known and q not in known:
-                    known[q] = known[p] + v
-                elif q in known and p not in known:
-                    known[p] = known[q] - v
-        return len(known) > before
 
     def _targets(self) -> bool:
         """Targets of which three points are known, and from these all their points."""
@@ -293,28 +279,3 @@ def _resections(x: FloatArray, rays: FloatArray) -> FloatArray:
         except SurveyError:  # on a line, or too wide: another group may do
             continue
     return np.concatenate(out)
-
-
-def with_poses(survey: Survey, poses: Mapping[ParameterName, Pose3]) -> Survey:
-    """The survey with these poses of stations and targets as start values where it has none."""
-    stations = []
-    for s in survey.stations:
-        name: ParameterName = ("world_from_station", s.station_id)
-        if s.world_from_station.value is None and name in poses:
-            s = replace(s, world_from_station=replace(s.world_from_station, value=poses[name]))
-        found = {n[2]: p for n, p in poses.items() if len(n) == 3 and n[:2] == name}
-        epochs = dict(s.epochs)
-        for epoch, pose in found.items():
-            own = epochs.get(epoch, s.world_from_station)
-            if own.value is None:
-                epochs[epoch] = replace(own, value=pose)
-        stations.append(replace(s, epochs=epochs))
-    targets = []
-    for t in survey.targets:
-        pose_of = poses.get(("carrier_from_target", t.target_id))
-        if t.carrier_from_target.value is None and pose_of is not None:
-            t = replace(t, carrier_from_target=replace(t.carrier_from_target, value=pose_of))
-        targets.append(t)
-    return replace(survey, stations=tuple(stations), targets=tuple(targets))
-
-

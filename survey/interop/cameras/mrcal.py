@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from adjust.lenses.models import MODELS
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, LensParameter
-from adjust.spatial.motions import skew
+from adjust.spatial.rigid import skew
 from survey.folder.text import decode, read_bytes
 from survey.interop.cameras.lens_maps import BROWN_8, MappedLens
 from survey.interop.cameras.rig import Rig, RigCamera, lens_of, pose_of, rig_network

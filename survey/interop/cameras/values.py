@@ -14,10 +14,8 @@ from adjust.model.survey import Camera, FloatArray, Station, Survey, Target
 from adjust.observations.images.batch import warp_shape
 from survey.interop.cameras.lens_maps import MappedLens, mapped_lens
 from survey.interop.cameras.rig import Rig, RigCamera
-from survey.jobs.adjusting.job import adjust_project
 from survey.project import Project
 from survey.project.targets import TargetKind
-from survey.report.results import RESULTS
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import scale_of
 
@@ -112,14 +110,12 @@ class CameraValues:
         return [e for e in found if self.frames.world_from(FrameRef("station", station.station_id, e)) is not None]
 
 
-def camera_values(project: Project) -> CameraValues:
-    """The values of a project. One with results is adjusted again, because its files do not hold every covariance."""
-    survey = project.survey
-    kinds = project.target_kinds
-    if not (project.folder / RESULTS / "solution.json").is_file():
+def camera_values(project: Project, result: Adjustment | None = None) -> CameraValues:
+    """The values of a project: those of its adjustment, or its start values where there is none."""
+    survey, kinds = project.survey, project.target_kinds
+    if result is None:
         start = cast(Adjustment, _Start(survey, {}))
         return CameraValues(survey, project.title, AdjustedFrames(start), {}, 1.0, False, kinds)
-    result = adjust_project(project, progress=False)
     factor = scale_of(result, project.options.sigmas).factor
     return CameraValues(
         result.survey, project.title, AdjustedFrames(result), result.estimates, factor, True, kinds

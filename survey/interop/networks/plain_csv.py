@@ -15,7 +15,7 @@ from typing import get_args
 
 import numpy as np
 
-from adjust.model.observations import CoordinateDifferences, Reading, ReadingKind
+from adjust.model.observations import CoordinateDifferences, Coordinates, Reading, ReadingKind
 from adjust.model.survey import Bearings, FloatArray
 from survey.folder.text import suggestion
 from survey.interop.networks.draft import AXES, DraftPoint, NetworkDraft, Vectors
@@ -225,11 +225,12 @@ def _reading_row(r: Reading) -> dict[str, str]:
 
 def _vector_rows(network: NetworkValues) -> list[dict[str, str]]:
     survey, rows = network.survey, []
-    for o in (*survey.coordinate_differences, *survey.coordinates):
-        difference = isinstance(o, CoordinateDifferences)
-        kind = "coordinate_difference" if difference else "coordinates"
-        at = [point_of(p) for p in o.at] if difference else [""] * len(o.values)
-        to = [point_of(p) for p in (o.to if difference else o.positions)]
+    vectors: tuple[CoordinateDifferences | Coordinates, ...] = (*survey.coordinate_differences, *survey.coordinates)
+    for o in vectors:
+        if isinstance(o, CoordinateDifferences):
+            kind, at, to = "coordinate_difference", [point_of(p) for p in o.at], [point_of(p) for p in o.to]
+        else:
+            kind, at, to = "coordinates", [""] * len(o.values), [point_of(p) for p in o.positions]
         for k, (a, t) in enumerate(zip(at, to, strict=True)):
             if not o.used or t is None or a is None:
                 continue
@@ -249,8 +250,8 @@ def correlated(network: NetworkValues) -> tuple[str, ...]:
     """What of a network's covariances a plain table cannot hold, for people."""
     survey = network.survey
     n = sum(len(c.reading_ids) for c in survey.reading_covariances)
-    m = sum(np.count_nonzero(np.where(np.isfinite(o.cov), o.cov, 0.0)) > np.isfinite(np.diagonal(o.cov)).sum()
-            for o in (*survey.coordinate_differences, *survey.coordinates))  # fmt: skip
+    covs = [*(d.cov for d in survey.coordinate_differences), *(c.cov for c in survey.coordinates)]
+    m = sum(np.count_nonzero(np.where(np.isfinite(c), c, 0.0)) > np.isfinite(np.diagonal(c)).sum() for c in covs)
     priors = sum(p.x_in_world.treatment == "prior" for p in survey.points)
     found = (("correlations of readings", n), ("correlations of coordinates", int(m)), ("priors of points", priors))
     return tuple(f"left out, {what}: {count}" for what, count in found if count)

@@ -10,6 +10,9 @@ from adjust.model.observations import PositionRef, Reading
 from adjust.model.survey import FloatArray, Survey
 from survey.solution.quantities import SigmaKind
 
+_HELD = ("readings", "coordinate_differences", "coordinates", "distances")
+"""Observations that formats of networks hold."""
+
 
 @dataclass(frozen=True, eq=False)
 class NetworkValues:
@@ -62,8 +65,7 @@ def left_out(survey: Survey) -> tuple[str, ...]:
         "alignments": len(survey.alignments),
         "free parameters of instruments": sum(len(i.parameters.free) for i in survey.instruments),
         "readings on stations, cameras or targets": sum(not between_points(r) for r in survey.readings),
-        "observations not in use": sum(not o.used for o in (*survey.readings, *survey.coordinate_differences,
-                                                            *survey.coordinates, *survey.distances)),
+        "observations not in use": sum(not o.used for kind in _HELD for o in survey.others[kind]),
         "centring errors": sum(r.target_centring_sigma > 0.0 for r in survey.readings)
         + sum(s.centring_sigma > 0.0 or s.height_sigma > 0.0 for s in survey.setups),
         "tilts or curvature of the level surface": int(

@@ -21,9 +21,9 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Survey
 from adjust.pose_network.from_survey import network_from_survey
 from adjust.start import find_start
-from adjust.statistics.pair_screen import PairOptions, adjusted_network, is_pure, network_solution
+from adjust.statistics.pair_networks import PairOptions, adjusted_network, is_pure, network_solution
 from adjust.statistics.supported import lost_notes, supported
-from survey.jobs.adjusting.job import adjust_project, told
+from survey.jobs.adjusting.steps import adjust_project, told
 from survey.project import Project
 from survey.solution.previous import Previous
 

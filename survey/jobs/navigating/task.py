@@ -12,7 +12,7 @@ from adjust.model.survey import Survey
 from adjust.navigation import NavigationEpoch, Spots
 from adjust.statistics.supported import supported
 from survey.folder.text import decode, natural_key, read_bytes
-from survey.jobs.adjusting.less_observations import in_use, only_between, points_read
+from survey.jobs.adjusting.subnetwork import in_use, only_between, points_read
 from survey.project import Project
 
 

@@ -14,7 +14,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from survey.folder.text import LARGEST_NUMBER, choice_hint, decode, id_problem, read_bytes, suggestion
 from survey.folder.units import to_si
-from survey.project.declared.toml_lines import KeyPath, key_lines
+from survey.project.declared.toml_text import KeyPath, key_lines
 
 _REQUIRED: Any = object()
 _LARGEST_TOML = 16 * 2**20  # bytes

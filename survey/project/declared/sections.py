@@ -18,14 +18,12 @@ from adjust.model.survey import (
     VectorParameter,
 )
 from survey.folder.units import from_si
-from survey.project.declared.bodies import body_sections
-from survey.project.declared.closures import closure_sections
-from survey.project.declared.instruments import instrument_sections, vertical_sections
+from survey.project.declared.instruments import body_sections, instrument_sections, vertical_sections
 from survey.project.declared.lenses import lens_to_toml
+from survey.project.declared.options import closure_sections, tolerance_sections
 from survey.project.declared.owners import GEOMETRY_UNITS, geometry_key
 from survey.project.declared.poses import quaternion_wxyz
 from survey.project.declared.targets import WARP
-from survey.project.declared.tolerances import tolerance_sections
 from survey.project.declared.toml_text import Section
 from survey.project.declared.vectors import check_vector
 from survey.project.project import FORMAT, AdjustmentOptions, Sigmas, SpotsRequest

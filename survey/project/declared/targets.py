@@ -12,7 +12,8 @@ from survey.project.declared.declarations import DECLARATIONS, keys_of
 from survey.project.declared.node import Node
 from survey.project.declared.owners import read_epochs
 from survey.project.declared.poses import read_pose
-from survey.project.tables.reading import Layout, read_table
+from survey.project.tables.files import read_table
+from survey.project.tables.reading import Layout
 from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind
 
 _KINDS = tuple(d.of[1] for d in DECLARATIONS if d.path == "targets.ID" and d.of is not None)

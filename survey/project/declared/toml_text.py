@@ -1,7 +1,9 @@
-"""Tables as TOML text, in the order given."""
+"""TOML: tables as text, and the lines on which the keys of a text stand."""
 
+import bisect
 import json
 import re
+import tomllib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -41,3 +43,135 @@ def _value(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(_value(item) for item in value)}]"
     raise TypeError(f"no TOML for {type(value)}")
+
+
+KeyPath = tuple[str | int, ...]
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
+_SCALAR_END = re.compile(r"[,\]}\n#]")
+
+
+def key_lines(text: str) -> dict[KeyPath, int]:
+    """Line (from 1) of every key, table header and array item of ``text``, which must be valid TOML."""
+    scanner = _Scanner(text.replace("\r\n", "\n"))
+    scanner.document()
+    return scanner.lines
+
+
+class _Scanner:
+    """Walks over a valid document; it checks nothing, because ``tomllib`` has."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.at = 0
+        self.lines: dict[KeyPath, int] = {}
+        self._newlines = [match.start() for match in re.finditer("\n", text)]
+        self._items: dict[KeyPath, int] = {}
+
+    def document(self) -> None:
+        table: KeyPath = ()
+        while self._skip_blank():
+            if self.text[self.at] == "[":
+                table = self._header()
+            else:
+                self._key_value(table)
+
+    def _header(self) -> KeyPath:
+        line = self._line()
+        is_array = self.text.startswith("[[", self.at)
+        self.at += 2 if is_array else 1
+        path = self._key()
+        self.at += 2 if is_array else 1
+        if is_array:
+            item = self._items.get(path, -1) + 1
+            self._items[path] = item
+            path = (*path, item)
+        self._record((), path, line)
+        return path
+
+    def _key_value(self, table: KeyPath) -> None:
+        line = self._line()
+        key = self._key()
+        self._record(table, key, line)
+        self.at += 1  # the equals sign
+        self._value(table + key)
+
+    def _record(self, table: KeyPath, key: KeyPath, line: int) -> None:
+        for length in range(1, len(key) + 1):
+            self.lines.setdefault(table + key[:length], line)
+
+    def _line(self) -> int:
+        return bisect.bisect_left(self._newlines, self.at) + 1
+
+    def _skip_blank(self) -> bool:
+        """Go to the next character that is neither blank nor comment; False at the end."""
+        while self.at < len(self.text):
+            character = self.text[self.at]
+            if character == "#":
+                end = self.text.find("\n", self.at)
+                self.at = len(self.text) if end < 0 else end
+            elif character in " \t\n":
+                self.at += 1
+            else:
+                return True
+        return False
+
+    def _key(self) -> KeyPath:
+        parts: list[str] = []
+        while True:
+            self._skip_blank()
+            if self.text[self.at] in "\"'":
+                start = self.at
+                self._string()
+                parts.append(tomllib.loads("k = " + self.text[start : self.at])["k"])
+            else:
+                match = _BARE.match(self.text, self.at)
+                self.at = match.end() if match else self.at + 1
+                parts.append(match.group() if match else "")
+            self._skip_blank()
+            if self.at >= len(self.text) or self.text[self.at] != ".":
+                return tuple(parts)
+            self.at += 1
+
+    def _value(self, path: KeyPath) -> None:
+        self._skip_blank()
+        character = self.text[self.at]
+        if character in "\"'":
+            self._string()
+        elif character == "[":
+            self._array(path)
+        elif character == "{":
+            self._inline_table(path)
+        else:
+            end = _SCALAR_END.search(self.text, self.at)
+            self.at = end.start() if end else len(self.text)
+
+    def _string(self) -> None:
+        quote = self.text[self.at]
+        mark = quote * 3 if self.text.startswith(quote * 3, self.at) else quote
+        self.at += len(mark)
+        while not self.text.startswith(mark, self.at):
+            self.at += 2 if quote == '"' and self.text[self.at] == "\\" else 1
+        self.at += len(mark)
+        while len(mark) == 3 and self.text.startswith(quote, self.at):
+            self.at += 1  # quotes may stand before the closing three
+
+    def _array(self, path: KeyPath) -> None:
+        self.at += 1
+        item = 0
+        while self._skip_blank() and self.text[self.at] != "]":
+            if self.text[self.at] == ",":
+                self.at += 1
+                continue
+            self.lines.setdefault((*path, item), self._line())
+            self._value((*path, item))
+            item += 1
+        self.at += 1
+
+    def _inline_table(self, path: KeyPath) -> None:
+        self.at += 1
+        while self._skip_blank() and self.text[self.at] != "}":
+            if self.text[self.at] == ",":
+                self.at += 1
+                continue
+            self._key_value(path)
+        self.at += 1

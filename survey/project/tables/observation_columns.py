@@ -10,28 +10,34 @@ from adjust.model.survey import FloatArray, Survey
 from survey.folder.units import from_si
 from survey.project.declared.poses import quaternion_wxyz
 from survey.project.project import SpotBlock
+from survey.project.tables.coordinates import XYZ_RHO, XYZ_SIGMAS
 from survey.project.tables.covariance import sigmas_and_correlations
-from survey.project.tables.measurements import XYZ_RHO, XYZ_SIGMAS
 from survey.project.tables.pairs import COVARIANCE_COLUMNS, QUATERNION, SIGMA_COLUMNS, TRANSLATION
+from survey.project.tables.reading import Columns, TextColumn
 from survey.project.tables.references import frame_text, position_text
 from survey.project.tables.terrestrial_columns import triple_rows
-from survey.project.tables.writing import Columns
+
+_FLAGS = ("false", "true")
 
 
 def image_point_columns(blocks: Sequence[ImageBlock], survey: Survey) -> Columns:
     """One row per image point; ``group`` and ``used`` only where they are not as usual."""
     names: dict[str | None, tuple[str, ...]] = {target.target_id: target.point_ids for target in survey.targets}
     names[None] = tuple(point.point_id for point in survey.points)
+    index: dict[str, int] = {}
+    codes = {owner: np.array([index.setdefault(n, len(index)) for n in ids], int) for owner, ids in names.items()}
     sizes = [len(block.uv) for block in blocks]
-    point_ids = [names[block.target_id][i] for block in blocks for i in block.point_idx.tolist()]
-    used = [flag for b in blocks for flag in (b.used.tolist() if b.used is not None else [True] * len(b.uv))]
+    used = [np.ones(len(block.uv), bool) if block.used is None else np.asarray(block.used) for block in blocks]
+    flags = np.concatenate([np.zeros(0, bool), *used])
+    points = [codes[block.target_id][np.asarray(block.point_idx, int)] for block in blocks]
     return {
         "epoch_id": _repeat([block.epoch_id for block in blocks], sizes),
         "camera_id": _repeat([block.camera_id for block in blocks], sizes),
         "target_id": _repeat([block.target_id or "" for block in blocks], sizes),
-        "point_id": point_ids,
+        "point_id": TextColumn(tuple(index), np.concatenate([np.zeros(0, int), *points])),
         **_measured(blocks),
-        **_group_columns(_repeat([block.group for block in blocks], sizes), used, "image"),
+        **({"group": _repeat([b.group for b in blocks], sizes)} if any(b.group != "image" for b in blocks) else {}),
+        **({} if flags.all() else {"used": TextColumn(_FLAGS, flags.astype(int))}),
     }
 
 
@@ -145,8 +151,9 @@ def coordinate_columns(coordinates: Sequence[Coordinates]) -> tuple[Columns, Col
     return table, {**extra, "covariance_mm2": np.array(covariances)}
 
 
-def _repeat(values: Sequence[str], sizes: Sequence[int]) -> list[str]:
-    return [value for value, size in zip(values, sizes, strict=True) for _ in range(size)]
+def _repeat(values: Sequence[str], sizes: Sequence[int]) -> TextColumn:
+    index = {name: i for i, name in enumerate(dict.fromkeys(values))}
+    return TextColumn(tuple(index), np.repeat(np.array([index[name] for name in values], int), sizes))
 
 
 def _group_columns(groups: Sequence[str], used: Sequence[bool], usual: str) -> dict[str, list[str]]:
@@ -154,5 +161,5 @@ def _group_columns(groups: Sequence[str], used: Sequence[bool], usual: str) -> d
     if any(group != usual for group in groups):
         columns["group"] = list(groups)
     if not all(used):
-        columns["used"] = ["true" if flag else "false" for flag in used]
+        columns["used"] = [_FLAGS[flag] for flag in used]
     return columns

@@ -1,23 +1,20 @@
-"""Tables of observations: CSV or Parquet into columns, with the line of every row.
+"""Tables of observations: which columns they have, and columns with the line of every row.
 
 Text columns become codes into their different names, so that nothing later runs per row.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from survey.folder.text import LARGEST_NUMBER, decode, formula_problem, id_problem, read_bytes, suggestion
-from survey.project.tables.csv_chunks import Chunk, csv_chunks
+from survey.folder.text import formula_problem, id_problem, suggestion
 
 LARGEST_ROWS = 50_000_000  # of one table: ten times what the largest surveys have
-_LARGEST_DECODED = 8 * 2**30  # bytes of the columns of a Parquet file
 FLAGS = ("group", "used")  # optional text columns of every table of observations
 
 
@@ -56,6 +53,12 @@ class TextColumn:
     def values(self) -> list[str]:
         """The text of every row."""
         return [self.names[code] for code in self.codes.tolist()]
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+
+Columns = Mapping[str, Sequence[str] | TextColumn | FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,44 +154,10 @@ def first_row(mask: npt.ArrayLike) -> int:
     return int(np.argmax(mask))
 
 
-def read_table(path: Path, layout: Layout) -> Table:
-    """Read ``.csv`` or ``.parquet``; raises SurveyError with file and line for whatever does not fit the layout."""
-    data, digest = read_bytes(path)
-    if path.suffix == ".parquet":
-        return _read_parquet(path, layout, data, digest)
-    text = decode(path, data)
-    if not text.strip():
-        raise SurveyError(f"{path}:1: the file is empty; the first line names the columns: {','.join(layout.required)}")
-    _check_rows(path, text.count("\n"))
-    header, chunks = csv_chunks(path, text)
-    check_header(path, header, layout)
-    return _assemble(path, layout, digest, header, chunks)
-
-
-def _check_rows(path: Path, n: int) -> None:
+def check_rows(path: Path, n: int) -> None:
+    """Raise where a table has more rows than are read."""
     if n > LARGEST_ROWS:
         raise SurveyError(f"{path}: found {n} rows, at most {LARGEST_ROWS} are read; split the survey into projects")
-
-
-def _assemble(path: Path, layout: Layout, digest: str, header: Sequence[str], chunks: Iterable[Chunk]) -> Table:
-    texts = {name: _TextBuilder() for name in header if layout.is_text(name)}
-    numbers = {name: _NumberBuilder() for name in header if not layout.is_text(name)}
-    builders: dict[str, _TextBuilder | _NumberBuilder] = {**texts, **numbers}
-    all_lines = [np.zeros(0, np.int64)]
-    for lines, columns in chunks:
-        all_lines.append(lines)
-        for name, column in zip(header, columns, strict=True):
-            bad = builders[name].add(column, name in layout.required)
-            if bad is not None:
-                raise SurveyError(f"{path}:{lines[bad[0]]}: {name}: {bad[1]}")
-    return Table(
-        path,
-        layout,
-        digest,
-        np.concatenate(all_lines),
-        {name: builder.column() for name, builder in texts.items()},
-        {name: builder.column() for name, builder in numbers.items()},
-    )
 
 
 def check_header(path: Path, header: Sequence[str], layout: Layout) -> None:
@@ -205,120 +174,3 @@ def check_header(path: Path, header: Sequence[str], layout: Layout) -> None:
     for name in layout.required:
         if name not in header:
             raise SurveyError(f"{path}:1: the column {name!r} is missing; add it")
-
-
-class _TextBuilder:
-    """Turns texts into codes, chunk by chunk."""
-
-    def __init__(self) -> None:
-        self.parts: list[IntArray] = []
-        self.index: dict[str, int] = {}
-
-    def add(self, column: Sequence[str], is_required: bool) -> tuple[int, str] | None:
-        for name in dict.fromkeys(column):
-            self.index.setdefault(name, len(self.index))
-        self.parts.append(np.fromiter(map(self.index.__getitem__, column), np.int64, len(column)))
-        if is_required and "" in self.index:
-            return column.index(""), "is blank; fill it in"
-        return None
-
-    def column(self) -> TextColumn:
-        return TextColumn(tuple(self.index), np.concatenate([np.zeros(0, np.int64), *self.parts]))
-
-
-class _NumberBuilder:
-    """Turns texts into numbers, chunk by chunk."""
-
-    def __init__(self) -> None:
-        self.parts: list[FloatArray] = []
-
-    def add(self, column: Sequence[str], is_required: bool) -> tuple[int, str] | None:
-        try:
-            values = np.fromiter(map(float, column), np.float64, len(column))
-        except ValueError:
-            values = None
-        if values is None or "_" in "".join(column):  # Python takes 1_000 for a number, people do not
-            values = np.empty(len(column))
-            for row, text in enumerate(column):
-                if text == "" and not is_required:
-                    values[row] = 0.0
-                    continue
-                try:
-                    values[row] = float(text.replace("_", "?"))
-                except ValueError:
-                    return row, "is blank; fill it in" if text == "" else f"found {text!r}, expected a number"
-        bad = ~(np.abs(values) <= LARGEST_NUMBER)
-        if bad.any():
-            row = first_row(bad)
-            problem = "too large to be meant; correct it" if np.isfinite(values[row]) else "it must be a finite number"
-            return row, f"found {column[row][:40]!r}; {problem}"
-        if not is_required and "" in column:
-            values[np.fromiter((text == "" for text in column), bool, len(column))] = np.nan
-        self.parts.append(values)
-        return None
-
-    def column(self) -> FloatArray:
-        return np.concatenate([np.zeros(0), *self.parts])
-
-
-def _read_parquet(path: Path, layout: Layout, data: bytes, digest: str) -> Table:
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError as error:
-        message = "Parquet needs pyarrow; install it with: pip install 'labsurvey[parquet]', or use CSV"
-        raise SurveyError(f"{path}: {message}") from error
-    try:
-        file = pq.ParquetFile(pa.BufferReader(data))
-        _check_rows(path, file.metadata.num_rows)
-        sizes = (file.metadata.row_group(i).total_byte_size for i in range(file.metadata.num_row_groups))
-        if sum(sizes) > _LARGEST_DECODED:
-            raise SurveyError(f"{path}: its columns take more than {_LARGEST_DECODED >> 30} GB; split the survey")
-        check_header(path, file.schema_arrow.names, layout)
-        content = file.read()
-        content.validate(full=True)
-    except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
-        raise SurveyError(f"{path}:1: not a Parquet file ({error}); write it again") from error
-    check_header(path, content.column_names, layout)
-    texts: dict[str, TextColumn] = {}
-    numbers: dict[str, FloatArray] = {}
-    for name in content.column_names:
-        array = content[name].combine_chunks()
-        if layout.is_text(name):
-            texts[name] = _parquet_text(path, name, array, name in layout.required)
-        else:
-            numbers[name] = _parquet_numbers(path, name, array, name in layout.required)
-    return Table(path, layout, digest, np.arange(1, content.num_rows + 1), texts, numbers)
-
-
-def _parquet_text(path: Path, name: str, array: Any, is_required: bool) -> TextColumn:
-    import pyarrow as pa
-
-    value_type = array.type.value_type if pa.types.is_dictionary(array.type) else array.type
-    if not (pa.types.is_string(value_type) or pa.types.is_large_string(value_type)):
-        raise SurveyError(f"{path}:1: {name}: the column holds {value_type}, expected text; write it as strings")
-    column = array.cast(value_type).fill_null("").dictionary_encode()
-    try:
-        names = tuple(column.dictionary.to_pylist())
-    except ValueError as error:
-        raise SurveyError(f"{path}:1: {name}: a text is not UTF-8 ({error}); write it again") from error
-    codes = np.asarray(column.indices.to_numpy(zero_copy_only=False), dtype=np.int64)
-    if is_required and "" in names:
-        raise SurveyError(f"{path}:{first_row(codes == names.index('')) + 1}: {name}: is blank; fill it in")
-    return TextColumn(names, codes)
-
-
-def _parquet_numbers(path: Path, name: str, array: Any, is_required: bool) -> FloatArray:
-    import pyarrow as pa
-
-    if not (pa.types.is_floating(array.type) or pa.types.is_integer(array.type)):
-        raise SurveyError(f"{path}:1: {name}: the column holds {array.type}, expected numbers; write it as doubles")
-    blank = np.asarray(array.is_null().to_numpy(zero_copy_only=False), dtype=bool)
-    values = np.array(array.cast(pa.float64()).fill_null(0.0).to_numpy(zero_copy_only=False), dtype=float)
-    bad = ~(np.abs(values) <= LARGEST_NUMBER) | (blank & is_required)
-    if bad.any():
-        row = first_row(bad)
-        found = "is blank; fill it in" if blank[row] else f"found {values[row]}; it must be a finite number"
-        raise SurveyError(f"{path}:{row + 1}: {name}: {found}")
-    values[blank] = np.nan
-    return values

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from adjust.model.observations import FrameKind, FrameRef, PositionRef
 from adjust.model.survey import Survey
 from survey.folder.text import id_problem, suggestion
+from survey.project.tables.reading import Table
 
 _KINDS: tuple[FrameKind, ...] = ("station", "camera", "target", "table", "mount")
 
@@ -141,3 +142,17 @@ def position_text(position: PositionRef) -> str:
     if position.frame is None:
         return position.point_id or ""
     return frame_text(position.frame) + (f"/{position.point_id}" if position.point_id is not None else "")
+
+
+def read_ends(
+    table: Table, row: int, texts: tuple[str, str], names: Names, what: str
+) -> tuple[PositionRef, PositionRef]:
+    """The positions that a row names in from_id and to_id; SurveyError where they are none, or the same."""
+    try:
+        a, b = (read_position(text, names) for text in texts)
+        check_epochs(a.frame, b.frame, names)
+    except NameProblemError as problem:
+        raise table.error(row, f"from_id, to_id: {problem}") from problem
+    if a == b:
+        raise table.error(row, f"from_id, to_id: both are {texts[0]!r}; a {what} joins two different positions")
+    return a, b

@@ -14,8 +14,9 @@ import numpy as np
 
 from survey.folder.text import decode, read_bytes
 from survey.project.detected import ImageKey
-from survey.project.tables.reading import Layout, Table, read_table
-from survey.project.tables.writing import Columns, cells_of
+from survey.project.tables.files import read_table
+from survey.project.tables.reading import Columns, Layout, Table
+from survey.project.tables.writing import cells_of
 
 _FALSE = ("false", "0")
 

@@ -15,12 +15,12 @@ from adjust.model.observations import (
 )
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.units import from_si
+from survey.project.tables.coordinates import DIFFERENCE, DIFFERENCE_RHO, DIFFERENCE_SIGMAS
 from survey.project.tables.covariance import sigmas_and_correlations
-from survey.project.tables.differences import DIFFERENCE, DIFFERENCE_RHO, DIFFERENCE_SIGMAS
 from survey.project.tables.geometric import axis_text
+from survey.project.tables.reading import Columns
 from survey.project.tables.references import frame_text, position_text
 from survey.project.tables.terrestrial import ANGLES, HEIGHTS
-from survey.project.tables.writing import Columns
 
 _Column = Sequence[str] | FloatArray
 

@@ -3,18 +3,18 @@
 import csv
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
-from survey.folder.text import atomic_write, formula_problem
+from survey.folder.text import atomic_write, formula_problem, utf8
+from survey.project.tables.arrow import LARGE, csv_rows, parquet_bytes
+from survey.project.tables.reading import Columns, TextColumn
 
 _NUMBERS = re.compile(r"[-+.\deE ]+")  # the components of an axis in one cell
-
-Columns = Mapping[str, Sequence[str] | FloatArray]
 
 
 def write_table(folder: Path, name: str, columns: Columns, parquet: bool = False) -> Path:
@@ -24,48 +24,42 @@ def write_table(folder: Path, name: str, columns: Columns, parquet: bool = False
     would take for a formula.
     """
     for column, values in columns.items():
-        for text in () if isinstance(values, np.ndarray) else dict.fromkeys(values):
+        for text in _names(values):
             if (problem := formula_problem(text)) and not _NUMBERS.fullmatch(text):
                 raise SurveyError(f"{folder}/{name}: {column}: {text[:40]!r}: {problem}")
     path, other = folder / f"{name}.csv", folder / f"{name}.parquet"
     if parquet:
         path, other = other, path
-    atomic_write(path, _parquet(path, columns) if parquet else _csv(columns))
+    atomic_write(path, parquet_bytes(columns) if parquet else _csv(columns))
     other.unlink(missing_ok=True)
     return path
 
 
-def _csv(columns: Columns) -> str:
+def _names(column: Sequence[str] | TextColumn | FloatArray) -> Sequence[str]:
+    """The different texts of a column; none of numbers."""
+    if isinstance(column, TextColumn):
+        return column.names
+    return () if isinstance(column, np.ndarray) else tuple(dict.fromkeys(column))
+
+
+def _csv(columns: Columns) -> bytes:
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(columns)
+    doubles = all(c.dtype == np.float64 for c in columns.values() if isinstance(c, np.ndarray))
+    if doubles and 10 * len(columns) * max(map(len, columns.values()), default=0) > LARGE:
+        return utf8(stream.getvalue()) + csv_rows(columns)
     writer.writerows(zip(*(cells_of(column) for column in columns.values()), strict=True))
-    return stream.getvalue()
+    return utf8(stream.getvalue())
 
 
-def cells_of(column: Sequence[str] | FloatArray) -> Sequence[object]:
+def cells_of(column: Sequence[str] | TextColumn | FloatArray) -> Sequence[object]:
     """The cells of a column as the csv module writes them; nan is blank."""
+    if isinstance(column, TextColumn):
+        return column.values()
     if not isinstance(column, np.ndarray):
         return column
     values: list[object] = column.tolist()
     for row in np.flatnonzero(np.isnan(column)).tolist():
         values[row] = None
     return values
-
-
-def _parquet(path: Path, columns: Columns) -> bytes:
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError as error:
-        message = "Parquet needs pyarrow; install it with: pip install 'labsurvey[parquet]', or write CSV"
-        raise SurveyError(f"{path}: {message}") from error
-    arrays = {
-        name: pa.array(column, from_pandas=True)
-        if isinstance(column, np.ndarray)
-        else pa.array(list(column), pa.string()).dictionary_encode()
-        for name, column in columns.items()
-    }
-    stream = io.BytesIO()
-    pq.write_table(pa.table(arrays), stream)
-    return stream.getvalue()

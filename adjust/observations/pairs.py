@@ -1,0 +1,322 @@
+"""All measured pairs between two bodies with a pose of their own: native factors and statistics of all at once.
+
+A pair with a held end is exactly a prior on the other: with a held, Log(Z^-1 B^-1 A) = -Ad(Z^-1) Log(Z A^-1 B). Of a
+pair of which only the rotation was measured the rows of the translation weigh nothing.
+
+Redundancy numbers and tests as in :mod:`adjust.precision.precision`: v' Q_vv^-1 v of a whole pair is
+chi-square with the rank of Q_vv degrees of freedom (Baarda 1968; Koch 1999, section 4.2).
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.distributions import chi2
+from adjust.frames.state import State
+from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, FrameTree, Unknowns
+from adjust.model.observations import Pair
+from adjust.model.result import ObservationResidual
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.observations.factors import Jacobians, custom
+from adjust.observations.listed import ObservationFactor, frame_text
+from adjust.precision.tree import TreeCovariance
+from adjust.relay.motions import Motions, exp, right_jacobian_inverse
+
+UNCONTROLLED = 1e-4
+"""Share of a pair's direction that others must control for it to be tested; weak covariances lose digits."""
+_HELD = -1
+
+
+@dataclass(frozen=True, eq=False)
+class PairArrays:
+    """E measured ``b_from_a``: rotations (E, 3, 3), translations (E, 3) m, nan where only the rotation was measured.
+
+    cov: (E, 6, 6) in the tangent of the frame on the right (a), infinite variance where nothing was measured.
+    """
+
+    rotations: FloatArray
+    translations: FloatArray
+    cov: FloatArray
+    used: BoolArray
+
+    def with_used(self, used: BoolArray) -> "PairArrays":
+        """The same with other pairs in use; nothing else is computed again."""
+        out = replace(self, used=used)
+        out.__dict__.update({n: v for n, v in self.__dict__.items() if n not in out.__dict__})
+        return out
+
+    @cached_property
+    def is_pose(self) -> BoolArray:
+        """Which pairs (E,) measured a translation too."""
+        return np.isfinite(self.cov[:, 3, 3])
+
+    @cached_property
+    def whitening(self) -> FloatArray:
+        """W (E, 6, 6), upper triangular, with W'W the inverse covariance; zero rows where nothing was measured."""
+        out = np.zeros((len(self.used), 6, 6))
+        for rows, n in ((self.is_pose, 6), (~self.is_pose, 3)):
+            if rows.any():
+                info = np.linalg.inv(self.cov[rows][:, :n, :n])
+                W = np.swapaxes(np.linalg.cholesky(0.5 * (info + np.swapaxes(info, 1, 2))), 1, 2)
+                out[np.ix_(rows, np.arange(n), np.arange(n))] = W
+        return out
+
+    @cached_property
+    def motions(self) -> Motions:
+        """All of them; translations that were not measured count as zero."""
+        return Motions(self.rotations, np.nan_to_num(self.translations))
+
+    @cached_property
+    def poses(self) -> list[Pose3]:
+        """The same one by one."""
+        return [Pose3(Rot3(R), t) for R, t in zip(self.rotations, np.nan_to_num(self.translations), strict=True)]
+
+    @cached_property
+    def logs(self) -> FloatArray:
+        """Logarithms (E, 6), of rotations the first three components."""
+        return self.motions.log()
+
+
+def pair_arrays(pairs: Sequence[Pair]) -> PairArrays:
+    """Pairs as arrays."""
+    cov = np.zeros((len(pairs), 6, 6))
+    for e, pair in enumerate(pairs):
+        k = len(pair.cov)
+        cov[e, :k, :k] = pair.cov
+        cov[e, range(k, 6), range(k, 6)] = np.inf
+    measured = [p.b_from_a for p in pairs]
+    R = [m.rotation().matrix() if isinstance(m, Pose3) else m.matrix() for m in measured]
+    t = [m.translation() if isinstance(m, Pose3) else np.full(3, np.nan) for m in measured]
+    return PairArrays(np.array(R).reshape(-1, 3, 3), np.array(t).reshape(-1, 3), cov, np.array([p.used for p in pairs]))
+
+
+class NoiseCache:
+    """GTSAM noise models of square roots of information, each made once."""
+
+    def __init__(self) -> None:
+        self._made: dict[bytes, gtsam.noiseModel.Gaussian] = {}
+
+    def __call__(self, whitening: FloatArray) -> gtsam.noiseModel.Gaussian:
+        """The model that whitens by this matrix (k, k)."""
+        name = whitening.tobytes()
+        if name not in self._made:
+            # never "smart": GTSAM would turn small sigmas into constraints
+            self._made[name] = gtsam.noiseModel.Gaussian.SqrtInformation(whitening, False)
+        return self._made[name]
+
+
+def native_factor(
+    a: int | Pose3, b: int | Pose3, b_from_a: Pose3, W: FloatArray, noise: NoiseCache
+) -> gtsam.NonlinearFactor | None:
+    """GTSAM's own factor of one pair between two ends, each a key or the pose where it is held; None where both are."""
+    if isinstance(a, Pose3):
+        if isinstance(b, Pose3):
+            return None
+        turned = np.asarray(np.linalg.qr(W @ b_from_a.inverse().AdjointMap(), mode="r"))
+        return gtsam.PriorFactorPose3(b, a.compose(b_from_a.inverse()), noise(turned))
+    if isinstance(b, Pose3):
+        return gtsam.PriorFactorPose3(a, b.compose(b_from_a), noise(W))
+    return gtsam.BetweenFactorPose3(b, a, b_from_a, noise(W))
+
+
+@dataclass(frozen=True, eq=False)
+class PairStatistics:
+    """Of every pair (E,): residual (E, dim) Log(measured^-1 adjusted), in frame a, and what the rest says of it.
+
+    whitened: (E, dim). redundancy: (E, dim) numbers of the whitened components, zero for pairs out of use. test,
+    freedom, p_value: of the whole pair; freedom 0 and nan where nothing controls it. A pair out of use is tested
+    against its prediction from the others. adjusted_cov: (E, dim, dim) of the adjusted ``b_from_a``. residual_cov:
+    (E, dim, dim).
+    """
+
+    residual: FloatArray
+    whitened: FloatArray
+    redundancy: FloatArray
+    test: FloatArray
+    freedom: IntArray
+    p_value: FloatArray
+    adjusted_cov: FloatArray
+    residual_cov: FloatArray
+
+    def first(self, dim: int) -> "PairStatistics":
+        """Of the first ``dim`` components."""
+        return PairStatistics(
+            self.residual[:, :dim], self.whitened[:, :dim], self.redundancy[:, :dim], self.test, self.freedom,
+            self.p_value, self.adjusted_cov[:, :dim, :dim], self.residual_cov[:, :dim, :dim],
+        )  # fmt: skip
+
+
+@dataclass(eq=False)
+class PairBatch:
+    """Pairs of a survey as one batch. rows: (E,) in ``Survey.pairs``. a_slot, b_slot: (E,) of their ends.
+
+    a_key, b_key: (E,) of GTSAM's variables, ``-1`` where that end is held.
+    """
+
+    arrays: PairArrays
+    rows: IntArray
+    a_slot: IntArray
+    b_slot: IntArray
+    unknowns: Unknowns
+    state: State
+    noise: NoiseCache = field(default_factory=NoiseCache)
+
+    def __post_init__(self) -> None:
+        keys = np.array([_HELD if k is None else k for k in self.unknowns.slot_key], dtype=np.int64)
+        self.a_key, self.b_key = keys[self.a_slot], keys[self.b_slot]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def _ends(self, e: int) -> tuple[int | Pose3, int | Pose3]:
+        keys, slots = (int(self.a_key[e]), int(self.b_key[e])), (self.a_slot[e], self.b_slot[e])
+        a, b = (k if k != _HELD else self.unknowns.slot_pose[int(s)] for k, s in zip(keys, slots, strict=True))
+        return a, b
+
+    @cached_property
+    def factors(self) -> list[gtsam.NonlinearFactor | None]:
+        """GTSAM's own factor of every pair, None between two held bodies."""
+        W, noise, poses = self.arrays.whitening, self.noise, self.arrays.poses
+        free = ((self.a_key != _HELD) & (self.b_key != _HELD)).tolist()
+        between = gtsam.BetweenFactorPose3
+        ends = zip(self.a_key.tolist(), self.b_key.tolist(), free, strict=True)
+        return [between(b, a, poses[e], noise(W[e])) if both else native_factor(*self._ends(e), poses[e], W[e], noise)
+                for e, (a, b, both) in enumerate(ends)]  # fmt: skip
+
+    def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        """Put the factors of the pairs in use into ``graph``."""
+        for factor, used in zip(self.factors, self.arrays.used.tolist(), strict=True):
+            if used and factor is not None:
+                graph.push_back(factor)
+
+    @cached_property
+    def both_held(self) -> BoolArray:
+        """Pairs (E,) between two held bodies."""
+        return np.asarray((self.a_key == _HELD) & (self.b_key == _HELD), dtype=np.bool_)
+
+    def keys(self) -> set[int]:
+        """The variables of all pairs, used or not."""
+        return set(np.concatenate([self.a_key, self.b_key]).tolist()) - {_HELD}
+
+    def next_to_held(self) -> set[int]:
+        """The variables that a pair in use joins with something held."""
+        a, b, used = self.a_key, self.b_key, self.arrays.used
+        return {*b[used & (a == _HELD)].tolist(), *a[used & (b == _HELD)].tolist()} - {_HELD}
+
+    def items(self, pairs: Sequence[Pair]) -> list[ObservationFactor]:
+        """What a report needs to know of each; ``pairs`` are those of the survey."""
+        logs = self.arrays.logs
+        out = []
+        for e, (row, is_pose) in enumerate(zip(self.rows.tolist(), self.arrays.is_pose.tolist(), strict=True)):
+            pair, k = pairs[row], 6 if is_pose else 3
+            ids = pair.pair_id, frame_text(pair.a), frame_text(pair.b)
+            out.append(ObservationFactor(self._exact(e, pair, is_pose), "pair", pair.group, ids, POSE_COMPONENTS[:k],
+                                         POSE_UNITS[:k], logs[e, :k], pair.used))  # fmt: skip
+        return out
+
+    def _exact(self, e: int, pair: Pair, is_pose: bool) -> gtsam.NonlinearFactor:
+        """A factor with just the measured components as residual, in frame a."""
+        factor, held = self.factors[e], self.a_key[e] == _HELD
+        if factor is not None and is_pose and not held:
+            return factor
+        a, b = self._ends(e)
+        keys = list(dict.fromkeys(x for x in (b, a) if not isinstance(x, Pose3)))
+        measured, k = self.arrays.poses[e], 6 if is_pose else 3
+
+        def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+            world_from_a, world_from_b = (x if isinstance(x, Pose3) else values.atPose3(x) for x in (a, b))
+            b_from_a, D = world_from_b.between(world_from_a), np.zeros((6, 6), order="F")
+            r = np.asarray(Pose3.Logmap(measured.between(b_from_a), D))
+            by: Jacobians = [] if isinstance(a, Pose3) else [(a, D[:k])]
+            if not isinstance(b, Pose3):
+                by.append((b, -(D @ b_from_a.inverse().AdjointMap())[:k]))
+            return r[:k], by
+
+        return custom(keys, pair.cov, residual)
+
+    def jacobians(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Residuals (E, 6), derivatives (E, 6, 6) by b and by a, and Ad(b_from_a^-1) (E, 6, 6), unweighted."""
+        self.state.load(values)
+        R, t = self.state.slot_R, self.state.slot_t
+        a, b = (Motions(R[slots], t[slots]) for slots in (self.a_slot, self.b_slot))
+        return pair_jacobians(self.arrays.motions, b.inverse() @ a)
+
+    def statistics(self, tree: TreeCovariance, values: gtsam.Values) -> PairStatistics:
+        """Statistics of all pairs, in use or not; they do not depend on the datum of ``tree``."""
+        arrays, a, b, held = self.arrays, self.a_key, self.b_key, self.both_held
+        used = np.asarray(arrays.used, dtype=np.bool_)
+        residual, by_b, by_a, turn = self.jacobians(values)
+        Q = np.zeros((len(self), 12, 12))
+        near = np.flatnonzero(used & ~held)
+        Q[near] = tree.pairs(b[near], a[near], 6)
+        for e in np.flatnonzero(~used & ~held).tolist():
+            keys = [int(b[e]), int(a[e])]
+            free = [i for i, k in enumerate(keys) if k != _HELD]
+            at = np.concatenate([np.arange(6 * i, 6 * i + 6) for i in free])
+            Q[e][np.ix_(at, at)] = tree.joint([keys[i] for i in free])
+        W = arrays.whitening
+        B = np.concatenate([by_b, by_a], axis=2)
+        J = np.concatenate([-turn, np.tile(np.eye(6), (len(a), 1, 1))], axis=2)
+        scatter, own = B @ Q @ np.swapaxes(B, 1, 2), J @ Q @ np.swapaxes(J, 1, 2)
+        sign = np.where(used, -1.0, 1.0)[:, None, None]
+        # a row of the whitening that is zero was not measured
+        Qvv = sign * (W @ scatter @ np.swapaxes(W, 1, 2)) + np.any(W, axis=2)[..., None] * np.eye(6)
+        white = np.einsum("nij,nj->ni", W, residual)
+        test, freedom = _quadratic(Qvv, white)
+        with np.errstate(invalid="ignore"):
+            p = np.where(freedom > 0, chi2.sf(test, np.maximum(freedom, 1)), np.nan)
+        redundancy = np.where(used[:, None], np.diagonal(Qvv, axis1=1, axis2=2), 0.0)
+        return PairStatistics(residual, white, redundancy, test, freedom, p, own, arrays.cov + sign * scatter)
+
+    def residuals(self, stats: PairStatistics, items: Iterable[ObservationFactor]) -> list[ObservationResidual]:
+        """As reports take them."""
+        v, cov = stats.residual, self.arrays.cov
+        adjusted = (self.arrays.motions @ exp(v)).log()
+        sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+        spread = np.diagonal(stats.residual_cov, axis1=1, axis2=2)
+        with np.errstate(invalid="ignore"):
+            seen = spread > UNCONTROLLED * sigma**2
+            standardized = np.where(seen, v / np.sqrt(np.where(seen, spread, 1.0)), np.nan)
+        turned = Motions(self.arrays.rotations @ exp(v[:, :3]).rotation).log()
+        adjusted[~self.arrays.is_pose, :3] = turned[~self.arrays.is_pose]
+        out = []
+        for e, item in enumerate(items):
+            k = len(item.components)
+            out.append(ObservationResidual(
+                "pair", item.group, item.ids, item.components, item.units, item.observed, adjusted[e, :k], v[e, :k],
+                sigma[e, :k], stats.redundancy[e, :k], standardized[e, :k], float(stats.test[e]), item.used,
+            ))  # fmt: skip
+        return out
+
+
+def pair_jacobians(measured: Motions, b_from_a: Motions) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Residuals (E, dim), their derivatives (E, dim, dim) by b and by a, and Ad(b_from_a^-1) (E, dim, dim)."""
+    residual = (measured.inverse() @ b_from_a).log()
+    by_a, turn = right_jacobian_inverse(residual), b_from_a.inverse().adjoint()
+    return residual, -by_a @ turn, by_a, turn
+
+
+def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:
+    """The forms v' Q^+ v (E,) and the rank of Q, eigenvalues below ``UNCONTROLLED`` counting as zero."""
+    w, U = np.linalg.eigh(Q)
+    kept = w > UNCONTROLLED
+    y = np.einsum("nij,ni->nj", U, v)
+    test = (np.where(kept, y * y, 0.0) / np.where(kept, w, 1.0)).sum(axis=1)
+    freedom = kept.sum(axis=1)
+    return np.where(freedom > 0, test, np.nan), freedom.astype(np.int64)
+
+
+def simple_pairs(survey: Survey, frames: FrameTree) -> tuple[IntArray, IntArray, IntArray]:
+    """Pairs between two fixed stations: their rows in ``Survey.pairs``, and the slots of their ends a and b."""
+    fixed = {s.station_id: s.world_from_station for s in survey.stations if s.motion == "fixed"}
+    rows = [row for row, p in enumerate(survey.pairs) if p.a.kind == p.b.kind == "station" and p.a != p.b
+            and p.a.frame_id in fixed and p.b.frame_id in fixed]  # fmt: skip
+    ends = [(survey.pairs[row].b.frame_id, survey.pairs[row].a.frame_id) for row in rows]
+    joined = dict.fromkeys(s for both in ends for s in both)
+    slot = {s: frames.unknowns.slot(("world_from_station", s), fixed[s]) for s in joined}
+    of_b, of_a = np.array([(slot[b], slot[a]) for b, a in ends], dtype=np.int64).reshape(-1, 2).T
+    return np.array(rows, dtype=np.int64), of_a, of_b

@@ -1,0 +1,229 @@
+"""The whole adjustment of a survey: without its gross errors, and with estimated variances where that is asked for."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from adjust.adjustment import adjust
+from adjust.graph.assembly import StartValues, values_of
+from adjust.model.errors import SurveyError
+from adjust.model.observations import ImageBlock
+from adjust.model.result import Adjustment
+from adjust.model.survey import Survey
+from adjust.statistics.criteria import limits
+from adjust.statistics.outlier_search import OutlierSearch, SearchOptions, search_outliers
+from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs, is_pure, uncontrolled_pairs
+from adjust.statistics.result import Component, VarianceComponents
+from adjust.statistics.scaling import scaled_survey
+from adjust.statistics.variance_components import ComponentOptions, Scaled, estimate_variance_components
+
+_LARGEST, _ROOM = 6000, 1e8
+"""Unknowns up to which gross errors are always searched; above, numbers that the search may need for its columns."""
+_PASSES = 3
+_SCREENED = "left out as gross errors"
+_OTHERS = (
+    "table", "pair", "distance", "coordinates", "coordinate_difference", "level", "alignment", "laser", "surface",
+    "direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance", "height_difference",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class CleanOptions:
+    """pairs: the adjustment itself, and whether what contradicts the rest is left out.
+
+    variance_components: the variances of all groups are estimated.
+    """
+
+    pairs: PairOptions = field(default_factory=PairOptions)
+    variance_components: bool = False
+
+
+def adjust_cleaned(
+    survey: Survey, options: CleanOptions = CleanOptions(), progress: Callable[[int, float], None] | None = None,
+    start: StartValues | None = None,
+) -> Adjustment:  # fmt: skip
+    """Adjust; what was left out and which variances were estimated is part of the result and its warnings.
+
+    Raises as :func:`adjust.adjustment.adjust`. Networks of nothing but pairs have a search of their own.
+    """
+    found = _cleaned(survey, options, progress, start)
+    if options.pairs.reject_pairs and _blamed_on_rays(survey, found):
+        # a wrong tape reading to a beacon that few images see is explained as well by leaving out its rays: the
+        # explanation that needs fewer observations left out is the likelier one
+        other = _others_first(survey, options, progress, start)
+        if other is not None and _left_out(survey, other) < _left_out(survey, found):
+            return other
+    return found
+
+
+def _cleaned(
+    survey: Survey, options: CleanOptions, progress: Callable[[int, float], None] | None, start: StartValues | None
+) -> Adjustment:
+    """Image points are screened before all others."""
+    first = adjust_with_pairs(survey, options.pairs, progress, start)
+    if is_pure(survey):
+        return first
+    now, search, scaled, factors = first, None, None, dict[str, float]()
+    rejected: set[tuple[str, ...]] | None = None
+    for _ in range(_PASSES):
+        if factors:  # what was left out before is tried again with the variances of now
+            given = scaled_survey(first.survey, factors)
+            now = adjust(given, values_of(now), options.pairs.adjust, progress)
+        search = _searched(survey, now, options, progress)
+        now = search.adjustment if search is not None else now
+        found = {(d.kind, *d.ids) for d in search.rejected} if search is not None else set[tuple[str, ...]]()
+        if not options.variance_components or found == rejected:
+            break
+        rejected = found
+        how = ComponentOptions(adjust=options.pairs.adjust)
+        scaled = estimate_variance_components(now.survey, options=how, progress=progress, first=now)
+        now = scaled.adjustment
+        factors = {c.group: factors.get(c.group, 1.0) * c.factor for c in scaled.components.components}
+    return _told(now, first, search, scaled, factors, _unsearched(now, options))
+
+
+def _unsearched(now: Adjustment, options: CleanOptions) -> tuple[str, ...]:
+    """That nothing was searched although something fails, in one line."""
+    n = _failing(now) if options.pairs.reject_pairs else 0
+    if not n or _searchable(now, n):
+        return ()
+    return (
+        f"{n} observations fail their tests, but gross errors were not searched for: these are too many among "
+        f"{now.n_unknowns} unknowns; check the sigmas, or leave out what the list of tests shows, worst first",
+    )
+
+
+def _searchable(now: Adjustment, n: int) -> bool:
+    """Whether ``n`` observations that fail can be left out one after the other."""
+    return now.n_unknowns <= _LARGEST or n * len(now.other_residuals) <= _ROOM
+
+
+def _blamed_on_rays(survey: Survey, found: Adjustment) -> bool:
+    """Whether rays to points, or images from stations, were left out that observations of another kind touch."""
+    touched = {r.point_id for d in survey.distances if d.used for r in (d.a, d.b) if r.frame is None}
+    touched |= {r.point_id for c in survey.coordinates if c.used for r in c.positions if r.frame is None}
+    touched |= {r.point_id for d in survey.coordinate_differences if d.used for r in (*d.at, *d.to) if r.frame is None}
+    touched |= {p.point_id for x in survey.readings if x.used for p in (x.at, x.to) if p.frame is None}
+    names = [p.point_id for p in found.survey.points]
+    paired = {r.frame_id for p in survey.pairs if p.used for r in (p.a, p.b) if r.kind == "station"}
+    carrying = {c.camera_id for c in survey.cameras if c.station_id in paired}
+    kept = {(b.camera_id, b.epoch_id) for b in found.survey.image_blocks if b.used is None or b.used.any()}
+    lost = {b.camera_id for b in survey.image_blocks if (b.camera_id, b.epoch_id) not in kept and _n_used(b)}
+    return bool(lost & carrying) or any(
+        b.camera_id in carrying or names[int(i)] in touched
+        for b in found.survey.image_blocks
+        if b.target_id is None and b.used is not None
+        for i in b.point_idx[~b.used]
+    )
+
+
+def _n_used(block: ImageBlock) -> int:
+    return len(block.uv) if block.used is None else int(block.used.sum())
+
+
+def _others_first(
+    survey: Survey, options: CleanOptions, progress: Callable[[int, float], None] | None, start: StartValues | None
+) -> Adjustment | None:
+    """The other order: all other kinds before the image points; None where that leads nowhere."""
+    every = replace(options.pairs.adjust, reject_points=False, reject_blocks=False)
+    unscreened = replace(options.pairs, adjust=every)
+    try:
+        first = adjust_with_pairs(survey, unscreened, progress, start)
+        search = _searched(survey, first, replace(options, pairs=unscreened), progress)
+        now = first if search is None else search.adjustment
+        if search is None or not search.rejected:
+            return None
+        found = _cleaned(now.survey, options, progress, values_of(now))
+    except SurveyError:
+        return None
+    notes = tuple(n for n in search.notes if n not in found.warnings)
+    return replace(found, decisions=(*search.log, *found.decisions), warnings=found.warnings + notes)
+
+
+def _left_out(given: Survey, found: Adjustment) -> int:
+    """Number of observed components in use that take no part any more; a whole image counts like each of its points."""
+    before = sum(2 * _n_used(b) for b in given.image_blocks)
+    after = 2 * int(found.image_residuals.used.sum())
+    out = sum(len(o.components) for o in found.other_residuals if not o.used)
+    unused = (given.distances, given.coordinates, given.pairs, given.coordinate_differences, given.readings,
+              given.levels, given.alignments, given.laser_spots, given.on_surfaces, given.table_readings)  # fmt: skip
+    return before - after + out - sum(1 for kind in unused for o in kind if not o.used)
+
+
+def _searched(
+    given: Survey, now: Adjustment, options: CleanOptions, progress: Callable[[int, float], None] | None
+) -> OutlierSearch | None:
+    """The search for gross errors; None where nothing fails, or nothing can be searched."""
+    n = _failing(now) if options.pairs.reject_pairs else 0
+    if not n or not _searchable(now, n):
+        return None
+    how = SearchOptions(kinds=_OTHERS, adjust=options.pairs.adjust)
+    return search_outliers(given, options=how, progress=progress, first=now)
+
+
+def _failing(now: Adjustment) -> int:
+    """How many observations that are no image points fail their tests."""
+    tests = [(o.test, len(o.components)) for o in now.other_residuals if o.used and float(o.redundancy.max()) > 1e-6]
+    n = len(tests) + int(now.image_residuals.used.sum())
+    statistic, freedom = np.array(tests, dtype=float).reshape(-1, 2).T
+    return int(np.count_nonzero(statistic > limits(SearchOptions().family_alpha, freedom, n)))
+
+
+def _told(
+    now: Adjustment, first: Adjustment, search: OutlierSearch | None, scaled: Scaled | None, factors: dict[str, float],
+    unsearched: tuple[str, ...] = (),
+) -> Adjustment:  # fmt: skip
+    """With its history, and the warnings of the first adjustment that are not about the solution itself."""
+    known = set(now.warnings)
+    about_first = ("left out", "camera")
+    screened = search.adjustment if search is not None and search.rejected else first  # image points, anew
+    about = [w for w in first.warnings if w.startswith(about_first) and _SCREENED not in w]
+    kept = tuple(w for w in (*about, *(w for w in screened.warnings if _SCREENED in w)) if w not in known)
+    notes = search.notes if search is not None else unsearched
+    components = None
+    if scaled is not None:
+        components = replace(scaled.components, components=_total(scaled.components.components, factors))
+        notes += component_notes(components)
+    return replace(
+        now, warnings=now.warnings + notes + kept + uncontrolled_pairs(now), variance_components=components,
+        decisions=search.log if search is not None else (),
+    )  # fmt: skip
+
+
+def _total(components: Sequence[Component], factors: dict[str, float]) -> tuple[Component, ...]:
+    """Over the a priori variances, of all passes."""
+    out = []
+    for c in components:
+        ratio = factors.get(c.group, c.factor) / c.factor
+        values = {name: getattr(c, name) * ratio for name in ("factor", "sigma", "lower", "upper")}
+        out.append(replace(c, **values))
+    return tuple(out)
+
+
+def component_notes(components: VarianceComponents) -> tuple[str, ...]:
+    """What the reader of variance components should know."""
+    out = []
+    for c in components.components:
+        if c.status == "vanished":
+            out.append(
+                f"variance component of group {c.group}: its residuals are smaller than any variance explains; check "
+                "whether its observations are independent of the others"
+            )
+        elif c.status == "no redundancy":
+            out.append(f"variance component of group {c.group}: too few checked observations; its sigmas are as given")
+        elif c.status == "estimated" and c.p < 0.01:
+            out.append(
+                f"variance component of group {c.group}: sigmas were {np.sqrt(c.factor):.2f} times those given "
+                f"(factor {c.factor:.3g} +- {c.sigma:.2g}, p {c.p:.2g})"
+            )
+    for groups in components.unseparable:
+        out.append(f"variance components of groups {', '.join(groups)}: only a mixture shows; they share one factor")
+    if not components.converged:
+        out.append("the variance components did not settle; look for gross errors or groups with too few observations")
+    return tuple(out)
+
+
+def rescaled(survey: Survey, components: VarianceComponents) -> Survey:
+    """A survey with the variances that another adjustment of the same instruments found."""
+    return scaled_survey(survey, {c.group: c.factor for c in components.components})

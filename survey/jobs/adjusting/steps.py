@@ -1,0 +1,221 @@
+"""How a project that was read is adjusted: a list of steps, run in order, each handing on what the next one takes."""
+
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+
+import numpy as np
+from tqdm import tqdm
+
+from adjust.adjustment import AdjustOptions, adjust
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.observations import ImageBlock
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import IntArray, Survey
+from adjust.statistics.pair_networks import PairOptions
+from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
+from adjust.statistics.supported import lost_notes, supported
+from adjust.statistics.undetermined_points import without_lost_points
+from survey.jobs.adjusting.probable_causes import explained, with_probable_causes
+from survey.jobs.adjusting.symmetric_boards import consistent_turns
+from survey.jobs.identify import identify_spots, without_points
+from survey.project import Project
+from survey.project.detected import DetectedImage
+
+Begin = Callable[[Survey], StartValues | None]
+Progress = Callable[[int, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """What one step hands on to the next: the project with its survey as it is now, and what was noticed.
+
+    lost: unknowns that went because nothing in use observes them. adjustment: once there is one.
+    """
+
+    project: Project
+    begin: Begin
+    progress: Progress
+    notes: tuple[str, ...] = ()
+    lost: tuple[ParameterName, ...] = ()
+    adjustment: Adjustment | None = None
+
+    @property
+    def survey(self) -> Survey:
+        """As it is now."""
+        return self.project.survey
+
+    def of(self, survey: Survey, notes: tuple[str, ...] = ()) -> "Work":
+        """The same with another survey, and more notes."""
+        return replace(self, project=replace(self.project, survey=survey), notes=self.notes + notes)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step: its name in the log, which projects it concerns, and what it makes of them. Raises SurveyError."""
+
+    name: str
+    concerns: Callable[[Work], bool]
+    run: Callable[[Work], Work]
+
+
+def _options(project: Project) -> CleanOptions:
+    said = project.options
+    how = AdjustOptions(said.alpha, said.reject_blocks, said.reject_points)
+    return CleanOptions(PairOptions(said.reject_pairs, how), said.variance_components)
+
+
+def _loops_closed(work: Work) -> Work:
+    from adjust.relay.closed import closed  # here: a survey without pairs starts without it
+
+    return work.of(closed(work.survey, work.project.options.closures))
+
+
+def _boards_turned(work: Work) -> Work:
+    return work.of(*consistent_turns(work.survey, work.project.target_kinds))
+
+
+def _spots_identified(work: Work) -> Work:
+    project = work.project
+    gate = project.spots_request.gate_px if project.spots_request is not None else 15.0
+    how = _options(project).pairs.adjust
+    try:
+        part = supported(without_points(project.survey))[0]
+        first = adjust(part, work.begin(part), how, work.progress)
+    except IndeterminateError as error:
+        raise SurveyError(
+            f"{project.folder}/observations: the spots cannot be identified, because cameras and stations are not "
+            f"determined without them; name the spots' beacons in image_points.csv, or hold a board\n({error})"
+        ) from error
+    found = identify_spots(project.survey, first, project.spots, gate)
+    notes = found.notes
+    if found.unidentified:
+        notes += (f"{found.unidentified} of {found.identified + found.unidentified} spots are no known beacon",)
+    survey = project.survey
+    return work.of(_seen_points(replace(survey, image_blocks=survey.image_blocks + found.blocks)), notes)
+
+
+def _unobserved_left_out(work: Work) -> Work:
+    survey, lost = supported(work.survey)
+    return replace(work.of(survey), lost=lost)
+
+
+def _adjusted(work: Work) -> Work:
+    """Least squares without gross errors, with variance components where they are asked for."""
+    how = _options(work.project)
+    try:
+        result = without_lost_points(
+            work.survey, lambda part: adjust_cleaned(part, how, work.progress, work.begin(part))
+        )
+    except SurveyError as error:
+        said = explained(work.survey, error)
+        if said is error:
+            raise
+        raise said from error
+    return replace(work, adjustment=result)
+
+
+def _causes_named(work: Work) -> Work:
+    return replace(work, adjustment=with_probable_causes(work.survey, _result(work)))
+
+
+STEPS = (
+    Step("loops", lambda w: w.project.options.pairs == "closed" and bool(w.survey.pairs), _loops_closed),
+    Step("symmetric boards", lambda w: bool(w.survey.image_blocks), _boards_turned),
+    Step("spots", lambda w: bool(w.project.spots), _spots_identified),
+    Step("unobserved", lambda _: True, _unobserved_left_out),
+    Step("adjust", lambda _: True, _adjusted),
+    Step("causes", lambda _: True, _causes_named),
+)
+
+
+def _untimed(_name: str) -> AbstractContextManager[None]:
+    return nullcontext()
+
+
+def adjust_project(
+    project: Project, progress: bool, begin: Begin = lambda _: None,
+    timed: Callable[[str], AbstractContextManager[None]] = _untimed,
+) -> Adjustment:  # fmt: skip
+    """Adjust what was read. Raises SurveyError.
+
+    begin: start values of a survey, found where it gives None. timed: what each step is run in, by its name.
+    """
+    others = (v for k, v in project.survey.others.items() if k != "table_readings")
+    if not any((project.survey.image_blocks, project.spots, *others)):
+        raise SurveyError(
+            f"{project.folder}: there is nothing to adjust; put images at images/<camera_id>/<epoch_id>.png or tables "
+            "into observations/"
+        )
+    with tqdm(desc="adjusting", unit=" steps", disable=not progress, file=sys.stderr, leave=False) as bar:
+
+        def told_bar(_iteration: int, omega: float) -> None:
+            bar.set_postfix_str(f"v'Pv = {omega:.6g}")
+            bar.update()
+
+        work = Work(project, begin, told_bar)
+        for step in STEPS:
+            if step.concerns(work):
+                with timed(step.name):
+                    work = step.run(work)
+    result = _result(work)
+    return told(project, work.survey, replace(result, warnings=result.warnings + work.notes + lost_notes(work.lost)))
+
+
+def _result(work: Work) -> Adjustment:
+    if work.adjustment is None:
+        raise ValueError("no step before this one has adjusted the survey")
+    return work.adjustment
+
+
+def told(project: Project, given: Survey, adjustment: Adjustment) -> Adjustment:
+    """An adjustment that says what was noticed when its project was read, and how much of ``given`` it left out."""
+    warnings = adjustment.warnings + project.notes + project.image_notes + image_warnings(project.detected)
+    images = sum(len(b.uv) if b.used is None else int(b.used.sum()) for b in given.image_blocks)
+    images -= int(adjustment.image_residuals.used.sum())
+    others = given.n_others_used - adjustment.survey.n_others_used
+    return replace(adjustment, warnings=warnings, n_screened=images + others)
+
+
+def image_warnings(images: Mapping[tuple[str, str], DetectedImage]) -> tuple[str, ...]:
+    """Boards of a wrong size, once each; images in which nothing was found for another reason, or not readable.
+
+    At every adjustment, not only at the first.
+    """
+    sizes = dict.fromkeys(entry.wrong_size for entry in images.values() if entry.wrong_size)
+    return tuple(f"detection: {text}" for text in sizes) + tuple(
+        f"detection: {entry.file}: {entry.status}{': ' + entry.message if entry.message else ''}"
+        for entry in images.values()
+        if entry.status == "failed" or (entry.status == "nothing" and not entry.wrong_size)
+    )  # fmt: skip
+
+
+def _seen_points(survey: Survey) -> Survey:
+    """Leave out the beacons that nothing observes any more: a beacon may be hidden in all images."""
+    observed: set[str | None] = {
+        survey.points[int(i)].point_id for b in survey.image_blocks if b.target_id is None for i in b.point_idx
+    }
+    observed |= {r.point_id for c in survey.coordinates for r in c.positions if r.frame is None}
+    refs = [r for d in survey.coordinate_differences for r in (*d.at, *d.to)]
+    refs += [o.position for o in survey.on_surfaces]
+    refs += [r for x in survey.readings for r in (x.at, x.to, x.second) if r is not None]
+    observed |= {r.point_id for r in refs if r.frame is None}
+    kept = tuple(p for p in survey.points if p.point_id in observed or p.x_in_world.treatment != "free")
+    if len(kept) == len(survey.points):
+        return survey
+    ids = {p.point_id: i for i, p in enumerate(kept)}
+    blocks = tuple(
+        b if b.target_id is not None
+        else replace(b, point_idx=_reindexed(survey, b, ids))
+        for b in survey.image_blocks
+    )  # fmt: skip
+    distances = tuple(
+        d for d in survey.distances if all(r.frame is not None or r.point_id in ids for r in (d.a, d.b))
+    )
+    return replace(survey, points=kept, image_blocks=blocks, distances=distances)
+
+
+def _reindexed(survey: Survey, block: ImageBlock, ids: dict[str, int]) -> IntArray:
+    return np.array([ids[survey.points[int(i)].point_id] for i in block.point_idx], dtype=np.int64)

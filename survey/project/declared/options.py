@@ -1,0 +1,214 @@
+"""How a project is adjusted and what it demands: [adjustment], [closures], [identification], [tolerances], [align]."""
+
+from collections.abc import Iterable
+from typing import Any, Literal
+
+import numpy as np
+from gtsam import Rot3
+
+from adjust.model.observations import Closure
+from adjust.model.survey import Survey
+from survey.folder.units import from_si, to_si
+from survey.project.declared.declarations import keys_of
+from survey.project.declared.node import Node
+from survey.project.declared.poses import quaternion_wxyz, rotation_from_euler, rotation_from_quaternion
+from survey.project.declared.toml_text import Section
+from survey.project.project import (
+    DEMANDED,
+    POSITION,
+    ROTATION,
+    SIGMA_KINDS,
+    AdjustmentOptions,
+    AlignmentTask,
+    Foot,
+    Tolerance,
+)
+from survey.project.tables.references import NameProblemError, Names, check_epochs, frame_text, read_frame
+
+_UNITS = ("mm", "arcsec", "deg", "px", "1")
+_SAID = {POSITION: ("mm",), ROTATION: ("arcsec", "deg")}
+
+
+def read_options(root: Node) -> AdjustmentOptions:
+    """The tables [adjustment], [closures], [tolerances] and [identification]. Raises SurveyError."""
+    node, said = root.table("adjustment"), root.table("identification")
+    node.allow(*keys_of("adjustment"))
+    alpha = node.number("alpha", 0.05, positive=True)
+    if alpha >= 1:
+        raise node.error(f"found {alpha:g}; it is a probability, between 0 and 1", "alpha")
+    flags = {name: node.flag(name, True) for name in ("reject_blocks", "reject_points", "reject_pairs")}
+    identification = tuple((key, said.text(key)) for key in said.values)
+    flags["variance_components"] = node.flag("variance_components", False)
+    asked = node.choice("sigmas", SIGMA_KINDS) if node.has("sigmas") else ""
+    sigmas = next((kind for kind in SIGMA_KINDS if kind == asked), None)
+    form, closures = _closures(root)
+    return AdjustmentOptions(
+        alpha, **flags, sigmas=sigmas, pairs=form, closures=closures, tolerances=_tolerances(root),
+        identification=identification,
+    )  # fmt: skip
+
+
+def _tolerances(root: Node) -> tuple[Tolerance, ...]:
+    """All demands, in the order of the file. Raises SurveyError."""
+    return tuple(_tolerance(name, node) for name, node in root.tables("tolerances"))
+
+
+def _tolerance(name: str, node: Node) -> Tolerance:
+    node.allow(*keys_of("tolerance"))
+    for key in ("expanded", "nominal", "tolerance"):
+        given = [full for unit in _UNITS if node.has(full := key if unit == "1" else f"{key}_{unit}")]
+        if len(given) > 1 and not (key == "expanded" and not node.has("component")):  # which has its own words for it
+            raise node.error(f"{given[0]} is given too; keep one of the two", given[1])
+    of = node.choice("of", DEMANDED)
+    ids = node.names("ids", ())
+    if node.has("component"):
+        component = node.text("component")
+        expanded, nominal, within = (_given(node, key, None) for key in ("expanded", "nominal", "tolerance"))
+        if expanded is None and within is None:
+            raise node.error("nothing is demanded; add tolerance_UNIT (with nominal_UNIT) or expanded_UNIT")
+        if nominal is not None and within is None:
+            raise node.error("a nominal value needs a tolerance; add tolerance_UNIT")
+        return Tolerance(name, of, ids, component, expanded, nominal, within)
+    quantity = POSITION if _given(node, "expanded", _SAID[POSITION]) is not None else ROTATION
+    largest = _given(node, "expanded", _SAID[quantity])
+    if largest is None:
+        raise node.error("nothing is demanded; add expanded_mm (of position) or expanded_arcsec (of rotation)")
+    if quantity == POSITION and _given(node, "expanded", _SAID[ROTATION]) is not None:
+        raise node.error("expanded_mm and an angle are both given; make two tolerances of them")
+    for key in ("nominal", "tolerance"):
+        if _given(node, key, None) is not None:
+            raise node.error(f"{key} is about one component; name it with 'component'")
+    return Tolerance(name, of, ids, quantity, largest)
+
+
+def _given(node: Node, key: str, units: tuple[str, ...] | None) -> float | None:
+    """The value under ``key_unit``, or under ``key`` for one without unit, in SI."""
+    for unit in units or _UNITS:
+        full = key if unit == "1" else f"{key}_{unit}"
+        if node.has(full):
+            value = node.number(full, positive=key != "nominal")
+            return value if unit in ("px", "1") else float(to_si(value, unit))
+    return None
+
+
+def tolerance_sections(tolerances: tuple[Tolerance, ...]) -> list[Section]:
+    """The inverse of :func:`read_options`; components are written in the unit that their name has in results."""
+    sections: list[Section] = []
+    for x in tolerances:
+        values: dict[str, Any] = {"of": x.of} | ({"ids": x.ids} if x.ids else {})
+        if x.quantity in _SAID:
+            unit = _SAID[x.quantity][0]
+            values[f"expanded_{unit}"] = None if x.expanded is None else float(from_si(x.expanded, unit))
+        else:
+            values["component"] = x.quantity
+            unit = _unit_of(x)
+            for key, value in (("expanded", x.expanded), ("nominal", x.nominal), ("tolerance", x.within)):
+                if value is not None:
+                    shown = value if unit in ("px", "1") else float(from_si(value, unit))
+                    values[key if unit == "1" else f"{key}_{unit}"] = shown
+        sections.append((("tolerances", x.name), values))
+    return sections
+
+
+def _unit_of(x: Tolerance) -> str:
+    if x.of == "table_geometry":
+        return "mm" if x.quantity == "axis_offset" else "arcsec"
+    return "px" if x.quantity in ("fx", "fy", "u0", "v0", "skew") else "1"
+
+
+FORMS: tuple[Literal["poses", "closed"], ...] = ("poses", "closed")
+
+
+def _closures(root: Node) -> tuple[Literal["poses", "closed"], tuple[Closure, ...]]:
+    """The form and all mounts, in the order of the file. Raises SurveyError."""
+    asked = root.table("adjustment").choice("pairs", FORMS, FORMS[0])
+    form = next(f for f in FORMS if f == asked)
+    closures = tuple(_closure(name, node) for name, node in root.tables("closures"))
+    if closures and form != "closed":
+        raise root.table("closures").error('a mount closes a loop only where loops are; write [adjustment] pairs = '
+                                           '"closed"', closures[0].closure_id)  # fmt: skip
+    return form, closures
+
+
+def _closure(name: str, node: Node) -> Closure:
+    node.allow(*keys_of("closure"))
+    along = node.number("sigma_mm", 0.0)
+    if along < 0.0:
+        raise node.error(f"found {along:g}; a sigma is not negative", "sigma_mm")
+    about = node.number("sigma_arcsec", positive=True)
+    return Closure(name, node.names("pairs"), float(to_si(about, "arcsec")), float(to_si(along, "mm")))
+
+
+def closure_sections(closures: tuple[Closure, ...]) -> list[Section]:
+    """The inverse of :func:`read_options`."""
+    return [
+        (("closures", c.closure_id), {
+            "pairs": c.pair_ids, "sigma_arcsec": float(from_si(c.rotation_sigma, "arcsec")),
+            "sigma_mm": float(from_si(c.translation_sigma, "mm")),
+        })
+        for c in closures
+    ]  # fmt: skip
+
+
+_ROTATIONS = ("rotation_quaternion_wxyz", "rotation_euler_xyz_deg")
+
+
+def read_alignment_tasks(root: Node, survey: Survey) -> tuple[AlignmentTask, ...]:
+    """The tables [align.*]."""
+    names = Names.of(survey)
+    tasks = []
+    for task_id, node in root.tables("align"):
+        node.allow(*keys_of("align"))
+        frames = []
+        for key in ("body", "onto"):
+            try:
+                frame = read_frame(node.text(key), names)
+                check_epochs(frame, None, names)
+            except NameProblemError as problem:
+                raise node.error(str(problem), key) from problem
+            frames.append(frame)
+        if frames[0] == frames[1]:
+            raise node.error("body and onto are the same; name the frame that the body is to be aligned with", "onto")
+        feet_node = node.table("feet_mm")
+        feet = tuple(Foot(name, *to_si(feet_node.numbers(name, (2,)), "mm").tolist()) for name in feet_node.values)
+        if feet and (len(feet) < 3 or np.linalg.matrix_rank(np.diff([(f.x, f.y) for f in feet], axis=0), 1e-9) < 2):
+            raise node.error(f"found {len(feet)} feet; three that are not in a row make a plane", "feet_mm")
+        pitch = to_si(node.number("pitch_mm", positive=True), "mm") if node.has("pitch_mm") else None
+        tolerance = None
+        if node.has("tolerance_arcsec"):
+            tolerance = float(to_si(node.number("tolerance_arcsec", positive=True), "arcsec"))
+        tasks.append(
+            AlignmentTask(task_id, frames[0], frames[1], _wanted(node), feet, None if pitch is None else float(pitch),
+                          tolerance)
+        )  # fmt: skip
+    return tuple(tasks)
+
+
+def _wanted(node: Node) -> Rot3:
+    if all(node.has(key) for key in _ROTATIONS):
+        raise node.error("the rotation is given twice; keep the quaternion or the Euler angles", _ROTATIONS[1])
+    if node.has(_ROTATIONS[1]):
+        return rotation_from_euler(to_si(node.numbers(_ROTATIONS[1], (3,)), "deg"))
+    if not node.has(_ROTATIONS[0]):
+        return Rot3()
+    rotation = rotation_from_quaternion(node.numbers(_ROTATIONS[0], (4,)))
+    if rotation is None:
+        raise node.error("the quaternion has not the length 1; correct it (w first)", _ROTATIONS[0])
+    return rotation
+
+
+def task_sections(tasks: Iterable[AlignmentTask]) -> list[Section]:
+    """The tables that ``read_alignment_tasks`` reads."""
+    sections: list[Section] = []
+    for task in tasks:
+        values: dict[str, Any] = {"body": frame_text(task.body), "onto": frame_text(task.onto)}
+        if not task.onto_from_body.equals(Rot3(), 0.0):
+            values["rotation_quaternion_wxyz"] = quaternion_wxyz(task.onto_from_body)
+        if task.feet:
+            values["feet_mm"] = {f.name: from_si([f.x, f.y], "mm").tolist() for f in task.feet}
+        if task.pitch is not None:
+            values["pitch_mm"] = float(from_si(task.pitch, "mm"))
+        if task.tolerance is not None:
+            values["tolerance_arcsec"] = float(from_si(task.tolerance, "arcsec"))
+        sections.append((("align", task.task_id), values))
+    return sections

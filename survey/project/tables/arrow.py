@@ -1,0 +1,239 @@
+"""Columns of large CSV tables and of Parquet files, by Arrow: the same doubles, to the bit, as Python reads and writes.
+
+What Arrow does not read as Python would (or not at all) is left to the readers that say what is wrong and where.
+"""
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from adjust.model.errors import SurveyError
+from adjust.model.survey import BoolArray, FloatArray
+from adjust.native.parallel import workers
+from survey.folder.text import LARGEST_NUMBER, utf8
+from survey.project.tables.reading import LARGEST_ROWS, Columns, Layout, TextColumn, check_header, check_rows, first_row
+
+LARGE = 2**20  # bytes of CSV, cells to write / 10: below, loading Arrow (30 ms) costs more than it saves
+_LARGEST_DECODED = 8 * 2**30  # bytes of the columns of a Parquet file
+_BLOCK, _ROWS = 4 * 2**20, 2**17  # bytes read, rows written at a time
+_ALIKE = (1e-4, 1e9)  # between these Arrow writes doubles as Python does, but for whole numbers
+
+
+def csv_columns(data: bytes, layout: Layout) -> dict[str, TextColumn | FloatArray] | None:
+    """The columns of a plain, faultless CSV table of many rows; None for any other, which is to be read row by row.
+
+    Plain: no quotes, every line of the same ending, no blank line.
+    """
+    if len(data) < LARGE or b'"' in data or (b"\r" in data and data.count(b"\r") != data.count(b"\r\n")):
+        return None
+    header = data[: data.find(b"\n")].decode("utf-8-sig", "replace").rstrip("\r").split(",")
+    if not set(layout.required) <= set(header) <= set(layout.columns) or not len(set(header)) == len(header) > 1:
+        return None
+    import pyarrow as pa
+    from pyarrow import csv as arrow_csv
+
+    types = {name: pa.dictionary(pa.int32(), pa.string()) if layout.is_text(name) else pa.float64() for name in header}
+    try:
+        read = arrow_csv.read_csv(
+            pa.BufferReader(data),
+            arrow_csv.ReadOptions(use_threads=workers() > 1, block_size=_BLOCK, skip_rows=1, column_names=header),
+            arrow_csv.ParseOptions(quote_char=False, ignore_empty_lines=False),
+            arrow_csv.ConvertOptions(column_types=types, null_values=[""], strings_can_be_null=False),
+        ).unify_dictionaries()
+    except (pa.ArrowException, OSError, ValueError):
+        return None
+    if read.num_rows > LARGEST_ROWS:
+        return None
+    out: dict[str, TextColumn | FloatArray] = {}
+    for name in header:
+        column = _text(read[name]) if layout.is_text(name) else _numbers(read[name])
+        if column is None or (name in layout.required and _has_blank(column)):
+            return None
+        out[name] = column
+    return out
+
+
+def _text(column: Any) -> TextColumn:
+    names = tuple(column.chunk(0).dictionary.to_pylist()) if column.num_chunks else ()
+    codes = [_values(chunk.indices, np.int32) for chunk in column.chunks]
+    return TextColumn(names, np.concatenate([np.zeros(0, np.int64), *codes]))
+
+
+def _numbers(column: Any) -> FloatArray | None:
+    """Doubles, nan where blank; None where one is not finite or too large."""
+    values = np.concatenate([np.zeros(0), *(_values(chunk, np.float64) for chunk in column.chunks)])
+    if column.null_count:
+        blank = np.concatenate([_blank(chunk) for chunk in column.chunks])
+        values[blank] = 0.0
+    if values.size and not max(values.max(), -values.min()) <= LARGEST_NUMBER:
+        return None
+    if column.null_count:
+        values[blank] = np.nan
+    return values
+
+
+def _values(array: Any, kind: type[np.generic]) -> npt.NDArray[Any]:
+    """What an array of Arrow holds, without ``to_numpy``, which loads pandas."""
+    size = np.dtype(kind).itemsize
+    return np.frombuffer(array.buffers()[1], kind, len(array), array.offset * size)
+
+
+def _blank(array: Any) -> BoolArray:
+    bits = array.buffers()[0]
+    if bits is None:
+        return np.zeros(len(array), bool)
+    valid = np.unpackbits(np.frombuffer(bits, np.uint8), bitorder="little")[array.offset :][: len(array)]
+    return ~valid.astype(bool)
+
+
+def _array(values: npt.NDArray[Any], kind: Any, blank: BoolArray | None = None) -> Any:
+    """The inverse of both."""
+    import pyarrow as pa
+
+    valid = None if blank is None else pa.py_buffer(np.packbits(~blank, bitorder="little"))
+    held = np.packbits(values, bitorder="little") if values.dtype == bool else np.ascontiguousarray(values)
+    return pa.Array.from_buffers(kind, len(values), [valid, pa.py_buffer(held)])
+
+
+def _has_blank(column: TextColumn | FloatArray) -> bool:
+    return "" in column.names if isinstance(column, TextColumn) else bool(np.isnan(column).any())
+
+
+def csv_rows(columns: Columns) -> bytes:
+    """Rows of CSV without their header, as the csv module writes them; nan is blank."""
+    import pyarrow.compute as pc
+
+    comma, nothing, end = _strings((",", "", "\n"))
+    arrays = [_dictionary(c) if isinstance(c, TextColumn) else c for c in map(_coded, columns.values())]
+
+    def rows(first: int) -> bytes:
+        texts = [_number_texts(c[first : first + _ROWS]) if isinstance(c, np.ndarray)
+                 else c.slice(first, _ROWS).dictionary_decode() for c in arrays]  # fmt: skip
+        found = pc.binary_join_element_wise(pc.binary_join_element_wise(*texts, comma), nothing, end)
+        _, ends, data = found.buffers()
+        return bytes(data.slice(0, int(np.frombuffer(ends, np.int32)[len(found)])))
+
+    with ThreadPoolExecutor(workers()) as pool:
+        return b"".join(pool.map(rows, range(0, len(arrays[0]), _ROWS)))
+
+
+def _coded(column: Sequence[str] | TextColumn | FloatArray) -> TextColumn | FloatArray:
+    if isinstance(column, TextColumn | np.ndarray):
+        return column
+    index = {name: i for i, name in enumerate(dict.fromkeys(column))}
+    return TextColumn(tuple(index), np.fromiter(map(index.__getitem__, column), np.int64, len(column)))
+
+
+def _dictionary(column: TextColumn) -> Any:
+    """A column of texts for Arrow, quoted as the csv module does."""
+    import pyarrow as pa
+
+    return pa.DictionaryArray.from_arrays(_array(column.codes, pa.int64()), _strings(map(_quoted, column.names)))
+
+
+def _quoted(name: str) -> str:
+    out = io.StringIO(newline="")
+    csv.writer(out, lineterminator="\n").writerow((name, ""))  # a row of one blank would be quoted
+    return out.getvalue().removesuffix(",\n")
+
+
+def _strings(texts: Iterable[str]) -> Any:
+    """Texts for Arrow: ``pyarrow.array``, or a text given to its functions, loads pandas."""
+    import pyarrow as pa
+
+    held = [utf8(text) for text in texts]
+    ends = np.cumsum([0, *map(len, held)], dtype=np.int32)
+    return pa.StringArray.from_buffers(len(held), pa.py_buffer(ends), pa.py_buffer(b"".join(held)))
+
+
+def _number_texts(values: FloatArray) -> Any:
+    """What Python writes for doubles: by Arrow, and by Python where the two differ; blank for nan."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    texts = pc.cast(_array(values, pa.float64(), np.isnan(values)), pa.string())
+    least, largest = _ALIKE
+    own = (values == np.rint(values)) | (np.abs(values) < least) | (np.abs(values) >= largest)
+    if own.any():
+        texts = pc.replace_with_mask(texts, _array(own, pa.bool_()), _strings(map(repr, values[own].tolist())))
+    return pc.fill_null(texts, _strings(("",))[0])
+
+
+def parquet_bytes(columns: Columns) -> bytes:
+    """A Parquet file: doubles, nan as null, and texts by their different names."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    arrays = {
+        name: pa.array(column, from_pandas=True)
+        if isinstance(column, np.ndarray)
+        else pa.array(column.names, pa.string()).take(pa.array(column.codes)).dictionary_encode()
+        for name, column in zip(columns, map(_coded, columns.values()), strict=True)
+    }
+    stream = io.BytesIO()
+    pq.write_table(pa.table(arrays), stream)
+    return stream.getvalue()
+
+
+def parquet_columns(path: Path, data: bytes, layout: Layout) -> dict[str, TextColumn | FloatArray]:
+    """The columns of a Parquet file. Raises SurveyError with file and row for whatever does not fit the layout."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        file = pq.ParquetFile(pa.BufferReader(data))
+        check_rows(path, file.metadata.num_rows)
+        sizes = (file.metadata.row_group(i).total_byte_size for i in range(file.metadata.num_row_groups))
+        if sum(sizes) > _LARGEST_DECODED:
+            raise SurveyError(f"{path}: its columns take more than {_LARGEST_DECODED >> 30} GB; split the survey")
+        check_header(path, file.schema_arrow.names, layout)
+        content = file.read()
+        content.validate(full=True)
+    except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+        raise SurveyError(f"{path}:1: not a Parquet file ({error}); write it again") from error
+    check_header(path, content.column_names, layout)
+    out: dict[str, TextColumn | FloatArray] = {}
+    for name in content.column_names:
+        array = content[name].combine_chunks()
+        columns_of = _parquet_text if layout.is_text(name) else _parquet_numbers
+        out[name] = columns_of(path, name, array, name in layout.required)
+    return out
+
+
+def _parquet_text(path: Path, name: str, array: Any, is_required: bool) -> TextColumn:
+    import pyarrow as pa
+
+    value_type = array.type.value_type if pa.types.is_dictionary(array.type) else array.type
+    if not (pa.types.is_string(value_type) or pa.types.is_large_string(value_type)):
+        raise SurveyError(f"{path}:1: {name}: the column holds {value_type}, expected text; write it as strings")
+    column = array.cast(value_type).fill_null("").dictionary_encode()
+    try:
+        names = tuple(column.dictionary.to_pylist())
+    except ValueError as error:
+        raise SurveyError(f"{path}:1: {name}: a text is not UTF-8 ({error}); write it again") from error
+    codes = np.asarray(column.indices.to_numpy(zero_copy_only=False), dtype=np.int64)
+    if is_required and "" in names:
+        raise SurveyError(f"{path}:{first_row(codes == names.index('')) + 1}: {name}: is blank; fill it in")
+    return TextColumn(names, codes)
+
+
+def _parquet_numbers(path: Path, name: str, array: Any, is_required: bool) -> FloatArray:
+    import pyarrow as pa
+
+    if not (pa.types.is_floating(array.type) or pa.types.is_integer(array.type)):
+        raise SurveyError(f"{path}:1: {name}: the column holds {array.type}, expected numbers; write it as doubles")
+    blank = np.asarray(array.is_null().to_numpy(zero_copy_only=False), dtype=bool)
+    values = np.array(array.cast(pa.float64()).fill_null(0.0).to_numpy(zero_copy_only=False), dtype=float)
+    bad = ~(np.abs(values) <= LARGEST_NUMBER) | (blank & is_required)
+    if bad.any():
+        row = first_row(bad)
+        found = "is blank; fill it in" if blank[row] else f"found {values[row]}; it must be a finite number"
+        raise SurveyError(f"{path}:{row + 1}: {name}: {found}")
+    values[blank] = np.nan
+    return values

@@ -1,0 +1,161 @@
+"""Tables of observations out of CSV or Parquet files, with file and line of whatever is wrong in them."""
+
+import contextlib
+import csv
+import io
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adjust.model.errors import SurveyError
+from adjust.model.survey import FloatArray, IntArray
+from survey.folder.text import LARGEST_NUMBER, decode, read_bytes
+from survey.project.tables.arrow import csv_columns, parquet_columns
+from survey.project.tables.reading import Layout, Table, TextColumn, check_header, check_rows, first_row
+
+CHUNK = 65536
+Chunk = tuple[IntArray, Sequence[Sequence[str]]]
+
+
+def read_table(path: Path, layout: Layout) -> Table:
+    """Read ``.csv`` or ``.parquet``; raises SurveyError with file and line for whatever does not fit the layout."""
+    data, digest = read_bytes(path)
+    if path.suffix == ".parquet":
+        columns = parquet_columns(path, data, layout)
+        return _table(path, layout, digest, np.arange(1, len(next(iter(columns.values()))) + 1), columns)
+    plain = csv_columns(data, layout)
+    if plain is not None:
+        return _table(path, layout, digest, np.arange(2, len(next(iter(plain.values()))) + 2), plain)
+    text = decode(path, data)
+    if not text.strip():
+        raise SurveyError(f"{path}:1: the file is empty; the first line names the columns: {','.join(layout.required)}")
+    check_rows(path, text.count("\n"))
+    header, chunks = csv_chunks(path, text)
+    check_header(path, header, layout)
+    return _assemble(path, layout, digest, header, chunks)
+
+
+def _assemble(path: Path, layout: Layout, digest: str, header: Sequence[str], chunks: Iterable[Chunk]) -> Table:
+    builders = {name: _TextBuilder() if layout.is_text(name) else _NumberBuilder() for name in header}
+    all_lines = [np.zeros(0, np.int64)]
+    for lines, columns in chunks:
+        all_lines.append(lines)
+        for name, column in zip(header, columns, strict=True):
+            bad = builders[name].add(column, name in layout.required)
+            if bad is not None:
+                raise SurveyError(f"{path}:{lines[bad[0]]}: {name}: {bad[1]}")
+    return _table(path, layout, digest, np.concatenate(all_lines), {n: b.column() for n, b in builders.items()})
+
+
+def _table(
+    path: Path, layout: Layout, digest: str, lines: IntArray, columns: Mapping[str, TextColumn | FloatArray]
+) -> Table:
+    texts = {name: column for name, column in columns.items() if isinstance(column, TextColumn)}
+    numbers = {name: column for name, column in columns.items() if not isinstance(column, TextColumn)}
+    return Table(path, layout, digest, lines, texts, numbers)
+
+
+class _TextBuilder:
+    """Turns texts into codes, chunk by chunk."""
+
+    def __init__(self) -> None:
+        self.parts: list[IntArray] = []
+        self.index: dict[str, int] = {}
+
+    def add(self, column: Sequence[str], is_required: bool) -> tuple[int, str] | None:
+        for name in dict.fromkeys(column):
+            self.index.setdefault(name, len(self.index))
+        self.parts.append(np.fromiter(map(self.index.__getitem__, column), np.int64, len(column)))
+        if is_required and "" in self.index:
+            return column.index(""), "is blank; fill it in"
+        return None
+
+    def column(self) -> TextColumn:
+        return TextColumn(tuple(self.index), np.concatenate([np.zeros(0, np.int64), *self.parts]))
+
+
+class _NumberBuilder:
+    """Turns texts into numbers, chunk by chunk."""
+
+    def __init__(self) -> None:
+        self.parts: list[FloatArray] = []
+
+    def add(self, column: Sequence[str], is_required: bool) -> tuple[int, str] | None:
+        try:
+            values = np.fromiter(map(float, column), np.float64, len(column))
+        except ValueError:
+            values = None
+        if values is None or "_" in "".join(column):  # Python takes 1_000 for a number, people do not
+            values = np.empty(len(column))
+            for row, text in enumerate(column):
+                if text == "" and not is_required:
+                    values[row] = 0.0
+                    continue
+                try:
+                    values[row] = float(text.replace("_", "?"))
+                except ValueError:
+                    return row, "is blank; fill it in" if text == "" else f"found {text!r}, expected a number"
+        bad = ~(np.abs(values) <= LARGEST_NUMBER)
+        if bad.any():
+            row = first_row(bad)
+            problem = "too large to be meant; correct it" if np.isfinite(values[row]) else "it must be a finite number"
+            return row, f"found {column[row][:40]!r}; {problem}"
+        if not is_required and "" in column:
+            values[np.fromiter((text == "" for text in column), bool, len(column))] = np.nan
+        self.parts.append(values)
+        return None
+
+    def column(self) -> FloatArray:
+        return np.concatenate([np.zeros(0), *self.parts])
+
+
+def csv_chunks(path: Path, text: str) -> tuple[list[str], Iterator[Chunk]]:
+    """The header, and the rows after it: the line of each row, and the columns. Raises SurveyError for broken rows."""
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    try:
+        header = next(reader)
+    except csv.Error as error:
+        raise SurveyError(f"{path}:1: not a CSV line ({error}); correct the quotes") from error
+    return header, _columns(path, text, reader, len(header))
+
+
+def _columns(path: Path, text: str, reader: Any, n: int) -> Iterator[Chunk]:
+    """Chunk by chunk through the csv module; raises where a row has a wrong length."""
+    line = reader.line_num + 1
+    while rows := _next_rows(path, text, reader):
+        lines = np.arange(line, line + len(rows))
+        _check_lengths(path, rows, lines, n, reader.line_num)
+        line += len(rows)
+        filled = np.fromiter(map(bool, rows), bool, len(rows))
+        if filled.any():
+            yield lines[filled], list(zip(*filter(None, rows), strict=True))
+
+
+def _next_rows(path: Path, text: str, reader: Any) -> list[list[str]]:
+    try:
+        return list(itertools.islice(reader, CHUNK))
+    except csv.Error as error:
+        raise SurveyError(f"{path}:{_last_start(text)}: not a CSV line ({error}); correct the quotes") from error
+
+
+def _check_lengths(path: Path, rows: list[list[str]], lines: IntArray, n: int, last_line: int) -> None:
+    if not set(map(len, rows)) <= {0, n}:
+        i = next(i for i, row in enumerate(rows) if len(row) not in (0, n))
+        hint = "; numbers have a decimal point, not a comma" if len(rows[i]) > n else ""
+        raise SurveyError(f"{path}:{lines[i]}: found {len(rows[i])} fields, expected {n} as in the first line{hint}")
+    if last_line != lines[-1]:
+        i = next(i for i, row in enumerate(rows) if any("\n" in field or "\r" in field for field in row))
+        raise SurveyError(f"{path}:{lines[i]}: a quoted field runs over the end of the line; close its quotes")
+
+
+def _last_start(text: str) -> int:
+    """The line on which the row begins that the csv module cannot read."""
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    line = 1
+    with contextlib.suppress(csv.Error):
+        for _ in reader:
+            line = reader.line_num + 1
+    return line

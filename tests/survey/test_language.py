@@ -1,0 +1,123 @@
+"""Catalogues of languages against the texts of the program: nothing is missing, nothing stale, nothing in code."""
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+
+import pytest
+from jinja2 import Environment, nodes
+
+import adjust
+import survey
+from adjust.model import observations
+from survey.batch.causes import CAUSES
+from survey.project.tables.terrestrial import KINDS
+from survey.report.language import (
+    GROUPS_BY_KIND,
+    LANGUAGES,
+    MissingTranslationError,
+    catalogue,
+    group_name,
+    message,
+    speaking,
+    t,
+)
+
+SURVEY, ADJUST = (Path(str(package.__file__)).parent for package in (survey, adjust))
+PAGES = (*SURVEY.glob("report/*.py"), *SURVEY.glob("batch/*.py"))  # what is said in the reader's language
+TEMPLATES = SURVEY / "report" / "templates"
+OTHERS = [language for language in LANGUAGES if language != "en"]
+
+
+def literals(paths: tuple[Path, ...]) -> set[str]:
+    """All literal texts, those within f-strings piece by piece."""
+    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in paths)
+    return {
+        node.value for tree in trees for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }  # fmt: skip
+
+
+def said_by_templates() -> set[str]:
+    """What ``t`` is called with in templates."""
+    out = set()
+    for path in TEMPLATES.glob("*.html"):
+        for call in Environment().parse(path.read_text(encoding="utf-8")).find_all(nodes.Call):
+            if isinstance(call.node, nodes.Name) and call.node.name == "t" and isinstance(call.args[0], nodes.Const):
+                out.add(call.args[0].value)
+    return out
+
+
+def said_by_pages() -> Iterator[str]:
+    """What ``t`` and ``section`` are called with, headings of tables, titles of the sections."""
+    at = {"t": 0, "section": 1}
+    for path in PAGES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in at and node.args:
+                text = node.args[at[node.func.id]]
+                if isinstance(text, ast.Constant) and isinstance(text.value, str):
+                    yield text.value
+            if isinstance(node, ast.Assign) and any(getattr(x, "id", "").lower() == "columns" for x in node.targets):
+                words = (x.value for x in ast.walk(node.value) if isinstance(x, ast.Constant))
+                yield from (x.removeprefix("<") for x in words if isinstance(x, str) and re.search(r"[A-Za-z]{4}", x))
+
+
+@pytest.mark.parametrize("language", OTHERS)
+def test_every_text_has_its_translation(language: str) -> None:
+    wanted = {*said_by_pages(), *said_by_templates(), *CAUSES.values()}
+    assert len(wanted) > 250
+    assert wanted - set(catalogue(language).texts) == set()
+
+
+@pytest.mark.parametrize("language", OTHERS)
+def test_nothing_stale_remains(language: str) -> None:
+    near = literals(PAGES)
+    far = literals((*SURVEY.rglob("*.py"), *ADJUST.rglob("*.py")))
+    used = near | {x.removeprefix("<") for x in near} | said_by_templates() | {x.replace("_", " ") for x in far}
+    assert set(catalogue(language).texts) - used == set()
+    everything = "\n".join(far)
+    for pattern, _ in catalogue(language).messages:
+        words = re.findall(r"[a-z][a-z' ]+[a-z']", re.sub(r"\((?:\?:)?[^()]*(?<!\\)\)|\\S", "|", pattern))
+        assert " ".join(max(words, key=len).split()[-4:]) in everything, pattern
+
+
+@pytest.mark.parametrize("language", OTHERS)
+def test_translations_take_what_the_texts_give(language: str) -> None:
+    for english, said in catalogue(language).texts.items():
+        assert set(re.findall(r"\{(\w+)\}", english)) == set(re.findall(r"\{(\w+)\}", said)), english
+        assert re.findall(r"<[^>]*>", english) == re.findall(r"<[^>]*>", said), english
+    for pattern, said in catalogue(language).messages:
+        assert re.compile(pattern).groups == said.count("{}"), pattern
+
+
+def test_a_text_that_is_missing_is_a_bug() -> None:
+    with speaking("de"), pytest.raises(MissingTranslationError):
+        t("no such text")
+
+
+def test_values_in_a_text_are_text() -> None:
+    assert t("Close no loop: {names}", names="<b>") == "Close no loop: &lt;b&gt;"
+
+
+def test_groups_named_after_their_kind_are_said_in_the_language_and_others_as_they_are() -> None:
+    named = {
+        field.default
+        for kind in vars(observations).values() if is_dataclass(kind)
+        for field in fields(kind) if field.name == "group"
+    }  # fmt: skip
+    assert {"image", "distance", "coordinates"} <= named
+    assert named | set(KINDS) <= GROUPS_BY_KIND
+    with speaking("de"):
+        assert group_name("slope_distance") == "Schrägstrecke"
+        assert [x for x in GROUPS_BY_KIND if group_name(x) == x.replace("_", " ")] == []
+        assert group_name("points") == "points"  # a name that people gave
+    assert group_name("slope_distance") == "slope distance"
+
+
+def test_german_messages_have_german_numbers() -> None:
+    said = "Global test failed: residuals are 1.37 times what the sigmas of the observations allow. Look for errors."
+    with speaking("de"):
+        assert "das 1,37-fache" in message(said)
+        assert "Epoche 1.5" in message("camera X at epoch 1.5, target board: not used")

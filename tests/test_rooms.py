@@ -1,0 +1,87 @@
+"""The order of the modules: none imports itself round about, read from the sources of all three packages."""
+
+import ast
+from collections.abc import Iterator, Mapping
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("adjust", "survey", "capture")
+
+
+def _modules(root: Path) -> dict[str, Path]:
+    paths = (path for name in PACKAGES for path in (root / name).rglob("*.py"))
+    found = {path.relative_to(root).with_suffix("").as_posix(): path for path in paths}
+    return {name.removesuffix("/__init__").replace("/", "."): path for name, path in found.items()}
+
+
+def _statements(node: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
+    """Imports anywhere, in functions too, but not those for type checkers alone."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import | ast.ImportFrom):
+            yield child
+        elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+            for other in child.orelse:
+                yield from _statements(ast.Module([other], []))
+        else:
+            yield from _statements(child)
+
+
+def _named(name: str, is_package: bool, statement: ast.Import | ast.ImportFrom) -> Iterator[str]:
+    if isinstance(statement, ast.Import):
+        yield from (alias.name for alias in statement.names)
+        return
+    above = name.split(".")[: len(name.split(".")) + is_package - statement.level] if statement.level else []
+    base = ".".join((*above, *filter(None, [statement.module])))
+    for alias in statement.names:
+        yield from (f"{base}.{alias.name}", base)
+
+
+@cache
+def _imports(root: Path) -> dict[str, set[str]]:
+    """What every module imports: a name out of a package's face is that package, a module in it the module."""
+    modules = _modules(root)
+    out: dict[str, set[str]] = {}
+    for name, path in modules.items():
+        out[name] = set()
+        for statement in _statements(ast.parse(path.read_text(encoding="utf-8"))):
+            named = list(_named(name, path.name == "__init__.py", statement))
+            if isinstance(statement, ast.ImportFrom):  # "from package import module" is of the module
+                named = [full if full in modules else base for full, base in zip(named[::2], named[1::2], strict=True)]
+            out[name] |= {other for other in named if other in modules and other != name}
+    return out
+
+
+def _circle(imports: Mapping[str, set[str]]) -> list[str]:
+    try:
+        TopologicalSorter(imports).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_module_imports_itself_round_about(package: str) -> None:
+    imports = {name: of for name, of in _imports(ROOT).items() if name.split(".")[0] == package}
+    assert imports
+    assert _circle(imports) == []
+
+
+def test_a_circle_is_found_through_functions_and_relative_imports_but_not_through_types(tmp_path: Path) -> None:
+    (tmp_path / "survey").mkdir()
+    texts = {
+        "__init__": "",
+        "a": "def late():\n    from survey.b import thing\n",
+        "b": "from . import c\n",
+        "c": "import typing\nif typing.TYPE_CHECKING:\n    from .a import late\nelse:\n    import survey.d\n",
+        "d": "",
+    }
+    for name, text in texts.items():
+        (tmp_path / "survey" / f"{name}.py").write_text(text)
+    assert _circle(_imports(tmp_path)) == []
+    (tmp_path / "survey/d.py").write_text("from .a import late\n")
+    _imports.cache_clear()
+    assert set(_circle(_imports(tmp_path))) == {f"survey.{name}" for name in "abcd"}
