@@ -19,7 +19,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler
-from adjust.statistics.pair_screen import values_of
+from adjust.graph.assembly import values_of
 
 Motion = Pose3 | Rot3
 _CLEARLY = 3.0

@@ -15,7 +15,7 @@ from adjust.diagnosis.screen import Screen, screen
 from adjust.diagnosis.units.conventions import ANGLES, MISREADINGS, SLIPS, TURNS, Misreading
 from adjust.model.observations import Reading
 from adjust.model.survey import IntArray, Survey
-from adjust.statistics.pair_screen import values_of
+from adjust.graph.assembly import values_of
 
 _CAP = 25.0
 _CLEARLY = 3.0
