@@ -4,14 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.diagnosis.case import Case
+from adjust.diagnosis.case import CAP, Case, block_misfits
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
-
-CAP = 25.0
-"""The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +41,12 @@ class Trial:
 
 def tried(hypothesis: Hypothesis, case: Case) -> Trial:
     """The survey of a hypothesis adjusted as its case is; no change of what the case holds."""
+    survey = hypothesis.changed()
     try:
-        result = case.run(hypothesis.survey)
+        result = None if survey is None else case.run(survey)
     except SurveyError:
-        return Trial(hypothesis, misfit_of(None, hypothesis.survey), None)
-    return Trial(hypothesis, misfit_of(result, hypothesis.survey), result)
+        result = None
+    return Trial(hypothesis, misfit_of(result, survey or case.survey), result)
 
 
 def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
@@ -61,22 +59,10 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
     if result is None:
         return Misfit(CAP * points, points, points, 0)
     images = result.image_residuals
-    cov = np.concatenate([np.zeros((0, 2, 2)), *(b.cov for b in result.survey.image_blocks)])
-    squares = _whitened(images.residuals, cov)
     others = np.concatenate([np.zeros(0), *(_squares(o.residual, o.sigma) for o in result.other_residuals)])
-    unused = int(2 * (~images.used).sum()) + max(0, points - 2 * len(cov))
-    unused += sum(len(o.residual) for o in result.other_residuals if not o.used)
-    omega = float(np.minimum(squares, 2.0 * CAP).sum() + np.minimum(others, CAP).sum())
-    omega += CAP * max(0, points - 2 * len(cov))  # blocks that are not even predicted
+    unused = points - 2 * int(images.used.sum()) + sum(len(o.residual) for o in result.other_residuals if not o.used)
+    omega = float(block_misfits(survey, result).sum() + np.minimum(others, CAP).sum())
     return Misfit(omega, unused, points + len(others), result.redundancy)
-
-
-def _whitened(residuals: FloatArray, cov: FloatArray) -> FloatArray:
-    """(n,) v' inv(C) v of image points; what cannot be predicted counts as the bound."""
-    if not len(residuals):
-        return np.zeros(0)
-    squares = np.einsum("ni,nij,nj->n", residuals, np.linalg.inv(cov), residuals)
-    return np.where(np.isfinite(squares), squares, np.inf)
 
 
 def _squares(residual: FloatArray, sigma: FloatArray) -> FloatArray:
