@@ -1,19 +1,21 @@
 """The way of a diagnosis: hypotheses from cheap evidence, the likeliest tried, those that explain the misfit ranked."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.ranking import Candidate, ranked
-from adjust.diagnosis.trial import Misfit, misfit_of, tried
+from adjust.diagnosis.trial import Misfit, Trial, misfit_of, tried
 from adjust.model.errors import SurveyError
 
 MOST_TRIALS = 10
 _SHOWN = 3
+_NOISE = 1.2  # variance factor
+_FAINT = 0.2
 
-FAMILIES: tuple[str, ...] = ()
+FAMILIES: tuple[str, ...] = ("images", "targets", "bodies", "names", "units", "time", "weights")
 """Rooms of this one, each with ``hypotheses(case) -> Iterable[Hypothesis]``: what cheap evidence makes worth a try."""
 
 Family = Callable[[Case], Iterable[Hypothesis]]
@@ -44,9 +46,28 @@ def diagnose(case: Case, families: Sequence[Family] | None = None, most: int = M
     formed = [h for family in (_all_families() if families is None else families) for h in _formed(family, case)]
     formed.sort(key=lambda h: -h.evidence)
     base = misfit_of(case.result, case.survey)
-    trials = [tried(h, case) for h in formed[:most]]
+    trials: list[Trial] = []
+    queue, names, left = list(formed), [], most
+    while queue and left > 0 and not _done(trials, queue[0]):
+        first = queue.pop(0)
+        names.append(first.name)
+        left -= 1
+        trial = tried(first, case)
+        more = list(first.follow(trial.result)) if first.follow is not None and trial.result is not None else []
+        same = [replace(trial, hypothesis=h) for h in more if h.survey is first.survey]
+        trials += same or [trial]
+        queue[:0] = [h for h in more if h.survey is not first.survey]
     looked_at = sum(h.looked_at for h in formed)
-    return Diagnosis(ranked(base, trials, looked_at), tuple(dict.fromkeys(h.name for h in formed[:most])), base)
+    return Diagnosis(ranked(base, trials, looked_at), tuple(dict.fromkeys(names)), base)
+
+
+def _done(trials: Sequence[Trial], following: Hypothesis) -> bool:
+    """Whether one explains everything down to the noise, and what follows is much less evident."""
+    return any(
+        t.result is not None and t.misfit.unused == 0 and t.misfit.omega < _NOISE * t.misfit.redundancy
+        and following.evidence < _FAINT * t.hypothesis.evidence
+        for t in trials
+    )  # fmt: skip
 
 
 def _all_families() -> list[Family]:

@@ -1,9 +1,9 @@
 """What may be wrong with a survey: one cause, the one change that would mend it, and where a project says it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from adjust.graph.assembly import StartValues
+from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 
 
@@ -76,22 +76,28 @@ class Hypothesis:
     """One cause, and the survey as it would be without it.
 
     name: of the kind of cause ("images mirrored"), the same for every place. cause: what is wrong, a sentence about
-    named things. change: what would mend it. survey: the survey with that one change, to be tried. edits: the same as
+    named things. change: what would mend it. survey: the survey with that one change, to be tried, or what makes it where
+    that takes adjustments of its own. edits: the same as
     changes of a project, none where only a person can do it. evidence: how clearly cheap evidence speaks for it, a
     ratio of misfits or of sigmas; only the order of trials follows it. parameters: how many numbers of the change were
     chosen to fit (a cut's epoch, a factor). looked_at: how many such hypotheses were compared with each other, for the
-    family-wise level. start: start values, found where None. penalty: what the change adds to minus
-    twice the log likelihood beside v'Pv, where it changes variances: the sum of the logarithms of their factors.
+    family-wise level. follow: what the adjustment tells more exactly, in place of this one: the same survey under its
+    right name, or another one to be tried. penalty: what the change adds to minus twice the log likelihood beside v'Pv,
+    where it changes variances: the sum of the logarithms of their factors.
     """
 
     name: str
     cause: str
     change: str
     place: Place
-    survey: Survey
+    survey: Survey | Callable[[], Survey | None]
     edits: tuple[Edit, ...] = ()
     evidence: float = 1.0
     parameters: int = 1
     looked_at: int = 1
-    start: StartValues | None = None
+    follow: Callable[[Adjustment], Sequence["Hypothesis"]] | None = None
     penalty: float = 0.0
+
+    def changed(self) -> Survey | None:
+        """The survey to be tried; None where the change turns out not to be possible."""
+        return self.survey() if callable(self.survey) else self.survey

@@ -5,14 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from adjust.diagnosis.case import Case
+from adjust.diagnosis.case import CAP, Case, block_misfits
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
-
-CAP = 25.0
-"""The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +42,12 @@ class Trial:
 
 def tried(hypothesis: Hypothesis, case: Case) -> Trial:
     """The survey of a hypothesis adjusted as its case is; no change of what the case holds."""
+    survey = hypothesis.changed()
     try:
-        result = case.run(hypothesis.survey)
+        result = None if survey is None else case.run(survey)
     except SurveyError:
-        return Trial(hypothesis, misfit_of(None, hypothesis.survey), None)
-    return Trial(hypothesis, misfit_of(result, hypothesis.survey), result)
+        result = None
+    return Trial(hypothesis, misfit_of(result, survey or case.survey), result)
 
 
 def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
@@ -63,14 +61,11 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
     if result is None:
         return Misfit(CAP * (points + n_others), points + n_others, points + n_others, 0)
     images = result.image_residuals
-    cov = np.concatenate([np.zeros((0, 2, 2)), *(b.cov for b in result.survey.image_blocks)])
-    squares = _whitened(images.residuals, cov)
     others = np.concatenate([np.zeros(0), *(_squares(o.residual, o.sigma) for o in result.other_residuals)])
-    gone = max(0, points - 2 * len(cov)) + max(0, n_others - n_other_components(result.survey, used_only=False))
-    unused = int(2 * (~images.used).sum()) + gone
+    gone = max(0, n_others - n_other_components(result.survey, used_only=False))
+    unused = points - 2 * int(images.used.sum()) + gone
     unused += sum(len(o.residual) for o in result.other_residuals if not o.used)
-    omega = float(np.minimum(squares, 2.0 * CAP).sum() + np.minimum(others, CAP).sum())
-    omega += CAP * gone  # what is not even predicted
+    omega = float(block_misfits(survey, result).sum() + np.minimum(others, CAP).sum()) + CAP * gone
     return Misfit(omega, unused, points + max(len(others), n_others), result.redundancy)
 
 
@@ -85,14 +80,6 @@ def _n_components(observed: Any) -> int:
     """Of one observation: the finite variances of its covariance, one where it has a sigma."""
     cov = getattr(observed, "cov", None)
     return 1 if cov is None else int(np.isfinite(np.diag(cov)).sum())
-
-
-def _whitened(residuals: FloatArray, cov: FloatArray) -> FloatArray:
-    """(n,) v' inv(C) v of image points; what cannot be predicted counts as the bound."""
-    if not len(residuals):
-        return np.zeros(0)
-    squares = np.einsum("ni,nij,nj->n", residuals, np.linalg.inv(cov), residuals)
-    return np.where(np.isfinite(squares), squares, np.inf)
 
 
 def _squares(residual: FloatArray, sigma: FloatArray) -> FloatArray:

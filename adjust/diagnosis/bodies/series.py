@@ -95,6 +95,27 @@ def _implied(
     return i, back @ view.poses[0] @ inverse(after), A @ view_covariance(case.survey.image_blocks[i], view) @ A.T
 
 
+def placed_views(case: Case, result: Adjustment, target_id: str) -> tuple[FloatArray, FloatArray]:
+    """Places (n, 3) m of the cameras that see a target that stands still, and (n, 3) m from each to the target's origin.
+
+    Both in the frame that carries the target, by an adjustment without it; the second from single images.
+    """
+    names, chains = chains_of(case.survey)
+    slot = next((s for s, name in names.items() if name == ("carrier_from_target", target_id)), None)
+    poses = {s: _pose(case.survey, result, tuple(name)) for s, name in names.items()}
+    places, offsets = [], []
+    for i, chain in enumerate(chains):
+        if slot is None or case.survey.image_blocks[i].target_id != target_id:
+            continue
+        found = _implied(case, poses, chain, slot, i, set())
+        if found is not None:
+            link, view = found[1], case.views[i].poses[0]
+            c = (link @ inverse(view))[:3, 3]
+            places.append(c)
+            offsets.append(link[:3, 3] - c)
+    return np.array(places).reshape(-1, 3), np.array(offsets).reshape(-1, 3)
+
+
 def _pose(survey: Survey, result: Adjustment, name: tuple[str, ...]) -> FloatArray | None:
     """(4, 4) of a slot; None where the adjustment has no value of it."""
     if name[0] == "table_motion":

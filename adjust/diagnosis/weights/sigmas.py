@@ -46,7 +46,7 @@ def wrong_factors(case: Case) -> Iterator[Hypothesis]:
             f"multiply them by {k:.3g}: {group.group} = {k:.3g} below [sigmas.scale] in survey.toml, or give the "
             "sigmas that the instrument has", Place("group", (group.group,), "sigmas.scale"),
             scaled_survey(case.survey, {group.group: factor}), (ScaleKey(("sigmas", "scale", group.group), k),),
-            max(factor, 1.0 / factor), 1, len(tested), None, group.n_observations * float(np.log(factor)),
+            max(factor, 1.0 / factor), 1, len(tested), penalty=group.n_observations * float(np.log(factor)),
         )  # fmt: skip
 
 
@@ -93,7 +93,7 @@ def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[Any], u
     return Hypothesis(
         "odd sigma", f"{kind} {', '.join(ids[:5])}{f' and {len(ids) - 5} more' if len(ids) > 5 else ''}: the sigma "
         f"is {ratio:.0f} times off the usual one of group {group}", "give the sigma that was meant, or none",
-        Place("reading", tuple(ids), "sigma"), replace(case.survey, **{field: items}), (), ratio, 1, 1, None, penalty,
+        Place("reading", tuple(ids), "sigma"), replace(case.survey, **{field: items}), (), ratio, penalty=penalty,
     )  # fmt: skip
 
 
