@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from gtsam import Pose3, Quaternion, Rot3
+from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
@@ -53,13 +53,13 @@ def _matrix(m: Motion) -> FloatArray:
 def _last_first(m: Motion) -> Motion:
     """The four numbers stood as x y z w in the columns w x y z."""
     q = (m.rotation() if isinstance(m, Pose3) else m).toQuaternion()
-    return _rotated(m, Rot3(Quaternion(q.z(), q.w(), q.x(), q.y())).matrix())
+    return _rotated(m, Rot3.Quaternion(q.z(), q.w(), q.x(), q.y()).matrix())
 
 
 def _first_last(m: Motion) -> Motion:
     """The four numbers stood as w x y z in columns named x y z w."""
     q = (m.rotation() if isinstance(m, Pose3) else m).toQuaternion()
-    return _rotated(m, Rot3(Quaternion(q.x(), q.y(), q.z(), q.w())).matrix())
+    return _rotated(m, Rot3.Quaternion(q.x(), q.y(), q.z(), q.w()).matrix())
 
 
 def _turned_back(m: Motion) -> Motion:
