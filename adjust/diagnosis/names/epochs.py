@@ -14,6 +14,8 @@ from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.sequences import Link, Shift, fitted, links, shifts, typical
 from adjust.model.observations import FrameRef, ImageBlock, Pair
 from adjust.model.survey import FloatArray, Survey
+from adjust.spatial.averaging import mean_pose
+from adjust.spatial.rigid import inverse
 
 _CLEARLY = 3.0
 _SUSPECTS = 6
@@ -102,21 +104,26 @@ def _exchanged(survey: Survey, link: Link) -> Iterator[Hypothesis]:
 
 
 def _cameras(survey: Survey, link: Link) -> Iterator[Hypothesis]:
-    """Images of two cameras under each other's names: at one epoch, or from one on."""
-    fit = fitted("rig", link.first, link.second)
-    if fit is None:
-        return
-    lever = fit.misses(link.first, link.second)
-    other = fit.misses(link.second, link.first)
-    ratio = lever / (other + float(np.median(np.minimum(lever, other))) + 1e-9)
-    wrong = np.flatnonzero(ratio > _CLEARLY)
-    if 0 < len(wrong) < len(lever):
-        epochs = tuple(link.epochs[i] for i in wrong)
+    """Images of two cameras under each other's names, at the smaller part of the epochs: one, or from one on.
+
+    An exchange inverts the motion between the two: the one that joins all epochs either way is found first.
+    """
+    n, lever = len(link.epochs), float(np.median(np.linalg.norm(link.first[:, :3, 3], axis=1)))
+    motions = link.first @ inverse(link.second)
+    both, members = np.concatenate([motions, inverse(motions)]), np.tile(np.arange(n), 2)
+    apart = mean_pose(both, lever, members)[1].reshape(2, n)
+    wrong = apart[1] < apart[0]
+    if 2 * wrong.sum() > n or (2 * wrong.sum() == n and wrong[0]):
+        wrong = ~wrong
+    near, far = apart.min(axis=0), apart.max(axis=0)
+    ratio = float(np.min(far / (near + float(np.median(near)) + 1e-9)))
+    if wrong.any() and ratio > _CLEARLY:
+        epochs = tuple(e for e, w in zip(link.epochs, wrong, strict=True) if w)
         a, b = link.names
         yield Hypothesis(
             "cameras exchanged", f"cameras {a} and {b} have each other's images at {_listed(epochs, link.epochs)}",
             f"exchange these images between images/{a} and images/{b}", Place("camera", (a, b), "", epochs),
-            exchanged_cameras(survey, a, b, epochs), (), float(ratio[wrong].min()), 2, len(lever),
+            exchanged_cameras(survey, a, b, epochs), (), ratio, 2, n,
         )  # fmt: skip
 
 

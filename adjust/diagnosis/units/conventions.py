@@ -65,6 +65,5 @@ MISREADINGS: tuple[Misreading, ...] = (
     Misreading("angles from another zero", "are zenith angles of the second face", -1.0, 2.0 * np.pi, ("zenith",)),
     Misreading("sign of height differences", "have the other sign", -1.0, 0.0, ("height_difference",)),
 )
-"""Slips of the decimal point are tried on single values alone: see ``SLIPS``."""
-
 SLIPS: tuple[float, ...] = (10.0, 0.1, 100.0, 0.01)
+"""Slips of the decimal point, tried on single values alone."""

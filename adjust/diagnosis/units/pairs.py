@@ -150,9 +150,22 @@ def misread_pairs(case: Case) -> Iterator[Hypothesis]:
     found.sort(key=lambda f: (-f[0], -len(f[1].rows)))
     for evidence, scope, convention, changed in found[:_MOST]:
         if evidence > _CLEARLY:
-            cause = f"{scope.text} {convention.said}"
+            cause = f"{scope.text} {convention.said}{_lengths(changed, hands)}"
             yield Hypothesis(convention.name, cause, f"in pairs.csv {convention.remedy}", scope.place, changed,
                              _edits(survey, scope.rows, convention), evidence, 1, looked_at)  # fmt: skip
+
+
+def _lengths(survey: Survey, hands: list[Link]) -> str:
+    """How far camera and target are from hand and base: what no residual shows, a person sees."""
+    out = []
+    for link in hands[:1]:
+        fit = fitted(link.kind, link.first, _second(survey, link))
+        if fit is not None:
+            left, right = (float(np.linalg.norm(x[:3, 3])) for x in (fit.left, fit.right))
+            out.append(f" (then the camera is {left:.3f} m from the hand and the target {right:.3f} m from the base; "
+                       "with the robot's poses the other way round and the camera beside the robot, as well: "
+                       f"{left:.3f} m from the base and {right:.3f} m from the hand)")  # fmt: skip
+    return "".join(out)
 
 
 def mended(survey: Survey, rows: IntArray, convention: Convention) -> Survey | None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
+from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen, screen
 from adjust.diagnosis.units.conventions import ANGLES, MISREADINGS, SLIPS, TURNS, Misreading
 from adjust.model.observations import Reading
@@ -20,7 +20,7 @@ from adjust.graph.assembly import values_of
 _CAP = 25.0
 _CLEARLY = 3.0
 """By how much the misfit of the readings concerned has to fall."""
-_MOST = 6
+_MOST, _SINGLE = 6, 8
 _LARGE_START = 2500
 """Readings up to which start values are found anew for every hypothesis that concerns all of a kind."""
 
@@ -46,9 +46,28 @@ def misread_readings(case: Case) -> Iterator[Hypothesis]:
             looked_at += 1
             found.append((_evidence(survey, before, scope, misreading), scope, misreading))
     found.sort(key=lambda f: (-f[0], -len(f[1].rows)))
+    found += _slips(survey, before)
+    found.sort(key=lambda f: (-f[0], -len(f[1].rows)))
     for evidence, scope, misreading in found[:_MOST]:
         if evidence > _CLEARLY:
             yield _hypothesis(survey, scope, misreading, evidence, looked_at)
+
+
+def _slips(survey: Survey, before: Screen | None) -> list[tuple[float, Scope, Misreading]]:
+    """Single readings that fit with their decimal point one or two places on: of those that miss most."""
+    if before is None:
+        return []
+    out = []
+    for i in np.argsort(-before.readings)[:_SINGLE].tolist():
+        r = survey.readings[i]
+        scope = Scope(np.array([i]), f"reading {r.reading_id}", Place("reading", (r.reading_id,), "value"))
+        for factor in SLIPS:
+            slip = Misreading("slipped decimal", f"has slipped: {r.value:.9g} for {factor * r.value:.9g} (SI)", factor,
+                              0.0, (r.kind,))  # fmt: skip
+            evidence = _evidence(survey, before, scope, slip)
+            if evidence > _CLEARLY:
+                out.append((evidence, scope, slip))
+    return out
 
 
 def at_best(case: Case) -> Screen | None:
@@ -127,20 +146,17 @@ def _concerns_all(survey: Survey, scope: Scope) -> bool:
 
 def _hypothesis(survey: Survey, scope: Scope, misreading: Misreading, evidence: float, looked_at: int) -> Hypothesis:
     return Hypothesis(
-        misreading.name, f"{scope.text}: their values {misreading.said}", _remedy(misreading), scope.place,
-        mended(survey, scope.rows, misreading), edits(survey, scope.rows, misreading), evidence, 1, max(looked_at, 1),
+        misreading.name, _cause(scope, misreading), _remedy(misreading), scope.place,
+        mended(survey, scope.rows, misreading), (), evidence, 1, max(looked_at, 1),
     )  # fmt: skip
+
+
+def _cause(scope: Scope, misreading: Misreading) -> str:
+    what = "its decimal point" if misreading.name == "slipped decimal" else "their values"
+    return f"{scope.text}: {what} {misreading.said}"
 
 
 def _remedy(misreading: Misreading) -> str:
     if misreading.offset:
         return "in terrestrial.csv give them as zenith angles"
     return f"in terrestrial.csv multiply them by {misreading.factor:.10g}, or name the column by their unit"
-
-
-def edits(survey: Survey, rows: IntArray, misreading: Misreading) -> tuple[ChangeColumns, ...]:
-    """The same in the table, where the value stands in one column by its unit; angles in degrees."""
-    ids = tuple(survey.readings[i].reading_id for i in rows)
-    if misreading.offset:
-        return ()
-    return (ChangeColumns("terrestrial", ("value",), np.array([[misreading.factor]]), np.zeros(1), {"reading_id": ids}),)
