@@ -11,7 +11,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
-from adjust.diagnosis.sequences import Link, Shift, fitted, links, shifts, typical
+from adjust.diagnosis.sequences import Link, Shift, fitted, links, shifts
 from adjust.model.observations import FrameRef, ImageBlock, Pair
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.averaging import mean_pose

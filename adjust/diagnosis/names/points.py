@@ -13,7 +13,7 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, Rename
 from adjust.diagnosis.screen import Screen, screen
-from adjust.diagnosis.units.readings import at_best
+from adjust.diagnosis.units.readings import at_best, drop
 from adjust.model.observations import PositionRef, Reading
 from adjust.model.survey import IntArray, Survey
 
@@ -75,10 +75,7 @@ def exchanged(survey: Survey, rows: IntArray, a: str, b: str) -> Survey:
 
 def _evidence(before: Screen, changed: Survey, rows: IntArray) -> float:
     after = screen(changed, before.start)
-    if after is None:
-        return 0.0
-    old, new = (np.minimum(s.readings[rows] / before.scale, _CAP).sum() for s in (before, after))
-    return float(old / (new + 0.1 * len(rows) + 1.0))
+    return 0.0 if after is None else drop(before, rows, after.readings[rows])
 
 
 def _hypothesis(changed: Survey, setup_id: str | None, a: str, b: str, evidence: float) -> Hypothesis:

@@ -13,9 +13,15 @@ from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen
 from adjust.diagnosis.units.readings import at_best
 from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.statistics.system import linear_system
+from adjust.statistics.weakness import times_covariance
 
 _CLEARLY, _CAP = 3.0, 25.0
 _MOST = 4
+_LARGEST = 10.0
+"""m: what no height of an instrument or a target, and no reflector's constant, is wrong by."""
+_SEEN = 1e-4
+"""Share of a constant's column that no unknown takes over, below which it does not show."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +45,41 @@ def wrong_heights(case: Case) -> Iterator[Hypothesis]:
     if before is None or before.graph.terrestrial is None:
         return
     constants = list(_constants(survey, before))
-    found = [(e, c, d) for c in constants for e, d in [_evidence(before, c)] if e > _CLEARLY]
+    judged = _by_scores(case, constants) or [_evidence(before, c) for c in constants]
+    found = [(e, c, d) for c, (e, d) in zip(constants, judged, strict=True) if e > _CLEARLY and abs(d) < _LARGEST]
     for evidence, constant, metres in sorted(found, key=lambda f: (-f[0], -len(f[1].rows)))[:_MOST]:
         changed = _changed(survey, constant, metres)
+        amount = -metres if constant.name == "prism constant" else metres
         yield Hypothesis(
-            constant.name, f"{constant.text} is wrong by about {-1e3 * metres:.1f} mm",
-            f"{constant.remedy} by {1e3 * metres:+.1f} mm", constant.place, changed, (), evidence, 1, len(constants),
+            constant.name, f"{constant.text} is wrong by about {-1e3 * amount:+.1f} mm",
+            f"{constant.remedy} by {1e3 * amount:+.1f} mm", constant.place, changed, (), evidence, 1, len(constants),
         )  # fmt: skip
+
+
+def _by_scores(case: Case, constants: list[_Constant]) -> list[tuple[float, float]]:
+    """The same by the score test at the solution (Rao 1948), where there is one that left nothing out.
+
+    With the whitened column b of a constant, ``g = b' e`` and ``m = b' (I - A Q A') b``: g^2 / m is what v'Pv falls by,
+    and -g / m the constant.
+    """
+    result = case.result
+    if result is None or len(result.survey.readings) != len(case.survey.readings):
+        return []
+    if not all(r.used for r in result.survey.readings):
+        return []
+    system = linear_system(result)
+    first = int(system.ptr[len(system.ptr) - 1 - len(case.survey.readings)])
+    sigma = np.array([r.sigma for r in case.survey.readings])
+    B = np.zeros((len(system.e), len(constants)))
+    for k, c in enumerate(constants):
+        B[first + c.rows, k] = c.by / sigma[c.rows]
+    g = B.T @ system.e
+    AtB = np.asarray(system.A.T @ B)
+    m = np.einsum("ij,ij->j", B, B) - np.einsum("ij,ij->j", AtB, times_covariance(system, AtB))
+    sure = m > _SEEN * np.einsum("ij,ij->j", B, B)
+    metres = np.where(sure, -g / np.where(sure, m, 1.0), 0.0)
+    drop = np.where(sure, g**2 / np.where(sure, m, 1.0), 0.0)
+    return [(float(result.omega / max(result.omega - d, 1.0)), float(x)) for d, x in zip(drop, metres, strict=True)]
 
 
 def _constants(survey: Survey, before: Screen) -> Iterator[_Constant]:

@@ -15,11 +15,11 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
 from adjust.diagnosis.screen import Screen, screen
 from adjust.diagnosis.sequences import Link, fitted, links, typical, with_pairs
+from adjust.graph.assembly import values_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler
-from adjust.graph.assembly import values_of
 
 Motion = Pose3 | Rot3
 _CLEARLY = 3.0

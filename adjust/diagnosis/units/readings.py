@@ -13,9 +13,11 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen, screen
 from adjust.diagnosis.units.conventions import ANGLES, MISREADINGS, SLIPS, TURNS, Misreading
-from adjust.model.observations import Reading
-from adjust.model.survey import IntArray, Survey
 from adjust.graph.assembly import values_of
+from adjust.model.observations import Reading
+from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.observations.terrestrial.batch import circular_median
+from adjust.observations.terrestrial.equations import DIRECTION, wrapped
 
 _CAP = 25.0
 _CLEARLY = 3.0
@@ -124,19 +126,41 @@ def mended(survey: Survey, rows: IntArray, misreading: Misreading) -> Survey:
 
 def _evidence(survey: Survey, before: Screen | None, scope: Scope, misreading: Misreading) -> float:
     """How many times smaller the bounded misfit becomes."""
-    whole = _concerns_all(survey, scope)
-    changed = mended(survey, scope.rows, misreading)
-    start = None if before is None or (whole and len(survey.readings) <= _LARGE_START) else before.start
-    after = screen(changed, start)
+    n, whole = len(survey.readings), _concerns_all(survey, scope)
+    if before is not None and not (whole and n <= _LARGE_START):
+        return drop(before, scope.rows, _mended_squares(before, scope.rows, misreading))
+    after = screen(mended(survey, scope.rows, misreading))
     if after is None:
         return 0.0
     if before is None:
-        n = len(survey.readings)
         return _CAP * n / (after.misfit(after.scale) + 0.1 * n)
-    rows = np.arange(len(survey.readings)) if whole else scope.rows
     scale = min(before.scale, after.scale)
-    old, new = (np.minimum(s.readings[rows] / scale, _CAP).sum() for s in (before, after))
-    return float(old / (new + 0.1 * len(rows)))
+    return before.misfit(scale) / (after.misfit(scale) + 0.1 * n)
+
+
+def drop(before: Screen, rows: IntArray, after: FloatArray) -> float:
+    """How many times smaller the bounded misfit of these readings becomes, times its share of all misfit."""
+    every, now = (np.minimum(s / before.scale, _CAP) for s in (before.readings, after))
+    old, new = float(every[rows].sum()), float(now.sum())
+    share = max(0.0, old - new) / max(float(every.sum()), 1e-9)
+    return share * old / (new + 0.1 * len(rows) + 1.0)
+
+
+def _mended_squares(before: Screen, rows: IntArray, misreading: Misreading) -> FloatArray:
+    """(n,) squares over sigmas of mended readings where everything else is; directions of a set-up share a turn."""
+    batch = before.graph.terrestrial
+    if batch is None:
+        return np.zeros(len(rows))
+    a = batch.layout.arrays
+    observed = np.array(a.observed)
+    observed[rows] = misreading.mend(observed[rows])
+    miss = wrapped(a.kind, before.predicted, observed)
+    for orientation in np.unique(a.orientation[rows][a.kind[rows] == DIRECTION]):
+        of = (a.kind == DIRECTION) & (a.orientation == orientation)
+        turn = circular_median(miss[of & np.isfinite(miss)])
+        miss[of] = wrapped(a.kind[of], miss[of], np.full(int(of.sum()), turn))
+    squares = (miss[rows] / batch.sigma[rows]) ** 2
+    return np.where(np.isfinite(squares), squares, np.inf)
 
 
 def _concerns_all(survey: Survey, scope: Scope) -> bool:

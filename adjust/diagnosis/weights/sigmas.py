@@ -24,6 +24,8 @@ _ODD = 100.0
 """Ratio of a sigma to the usual one of its kind that nobody means: a sigma of zero, or of a metre."""
 _TAILS = 3.0
 """How much heavier than normal the residuals' largest fifth may be for one factor to explain all of them."""
+_LAST = 2.0
+"""Evidence at most: sigmas that are large enough fit anything, so what else there is to try is tried first."""
 _KINDS = ("readings", "distances", "levels", "on_surfaces")
 
 
@@ -42,11 +44,12 @@ def wrong_factors(case: Case) -> Iterator[Hypothesis]:
         k = float(np.sqrt(factor))
         yield Hypothesis(
             "sigmas of a group", f"the sigmas of group {group.group} are {k if k > 1 else 1 / k:.2g} times too "
-            f"{'small' if k > 1 else 'large'}: its residuals are evenly {'larger' if k > 1 else 'smaller'} than they say",
+            f"{'small' if k > 1 else 'large'}: its residuals are evenly {'larger' if k > 1 else 'smaller'} than they "
+            "say",
             f"multiply them by {k:.3g}: {group.group} = {k:.3g} below [sigmas.scale] in survey.toml, or give the "
             "sigmas that the instrument has", Place("group", (group.group,), "sigmas.scale"),
             scaled_survey(case.survey, {group.group: factor}), (ScaleKey(("sigmas", "scale", group.group), k),),
-            max(factor, 1.0 / factor), 1, len(tested), penalty=group.n_observations * float(np.log(factor)),
+            min(max(factor, 1.0 / factor), _LAST), 1, len(tested), penalty=group.n_observations * float(np.log(factor)),
         )  # fmt: skip
 
 
@@ -93,9 +96,10 @@ def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[Any], u
     return Hypothesis(
         "odd sigma", f"{kind} {', '.join(ids[:5])}{f' and {len(ids) - 5} more' if len(ids) > 5 else ''}: the sigma "
         f"is {ratio:.0f} times off the usual one of group {group}", "give the sigma that was meant, or none",
-        Place("reading", tuple(ids), "sigma"), replace(case.survey, **{field: items}), (), ratio, penalty=penalty,
+        Place("reading", tuple(ids), "sigma"), replace(case.survey, **{field: items}), (), min(ratio, 10.0), penalty=penalty,
     )  # fmt: skip
 
 
 def _id(o: Any) -> str:
-    return str(next((getattr(o, n) for n in ("reading_id", "distance_id", "level_id", "surface_id") if hasattr(o, n)), "?"))
+    names = ("reading_id", "distance_id", "level_id", "surface_id")
+    return str(next(getattr(o, n) for n in names if hasattr(o, n)))
