@@ -126,7 +126,7 @@ def _points(survey: Survey, used: Mapping[str, int], expected: Adjustment | None
             and 0 < used.get(p.point_id, 0) <= 3 - len(p.x_in_world.held)]  # fmt: skip
     if bare and expected is not None:
         yield Finding("weak", "no redundancy", tuple(bare), f"points without redundancy: {_names(bare)}",
-                      "observe each once more, best from another direction: a gross error there shows nowhere")  # fmt: skip
+                      "observe each once more, best from another direction: an error there shows nowhere")  # fmt: skip
 
 
 def _epochs(survey: Survey) -> Iterator[Finding]:
@@ -146,7 +146,7 @@ def _epochs(survey: Survey) -> Iterator[Finding]:
     if rig and lonely and len(lonely) > 0.5 * len(seen):
         yield Finding("weak", "epochs without partners", tuple(lonely),
                       f"{len(lonely)} of {len(seen)} epochs are seen by one camera alone: {_names(lonely)}",
-                      "they give lenses, but join no cameras; check the names of files, or take epochs that two see")  # fmt: skip
+                      "they join no cameras; check the names of files, or take epochs that two see")  # fmt: skip
     read = {t.epoch_id: t.table_id for t in survey.table_readings}
     blind = [e for e in read if e not in seen]
     if blind and survey.image_blocks:
@@ -193,7 +193,7 @@ def _spacing(uv: FloatArray) -> float:
 def _incidence(camera_from_target: FloatArray) -> float:
     """Angle (rad) between the target's normal and the line of sight to its origin."""
     sight = camera_from_target[:3, 3] / np.linalg.norm(camera_from_target[:3, 3])
-    return float(np.arccos(min(1.0, abs(camera_from_target[:3, 2] @ sight))))
+    return float(np.arccos(min(1.0, abs(float(camera_from_target[:3, 2] @ sight)))))
 
 
 def _cameras(case: Case) -> Iterator[Finding]:
@@ -204,7 +204,7 @@ def _cameras(case: Case) -> Iterator[Finding]:
         blocks = [(i, b) for i, b in enumerate(case.survey.image_blocks) if b.camera_id == camera.camera_id]
         if not blocks:
             yield Finding("problem", "camera without images", (camera.camera_id,),
-                          f"camera {camera.camera_id} has no image points", "detect its images, or remove it")  # fmt: skip
+                          f"camera {camera.camera_id} has no image points", "detect them, or remove it")  # fmt: skip
             continue
         yield from _coverage(camera, np.concatenate([b.uv for _, b in blocks]))
         poses = [case.views[i].poses[0] for i, _ in blocks if i in case.views and len(case.views[i].poses)]
@@ -223,7 +223,7 @@ def _coverage(camera: Camera, uv: FloatArray) -> Iterator[Finding]:
         where = f", none at the {' and '.join(missing)}" if missing else ""
         yield Finding("weak", "image not covered", (camera.camera_id,),
                       f"camera {camera.camera_id}: its points cover {100 * share:.0f} % of the image{where}",
-                      "bring the target into the corners and edges: distortion is not known where no points are")  # fmt: skip
+                      "bring the target into corners and edges: distortion is unknown where no points are")  # fmt: skip
 
 
 def _views(camera: Camera, poses: FloatArray) -> Iterator[Finding]:
@@ -267,7 +267,7 @@ def _lengths(survey: Survey) -> Iterator[Finding]:
     for setup_id, length in typical.items():
         ratio = length / usual
         if not 0.02 < ratio < 50.0:
-            near = min(LENGTH_RATIOS, key=lambda said: abs(np.log(LENGTH_RATIOS[said] * ratio)))
+            near = min(LENGTH_RATIOS, key=lambda said: abs(float(np.log(LENGTH_RATIOS[said] * ratio))))
             yield Finding("problem", "suspicious unit", (setup_id,), f"distances of set-up {setup_id} are {ratio:.3g} "
                           f"times those of the others: perhaps they {near}", "check value_m and value_mm")  # fmt: skip
 

@@ -71,3 +71,8 @@ def screen(survey: Survey, start: StartValues | None = None) -> Screen | None:
         return Screen(graph, start)
     except SurveyError:
         return None
+
+
+def improvement(before: float, after: float, n: int) -> float:
+    """How many times less than before the bounded misfits of n observations exceed their noise, which is about n."""
+    return (before - n) / (max(after - n, 0.0) + 5.0 + 0.02 * n)

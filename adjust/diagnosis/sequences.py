@@ -99,8 +99,8 @@ def _rigs(survey: Survey, seen: Mapping[tuple[str, str], Mapping[str, FloatArray
                 a, b = seen[camera, target], seen[other, target]
                 epochs = tuple(e for e in a if e in b)
                 if len(epochs) >= _FEWEST:
-                    yield Link("rig", (camera, other), epochs, *(np.array([x[e] for e in epochs]) for x in (a, b)),
-                               target)  # fmt: skip
+                    first, second = (np.array([x[e] for e in epochs]) for x in (a, b))
+                    yield Link("rig", (camera, other), epochs, first, second, target)
 
 
 def _hands(survey: Survey, seen: Mapping[tuple[str, str], Mapping[str, FloatArray]]) -> Iterator[Link]:

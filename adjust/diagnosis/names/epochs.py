@@ -6,6 +6,7 @@ Evidence: a rig, or a hand and its eye, is rigid; see :mod:`adjust.diagnosis.seq
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -58,7 +59,8 @@ def _said(link: Link) -> tuple[str, str, Place]:
     """What the second is called, where its epochs stand, and its place."""
     if link.pairs:
         return f"the measured poses of {link.names[1]}", "pairs.csv", Place("station", (link.names[1],), "epoch")
-    return f"the images of camera {link.names[1]}", f"images/{link.names[1]}", Place("camera", (link.names[1],), "epoch")
+    camera = link.names[1]
+    return f"the images of camera {camera}", f"images/{camera}", Place("camera", (camera,), "epoch")
 
 
 def _shifted(survey: Survey, link: Link) -> Iterator[Hypothesis]:
@@ -145,11 +147,11 @@ def exchanged_cameras(survey: Survey, a: str, b: str, epochs: tuple[str, ...]) -
 
 def _twice(survey: Survey) -> Iterator[Hypothesis]:
     """Two measured poses of the same frames, or two readings of a table at one epoch, that differ: either may go."""
-    for field, key in (("pairs", lambda p: (p.a, p.b)), ("table_readings", lambda t: (t.table_id, t.epoch_id))):
-        seen: dict[object, list[int]] = {}
+    for field, ends in (("pairs", ("a", "b")), ("table_readings", ("table_id", "epoch_id"))):
+        seen: dict[tuple[object, ...], list[int]] = {}
         for i, o in enumerate(getattr(survey, field)):
             if o.used:
-                seen.setdefault(key(o), []).append(i)
+                seen.setdefault(tuple(getattr(o, end) for end in ends), []).append(i)
         for rows in seen.values():
             for i in rows if len(rows) > 1 and not _agree([getattr(survey, field)[k] for k in rows]) else ():
                 yield _without_one(survey, field, i)
@@ -170,7 +172,7 @@ def _difference(a: object, b: object) -> FloatArray:
 def _without_one(survey: Survey, field: str, row: int) -> Hypothesis:
     o = getattr(survey, field)[row]
     what = f"pair {o.pair_id}" if field == "pairs" else f"the reading of table {o.table_id} at epoch {o.epoch_id}"
-    kept = tuple(x for i, x in enumerate(getattr(survey, field)) if i != row)
+    kept: dict[str, Any] = {field: tuple(x for i, x in enumerate(getattr(survey, field)) if i != row)}
     return Hypothesis("the same twice", f"{what} is there twice with different values, and this one (row {row + 1} of "
                       "those in use) does not fit", "leave it out", Place(field, (str(row),)),
-                      replace(survey, **{field: kept}), (), 10.0, 1, 2)  # fmt: skip
+                      replace(survey, **kept), (), 10.0, 1, 2)  # fmt: skip

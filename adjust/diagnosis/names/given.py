@@ -11,7 +11,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
-from adjust.diagnosis.screen import Screen, screen
+from adjust.diagnosis.screen import Screen, improvement, screen
 from adjust.model.survey import FloatArray, Point, Survey
 
 _CLEARLY = 2.0
@@ -30,7 +30,8 @@ def wrong_given(case: Case) -> Iterator[Hypothesis]:
     tried = [*_exchanges(survey, given), *_slips(survey, given), *_axes(survey, given)][:_TRIALS]
     found = []
     for h in tried:
-        evidence = _evidence(before, screen(h.survey))
+        changed = h.changed()
+        evidence = 0.0 if changed is None else _evidence(before, screen(changed))
         if evidence > _CLEARLY:
             found.append(replace(h, evidence=evidence, looked_at=len(tried)))
     yield from sorted(found, key=lambda h: -h.evidence)[:_MOST]
@@ -42,7 +43,7 @@ def _evidence(before: Screen | None, after: Screen | None) -> float:
     n = len(after.readings)
     least = after.scale if before is None else min(after.scale, before.scale)
     old = 25.0 * n if before is None else before.misfit(least)
-    return old / (after.misfit(least) + 0.1 * n)
+    return improvement(old, after.misfit(least), n)
 
 
 def with_given(survey: Survey, new: dict[str, FloatArray]) -> Survey:

@@ -1,5 +1,4 @@
-"""Two points of a network that are called by each other's names, in one set-up or in all readings; rows of another
-set-up.
+"""Two points of a network that are called by each other's names, in one set-up or in all readings.
 
 Evidence: the readings concerned against what the rest predicts at its robust start, with the names exchanged.
 """

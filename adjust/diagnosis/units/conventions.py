@@ -17,8 +17,9 @@ LENGTHS: tuple[ReadingKind, ...] = ("slope_distance", "horizontal_distance", "he
 
 @dataclass(frozen=True)
 class Misreading:
-    """name: of the kind of mistake. said: what is wrong with the values. factor, offset (rad or m): true = factor *
-    read + offset. kinds: of readings that can be misread so.
+    """True value = factor * read + offset (rad or m).
+
+    name: of the kind of mistake. said: what is wrong with the values. kinds: of readings that can be misread so.
     """
 
     name: str

@@ -12,6 +12,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen
 from adjust.diagnosis.units.readings import at_best
+from adjust.model.observations import Reading
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.statistics.system import linear_system
 from adjust.statistics.weakness import times_covariance
@@ -142,7 +143,7 @@ def _changed(survey: Survey, constant: _Constant, metres: float) -> Survey:
     """With the constant as it probably was; its readings then fit without it."""
     rows = set(constant.rows.tolist())
 
-    def mended(i: int) -> object:
+    def mended(i: int) -> Reading:
         r = survey.readings[i]
         if i not in rows:
             return r

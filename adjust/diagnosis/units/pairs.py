@@ -1,12 +1,13 @@
 """Measured poses and rotations written in another convention than they were read in: all, of a group, single ones.
 
-In a network of pairs the loops tell; of a robot's poses the camera on its hand (or the one that sees its hand) does: the
-turns and shifts of both sides must be those of one rigid body. Inverting both sides of a hand and its eye changes no
-residual (eye-in-hand taken for eye-to-hand): only the lengths of the result tell.
+In a network of pairs the loops tell; of a robot's poses the camera on its hand, or one that sees its hand, does: turns
+and shifts of both sides must be those of one rigid body. Inverting both sides of a hand and its eye changes no residual
+(eye-in-hand taken for eye-to-hand): only the lengths of the result tell.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from gtsam import Pose3, Rot3
@@ -52,13 +53,13 @@ def _matrix(m: Motion) -> FloatArray:
 
 def _last_first(m: Motion) -> Motion:
     """The four numbers stood as x y z w in the columns w x y z."""
-    q = (m.rotation() if isinstance(m, Pose3) else m).toQuaternion()
+    q: Any = (m.rotation() if isinstance(m, Pose3) else m).toQuaternion()
     return _rotated(m, Rot3.Quaternion(q.z(), q.w(), q.x(), q.y()).matrix())
 
 
 def _first_last(m: Motion) -> Motion:
     """The four numbers stood as w x y z in columns named x y z w."""
-    q = (m.rotation() if isinstance(m, Pose3) else m).toQuaternion()
+    q: Any = (m.rotation() if isinstance(m, Pose3) else m).toQuaternion()
     return _rotated(m, Rot3.Quaternion(q.x(), q.y(), q.z(), q.w()).matrix())
 
 

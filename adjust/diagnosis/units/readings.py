@@ -4,15 +4,15 @@ Evidence: values as mended against those that the rest of the survey predicts at
 where there is one). What concerns every reading of its kind may have spoilt the start: then it is found anew.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
-from adjust.diagnosis.screen import Screen, screen
-from adjust.diagnosis.units.conventions import ANGLES, MISREADINGS, SLIPS, TURNS, Misreading
+from adjust.diagnosis.screen import Screen, improvement, screen
+from adjust.diagnosis.units.conventions import ANGLES, LENGTHS, MISREADINGS, SLIPS, TURNS, Misreading
 from adjust.graph.assembly import values_of
 from adjust.model.observations import Reading
 from adjust.model.survey import FloatArray, IntArray, Survey
@@ -84,19 +84,19 @@ def scopes(survey: Survey) -> Iterator[Scope]:
     readings = survey.readings
     kinds = list(dict.fromkeys(r.kind for r in readings))
     for kind in kinds:
-        rows = _rows(readings, lambda r, kind=kind: r.kind == kind)
+        rows = _rows(readings, (kind,))
         yield Scope(rows, f"all readings of kind {kind}", Place("reading", (kind,), "value"))
     for names in (ANGLES, TURNS):
-        rows = _rows(readings, lambda r, names=names: r.kind in names)
+        rows = _rows(readings, names)
         if len({readings[i].kind for i in rows}) > 1:
             what = "angles" if names is ANGLES else "horizontal angles"
             yield Scope(rows, f"all {what}", Place("reading", (what,), "value"))
-    lengths = _rows(readings, lambda r: r.kind not in ANGLES)
+    lengths = _rows(readings, LENGTHS)
     if len({readings[i].kind for i in lengths}) > 1:
         yield Scope(lengths, "all lengths", Place("reading", ("lengths",), "value"))
     setups = list(dict.fromkeys(r.setup_id for r in readings if r.setup_id))
     for setup_id in setups if len(setups) > 1 else []:
-        mine = _rows(readings, lambda r, s=setup_id: r.setup_id == s)
+        mine = np.array([i for i, r in enumerate(readings) if r.setup_id == setup_id], dtype=np.int64)
         place = Place("setup", (setup_id,), "value")
         for kind in dict.fromkeys(readings[i].kind for i in mine):
             rows = np.array([i for i in mine if readings[i].kind == kind], dtype=np.int64)
@@ -106,8 +106,8 @@ def scopes(survey: Survey) -> Iterator[Scope]:
             yield Scope(angles, f"the angles of set-up {setup_id}", place)
 
 
-def _rows(readings: Sequence[Reading], wanted: Callable[[Reading], bool]) -> IntArray:
-    return np.array([i for i, r in enumerate(readings) if wanted(r)], dtype=np.int64)
+def _rows(readings: Sequence[Reading], kinds: Sequence[str]) -> IntArray:
+    return np.array([i for i, r in enumerate(readings) if r.kind in kinds], dtype=np.int64)
 
 
 def _possible(survey: Survey, scope: Scope) -> Iterator[Misreading]:
@@ -133,17 +133,16 @@ def _evidence(survey: Survey, before: Screen | None, scope: Scope, misreading: M
     if after is None:
         return 0.0
     if before is None:
-        return _CAP * n / (after.misfit(after.scale) + 0.1 * n)
+        return improvement(_CAP * n, after.misfit(after.scale), n)
     scale = min(before.scale, after.scale)
-    return before.misfit(scale) / (after.misfit(scale) + 0.1 * n)
+    return improvement(before.misfit(scale), after.misfit(scale), n)
 
 
 def drop(before: Screen, rows: IntArray, after: FloatArray) -> float:
-    """How many times smaller the bounded misfit of these readings becomes, times its share of all misfit."""
+    """How much less everything misfits when these readings do as in ``after`` (n,), squares over sigmas."""
     every, now = (np.minimum(s / before.scale, _CAP) for s in (before.readings, after))
-    old, new = float(every[rows].sum()), float(now.sum())
-    share = max(0.0, old - new) / max(float(every.sum()), 1e-9)
-    return share * old / (new + 0.1 * len(rows) + 1.0)
+    total = float(every.sum())
+    return improvement(total, total - float(every[rows].sum()) + float(now.sum()), len(every))
 
 
 def _mended_squares(before: Screen, rows: IntArray, misreading: Misreading) -> FloatArray:

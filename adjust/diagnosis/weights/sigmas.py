@@ -60,7 +60,7 @@ def _standardized(result: Adjustment, group: str) -> FloatArray:
     rows = np.repeat(of_block, np.diff(images.block_ptr)) & images.used
     others = [o.standardized for o in result.other_residuals if o.group == group and o.used]
     every = np.concatenate([images.standardized[rows].ravel(), *others])
-    return every[np.isfinite(every)]
+    return np.asarray(every[np.isfinite(every)])
 
 
 def _evenly(w: FloatArray) -> bool:
@@ -90,13 +90,15 @@ def odd_sigmas(case: Case) -> Iterator[Hypothesis]:
 def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[Any], usual: float) -> Hypothesis:
     ids = [_id(o) for o in odd]
     chosen = {id(o) for o in odd}
-    items = tuple(replace(o, sigma=usual) if id(o) in chosen else o for o in getattr(case.survey, field))
+    every = getattr(case.survey, field)
+    changed: dict[str, Any] = {field: tuple(replace(o, sigma=usual) if id(o) in chosen else o for o in every)}
     penalty = float(sum(2.0 * np.log(usual / max(o.sigma, 1e-300)) for o in odd))
     ratio = max(max(o.sigma / usual, usual / max(o.sigma, 1e-300)) for o in odd)
     return Hypothesis(
         "odd sigma", f"{kind} {', '.join(ids[:5])}{f' and {len(ids) - 5} more' if len(ids) > 5 else ''}: the sigma "
         f"is {ratio:.0f} times off the usual one of group {group}", "give the sigma that was meant, or none",
-        Place("reading", tuple(ids), "sigma"), replace(case.survey, **{field: items}), (), min(ratio, 10.0), penalty=penalty,
+        Place("reading", tuple(ids), "sigma"), replace(case.survey, **changed), (),
+        min(ratio, 10.0), penalty=penalty,
     )  # fmt: skip
 
 
