@@ -49,17 +49,12 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
     for trial, probability in zip(good, weight, strict=True):
         critical = float(chi2.isf(_ALPHA / number, max(1, trial.hypothesis.parameters)))
         statistic = (base.omega - trial.misfit.omega) / scale
-        share = (base.omega - trial.misfit.omega) / max(base.excess - scale_excess(base, scale), 1e-9)
+        share = (base.omega - trial.misfit.omega) / max(base.excess, 1e-9)
         if statistic > critical and share > _EXPLAINED and trial.misfit.unused <= base.unused:
             sigma0 = trial.result.sigma0 if trial.result is not None else float("nan")
             explained = float(np.clip(share, 0.0, 1.0))
             out.append(Candidate(trial.hypothesis, explained, statistic, critical, float(probability), sigma0))
     return tuple(sorted(out, key=lambda c: -c.probability))
-
-
-def scale_excess(base: Misfit, scale: float) -> float:
-    """How much of the excess is noise, where the best of all leaves a variance factor above one."""
-    return (scale - 1.0) * base.redundancy
 
 
 def _probabilities(base: Misfit, trials: Sequence[Trial], scale: float) -> FloatArray:
