@@ -56,7 +56,7 @@ class Case:
         return tuple(out)
 
     def _worst(self, field_name: str, ids: list[str]) -> list[str]:
-        share = {owner: 0.0 for owner in ids}
+        share = dict.fromkeys(ids, 0.0)
         for block, value in zip(self.survey.image_blocks, self.block_misfit, strict=True):
             owner = getattr(block, field_name)
             if owner in share:

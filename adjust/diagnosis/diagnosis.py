@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
+from typing import Any
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
@@ -36,6 +37,18 @@ class Diagnosis:
     def lines(self) -> tuple[str, ...]:
         """For people: the first cause, what it changes, how sure it is, and the next one."""
         return tuple(_text(i, c) for i, c in enumerate(self.candidates[:_SHOWN], start=1))
+
+    def told(self) -> list[dict[str, Any]]:
+        """The candidates for machines: name, cause, change, ids, epochs, and how sure it is."""
+        return [
+            {
+                "name": c.hypothesis.name, "cause": c.hypothesis.cause, "change": c.hypothesis.change,
+                "kind": c.hypothesis.place.kind, "ids": list(c.hypothesis.place.ids),
+                "epochs": list(c.hypothesis.place.epochs), "explained": c.explained, "statistic": c.statistic,
+                "critical": c.critical, "probability": c.probability, "sigma0": c.sigma0,
+            }
+            for c in self.candidates[:_SHOWN]
+        ]  # fmt: skip
 
 
 def diagnose(case: Case, families: Sequence[Family] | None = None, most: int = MOST_TRIALS) -> Diagnosis:
@@ -85,8 +98,7 @@ def _formed(family: Family, case: Case) -> list[Hypothesis]:
 def _text(number: int, candidate: Candidate) -> str:
     h = candidate.hypothesis
     sure = "" if candidate.probability > 0.99 else f", probability {100.0 * candidate.probability:.0f} %"
-    first = "probable cause" if number == 1 else "or"
     return (
-        f"{first}: {h.cause}; {h.change} (explains {100.0 * candidate.explained:.0f} % of the misfit, sigma0 becomes "
+        f"{'' if number == 1 else 'or else: '}{h.cause}; {h.change} (explains {100.0 * candidate.explained:.0f} % of the misfit, sigma0 becomes "
         f"{candidate.sigma0:.3g}{sure}; --try {number})"
     )

@@ -24,7 +24,8 @@ _LEAST = 2  # images on either side of a step
 @dataclass(frozen=True, eq=False)
 class Series:
     """The values (n, 4, 4) that n images give one link of their chains, with covariances (n, 6, 6) of a small motion on
-    the left; blocks: (n,) positions in ``Survey.image_blocks``, in their order."""
+    the left; blocks: (n,) positions in ``Survey.image_blocks``, in their order.
+    """
 
     name: ParameterName
     blocks: IntArray
