@@ -99,6 +99,6 @@ def _text(number: int, candidate: Candidate) -> str:
     h = candidate.hypothesis
     sure = "" if candidate.probability > 0.99 else f", probability {100.0 * candidate.probability:.0f} %"
     return (
-        f"{'' if number == 1 else 'or else: '}{h.cause}; {h.change} (explains {100.0 * candidate.explained:.0f} % of the misfit, sigma0 becomes "
-        f"{candidate.sigma0:.3g}{sure}; --try {number})"
+        f"{'' if number == 1 else 'or else: '}{h.cause}; {h.change} (explains {100.0 * candidate.explained:.0f} % of "
+        f"the misfit, sigma0 becomes {candidate.sigma0:.3g}{sure}; --try {number})"
     )

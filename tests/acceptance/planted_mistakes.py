@@ -160,7 +160,7 @@ def moved(name_of: Callable[[Survey], tuple[str, ...]], share: float) -> Plant:
             Rot3.Rodrigues(np.radians(size / 100.0) * np.array([0.3, 1.0, -0.5])),
             size / 1e3 * np.array([1.0, 0.4, -0.3]),
         )
-            before, after = Scene(survey, truth), Scene(survey, {**truth, name: pose * knock})
+        before, after = Scene(survey, truth), Scene(survey, {**truth, name: pose * knock})
         field = "camera_id" if name[0] == "station_from_camera" else "target_id"
         mine = [b for b in survey.image_blocks if getattr(b, field) == name[1]]
         epochs = list(dict.fromkeys(b.epoch_id for b in mine))

@@ -74,7 +74,7 @@ def _difference(result: Adjustment, camera: str, new: str) -> Difference | None:
         return None
     free = [i for i, status in enumerate(lenses[0].status) if status in ("free", "prior")]
     motion = before.between(after)
-    cov = _joint(result, [x for x in (*lenses, *poses)], [free, free, list(range(6)), list(range(6))])
+    cov = _joint(result, [*lenses, *poses], [free, free, list(range(6)), list(range(6))])
     n, A = len(free), motion.inverse().AdjointMap()
     J = np.zeros((n + 6, 2 * n + 12))
     J[:n, : 2 * n] = np.hstack([-np.eye(n), np.eye(n)])
@@ -109,7 +109,8 @@ def turned_images(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Iterat
                 f"camera {camera}: its images are turned from epoch {epochs[0]} on",
                 f"turn them by {how.text}, and detect them again",
                 Place("camera", (camera,), epochs=epochs), mapped(survey, camera, set(epochs), how),
-                edits_of(survey, camera, epochs, how), evidence=(0.9 if step.motion is None else 1.1) * step.gain, looked_at=step.cuts,
+                edits_of(survey, camera, epochs, how), looked_at=step.cuts,
+                evidence=(0.9 if step.motion is None else 1.1) * step.gain,
             )  # fmt: skip
 
 

@@ -23,8 +23,9 @@ _LEAST = 2  # images on either side of a step
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """The values (n, 4, 4) that n images give one link of their chains, with covariances (n, 6, 6) of a small motion on
-    the left; blocks: (n,) positions in ``Survey.image_blocks``, in their order.
+    """The values (n, 4, 4) that n images give one link of their chains.
+
+    blocks: (n,) positions in ``Survey.image_blocks``, in their order. cov: (n, 6, 6) of a small motion on the left.
     """
 
     name: ParameterName
@@ -101,7 +102,7 @@ def _implied(
 
 
 def placed_views(case: Case, result: Adjustment, target_id: str) -> tuple[FloatArray, FloatArray]:
-    """Places (n, 3) m of the cameras that see a target that stands still, and (n, 3) m from each to the target's origin.
+    """Places (n, 3) m of the cameras that see a target that stands still, and (n, 3) m from each to its origin.
 
     Both in the frame that carries the target, by an adjustment without it; the second from single images.
     """
@@ -149,8 +150,8 @@ def step_of(series: Series) -> Step | None:
     rows = np.arange(len(series.blocks))[:: max(1, len(series.blocks) // _MOST)]
     L, cov = series.links[rows], series.cov[rows]
     between = L[:, None] @ inverse(L)[None]
-    d = np.concatenate([rotation_log(between[..., :3, :3].reshape(-1, 3, 3)), between[..., :3, 3].reshape(-1, 3)], axis=1)
-    n = len(rows)
+    turns, n = rotation_log(between[..., :3, :3].reshape(-1, 3, 3)), len(rows)
+    d = np.concatenate([turns, between[..., :3, 3].reshape(-1, 3)], axis=1)
     info = np.linalg.inv((cov[:, None] + cov[None]).reshape(-1, 6, 6))
     squares = np.einsum("ni,nij,nj->n", d, info, d).reshape(n, n)
     near = np.diag(squares, 1)
@@ -158,7 +159,8 @@ def step_of(series: Series) -> Step | None:
     before = np.cumsum(capped, axis=1)
     whole = float(before[:, -1].min())
     costs = [
-        float(before[:k, k - 1].min() + (before[k:, -1] - before[k:, k - 1]).min()) for k in range(_LEAST, n - _LEAST + 1)
+        float(before[:k, k - 1].min() + (before[k:, -1] - before[k:, k - 1]).min())
+        for k in range(_LEAST, n - _LEAST + 1)
     ]
     if not costs:
         return None

@@ -59,7 +59,8 @@ def _hypothesis(case: Case, camera: str, blocks: list[int], whole: bool, how: Im
 
 def _is_flat(x: FloatArray) -> bool:
     s = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
-    return len(x) >= 4 and s[2] < _FLAT * s[1] and float(np.ptp(x[:, 2])) < _FLAT * float(np.ptp(x[:, :2], axis=0).max())
+    across = float(np.ptp(x[:, :2], axis=0).max())
+    return len(x) >= 4 and s[2] < _FLAT * s[1] and float(np.ptp(x[:, 2])) < _FLAT * across
 
 
 def _from_behind(view: View) -> bool:
