@@ -57,7 +57,7 @@ def diagnose(case: Case, families: Sequence[Family] | None = None, most: int = M
     families: those of ``FAMILIES`` where None. most: adjustments at most. Nothing is repaired, nothing is written.
     """
     formed = [h for family in (_all_families() if families is None else families) for h in _formed(family, case)]
-    formed.sort(key=lambda h: -h.evidence)
+    formed = _in_turn(formed)
     base = misfit_of(case.result, case.survey)
     trials: list[Trial] = []
     queue, names, left = list(formed), [], most
@@ -81,6 +81,16 @@ def _done(trials: Sequence[Trial], following: Hypothesis) -> bool:
         and following.evidence < _FAINT * t.hypothesis.evidence
         for t in trials
     )  # fmt: skip
+
+
+def _in_turn(formed: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The most evident first; but of every kind one before the second of any, as their evidence is not of one measure."""
+    before: dict[str, int] = {}
+    turns = []
+    for h in sorted(formed, key=lambda h: -h.evidence):
+        turns.append((before.setdefault(h.name, 0), h))
+        before[h.name] += 1
+    return [h for _, h in sorted(turns, key=lambda item: item[0])]
 
 
 def _all_families() -> list[Family]:

@@ -49,7 +49,7 @@ def wrong_sizes(case: Case) -> Iterator[Hypothesis]:
 def _hypotheses(survey: Survey, target: str, ratio: float, sigma: float) -> Iterator[Hypothesis]:
     near = max(_NEAR, _CLEAR * sigma / ratio)
     known = [(f, why) for f, why in KNOWN if abs(np.log(ratio / f)) < near]
-    clear = abs(ratio - 1.0) / sigma
+    clear = ((ratio - 1.0) / sigma) ** 2
     for factor, why in sorted(known, key=lambda item: abs(np.log(ratio / item[0])))[:1]:
         yield _hypothesis(survey, target, factor, f": {why}", 1, clear)
     yield _hypothesis(survey, target, ratio, "", 2, 0.9 * clear)
