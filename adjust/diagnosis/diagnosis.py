@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
+from typing import Any
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
@@ -37,6 +38,18 @@ class Diagnosis:
         """For people: the first cause, what it changes, how sure it is, and the next one."""
         return tuple(_text(i, c) for i, c in enumerate(self.candidates[:_SHOWN], start=1))
 
+    def told(self) -> list[dict[str, Any]]:
+        """The candidates for machines: name, cause, change, ids, epochs, and how sure it is."""
+        return [
+            {
+                "name": c.hypothesis.name, "cause": c.hypothesis.cause, "change": c.hypothesis.change,
+                "kind": c.hypothesis.place.kind, "ids": list(c.hypothesis.place.ids),
+                "epochs": list(c.hypothesis.place.epochs), "explained": c.explained, "statistic": c.statistic,
+                "critical": c.critical, "probability": c.probability, "sigma0": c.sigma0,
+            }
+            for c in self.candidates[:_SHOWN]
+        ]  # fmt: skip
+
 
 def diagnose(case: Case, families: Sequence[Family] | None = None, most: int = MOST_TRIALS) -> Diagnosis:
     """Form the hypotheses of all families, try the likeliest of them, and rank those that explain the misfit.
@@ -44,7 +57,7 @@ def diagnose(case: Case, families: Sequence[Family] | None = None, most: int = M
     families: those of ``FAMILIES`` where None. most: adjustments at most. Nothing is repaired, nothing is written.
     """
     formed = [h for family in (_all_families() if families is None else families) for h in _formed(family, case)]
-    formed.sort(key=lambda h: -h.evidence)
+    formed = _in_turn(formed)
     base = misfit_of(case.result, case.survey)
     trials: list[Trial] = []
     queue, names, left = list(formed), [], most
@@ -70,6 +83,16 @@ def _done(trials: Sequence[Trial], following: Hypothesis) -> bool:
     )  # fmt: skip
 
 
+def _in_turn(formed: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The most evident first; but of every kind one before the second of any, as their evidence is not of one measure."""
+    before: dict[str, int] = {}
+    turns = []
+    for h in sorted(formed, key=lambda h: -h.evidence):
+        turns.append((before.setdefault(h.name, 0), h))
+        before[h.name] += 1
+    return [h for _, h in sorted(turns, key=lambda item: item[0])]
+
+
 def _all_families() -> list[Family]:
     return [import_module(f"adjust.diagnosis.{name}").hypotheses for name in FAMILIES]
 
@@ -85,8 +108,7 @@ def _formed(family: Family, case: Case) -> list[Hypothesis]:
 def _text(number: int, candidate: Candidate) -> str:
     h = candidate.hypothesis
     sure = "" if candidate.probability > 0.99 else f", probability {100.0 * candidate.probability:.0f} %"
-    first = "probable cause" if number == 1 else "or"
     return (
-        f"{first}: {h.cause}; {h.change} (explains {100.0 * candidate.explained:.0f} % of the misfit, sigma0 becomes "
-        f"{candidate.sigma0:.3g}{sure}; --try {number})"
+        f"{'' if number == 1 else 'or else: '}{h.cause}; {h.change} (explains {100.0 * candidate.explained:.0f} % of "
+        f"the misfit, sigma0 becomes {candidate.sigma0:.3g}{sure}; --try {number})"
     )

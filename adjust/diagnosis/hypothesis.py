@@ -76,14 +76,14 @@ class Hypothesis:
     """One cause, and the survey as it would be without it.
 
     name: of the kind of cause ("images mirrored"), the same for every place. cause: what is wrong, a sentence about
-    named things. change: what would mend it. survey: the survey with that one change, to be tried, or what makes it where
-    that takes adjustments of its own. edits: the same as
-    changes of a project, none where only a person can do it. evidence: how clearly cheap evidence speaks for it, a
-    ratio of misfits or of sigmas; only the order of trials follows it. parameters: how many numbers of the change were
-    chosen to fit (a cut's epoch, a factor). looked_at: how many such hypotheses were compared with each other, for the
-    family-wise level. follow: what the adjustment tells more exactly, in place of this one: the same survey under its
-    right name, or another one to be tried. penalty: what the change adds to minus twice the log likelihood beside v'Pv,
-    where it changes variances: the sum of the logarithms of their factors.
+    named things. change: what would mend it. survey: the survey with that one change, to be tried, or what makes it
+    where that takes adjustments of its own. edits: the same as changes of a project, none where only a person can
+    do it. evidence: how clearly cheap evidence speaks for it, a ratio of misfits or of sigmas; only the order of
+    trials follows it. parameters: how many numbers of the change were chosen to fit (a cut's epoch, a factor).
+    looked_at: how many such hypotheses were compared with each other, for the family-wise level. follow: what the
+    adjustment tells more exactly, in place of this one: the same survey under its right name, or another one to be
+    tried. penalty: what the change adds to minus twice the log likelihood beside v'Pv, where it changes variances: the
+    sum of the logarithms of their factors.
     """
 
     name: str

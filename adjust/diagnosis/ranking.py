@@ -49,7 +49,7 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
     for trial, probability in zip(good, weight, strict=True):
         critical = float(chi2.isf(_ALPHA / number, max(1, trial.hypothesis.parameters)))
         statistic = (base.omega - _cost(trial)) / scale
-        share = (base.omega - _cost(trial)) / max(base.excess - scale_excess(base, scale), 1e-9)
+        share = (base.omega - _cost(trial)) / max(base.excess, 1e-9)
         if statistic > critical and share > _EXPLAINED and trial.misfit.unused <= base.unused:
             sigma0 = trial.result.sigma0 if trial.result is not None else float("nan")
             explained = float(np.clip(share, 0.0, 1.0))
@@ -59,11 +59,6 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
 
 def _cost(trial: Trial) -> float:
     return trial.misfit.omega + trial.hypothesis.penalty
-
-
-def scale_excess(base: Misfit, scale: float) -> float:
-    """How much of the excess is noise, where the best of all leaves a variance factor above one."""
-    return (scale - 1.0) * base.redundancy
 
 
 def _probabilities(base: Misfit, trials: Sequence[Trial], scale: float) -> FloatArray:

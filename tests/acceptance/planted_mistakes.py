@@ -1,4 +1,7 @@
-"""Mistakes of images, targets and bodies planted into simulated surveys: each in two kinds of survey and three sizes."""
+"""Mistakes of images, targets and bodies planted into simulated surveys, each in two kinds of survey and three sizes.
+
+``python -m tests.acceptance.planted_mistakes`` prints the whole table: named first, among three, silent.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -6,6 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from gtsam import Pose3, Rot3
 
+import adjust
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.diagnosis import Diagnosis, diagnose
+from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import FloatArray, Survey
 from survey.simulate import LabSize, full_lab, head_on_table, relay, stereo
@@ -37,7 +44,9 @@ def survey_of(kind: str, seed: int) -> tuple[Survey, Truth]:
     return made[kind]()
 
 
-def in_images(survey: Survey, chosen: Callable[[ImageBlock], bool], change: Callable[[ImageBlock], ImageBlock]) -> Survey:
+def in_images(
+    survey: Survey, chosen: Callable[[ImageBlock], bool], change: Callable[[ImageBlock], ImageBlock]
+) -> Survey:
     """The survey with some image blocks changed."""
     return replace(survey, image_blocks=tuple(change(b) if chosen(b) else b for b in survey.image_blocks))
 
@@ -53,14 +62,14 @@ def camera_of(survey: Survey) -> str:
     return survey.cameras[1].camera_id
 
 
-def mapped(A: FloatArray, share_of: Callable[[float], float] = lambda s: s) -> Plant:
-    """Image coordinates about the middle of the image times A, in the last images of the camera."""
+def mapped(A: FloatArray) -> Plant:
+    """Image coordinates about the middle of the image times A, in the last images of the camera, a share of them."""
 
     def plant(survey: Survey, _: Truth, size: float) -> Survey:
         camera = camera_of(survey)
         width, height = next(c.image_size for c in survey.cameras if c.camera_id == camera)
         middle = np.array([width - 1.0, height - 1.0]) / 2.0
-        epochs = later(survey, camera, share_of(size))
+        epochs = later(survey, camera, size)
         out = middle if A[0, 0] else middle[::-1]
         return in_images(
             survey,
@@ -76,7 +85,9 @@ def shifted(survey: Survey, _: Truth, size: float) -> Survey:
     camera = camera_of(survey)
     epochs = later(survey, camera, 0.6)
     return in_images(
-        survey, lambda b: b.camera_id == camera and b.epoch_id in epochs, lambda b: replace(b, uv=b.uv + (size, -size / 2))
+        survey,
+        lambda b: b.camera_id == camera and b.epoch_id in epochs,
+        lambda b: replace(b, uv=b.uv + (size, -size / 2)),
     )
 
 
@@ -124,7 +135,7 @@ def board_of(survey: Survey) -> str:
 
 
 def bent(survey: Survey, _: Truth, size: float) -> Survey:
-    """The board is believed flat and is bent by ``size`` mm: here, believed bent and flat."""
+    """The board is believed to sag by ``size`` mm, and is flat."""
 
     def sag(x: FloatArray) -> FloatArray:
         u = (x[:, 0] - x[:, 0].min()) / np.ptp(x[:, 0])
@@ -149,8 +160,7 @@ def moved(name_of: Callable[[Survey], tuple[str, ...]], share: float) -> Plant:
             Rot3.Rodrigues(np.radians(size / 100.0) * np.array([0.3, 1.0, -0.5])),
             size / 1e3 * np.array([1.0, 0.4, -0.3]),
         )
-        assert isinstance(pose, Pose3)
-        before, after = Scene(survey, truth), Scene(survey, truth | {name: pose * knock})
+        before, after = Scene(survey, truth), Scene(survey, {**truth, name: pose * knock})
         field = "camera_id" if name[0] == "station_from_camera" else "target_id"
         mine = [b for b in survey.image_blocks if getattr(b, field) == name[1]]
         epochs = list(dict.fromkeys(b.epoch_id for b in mine))
@@ -204,3 +214,33 @@ MISTAKES = (
             target_geometry(board_of, lambda s: np.array([[1.0, s, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))),
     Mistake("target bent", "target", ("stereo", "head"), (0.5, 1.5, 5.0), bent),
 )  # fmt: skip
+
+
+def table() -> list[tuple[str, str, float, str]]:
+    """(name, kind, size, outcome) of all mistakes; outcome: first, among three, another first, silent."""
+    rows = []
+    for mistake in MISTAKES:
+        for kind in mistake.kinds:
+            survey, truth = survey_of(kind, 3)
+            about = camera_of(survey) if mistake.about == "camera" else board_of(survey)
+            for size in mistake.sizes:
+                found = diagnosed(mistake.plant(survey, truth, size)).candidates
+                names = [(c.hypothesis.name, c.hypothesis.place.ids[0]) for c in found[:3]]
+                place = names.index((mistake.name, about)) if (mistake.name, about) in names else -1
+                outcome = "first" if place == 0 else "among three" if place > 0 else "another" if names else "silent"
+                rows.append((mistake.name, kind, size, outcome))
+                print(f"{mistake.name:18} {kind:8} {size:10.4g}  {outcome}", flush=True)
+    return rows
+
+
+def diagnosed(survey: Survey) -> Diagnosis:
+    """The diagnosis of a survey, whether it can be adjusted or not."""
+    try:
+        return diagnose(Case(survey, adjust.solve(survey)))
+    except SurveyError as error:
+        return diagnose(Case(survey, None, error))
+
+
+if __name__ == "__main__":
+    outcomes = [row[3] for row in table()]
+    print({name: outcomes.count(name) for name in dict.fromkeys(outcomes)})

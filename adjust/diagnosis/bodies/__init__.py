@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 
-from adjust.diagnosis.bodies.cameras import changed_camera
+from adjust.diagnosis.bodies.cameras import changed_camera, turned_images
 from adjust.diagnosis.bodies.lens_steps import lens_steps
 from adjust.diagnosis.bodies.series import Step, series_of, step_of
 from adjust.diagnosis.bodies.split import epochs_from
@@ -16,7 +16,9 @@ _MOST = 4
 
 def hypotheses(case: Case) -> Iterable[Hypothesis]:
     """Cameras and targets that are others from some epoch on, where single images show a step."""
-    found = {(s.name[1], s.first): s for s in _steps(case)}
+    found: dict[tuple[str, int], Step] = {}
+    for step in _steps(case):  # the first of a place tells the motion too
+        found.setdefault((step.name[1], step.first), step)
     for step in sorted(found.values(), key=lambda s: -s.gain)[:_MOST]:
         yield from _of(case, step)
 
@@ -36,5 +38,7 @@ def _steps(case: Case) -> Iterator[Step]:
 def _of(case: Case, step: Step) -> Iterator[Hypothesis]:
     is_camera = step.name[0] == "station_from_camera"
     epochs = epochs_from(case.survey, "camera_id" if is_camera else "target_id", step.name[1], step.first)
+    if epochs and is_camera:
+        yield from turned_images(case.survey, step, epochs)
     if epochs:
         yield changed_camera(case.survey, step, epochs) if is_camera else moved_target(case.survey, step, epochs)

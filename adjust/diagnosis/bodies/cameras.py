@@ -1,10 +1,10 @@
 """A camera that is another one from some epoch on, and what of it changed: its place, its focus, its images."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Pose3
 
 from adjust.diagnosis.bodies.series import Step
 from adjust.diagnosis.bodies.split import split_camera
@@ -12,12 +12,13 @@ from adjust.diagnosis.bodies.targets import motion_text
 from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place
 from adjust.diagnosis.images.maps import TURNED, edits_of, mapped
 from adjust.distributions import chi2
-from adjust.model.result import Adjustment
+from adjust.model.result import Adjustment, Estimate
 from adjust.model.survey import FloatArray, Survey
+from adjust.spatial.rigid import rotation_log
 
 _ALPHA = 1e-5
 _FOCAL, _CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
-_NEAR = np.radians(5.0)
+_NEAR = np.radians(10.0)  # lenses that were found in images of both ways are not good
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +57,11 @@ def changed_camera(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Hypot
 
     def told(result: Adjustment) -> Sequence[Hypothesis]:
         found = _difference(result, camera, new)
-        return () if found is None else (*_turned(survey, hypothesis, found), _named(hypothesis, found))
+        if found is None:
+            return ()
+        seen = replace(step, motion=found.motion.inverse().matrix())
+        turned = turned_images(survey, seen, epochs) if step.motion is None else ()
+        return (*turned, _named(hypothesis, found))
 
     return replace(hypothesis, follow=told)
 
@@ -69,37 +74,44 @@ def _difference(result: Adjustment, camera: str, new: str) -> Difference | None:
         return None
     free = [i for i, status in enumerate(lenses[0].status) if status in ("free", "prior")]
     motion = before.between(after)
-    A = motion.inverse().AdjointMap()
-    cov = np.zeros((len(free) + 6,) * 2)
-    cov[: len(free), : len(free)] = sum(x.cov[np.ix_(free, free)] for x in lenses)
-    cov[len(free) :, len(free) :] = poses[1].cov + A @ poses[0].cov @ A.T
+    cov = _joint(result, [*lenses, *poses], [free, free, list(range(6)), list(range(6))])
+    n, A = len(free), motion.inverse().AdjointMap()
+    J = np.zeros((n + 6, 2 * n + 12))
+    J[:n, : 2 * n] = np.hstack([-np.eye(n), np.eye(n)])
+    J[n:, 2 * n :] = np.hstack([-A, np.eye(6)])
+    cov = J @ cov @ J.T
     names = tuple(lenses[0].components[i] for i in free)
     values = [np.asarray(x.value)[free] for x in lenses]
     d = np.concatenate([values[1] - values[0], Pose3.Logmap(motion)])
     return Difference(names, values[0], d, cov * max(1.0, result.sigma0**2), motion)
 
 
-def _turned(survey: Survey, hypothesis: Hypothesis, found: Difference) -> list[Hypothesis]:
-    """The images turned back, where the camera turned about its line of sight by quarter turns."""
-    turn = Rot3.Logmap(found.motion.rotation())
-    angle = float(np.linalg.norm(turn))
-    for degrees in (90, 180):
-        near = np.abs(turn) - np.radians(degrees) * np.array([0.0, 0.0, 1.0])
-        if angle > 0.0 and float(np.linalg.norm(near)) < _NEAR:
-            # of an image that was turned the camera seems turned the other way
-            sign = 1 if turn[2] > 0.0 else -1
-            how = TURNED[degrees if degrees == 180 else (90 if sign > 0 else 270)]
-            camera, epochs = hypothesis.place.ids[0], hypothesis.place.epochs
-            return [
-                replace(
-                    hypothesis, name="images turned",
-                    cause=f"camera {camera}: its images are turned from epoch {epochs[0]} on",
-                    change=f"turn them by {how.text}, and detect them again",
-                    survey=mapped(survey, camera, set(epochs), how), edits=edits_of(survey, camera, epochs, how),
-                    parameters=1, follow=None,
-                )
-            ]  # fmt: skip
-    return []
+def _joint(result: Adjustment, estimates: Sequence[Estimate], rows: Sequence[Sequence[int]]) -> FloatArray:
+    """Joint covariance of some components of several estimates, zero where they are held."""
+    sizes = [len(r) for r in rows]
+    at = np.cumsum([0, *sizes])
+    out = np.zeros((at[-1], at[-1]))
+    known = [k for k, e in enumerate(estimates) if e.name in result.precision.graph.unknowns.by_name]
+    where = np.concatenate([np.arange(at[k], at[k + 1]) for k in known])
+    out[np.ix_(where, where)] = result.precision.joint([estimates[k].name for k in known])
+    return out
+
+
+def turned_images(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Iterator[Hypothesis]:
+    """The images turned back, where the camera seems to have turned about its line of sight by quarter turns."""
+    turn = np.radians([0.0, 0.0, 180.0]) if step.motion is None else rotation_log(step.motion[:3, :3])
+    for degrees, back in ((90.0, 270), (180.0, 180), (-90.0, 90)):
+        off = min(float(np.linalg.norm(turn - s * np.radians([0.0, 0.0, degrees]))) for s in (1, 1 - 2 * (back == 180)))
+        if off < _NEAR:
+            camera, how = step.name[1], TURNED[back]
+            yield Hypothesis(
+                "images turned",
+                f"camera {camera}: its images are turned from epoch {epochs[0]} on",
+                f"turn them by {how.text}, and detect them again",
+                Place("camera", (camera,), epochs=epochs), mapped(survey, camera, set(epochs), how),
+                edits_of(survey, camera, epochs, how), looked_at=step.cuts,
+                evidence=(0.9 if step.motion is None else 1.1) * step.gain,
+            )  # fmt: skip
 
 
 def _named(hypothesis: Hypothesis, found: Difference) -> Hypothesis:

@@ -23,8 +23,9 @@ _LEAST = 2  # images on either side of a step
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """The values (n, 4, 4) that n images give one link of their chains, with covariances (n, 6, 6) of a small motion on
-    the left; blocks: (n,) positions in ``Survey.image_blocks``, in their order.
+    """The values (n, 4, 4) that n images give one link of their chains.
+
+    blocks: (n,) positions in ``Survey.image_blocks``, in their order. cov: (n, 6, 6) of a small motion on the left.
     """
 
     name: ParameterName
@@ -33,14 +34,18 @@ class Series:
     cov: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Step:
-    """A series with another value from block ``first`` on. gain: drop of the bounded sum of squares; cuts: compared."""
+    """A series with another value from block ``first`` on. gain: drop of the bounded sum of squares; cuts: compared.
+
+    motion: (4, 4) the later value of the link over the earlier one, where both are known.
+    """
 
     name: ParameterName
     first: int
     gain: float
     cuts: int
+    motion: FloatArray | None = None
 
 
 def chains_of(survey: Survey) -> tuple[dict[int, str | tuple[str, ...]], list[Chain]]:
@@ -97,7 +102,7 @@ def _implied(
 
 
 def placed_views(case: Case, result: Adjustment, target_id: str) -> tuple[FloatArray, FloatArray]:
-    """Places (n, 3) m of the cameras that see a target that stands still, and (n, 3) m from each to the target's origin.
+    """Places (n, 3) m of the cameras that see a target that stands still, and (n, 3) m from each to its origin.
 
     Both in the frame that carries the target, by an adjustment without it; the second from single images.
     """
@@ -122,11 +127,13 @@ def _pose(survey: Survey, result: Adjustment, name: tuple[str, ...]) -> FloatArr
     if name[0] == "table_motion":
         angles = result.estimates.get(("table_angles", name[1], name[2]))
         geometry = result.estimates.get(("table_geometry", name[1]))
-        if angles is None or geometry is None:
+        read = next((r for r in survey.table_readings if (r.table_id, r.epoch_id) == name[1:]), None)
+        if geometry is None or (angles is None and read is None):
             return None
         table = next(t for t in survey.tables if t.table_id == name[1])
         g = dict(zip(geometry.components, np.asarray(geometry.value), strict=True))
-        a = [float(v) + g.get(f"zero_{k + 1}", 0.0) for k, v in enumerate(np.asarray(angles.value))]
+        said = np.asarray(angles.value) if angles is not None else read.angles if read is not None else np.zeros(0)
+        a = [float(v) + g.get(f"zero_{k + 1}", 0.0) for k, v in enumerate(said)]
         axes = ["xyz".index(x) for x in table.axes]
         one = [np.array([v]) for v in (a[0], a[-1], g.get("non_orthogonality", 0.0), g.get("axis_offset", 0.0))]
         R, t, _ = table_motion(axes[0], axes[1] if len(axes) > 1 else -1, *one)
@@ -143,8 +150,8 @@ def step_of(series: Series) -> Step | None:
     rows = np.arange(len(series.blocks))[:: max(1, len(series.blocks) // _MOST)]
     L, cov = series.links[rows], series.cov[rows]
     between = L[:, None] @ inverse(L)[None]
-    d = np.concatenate([rotation_log(between[..., :3, :3].reshape(-1, 3, 3)), between[..., :3, 3].reshape(-1, 3)], axis=1)
-    n = len(rows)
+    turns, n = rotation_log(between[..., :3, :3].reshape(-1, 3, 3)), len(rows)
+    d = np.concatenate([turns, between[..., :3, 3].reshape(-1, 3)], axis=1)
     info = np.linalg.inv((cov[:, None] + cov[None]).reshape(-1, 6, 6))
     squares = np.einsum("ni,nij,nj->n", d, info, d).reshape(n, n)
     near = np.diag(squares, 1)
@@ -152,7 +159,8 @@ def step_of(series: Series) -> Step | None:
     before = np.cumsum(capped, axis=1)
     whole = float(before[:, -1].min())
     costs = [
-        float(before[:k, k - 1].min() + (before[k:, -1] - before[k:, k - 1]).min()) for k in range(_LEAST, n - _LEAST + 1)
+        float(before[:k, k - 1].min() + (before[k:, -1] - before[k:, k - 1]).min())
+        for k in range(_LEAST, n - _LEAST + 1)
     ]
     if not costs:
         return None
@@ -160,4 +168,6 @@ def step_of(series: Series) -> Step | None:
     gain = whole - costs[best]
     if gain < float(chi2.isf(1e-4 / len(costs), 6)):
         return None
-    return Step(series.name, int(series.blocks[rows[best + _LEAST]]), gain, len(costs))
+    k = best + _LEAST
+    early, late = int(np.argmin(before[:k, k - 1])), k + int(np.argmin(before[k:, -1] - before[k:, k - 1]))
+    return Step(series.name, int(series.blocks[rows[k]]), gain, len(costs), L[late] @ inverse(L[early]))

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import replace
 
+from adjust.model.observations import ImageBlock
 from adjust.model.survey import PoseParameter, Survey
 
 
@@ -33,9 +34,10 @@ def split_target(survey: Survey, target_id: str, epochs: Iterable[str], new_id: 
     )
 
 
-def _renamed(survey: Survey, field: str, owner_id: str, epochs: Iterable[str], new_id: str) -> tuple[object, ...]:
+def _renamed(survey: Survey, field: str, owner_id: str, epochs: Iterable[str], new_id: str) -> tuple[ImageBlock, ...]:
     chosen = set(epochs)
     return tuple(
-        replace(b, **{field: new_id}) if getattr(b, field) == owner_id and b.epoch_id in chosen else b
+        b if getattr(b, field) != owner_id or b.epoch_id not in chosen
+        else replace(b, camera_id=new_id) if field == "camera_id" else replace(b, target_id=new_id)
         for b in survey.image_blocks
-    )
+    )  # fmt: skip

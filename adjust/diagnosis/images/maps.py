@@ -17,9 +17,9 @@ class ImageMap:
     matrix: FloatArray
 
     def offset(self, image_size: tuple[int, int]) -> FloatArray:
-        """(2,) px: uv is mapped to matrix @ uv + offset."""
+        """(2,) px: uv of what became of an image of this size is mapped back to matrix @ uv + offset."""
         middle = (np.array(image_size, dtype=float) - 1.0) / 2.0
-        return np.asarray(np.abs(self.matrix) @ middle - self.matrix @ middle)
+        return np.asarray(middle - self.matrix @ np.abs(self.matrix) @ middle)
 
 
 MIRRORED = (

@@ -37,12 +37,13 @@ def mirrored_images(case: Case) -> Iterator[Hypothesis]:
 
 
 def _hypothesis(case: Case, camera: str, blocks: list[int], whole: bool, how: ImageMap) -> Hypothesis:
-    found = {case.survey.image_blocks[i].epoch_id for i in blocks}
-    epochs = tuple(
-        dict.fromkeys(
-            b.epoch_id for b in case.survey.image_blocks if b.camera_id == camera and (whole or b.epoch_id in found)
-        )
-    )
+    survey, bad = case.survey, set(blocks)
+    mine = [i for i, b in enumerate(survey.image_blocks) if b.camera_id == camera]
+    first = min(blocks)
+    # images of other things than flat targets are as those around them
+    onwards = all(i in bad for i in mine if i >= first and i in case.views and _is_flat(case.views[i].x))
+    chosen = [i for i in mine if whole or i in bad or (onwards and i >= first)]
+    epochs = tuple(dict.fromkeys(survey.image_blocks[i].epoch_id for i in chosen))
     n = sum(b.camera_id == camera for b in case.survey.image_blocks)
     which = "all its images" if whole else f"{len(epochs)} of its {n} images ({epochs[0]} ... {epochs[-1]})"
     return Hypothesis(
@@ -58,7 +59,8 @@ def _hypothesis(case: Case, camera: str, blocks: list[int], whole: bool, how: Im
 
 def _is_flat(x: FloatArray) -> bool:
     s = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
-    return len(x) >= 4 and s[2] < _FLAT * s[1] and float(np.ptp(x[:, 2])) < _FLAT * float(np.ptp(x[:, :2], axis=0).max())
+    across = float(np.ptp(x[:, :2], axis=0).max())
+    return len(x) >= 4 and s[2] < _FLAT * s[1] and float(np.ptp(x[:, 2])) < _FLAT * across
 
 
 def _from_behind(view: View) -> bool:

@@ -23,6 +23,8 @@ KNOWN = (  # factor from what is said to what is meant, and how that comes about
     (0.97, "printed to fit the page, at 97 %"),
     (1.0 / 0.97, "measured on a print that was made to fit the page"),
     (210.0 / 215.9, "printed on A4 for US letter"),
+    (0.8, "the side of a marker is eight tenths of the square that was given for it"),
+    (1.25, "the side of the square is ten eighths of the marker that was given for it"),
     (0.5, "two squares were measured for one"),
     (2.0, "one square was measured for two"),
     (np.sqrt(2.0), "the diagonal was meant, or A4 was enlarged to A3"),
@@ -30,7 +32,6 @@ KNOWN = (  # factor from what is said to what is meant, and how that comes about
 )
 _CLEAR = 5.0  # sigmas
 _NEAR = 0.003
-_PITCHES = ((8, 10), (10, 8), (7, 9), (9, 7))
 
 
 def wrong_sizes(case: Case) -> Iterator[Hypothesis]:
@@ -48,7 +49,7 @@ def wrong_sizes(case: Case) -> Iterator[Hypothesis]:
 def _hypotheses(survey: Survey, target: str, ratio: float, sigma: float) -> Iterator[Hypothesis]:
     near = max(_NEAR, _CLEAR * sigma / ratio)
     known = [(f, why) for f, why in KNOWN if abs(np.log(ratio / f)) < near]
-    clear = abs(ratio - 1.0) / sigma
+    clear = ((ratio - 1.0) / sigma) ** 2
     for factor, why in sorted(known, key=lambda item: abs(np.log(ratio / item[0])))[:1]:
         yield _hypothesis(survey, target, factor, f": {why}", 1, clear)
     yield _hypothesis(survey, target, ratio, "", 2, 0.9 * clear)
