@@ -18,12 +18,13 @@ from adjust.model.survey import IntArray, Survey
 
 _CLEARLY, _CAP = 3.0, 25.0
 _SUSPECTS, _MOST = 6, 4
+_LARGE = 2500
 
 
 def exchanged_points(case: Case) -> Iterator[Hypothesis]:
     """Pairs of points whose exchange makes their readings fit, the clearest first."""
     survey = case.survey
-    before = at_best(case) if survey.readings else None
+    before = at_best(case) if 0 < len(survey.readings) <= _LARGE else None
     if before is None:
         return
     found, looked_at = list[tuple[float, Hypothesis]](), 0

@@ -28,10 +28,10 @@ def forgotten_motion(case: Case) -> Iterator[Hypothesis]:
     carriers = {t.target_id: t.station_id for t in survey.targets}
     moves: dict[tuple[str, str], float] = {}
     for (camera_id, target_id), (poses, error_px, focal) in _poses(case).items():
-        if target_id in still and station_of[camera_id] in fixed and len(poses) >= _FEWEST:
-            if carriers[target_id] != station_of[camera_id]:
-                key = (station_of[camera_id], target_id)
-                moves[key] = max(moves.get(key, 0.0), _scatter(poses, error_px / focal))
+        joined = carriers[target_id] == station_of[camera_id]
+        if target_id in still and station_of[camera_id] in fixed and len(poses) >= _FEWEST and not joined:
+            key = (station_of[camera_id], target_id)
+            moves[key] = max(moves.get(key, 0.0), _scatter(poses, error_px / focal))
     moved = {k: r for k, r in moves.items() if r > _CLEARLY}
     for target_id in dict.fromkeys(t for _, t in moved):
         yield _target(survey, target_id, max(r for (_, t), r in moved.items() if t == target_id))

@@ -26,6 +26,8 @@ Motion = Pose3 | Rot3
 _CLEARLY = 3.0
 _MOST, _SINGLE = 5, 8
 _CAP = 25.0
+_LARGE = 500
+"""Pairs up to which start values are found anew for every convention."""
 
 
 @dataclass(frozen=True)
@@ -242,6 +244,8 @@ def _second(survey: Survey, link: Link) -> FloatArray:
 
 
 def _by_start(case: Case) -> _Judge | None:
+    if len(case.survey.pairs) > _LARGE:
+        return None
     before = None if case.result is None else screen(case.survey, values_of(case.result))
     before = before or screen(case.survey)
     if before is None:
