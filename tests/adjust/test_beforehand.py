@@ -22,7 +22,8 @@ def test_a_sound_survey_has_no_problems(survey: Survey) -> None:
 
 def test_nothing_is_changed_and_the_redundancy_is_that_of_the_adjustment() -> None:
     expected = look_beforehand(hall()).expected
-    assert expected is not None and (expected.n_observations, expected.redundancy) == (88, 66)
+    assert expected is not None
+    assert (expected.n_observations, expected.redundancy) == (88, 66)
 
 
 def test_a_name_that_appears_once() -> None:

@@ -41,14 +41,16 @@ def test_the_offset_of_a_camera_is_estimated_from_the_motion(offset: float) -> N
 
 def test_simultaneous_cameras_have_no_offset() -> None:
     found = time_offset(moving(0.0))
-    assert found is not None and abs(found.intervals) < 4.0 * found.sigma
+    assert found is not None
+    assert abs(found.intervals) < 4.0 * found.sigma
 
 
 def test_a_real_session_of_free_running_cameras() -> None:
     """cam1 is 116 +- 9 ms before cam0 by an independent computation; six frames a second."""
     case = Case(read(data_folder("calibration", "unsynchronised")).survey)
     (found,) = unsynchronised(case)
-    assert found.name == "cameras not simultaneous" and found.place.ids == ("cam1",)
+    assert found.name == "cameras not simultaneous"
+    assert found.place.ids == ("cam1",)
     offset = next(o for link in links(case) if link.names == ("cam0", "cam1") if (o := time_offset(link)))
     assert 1e3 * offset.intervals / 6.0 == pytest.approx(-116.0, abs=3 * 9.0)
 
@@ -62,7 +64,8 @@ def test_motion_that_was_forgotten() -> None:
     good = stereo(2)[0]
     wrong = replace(good, targets=tuple(replace(t, motion="fixed") for t in good.targets))
     first = next(forgotten_motion(Case(wrong)))
-    assert first.name == "motion forgotten" and first.place.ids == ("board",)
+    assert first.name == "motion forgotten"
+    assert first.place.ids == ("board",)
     assert adjust(first.changed()).sigma0 == pytest.approx(adjust(good).sigma0, rel=1e-6)
 
 
@@ -75,7 +78,8 @@ def test_what_stands_still_is_not_blamed(survey) -> None:
 def test_sigmas_of_a_group_wrong_by_a_factor(k: float) -> None:
     wrong = scaled_survey(hall(), {"reading": k**2})
     (found,) = wrong_factors(case_of(wrong))
-    assert found.name == "sigmas of a group" and found.place.ids == ("reading",)
+    assert found.name == "sigmas of a group"
+    assert found.place.ids == ("reading",)
     assert ("small" if k < 1 else "large") in found.cause
     assert case_of(found.changed()).result.sigma0 == pytest.approx(1.0, abs=0.01)
 

@@ -25,7 +25,9 @@ def test_a_sound_project(robot: Path, capsys: pytest.CaptureFixture[str]) -> Non
     before = files(robot)
     assert main(["check", str(robot)]) == 0
     shown = capsys.readouterr()
-    assert "0 problems" in shown.out and "nothing was adjusted" in shown.out and "redundancy 1420" in shown.out
+    assert "0 problems" in shown.out
+    assert "nothing was adjusted" in shown.out
+    assert "redundancy 1420" in shown.out
     assert "Next: labsurvey adjust" in shown.err
     assert files(robot) == before
 
@@ -38,7 +40,8 @@ def test_problems_have_an_exit_code_and_are_in_the_json(robot: Path, capsys: pyt
     found = json.loads(capsys.readouterr().out)
     assert found["problems"] == 1
     (first,) = [f for f in found["findings"] if f["level"] == "problem"]
-    assert first["kind"] == "no start values" and first["remedy"]
+    assert first["kind"] == "no start values"
+    assert first["remedy"]
 
 
 def test_a_folder_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
