@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 from survey.commands.adjusting import declare_adjust
 from survey.commands.aligning import declare_align
+from survey.commands.checking import declare_check
 from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, Version, run_as_program, run_command
 from survey.commands.comparing import declare_compare
 from survey.commands.completion import declare_completion
@@ -47,6 +48,7 @@ _COMMANDS = (
     declare_open,
     declare_detect,
     declare_report,
+    declare_check,
     declare_plan,
     declare_add,
     declare_remove,

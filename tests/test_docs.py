@@ -41,6 +41,7 @@ SHELLS = ("sh", "")
 # pages whose blocks are carried out by tests of their own
 RUN_ELSEWHERE = {
     "docs/planning.md": "tests/acceptance/test_plan.py",
+    "docs/check.md": "tests/survey/test_checking.py",
     "docs/observations.md": "tests/survey/test_docs_observations.py",
     "docs/capture.md": "tests/capture/test_plan.py",
     "docs/relay.md": "tests/acceptance/test_relay_cli.py",

@@ -18,3 +18,11 @@ class IndeterminateError(SurveyError):
 
 class NotConvergedError(SurveyError):
     """The adjustment did not reach a minimum; the message says what kept moving."""
+
+
+class DiagnosedError(SurveyError):
+    """An adjustment that failed, with what explains it (``adjust.diagnosis.diagnosis.Diagnosis``)."""
+
+    def __init__(self, message: str, diagnosis: object) -> None:
+        super().__init__(message)
+        self.diagnosis = diagnosis

@@ -191,7 +191,8 @@ class Adjustment:
     precision: gives joint covariances, ``precision.joint([name, ...])``.
     variance_components: ``adjust.statistics.result.VarianceComponents``, where they were estimated. decisions: the log
     of the search for gross errors, ``adjust.statistics.result.Decision``. n_screened: image points and other
-    observations that were in use and that this adjustment left out, where that was counted.
+    observations that were in use and that this adjustment left out, where that was counted. diagnosis:
+    ``adjust.diagnosis.diagnosis.Diagnosis``, where something does not fit and is explained.
     """
 
     survey: Survey
@@ -215,6 +216,7 @@ class Adjustment:
     variance_components: Any = None
     decisions: tuple[Any, ...] = ()
     n_screened: int = 0
+    diagnosis: Any = None
 
     @cached_property
     def other_arrays(self) -> OtherArrays:

@@ -30,6 +30,10 @@ def declare_adjust(commands: Any, shaped: dict[str, Any]) -> None:
         help="published: also the published step-by-step methods (head on a table, measured pairs), beside the joint "
         "adjustment; default: joint",
     )  # fmt: skip
+    parser.add_argument(
+        "--try", type=positive, metavar="N", dest="candidate",
+        help="carry out cause N of the diagnosis on the project, then adjust; changed files are kept in FOLDER/kept",
+    )  # fmt: skip
     batch = parser.add_argument_group("batch")
     batch.add_argument("--jobs", type=positive, metavar="N", help="folders at a time; default: one per core")
     batch.add_argument(
@@ -54,6 +58,8 @@ def _adjust(arguments: argparse.Namespace) -> int:
             arguments.parser.error("--out needs a single FOLDER: the results of several would be mixed up")
         if arguments.method != "joint":
             arguments.parser.error("--method published needs a single FOLDER: it is beside one adjustment")
+        if arguments.candidate is not None:
+            arguments.parser.error("--try needs a single FOLDER: it changes one project")
         if len({folder.resolve() for folder in folders}) < len(folders):
             arguments.parser.error("a FOLDER is named twice")
         if arguments.resume and arguments.report is None:
@@ -69,6 +75,10 @@ def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
     require_project(folder, arguments.out)
     from survey.jobs.adjusting.job import adjust_job
 
+    if arguments.candidate is not None:
+        from survey.jobs.adjusting.trying import try_job
+
+        say(arguments, try_job(folder, arguments.candidate))
     outcome = adjust_job(
         folder, out=arguments.out, progress=not is_set(arguments, "quiet"), redetect=arguments.redetect,
         method=arguments.method,

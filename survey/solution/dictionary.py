@@ -82,6 +82,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
             "groups": {g.group: _group(g) for g in adjustment.groups},
             **left_out_dict(adjustment, run.left_out, run.n_left_out, run.n_unused_in_files),
             "warnings": [*findings(found.consistency if found else None), *adjustment.warnings],
+            **({"diagnosis": adjustment.diagnosis.told()} if adjustment.diagnosis is not None else {}),
             **(statistics_dict(adjustment, found, scale) if found is not None else {}),
             "inputs": {
                 "folder": run.folder,

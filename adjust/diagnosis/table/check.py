@@ -49,6 +49,18 @@ def probable_causes(survey: Survey, result: Adjustment | None = None) -> tuple[s
     return tuple(line for views in every for line in _causes(survey, views))
 
 
+_SYMPTOMS = (
+    "its images contradict those of all others",
+    "no exchange of the axes, unit or shift by one epoch explains it",
+    "which no reading of table",
+)
+
+
+def only_symptoms(lines: Sequence[str]) -> bool:
+    """Whether the lines of ``probable_causes`` say where something does not fit, but not what happened."""
+    return all(any(text in line for text in _SYMPTOMS) for line in lines)
+
+
 def sign_warnings(survey: Survey, result: Adjustment) -> tuple[str, ...]:
     """Axes whose sign contradicts poses that are given as starts: images alone do not see it."""
     out = []

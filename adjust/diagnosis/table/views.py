@@ -208,7 +208,7 @@ def _gathered(
     seen = {b.epoch_id for b in blocks}
     epoch_ids = tuple(e for e in readings if e in seen)
     poses = np.array([v.poses[0] for v in views])
-    cov = np.array([_covariance(b, v) for b, v in zip(blocks, views, strict=True)])
+    cov = np.array([view_covariance(b, v) for b, v in zip(blocks, views, strict=True)])
     other_way = np.array(turned)
     poses[other_way] = inverse(poses[other_way])
     A = adjoint(poses[other_way])
@@ -221,7 +221,7 @@ def _gathered(
     )  # fmt: skip
 
 
-def _covariance(block: ImageBlock, view: View) -> FloatArray:
+def view_covariance(block: ImageBlock, view: View) -> FloatArray:
     """Covariance (6, 6) of camera_from_target, a small motion on its left, from the points' noise."""
     p = view.x @ view.poses[0][:3, :3].T + view.poses[0][:3, 3]
     depth = np.linalg.norm(p, axis=1)

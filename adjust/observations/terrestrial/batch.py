@@ -263,9 +263,9 @@ class TerrestrialBatch:
             rows = np.flatnonzero((a.orientation == i) & (a.kind == k.DIRECTION))
             turn = self.residual[rows]
             if setup_id not in known and vector.key is not None:
-                values.update(vector.key, self.orientation[i : i + 1] + _circular_median(turn[np.isfinite(turn)]))
+                values.update(vector.key, self.orientation[i : i + 1] + circular_median(turn[np.isfinite(turn)]))
             elif setup_id not in known and setup_id in poses:
-                turn_about_z = self.sign * _circular_median(turn[np.isfinite(turn)])
+                turn_about_z = self.sign * circular_median(turn[np.isfinite(turn)])
                 station = values.atPose3(poses[setup_id])
                 values.update(poses[setup_id], station * gtsam.Pose3(gtsam.Rot3.Rz(turn_about_z), np.zeros(3)))
 
@@ -284,7 +284,7 @@ def sigmas(a: ReadingArrays, axes: FloatArray, A: FloatArray) -> FloatArray:
     return np.sqrt(variance)
 
 
-def _circular_median(angles: FloatArray) -> float:
+def circular_median(angles: FloatArray) -> float:
     """The angle nearest to all others (least sum of absolute differences), of those given; zero of none."""
     if len(angles) == 0:
         return 0.0

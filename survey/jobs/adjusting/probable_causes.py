@@ -1,26 +1,39 @@
 """Why an adjustment failed, or what contradicts in it, where the images can tell. Nothing is repaired."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
+from adjust.model.errors import DiagnosedError, IndeterminateError, NotConvergedError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 from survey.project.epoch_names import separate_epochs
+
+if TYPE_CHECKING:
+    from adjust.diagnosis.diagnosis import Diagnosis
+
+
+_LARGE = 1.15
+"""sigma0 from which a mistake is looked for by trial; below, sigmas that are a little small explain as much."""
 
 
 def explained(survey: Survey, error: SurveyError) -> SurveyError:
     """What an adjustment of ``survey`` raised, with the probable causes in front where there are any."""
     apart, contradictions = separate_epochs(survey), _probable_causes(survey)
-    if not apart and not contradictions:
+    diagnosis = _diagnosis(survey, None, error, contradictions)
+    tried = diagnosis.lines if diagnosis is not None else ()
+    if not apart and not contradictions and not tried:
         return error
-    lines = "\n  - ".join(["probable cause:", *apart, *contradictions])
-    said = _consequence(error) if contradictions else f"without that: {error}"
-    return SurveyError(f"{lines}\n{said}")
+    lines = "\n  - ".join(["probable cause:", *apart, *tried, *contradictions])
+    said = _consequence(error) if contradictions or tried else f"without that: {error}"
+    message = f"{lines}\n{said}"
+    return SurveyError(message) if diagnosis is None else DiagnosedError(message, diagnosis)
 
 
 def with_probable_causes(survey: Survey, result: Adjustment) -> Adjustment:
     """The adjustment of ``survey`` with the probable causes of what contradicts as its first warnings."""
     warnings: tuple[str, ...] = ()
+    diagnosis: Diagnosis | None = None
     if survey.tables:
         from adjust.diagnosis.table import sign_warnings  # here: a survey without a table starts without it
 
@@ -28,8 +41,29 @@ def with_probable_causes(survey: Survey, result: Adjustment) -> Adjustment:
     if _contradicted(survey, result):
         # what does not fit may have spoilt the lenses too: then those that the images alone give
         causes = _probable_causes(survey, result) or _probable_causes(survey)
+        if not warnings:
+            diagnosis = _diagnosis(survey, result, None, causes)
+            warnings = diagnosis.lines if diagnosis is not None else ()
         warnings += tuple(c for c in causes if c not in warnings)
-    return replace(result, warnings=tuple(f"probable cause: {c}" for c in warnings) + result.warnings)
+    lines = tuple(f"probable cause: {c}" for c in warnings)
+    return replace(result, warnings=lines + result.warnings, diagnosis=diagnosis)
+
+
+def _diagnosis(
+    survey: Survey, result: Adjustment | None, error: SurveyError | None, causes: Sequence[str]
+) -> "Diagnosis | None":
+    """What explains the misfit by trial, where closed forms have not named it; None where nothing does."""
+    from adjust.diagnosis.table import only_symptoms  # here: a survey that fits starts without them
+
+    refused = error is not None and not isinstance(error, IndeterminateError | NotConvergedError)
+    fits = result is not None and result.sigma0 < _LARGE and not _images_refused(survey, result)
+    if refused or fits or not survey.image_blocks or not only_symptoms(causes):
+        return None
+    from adjust.diagnosis.case import Case
+    from adjust.diagnosis.diagnosis import diagnose
+
+    found = diagnose(Case(survey, result, error))
+    return found if found.candidates else None
 
 
 def _consequence(error: SurveyError) -> str:
@@ -52,5 +86,9 @@ def _contradicted(survey: Survey, result: Adjustment) -> bool:
     test = result.global_test
     if test is not None and test.omega > test.upper:
         return True
+    return _images_refused(survey, result)
+
+
+def _images_refused(survey: Survey, result: Adjustment) -> bool:
     taking_part = sum(1 for b in result.survey.image_blocks if b.used is None or b.used.any())
     return taking_part < sum(1 for b in survey.image_blocks if b.used is None or b.used.any())

@@ -1,0 +1,44 @@
+"""Bodies taken for rigid that are not: a camera or target moved, a focus touched, an image cropped or turned later."""
+
+from collections.abc import Iterable, Iterator
+
+from adjust.diagnosis.bodies.cameras import changed_camera, turned_images
+from adjust.diagnosis.bodies.lens_steps import lens_steps
+from adjust.diagnosis.bodies.series import Step, series_of, step_of
+from adjust.diagnosis.bodies.split import epochs_from
+from adjust.diagnosis.bodies.targets import moved_target
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis
+
+__all__ = ["hypotheses"]
+_MOST = 4
+
+
+def hypotheses(case: Case) -> Iterable[Hypothesis]:
+    """Cameras and targets that are others from some epoch on, where single images show a step."""
+    found: dict[tuple[str, int], Step] = {}
+    for step in _steps(case):  # the first of a place tells the motion too
+        found.setdefault((step.name[1], step.first), step)
+    for step in sorted(found.values(), key=lambda s: -s.gain)[:_MOST]:
+        yield from _of(case, step)
+
+
+def _steps(case: Case) -> Iterator[Step]:
+    found = []
+    if case.result is not None:
+        found = [step for series in series_of(case, case.result) if (step := step_of(series)) is not None]
+    if not found:
+        for (_, owner), result in case.without_one:
+            steps = [step_of(s) for s in series_of(case, result) if s.name[1] == owner]
+            found += [s for s in steps if s is not None]
+    yield from found
+    yield from lens_steps(case)
+
+
+def _of(case: Case, step: Step) -> Iterator[Hypothesis]:
+    is_camera = step.name[0] == "station_from_camera"
+    epochs = epochs_from(case.survey, "camera_id" if is_camera else "target_id", step.name[1], step.first)
+    if epochs and is_camera:
+        yield from turned_images(case.survey, step, epochs)
+    if epochs:
+        yield changed_camera(case.survey, step, epochs) if is_camera else moved_target(case.survey, step, epochs)

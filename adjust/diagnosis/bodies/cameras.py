@@ -1,0 +1,155 @@
+"""A camera that is another one from some epoch on, and what of it changed: its place, its focus, its images."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.diagnosis.bodies.series import Step
+from adjust.diagnosis.bodies.split import split_camera
+from adjust.diagnosis.bodies.targets import motion_text
+from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place
+from adjust.diagnosis.images.maps import TURNED, edits_of, mapped
+from adjust.distributions import chi2
+from adjust.model.result import Adjustment, Estimate
+from adjust.model.survey import FloatArray, Survey
+from adjust.spatial.rigid import rotation_log
+
+_ALPHA = 1e-5
+_FOCAL, _CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
+_NEAR = np.radians(10.0)  # lenses that were found in images of both ways are not good
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """Lens and place of a camera after a step against before: free lens parameters, then a motion (rad, m), and cov.
+
+    names: of the free lens parameters. before: their values before. motion: before_from_after.
+    """
+
+    names: tuple[str, ...]
+    before: FloatArray
+    d: FloatArray
+    cov: FloatArray
+    motion: Pose3
+
+    def vanishes(self, rows: Sequence[int], expected: FloatArray | None = None) -> bool:
+        """Whether these components are as expected (zero where not given), by a chi-square test."""
+        at = list(rows)
+        off = (self.d if expected is None else self.d - expected)[at]
+        inverse = np.linalg.pinv(self.cov[np.ix_(at, at)], rcond=1e-14, hermitian=True)
+        return float(off @ inverse @ off) < float(chi2.isf(_ALPHA, len(at)))
+
+
+def changed_camera(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Hypothesis:
+    """Lens and place of the camera free from some epoch on; named by what differs once that is adjusted."""
+    camera, new = step.name[1], f"{step.name[1]} from {epochs[0]}"
+    hypothesis = Hypothesis(
+        "camera changed",
+        f"camera {camera}: lens and place are others from epoch {epochs[0]} on: it was exchanged, or knocked",
+        f"give it a name of its own from epoch {epochs[0]} on, or leave its {len(epochs)} images since then out",
+        Place("camera", (camera,), epochs=epochs),
+        split_camera(survey, camera, epochs, new),
+        (LeaveOut(tuple(f"image:{camera}/{e}" for e in epochs)),),
+        evidence=step.gain, parameters=15, looked_at=step.cuts,
+    )  # fmt: skip
+
+    def told(result: Adjustment) -> Sequence[Hypothesis]:
+        found = _difference(result, camera, new)
+        if found is None:
+            return ()
+        seen = replace(step, motion=found.motion.inverse().matrix())
+        turned = turned_images(survey, seen, epochs) if step.motion is None else ()
+        return (*turned, _named(hypothesis, found))
+
+    return replace(hypothesis, follow=told)
+
+
+def _difference(result: Adjustment, camera: str, new: str) -> Difference | None:
+    lenses = [result.estimates[("lens", name)] for name in (camera, new)]
+    poses = [result.estimates[("station_from_camera", name)] for name in (camera, new)]
+    before, after = (p.value for p in poses)
+    if not isinstance(before, Pose3) or not isinstance(after, Pose3) or isinstance(lenses[0].value, Pose3):
+        return None
+    free = [i for i, status in enumerate(lenses[0].status) if status in ("free", "prior")]
+    motion = before.between(after)
+    cov = _joint(result, [*lenses, *poses], [free, free, list(range(6)), list(range(6))])
+    n, A = len(free), motion.inverse().AdjointMap()
+    J = np.zeros((n + 6, 2 * n + 12))
+    J[:n, : 2 * n] = np.hstack([-np.eye(n), np.eye(n)])
+    J[n:, 2 * n :] = np.hstack([-A, np.eye(6)])
+    cov = J @ cov @ J.T
+    names = tuple(lenses[0].components[i] for i in free)
+    values = [np.asarray(x.value)[free] for x in lenses]
+    d = np.concatenate([values[1] - values[0], Pose3.Logmap(motion)])
+    return Difference(names, values[0], d, cov * max(1.0, result.sigma0**2), motion)
+
+
+def _joint(result: Adjustment, estimates: Sequence[Estimate], rows: Sequence[Sequence[int]]) -> FloatArray:
+    """Joint covariance of some components of several estimates, zero where they are held."""
+    sizes = [len(r) for r in rows]
+    at = np.cumsum([0, *sizes])
+    out = np.zeros((at[-1], at[-1]))
+    known = [k for k, e in enumerate(estimates) if e.name in result.precision.graph.unknowns.by_name]
+    where = np.concatenate([np.arange(at[k], at[k + 1]) for k in known])
+    out[np.ix_(where, where)] = result.precision.joint([estimates[k].name for k in known])
+    return out
+
+
+def turned_images(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Iterator[Hypothesis]:
+    """The images turned back, where the camera seems to have turned about its line of sight by quarter turns."""
+    turn = np.radians([0.0, 0.0, 180.0]) if step.motion is None else rotation_log(step.motion[:3, :3])
+    for degrees, back in ((90.0, 270), (180.0, 180), (-90.0, 90)):
+        off = min(float(np.linalg.norm(turn - s * np.radians([0.0, 0.0, degrees]))) for s in (1, 1 - 2 * (back == 180)))
+        if off < _NEAR:
+            camera, how = step.name[1], TURNED[back]
+            yield Hypothesis(
+                "images turned",
+                f"camera {camera}: its images are turned from epoch {epochs[0]} on",
+                f"turn them by {how.text}, and detect them again",
+                Place("camera", (camera,), epochs=epochs), mapped(survey, camera, set(epochs), how),
+                edits_of(survey, camera, epochs, how), looked_at=step.cuts,
+                evidence=(0.9 if step.motion is None else 1.1) * step.gain,
+            )  # fmt: skip
+
+
+def _named(hypothesis: Hypothesis, found: Difference) -> Hypothesis:
+    """The same survey under the name of the simplest change that agrees with what was adjusted."""
+    camera, first = hypothesis.place.ids[0], hypothesis.place.epochs[0]
+    n, begin = len(found.names), f"camera {hypothesis.place.ids[0]}: from epoch {hypothesis.place.epochs[0]} on "
+    place = list(range(n, n + 6))
+    other = [i for i, name in enumerate(found.names) if name not in _FOCAL + _CENTRE]
+    focal = [i for i, name in enumerate(found.names) if name in _FOCAL]
+    centre = [i for i, name in enumerate(found.names) if name in _CENTRE]
+    by = {name: f"{value:+.2f}" for name, value in zip(found.names, found.d, strict=False)}
+    if centre and found.vanishes([*focal, *other, *place]):
+        shift = ", ".join(by[found.names[i]] for i in centre)
+        return replace(hypothesis, name="images shifted", parameters=3,
+                       cause=f"{begin}its images are shifted by ({shift}) px: another crop of the sensor")  # fmt: skip
+    if focal:
+        ratio = 1.0 + found.d[focal[0]] / found.before[focal[0]]
+        expected = _resized(found, ratio)
+        if found.vanishes([*focal[1:], *centre, *other, *place], expected):
+            return replace(hypothesis, name="images resized", parameters=2,
+                           cause=f"{begin}its images have {ratio:.5g} times the size")  # fmt: skip
+        if found.vanishes([*other, *place]):
+            return replace(hypothesis, name="focus touched", parameters=5,
+                           cause=f"{begin}its focal length is {ratio:.5f} times the former one: focus or zoom was "
+                           "touched")  # fmt: skip
+    if found.vanishes([*focal, *centre, *other]):
+        return replace(hypothesis, name="camera moved", parameters=7,
+                       cause=f"camera {camera} was moved on its station before epoch {first} "
+                       f"{motion_text(found.motion)}")  # fmt: skip
+    return hypothesis
+
+
+def _resized(found: Difference, ratio: float) -> FloatArray:
+    """What the difference (n + 6,) is where the image was scaled, the corner of its first pixel staying where it is."""
+    out = np.zeros_like(found.d)
+    for i, name in enumerate(found.names):
+        if name in _FOCAL:
+            out[i] = (ratio - 1.0) * found.before[i]
+        elif name in ("u0", "v0"):
+            out[i] = (ratio - 1.0) * (found.before[i] + 0.5)
+    return out

@@ -1,0 +1,47 @@
+"""A target that was moved during the session."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.diagnosis.bodies.series import Step
+from adjust.diagnosis.bodies.split import split_target
+from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place
+from adjust.model.result import Adjustment
+from adjust.model.survey import Survey
+
+
+def moved_target(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Hypothesis:
+    """The target at a place of its own from some epoch on."""
+    target, new = step.name[1], f"{step.name[1]} from {epochs[0]}"
+    images = dict.fromkeys(
+        f"target:{b.camera_id}/{b.epoch_id}/{target}"
+        for b in survey.image_blocks
+        if b.target_id == target and b.epoch_id in epochs
+    )
+    hypothesis = Hypothesis(
+        "target moved",
+        f"target {target} was moved before epoch {epochs[0]}",
+        f"give it a name of its own from epoch {epochs[0]} on, or leave these {len(images)} images of it out",
+        Place("target", (target,), epochs=epochs),
+        split_target(survey, target, epochs, new),
+        (LeaveOut(tuple(images)),),
+        evidence=step.gain, parameters=7, looked_at=step.cuts,
+    )  # fmt: skip
+
+    def told(result: Adjustment) -> Sequence[Hypothesis]:
+        before, after = (result.estimates[("carrier_from_target", name)].value for name in (target, new))
+        if not isinstance(before, Pose3) or not isinstance(after, Pose3):
+            return ()
+        return (replace(hypothesis, cause=f"{hypothesis.cause} {motion_text(before.between(after))}"),)
+
+    return replace(hypothesis, follow=told)
+
+
+def motion_text(motion: Pose3) -> str:
+    """By how many millimetres and degrees, in its own axes."""
+    shift = ", ".join(f"{1e3 * v:.2f}" for v in motion.translation())
+    angle = np.degrees(np.linalg.norm(Rot3.Logmap(motion.rotation())))
+    return f"by ({shift}) mm and {angle:.3f} deg in its own axes"

@@ -1,0 +1,114 @@
+"""The way of a diagnosis: hypotheses from cheap evidence, the likeliest tried, those that explain the misfit ranked."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import Any
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.ranking import Candidate, ranked
+from adjust.diagnosis.trial import Misfit, Trial, misfit_of, tried
+from adjust.model.errors import SurveyError
+
+MOST_TRIALS = 10
+_SHOWN = 3
+_NOISE = 1.2  # variance factor
+_FAINT = 0.2
+
+FAMILIES: tuple[str, ...] = ("images", "targets", "bodies", "names", "units", "time", "weights")
+"""Rooms of this one, each with ``hypotheses(case) -> Iterable[Hypothesis]``: what cheap evidence makes worth a try."""
+
+Family = Callable[[Case], Iterable[Hypothesis]]
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What explains that a survey does not fit: candidates, the best first; empty where nothing that was tried does.
+
+    tried: names of the kinds of causes that were tried, whether they explain anything or not.
+    """
+
+    candidates: tuple[Candidate, ...]
+    tried: tuple[str, ...]
+    misfit: Misfit
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """For people: the first cause, what it changes, how sure it is, and the next one."""
+        return tuple(_text(i, c) for i, c in enumerate(self.candidates[:_SHOWN], start=1))
+
+    def told(self) -> list[dict[str, Any]]:
+        """The candidates for machines: name, cause, change, ids, epochs, and how sure it is."""
+        return [
+            {
+                "name": c.hypothesis.name, "cause": c.hypothesis.cause, "change": c.hypothesis.change,
+                "kind": c.hypothesis.place.kind, "ids": list(c.hypothesis.place.ids),
+                "epochs": list(c.hypothesis.place.epochs), "explained": c.explained, "statistic": c.statistic,
+                "critical": c.critical, "probability": c.probability, "sigma0": c.sigma0,
+            }
+            for c in self.candidates[:_SHOWN]
+        ]  # fmt: skip
+
+
+def diagnose(case: Case, families: Sequence[Family] | None = None, most: int = MOST_TRIALS) -> Diagnosis:
+    """Form the hypotheses of all families, try the likeliest of them, and rank those that explain the misfit.
+
+    families: those of ``FAMILIES`` where None. most: adjustments at most. Nothing is repaired, nothing is written.
+    """
+    formed = [h for family in (_all_families() if families is None else families) for h in _formed(family, case)]
+    formed = _in_turn(formed)
+    base = misfit_of(case.result, case.survey)
+    trials: list[Trial] = []
+    queue, names, left = list(formed), [], most
+    while queue and left > 0 and not _done(trials, queue[0]):
+        first = queue.pop(0)
+        names.append(first.name)
+        left -= 1
+        trial = tried(first, case)
+        more = list(first.follow(trial.result)) if first.follow is not None and trial.result is not None else []
+        same = [replace(trial, hypothesis=h) for h in more if h.survey is first.survey]
+        trials += same or [trial]
+        queue[:0] = [h for h in more if h.survey is not first.survey]
+    looked_at = sum(h.looked_at for h in formed)
+    return Diagnosis(ranked(base, trials, looked_at), tuple(dict.fromkeys(names)), base)
+
+
+def _done(trials: Sequence[Trial], following: Hypothesis) -> bool:
+    """Whether one explains everything down to the noise, and what follows is much less evident."""
+    return any(
+        t.result is not None and t.misfit.unused == 0 and t.misfit.omega < _NOISE * t.misfit.redundancy
+        and following.evidence < _FAINT * t.hypothesis.evidence
+        for t in trials
+    )  # fmt: skip
+
+
+def _in_turn(formed: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The most evident first; but of every kind one before the second of any: their evidence is not of one measure."""
+    before: dict[str, int] = {}
+    turns = []
+    for h in sorted(formed, key=lambda h: -h.evidence):
+        turns.append((before.setdefault(h.name, 0), h))
+        before[h.name] += 1
+    return [h for _, h in sorted(turns, key=lambda item: item[0])]
+
+
+def _all_families() -> list[Family]:
+    return [import_module(f"adjust.diagnosis.{name}").hypotheses for name in FAMILIES]
+
+
+def _formed(family: Family, case: Case) -> list[Hypothesis]:
+    """The hypotheses of one family; none where the observations do not even suffice to form them."""
+    try:
+        return list(family(case))
+    except SurveyError:
+        return []
+
+
+def _text(number: int, candidate: Candidate) -> str:
+    h = candidate.hypothesis
+    sure = "" if candidate.probability > 0.99 else f", probability {100.0 * candidate.probability:.0f} %"
+    return (
+        f"{'' if number == 1 else 'or else: '}{h.cause}; {h.change} (explains {100.0 * candidate.explained:.0f} % of "
+        f"the misfit, sigma0 becomes {candidate.sigma0:.3g}{sure}; --try {number})"
+    )

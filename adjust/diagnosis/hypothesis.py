@@ -1,0 +1,103 @@
+"""What may be wrong with a survey: one cause, the one change that would mend it, and where a project says it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray, Survey
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a mistake sits. kind: camera, station, table, target, point, image, reading, pair, epoch, group ...
+
+    ids: of the thing, an image by camera and epoch. key: of ``survey.toml`` or a column of the table, where one is at
+    fault. epochs: those concerned, all where empty.
+    """
+
+    kind: str
+    ids: tuple[str, ...]
+    key: str = ""
+    epochs: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ScaleKey:
+    """The number, or every number, at ``path`` of ``survey.toml`` is multiplied: ("targets", "board", "square_mm")."""
+
+    path: tuple[str, ...]
+    factor: float
+
+
+@dataclass(frozen=True)
+class SetKey:
+    """The value at ``path`` of ``survey.toml`` becomes another: a number, a word, yes or no, a list of words."""
+
+    path: tuple[str, ...]
+    value: float | int | str | bool | tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeColumns:
+    """In the rows of a table where each column of ``where`` has one of its values: new = matrix @ old + offset.
+
+    columns: k numeric columns, in the units in which they stand there; matrix: (k, k); offset: (k,).
+    """
+
+    table: str
+    columns: tuple[str, ...]
+    matrix: FloatArray
+    offset: FloatArray
+    where: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Rename:
+    """In the rows of a table where each column of ``where`` has one of its values: ids of a column become others."""
+
+    table: str
+    column: str
+    names: Mapping[str, str]
+    where: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class LeaveOut:
+    """Rows of ``exclusions.csv``, each as a person would name it: "image:Y/hY06", "epoch:t09", "pairs:p3"."""
+
+    names: tuple[str, ...]
+
+
+Edit = ScaleKey | SetKey | ChangeColumns | Rename | LeaveOut
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One cause, and the survey as it would be without it.
+
+    name: of the kind of cause ("images mirrored"), the same for every place. cause: what is wrong, a sentence about
+    named things. change: what would mend it. survey: the survey with that one change, to be tried, or what makes it
+    where that takes adjustments of its own. edits: the same as changes of a project, none where only a person can
+    do it. evidence: how clearly cheap evidence speaks for it, a ratio of misfits or of sigmas; only the order of
+    trials follows it. parameters: how many numbers of the change were chosen to fit (a cut's epoch, a factor).
+    looked_at: how many such hypotheses were compared with each other, for the family-wise level. follow: what the
+    adjustment tells more exactly, in place of this one: the same survey under its right name, or another one to be
+    tried. penalty: what the change adds to minus twice the log likelihood beside v'Pv, where it changes variances: the
+    sum of the logarithms of their factors.
+    """
+
+    name: str
+    cause: str
+    change: str
+    place: Place
+    survey: Survey | Callable[[], Survey | None]
+    edits: tuple[Edit, ...] = ()
+    evidence: float = 1.0
+    parameters: int = 1
+    looked_at: int = 1
+    follow: Callable[[Adjustment], Sequence["Hypothesis"]] | None = None
+    penalty: float = 0.0
+
+    def changed(self) -> Survey | None:
+        """The survey to be tried; None where the change turns out not to be possible."""
+        return self.survey() if callable(self.survey) else self.survey

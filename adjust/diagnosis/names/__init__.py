@@ -1,0 +1,16 @@
+"""Things called by each other's names, and epochs out of order: points, cameras, epochs, the same epoch twice."""
+
+from collections.abc import Iterator
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.names.epochs import misplaced_epochs
+from adjust.diagnosis.names.given import wrong_given
+from adjust.diagnosis.names.points import exchanged_points
+
+
+def hypotheses(case: Case) -> Iterator[Hypothesis]:
+    """Of readings, given coordinates, images and the poses of hands."""
+    yield from exchanged_points(case)
+    yield from wrong_given(case)
+    yield from misplaced_epochs(case)

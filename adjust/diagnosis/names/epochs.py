@@ -1,0 +1,178 @@
+"""Epochs out of order: shifted by one from somewhere on, exchanged, twice; cameras whose images changed places.
+
+Evidence: a rig, or a hand and its eye, is rigid; see :mod:`adjust.diagnosis.sequences`.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.sequences import Link, Shift, fitted, links, shifts
+from adjust.model.observations import FrameRef, ImageBlock, Pair
+from adjust.model.survey import FloatArray, Survey
+from adjust.spatial.averaging import mean_pose
+from adjust.spatial.rigid import inverse
+
+_CLEARLY = 3.0
+_SUSPECTS = 6
+
+
+def misplaced_epochs(case: Case) -> Iterator[Hypothesis]:
+    """Of every rig and hand: shifts, exchanged epochs, exchanged cameras; observations that are there twice."""
+    yield from _twice(case.survey)
+    for link in links(case):
+        yield from _shifted(case.survey, link)
+        yield from _exchanged(case.survey, link)
+        if link.kind == "rig":
+            yield from _cameras(case.survey, link)
+
+
+def _moved(survey: Survey, link: Link, epoch_of: Mapping[str, str]) -> Survey:
+    """The survey with the second's observations at other epochs; those that would have none are dropped."""
+    if link.pairs:
+        chosen = set(link.pairs)
+        pairs = tuple(_pair_at(p, epoch_of) if i in chosen else p for i, p in enumerate(survey.pairs))
+        return replace(survey, pairs=tuple(p for p in pairs if p is not None))
+    blocks = tuple(_block_at(b, epoch_of) if b.camera_id == link.names[1] else b for b in survey.image_blocks)
+    return replace(survey, image_blocks=tuple(b for b in blocks if b is not None))
+
+
+def _block_at(block: ImageBlock, epoch_of: Mapping[str, str]) -> ImageBlock | None:
+    new = epoch_of.get(block.epoch_id, block.epoch_id)
+    return replace(block, epoch_id=new) if new else None
+
+
+def _pair_at(pair: Pair, epoch_of: Mapping[str, str]) -> Pair | None:
+    def at(ref: FrameRef) -> FrameRef:
+        return replace(ref, epoch_id=epoch_of.get(ref.epoch_id, ref.epoch_id)) if ref.epoch_id else ref
+
+    a, b = at(pair.a), at(pair.b)
+    return None if "" in (a.epoch_id, b.epoch_id) else replace(pair, a=a, b=b)
+
+
+def _said(link: Link) -> tuple[str, str, Place]:
+    """What the second is called, where its epochs stand, and its place."""
+    if link.pairs:
+        return f"the measured poses of {link.names[1]}", "pairs.csv", Place("station", (link.names[1],), "epoch")
+    camera = link.names[1]
+    return f"the images of camera {camera}", f"images/{camera}", Place("camera", (camera,), "epoch")
+
+
+def _shifted(survey: Survey, link: Link) -> Iterator[Hypothesis]:
+    found = shifts(link)
+    for shift in found[:2]:
+        if shift.evidence > _CLEARLY:
+            yield _shift(survey, link, shift, len(found) * len(link.epochs))
+
+
+def _shift(survey: Survey, link: Link, shift: Shift, looked_at: int) -> Hypothesis:
+    n, epochs = len(link.epochs), link.epochs
+    epoch_of = {e: epochs[i - shift.by] if shift.begin <= i - shift.by < n else "" for i, e in enumerate(epochs)
+                if i >= shift.begin}  # fmt: skip
+    what, file, place = _said(link)
+    since = "throughout" if shift.begin == 0 else f"from epoch {epochs[shift.begin]} on"
+    which = "late" if shift.by > 0 else "early"
+    name = "epochs shifted"
+    return Hypothesis(
+        name, f"{what} are {abs(shift.by)} epoch{'s' * (abs(shift.by) > 1)} too {which} {since}: one is missing or "
+        "there twice", f"rename the epochs in {file}", replace(place, epochs=epochs[shift.begin :]),
+        _moved(survey, link, epoch_of), (), shift.evidence, 2, looked_at,
+    )  # fmt: skip
+
+
+def _exchanged(survey: Survey, link: Link) -> Iterator[Hypothesis]:
+    """Two epochs of the second that changed places."""
+    fit = fitted(link.kind, link.first, link.second)
+    if fit is None:
+        return
+    misses = fit.misses(link.first, link.second)
+    suspects = np.argsort(-misses)[:_SUSPECTS].tolist()
+    found = []
+    for i, j in combinations(sorted(suspects), 2):
+        now = fit.misses(link.first[[i, j]], link.second[[j, i]])
+        found.append((float(misses[[i, j]].min() / (now.max() + float(np.median(misses)) + 1e-9)), i, j))
+    for evidence, i, j in sorted(found, reverse=True)[:1]:
+        if evidence > _CLEARLY:
+            a, b = link.epochs[i], link.epochs[j]
+            what, file, place = _said(link)
+            yield Hypothesis("epochs exchanged", f"{what} at epochs {a} and {b} changed places",
+                             f"exchange them in {file}", replace(place, epochs=(a, b)),
+                             _moved(survey, link, {a: b, b: a}), (), evidence, 2, len(found))  # fmt: skip
+
+
+def _cameras(survey: Survey, link: Link) -> Iterator[Hypothesis]:
+    """Images of two cameras under each other's names, at the smaller part of the epochs: one, or from one on.
+
+    An exchange inverts the motion between the two: the one that joins all epochs either way is found first.
+    """
+    n, lever = len(link.epochs), float(np.median(np.linalg.norm(link.first[:, :3, 3], axis=1)))
+    motions = link.first @ inverse(link.second)
+    both, members = np.concatenate([motions, inverse(motions)]), np.tile(np.arange(n), 2)
+    apart = mean_pose(both, lever, members)[1].reshape(2, n)
+    wrong = apart[1] < apart[0]
+    if 2 * wrong.sum() > n or (2 * wrong.sum() == n and wrong[0]):
+        wrong = ~wrong
+    near, far = apart.min(axis=0), apart.max(axis=0)
+    ratio = float(np.min(far / (near + float(np.median(near)) + 1e-9)))
+    if wrong.any() and ratio > _CLEARLY:
+        epochs = tuple(e for e, w in zip(link.epochs, wrong, strict=True) if w)
+        a, b = link.names
+        yield Hypothesis(
+            "cameras exchanged", f"cameras {a} and {b} have each other's images at {_listed(epochs, link.epochs)}",
+            f"exchange these images between images/{a} and images/{b}", Place("camera", (a, b), "", epochs),
+            exchanged_cameras(survey, a, b, epochs), (), ratio, 2, n,
+        )  # fmt: skip
+
+
+def _listed(some: tuple[str, ...], every: tuple[str, ...]) -> str:
+    if some == every[-len(some) :] and len(some) > 1:
+        return f"epoch {some[0]} and from it on"
+    return "epoch " + ", ".join(some[:6]) + (f" and {len(some) - 6} more" if len(some) > 6 else "")
+
+
+def exchanged_cameras(survey: Survey, a: str, b: str, epochs: tuple[str, ...]) -> Survey:
+    """The survey with the images of two cameras exchanged at these epochs."""
+    other, chosen = {a: b, b: a}, set(epochs)
+    blocks = tuple(
+        replace(x, camera_id=other[x.camera_id]) if x.camera_id in other and x.epoch_id in chosen else x
+        for x in survey.image_blocks
+    )
+    return replace(survey, image_blocks=blocks)
+
+
+def _twice(survey: Survey) -> Iterator[Hypothesis]:
+    """Two measured poses of the same frames, or two readings of a table at one epoch, that differ: either may go."""
+    for field, ends in (("pairs", ("a", "b")), ("table_readings", ("table_id", "epoch_id"))):
+        seen: dict[tuple[object, ...], list[int]] = {}
+        for i, o in enumerate(getattr(survey, field)):
+            if o.used:
+                seen.setdefault(tuple(getattr(o, end) for end in ends), []).append(i)
+        for rows in seen.values():
+            for i in rows if len(rows) > 1 and not _agree([getattr(survey, field)[k] for k in rows]) else ():
+                yield _without_one(survey, field, i)
+
+
+def _agree(observed: list[object]) -> bool:
+    """Whether values of the same thing differ by less than ten sigmas."""
+    first = observed[0]
+    return all(float(np.max(np.abs(_difference(first, o)) / np.sqrt(np.diag(o.cov)))) < 10.0 for o in observed)  # type: ignore[attr-defined]
+
+
+def _difference(a: object, b: object) -> FloatArray:
+    if isinstance(a, Pair) and isinstance(b, Pair):
+        return np.asarray(a.b_from_a.localCoordinates(b.b_from_a))  # type: ignore[arg-type]
+    return np.asarray(a.angles - b.angles)  # type: ignore[attr-defined]
+
+
+def _without_one(survey: Survey, field: str, row: int) -> Hypothesis:
+    o = getattr(survey, field)[row]
+    what = f"pair {o.pair_id}" if field == "pairs" else f"the reading of table {o.table_id} at epoch {o.epoch_id}"
+    kept: dict[str, Any] = {field: tuple(x for i, x in enumerate(getattr(survey, field)) if i != row)}
+    return Hypothesis("the same twice", f"{what} is there twice with different values, and this one (row {row + 1} of "
+                      "those in use) does not fit", "leave it out", Place(field, (str(row),)),
+                      replace(survey, **kept), (), 10.0, 1, 2)  # fmt: skip

@@ -1,0 +1,101 @@
+"""Given coordinates that are those of another point, or slipped, or in other axes: each change tried at its own start.
+
+Held values and priors of points, which the readings of a network contradict.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.screen import Screen, improvement, screen
+from adjust.model.survey import FloatArray, Point, Survey
+
+_CLEARLY = 2.0
+_MOST, _TRIALS = 4, 80
+_SLIPS = (10.0, 0.1, 100.0, 0.01, 1000.0, 0.001)
+_LARGE = 2500
+
+
+def wrong_given(case: Case) -> Iterator[Hypothesis]:
+    """Changes of given coordinates after which the survey's own start fits its observations better."""
+    survey = case.survey
+    given = [p.point_id for p in survey.points if p.x_in_world.treatment != "free" and p.x_in_world.value is not None]
+    if not given or not survey.readings or len(survey.readings) > _LARGE:
+        return
+    before = screen(survey)
+    tried = [*_exchanges(survey, given), *_slips(survey, given), *_axes(survey, given)][:_TRIALS]
+    found = []
+    for h in tried:
+        changed = h.changed()
+        evidence = 0.0 if changed is None else _evidence(before, screen(changed))
+        if evidence > _CLEARLY:
+            found.append(replace(h, evidence=evidence, looked_at=len(tried)))
+    yield from sorted(found, key=lambda h: -h.evidence)[:_MOST]
+
+
+def _evidence(before: Screen | None, after: Screen | None) -> float:
+    if after is None or not len(after.readings):
+        return 0.0
+    n = len(after.readings)
+    least = after.scale if before is None else min(after.scale, before.scale)
+    old = 25.0 * n if before is None else before.misfit(least)
+    return improvement(old, after.misfit(least), n)
+
+
+def with_given(survey: Survey, new: dict[str, FloatArray]) -> Survey:
+    """The survey with other given coordinates (3,) m of these points."""
+    def point(p: Point) -> Point:
+        return replace(p, x_in_world=replace(p.x_in_world, value=new[p.point_id])) if p.point_id in new else p
+
+    return replace(survey, points=tuple(point(p) for p in survey.points))
+
+
+def _values(survey: Survey, given: list[str]) -> dict[str, FloatArray]:
+    every = {p.point_id: p.x_in_world.value for p in survey.points}
+    return {n: np.asarray(every[n], dtype=float) for n in given}
+
+
+def _exchanges(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
+    x = _values(survey, given)
+    for a, b in combinations(given, 2):
+        yield Hypothesis(
+            "given points exchanged", f"the given coordinates of points {a} and {b} are each other's",
+            f"exchange the coordinates of {a} and {b} in survey.toml", Place("point", (a, b), "x_in_world"),
+            with_given(survey, {a: x[b], b: x[a]}),
+        )  # fmt: skip
+
+
+def _slips(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
+    for name, x in _values(survey, given).items():
+        for axis, factor in ((i, f) for i in range(3) for f in _SLIPS):
+            new = x.copy()
+            new[axis] *= factor
+            if abs(new[axis] - x[axis]) > 1e-6:
+                yield _slip(survey, name, axis, x[axis], new)
+
+
+def _slip(survey: Survey, name: str, axis: int, read: float, new: FloatArray) -> Hypothesis:
+    what = "xyz"[axis]
+    return Hypothesis(
+        "slipped decimal", f"point {name}: the decimal point of its given {what} has slipped: {read:.10g} m for "
+        f"{new[axis]:.10g} m", f"write {new[axis]:.10g} m for {what} of point {name} in survey.toml",
+        Place("point", (name,), what), with_given(survey, {name: new}),
+    )  # fmt: skip
+
+
+def _axes(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
+    """All given coordinates in other axes or another unit."""
+    x = _values(survey, given)
+    for said, remedy, M in (
+        ("have x and y exchanged (north first, or left-handed)", "exchange x and y of all of them",
+         np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])),
+        ("are millimetres, read as metres", "multiply all of them by 0.001", 0.001 * np.eye(3)),
+        ("are metres, read as millimetres", "multiply all of them by 1000", 1000.0 * np.eye(3)),
+    ):  # fmt: skip
+        yield Hypothesis("axes or unit of given coordinates", f"the given coordinates {said}",
+                         f"{remedy} in survey.toml", Place("point", tuple(given), "x_in_world"),
+                         with_given(survey, {n: M @ v for n, v in x.items()}))  # fmt: skip

@@ -1,0 +1,88 @@
+"""Two points of a network that are called by each other's names, in one set-up or in all readings.
+
+Evidence: the readings concerned against what the rest predicts at its robust start, with the names exchanged.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis, Place, Rename
+from adjust.diagnosis.screen import Screen, screen
+from adjust.diagnosis.units.readings import at_best, drop
+from adjust.model.observations import PositionRef, Reading
+from adjust.model.survey import IntArray, Survey
+
+_CLEARLY, _CAP = 3.0, 25.0
+_SUSPECTS, _MOST = 6, 4
+_LARGE = 2500
+
+
+def exchanged_points(case: Case) -> Iterator[Hypothesis]:
+    """Pairs of points whose exchange makes their readings fit, the clearest first."""
+    survey = case.survey
+    before = at_best(case) if 0 < len(survey.readings) <= _LARGE else None
+    if before is None:
+        return
+    found, looked_at = list[tuple[float, Hypothesis]](), 0
+    for setup_id in (None, *dict.fromkeys(r.setup_id for r in survey.readings if r.setup_id)):
+        for a, b in combinations(_suspects(survey, before, setup_id), 2):
+            looked_at += 1
+            rows = _of_points(survey, setup_id, (a, b))
+            changed = exchanged(survey, rows, a, b)
+            evidence = _evidence(before, changed, rows)
+            if evidence > _CLEARLY:
+                found.append((evidence, _hypothesis(changed, setup_id, a, b, evidence)))
+    found.sort(key=lambda f: -f[0])
+    yield from (replace(h, looked_at=max(1, looked_at)) for _, h in found[:_MOST])
+
+
+def _suspects(survey: Survey, before: Screen, setup_id: str | None) -> list[str]:
+    """Points whose sights (of one set-up, of all) miss most, worst first; only such as do miss."""
+    misses: dict[str, list[float]] = {}
+    for r, square in zip(survey.readings, before.readings.tolist(), strict=True):
+        if r.to.frame is None and (setup_id is None or r.setup_id == setup_id):
+            misses.setdefault(str(r.to.point_id), []).append(min(square / before.scale, _CAP))
+    worst = {name: float(np.mean(v)) for name, v in misses.items()}
+    return [n for n in sorted(worst, key=lambda n: -worst[n])[:_SUSPECTS] if worst[n] > _CLEARLY]
+
+
+def _of_points(survey: Survey, setup_id: str | None, names: tuple[str, str]) -> IntArray:
+    return np.array(
+        [i for i, r in enumerate(survey.readings) if (setup_id is None or r.setup_id == setup_id)
+         and (r.to.point_id in names or (r.second is not None and r.second.point_id in names))],
+        dtype=np.int64,
+    )  # fmt: skip
+
+
+def exchanged(survey: Survey, rows: IntArray, a: str, b: str) -> Survey:
+    """The survey with the targets a and b of these readings called by each other's names."""
+    other, chosen = {a: b, b: a}, set(rows.tolist())
+
+    def named(ref: PositionRef) -> PositionRef:
+        known = ref.frame is None and ref.point_id in other
+        return PositionRef(other[str(ref.point_id)]) if known else ref
+
+    def renamed(r: Reading) -> Reading:
+        return replace(r, to=named(r.to), second=None if r.second is None else named(r.second))
+
+    readings = tuple(renamed(r) if i in chosen else r for i, r in enumerate(survey.readings))
+    return replace(survey, readings=tuple(r if r.at != r.to else survey.readings[i] for i, r in enumerate(readings)))
+
+
+def _evidence(before: Screen, changed: Survey, rows: IntArray) -> float:
+    after = screen(changed, before.start)
+    return 0.0 if after is None else drop(before, rows, after.readings[rows])
+
+
+def _hypothesis(changed: Survey, setup_id: str | None, a: str, b: str, evidence: float) -> Hypothesis:
+    where = "everywhere" if setup_id is None else f"in set-up {setup_id}"
+    at = {} if setup_id is None else {"setup_id": (setup_id,)}
+    return Hypothesis(
+        "points exchanged", f"points {a} and {b} are called by each other's names {where}",
+        "exchange them in to_id of terrestrial.csv", Place("point", (a, b), "to_id"), changed,
+        (Rename("terrestrial", "to_id", {a: b, b: a}, at),), evidence,
+    )  # fmt: skip

@@ -1,0 +1,70 @@
+"""Which of the tried hypotheses explains a misfit, and how much better than the next one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.trial import Misfit, Trial
+from adjust.distributions import chi2
+from adjust.model.survey import FloatArray
+
+_ALPHA = 1e-4
+_EXPLAINED = 0.5  # share of the excess that a cause takes away at least
+_LOG_LARGEST = 600.0
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A hypothesis that passed its test. explained: share of the misfit beyond noise that it takes away, 0 to 1.
+
+    statistic: drop of the bounded v'Pv over the variance factor that is left; critical: what it exceeds.
+    probability: among all that were tried and the survey as it stands, by their likelihood and number of parameters.
+    sigma0: of the adjustment with the change.
+    """
+
+    hypothesis: Hypothesis
+    explained: float
+    statistic: float
+    critical: float
+    probability: float
+    sigma0: float
+
+
+def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candidate, ...]:
+    """The trials that explain the misfit by test, the best first.
+
+    Each drop of v'Pv is tested against chi-square with as many degrees of freedom as the change has parameters, at a
+    level shared by all hypotheses that were looked at (Bonferroni). Compared with each other by v'Pv plus p ln n
+    (Schwarz 1978), all in units of the least variance factor that any of them leaves.
+    """
+    good = [t for t in trials if t.result is not None]
+    if not good:
+        return ()
+    scale = max(1.0, min(t.misfit.omega / max(t.misfit.redundancy, 1) for t in good))
+    number = max(looked_at, len(trials), 1)
+    weight = _probabilities(base, good, scale)
+    out = []
+    for trial, probability in zip(good, weight, strict=True):
+        critical = float(chi2.isf(_ALPHA / number, max(1, trial.hypothesis.parameters)))
+        statistic = (base.omega - _cost(trial)) / scale
+        share = (base.omega - _cost(trial)) / max(base.excess, 1e-9)
+        if statistic > critical and share > _EXPLAINED and trial.misfit.unused <= base.unused:
+            sigma0 = trial.result.sigma0 if trial.result is not None else float("nan")
+            explained = float(np.clip(share, 0.0, 1.0))
+            out.append(Candidate(trial.hypothesis, explained, statistic, critical, float(probability), sigma0))
+    return tuple(sorted(out, key=lambda c: -c.probability))
+
+
+def _cost(trial: Trial) -> float:
+    return trial.misfit.omega + trial.hypothesis.penalty
+
+
+def _probabilities(base: Misfit, trials: Sequence[Trial], scale: float) -> FloatArray:
+    """(k,) of the trials, with the survey as it stands as one more explanation."""
+    n = max(base.count, 2)
+    score = [base.omega / scale, *(_cost(t) / scale + t.hypothesis.parameters * np.log(n) for t in trials)]
+    half = -0.5 * (np.array(score) - min(score))
+    likelihood = np.exp(np.maximum(half, -_LOG_LARGEST))
+    return np.asarray((likelihood / likelihood.sum())[1:])

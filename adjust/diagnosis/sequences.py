@@ -1,0 +1,186 @@
+"""Two sequences of poses over the same epochs that a constant motion, or two, should join: a rig, a hand and its eye.
+
+``first = left * second * right`` at every epoch. Two cameras that see the same moving target: ``right`` is the
+identity. A camera on a robot's hand and the robot's own poses: ``left`` is the camera in the hand, ``right`` the target
+in the base (closed form: Shah 2013, in :mod:`adjust.start.closed_forms.hand_eye`).
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.diagnosis.case import Case
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Pair
+from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.spatial.averaging import mean_pose, pose_distance
+from adjust.spatial.rigid import inverse
+from adjust.start.closed_forms.hand_eye import solve_ax_zb
+
+_FEWEST = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """Poses (n, 4, 4) of two things at n epochs. kind: "rig" or "hand_eye". names: of first and second.
+
+    pairs: positions in ``Survey.pairs`` of the second, where it is measured by pairs; target_id: seen by the first.
+    """
+
+    kind: Literal["rig", "hand_eye"]
+    names: tuple[str, str]
+    epochs: tuple[str, ...]
+    first: FloatArray
+    second: FloatArray
+    target_id: str
+    pairs: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The constant motions (4, 4) of a link."""
+
+    left: FloatArray
+    right: FloatArray
+
+    def misses(self, first: FloatArray, second: FloatArray) -> FloatArray:
+        """(n,) m: how far first and second are apart, a turn counted at the target's distance."""
+        lever = float(np.median(np.linalg.norm(first[:, :3, 3], axis=1)))
+        return pose_distance(inverse(self.left @ second @ self.right) @ first, np.eye(4), lever)
+
+
+def fitted(kind: str, first: FloatArray, second: FloatArray) -> Fit | None:
+    """The motions that join most of the epochs; None where they do not determine any."""
+    if len(first) < 3:
+        return None
+    if kind == "rig":
+        lever = float(np.median(np.linalg.norm(first[:, :3, 3], axis=1)))
+        return Fit(mean_pose(first @ inverse(second), lever)[0], np.eye(4))
+    try:
+        right, left, _ = solve_ax_zb(first, second)
+    except (SurveyError, np.linalg.LinAlgError):
+        return None
+    return Fit(left, inverse(right))
+
+
+def typical(misses: FloatArray) -> float:
+    """m: what nearly all epochs stay within."""
+    return float(np.quantile(misses, 0.9)) + 1e-9 if len(misses) else float("inf")
+
+
+def links(case: Case) -> Iterator[Link]:
+    """The rigs and hands of a survey that have five epochs or more in common."""
+    seen = _views_by_thing(case)
+    yield from _rigs(case.survey, seen)
+    yield from _hands(case.survey, seen)
+
+
+def _views_by_thing(case: Case) -> dict[tuple[str, str], dict[str, FloatArray]]:
+    """camera_from_target by (camera, target), then by epoch."""
+    out: dict[tuple[str, str], dict[str, FloatArray]] = {}
+    for i, view in sorted(case.views.items()):
+        block = case.survey.image_blocks[i]
+        if len(view.poses):
+            out.setdefault((block.camera_id, str(block.target_id)), {})[block.epoch_id] = view.poses[0]
+    return out
+
+
+def _rigs(survey: Survey, seen: Mapping[tuple[str, str], Mapping[str, FloatArray]]) -> Iterator[Link]:
+    rigid = {s.station_id for s in survey.stations if s.motion == "fixed"}
+    bodies = {c.camera_id: "world" if c.station_id in rigid else c.station_id for c in survey.cameras}
+    moving = {t.target_id for t in survey.targets if t.station_id is None}
+    keys = list(seen)
+    for i, (camera, target) in enumerate(keys):
+        for other, its in keys[i + 1 :]:
+            if its == target and target in moving and bodies[camera] == bodies[other] and camera != other:
+                a, b = seen[camera, target], seen[other, target]
+                epochs = tuple(e for e in a if e in b)
+                if len(epochs) >= _FEWEST:
+                    first, second = (np.array([x[e] for e in epochs]) for x in (a, b))
+                    yield Link("rig", (camera, other), epochs, first, second, target)
+
+
+def _hands(survey: Survey, seen: Mapping[tuple[str, str], Mapping[str, FloatArray]]) -> Iterator[Link]:
+    station_of = {c.camera_id: c.station_id for c in survey.cameras}
+    carrier_of = {t.target_id: t.station_id for t in survey.targets}
+    for station, poses in hand_poses(survey).items():
+        for (camera, target), views in seen.items():
+            on_hand, held = station_of[camera] == station, carrier_of[target] == station
+            epochs = tuple(e for e in views if e in poses)
+            if on_hand != held and len(epochs) >= _FEWEST:
+                second = np.array([poses[e][1].matrix() for e in epochs])
+                second = second if on_hand else inverse(second)
+                first = np.array([views[e] for e in epochs])
+                yield Link("hand_eye", (camera, station), epochs, first, second, target,
+                           tuple(poses[e][0] for e in epochs))  # fmt: skip
+
+
+def hand_poses(survey: Survey) -> dict[str, dict[str, tuple[int, Pose3]]]:
+    """By moving station and epoch: the position of its measured pose among the pairs, and station_from_base."""
+    out: dict[str, dict[str, tuple[int, Pose3]]] = {}
+    for i, pair in enumerate(survey.pairs):
+        if isinstance(pair.b_from_a, Rot3) or not pair.used:
+            continue
+        if pair.b.epoch_id and not pair.a.epoch_id:
+            out.setdefault(pair.b.frame_id, {})[pair.b.epoch_id] = (i, pair.b_from_a)
+        elif pair.a.epoch_id and not pair.b.epoch_id:
+            out.setdefault(pair.a.frame_id, {})[pair.a.epoch_id] = (i, pair.b_from_a.inverse())
+    return out
+
+
+def with_pairs(survey: Survey, new: Mapping[int, Pair]) -> Survey:
+    """The survey with other pairs at these positions."""
+    return replace(survey, pairs=tuple(new.get(i, p) for i, p in enumerate(survey.pairs)))
+
+
+@dataclass(frozen=True)
+class Shift:
+    """From epoch number ``begin`` on the second is that of ``by`` epochs later; evidence: ratio of misfits."""
+
+    begin: int
+    by: int
+    evidence: float
+
+
+def shifts(link: Link, most: int = 3) -> Sequence[Shift]:
+    """Shifts of the second sequence that join it with the first, everywhere or from an epoch on; the best first.
+
+    The motions are those that most epochs give as they stand, or shifted throughout; the border is where the sum of
+    misses is least.
+    """
+    n, fits = len(link.epochs), {}
+    for by in range(-most, most + 1):
+        i = _inside(n, by)
+        fits[by] = fitted(link.kind, link.first[i], link.second[i + by])
+    plain = fits[0]
+    base = typical(plain.misses(link.first, link.second)) if plain is not None else float("inf")
+    found = []
+    for by, own in fits.items():
+        if by == 0:
+            continue
+        for fit in (own, plain):
+            if fit is not None:
+                found.append(_best_border(link, fit, by, base))
+    return sorted((s for s in found if s is not None), key=lambda s: -s.evidence)
+
+
+def _inside(n: int, by: int) -> IntArray:
+    return np.arange(max(0, -by), n - max(0, by))
+
+
+def _best_border(link: Link, fit: Fit, by: int, base: float) -> Shift | None:
+    n, inside = len(link.epochs), _inside(len(link.epochs), by)
+    as_is = fit.misses(link.first, link.second)
+    moved = np.zeros(n)
+    moved[inside] = fit.misses(link.first[inside], link.second[inside + by])
+    bound = 50.0 * max(float(np.median(np.minimum(as_is, moved))), 1e-6)
+    before, after = np.minimum(as_is, bound), np.minimum(moved, bound)
+    costs = np.concatenate([[0.0], np.cumsum(before)]) + np.concatenate([np.cumsum(after[::-1])[::-1], [0.0]])
+    begin = int(np.argmin(costs))
+    if begin >= n - 1:
+        return None
+    rest = np.concatenate([as_is[:begin], moved[inside[inside >= begin]]])
+    return Shift(begin, by, base / typical(rest))

@@ -1,0 +1,80 @@
+"""``motion = "epoch"`` forgotten: a target, or a station, that is said to stand still and is seen to move.
+
+Evidence: poses of single images, ``camera_from_target`` of a camera that stands still too, scatter far more than each
+fits its own image.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
+from adjust.model.survey import FloatArray, Survey
+from adjust.spatial.averaging import mean_pose
+from adjust.spatial.rigid import inverse
+
+_CLEARLY = 10.0
+_FEWEST = 3
+
+
+def forgotten_motion(case: Case) -> Iterator[Hypothesis]:
+    """Targets before stations: what is held by hand is moved more often than what carries cameras."""
+    survey = case.survey
+    fixed = {s.station_id for s in survey.stations if s.motion == "fixed"}
+    still = {t.target_id for t in survey.targets if t.motion == "fixed" and (t.station_id or "") in fixed | {""}}
+    station_of = {c.camera_id: c.station_id for c in survey.cameras}
+    carriers = {t.target_id: t.station_id for t in survey.targets}
+    moves: dict[tuple[str, str], float] = {}
+    for (camera_id, target_id), (poses, error_px, focal) in _poses(case).items():
+        joined = carriers[target_id] == station_of[camera_id]
+        if target_id in still and station_of[camera_id] in fixed and len(poses) >= _FEWEST and not joined:
+            key = (station_of[camera_id], target_id)
+            moves[key] = max(moves.get(key, 0.0), _scatter(poses, error_px / focal))
+    moved = {k: r for k, r in moves.items() if r > _CLEARLY}
+    for target_id in dict.fromkeys(t for _, t in moved):
+        yield _target(survey, target_id, max(r for (_, t), r in moved.items() if t == target_id))
+    for station_id in dict.fromkeys(s for s, _ in moved):
+        mine = [(t, r) for (s, t), r in moved.items() if s == station_id]
+        yield _station(survey, station_id, max(r for _, r in mine))
+
+
+def _poses(case: Case) -> dict[tuple[str, str], tuple[FloatArray, float, float]]:
+    """By camera and target: poses target_from_camera (n, 4, 4), the typical error and the focal length, px."""
+    found: dict[tuple[str, str], list[int]] = {}
+    for i, view in sorted(case.views.items()):
+        block = case.survey.image_blocks[i]
+        if len(view.poses):
+            found.setdefault((block.camera_id, str(block.target_id)), []).append(i)
+    return {
+        key: (inverse(np.array([case.views[i].poses[0] for i in rows])),
+              float(np.median([case.views[i].error_px[0] for i in rows])), case.views[rows[0]].focal_px)
+        for key, rows in found.items()
+    }  # fmt: skip
+
+
+def _scatter(target_from_camera: FloatArray, error_rad: float) -> float:
+    """How far the poses are apart, as angles at the camera, over the error of a single image."""
+    lever = float(np.median(np.linalg.norm(target_from_camera[:, :3, 3], axis=1)))
+    apart = mean_pose(target_from_camera, lever)[1]
+    return float(np.median(apart) / lever / max(10.0 * error_rad, 1e-5))
+
+
+def _target(survey: Survey, target_id: str, evidence: float) -> Hypothesis:
+    targets = tuple(replace(t, motion="epoch") if t.target_id == target_id else t for t in survey.targets)
+    return Hypothesis(
+        "motion forgotten", f"target {target_id} moves between epochs, but is said to stand still",
+        f'write motion = "epoch" below [targets.{target_id}] in survey.toml', Place("target", (target_id,), "motion"),
+        replace(survey, targets=targets), (SetKey(("targets", target_id, "motion"), "epoch"),), evidence, 6,
+    )  # fmt: skip
+
+
+def _station(survey: Survey, station_id: str, evidence: float) -> Hypothesis:
+    stations = tuple(replace(s, motion="epoch") if s.station_id == station_id else s for s in survey.stations)
+    return Hypothesis(
+        "motion forgotten", f"station {station_id} moves between epochs, but is said to stand still",
+        f'write motion = "epoch" below [stations.{station_id}] in survey.toml',
+        Place("station", (station_id,), "motion"), replace(survey, stations=stations),
+        (SetKey(("stations", station_id, "motion"), "epoch"),), 0.9 * evidence, 6,
+    )  # fmt: skip

@@ -1,0 +1,114 @@
+"""Cameras that do not expose at the same time: each fits alone, together they do not, in proportion to the motion.
+
+The time offset of a camera is one unknown: what its images are off by, over how fast the target moves there (both from
+the poses of single images), by least squares; the unit is the interval between epochs.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.sequences import Link, fitted, links
+from adjust.distributions import norm
+from adjust.model.survey import PoseParameter, Station, Survey
+
+_ALPHA = 1e-4
+_ALONE_PX = 1.0
+_SPREAD = 5.0
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Of a camera after another, in intervals between epochs. misses: m, typical, of the board between the two."""
+
+    camera_id: str
+    reference_id: str
+    intervals: float
+    sigma: float
+    misses: float
+
+
+def unsynchronised(case: Case) -> Iterator[Hypothesis]:
+    """One hypothesis: all cameras that see a moving target expose at their own times."""
+    rigs = [link for link in links(case) if link.kind == "rig"]
+    offsets = [o for o in (time_offset(link) for link in rigs) if o is not None]
+    bound = norm.isf(_ALPHA / max(1, len(rigs)))
+    clear = [o for o in offsets if abs(o.intervals) > bound * o.sigma]
+    seen = np.nanmedian(case.error_px) if len(case.error_px) else np.inf
+    if not clear or not seen < _ALONE_PX:
+        return
+    worst = max(clear, key=lambda o: abs(o.intervals) / o.sigma)
+    cameras = tuple(sorted({o.camera_id for o in offsets} | {o.reference_id for o in offsets}))
+    alone, n_epochs = apart(case.survey, cameras[1:])
+    if alone is None:
+        return
+    said = ", ".join(
+        f"{o.camera_id} after {o.reference_id} by {o.intervals:+.2f} +- {o.sigma:.2f} intervals" for o in clear[:4]
+    )
+    yield Hypothesis(
+        "cameras not simultaneous",
+        f"cameras {', '.join(cameras)} do not expose at the same time: each fits alone ({seen:.2f} px), but camera "
+        f"{worst.camera_id} sees the moving target typically {1e3 * worst.misses:.1f} mm from where camera "
+        f"{worst.reference_id} does, in proportion to its motion ({said})",
+        "trigger the cameras together, or hold the target still at every epoch, and measure again",
+        Place("camera", (worst.camera_id,)), alone, (), abs(worst.intervals) / worst.sigma, 6 * n_epochs,
+        max(1, len(rigs)),
+    )  # fmt: skip
+
+
+def time_offset(link: Link) -> Offset | None:
+    """The second's offset after the first, by least squares; None where the target hardly moves."""
+    fit = fitted("rig", link.first, link.second)
+    if fit is None or len(link.epochs) < 6:
+        return None
+    seen, moved = link.first[:, :3, 3], (fit.left @ link.second)[:, :3, 3]
+    velocity = 0.5 * (seen[2:] - seen[:-2])
+    miss = (seen - moved)[1:-1]
+    steps = np.linalg.norm(np.diff(seen, axis=0), axis=1)
+    whole = (steps[1:] < _SPREAD * np.median(steps)) & (steps[:-1] < _SPREAD * np.median(steps))
+    velocity, miss = velocity[whole], miss[whole]
+    if len(miss) < 4 or np.linalg.norm(velocity) < 1e-9:
+        return None
+    A = np.hstack([-velocity.reshape(-1, 1), np.tile(np.eye(3), (len(miss), 1))])  # the rest of the rig's fit beside
+    N = A.T @ A
+    if np.linalg.cond(N) > 1e10:
+        return None
+    x = np.linalg.solve(N, A.T @ miss.ravel())
+    rest = miss.ravel() - A @ x
+    variance = float(rest @ rest) / max(1, rest.size - 4) * np.linalg.inv(N)[0, 0]
+    return Offset(link.names[1], link.names[0], float(x[0]), float(np.sqrt(variance)),
+                  float(np.median(np.linalg.norm(miss, axis=1))))  # fmt: skip
+
+
+def apart(survey: Survey, cameras: tuple[str, ...]) -> tuple[Survey | None, int]:
+    """The survey in which each of these cameras has epochs, and a fixed body, of its own; how many epochs that adds.
+
+    Nothing joins such a camera with the others any more: its body is held where it is, at the world's origin. None
+    where cameras stand on bodies that move.
+    """
+    stations = {s.station_id: s for s in survey.stations}
+    chosen = {c.camera_id: c for c in survey.cameras if c.camera_id in cameras}
+    if any(stations[c.station_id].motion != "fixed" for c in chosen.values()):
+        return None, 0
+    blocks = tuple(
+        replace(b, epoch_id=_own(b.epoch_id, b.camera_id)) if b.camera_id in chosen else b for b in survey.image_blocks
+    )
+    new = tuple(
+        replace(c, station_id=_own("body", c.camera_id), station_from_camera=_held())
+        if c.camera_id in chosen else c for c in survey.cameras
+    )  # fmt: skip
+    bodies = tuple(Station(_own("body", c), world_from_station=_held()) for c in chosen)
+    added = {b.epoch_id for b in blocks} - {b.epoch_id for b in survey.image_blocks}
+    return replace(survey, cameras=new, image_blocks=blocks, stations=survey.stations + bodies), len(added)
+
+
+def _own(name: str, camera_id: str) -> str:
+    return f"{name} of {camera_id}"
+
+
+def _held() -> PoseParameter:
+    return PoseParameter(Pose3(), "held")

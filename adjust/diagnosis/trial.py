@@ -1,0 +1,88 @@
+"""One hypothesis, tried: its survey adjusted, and what is left unexplained."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from adjust.diagnosis.case import CAP, Case, block_misfits
+from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray, Survey
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What a survey leaves unexplained. omega: sum of squares over sigmas, each bounded by ``CAP``, all observations.
+
+    unused: components that take no part, or cannot be predicted. count: of all components. redundancy: of the
+    adjustment, 0 where there is none.
+    """
+
+    omega: float
+    unused: int
+    count: int
+    redundancy: int
+
+    @property
+    def excess(self) -> float:
+        """By how much the misfit is larger than noise makes it."""
+        return max(0.0, self.omega - self.redundancy)
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A hypothesis, with the misfit of its survey and the adjustment that showed it (None: it led to no solution)."""
+
+    hypothesis: Hypothesis
+    misfit: Misfit
+    result: Adjustment | None
+
+
+def tried(hypothesis: Hypothesis, case: Case) -> Trial:
+    """The survey of a hypothesis adjusted as its case is; no change of what the case holds."""
+    survey = hypothesis.changed()
+    try:
+        result = None if survey is None else case.run(survey)
+    except SurveyError:
+        result = None
+    return Trial(hypothesis, misfit_of(result, survey or case.survey), result)
+
+
+def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
+    """What an adjustment leaves unexplained of a survey; everything where there is none.
+
+    Observations that the start, a screen or a search left out count as they are predicted, bounded: else an
+    explanation that leaves more of them out would look the better one.
+    """
+    points = 2 * sum(len(b.uv) if b.used is None else int(b.used.sum()) for b in survey.image_blocks)
+    n_others = n_other_components(survey)
+    if result is None:
+        return Misfit(CAP * (points + n_others), points + n_others, points + n_others, 0)
+    images = result.image_residuals
+    others = np.concatenate([np.zeros(0), *(_squares(o.residual, o.sigma) for o in result.other_residuals)])
+    gone = max(0, n_others - n_other_components(result.survey, used_only=False))
+    unused = points - 2 * int(images.used.sum()) + gone
+    unused += sum(len(o.residual) for o in result.other_residuals if not o.used)
+    omega = float(block_misfits(survey, result).sum() + np.minimum(others, CAP).sum()) + CAP * gone
+    return Misfit(omega, unused, points + max(len(others), n_others), result.redundancy)
+
+
+def n_other_components(survey: Survey, used_only: bool = True) -> int:
+    """Observed components in use, or all, that are no image points."""
+    kinds = (survey.table_readings, survey.pairs, survey.distances, survey.coordinates, survey.readings, survey.levels,
+             survey.coordinate_differences, survey.alignments, survey.laser_spots, survey.on_surfaces)  # fmt: skip
+    return sum(_n_components(o) for kind in kinds for o in kind if o.used or not used_only)
+
+
+def _n_components(observed: Any) -> int:
+    """Of one observation: the finite variances of its covariance, one where it has a sigma."""
+    cov = getattr(observed, "cov", None)
+    return 1 if cov is None else int(np.isfinite(np.diag(cov)).sum())
+
+
+def _squares(residual: FloatArray, sigma: FloatArray) -> FloatArray:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        squares = (residual / sigma) ** 2
+    return np.where(np.isnan(squares), 0.0, squares)

@@ -1,0 +1,71 @@
+"""The ways in which a number is misread, each with the words for it: true value = ``mend`` (value as read).
+
+Ratios of units and conventions of angles are exact; a ratio that observations show is compared with them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.model.observations import ReadingKind
+from adjust.model.survey import FloatArray
+
+ANGLES: tuple[ReadingKind, ...] = ("direction", "angle", "azimuth", "zenith")
+TURNS: tuple[ReadingKind, ...] = ("direction", "angle", "azimuth")
+LENGTHS: tuple[ReadingKind, ...] = ("slope_distance", "horizontal_distance", "height_difference")
+
+
+@dataclass(frozen=True)
+class Misreading:
+    """True value = factor * read + offset (rad or m).
+
+    name: of the kind of mistake. said: what is wrong with the values. kinds: of readings that can be misread so.
+    """
+
+    name: str
+    said: str
+    factor: float
+    offset: float
+    kinds: tuple[ReadingKind, ...]
+
+    def mend(self, values: FloatArray) -> FloatArray:
+        """(n,) true values of values as they were read."""
+        return np.asarray(self.factor * values + self.offset)
+
+
+def _scaled(name: str, kinds: tuple[ReadingKind, ...], ratios: dict[str, float]) -> list[Misreading]:
+    return [Misreading(name, said, ratio, 0.0, kinds) for said, ratio in ratios.items()]
+
+
+LENGTH_RATIOS = {
+    "are metres, read as millimetres": 1000.0,
+    "are millimetres, read as metres": 0.001,
+    "are inches, read as millimetres": 25.4,
+    "are millimetres, read as inches": 1.0 / 25.4,
+    "are feet, read as metres": 0.3048,
+    "are metres, read as feet": 1.0 / 0.3048,
+    "are centimetres, read as millimetres": 10.0,
+    "are centimetres, read as metres": 0.01,
+    "are inches, read as metres": 0.0254,
+}
+ANGLE_RATIOS = {
+    "are gon, read as degrees": 0.9,
+    "are degrees, read as gon": 1.0 / 0.9,
+    "are radians, read as degrees": 180.0 / np.pi,
+    "are radians, read as gon": 200.0 / np.pi,
+    "are degrees, read as radians": np.pi / 180.0,
+    "are gon, read as radians": np.pi / 200.0,
+    "are arcseconds, read as degrees": 1.0 / 3600.0,
+    "are degrees, read as arcseconds": 3600.0,
+}
+MISREADINGS: tuple[Misreading, ...] = (
+    *_scaled("unit of lengths", LENGTHS, LENGTH_RATIOS),
+    *_scaled("unit of angles", ANGLES, ANGLE_RATIOS),
+    Misreading("sense of rotation", "count the other way round", -1.0, 0.0, TURNS),
+    Misreading("angles from another zero", "are elevations, read as zenith angles", -1.0, np.pi / 2.0, ("zenith",)),
+    Misreading("angles from another zero", "are nadir angles, read as zenith angles", -1.0, np.pi, ("zenith",)),
+    Misreading("angles from another zero", "are zenith angles of the second face", -1.0, 2.0 * np.pi, ("zenith",)),
+    Misreading("sign of height differences", "have the other sign", -1.0, 0.0, ("height_difference",)),
+)
+SLIPS: tuple[float, ...] = (10.0, 0.1, 100.0, 0.01)
+"""Slips of the decimal point, tried on single values alone."""

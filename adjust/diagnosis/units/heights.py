@@ -1,0 +1,156 @@
+"""Constants that shift readings: the height of an instrument or a target, the offset of a reflector (prism constant).
+
+Each is estimated as the median of what single readings say, and must explain nearly all of them.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.screen import Screen
+from adjust.diagnosis.units.readings import at_best
+from adjust.model.observations import Reading
+from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.statistics.system import linear_system
+from adjust.statistics.weakness import times_covariance
+
+_CLEARLY, _CAP = 3.0, 25.0
+_MOST = 4
+_LARGEST = 10.0
+"""m: what no height of an instrument or a target, and no reflector's constant, is wrong by."""
+_SEEN = 1e-4
+"""Share of a constant's column that no unknown takes over, below which it does not show."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Constant:
+    """rows: of the readings that a change by 1 m changes by ``by`` (n,)."""
+
+    name: str
+    text: str
+    place: Place
+    rows: IntArray
+    by: FloatArray
+    remedy: str
+
+
+def wrong_heights(case: Case) -> Iterator[Hypothesis]:
+    """Constants for which most of their readings speak, the clearest first."""
+    survey = case.survey
+    if not survey.readings:
+        return
+    before = at_best(case)
+    if before is None or before.graph.terrestrial is None:
+        return
+    constants = list(_constants(survey, before))
+    judged = _by_scores(case, constants) or [_evidence(before, c) for c in constants]
+    found = [(e, c, d) for c, (e, d) in zip(constants, judged, strict=True) if e > _CLEARLY and abs(d) < _LARGEST]
+    for evidence, constant, metres in sorted(found, key=lambda f: (-f[0], -len(f[1].rows)))[:_MOST]:
+        changed = _changed(survey, constant, metres)
+        amount = -metres if constant.name == "prism constant" else metres
+        yield Hypothesis(
+            constant.name, f"{constant.text} is wrong by about {-1e3 * amount:+.1f} mm",
+            f"{constant.remedy} by {1e3 * amount:+.1f} mm", constant.place, changed, (), evidence, 1, len(constants),
+        )  # fmt: skip
+
+
+def _by_scores(case: Case, constants: list[_Constant]) -> list[tuple[float, float]]:
+    """The same by the score test at the solution (Rao 1948), where there is one that left nothing out.
+
+    With the whitened column b of a constant, ``g = b' e`` and ``m = b' (I - A Q A') b``: g^2 / m is what v'Pv falls by,
+    and -g / m the constant.
+    """
+    result = case.result
+    if result is None or len(result.survey.readings) != len(case.survey.readings):
+        return []
+    if not all(r.used for r in result.survey.readings):
+        return []
+    system = linear_system(result)
+    first = int(system.ptr[len(system.ptr) - 1 - len(case.survey.readings)])
+    sigma = np.array([r.sigma for r in case.survey.readings])
+    B = np.zeros((len(system.e), len(constants)))
+    for k, c in enumerate(constants):
+        B[first + c.rows, k] = c.by / sigma[c.rows]
+    g = B.T @ system.e
+    AtB = np.asarray(system.A.T @ B)
+    m = np.einsum("ij,ij->j", B, B) - np.einsum("ij,ij->j", AtB, times_covariance(system, AtB))
+    sure = m > _SEEN * np.einsum("ij,ij->j", B, B)
+    metres = np.where(sure, -g / np.where(sure, m, 1.0), 0.0)
+    drop = np.where(sure, g**2 / np.where(sure, m, 1.0), 0.0)
+    return [(float(result.omega / max(result.omega - d, 1.0)), float(x)) for d, x in zip(drop, metres, strict=True)]
+
+
+def _constants(survey: Survey, before: Screen) -> Iterator[_Constant]:
+    batch = before.graph.terrestrial
+    if batch is None:
+        return
+    A, kinds = batch.A, np.array([r.kind for r in survey.readings])
+    setups = np.array([r.setup_id for r in survey.readings])
+    targets = np.array([str(r.to.point_id) for r in survey.readings])
+    up_to, up_at = A[:, 5], A[:, 2]  # by the height of the target's and of the instrument's position
+    tilted = np.isin(kinds, ("zenith", "slope_distance", "height_difference"))
+    lengths = np.isin(kinds, ("slope_distance", "horizontal_distance"))
+    for setup_id in dict.fromkeys(s for s in setups.tolist() if s):
+        rows = np.flatnonzero((setups == setup_id) & tilted)
+        if len(rows) >= 3:
+            yield _Constant("instrument height", f"the instrument's height at set-up {setup_id}",
+                            Place("setup", (setup_id,), "instrument_height_m"), rows, up_at[rows],
+                            "change instrument_height of its rows in terrestrial.csv")  # fmt: skip
+        rows = np.flatnonzero((setups == setup_id) & lengths)
+        if len(rows) >= 3:
+            yield _Constant("prism constant", f"the reflector's constant at set-up {setup_id}",
+                            Place("setup", (setup_id,), "value"), rows, np.ones(len(rows)),
+                            "change the distances of its rows in terrestrial.csv")  # fmt: skip
+    for target in dict.fromkeys(targets.tolist()):
+        rows = np.flatnonzero((targets == target) & tilted)
+        if len(rows) >= 3:
+            yield _Constant("target height", f"the target's height on point {target}",
+                            Place("point", (target,), "target_height_m"), rows, up_to[rows],
+                            "change target_height of its rows in terrestrial.csv")  # fmt: skip
+    rows = np.flatnonzero(lengths)
+    if len(rows) >= 3:
+        yield _Constant("prism constant", "the reflector's constant of all distances", Place("instrument", (), ""),
+                        rows, np.ones(len(rows)), "give an instrument's distance_offset, or change all distances")
+
+
+def _evidence(before: Screen, constant: _Constant) -> tuple[float, float]:
+    """How many times smaller the misfit of its readings becomes, and the constant's change (m)."""
+    batch = before.graph.terrestrial
+    if batch is None:
+        return 0.0, 0.0
+    rows = constant.rows
+    sigma, miss = batch.sigma[rows], -batch.residual[rows]  # observed minus predicted
+    weight = np.abs(constant.by) / sigma
+    if not (weight > 0).any() or not np.isfinite(miss).all():
+        return 0.0, 0.0
+    metres = _weighted_median(miss[weight > 0] / constant.by[weight > 0], weight[weight > 0])
+    scale = before.scale
+    old = np.minimum((miss / sigma) ** 2 / scale, _CAP).sum()
+    new = np.minimum(((miss - constant.by * metres) / sigma) ** 2 / scale, _CAP).sum()
+    return float(old / (new + 0.1 * len(rows) + 1.0)), metres
+
+
+def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
+
+
+def _changed(survey: Survey, constant: _Constant, metres: float) -> Survey:
+    """With the constant as it probably was; its readings then fit without it."""
+    rows = set(constant.rows.tolist())
+
+    def mended(i: int) -> Reading:
+        r = survey.readings[i]
+        if i not in rows:
+            return r
+        if constant.name == "instrument height":
+            return replace(r, instrument_height=r.instrument_height + metres)
+        if constant.name == "target height":
+            return replace(r, target_height=r.target_height + metres)
+        return replace(r, value=r.value - metres)
+
+    return replace(survey, readings=tuple(mended(i) for i in range(len(survey.readings))))

@@ -1,0 +1,280 @@
+"""Measured poses and rotations written in another convention than they were read in: all, of a group, single ones.
+
+In a network of pairs the loops tell; of a robot's poses the camera on its hand, or one that sees its hand, does: turns
+and shifts of both sides must be those of one rigid body. Inverting both sides of a hand and its eye changes no residual
+(eye-in-hand taken for eye-to-hand): only the lengths of the result tell.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from gtsam import Pose3, Rot3
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
+from adjust.diagnosis.screen import Screen, screen
+from adjust.diagnosis.sequences import Link, fitted, links, typical, with_pairs
+from adjust.graph.assembly import values_of
+from adjust.model.errors import SurveyError
+from adjust.model.observations import Pair
+from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler
+
+Motion = Pose3 | Rot3
+_CLEARLY = 3.0
+_MOST, _SINGLE = 5, 8
+_CAP = 25.0
+_LARGE = 500
+"""Pairs up to which start values are found anew for every convention."""
+
+
+@dataclass(frozen=True)
+class Convention:
+    """name: of the kind of mistake. said: what is wrong. remedy: in pairs.csv. mend: the motion as it was meant."""
+
+    name: str
+    said: str
+    remedy: str
+    mend: Callable[[Motion], Motion | None]
+    scale: float | None = None
+
+
+def _inverted(m: Motion) -> Motion:
+    return m.inverse()
+
+
+def _rotated(m: Motion, R: FloatArray) -> Motion:
+    return Pose3(Rot3(R), m.translation()) if isinstance(m, Pose3) else Rot3(R)
+
+
+def _matrix(m: Motion) -> FloatArray:
+    return np.asarray((m.rotation() if isinstance(m, Pose3) else m).matrix())
+
+
+def _last_first(m: Motion) -> Motion:
+    """The four numbers stood as x y z w in the columns w x y z."""
+    q: Any = (m.rotation() if isinstance(m, Pose3) else m).toQuaternion()
+    return _rotated(m, Rot3.Quaternion(q.z(), q.w(), q.x(), q.y()).matrix())
+
+
+def _first_last(m: Motion) -> Motion:
+    """The four numbers stood as w x y z in columns named x y z w."""
+    q: Any = (m.rotation() if isinstance(m, Pose3) else m).toQuaternion()
+    return _rotated(m, Rot3.Quaternion(q.x(), q.y(), q.z(), q.w()).matrix())
+
+
+def _turned_back(m: Motion) -> Motion:
+    return _rotated(m, _matrix(m).T)
+
+
+def _reversed_euler(m: Motion) -> Motion | None:
+    """Angles about z, y, x were applied in the order x, y, z: ``Rz Ry Rx`` was read, ``Rx Ry Rz`` meant."""
+    return _by_euler(m, lambda a: matrix_from_euler(-a, "zyx").T)
+
+
+def _other_euler(m: Motion) -> Motion | None:
+    return _by_euler(m, lambda a: matrix_from_euler(a, "213"))
+
+
+def _by_euler(m: Motion, meant: Callable[[FloatArray], FloatArray]) -> Motion | None:
+    try:
+        return _rotated(m, meant(euler_from_matrix(_matrix(m), "zyx")))
+    except SurveyError:  # gimbal lock: the angles are not known
+        return None
+
+
+def _left_handed(m: Motion) -> Motion:
+    """Both frames have one axis the other way round: S R S and S t with S = diag(1, 1, -1)."""
+    S = np.diag([1.0, 1.0, -1.0])
+    R = S @ _matrix(m) @ S
+    return Pose3(Rot3(R), S @ m.translation()) if isinstance(m, Pose3) else Rot3(R)
+
+
+def _origin_of_a(m: Motion) -> Motion | None:
+    """The shift stands in the axes of a: ``-R t`` was meant for ``t``."""
+    return Pose3(m.rotation(), -(_matrix(m) @ m.translation())) if isinstance(m, Pose3) else None
+
+
+def _scaled(factor: float) -> Callable[[Motion], Motion | None]:
+    return lambda m: Pose3(m.rotation(), factor * m.translation()) if isinstance(m, Pose3) else None
+
+
+CONVENTIONS: tuple[Convention, ...] = (
+    Convention("pairs inverted", "are a_from_b, read as b_from_a", "exchange a_id and b_id", _inverted),
+    Convention("unit of shifts", "have shifts in metres, read as millimetres", "multiply tx, ty, tz by 1000",
+               _scaled(1000.0), 1000.0),
+    Convention("unit of shifts", "have shifts in millimetres, read as metres", "multiply tx, ty, tz by 0.001",
+               _scaled(0.001), 0.001),
+    Convention("unit of shifts", "have shifts in inches, read as millimetres", "multiply tx, ty, tz by 25.4",
+               _scaled(25.4), 25.4),
+    Convention("order of quaternions", "have quaternions in the order x y z w, read as w x y z",
+               "put the last of the four numbers first", _last_first),
+    Convention("order of quaternions", "have quaternions in the order w x y z, read as x y z w",
+               "put the first of the four numbers last", _first_last),
+    Convention("rotations inverted", "have the rotation of a_from_b beside the shift of b_from_a",
+               "negate qx, qy and qz", _turned_back),
+    Convention("shift in other axes", "have the origin of b in a, read as that of a in b",
+               "replace the shifts t by -R t", _origin_of_a),
+    Convention("order of Euler angles", "have Euler angles about x, y, z, read as about z, y, x",
+               "give them in the order of the columns", _reversed_euler),
+    Convention("order of Euler angles", "have Euler angles of order 2-1-3, read as z, y, x",
+               "name the columns by that order", _other_euler),
+    Convention("left-handed frames", "are of frames whose z axis points the other way (left-handed)",
+               "negate qx, qy and tz", _left_handed),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Scope:
+    rows: IntArray
+    text: str
+    place: Place
+
+
+def misread_pairs(case: Case) -> Iterator[Hypothesis]:
+    """The conventions for which loops, or what the pairs join, speak; the clearest first."""
+    survey = case.survey
+    if not survey.pairs:
+        return
+    hands = [link for link in links(case) if link.kind == "hand_eye"]
+    judge = _by_hands(survey, hands) if hands else _by_start(case)
+    if judge is None:
+        return
+    found, looked_at = list[tuple[float, _Scope, Convention, Survey]](), 0
+    for scope in _scopes(survey, judge.worst):
+        for convention in CONVENTIONS:
+            changed = mended(survey, scope.rows, convention)
+            if changed is None:
+                continue
+            looked_at += 1
+            found.append((judge.evidence(changed, scope.rows), scope, convention, changed))
+    found.sort(key=lambda f: (-f[0], -len(f[1].rows)))
+    for evidence, scope, convention, changed in found[:_MOST]:
+        if evidence > _CLEARLY:
+            cause = f"{scope.text} {convention.said}{_lengths(changed, hands)}"
+            yield Hypothesis(convention.name, cause, f"in pairs.csv {convention.remedy}", scope.place, changed,
+                             _edits(survey, scope.rows, convention), evidence, 1, looked_at)  # fmt: skip
+
+
+def _lengths(survey: Survey, hands: list[Link]) -> str:
+    """How far camera and target are from hand and base: what no residual shows, a person sees."""
+    out = []
+    for link in hands[:1]:
+        fit = fitted(link.kind, link.first, _second(survey, link))
+        if fit is not None:
+            left, right = (float(np.linalg.norm(x[:3, 3])) for x in (fit.left, fit.right))
+            out.append(f" (then the camera is {left:.3f} m from the hand and the target {right:.3f} m from the base; "
+                       "with the robot's poses the other way round and the camera beside the robot, as well: "
+                       f"{left:.3f} m from the base and {right:.3f} m from the hand)")  # fmt: skip
+    return "".join(out)
+
+
+def mended(survey: Survey, rows: IntArray, convention: Convention) -> Survey | None:
+    """The survey with these pairs as they were meant; None where they cannot have been misread so.
+
+    The covariance is in the tangent of the motion as it is written; rotation and shift keep their sigmas.
+    """
+    new: dict[int, Pair] = {}
+    for i in rows.tolist():
+        motion = convention.mend(survey.pairs[i].b_from_a)
+        if motion is None:
+            return None
+        new[i] = replace(survey.pairs[i], b_from_a=motion)
+    return with_pairs(survey, new)
+
+
+def _scopes(survey: Survey, worst: IntArray) -> Iterator[_Scope]:
+    every = np.array([i for i, p in enumerate(survey.pairs) if p.used], dtype=np.int64)
+    yield _Scope(every, "all measured pairs", Place("pair", ("all",)))
+    groups = list(dict.fromkeys(survey.pairs[i].group for i in every))
+    for group in groups if len(groups) > 1 else []:
+        rows = np.array([i for i in every if survey.pairs[i].group == group])
+        yield _Scope(rows, f"the pairs of group {group}", Place("group", (group,)))
+    ends = {r.frame_id for i in every for r in (survey.pairs[i].a, survey.pairs[i].b)}
+    for frame_id in sorted(ends) if 2 < len(ends) < 40 else []:
+        rows = np.array([i for i in every if frame_id in (survey.pairs[i].a.frame_id, survey.pairs[i].b.frame_id)])
+        if 1 < len(rows) < len(every):
+            yield _Scope(rows, f"the pairs of {frame_id}", Place("station", (frame_id,)))
+    for i in worst[:_SINGLE].tolist():
+        pair = survey.pairs[i]
+        yield _Scope(np.array([i]), f"pair {pair.pair_id}: its values", Place("pair", (pair.pair_id,)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Judge:
+    """worst: pairs that fit least, first. evidence: of a changed survey, how many times less its pairs miss."""
+
+    worst: IntArray
+    evidence: Callable[[Survey, IntArray], float]
+
+
+def _by_hands(survey: Survey, hands: list[Link]) -> _Judge:
+    def misses(changed: Survey) -> FloatArray:
+        parts = []
+        for link in hands:
+            second = _second(changed, link)
+            fit = fitted(link.kind, link.first, second)
+            parts.append(np.full(len(link.epochs), np.inf) if fit is None else fit.misses(link.first, second))
+        return np.concatenate(parts)
+
+    base = misses(survey)
+    rows = np.concatenate([np.array(link.pairs, dtype=np.int64) for link in hands])
+
+    def evidence(changed: Survey, of: IntArray) -> float:
+        some = np.isin(rows, of)
+        if not some.any():
+            return 0.0
+        return typical(base[some]) / typical(misses(changed)[some])
+
+    return _Judge(rows[np.argsort(-base, kind="stable")], evidence)
+
+
+def _second(survey: Survey, link: Link) -> FloatArray:
+    """The poses of the hand, in the direction that the link has them, from the pairs of a survey."""
+    out = []
+    on_hand = any(c.camera_id == link.names[0] and c.station_id == link.names[1] for c in survey.cameras)
+    for i in link.pairs:
+        pair = survey.pairs[i]
+        pose = pair.b_from_a.matrix() if isinstance(pair.b_from_a, Pose3) else np.eye(4)
+        forwards = pair.b.frame_id == link.names[1] and bool(pair.b.epoch_id)
+        out.append(pose if forwards == on_hand else np.linalg.inv(pose))
+    return np.array(out)
+
+
+def _by_start(case: Case) -> _Judge | None:
+    if len(case.survey.pairs) > _LARGE:
+        return None
+    before = None if case.result is None else screen(case.survey, values_of(case.result))
+    before = before or screen(case.survey)
+    if before is None:
+        return None
+    squares = _of_pairs(before, case.survey)
+    worst = np.argsort(-squares, kind="stable")
+
+    def evidence(changed: Survey, of: IntArray) -> float:
+        whole = len(of) > 0.5 * len(changed.pairs)
+        after = screen(changed, None if whole else before.start) or before
+        now = _of_pairs(after, changed)
+        rows = np.arange(len(now)) if whole else of
+        typical_now = float(np.median(now)) / 2.0
+        scale = max(1.0, min(typical_now, float(np.median(squares)) / 2.0))
+        old, new = (np.minimum(s[rows] / scale, _CAP).sum() for s in (squares, now))
+        return float(old / (new + 0.1 * len(rows)))
+
+    return _Judge(worst, evidence)
+
+
+def _of_pairs(found: Screen, survey: Survey) -> FloatArray:
+    """(p,) squares over sigmas of the pairs, in their order; zero of what is no factor."""
+    at = {o.ids[0]: found.others[i] for i, o in enumerate(found.graph.others) if o.kind == "pair"}
+    return np.array([at.get(p.pair_id, 0.0) for p in survey.pairs])
+
+
+def _edits(survey: Survey, rows: IntArray, convention: Convention) -> tuple[ChangeColumns, ...]:
+    if convention.scale is None:
+        return ()
+    ids = tuple(survey.pairs[i].pair_id for i in rows)
+    return (ChangeColumns("pairs", ("tx_mm", "ty_mm", "tz_mm"), convention.scale * np.eye(3), np.zeros(3),
+                          {"pair_id": ids}),)  # fmt: skip

@@ -1,0 +1,107 @@
+"""Sigmas that the residuals contradict. More variance always lowers v'Pv: its logarithm counts against it.
+
+A group with r redundancy and v'Pv Omega whose sigmas are all wrong by the same factor k has Omega / r near k^2, and no
+residual stands out from the others: what stands out is a gross error, not a wrong sigma.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey
+from adjust.distributions import chi2
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray
+from adjust.statistics.scaling import scaled_survey
+
+_ALPHA = 1e-4
+_FEWEST = 8.0
+"""Redundancy from which a factor says anything."""
+_ODD = 100.0
+"""Ratio of a sigma to the usual one of its kind that nobody means: a sigma of zero, or of a metre."""
+_TAILS = 3.0
+"""How much heavier than normal the residuals' largest fifth may be for one factor to explain all of them."""
+_LAST = 2.0
+"""Evidence at most: sigmas that are large enough fit anything, so what else there is to try is tried first."""
+_KINDS = ("readings", "distances", "levels", "on_surfaces")
+
+
+def wrong_factors(case: Case) -> Iterator[Hypothesis]:
+    """One factor for the sigmas of each group that its residuals contradict, throughout."""
+    result = case.result
+    if result is None:
+        return
+    tested = [g for g in result.groups if g.redundancy >= _FEWEST and np.isfinite(g.factor)]
+    for group in tested:
+        low, high = (float(chi2.ppf(p, group.redundancy)) for p in (_ALPHA, 1.0 - _ALPHA))
+        evenly = _evenly(_standardized(result, group.group))
+        if low <= group.omega <= high or not evenly or group.factor <= 0.0:
+            continue
+        factor = float(group.factor)
+        k = float(np.sqrt(factor))
+        yield Hypothesis(
+            "sigmas of a group", f"the sigmas of group {group.group} are {k if k > 1 else 1 / k:.2g} times too "
+            f"{'small' if k > 1 else 'large'}: its residuals are evenly {'larger' if k > 1 else 'smaller'} than they "
+            "say",
+            f"multiply them by {k:.3g}: {group.group} = {k:.3g} below [sigmas.scale] in survey.toml, or give the "
+            "sigmas that the instrument has", Place("group", (group.group,), "sigmas.scale"),
+            scaled_survey(case.survey, {group.group: factor}), (ScaleKey(("sigmas", "scale", group.group), k),),
+            min(max(factor, 1.0 / factor), _LAST), 1, len(tested), penalty=group.n_observations * float(np.log(factor)),
+        )  # fmt: skip
+
+
+def _standardized(result: Adjustment, group: str) -> FloatArray:
+    """All residuals of a group over their own sigmas."""
+    images = result.image_residuals
+    of_block = np.array([b.group == group for b in result.survey.image_blocks], dtype=bool)
+    rows = np.repeat(of_block, np.diff(images.block_ptr)) & images.used
+    others = [o.standardized for o in result.other_residuals if o.group == group and o.used]
+    every = np.concatenate([images.standardized[rows].ravel(), *others])
+    return np.asarray(every[np.isfinite(every)])
+
+
+def _evenly(w: FloatArray) -> bool:
+    """Whether the residuals (n,) are of one normal distribution, but for its width: of its middle and of its tails."""
+    if len(w) < _FEWEST:
+        return False
+    size = np.sort(np.abs(w))
+    middle = float(np.median(size)) / 0.6745
+    tail = float(np.quantile(size, 0.95)) / 1.96
+    return middle > 0.0 and tail < _TAILS * middle
+
+
+def odd_sigmas(case: Case) -> Iterator[Hypothesis]:
+    """Observations whose sigma is a hundred times another's of the same kind and group, or a hundredth."""
+    for field in _KINDS:
+        observed = [o for o in getattr(case.survey, field) if o.used]
+        by_kind: dict[tuple[str, str], list[Any]] = {}
+        for o in observed:
+            by_kind.setdefault((getattr(o, "kind", field), o.group), []).append(o)
+        for (kind, group), members in by_kind.items():
+            usual = float(np.median([o.sigma for o in members]))
+            odd = [o for o in members if not 1.0 / _ODD < o.sigma / usual < _ODD]
+            if odd and len(members) > 2 * len(odd) + 1:
+                yield _with_usual(case, field, kind, group, odd, usual)
+
+
+def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[Any], usual: float) -> Hypothesis:
+    ids = [_id(o) for o in odd]
+    chosen = {id(o) for o in odd}
+    every = getattr(case.survey, field)
+    changed: dict[str, Any] = {field: tuple(replace(o, sigma=usual) if id(o) in chosen else o for o in every)}
+    penalty = float(sum(2.0 * np.log(usual / max(o.sigma, 1e-300)) for o in odd))
+    ratio = max(max(o.sigma / usual, usual / max(o.sigma, 1e-300)) for o in odd)
+    return Hypothesis(
+        "odd sigma", f"{kind} {', '.join(ids[:5])}{f' and {len(ids) - 5} more' if len(ids) > 5 else ''}: the sigma "
+        f"is {ratio:.0f} times off the usual one of group {group}", "give the sigma that was meant, or none",
+        Place("reading", tuple(ids), "sigma"), replace(case.survey, **changed), (),
+        min(ratio, 10.0), penalty=penalty,
+    )  # fmt: skip
+
+
+def _id(o: Any) -> str:
+    names = ("reading_id", "distance_id", "level_id", "surface_id")
+    return str(next(getattr(o, n) for n in names if hasattr(o, n)))

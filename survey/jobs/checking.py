@@ -1,0 +1,98 @@
+"""The job ``check``: what a survey cannot give, before it is adjusted, and what to measure next.
+
+>>> outcome = check_job(Path("lab"))
+>>> print(outcome.text())
+"""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from adjust.diagnosis.beforehand import Beforehand, look_beforehand
+from adjust.model.errors import SurveyError
+from survey.project import Project, read
+
+if TYPE_CHECKING:
+    from adjust.design import Selection
+
+_MOST = 5
+
+
+@dataclass(frozen=True, eq=False)
+class CheckOutcome:
+    """What was found in a project. next_best: candidates of plan.toml, the most useful first."""
+
+    project: Project
+    beforehand: Beforehand
+    next_best: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def n_problems(self) -> int:
+        """Findings that spoil or stop the adjustment."""
+        return sum(f.level == "problem" for f in self.beforehand.findings)
+
+    def summary(self) -> dict[str, Any]:
+        """As plain values."""
+        expected = self.beforehand.expected
+        counts = {} if expected is None else {
+            "observations": expected.n_observations, "unknowns": expected.n_unknowns,
+            "redundancy": expected.redundancy, "datum_defect": expected.datum_defect,
+        }  # fmt: skip
+        return {
+            "folder": str(self.project.folder),
+            **counts,
+            "problems": self.n_problems,
+            "findings": [asdict(f) for f in self.beforehand.findings],
+            "measure_next": list(self.next_best),
+            "notes": list(self.notes),
+        }
+
+    def text(self) -> str:
+        """For people: problems, then weak points, then what to measure next."""
+        expected, findings = self.beforehand.expected, self.beforehand.findings
+        lines = [f"{self.project.title or self.project.folder}: {self.n_problems} problems, "
+                 f"{len(findings) - self.n_problems} weak points; nothing was adjusted"]  # fmt: skip
+        if expected is not None:
+            lines.append(f"{expected.n_observations} observations, {expected.n_unknowns} unknowns, "
+                         f"redundancy {expected.redundancy}")  # fmt: skip
+        for finding in findings:
+            mark = "problem" if finding.level == "problem" else "weak"
+            lines += [f"{mark}: {finding.found}", f"  -> {finding.remedy}"]
+        if self.next_best:
+            lines.append("measure next (of the candidates of plan.toml): " + ", ".join(self.next_best))
+        return "\n".join([*lines, *self.notes])
+
+
+def check_job(folder: Path) -> CheckOutcome:
+    """Look at a project without adjusting it; writes nothing. Raises SurveyError where it cannot be read."""
+    project = read(Path(folder))
+    notes = project.notes + project.image_notes
+    waiting = len(project.images) and not project.survey.image_blocks
+    if waiting:
+        notes += (f"{len(project.images)} images are not detected yet: labsurvey detect {folder}",)
+    found = look_beforehand(project.survey)
+    best, said = _next_best(project, found)
+    return CheckOutcome(project, found, best, notes + said)
+
+
+def _next_best(project: Project, found: Beforehand) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The candidates of plan.toml that help most beside what is measured, and why there are none."""
+    if not (project.folder / "plan.toml").is_file():
+        return (), ("what to measure next: list candidates in plan.toml; labsurvey plan ranks them",)
+    from adjust.design import expect, select
+    from survey.planning.building import build_plan
+    from survey.planning.plan_file import read_plan
+    from survey.planning.wanted import wanted_components
+
+    try:
+        plan = read_plan(project.folder, project.survey)
+        planned = build_plan(project, plan, found.expected, [])
+        if not planned.candidates:
+            return (), ("what to measure next: plan.toml lists no candidates",)
+        expected = expect(planned.survey, planned.start)
+        chosen: Selection = select(planned.survey, planned.start, planned.candidates,
+                                   wanted_components(expected, plan.wanted), _MOST, "D", expected)  # fmt: skip
+    except SurveyError as error:
+        return (), (f"what to measure next cannot be told: {str(error).splitlines()[0]}",)
+    return tuple(step.name for step in chosen.steps), ()

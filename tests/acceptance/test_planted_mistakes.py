@@ -1,0 +1,107 @@
+"""Planted mistakes are named first, innocent surveys are not blamed, and a named cause can be tried and taken back."""
+
+import json
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from survey.cli import main
+from survey.project.writing import write_project
+from survey.simulate.parts import wall_grid
+from tests.acceptance.planted_mistakes import MISTAKES, board_of, camera_of, diagnosed, survey_of
+
+NAMED = {  # one size of each, in one kind of survey; the whole table is python -m tests.acceptance.planted_mistakes
+    ("images mirrored", "stereo"): 0.6,
+    ("images turned", "stereo"): 0.4,
+    ("images shifted", "head"): 12.0,
+    ("images resized", "stereo"): 0.8,
+    ("focus touched", "stereo"): 0.01,
+    ("camera moved", "head"): 6.0,
+    ("target moved", "relay"): 10.0,
+    ("target scaled", "relay"): 0.8,
+    ("target stretched", "stereo"): 1.01,
+    ("target sheared", "stereo"): 0.01,
+    ("target bent", "stereo"): 1.5,
+}
+
+
+@pytest.mark.parametrize(("name", "kind"), NAMED)
+def test_planted_mistake_is_named_first(name: str, kind: str) -> None:
+    mistake = next(m for m in MISTAKES if m.name == name and kind in m.kinds)
+    survey, truth = survey_of(kind, 3)
+    planted = mistake.plant(survey, truth, NAMED[name, kind])
+    first = diagnosed(planted).candidates[0]
+    about = camera_of(survey) if mistake.about == "camera" else board_of(survey)
+    assert (first.hypothesis.name, first.hypothesis.place.ids) == (name, (about,))
+    assert first.explained > 0.9
+    assert first.sigma0 < 1.1
+
+
+@pytest.mark.parametrize("kind", ["stereo", "head"])
+@pytest.mark.parametrize("smaller", [1.0, 1.3])
+def test_innocent_survey_is_not_blamed(kind: str, smaller: float) -> None:
+    """Nor one whose image sigmas are given too small, though its global test fails."""
+    survey, _ = survey_of(kind, 11)
+    blocks = tuple(replace(b, cov=b.cov / smaller**2) for b in survey.image_blocks)
+    assert not diagnosed(replace(survey, image_blocks=blocks)).candidates
+
+
+def test_nothing_that_was_given_is_changed() -> None:
+    survey, truth = survey_of("stereo", 3)
+    planted = next(m for m in MISTAKES if m.name == "camera moved").plant(survey, truth, 6.0)
+    before = [b.uv.copy() for b in planted.image_blocks]
+    diagnosed(planted)
+    assert all(np.array_equal(b.uv, uv) for b, uv in zip(planted.image_blocks, before, strict=True))
+
+
+def test_named_in_results_and_tried(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Half of one camera's images mirrored: refused with the cause; tried: rows changed, the old table kept."""
+    survey, truth = survey_of("stereo", 3)
+    planted = next(m for m in MISTAKES if m.name == "images mirrored").plant(survey, truth, 0.6)
+    lab = tmp_path / "lab"
+    write_project(lab, planted)
+    table = lab / "observations" / "image_points.csv"
+    was = table.read_bytes()
+    assert main(["adjust", str(lab), "--quiet"]) == 1
+    assert "camera right: 7 of its 12 images" in capsys.readouterr().err
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+    assert (lab / "kept" / "image_points-1.csv").read_bytes() == was
+    assert table.read_bytes() != was
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert solution["summary"]["sigma0"] < 1.1
+    assert "diagnosis" not in solution
+
+
+def test_size_of_a_target_tried(tmp_path: Path) -> None:
+    """The plates' markers given at 25 mm for an inch: the number in survey.toml is changed, its comment stays."""
+    survey, truth = survey_of("relay", 3)
+    planted = next(m for m in MISTAKES if m.name == "target scaled").plant(survey, truth, 25.0 / 25.4)
+    lab = tmp_path / "lab"
+    name = board_of(survey)
+    true, off = wall_grid(1), 25.0 / 25.4
+    wrong = replace(true, marker_m=true.marker_m * off, gap_m=true.gap_m * off)
+    write_project(lab, planted, target_kinds={name: wrong})
+    definition = lab / "survey.toml"
+    text = definition.read_text(encoding="utf-8").replace("marker_mm", "# of the shop\nmarker_mm", 1)
+    definition.write_text(text, encoding="utf-8")
+    assert main(["adjust", str(lab), "--quiet"]) == 3
+    solution = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert (solution["diagnosis"][0]["name"], solution["diagnosis"][0]["ids"]) == ("target scaled", [name])
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+    new = tomllib.loads(definition.read_text(encoding="utf-8"))["targets"][name]
+    assert new["marker_mm"] == pytest.approx(1e3 * true.marker_m)
+    assert "# of the shop" in definition.read_text(encoding="utf-8")
+    assert (lab / "kept" / "survey-1.toml").read_text(encoding="utf-8") == text
+
+
+def test_try_says_what_it_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    survey, _ = survey_of("stereo", 11)
+    lab = tmp_path / "lab"
+    write_project(lab, survey)
+    said = tomllib.loads((lab / "survey.toml").read_text(encoding="utf-8"))
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 1
+    assert "the diagnosis names no cause that it could change" in capsys.readouterr().err
+    assert tomllib.loads((lab / "survey.toml").read_text(encoding="utf-8")) == said
