@@ -84,7 +84,7 @@ def _done(trials: Sequence[Trial], following: Hypothesis) -> bool:
 
 
 def _in_turn(formed: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The most evident first; but of every kind one before the second of any: their evidence is not of one measure."""
+    """The most evident first; of every kind one before the second of any: their evidence is not of one measure."""
     before: dict[str, int] = {}
     turns = []
     for h in sorted(formed, key=lambda h: -h.evidence):
