@@ -21,7 +21,7 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.start import find_start
 from adjust.start.readings.joint import find_all, needs_points
-from adjust.statistics.supported import supported
+from adjust.statistics.outliers.supported import supported
 
 _CELLS = (8, 6)
 _COVERED, _SMALL_IMAGE = 0.5, 0.15

@@ -7,8 +7,8 @@ import numpy as np
 
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.trial import Misfit, Trial
-from adjust.distributions import chi2
 from adjust.model.survey import FloatArray
+from adjust.testing.distributions import chi2
 
 _ALPHA = 1e-4
 _EXPLAINED = 0.5  # share of the excess that a cause takes away at least

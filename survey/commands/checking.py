@@ -26,7 +26,7 @@ def declare_check(commands: Any, shaped: dict[str, Any]) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder)
-    from survey.jobs.checking import check_job
+    from survey.planning.checking import check_job
 
     outcome = check_job(arguments.folder)
     if is_set(arguments, "json"):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from survey.cli import main
-from survey.jobs.checking import check_job
+from survey.planning.checking import check_job
 from tests.data import data_folder
 
 

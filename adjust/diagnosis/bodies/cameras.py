@@ -11,10 +11,10 @@ from adjust.diagnosis.bodies.split import split_camera
 from adjust.diagnosis.bodies.targets import motion_text
 from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place
 from adjust.diagnosis.images.maps import TURNED, edits_of, mapped
-from adjust.distributions import chi2
 from adjust.model.result import Adjustment, Estimate
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.rigid import rotation_log
+from adjust.testing.distributions import chi2
 
 _ALPHA = 1e-5
 _FOCAL, _CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")

@@ -8,9 +8,9 @@ from adjust.diagnosis.bodies.series import Step
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.table.views import single_camera_survey
 from adjust.diagnosis.trial import misfit_of
-from adjust.distributions import chi2
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey
+from adjust.testing.distributions import chi2
 
 _LEAST = 3  # images on either side
 _CUTS = 7

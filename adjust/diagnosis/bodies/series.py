@@ -8,12 +8,12 @@ from gtsam import Pose3
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.table.views import adjoint, view_covariance
-from adjust.distributions import chi2
 from adjust.frames.chains import table_motion
 from adjust.frames.unknowns import Chain, FrameTree, Unknowns
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rigid import inverse, rigid, rotation_log
+from adjust.testing.distributions import chi2
 
 _CAP = 60.0  # of one comparison of two images, chi-square with six degrees of freedom
 _MEDIAN_6 = 5.348

@@ -13,8 +13,8 @@ from gtsam import Pose3
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.sequences import Link, fitted, links
-from adjust.distributions import norm
 from adjust.model.survey import PoseParameter, Station, Survey
+from adjust.testing.distributions import norm
 
 _ALPHA = 1e-4
 _ALONE_PX = 1.0

@@ -12,10 +12,10 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey
-from adjust.distributions import chi2
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
 from adjust.statistics.scaling import scaled_survey
+from adjust.testing.distributions import chi2
 
 _ALPHA = 1e-4
 _FEWEST = 8.0
