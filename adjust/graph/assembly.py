@@ -149,9 +149,20 @@ class AdjustmentGraph:
         """``system``, or where ``reduction`` is None what it is with all poses in sight."""
         return self._unreduced if reduction is None else self._reduced
 
+    @cached_property
+    def _on_unknowns(self) -> gtsam.NonlinearFactorGraph:
+        """``others_graph`` without observations of what is held: they are constant, and GTSAM eliminates none of them."""
+        if all(item.factor.size() for item in self.singles):
+            return self.others_graph
+        graph = gtsam.NonlinearFactorGraph()
+        for i in range(self.others_graph.size()):
+            if self.others_graph.at(i).size():
+                graph.push_back(self.others_graph.at(i))
+        return graph
+
     def _factors(self, reduction: PoseReduction | None) -> gtsam.NonlinearFactorGraph:
         """All factors but those of a bundle, and of the image blocks that ``reduction`` takes."""
-        graph = gtsam.NonlinearFactorGraph(self.others_graph)
+        graph = gtsam.NonlinearFactorGraph(self._on_unknowns)
         self.images.add_factors(graph, None if reduction is None else reduction.others)
         if self.terrestrial is not None:
             self.terrestrial.add_factors(graph)

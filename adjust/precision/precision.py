@@ -156,7 +156,9 @@ class Precision:
         if found is None:
             linear = item.factor.linearize(self.solved.values)
             (A, b), keys = linear.jacobian(), list(linear.keys())
-            M = A @ self._in_datum(keys, self.tree.joint(keys)) @ A.T
+            M = np.zeros((len(b), len(b)))  # of what is held: nothing moves it
+            if keys:
+                M = A @ self._in_datum(keys, self.tree.joint(keys)) @ A.T
             W = np.asarray(noise_of(item).R())
             found = self._rows[item] = ObservationRows(keys, A, -b, M, W, np.asarray(np.linalg.inv(W)))
         return found

@@ -473,7 +473,8 @@ def _other_rows(
     for item in precision.graph.others:
         rows = precision.rows(item)
         n_rows = len(rows.e)
-        entries.add(np.arange(at, at + n_rows), np.concatenate([key_columns[k] for k in rows.keys]), rows.A)
+        columns = np.concatenate([np.zeros(0, dtype=np.int64), *(key_columns[k] for k in rows.keys)])
+        entries.add(np.arange(at, at + n_rows), columns, rows.A)
         residuals.append(rows.e)
         lengths.append(n_rows)
         at += n_rows

@@ -101,3 +101,20 @@ def test_unknown_component_and_missing_value_are_named() -> None:
         broken = replace(survey, points=(Point("P0", PointParameter(value, held=held)), *survey.points[1:]))
         with pytest.raises(SurveyError, match=words):
             adjust(broken, start_of(survey))
+
+
+def test_an_observation_of_what_is_held_counts_and_moves_nothing() -> None:
+    """Its residual is what it is, its redundancy whole; without factors on unknowns GTSAM would eliminate nothing."""
+    survey = replace(plane_network(2), datum=Datum())
+    held = tuple(replace(p, x_in_world=replace(p.x_in_world, treatment="held")) for p in survey.points[:2])
+    survey = replace(survey, points=held + survey.points[2:], distances=survey.distances[1:])
+    off = np.asarray(held[0].x_in_world.value) + [0.003, -0.001, 0.0]
+    seen = replace(survey, coordinates=(Coordinates((PositionRef("P0"),), off[None], np.eye(3) * SIGMA**2),))
+    without, result = adjust(survey, start_of(survey)), adjust(seen, start_of(survey))
+    assert result.omega - without.omega == pytest.approx((0.003**2 + 0.001**2) / SIGMA**2)
+    assert result.redundancy - without.redundancy == 3
+    (residual,) = (o for o in result.other_residuals if o.kind == "coordinates")
+    np.testing.assert_allclose(residual.redundancy, 1.0)
+    for name, estimate in without.estimates.items():
+        np.testing.assert_allclose(result.estimates[name].value, estimate.value, atol=1e-12)
+        np.testing.assert_allclose(result.estimates[name].cov, estimate.cov, atol=1e-15)
