@@ -151,7 +151,7 @@ class AdjustmentGraph:
 
     @cached_property
     def _on_unknowns(self) -> gtsam.NonlinearFactorGraph:
-        """``others_graph`` without observations of what is held: they are constant, and GTSAM eliminates none of them."""
+        """``others_graph`` without observations of what is held: they are constant, and on no unknown to eliminate."""
         if all(item.factor.size() for item in self.singles):
             return self.others_graph
         graph = gtsam.NonlinearFactorGraph()
