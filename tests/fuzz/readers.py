@@ -81,8 +81,8 @@ def _table(name: str, number: int) -> Callable[[Path], Read]:
             if "/" not in other or Path(other).stem in beside:
                 (folder / other).parent.mkdir(exist_ok=True)
                 (folder / other).write_bytes(data)
-        known = reading._read_definition(folder)
-        reading._read_definition = lambda _folder: known  # type: ignore[assignment]
+        read_whole, known = reading._read_definition, reading._read_definition(folder)
+        reading._read_definition = lambda at, text=None: known if at == folder else read_whole(at, text)
         (folder / "observations").mkdir(exist_ok=True)
         path = folder / "observations" / name
 
