@@ -11,7 +11,7 @@ from adjust.adjustment import adjust
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
-from adjust.model.survey import FloatArray, Survey
+from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.start.lenses import Sighting, start_lens
 from adjust.start.views import Sight, View, all_rays, focal_px, make_views, target_points, used_rows
 
@@ -104,18 +104,23 @@ def _place(block: ImageBlock) -> tuple[str, str, str | None, str]:
     return block.camera_id, block.epoch_id, block.target_id, block.group
 
 
-def own_lenses(survey: Survey) -> dict[str, FloatArray]:
-    """Start values of lenses (n,) by camera, from the images of targets of each camera alone."""
+def own_lens(survey: Survey, camera: Camera) -> FloatArray:
+    """Start values (n,) of a lens from the camera's images of targets alone; SurveyError where they give none."""
     points = {t.target_id: target_points(t) for t in survey.targets}
+    mine = [
+        (i, b) for i, b in enumerate(survey.image_blocks)
+        if b.camera_id == camera.camera_id and b.target_id is not None
+    ]  # fmt: skip
+    seen = [Sighting(i, points[str(b.target_id)][b.point_idx[used_rows(b)]], b.uv[used_rows(b)]) for i, b in mine]
+    return start_lens(camera, [s for s in seen if len(s.x)]).values
+
+
+def own_lenses(survey: Survey) -> dict[str, FloatArray]:
+    """:func:`own_lens` of every camera whose images give one."""
     found = {}
     for camera in survey.cameras:
-        blocks = [
-            (i, b) for i, b in enumerate(survey.image_blocks)
-            if b.camera_id == camera.camera_id and b.target_id is not None
-        ]  # fmt: skip
-        seen = [Sighting(i, points[str(b.target_id)][b.point_idx[used_rows(b)]], b.uv[used_rows(b)]) for i, b in blocks]
         try:
-            found[camera.camera_id] = start_lens(camera, [s for s in seen if len(s.x)]).values
+            found[camera.camera_id] = own_lens(survey, camera)
         except SurveyError:
             continue
     return found

@@ -9,13 +9,13 @@ from functools import cached_property
 import numpy as np
 
 from adjust.adjustment import start_values
+from adjust.diagnosis.case import CAP
 from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, Survey
 from adjust.start import find_start
 from adjust.start.readings.joint import find_all, needs_points
 
-_CAP = 25.0
 _MEDIAN = 0.455  # of chi-square with one degree of freedom
 
 
@@ -54,7 +54,7 @@ class Screen:
 
     def misfit(self, scale: float = 1.0) -> float:
         """Sum of squares, each bounded, over a variance factor."""
-        return float(np.minimum(np.concatenate([self.readings, self.others]) / scale, _CAP).sum())
+        return float(np.minimum(np.concatenate([self.readings, self.others]) / scale, CAP).sum())
 
 
 def _finite(squares: FloatArray) -> FloatArray:

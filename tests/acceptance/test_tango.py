@@ -21,8 +21,9 @@ from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey
 from adjust.relay.conditions import adjust_conditions
 from adjust.relay.eyes.drift import fit_drift, rescaled, sequences
-from adjust.relay.eyes.eyes import EyeOptions, PoseSequence, adjust_eye_motions, adjust_eyes
+from adjust.relay.eyes.eyes import EyeOptions, adjust_eye_motions, adjust_eyes
 from adjust.relay.eyes.pairs import close_loops, pairs_of, triangle_misclosure
+from adjust.relay.eyes.sequences import PoseSequence
 from adjust.relay.eyes.trajectories import CommonMotions, Trajectory, common_motions, time_offset
 from adjust.relay.loops import loop_misclosures
 from adjust.relay.network import network_from_pairs

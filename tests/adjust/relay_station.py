@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Station, Survey, Target
-from adjust.relay.eyes.eyes import PoseSequence
+from adjust.relay.eyes.sequences import PoseSequence
 from adjust.spatial.rigid_motions import Motions
 from survey.simulate.scene import BROWN
 

@@ -14,17 +14,10 @@ from adjust.adjustment import adjust
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.survey import FloatArray
-from adjust.relay.eyes.eyes import (
-    EyeOptions,
-    KnownWorlds,
-    MotionSequence,
-    PoseSequence,
-    adjust_eye_motions,
-    adjust_eyes,
-    pair_from_marker,
-)
+from adjust.relay.eyes.eyes import EyeOptions, adjust_eye_motions, adjust_eyes, pair_from_marker
 from adjust.relay.eyes.images import camera_sequence, eye_sequences, target_sequence
 from adjust.relay.eyes.pairs import close_loops, pairs_of, triangle_misclosure
+from adjust.relay.eyes.sequences import KnownWorlds, MotionSequence, PoseSequence
 from adjust.relay.eyes.setup import motion_setup, pose_setup
 from adjust.relay.eyes.solver import EyeProblem, linearise
 from adjust.spatial.rigid_motions import Motions

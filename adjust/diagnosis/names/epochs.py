@@ -9,11 +9,12 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.sequences import Link, Shift, fitted, links, shifts
-from adjust.model.observations import FrameRef, ImageBlock, Pair
+from adjust.model.observations import FrameRef, ImageBlock, Pair, TableReading
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
 from adjust.spatial.rigid import inverse
@@ -147,26 +148,37 @@ def exchanged_cameras(survey: Survey, a: str, b: str, epochs: tuple[str, ...]) -
 
 def _twice(survey: Survey) -> Iterator[Hypothesis]:
     """Two measured poses of the same frames, or two readings of a table at one epoch, that differ: either may go."""
-    for field, ends in (("pairs", ("a", "b")), ("table_readings", ("table_id", "epoch_id"))):
-        seen: dict[tuple[object, ...], list[int]] = {}
-        for i, o in enumerate(getattr(survey, field)):
-            if o.used:
-                seen.setdefault(tuple(getattr(o, end) for end in ends), []).append(i)
-        for rows in seen.values():
-            for i in rows if len(rows) > 1 and not _agree([getattr(survey, field)[k] for k in rows]) else ():
-                yield _without_one(survey, field, i)
+    pairs: dict[tuple[object, ...], list[tuple[int, Pair]]] = {}
+    for i, p in enumerate(survey.pairs):
+        if p.used:
+            pairs.setdefault((p.a, p.b, type(p.b_from_a)), []).append((i, p))
+    readings: dict[tuple[str, str], list[tuple[int, TableReading]]] = {}
+    for i, r in enumerate(survey.table_readings):
+        if r.used:
+            readings.setdefault((r.table_id, r.epoch_id), []).append((i, r))
+    for same in pairs.values():
+        (_, first), *others = same
+        if any(_far(_between(first, p), p.cov) for _, p in others):
+            yield from (_without_one(survey, "pairs", i) for i, _ in same)
+    for at_epoch in readings.values():
+        (_, one), *more = at_epoch
+        if any(_far(r.angles - one.angles, r.cov) for _, r in more):
+            yield from (_without_one(survey, "table_readings", i) for i, _ in at_epoch)
 
 
-def _agree(observed: list[object]) -> bool:
-    """Whether values of the same thing differ by less than ten sigmas."""
-    first = observed[0]
-    return all(float(np.max(np.abs(_difference(first, o)) / np.sqrt(np.diag(o.cov)))) < 10.0 for o in observed)  # type: ignore[attr-defined]
+def _between(one: Pair, other: Pair) -> FloatArray:
+    """Tangent of the second of two motions of one kind at the first."""
+    a, b = one.b_from_a, other.b_from_a
+    if isinstance(a, Pose3) and isinstance(b, Pose3):
+        return np.asarray(a.localCoordinates(b))
+    if isinstance(a, Rot3) and isinstance(b, Rot3):
+        return np.asarray(a.localCoordinates(b))
+    raise TypeError(f"pairs {one.pair_id} and {other.pair_id} measure different kinds of motion")
 
 
-def _difference(a: object, b: object) -> FloatArray:
-    if isinstance(a, Pair) and isinstance(b, Pair):
-        return np.asarray(a.b_from_a.localCoordinates(b.b_from_a))  # type: ignore[arg-type]
-    return np.asarray(a.angles - b.angles)  # type: ignore[attr-defined]
+def _far(difference: FloatArray, cov: FloatArray) -> bool:
+    """Whether a value lies ten sigmas or more from another of the same thing."""
+    return bool(np.max(np.abs(difference) / np.sqrt(np.diag(cov))) >= 10.0)
 
 
 def _without_one(survey: Survey, field: str, row: int) -> Hypothesis:

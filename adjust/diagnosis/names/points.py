@@ -9,14 +9,14 @@ from itertools import combinations
 
 import numpy as np
 
-from adjust.diagnosis.case import Case
+from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, Rename
 from adjust.diagnosis.screen import Screen, screen
 from adjust.diagnosis.units.readings import at_best, drop
 from adjust.model.observations import PositionRef, Reading
 from adjust.model.survey import IntArray, Survey
 
-_CLEARLY, _CAP = 3.0, 25.0
+_CLEARLY = 3.0
 _SUSPECTS, _MOST = 6, 4
 _LARGE = 2500
 
@@ -45,7 +45,7 @@ def _suspects(survey: Survey, before: Screen, setup_id: str | None) -> list[str]
     misses: dict[str, list[float]] = {}
     for r, square in zip(survey.readings, before.readings.tolist(), strict=True):
         if r.to.frame is None and (setup_id is None or r.setup_id == setup_id):
-            misses.setdefault(str(r.to.point_id), []).append(min(square / before.scale, _CAP))
+            misses.setdefault(str(r.to.point_id), []).append(min(square / before.scale, CAP))
     worst = {name: float(np.mean(v)) for name, v in misses.items()}
     return [n for n in sorted(worst, key=lambda n: -worst[n])[:_SUSPECTS] if worst[n] > _CLEARLY]
 

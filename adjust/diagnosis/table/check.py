@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from gtsam import Pose3
 
+from adjust.diagnosis.case import with_lenses
 from adjust.diagnosis.table.fit import fit_table
 from adjust.diagnosis.table.places import (
     Places,
@@ -43,7 +44,7 @@ def probable_causes(survey: Survey, result: Adjustment | None = None) -> tuple[s
     table carries anything.
     """
     try:
-        every = table_views(survey if result is None else _with_lenses(survey, result))
+        every = table_views(survey if result is None else with_lenses(survey, result))
     except SurveyError:
         return ()
     return tuple(line for views in every for line in _causes(survey, views))
@@ -72,14 +73,6 @@ def sign_warnings(survey: Survey, result: Adjustment) -> tuple[str, ...]:
         if verdict is not None:
             out.append(_sign_text(table, verdict))
     return tuple(out)
-
-
-def _with_lenses(survey: Survey, result: Adjustment) -> Survey:
-    cameras = []
-    for camera in survey.cameras:
-        value = result.estimates[("lens", camera.camera_id)].value
-        cameras.append(camera if isinstance(value, Pose3) else replace(camera, lens=replace(camera.lens, values=value)))
-    return replace(survey, cameras=tuple(cameras))
 
 
 def _adjusted_constants(

@@ -7,12 +7,12 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.adjustment import adjust
+from adjust.diagnosis.case import own_lens, single_views
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Station, Survey, Table, Target
 from adjust.spatial.rigid import inverse, rigid, rotation_exp, skew
-from adjust.start.lenses import Sighting, start_lens
-from adjust.start.views import Sight, View, all_rays, focal_px, make_views, target_points, untrustworthy, used_rows
+from adjust.start.views import View, untrustworthy
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,24 +174,12 @@ def poses_of_views(survey: Survey) -> dict[int, View]:
 
     Raises SurveyError where a camera has no lens and its images give none.
     """
-    targets = {t.target_id: target_points(t) for t in survey.targets}
-    lenses, cameras = {}, {c.camera_id: c for c in survey.cameras}
-    for camera_id in dict.fromkeys(b.camera_id for b in survey.image_blocks):
-        mine = [(i, b) for i, b in enumerate(survey.image_blocks) if b.camera_id == camera_id]
-        seen = [Sighting(i, targets[str(b.target_id)][b.point_idx[used_rows(b)]], b.uv[used_rows(b)]) for i, b in mine]
-        lenses[camera_id] = start_lens(cameras[camera_id], [s for s in seen if len(s.x)]).values
-    rays, _ = all_rays(survey, lenses)
-    sights = []
-    for i, block in enumerate(survey.image_blocks):
-        used = used_rows(block)
-        if i in rays and used.sum() >= 3:
-            x = targets[str(block.target_id)][block.point_idx[used]]
-            focal = focal_px(cameras[block.camera_id], lenses[block.camera_id])
-            sights.append(Sight(i, x, rays[i][used], focal))
+    cameras = {c.camera_id: c for c in survey.cameras}
+    seen = dict.fromkeys(b.camera_id for b in survey.image_blocks)
     # those without a pose are named by the search for start values
-    refined = make_views(sights)[0]
-    reasons, _ = untrustworthy(refined, survey)
-    return {v.block_idx: v for v in refined if v.block_idx not in reasons}
+    found = single_views(survey, {camera_id: own_lens(survey, cameras[camera_id]) for camera_id in seen})
+    reasons, _ = untrustworthy(list(found.values()), survey)
+    return {i: view for i, view in found.items() if i not in reasons}
 
 
 def _stands(survey: Survey, station_id: str) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.diagnosis.case import Case
+from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen
 from adjust.diagnosis.units.readings import at_best
@@ -17,7 +17,7 @@ from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.statistics.system import linear_system
 from adjust.statistics.weakness import times_covariance
 
-_CLEARLY, _CAP = 3.0, 25.0
+_CLEARLY = 3.0
 _MOST = 4
 _LARGEST = 10.0
 """m: what no height of an instrument or a target, and no reflector's constant, is wrong by."""
@@ -128,8 +128,8 @@ def _evidence(before: Screen, constant: _Constant) -> tuple[float, float]:
         return 0.0, 0.0
     metres = _weighted_median(miss[weight > 0] / constant.by[weight > 0], weight[weight > 0])
     scale = before.scale
-    old = np.minimum((miss / sigma) ** 2 / scale, _CAP).sum()
-    new = np.minimum(((miss - constant.by * metres) / sigma) ** 2 / scale, _CAP).sum()
+    old = np.minimum((miss / sigma) ** 2 / scale, CAP).sum()
+    new = np.minimum(((miss - constant.by * metres) / sigma) ** 2 / scale, CAP).sum()
     return float(old / (new + 0.1 * len(rows) + 1.0)), metres
 
 

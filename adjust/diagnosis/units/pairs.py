@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.diagnosis.case import Case
+from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
 from adjust.diagnosis.screen import Screen, screen
 from adjust.diagnosis.sequences import Link, fitted, links, typical, with_pairs
@@ -25,7 +25,6 @@ from adjust.spatial.rotation_forms import euler_from_matrix, matrix_from_euler
 Motion = Pose3 | Rot3
 _CLEARLY = 3.0
 _MOST, _SINGLE = 5, 8
-_CAP = 25.0
 _LARGE = 500
 """Pairs up to which start values are found anew for every convention."""
 
@@ -260,7 +259,7 @@ def _by_start(case: Case) -> _Judge | None:
         rows = np.arange(len(now)) if whole else of
         typical_now = float(np.median(now)) / 2.0
         scale = max(1.0, min(typical_now, float(np.median(squares)) / 2.0))
-        old, new = (np.minimum(s[rows] / scale, _CAP).sum() for s in (squares, now))
+        old, new = (np.minimum(s[rows] / scale, CAP).sum() for s in (squares, now))
         return float(old / (new + 0.1 * len(rows)))
 
     return _Judge(worst, evidence)

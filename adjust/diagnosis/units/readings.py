@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.diagnosis.case import Case
+from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen, improvement, screen
 from adjust.diagnosis.units.conventions import ANGLES, LENGTHS, MISREADINGS, SLIPS, TURNS, Misreading
@@ -19,7 +19,6 @@ from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.observations.terrestrial.batch import circular_median
 from adjust.observations.terrestrial.equations import DIRECTION, wrapped
 
-_CAP = 25.0
 _CLEARLY = 3.0
 """By how much the misfit of the readings concerned has to fall."""
 _MOST, _SINGLE = 6, 8
@@ -133,14 +132,14 @@ def _evidence(survey: Survey, before: Screen | None, scope: Scope, misreading: M
     if after is None:
         return 0.0
     if before is None:
-        return improvement(_CAP * n, after.misfit(after.scale), n)
+        return improvement(CAP * n, after.misfit(after.scale), n)
     scale = min(before.scale, after.scale)
     return improvement(before.misfit(scale), after.misfit(scale), n)
 
 
 def drop(before: Screen, rows: IntArray, after: FloatArray) -> float:
     """How much less everything misfits when these readings do as in ``after`` (n,), squares over sigmas."""
-    every, now = (np.minimum(s / before.scale, _CAP) for s in (before.readings, after))
+    every, now = (np.minimum(s / before.scale, CAP) for s in (before.readings, after))
     total = float(every.sum())
     return improvement(total, total - float(every[rows].sum()) + float(now.sum()), len(every))
 

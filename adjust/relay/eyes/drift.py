@@ -12,7 +12,8 @@ import numpy as np
 
 from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
-from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, MotionSequence, adjust_eye_motions
+from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eye_motions
+from adjust.relay.eyes.sequences import MotionSequence
 from adjust.relay.eyes.solver import EyeProblem, EyeSolution, linearise
 from adjust.relay.eyes.trajectories import CommonMotions, Trajectory, common_motions
 from adjust.spatial.rigid_motions import Motions

@@ -13,7 +13,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, PoseParameter, Station, Survey, Target
-from adjust.relay.eyes.eyes import PoseSequence, symmetric
+from adjust.relay.eyes.eyes import symmetric
+from adjust.relay.eyes.sequences import PoseSequence
 from adjust.relay.eyes.setup import from_matrix
 from adjust.relay.eyes.solver import stacked
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
@@ -11,12 +10,10 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.pose_network.cycles import adjacency
+from adjust.relay.eyes.sequences import KnownWorlds, MotionSequence, PoseSequence
 from adjust.relay.eyes.solver import EyeConditions, EyeProblem, KnownMotion, stacked
 from adjust.spatial.rigid_motions import Motions, identities
 from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb
-
-if TYPE_CHECKING:  # the frozen values live with the functions that take them
-    from adjust.relay.eyes.eyes import KnownWorlds, MotionSequence, PoseSequence
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +31,7 @@ class EyeSetup:
     scaled_eyes: tuple[int, ...] = ()
 
 
-def motion_setup(sequences: "Sequence[MotionSequence]", free_scales: bool) -> EyeSetup:
+def motion_setup(sequences: Sequence[MotionSequence], free_scales: bool) -> EyeSetup:
     """Conditions between the first eye that moved over an interval and every other one."""
     eyes = _eyes([s.eye for s in sequences])
     rows = _joined([s.interval_ids for s in sequences], [s.eye.frame_id for s in sequences], "interval")
@@ -60,7 +57,7 @@ def _scale_idx(eye: IntArray, free_scales: bool) -> IntArray:
     return eye - 1 if free_scales else np.full_like(eye, -1)
 
 
-def pose_setup(sequences: "Sequence[PoseSequence]", known: "Sequence[KnownWorlds]") -> EyeSetup:
+def pose_setup(sequences: Sequence[PoseSequence], known: Sequence[KnownWorlds]) -> EyeSetup:
     """Conditions between the first eye that saw anything at an epoch and every other one."""
     eyes = _eyes([s.eye for s in sequences])
     rows = _joined([s.epoch_ids for s in sequences], [s.eye.frame_id for s in sequences], "epoch")
@@ -83,7 +80,7 @@ def pose_setup(sequences: "Sequence[PoseSequence]", known: "Sequence[KnownWorlds
     return EyeSetup(eyes, problem, names, False, world_idx)
 
 
-def _known(a: int, b: int, relation: "KnownWorlds", free: BoolArray) -> KnownMotion:
+def _known(a: int, b: int, relation: KnownWorlds, free: BoolArray) -> KnownMotion:
     """A relation to the held world; between two free ones there is no datum that makes it one unknown's."""
     motion = from_matrix(relation.a_from_b.matrix())
     if not free[a]:
@@ -99,7 +96,7 @@ def _known(a: int, b: int, relation: "KnownWorlds", free: BoolArray) -> KnownMot
 
 def _pose_start(
     c: EyeConditions, observed: Motions, free: BoolArray, n_eyes: int,
-    known: "list[tuple[int, int, KnownWorlds]]", eyes: tuple[FrameRef, ...],
+    known: list[tuple[int, int, KnownWorlds]], eyes: tuple[FrameRef, ...],
 ) -> tuple[Motions, BoolArray]:  # fmt: skip
     """Start values of eyes and worlds, one eye after the other; holds one world of each part that hangs together."""
     _refuse_unlinked(n_eyes, c.eye_k, c.eye_l, [e.frame_id for e in eyes], "eyes")
@@ -140,7 +137,7 @@ def _eye_from_eye(
     B: Motions,
     wa: IntArray,
     wb: IntArray,
-    known: "list[tuple[int, int, KnownWorlds]]",
+    known: list[tuple[int, int, KnownWorlds]],
     eyes: tuple[FrameRef, FrameRef],
 ) -> Motions:
     """``a_from_b`` of two eyes: directly where their worlds are the same or known, else from the motions."""
