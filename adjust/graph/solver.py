@@ -116,9 +116,9 @@ class _Loop:
         decrease = 0.0
         if self.at.reduction is not None:
             decrease += self.at.reduction.complete(delta)
-        if self.graph.bundle is not None:
-            self.graph.bundle.complete(delta)
-            decrease += self.graph.bundle.hidden_decrease
+        for bundle in self.graph.bundles:
+            bundle.complete(delta)
+            decrease += bundle.hidden_decrease
         if self.datum is not None:
             delta = self.datum.completed(self.graph, self.at.values, delta)
         return delta, decrease

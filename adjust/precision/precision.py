@@ -64,10 +64,11 @@ class Precision:
         dims = {key: unknown.dim for key, unknown in graph.unknowns.by_key.items()}
         self.tree = TreeCovariance(solved.tree, dims, solved.leaves)
         self.hidden: dict[int, FloatArray] = {}
-        self.bundle_influence = np.zeros((0, 3))
-        self._hidden = None if graph.bundle is None else BundleHidden(graph.bundle)
-        if self._hidden is not None:
-            self._add_hidden(self._hidden)
+        self.bundle_influence: list[FloatArray] = []
+        """Whitened A Q A' (K, 3) of the image points of every bundle, in its sorted order."""
+        self._hidden = [BundleHidden(bundle) for bundle in graph.bundles]
+        for hidden in self._hidden:
+            self._add_hidden(hidden)
         self.by_conditions: Mapping[str, FloatArray] = {}
         """Covariances (k, k) of adjusted pairs by id, where they are from the conditions of their loops."""
         self.transformation: STransformation | None = None
@@ -77,7 +78,7 @@ class Precision:
 
     def products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
         """Covariance, as solved, times the transpose of ``rows`` (k, dim per key): (dim, k) for every unknown."""
-        tree, below = self.tree, self._hidden
+        tree = self.tree
         k = next(iter(rows.values())).shape[0]
         right = np.zeros((tree.n, k))
         hidden = {}
@@ -86,12 +87,12 @@ class Precision:
                 hidden[key] = row.T
             else:
                 right[tree.rows([key])] += row.T
-        if below is not None:
+        for below in self._hidden if hidden else ():
             right[tree.rows(below.batch.interface)] += below.transposed(hidden, k)
         product = tree.times(right)
         at = tree.places()
         out = {key: product[place] for key, place in at.items()}
-        if below is not None:
+        for below in self._hidden:
             out |= below.products(product[tree.rows(below.batch.interface)], hidden)
         return out
 
@@ -107,8 +108,8 @@ class Precision:
 
     def _add_hidden(self, hidden: BundleHidden) -> None:
         bundle = hidden.batch
-        Q, points, self.bundle_influence = hidden.covariances(self.tree.joint(bundle.interface), self.solved.values)
-        self.bundle_order_cov = Q
+        Q, points, influence = hidden.covariances(self.tree.joint(bundle.interface))
+        self.bundle_influence.append(influence)
         for key in bundle.hidden_poses:
             at = bundle.key_at[key]
             self.hidden[key] = Q[at : at + 6, at : at + 6]
@@ -133,19 +134,19 @@ class Precision:
         Raises KeyError for a name that is not an unknown.
         """
         keys = [self.graph.unknowns.by_name[name].key for name in names]
-        hidden = [k for k in keys if k in self.hidden]
-        if not hidden or self._hidden is None:
+        below = [(b, hidden) for b in self._hidden if (hidden := [k for k in keys if b.hides(k)])]
+        if not below:
             return self._in_datum(keys, self.tree.joint(keys))
-        bundle = self._hidden.batch
         seen = [k for k in keys if k not in self.hidden]
-        outer = list(dict.fromkeys(bundle.interface + seen))
+        outer = list(dict.fromkeys([k for b, _ in below for k in b.batch.interface] + seen))
         Q, at = self.tree.joint(outer), stacking(self.graph, outer)
-        M, own = self._hidden.from_interface(hidden)
-        interface, mine = at.index(bundle.interface), stacking(self.graph, hidden)
         L = np.zeros((sum(self.tree.dims[k] for k in keys), at.n))
         scatter, place = np.zeros((len(L), len(L))), stacking(self.graph, keys)
-        L[np.ix_(place.index(hidden), interface)] = M[mine.index(hidden)]
-        scatter[np.ix_(place.index(hidden), place.index(hidden))] = own
+        for b, hidden in below:
+            M, own = b.from_interface(hidden)
+            mine = place.index(hidden)
+            L[np.ix_(mine, at.index(b.batch.interface))] = M
+            scatter[np.ix_(mine, mine)] = own
         if seen:
             L[place.index(seen), at.index(seen)] = 1.0
         return self._in_datum(keys, L @ Q @ L.T + scatter)
@@ -232,15 +233,15 @@ def noise_of(item: ObservationFactor) -> gtsam.noiseModel.Gaussian:
 def image_residuals(precision: Precision) -> ImageResiduals:
     """Residuals and their statistics of all image points, in the order of ``Survey.image_blocks``."""
     graph = precision.graph
-    images, bundle = graph.images, graph.bundle
+    images = graph.images
     residual, influence = images.statistics(precision.tree)
-    parts = [_test(residual, influence, images.W_all, images.used)]
-    if bundle is not None:
-        stats = _test(bundle.residuals_px(), precision.bundle_influence, bundle.W_all, bundle.used)
-        back = np.empty(len(bundle.sorted), dtype=np.int64)
-        back[bundle.sorted] = np.arange(len(back))
-        parts.append(tuple(a[back] for a in stats))
-    return _merge(graph, parts)
+    known = _test(residual, influence, images.W_all, images.used)
+    unknown = [
+        tuple(b.unsorted(a) for a in _test(b.residuals_px(), influence, b.W_all, b.used))
+        for b, influence in zip(graph.bundles, precision.bundle_influence, strict=True)
+    ]
+    ptr = np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks])
+    return ImageResiduals(ptr, *(np.asarray(graph.joined(a, more)) for a, *more in zip(known, *unknown, strict=True)))
 
 
 def _test(v: FloatArray, M: FloatArray, W: FloatArray, used: BoolArray) -> tuple[Any, ...]:
@@ -272,23 +273,6 @@ def _fill_test(
     sv = np.sqrt(np.maximum(0.0, i11 * i11 * q11))
     standardized[:, 0] = np.where(su > 1e-9 * i00, v0 / su, np.nan)
     standardized[:, 1] = np.where(sv > 1e-9 * i11, v1 / sv, np.nan)
-
-
-def _merge(graph: AdjustmentGraph, parts: list[tuple[Any, ...]]) -> ImageResiduals:
-    if len(parts) == 1:
-        return ImageResiduals(graph.images.ptr, *(np.asarray(part) for part in parts[0]))
-    ptr = np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks])
-    n_points = int(ptr[-1])
-    out: list[Any] = [np.zeros((n_points, 2)) for _ in range(3)]
-    out += [np.zeros(n_points), np.zeros(n_points, dtype=np.bool_)]
-    at = [0, 0]
-    for i, (_, free) in enumerate(graph.image_order):
-        n = int(ptr[i + 1] - ptr[i])
-        source = slice(at[int(free)], at[int(free)] + n)
-        for a, part in zip(out, parts[int(free)], strict=True):
-            a[ptr[i] : ptr[i + 1]] = part[source]
-        at[int(free)] += n
-    return ImageResiduals(ptr, *out)
 
 
 def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:

@@ -104,31 +104,17 @@ def image_whitened(precision: Precision) -> tuple[FloatArray, FloatArray, FloatA
     """Of all image points whitened residuals (N, 2), whitened A Q A' and square root information (N, 2, 2)."""
     graph, values = precision.graph, precision.solved.values
     graph.prepare(values, jacobians=True)
-    images, bundle = graph.images, graph.bundle
+    images = graph.images
     v, M3 = images.statistics(precision.tree)
     parts = [(v, M3, images.W_all)]
-    if bundle is not None:
-        bundle.whitened_squares(values)
-        found = bundle.residuals_px(), precision.bundle_influence, bundle.W_all
-        parts.append((bundle.unsorted(found[0]), bundle.unsorted(found[1]), bundle.unsorted(found[2])))
-    order = _image_order(precision)
-    v, M3, W3 = (np.concatenate([p[i] for p in parts])[order] for i in range(3))
+    for b, influence in zip(graph.bundles, precision.bundle_influence, strict=True):
+        b.whitened_squares()
+        parts.append((b.unsorted(b.residuals_px()), b.unsorted(influence), b.unsorted(b.W_all)))
+    v, M3, W3 = (graph.joined(of_images, of_bundles) for of_images, *of_bundles in zip(*parts, strict=True))
     W = np.zeros((len(v), 2, 2))
     W[:, 0, 0], W[:, 0, 1], W[:, 1, 1] = W3.T
     M = np.stack([M3[:, :2], M3[:, 1:]], axis=1)
     return np.einsum("nij,nj->ni", W, v), M, W
-
-
-def _image_order(precision: Precision) -> IntArray:
-    """Where the image points (N,), in the order of the survey's blocks, stand: known targets first, then the bundle."""
-    graph = precision.graph
-    out: list[IntArray] = [np.zeros(0, dtype=np.int64)]
-    at = [0, graph.images.n_points]
-    for i, free in graph.image_order:
-        n = len(graph.survey.image_blocks[i].uv)
-        out.append(np.arange(at[int(free)], at[int(free)] + n))
-        at[int(free)] += n
-    return np.concatenate(out)
 
 
 def _images(precision: Precision) -> list[_Batch]:

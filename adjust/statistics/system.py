@@ -11,7 +11,6 @@ from itertools import pairwise
 
 import numpy as np
 import scipy
-from gtsam import Values
 from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
@@ -296,7 +295,7 @@ def assembled(precision: Precision, image_rows: Callable[[Precision, int, KeyCol
 def _points_apart(precision: Precision, n: int, key_columns: KeyColumns) -> ImageRows:
     """Every image point an observation of its own."""
     graph = precision.graph
-    A, e = _image_rows(graph, n, key_columns, precision.solved.values)
+    A, e = _image_rows(graph, n, key_columns)
     groups = [b.group for b in graph.survey.image_blocks for _ in range(len(b.uv))]
     return ImageRows(A, e, np.full(len(groups), 2), graph.used(), groups)
 
@@ -393,21 +392,13 @@ class Entries:
 Rows = tuple[sparse.csr_matrix, FloatArray]
 
 
-def _image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns, values: Values) -> Rows:
+def _image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows:
     """Rows of all image points in the order of ``Survey.image_blocks``."""
-    parts = [_known_rows(graph, n, key_columns)]
-    n_known = parts[0][0].shape[0] // 2
-    if graph.bundle is not None:
-        parts.append(bundle_rows(graph, n, key_columns, values))
+    parts = [_known_rows(graph, n, key_columns)] + [bundle_rows(b, n, key_columns) for b in graph.bundles]
+    if len(parts) == 1:
+        return parts[0]
     A, e = sparse.vstack([p[0] for p in parts]).tocsr(), np.concatenate([p[1] for p in parts])
-    source, at = [], [0, n_known]
-    for i, free in graph.image_order:
-        k = len(graph.survey.image_blocks[i].uv)
-        source.append(np.arange(at[int(free)], at[int(free)] + k))
-        at[int(free)] += k
-    if not source or len(parts) == 1:
-        return A, e
-    order = (2 * np.concatenate(source)[:, None] + np.arange(2)).ravel()
+    order = (2 * graph.image_rows[:, None] + np.arange(2)).ravel()
     return A[order], e[order]
 
 
@@ -431,12 +422,9 @@ def _known_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows
     return entries.matrix((len(e), n)), e
 
 
-def bundle_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns, values: Values) -> Rows:
+def bundle_rows(bundle: BundleBatch, n: int, key_columns: KeyColumns) -> Rows:
     """Whitened rows of the image points of unknown points, used or not, in the order of the bundle's blocks."""
-    bundle = graph.bundle
-    if bundle is None:
-        raise ValueError("a survey without unknown points has no such rows")
-    bundle.whitened_squares(values)  # leaves the rows of all points, used or not, with their own weights
+    bundle.whitened_squares()  # leaves the rows of all points, used or not, with their own weights
     k = len(bundle.point)
     local, points = Entries(), Entries()
     for camera in np.unique(bundle.camera_of):
