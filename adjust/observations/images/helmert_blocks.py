@@ -75,7 +75,7 @@ def _far_apart(seen: sparse.csc_array) -> FloatArray:
     n = len(of_pose)
     operator = LinearOperator((n, n), matvec=common, dtype=np.float64)
     try:
-        found = eigsh(operator, k=2, which="LA", v0=np.random.default_rng(0).normal(size=n), tol=1e-4, maxiter=_STEPS)
+        found = eigsh(operator, k=2, which="LA", v0=np.random.default_rng(0).normal(size=n), tol=1e-3, maxiter=_STEPS)
     except ArpackNoConvergence as error:  # rough vectors cut well enough
         found = error.eigenvalues, error.eigenvectors
     return np.asarray(found[1][:, 0] / of_pose if found[1].shape[1] == 2 else np.zeros(n))
