@@ -23,8 +23,8 @@ from survey.project.tables.pairs import COVARIANCE_COLUMNS, EULER, PAIRS, QUATER
 from survey.project.tables.reading import Table
 from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame
 from survey.report.results import RESULTS
+from survey.solution.earlier.previous import Move, Previous, moves, read_previous
 from survey.solution.loops import network_dict, pair_network
-from survey.solution.previous import Move, Previous, moves, read_previous
 
 _MOST_MOVES = 200
 _MOST_SHOWN = 8

@@ -30,7 +30,7 @@ from survey.project.merging import point_files, read_copy
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.project.reading import read_all
 from survey.report.results import RESULTS
-from survey.solution.previous import Move, Previous, moves, read_previous
+from survey.solution.earlier.previous import Move, Previous, moves, read_previous
 
 _MOST_MOVES, _MOST_SHOWN = 200, 8
 

@@ -40,9 +40,9 @@ from survey.project.exclusions import Exclusion, Name, Row, appended, in_force, 
 from survey.project.observed import Hits, Observed, union
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, SpotBlock
 from survey.project.reading import leaving_out, read_all
-from survey.solution.changes import Changes, Snapshot, snapshot, solution_changes
+from survey.solution.earlier.changes import Changes, Snapshot, snapshot, solution_changes
+from survey.solution.earlier.runs import definition_of, find_run, load_run, remove_empty
 from survey.solution.quantities import Scale, scale_of
-from survey.solution.runs import definition_of, find_run, load_run, remove_empty
 from survey.solution.statistics import Statistics, statistics_of
 from survey.workbench.rows import PointRows, point_rows
 
