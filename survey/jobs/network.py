@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.observations import Pair
 from survey.folder.replacing import complete, place_for, replace_parts
 from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, made
@@ -28,6 +28,7 @@ from survey.solution.loops import network_dict, pair_network
 
 _MOST_MOVES = 200
 _MOST_SHOWN = 8
+_MOST_NAMED = 12
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class PlanOutcome:
             f"  conditions per pair           {n['conditions_per_pair']:>8.2f}",
         ]
         groups = n["inseparable_pairs"]
-        lines += [f"  errors seen but not told apart: {_named(group)}" for group in groups[:_MOST_SHOWN]]
+        lines += [f"  errors seen but not told apart: {listed(group, _MOST_NAMED)}" for group in groups[:_MOST_SHOWN]]
         lines += [f"  and {len(groups) - _MOST_SHOWN} more such groups"] if len(groups) > _MOST_SHOWN else []
         return "\n".join(lines)
 
@@ -113,21 +114,17 @@ def _problems(definition: Definition, network: dict[str, Any]) -> tuple[str, ...
     out = []
     parts = network["parts"]
     if parts:
-        named = " | ".join(_named(part) for part in parts[:6]) + (" | ..." if len(parts) > 6 else "")
+        named = " | ".join(listed(part, _MOST_NAMED) for part in parts[:6]) + (" | ..." if len(parts) > 6 else "")
         beside = ", unless images join them" if definition.survey.cameras else ""
         out.append(f"the pairs leave {len(parts)} parts that hang together by nothing{beside}: {named}")
     if definition.survey.datum.kind == "given" and not network["given_stations"] and not definition.survey.cameras:
         out.append('no station is held or has a prior; hold one, or write [datum] kind = "inner"')
     if network["uncontrolled_pairs"]:
         out.append(
-            f"close no loop, so that nobody would notice an error in them: {_named(network['uncontrolled_pairs'])}; "
-            "measure a second way to what they lead to"
+            f"close no loop, so that nobody would notice an error in them: "
+            f"{listed(network['uncontrolled_pairs'], _MOST_NAMED)}; measure a second way to what they lead to"
         )
     return tuple(out)
-
-
-def _named(ids: Sequence[str], most: int = 12) -> str:
-    return ", ".join(ids[:most]) + (f" and {len(ids) - most} more" if len(ids) > most else "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +177,7 @@ class AddOutcome:
 
 
 def _added(what: Any) -> str:
-    return _named(what) if isinstance(what, list) else str(what)
+    return listed(what, _MOST_NAMED) if isinstance(what, list) else str(what)
 
 
 def _sigma0(summary: Any) -> str:
