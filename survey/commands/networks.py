@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from survey.commands.common import DONE, is_set, print_json, require_project, say, tested
+from survey.commands.common import DONE, is_set, print_json, require_project, say, show, tested
 from survey.commands.excluding import NAMES
 from survey.commands.parser import project_folder
 
@@ -88,11 +88,7 @@ def _add(arguments: argparse.Namespace) -> int:
     from survey.jobs.network import add_job
 
     outcome = add_job(arguments.folder, arguments.new, out=arguments.out, progress=not is_set(arguments, "quiet"))
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(outcome.text())
-        say(arguments, *(f"written: {path}" for path in outcome.outcome.paths.values()))
+    show(arguments, outcome, outcome.outcome.paths.values())
     return tested(outcome.outcome.solution["summary"])
 
 
@@ -105,11 +101,7 @@ def _remove(arguments: argparse.Namespace) -> int:
         arguments.folder, arguments.names, out=arguments.out, progress=progress, reason=arguments.reason,
         author=arguments.author,
     )  # fmt: skip
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(outcome.text())
-        say(arguments, *(f"written: {path}" for path in outcome.outcome.paths.values()))
+    show(arguments, outcome, outcome.outcome.paths.values())
     return tested(outcome.outcome.solution["summary"])
 
 

@@ -14,7 +14,8 @@ from survey.commands.common import (
     print_json,
     require_project,
     say,
-)  # fmt: skip
+    show,
+)
 from survey.commands.parser import project_folder
 
 _DESCRIPTION = """\
@@ -85,11 +86,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         arguments.jobs, arguments.navigation, arguments.place,
     )  # fmt: skip
     outcome = planning_job(arguments.folder, request, out=arguments.out, progress=not is_set(arguments, "quiet"))
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-        return DONE
-    print(outcome.text())
-    say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+    show(arguments, outcome, outcome.paths.values())
     return DONE
 
 
@@ -99,11 +96,7 @@ def _error_analysis(arguments: argparse.Namespace) -> int:
     result = error_analysis_job(
         arguments.out, n_trials=arguments.trials or 10_000, seed=arguments.seed, rms_px=arguments.pixels
     )
-    if is_set(arguments, "json"):
-        print_json(result.summary())
-        return DONE
-    print(result.text())
-    say(arguments, *(f"written: {path}" for path in result.paths.values()))
+    show(arguments, result, result.paths.values())
     return DONE
 
 
@@ -112,10 +105,7 @@ def _network(arguments: argparse.Namespace) -> int:
     from survey.jobs.network import plan_job
 
     outcome = plan_job(arguments.folder)
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(f"{outcome.text()}\nNext: labsurvey adjust {arguments.folder}")
+    show(arguments, outcome, then=f"\nNext: labsurvey adjust {arguments.folder}")
     return DONE
 
 

@@ -282,7 +282,7 @@ class Workbench:
         if mode == "cold" or self.version == 0 or not spot_places(project.spots) <= situation.known_spots:
             return None, "cold"
         survey = situation.now
-        named = tuple(_used_only(b) for b in survey.image_blocks[len(project.survey.image_blocks) :])
+        named = tuple(b.in_use() for b in survey.image_blocks[len(project.survey.image_blocks) :])
         blocks = (*project.survey.image_blocks, *(b for b in named if len(b.uv)))
         survey = replace(project.survey, image_blocks=blocks)
         survey = seen_points(survey) if project.spots else survey
@@ -545,11 +545,6 @@ def _complex(uv: FloatArray) -> list[complex]:
 
 def _n_used(block: ImageBlock) -> int:
     return len(block.uv) if block.used is None else int(block.used.sum())
-
-
-def _used_only(block: ImageBlock) -> ImageBlock:
-    rows = np.arange(len(block.uv)) if block.used is None else np.flatnonzero(block.used)
-    return replace(block, point_idx=block.point_idx[rows], uv=block.uv[rows], cov=block.cov[rows], used=None)
 
 
 def _identified(everything: Project, adjustment: Adjustment) -> tuple[ImageBlock, ...]:
