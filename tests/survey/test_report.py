@@ -398,6 +398,7 @@ def test_the_largest_are_those_of_a_whole_sorting() -> None:
     assert worst(np.empty(0), 5).tolist() == []
 
 
+@pytest.mark.slow
 def test_the_page_grows_no_further_with_the_observations() -> None:
     small, large = (lab_adjustment(Lab(n_epochs=n, n_beacons=60)) for n in (150, 600))
     assert 2 * len(small.image_residuals.test) > observations.MOST
