@@ -10,6 +10,7 @@ from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.graph.solver import Solved, SolveOptions, settled, solve
 from adjust.lenses.models import MODELS, camera_constants, monotone_radius_px, principal_point_px
+from adjust.model.errors import listed
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, Survey
@@ -89,10 +90,9 @@ def rejections(survey: Survey, given: Survey) -> tuple[str, ...]:
         names = [ids[int(i)] for i in block.point_idx[~block.used] if int(i) not in old]
         if not names:
             continue
-        more = f" and {len(names) - 8} more" if len(names) > 8 else ""
         out.append(
             f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}: left out as "
-            f"gross errors: {', '.join(names[:8])}{more}"
+            f"gross errors: {listed(names, 8)}"
         )
     return tuple(out)
 

@@ -6,7 +6,7 @@ import numpy as np
 from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import BLIND, Stacking, gauge, independent_rows, stacking, times, visible_keys
-from adjust.model.errors import IndeterminateError
+from adjust.model.errors import IndeterminateError, listed
 from adjust.model.survey import FloatArray, Station
 from adjust.observations.images.bundle_hidden import BundleHidden
 
@@ -252,9 +252,8 @@ def _rest(graph: AdjustmentGraph, stack: Stacking, null: FloatArray, lines: list
     for vector in (null @ np.linalg.inv(null[pivots])).T:
         texts = _moving(graph, stack, vector)
         names += texts
-        more = f" and {len(texts) - 6} more" if len(texts) > 6 else ""
         lines.append(
-            f"{'; '.join(texts[:6])}{more}: they move together without changing any observation; measure or hold one"
+            f"{listed(texts, 6, '; ')}: they move together without changing any observation; measure or hold one"
             if len(texts) > 1
             else f"{texts[0]}: the observations do not determine it; measure or hold it"
         )

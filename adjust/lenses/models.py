@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.lenses.radial import RadialProfile, invert_radius, radial_profile
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.survey import BoolArray, Camera, FloatArray
 from adjust.native import lenses as kernels
 from adjust.native.parallel import run_split, split_blocks
@@ -251,9 +251,7 @@ def _arrays(*arrays: FloatArray) -> tuple[FloatArray, ...]:
 def _pixels(uv: FloatArray, which: BoolArray, shown: int = 5) -> str:
     """Some of the named pixels, for a message."""
     bad = uv[which]
-    text = ", ".join(f"({u:.1f}, {v:.1f})" for u, v in bad[:shown])
-    more = f" and {len(bad) - shown} more" if len(bad) > shown else ""
-    return f"pixels {text}{more}"
+    return f"pixels {listed([f'({u:.1f}, {v:.1f})' for u, v in bad], shown)}"
 
 
 def _require_invertible(

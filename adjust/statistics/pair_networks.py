@@ -8,7 +8,7 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust, assemble
 from adjust.graph.assembly import StartValues
-from adjust.model.errors import IndeterminateError
+from adjust.model.errors import IndeterminateError, listed
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 
@@ -66,9 +66,8 @@ def _network_solution(
     lost = [s.station_id for s in survey.stations
             if s.station_id not in reached and s.world_from_station.treatment == "free"]  # fmt: skip
     if lost:
-        more = f" and {len(lost) - 8} more" if len(lost) > 8 else ""
         raise IndeterminateError(
-            f"no measured pair ties {', '.join(lost[:8])}{more} to the datum; measure a pair to the rest, hold the "
+            f"no measured pair ties {listed(lost, 8)} to the datum; measure a pair to the rest, hold the "
             "station, or leave it out", tuple(lost),
         )  # fmt: skip
     from adjust.pose_network import NetworkOptions, solve_network  # here: a survey without pairs starts without it
@@ -99,8 +98,7 @@ def uncontrolled_pairs(result: Adjustment) -> tuple[str, ...]:
            if o.kind == "pair" and o.used and float(o.redundancy.max()) < _CONTROLLED]  # fmt: skip
     if not ids:
         return ()
-    named = ", ".join(ids[:12]) + (f" and {len(ids) - 12} more" if len(ids) > 12 else "")
     what = "pair {} closes no loop: nobody would notice an error in it" if len(ids) == 1 else (
         "pairs {} close no loop: nobody would notice an error in them"
     )  # fmt: skip
-    return (what.format(named) + "; measure a second way to what it leads to",)
+    return (what.format(listed(ids, 12)) + "; measure a second way to what it leads to",)

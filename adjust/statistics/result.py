@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 
+from adjust.model.errors import listed
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.testing.criteria import Criteria
@@ -231,9 +232,8 @@ class WeakDirection:
 
     def text(self, most: int = 6) -> str:
         """For people."""
-        named = ", ".join(f"{' '.join(p.name)} {p.component} {p.amount:+.2g} {p.unit}" for p in self.parts[:most])
-        more = f" and {len(self.parts) - most} more" if len(self.parts) > most else ""
-        return f"{self.inflation:.3g} times weaker together than alone: {named}{more}"
+        named = [f"{' '.join(p.name)} {p.component} {p.amount:+.2g} {p.unit}" for p in self.parts]
+        return f"{self.inflation:.3g} times weaker together than alone: {listed(named, most)}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,17 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from survey.commands.common import is_set, not_negative, positive, postpone, print_json, require_project, say, tested
+from survey.commands.common import (
+    is_set,
+    not_negative,
+    positive,
+    postpone,
+    print_json,
+    require_project,
+    say,
+    show,
+    tested,
+)
 from survey.commands.parser import project_folder
 
 if TYPE_CHECKING:
@@ -83,11 +93,7 @@ def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
         folder, out=arguments.out, progress=not is_set(arguments, "quiet"), redetect=arguments.redetect,
         method=arguments.method,
     )
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(outcome.text())
-        say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+    show(arguments, outcome, outcome.paths.values())
     if is_set(arguments, "verbose"):
         say(arguments, *(f"{step}: {seconds:.2f} s" for step, seconds in outcome.run.seconds.items()))
     return tested(outcome.solution["summary"])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from adjust.model.result import Adjustment
-from survey.report.published import head_rows, worst_pairs
+from survey.report.sections.published import head_rows, worst_pairs
 from survey.solution.dictionary import RunInfo, solution_dict
 
 _WIDTH = 100

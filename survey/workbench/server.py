@@ -23,7 +23,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from adjust.model.errors import SurveyError
 from survey.folder.locking import BusyError
-from survey.solution.runs import pin_run
+from survey.solution.earlier.runs import pin_run
 from survey.workbench import cameras, guard, pictures, views
 from survey.workbench.session import CancelledError, ChangedError, Workbench
 

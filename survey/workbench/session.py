@@ -40,9 +40,9 @@ from survey.project.exclusions import Exclusion, Name, Row, appended, in_force, 
 from survey.project.observed import Hits, Observed, union
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, SpotBlock
 from survey.project.reading import leaving_out, read_all
-from survey.solution.changes import Changes, Snapshot, snapshot, solution_changes
+from survey.solution.earlier.changes import Changes, Snapshot, snapshot, solution_changes
+from survey.solution.earlier.runs import definition_of, find_run, load_run, remove_empty
 from survey.solution.quantities import Scale, scale_of
-from survey.solution.runs import definition_of, find_run, load_run, remove_empty
 from survey.solution.statistics import Statistics, statistics_of
 from survey.workbench.rows import PointRows, point_rows
 
@@ -282,7 +282,7 @@ class Workbench:
         if mode == "cold" or self.version == 0 or not spot_places(project.spots) <= situation.known_spots:
             return None, "cold"
         survey = situation.now
-        named = tuple(_used_only(b) for b in survey.image_blocks[len(project.survey.image_blocks) :])
+        named = tuple(b.in_use() for b in survey.image_blocks[len(project.survey.image_blocks) :])
         blocks = (*project.survey.image_blocks, *(b for b in named if len(b.uv)))
         survey = replace(project.survey, image_blocks=blocks)
         survey = seen_points(survey) if project.spots else survey
@@ -545,11 +545,6 @@ def _complex(uv: FloatArray) -> list[complex]:
 
 def _n_used(block: ImageBlock) -> int:
     return len(block.uv) if block.used is None else int(block.used.sum())
-
-
-def _used_only(block: ImageBlock) -> ImageBlock:
-    rows = np.arange(len(block.uv)) if block.used is None else np.flatnonzero(block.used)
-    return replace(block, point_idx=block.point_idx[rows], uv=block.uv[rows], cov=block.cov[rows], used=None)
 
 
 def _identified(everything: Project, adjustment: Adjustment) -> tuple[ImageBlock, ...]:

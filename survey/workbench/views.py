@@ -14,11 +14,11 @@ from adjust.model.result import Adjustment
 from survey.folder.text import suggestion
 from survey.project.observed import name_of_residual
 from survey.report.scene import scene_of
-from survey.solution.changes import snapshot
 from survey.solution.dictionary import plain, solution_dict
+from survey.solution.earlier.changes import snapshot
+from survey.solution.earlier.runs import list_runs
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import ARCSEC_PER_RAD, sigma_unit_for_people, sigmas_of, status_of, unit_for_people
-from survey.solution.runs import list_runs
 from survey.solution.verdict import suspects
 from survey.workbench.rows import BY_THIS_RUN, IN_USE, columns, reading_rows
 from survey.workbench.session import Workbench

@@ -135,6 +135,7 @@ def test_arrow_writes_numbers_of_every_size_as_python_does() -> None:
     assert csv_rows({"x": values, "y": values}).decode().splitlines() == [f"{v!r},{v!r}" for v in values.tolist()]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_a_large_table_comes_back_as_it_was_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(4)
@@ -152,6 +153,7 @@ def test_a_large_table_comes_back_as_it_was_written(tmp_path: Path, monkeypatch:
     assert table.text("a_id").values() == ids
 
 
+@pytest.mark.slow
 def test_a_small_table_loads_no_arrow_and_a_large_one_no_pandas(tmp_path: Path) -> None:
     for name, n in (("small", 100), ("large", 150_000)):
         (tmp_path / f"{name}.csv").write_text(HEADER + "p1,1.25,g,0.125\n" * n)

@@ -12,12 +12,13 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ImageResiduals
 from adjust.model.survey import Survey
 from survey.project.detected import DetectedImage
-from survey.report import drawing, markup, observations, report_html, summary_text, unknowns
+from survey.report import drawing, markup, report_html, summary_text
 from survey.report.charts import CameraResiduals, histogram, mean_field, vector_field
 from survey.report.context import worst
 from survey.report.language import esc
 from survey.report.picture import perspective, pictures, plan
 from survey.report.scene import Scene, Spot, enlargement, scene_of
+from survey.report.sections import observations, unknowns
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.quantities import scale_of
 from tests.survey.adjustments import Lab, correlate, lab_adjustment
@@ -397,6 +398,7 @@ def test_the_largest_are_those_of_a_whole_sorting() -> None:
     assert worst(np.empty(0), 5).tolist() == []
 
 
+@pytest.mark.slow
 def test_the_page_grows_no_further_with_the_observations() -> None:
     small, large = (lab_adjustment(Lab(n_epochs=n, n_beacons=60)) for n in (150, 600))
     assert 2 * len(small.image_residuals.test) > observations.MOST

@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 
 from adjust.model.errors import SurveyError
-from survey.report import observations, report_html
 from survey.report import page as printing
+from survey.report import report_html
 from survey.report.drawing import DARK
+from survey.report.sections import observations
 from survey.solution.dictionary import RunInfo
 from tests.survey.adjustments import Lab, lab_adjustment
 

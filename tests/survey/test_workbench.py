@@ -15,8 +15,8 @@ from survey.cli import main
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.excluding import exclude_job
 from survey.project import read
-from survey.solution.changes import snapshot, solution_changes
-from survey.solution.runs import MOST, list_runs, load_run
+from survey.solution.earlier.changes import snapshot, solution_changes
+from survey.solution.earlier.runs import MOST, list_runs, load_run
 from survey.workbench import views
 from survey.workbench.pictures import picture
 from survey.workbench.rows import BY_PEOPLE, IN_USE, columns, point_rows

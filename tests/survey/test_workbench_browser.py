@@ -21,6 +21,7 @@ from survey.workbench.server import WEB, Listening, Server
 from survey.workbench.session import Workbench
 from tests.survey.test_report_browser import CONTRAST, need_browser
 
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 WRONG = ("tX05", "X", "board", "c40")  # an image point that is moved by 4 px
 NAME = "X/tX05/board/c40"
 SECONDS = 30.0

@@ -139,6 +139,7 @@ def test_the_socket_needs_origin_and_token(mine):
             assert "progress" in kinds
 
 
+@pytest.mark.slow
 def test_a_mistake_is_found_seen_left_out_and_taken_back(mine):
     name = wrong_point(mine)
     with page(mine) as client:
@@ -171,6 +172,7 @@ def test_a_mistake_is_found_seen_left_out_and_taken_back(mine):
         assert all(c["sigmas"] < 1e-6 for c in same["components"] if c["sigmas"] is not None)
 
 
+@pytest.mark.slow
 def test_the_command_line_and_two_pages_lose_nothing_of_each_other(mine):
     first, second = image_of(mine), "right/" + image_of(mine).split("/")[1]
     with page(mine) as a, page(mine) as b:

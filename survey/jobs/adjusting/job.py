@@ -20,8 +20,8 @@ from survey.jobs.detecting import author_name, detect_in, detect_job, remember_i
 from survey.project import Project, read
 from survey.project.project import RESULTS
 from survey.report.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, solution_dict, summary_text
+from survey.solution.earlier.runs import record_run, remove_empty
 from survey.solution.quantities import USUAL, scale_of
-from survey.solution.runs import record_run, remove_empty
 from survey.solution.statistics import Statistics, statistics_of
 
 _PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-headless")

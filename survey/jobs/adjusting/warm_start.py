@@ -22,7 +22,7 @@ from adjust.start import find_start
 from adjust.statistics.pair_networks import is_pure
 from survey.jobs.adjusting.steps import adjust_project
 from survey.project import Project
-from survey.solution.previous import Previous
+from survey.solution.earlier.previous import Previous
 
 WARM, COLD = "from the previous solution", "from the beginning"
 

@@ -1,6 +1,6 @@
 """A survey less the observations that concern positions it is to do without."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -38,14 +38,26 @@ def only_between(survey: Survey, keep: Callable[[PositionRef], bool]) -> Survey:
     )
 
 
+def with_points(survey: Survey, kept: Sequence[int]) -> Survey:
+    """The survey with these of its world points (positions in ``points``), less all that was observed of the others."""
+    if len(kept) == len(survey.points):
+        return survey
+    new = np.full(len(survey.points), -1, dtype=np.int64)
+    new[list(kept)] = np.arange(len(kept))
+    blocks = []
+    for block in survey.image_blocks:
+        if block.target_id is None:
+            left = block.part(new[block.point_idx] >= 0)
+            block = replace(left, point_idx=new[left.point_idx])
+        blocks += [block] if len(block.uv) else []
+    ids = {survey.points[i].point_id for i in kept}
+    less = only_between(survey, lambda ref: ref.frame is not None or ref.point_id in ids)
+    return replace(less, points=tuple(survey.points[i] for i in kept), image_blocks=tuple(blocks))
+
+
 def in_use(survey: Survey) -> Survey:
     """The survey less the image points and table readings that are not used: for what predicts nothing of them."""
-    blocks = tuple(
-        b if b.used is None
-        else replace(b, point_idx=b.point_idx[b.used], uv=b.uv[b.used], cov=b.cov[b.used], used=None)
-        for b in survey.image_blocks
-        if b.used is None or b.used.any()
-    )  # fmt: skip
+    blocks = tuple(b.in_use() for b in survey.image_blocks if b.used is None or b.used.any())
     return replace(survey, image_blocks=blocks, table_readings=tuple(r for r in survey.table_readings if r.used))
 
 

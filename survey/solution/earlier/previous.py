@@ -21,6 +21,7 @@ from survey.solution.covariances import read_covariances
 from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind, key_of, unit_for_people
 
 # what damaged or foreign content makes the readers below raise
+_MOST_MOVES, _MOST_SHOWN = 200, 8
 _NOT_OURS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError, OSError)
 _POSES = {
     "cameras": ("station_from_camera",),
@@ -66,6 +67,40 @@ class Move:
     mm: float
     arcsec: float
     sigmas: float
+
+
+def change_dict(before: Previous | None, after: Mapping[str, Any], moved: Sequence[Move]) -> dict[str, Any]:
+    """The summary of a solution beside that of before, and the first moves, the largest first."""
+    was = {} if before is None else before.summary
+    return {
+        "redundancy_before": was.get("redundancy"),
+        "redundancy_after": after["redundancy"],
+        "sigma0_before": was.get("sigma0"),
+        "sigma0_after": after["sigma0"],
+        "n_moved_over_one_sigma": sum(m.sigmas > 1.0 for m in moved),
+        "moved": [
+            {"name": m.name, "moved_mm": m.mm, "moved_arcsec": m.arcsec, "moved_sigmas": m.sigmas}
+            for m in moved[:_MOST_MOVES]
+        ],
+    }
+
+
+def change_lines(
+    before: Previous, after: Mapping[str, Any], moved: Sequence[Move], how: str = "", what: str = "stations and points"
+) -> list[str]:
+    """The same for people."""
+    was, far = before.summary, [m for m in moved if m.sigmas > 1.0]
+    return [
+        f"redundancy {was['redundancy']} -> {after['redundancy']}, sigma0 {_sigma0(was)} -> {_sigma0(after)}{how}",
+        f"{len(far)} of {len(moved)} {what} moved by more than one of their sigmas"
+        + ("; the most" if moved and not far else ""),
+        *(f"  {m.name:<20}{m.mm:>10.3f} mm{m.arcsec:>9.1f} arcsec{m.sigmas:>8.2f} sigmas"
+          for m in (far or moved)[:_MOST_SHOWN]),
+    ]  # fmt: skip
+
+
+def _sigma0(summary: Mapping[str, Any]) -> str:
+    return "-" if summary["sigma0"] is None else f"{summary['sigma0']:.3f}"
 
 
 def read_previous(project: Project) -> Previous:

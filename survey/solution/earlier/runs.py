@@ -26,8 +26,8 @@ from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, decode, read_bytes
 from survey.project.exclusions import Exclusion, Name
 from survey.project.project import DEFINITION_FILE
-from survey.solution.changes import Snapshot, snapshot
 from survey.solution.dictionary import RunInfo, plain, solution_json
+from survey.solution.earlier.changes import Snapshot, snapshot
 
 RUNS, MOST = "runs", 50
 _RUN, _ESTIMATES, _SOLUTION = "run.json", "estimates.npz", "solution.json"

@@ -1,10 +1,13 @@
 """Surveys less some positions: what concerns them goes, what is correlated keeps what is left."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from adjust.model.observations import Distance, PositionRef, Reading, ReadingCovariance
-from adjust.model.survey import TILT, Setup, Survey, VectorParameter, Vertical
-from survey.jobs.adjusting.subnetwork import only_between, points_read
+from adjust.model.observations import Distance, FrameRef, ImageBlock, PositionRef, Reading, ReadingCovariance
+from adjust.model.subsets import only_between, points_read, with_points
+from adjust.model.survey import TILT, Point, Setup, Survey, VectorParameter, Vertical
+from adjust.statistics.outliers.undetermined_points import without_named_points
 
 A, B, C = PositionRef("A"), PositionRef("B"), PositionRef("C")
 
@@ -42,3 +45,28 @@ def test_without_readings_the_vertical_is_held() -> None:
 def test_points_that_readings_reach() -> None:
     assert points_read(survey()) == {"A", "B", "C"}
     assert points_read(only_between(survey(), lambda ref: ref != C)) == {"A", "B"}
+
+
+def test_without_a_point_observations_of_other_frames_points_of_its_name_stay() -> None:
+    board = FrameRef("target", "board")
+    images = (
+        ImageBlock("X", "e", None, np.array([2, 0, 1]), np.eye(3, 2), np.tile(np.eye(2), (3, 1, 1))),
+        ImageBlock("X", "e", "board", np.array([2]), np.eye(1, 2), np.eye(2)[None]),
+        ImageBlock("Y", "e", None, np.array([2]), np.eye(1, 2), np.eye(2)[None]),
+    )
+    whole = replace(
+        survey(),
+        points=tuple(Point(name) for name in "ABC"),
+        image_blocks=images,
+        distances=(*survey().distances, Distance("bc on a board", B, PositionRef("C", board), 1.0, 1e-3)),
+        readings=(*survey().readings, Reading("5", "slope_distance", A, PositionRef("C", board), 1.0, 2e-3, "S")),
+    )
+    for less in (with_points(whole, [0, 1]), without_named_points(whole, {"C"})):
+        assert [p.point_id for p in less.points] == ["A", "B"]
+        assert [d.distance_id for d in less.distances] == ["ab", "bc on a board"]
+        assert [r.reading_id for r in less.readings] == ["1", "4", "5"]
+        assert [(b.camera_id, b.target_id, b.point_idx.tolist()) for b in less.image_blocks] == [
+            ("X", None, [0, 1]),
+            ("X", "board", [2]),
+        ]
+        np.testing.assert_array_equal(less.image_blocks[0].uv, np.eye(3, 2)[1:])
