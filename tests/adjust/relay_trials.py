@@ -51,7 +51,7 @@ def _adjusted(
     at, (a, b), X = np.arange(trials), np.triu_indices(n, 1), out.copy()
     H, good = np.empty((n - 1, 3, n - 1, 3, trials)), np.ones(trials, dtype=np.bool_)
     for iteration in range(1, most + 1):
-        here = X_a, X_b, J, more, last = [part[..., : len(at)] for part in room]
+        here = X_a, _, J, more, last = [part[..., : len(at)] for part in room]
         r = _log(_times("ji,jk", m, _turns(X, a, b, here), more))
         _times("ij,kj", _inverse_jacobian(r), X_a, J)
         if not kept:
