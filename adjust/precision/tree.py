@@ -91,9 +91,13 @@ class TreeCovariance:
 
     def marginal(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
-        n = self.number[key]
-        along = np.arange(self._dims[n])
-        cov: FloatArray = self.arrays.cov[self._own[n] + self.arrays.width[self._home[n]] * along[:, None] + along]
+        return np.asarray(self.marginals(np.array([key]), int(self.dims[key]))[0])
+
+    def marginals(self, keys: IntArray, dim: int) -> FloatArray:
+        """Covariances (n, dim, dim) of unknowns of one dimension."""
+        n, along = np.array([self.number[k] for k in keys.tolist()], dtype=np.int64), np.arange(dim)
+        first, width = self._own[n], self._width[self._home[n]]
+        cov: FloatArray = self.arrays.cov[first[:, None, None] + width[:, None, None] * along[:, None] + along]
         return cov
 
     @cached_property
