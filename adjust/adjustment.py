@@ -196,33 +196,33 @@ def assemble(
 def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
     """Every parameter, free or held, with its covariance."""
     graph, values = precision.graph, precision.solved.values
-    u, out = graph.unknowns, {}
+    u, out, found = graph.unknowns, dict[ParameterName, Estimate](), precision.every_cov()
     for name, slot in u.slot_of.items():
         if name[0] == "table_motion":
             continue
         key = u.slot_key[slot]
         pose = u.slot_pose[slot] if key is None else values.atPose3(key)
-        cov = np.zeros((6, 6)) if key is None else precision.cov(key)
+        cov = np.zeros((6, 6)) if key is None else found[key]
         status = u.status(key, u.parameters[name].treatment, 6)
         out[name] = Estimate(name, pose, POSE_COMPONENTS, POSE_UNITS, cov, status)
     for name, vector in u.vectors.items():
         cov = np.zeros((len(vector.names),) * 2)
         if vector.key is not None:
-            cov = vector.matrix @ precision.cov(vector.key) @ vector.matrix.T
+            cov = vector.matrix @ found[vector.key] @ vector.matrix.T
         out[name] = Estimate(name, vector.full(values), vector.names, vector.units, cov, vector.status)
     for point in graph.survey.points:
         name = ("point", point.point_id)
         treatment = point.x_in_world.treatment
         free = u.by_name.get(name)
         x = u.held_points[point.point_id] if free is None else np.asarray(values.atPoint3(free.key))
-        cov = np.zeros((3, 3)) if free is None else precision.cov(free.key)
+        cov = np.zeros((3, 3)) if free is None else found[free.key]
         status = u.status(free.key if free else None, treatment, 3)
         out[name] = Estimate(name, x, ("x", "y", "z"), ("m",) * 3, cov, status)
     for name, unknown in u.by_name.items():
         if name[0] == "table_angles":
             n = unknown.dim
             out[name] = Estimate(name, np.asarray(values.atVector(unknown.key)), unknown.components, ("rad",) * n,
-                                 precision.cov(unknown.key), ("free",) * n)  # fmt: skip
+                                 found[unknown.key], ("free",) * n)  # fmt: skip
     return out
 
 

@@ -100,7 +100,7 @@ class AdjustmentGraph:
     bundles: tuple[BundleBatch, ...]
     image_order: list[tuple[int, int]]
     singles: list[ObservationFactor]
-    others_graph: gtsam.NonlinearFactorGraph
+    singles_graph: gtsam.NonlinearFactorGraph
     terrestrial: TerrestrialBatch | None = None
     reduction: PoseReduction | None = None
     pairs: "PairBatch | None" = None
@@ -114,6 +114,29 @@ class AdjustmentGraph:
         items, rest = self.pairs.items(self.survey.pairs), iter(self.singles)
         within = dict(zip((self.first_pair + self.pairs.rows).tolist(), items, strict=True))
         return [within[i] if i in within else next(rest) for i in range(len(within) + len(self.singles))]
+
+    @cached_property
+    def others_graph(self) -> gtsam.NonlinearFactorGraph:
+        """The factors of :attr:`others` that take part, and what holds single components."""
+        if self.pairs is None:
+            return self.singles_graph
+        graph = gtsam.NonlinearFactorGraph(self.singles_graph)
+        self.pairs.add_factors(graph)
+        return graph
+
+    @cached_property
+    def only_pairs(self) -> bool:
+        """Whether nothing but pairs between fixed stations is observed, and whole poses (priors) beside them."""
+        if self.pairs is None or self.survey.image_blocks or self.terrestrial is not None or self.unknowns.held:
+            return False
+        alone = [item.factor.keys() for item in self.singles if item.used and item.factor.size()]
+        if any(len(keys) > 1 for keys in alone) or any(u.kind != "pose" for u in self.unknowns.by_key.values()):
+            return False
+        return self.pairs.seen() | {keys[0] for keys in alone} == set(self.unknowns.by_key)
+
+    def keys(self, reduction: PoseReduction | None) -> list[int]:
+        """The unknowns of :meth:`view`, in ascending order."""
+        return sorted(self.unknowns.by_key) if self.only_pairs else list(self.view(reduction).keyVector())
 
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -205,6 +228,8 @@ class AdjustmentGraph:
         """Weighted square sum v'Pv of the last evaluation."""
         images = float(self.images.chi.sum()) + sum(bundle.chi_square for bundle in self.bundles)
         readings = self.terrestrial.chi_square if self.terrestrial is not None else 0.0
+        if self.only_pairs and self.pairs is not None:
+            return float(np.sum(self.pairs.rows_here()[0] ** 2)) + 2.0 * float(self.singles_graph.error(at.values))
         with self.state.serving():
             return images + readings + 2.0 * float(self.others_graph.error(at.values))
 
@@ -311,8 +336,6 @@ class GraphBuilder:
         for item in self.others:
             if item.used:
                 others.add(item.factor)
-        if pairs is not None:
-            pairs.add_factors(others)
         for factor in self._holds():
             others.add(factor)
         known = [(i, b) for i, free, b in split if not free]

@@ -18,7 +18,7 @@ _READABLE = {"rx": "rotation x", "ry": "rotation y", "rz": "rotation z", "tx": "
 
 def unobserved_unknowns(graph: AdjustmentGraph) -> list[str]:
     """Unknowns that occur in no factor at all."""
-    seen = set(graph.system.keyVector())
+    seen = set(graph.keys(graph.reduction))
     if graph.reduction is not None:
         seen |= set(graph.reduction.hidden)
     for bundle in graph.bundles:

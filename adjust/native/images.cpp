@@ -1,11 +1,12 @@
 // What Python calls of lenses, image points, views, planes, trees, reduced poses and simulated networks.
 #include "calibration.h"
+#include "chains.h"
 #include "planes.h"
 #include "reduction.h"
 
 extern "C" __attribute__((visibility("default"))) const Entry *images() {
     static constexpr Entry table[] = {
-        entry<lens_rows>("lens_rows"), entry<tangents_of>("tangents_of"), entry<normal_equations>("normal_equations"), entry<errors>("errors"),
+        entry<evaluate_chains>("evaluate_chains"), entry<lens_rows>("lens_rows"), entry<tangents_of>("tangents_of"), entry<normal_equations>("normal_equations"), entry<errors>("errors"),
         entry<block_rows>("block_rows"), entry<serve>("serve"), entry<local_by_keys>("local_by_keys"),
         entry<all_statistics>("all_statistics"), entry<reduce_poses>("reduce_poses"), entry<pose_steps>("pose_steps"),
         entry<leaf_rows>("leaf_rows"), entry<tree_block>("tree_block"), entry<invert_cliques>("invert_cliques"),

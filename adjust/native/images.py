@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.library import Function
 from adjust.native.trees import TREE, TreeArrays
 
@@ -22,6 +22,9 @@ LENSES = "kind[c] values[c,14] constants[c,4] n_free[c] n_map[c] source[c,14] co
 SEGMENTS = "segment_ptr[B+1] segment_kind[S] link[S] table[S] start[S] n[S] place[S]"
 _BATCH = f"{BLOCKS} X[3,N] shape[2,N] uv[2,N] W[3,N] {LENSES} R[B,3,3] t[B,3] warp[*,2]"
 CHAINED = "C[*,6,6] D[*,6,*]"
+_evaluate_chains = Function(
+    "evaluate_chains", "slot_R[S,3,3] slot_t[S,3] ptr[B+1] slot[L] inverse[L] R[B,3,3] t[B,3] C[L,6,6]"
+)
 _normal_equations = Function("normal_equations", f"which[*] {_BATCH} H[B,m,m] chi[B] depth[B]")
 _errors = Function("errors", f"which[*] {_BATCH} chi[B] depth[B]")
 _block_rows = Function("block_rows", f"which[g] {_BATCH} out[g,*,*]")
@@ -119,6 +122,14 @@ class KeyArrays(NamedTuple):
     ptr: IntArray
     key: IntArray
     place: IntArray
+
+
+def fill_chains(
+    slot_R: FloatArray, slot_t: FloatArray, ptr: IntArray, slot: IntArray, inverse: BoolArray, R: FloatArray,
+    t: FloatArray, C: FloatArray,
+) -> None:  # fmt: skip
+    """Poses R (B, 3, 3), t (B, 3) of chains and their derivatives C (links, 6, 6) by every link."""
+    _evaluate_chains(slot_R, slot_t, ptr, slot, inverse, R, t, C)
 
 
 def normal_equations(which: IntArray, at: BlocksAt, H: FloatArray, chi: FloatArray, depth: FloatArray) -> None:

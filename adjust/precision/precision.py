@@ -179,8 +179,11 @@ class Precision:
         return [i for i in range(len(self.graph.others)) if i not in within]
 
     def covs(self, keys: IntArray, dim: int) -> FloatArray:
-        """Covariances (n, dim, dim) of many unknowns of the same dimension, none of them hidden."""
-        Q = self.tree.pairs(keys, np.full(len(keys), -1), dim)[:, :dim, :dim]
+        """Covariances (n, dim, dim) of many unknowns of the same dimension."""
+        Q = np.empty((len(keys), dim, dim))
+        below = np.array([k in self.hidden for k in keys.tolist()], dtype=np.bool_)
+        Q[below] = np.array([self.hidden[k] for k in keys[below].tolist()]).reshape(-1, dim, dim)
+        Q[~below] = self.tree.marginals(keys[~below], dim)
         t = self.transformation
         if t is not None:
             G, W = (np.array([of[k] for k in keys.tolist()]) for of in (t.motions, t.spread))
@@ -190,6 +193,13 @@ class Precision:
             if held := list(self.graph.unknowns.held.get(key, ())):
                 Q[i, held], Q[i, :, held] = 0.0, 0.0
         return Q
+
+    def every_cov(self) -> dict[int, FloatArray]:
+        """Covariance (dim, dim) of every unknown."""
+        of_dim: dict[int, list[int]] = {}
+        for key, unknown in self.graph.unknowns.by_key.items():
+            of_dim.setdefault(unknown.dim, []).append(key)
+        return {k: Q for dim, keys in of_dim.items() for k, Q in zip(keys, self.covs(np.array(keys), dim), strict=True)}
 
     def pair_covariances(self) -> dict[str, FloatArray]:
         """Covariances (k, k) of the adjusted pairs by id, a priori, in the tangent in frame a."""

@@ -12,7 +12,19 @@ from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
 from adjust.model.survey import PoseParameter
-from adjust.native import bundles, images, lenses, loops, navigation, reduction, trees, views, vision
+from adjust.native import (
+    bundles,
+    elimination,
+    images,
+    lenses,
+    loops,
+    navigation,
+    pairs,
+    reduction,
+    trees,
+    views,
+    vision,
+)
 from adjust.native.library import Function
 from adjust.navigation import navigate
 from adjust.pose_network import solve_network
@@ -39,7 +51,7 @@ from tests.adjust.navigation import (
 from tests.adjust.terrestrial_networks import measured, polar_network
 from tests.adjust.test_image_reduction import near, warped_stereo
 
-_MODULES = (lenses, images, trees, reduction, bundles, navigation, views, vision, loops)
+_MODULES = (lenses, images, trees, reduction, bundles, navigation, views, vision, loops, pairs, elimination)
 FUNCTIONS = {f.name: f for module in _MODULES for f in vars(module).values() if isinstance(f, Function)}
 """All functions of the core that have a face in Python."""
 _KEPT = 2
@@ -102,7 +114,7 @@ def _images() -> None:
     batch = graph.images
     batch.rows(np.array([0]))
     batch.local_from_keys(np.array([0]))
-    solve_network(pose_networks.simulate(3, 2).network)
+    solve_network(pose_networks.simulate(3, 2).network).precision.pairs  # noqa: B018  # is computed when asked for
     loop_basis(topology([(a + b, a, b) for a, b in ("AB", "BC", "CA", "CD", "DA")]))
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
     graph, done = h.solved(survey, near(truth))  # nothing to reduce: every block is condensed for itself

@@ -21,7 +21,7 @@ from tests.adjust.native_calls import FUNCTIONS, Call, calls
 ROOT = Path(__file__).parents[2]
 RUNNABLE = instruction_sets()
 _WORK = ("work", "row")  # scratch, of which nothing is expected afterwards
-_BY_LANES = ("covariance_room",)  # answers with the padded size of scratch
+_BY_LANES = ("covariance_room", "elimination_room")  # answer with the padded size of scratch
 _SUMS_THAT_CANCEL = ("influence",)
 """Shares of a point in large covariances that cancel: what is left is compared, what was summed is larger."""
 _CONDITIONED = {("fit_lens", "cov"): 1e-9}
