@@ -223,7 +223,8 @@ class AdjustmentGraph:
         known, unknown = (np.concatenate(p) if p else rows[:0] for p in parts)
         return known, unknown
 
-    def _joined(self, known: _Rows, unknown: _Rows) -> _Rows:
+    def joined(self, known: _Rows, unknown: _Rows) -> _Rows:
+        """Rows of the image batch and of the bundle in the order of ``Survey.image_blocks``."""
         if self.bundle is None:
             return known
         out, at = [], [0, 0]
@@ -237,12 +238,12 @@ class AdjustmentGraph:
     def used(self) -> BoolArray:
         """Which image points (N,) take part, in the order of ``Survey.image_blocks``."""
         none: BoolArray = np.zeros(0, dtype=np.bool_)
-        return self._joined(self.images.used, none if self.bundle is None else self.bundle.unsorted(self.bundle.used))
+        return self.joined(self.images.used, none if self.bundle is None else self.bundle.unsorted(self.bundle.used))
 
     def square_roots(self) -> FloatArray:
         """Square root information (N, 3) of the image points: w00, w01, w11, as ``Survey.image_blocks`` are ordered."""
         none = np.zeros((0, 3))
-        return self._joined(self.images.W_all, none if self.bundle is None else self.bundle.unsorted(self.bundle.W_all))
+        return self.joined(self.images.W_all, none if self.bundle is None else self.bundle.unsorted(self.bundle.W_all))
 
     def set_weights(self, weights: FloatArray) -> None:
         """Weights (N,) of the image points, on top of their covariance; zero leaves a point out."""
@@ -255,7 +256,7 @@ class AdjustmentGraph:
         """Weighted squares v' inv(Q_ll) v (N,) of all image points at ``values``, whatever their weight."""
         self.prepare(values, jacobians=False)
         bundle = self.bundle.whitened_squares(values) if self.bundle is not None else np.zeros(0)
-        return self._joined(self.images.whitened_squares(), bundle)
+        return self.joined(self.images.whitened_squares(), bundle)
 
     def behind_camera(self) -> list[ImageBlock]:
         """Blocks with a point behind their camera at the prepared values."""

@@ -1,6 +1,7 @@
 // What Python calls of lenses, image points, views, planes, trees, reduced poses and simulated networks.
 #include "calibration.h"
 #include "planes.h"
+#include "point_tests.h"
 #include "reduction.h"
 
 extern "C" __attribute__((visibility("default"))) const Entry *images() {
@@ -14,6 +15,8 @@ extern "C" __attribute__((visibility("default"))) const Entry *images() {
         entry<refine_views>("refine_views"), entry<errors_of_views>("errors_of_views"),
         entry<offsets_of_views>("offsets_of_views"), entry<homographies>("homographies"),
         entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<turns_by>("turns_by"),
-        entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), {nullptr, nullptr, nullptr}};
+        entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), entry<residual_tests>("residual_tests"),
+        entry<controlled_directions>("controlled_directions"), entry<point_tests>("point_tests"),
+        entry<bias_ellipses>("bias_ellipses"), {nullptr, nullptr, nullptr}};
     return table;
 }

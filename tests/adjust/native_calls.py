@@ -12,7 +12,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
 from adjust.model.survey import PoseParameter
-from adjust.native import bundles, images, lenses, loops, navigation, reduction, trees, views, vision
+from adjust.native import bundles, images, lenses, loops, navigation, point_tests, reduction, trees, views, vision
 from adjust.native.library import Function
 from adjust.navigation import navigate
 from adjust.pose_network import solve_network
@@ -39,7 +39,7 @@ from tests.adjust.navigation import (
 from tests.adjust.terrestrial_networks import measured, polar_network
 from tests.adjust.test_image_reduction import near, warped_stereo
 
-_MODULES = (lenses, images, trees, reduction, bundles, navigation, views, vision, loops)
+_MODULES = (lenses, images, trees, reduction, bundles, navigation, views, vision, loops, point_tests)
 FUNCTIONS = {f.name: f for module in _MODULES for f in vars(module).values() if isinstance(f, Function)}
 """All functions of the core that have a face in Python."""
 _KEPT = 2
@@ -97,6 +97,11 @@ def _images() -> None:
     graph, done = h.solved(survey, near(truth))
     precision = Precision(graph, done)
     image_residuals(precision)
+    points, lambda0 = precision.image_points, np.array([17.0, 19.0])
+    n = len(points.v)
+    point_tests.controlled_directions(points, np.zeros(n, dtype=np.int64))
+    point_tests.point_tests(points, lambda0, tuple(np.zeros((n,) if i < 5 else (n, 2)) for i in range(9)))
+    point_tests.bias_ellipses(points, lambda0)
     names = list(graph.unknowns.by_name)
     precision.joint([names[0], names[-1]])
     batch = graph.images
