@@ -12,7 +12,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
 from adjust.model.survey import PoseParameter
-from adjust.native import bundles, images, lenses, loops, navigation, point_tests, reduction, trees, views, vision
+from adjust.native import bundles, images, lenses, loops, navigation, point_tests, reduction, text, trees, views, vision
 from adjust.native.library import Function
 from adjust.navigation import navigate
 from adjust.pose_network import solve_network
@@ -39,7 +39,7 @@ from tests.adjust.navigation import (
 from tests.adjust.terrestrial_networks import measured, polar_network
 from tests.adjust.test_image_reduction import near, warped_stereo
 
-_MODULES = (lenses, images, trees, reduction, bundles, navigation, views, vision, loops, point_tests)
+_MODULES = (lenses, images, trees, reduction, bundles, navigation, views, vision, loops, point_tests, text)
 FUNCTIONS = {f.name: f for module in _MODULES for f in vars(module).values() if isinstance(f, Function)}
 """All functions of the core that have a face in Python."""
 _KEPT = 2
@@ -102,6 +102,8 @@ def _images() -> None:
     point_tests.controlled_directions(points, np.zeros(n, dtype=np.int64))
     point_tests.point_tests(points, lambda0, tuple(np.zeros((n,) if i < 5 else (n, 2)) for i in range(9)))
     point_tests.bias_ellipses(points, lambda0)
+    words = text.Words.of(["a", "bc", ""])
+    text.number_rows(words, np.array([0, 1, 2]), words, np.array([1, 1, 0]), points.v[:3], [3, 0])
     names = list(graph.unknowns.by_name)
     precision.joint([names[0], names[-1]])
     batch = graph.images
