@@ -78,7 +78,7 @@ def image_residuals_csv(adjustment: Adjustment) -> bytes:
 
     def text(first: int) -> bytes:
         part = slice(first, first + _CHUNK)
-        values = np.column_stack([x[part] for x in numbers])
+        values: FloatArray = np.column_stack([x[part] for x in numbers]).astype(np.float64)
         made = number_rows(heads, rows.block[part], points, rows.point[part], values, _DECIMALS)
         return made if made is not None else _by_one(adjustment, rows, part, values)
 
