@@ -124,9 +124,19 @@ class LinearSystem:
     @cached_property
     def sigmas(self) -> FloatArray:
         """A priori sigmas (n,) of the unknowns, in the survey's datum."""
-        by_name, out = self.precision.graph.unknowns.by_name, np.zeros(len(self.columns))
-        for name, at in self.columns.at.items():
-            out[at] = np.sqrt(np.diag(self.precision.cov(by_name[name].key)))[self.columns.free[name]]
+        out = np.zeros(len(self.columns))
+        for k in {len(at) for at in self.columns.at.values()}:
+            mine = np.array([at for at in self.columns.at.values() if len(at) == k])
+            out[mine] = np.sqrt(np.diagonal(self.own_covariances(mine), axis1=1, axis2=2))
+        return out
+
+    def own_covariances(self, columns: IntArray) -> FloatArray:
+        """A priori covariances (u, k, k) of u unknowns, in the survey's datum; columns: (u, k) of all free components."""
+        by_name, out = self.precision.graph.unknowns.by_name, np.empty((*columns.shape, columns.shape[1]))
+        for i, first in enumerate(columns[:, 0].tolist() if columns.size else []):
+            name = self.columns.names[first]
+            free = self.columns.free[name]
+            out[i] = self.precision.cov(by_name[name].key)[free[:, None], free]
         return out
 
 
@@ -387,6 +397,11 @@ class Entries:
         if not self.parts:
             return sparse.csr_matrix(shape)
         r, c, v = (np.concatenate(x) for x in zip(*self.parts, strict=True))
+        if (r[1:] >= r[:-1]).all():  # row by row already
+            ptr = np.searchsorted(r, np.arange(shape[0] + 1))
+            out = sparse.csr_matrix((v, c, ptr), shape=shape)
+            out.sum_duplicates()
+            return out
         return sparse.csr_matrix((v, (r, c)), shape=shape)
 
 

@@ -91,15 +91,15 @@ def _variances(system: LinearSystem, index: IntArray) -> FloatArray:
 
 def _within(system: LinearSystem, number: IntArray, limit: float) -> list[tuple[int, int, float]]:
     """Pairs of components of one unknown that is not compared with others."""
-    by_name, out = system.precision.graph.unknowns.by_name, list[tuple[int, int, float]]()
-    for name, at in system.columns.at.items():
-        if len(at) > 1 and (number[at] < 0).all():
-            free = system.columns.free[name]
-            Q = system.precision.cov(by_name[name].key)[np.ix_(free, free)]
-            d = np.sqrt(np.maximum(np.diag(Q), 1e-300))
-            C = np.triu(Q / np.outer(d, d), 1)
-            a, b = np.nonzero(np.abs(C) >= limit)
-            out += zip(at[a].tolist(), at[b].tolist(), C[a, b].tolist(), strict=True)
+    apart = [at for at in system.columns.at.values() if len(at) > 1 and (number[at] < 0).all()]
+    out = list[tuple[int, int, float]]()
+    for k in sorted({len(at) for at in apart}):
+        columns = np.array([at for at in apart if len(at) == k])
+        C = system.own_covariances(columns)
+        d = np.sqrt(np.maximum(np.diagonal(C, axis1=1, axis2=2), 1e-300))
+        C = np.triu(C / (d[:, :, None] * d[:, None, :]), 1)
+        i, a, b = np.nonzero(np.abs(C) >= limit)
+        out += zip(columns[i, a].tolist(), columns[i, b].tolist(), C[i, a, b].tolist(), strict=True)
     return out
 
 
