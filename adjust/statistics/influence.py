@@ -55,7 +55,7 @@ def influences(
 
 
 def _positions(system: LinearSystem) -> tuple[list[ParameterName], IntArray, IntArray]:
-    """Unknowns that are positions in the world, the columns of all their coordinates, and where each begins in these."""
+    """Unknowns that are positions in the world, the columns of all their coordinates, where each begins in these."""
     names, columns, starts = list[ParameterName](), list[int](), list[int]()
     components = system.columns.components
     for name, at in system.columns.at.items():

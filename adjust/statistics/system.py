@@ -131,7 +131,7 @@ class LinearSystem:
         return out
 
     def own_covariances(self, columns: IntArray) -> FloatArray:
-        """A priori covariances (u, k, k) of u unknowns, in the survey's datum; columns: (u, k) of all free components."""
+        """A priori covariances (u, k, k) in the survey's datum of unknowns whose free components are columns (u, k)."""
         by_name, out = self.precision.graph.unknowns.by_name, np.empty((*columns.shape, columns.shape[1]))
         for i, first in enumerate(columns[:, 0].tolist() if columns.size else []):
             name = self.columns.names[first]

@@ -13,7 +13,7 @@ from survey.report import report_html, summary_text
 from survey.report.page import report_pdf
 from survey.solution.covariances import covariance_npz
 from survey.solution.dictionary import RunInfo, solution_dict, solution_json
-from survey.solution.residual_tables import image_residuals_csv, other_residuals_csv
+from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
 from survey.solution.statistics import Statistics
 
 __all__ = [
@@ -30,10 +30,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """language: of report.html, "en" or "de". pdf: write report.pdf too."""
+    """language: of report.html, "en" or "de". pdf, parquet: write report.pdf, residuals.parquet too."""
 
     language: str = "en"
     pdf: bool = False
+    parquet: bool = False
 
 
 ENGLISH_PAGE = ReportOptions()
@@ -76,6 +77,7 @@ def make_results(
     makers: Mapping[str, Callable[[], bytes]] = {
         "covariance.npz": lambda: covariance_npz(adjustment, run.sigmas),
         "residuals.csv": lambda: image_residuals_csv(adjustment),
+        **({"residuals.parquet": lambda: image_residuals_parquet(adjustment)} if options.parquet else {}),
         "residuals_other.csv": lambda: other_residuals_csv(adjustment),
         "report.html": page.encode,
         **({"report.pdf": lambda: pdf} if options.pdf else {}),

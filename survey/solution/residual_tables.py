@@ -7,14 +7,17 @@ import csv
 import io
 from dataclasses import dataclass
 from math import isfinite
+from typing import Any
 
 import numpy as np
 
-from adjust.model.result import Adjustment
-from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.model.result import Adjustment, ImageResiduals
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.parallel import side_by_side
 from adjust.native.text import Words, number_rows
 from survey.folder.text import cell_text
+from survey.project.tables.arrow import parquet_bytes
+from survey.project.tables.reading import TextColumn
 from survey.solution.quantities import sigma_unit_for_people, unit_for_people
 
 IMAGE_COLUMNS = (
@@ -74,7 +77,7 @@ def image_residuals_csv(adjustment: Adjustment) -> bytes:
     names = ((cell_text(b.epoch_id), cell_text(b.camera_id), cell_text(b.target_id or "")) for b in blocks)
     heads = Words.of([",".join(map(_quoted, x)) + "," for x in names])
     points = Words.of([_quoted(cell_text(p)) for p in rows.point_ids])
-    numbers = (rows.uv, found.residuals, rows.sigmas, found.redundancy, found.standardized, found.test, found.used)
+    numbers = _numbers(rows, found)
 
     def text(first: int) -> bytes:
         part = slice(first, first + _CHUNK)
@@ -83,6 +86,27 @@ def image_residuals_csv(adjustment: Adjustment) -> bytes:
         return made if made is not None else _by_one(adjustment, rows, part, values)
 
     return b"".join([IMAGE_COLUMNS.encode() + b"\n", *side_by_side(text, range(0, rows.block.size, _CHUNK))])
+
+
+def _numbers(rows: ImageRows, found: ImageResiduals) -> tuple[FloatArray | BoolArray, ...]:
+    """What follows the names in a row."""
+    return rows.uv, found.residuals, rows.sigmas, found.redundancy, found.standardized, found.test, found.used
+
+
+def image_residuals_parquet(adjustment: Adjustment) -> bytes:
+    """``residuals.parquet``: the columns of ``residuals.csv``, its numbers in full, ``used`` as true or false."""
+    rows, blocks = image_rows(adjustment), adjustment.survey.image_blocks
+    names = IMAGE_COLUMNS.split(",")
+    columns: dict[str, Any] = {}
+    for name, words in zip(names, ([b.epoch_id for b in blocks], [b.camera_id for b in blocks],
+                                   [b.target_id or "" for b in blocks]), strict=False):  # fmt: skip
+        index = {word: i for i, word in enumerate(dict.fromkeys(words))}
+        of_block = np.array([index[word] for word in words], dtype=np.int64)
+        columns[name] = TextColumn(tuple(index), of_block[rows.block])
+    columns["point_id"] = TextColumn(rows.point_ids, rows.point)
+    parts = [x.reshape(len(x), -1) for x in _numbers(rows, adjustment.image_residuals)]
+    values = (part[:, j] for part in parts for j in range(part.shape[1]))
+    return parquet_bytes(columns | dict(zip(names[4:], values, strict=True)))
 
 
 def _by_one(adjustment: Adjustment, rows: ImageRows, part: slice, values: FloatArray) -> bytes:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
+from pyarrow import parquet
 from scipy.spatial.transform import Rotation
 
 from adjust.model.observations import FrameRef
@@ -19,7 +20,7 @@ from survey.solution.covariances import covariance_npz, read_covariances
 from survey.solution.dictionary import RunInfo, correlated, solution_dict, solution_json
 from survey.solution.frames import AdjustedFrames, table_from_mount
 from survey.solution.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry
-from survey.solution.residual_tables import image_residuals_csv, other_residuals_csv
+from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
 from survey.solution.verdict import suspects, verdict
 from tests.survey.adjustments import POSE_COMPONENTS, POSE_UNITS, Lab, correlate, lab_adjustment
 
@@ -343,6 +344,20 @@ def test_fixed_numbers_are_what_python_prints(decimals: int) -> None:
                 assert len(word.partition(".")[2]) == decimals
     with pytest.raises(IndexError):
         number_rows(none, zero + 1, none, zero, values[:, None], [decimals])
+
+
+def test_parquet_has_what_the_csv_has(adjustment: Adjustment) -> None:
+    """Its numbers in full."""
+    columns = parquet.read_table(io.BytesIO(image_residuals_parquet(adjustment))).to_pydict()
+    rows, found = rows_of(image_residuals_csv(adjustment)), adjustment.image_residuals
+    assert list(columns) == list(rows[0])
+    for name in ("epoch_id", "camera_id", "target_id", "point_id"):
+        assert columns[name] == [row[name] for row in rows]
+    np.testing.assert_array_equal(columns["residual_v_px"], found.residuals[:, 1])
+    np.testing.assert_array_equal(columns["used"], found.used)
+    for name in list(columns)[4:-1]:
+        written = np.array([float(row[name]) if row[name] else np.nan for row in rows])
+        np.testing.assert_allclose(np.array(columns[name], dtype=float), written, atol=6e-5)
 
 
 def test_numbers_too_large_for_fixed_decimals_are_written_in_full(adjustment: Adjustment) -> None:
