@@ -383,8 +383,8 @@ class Entries:
 
     def add_blocks(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
         """Values (b, r, c) at rows (b, r) and columns (b, c)."""
-        down = np.broadcast_to(rows[:, :, None], values.shape)
-        across = np.broadcast_to(columns[:, None, :], values.shape)
+        down = np.broadcast_to(rows[:, :, None].astype(np.int32), values.shape)
+        across = np.broadcast_to(columns[:, None, :].astype(np.int32), values.shape)
         kept = across >= 0
         self.parts.append((down[kept], across[kept], values[kept]))
 

@@ -30,7 +30,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """language: of report.html, "en" or "de". pdf, parquet: write report.pdf, residuals.parquet too."""
+    """How results are written.
+
+    language: of report.html, "en" or "de". pdf: report.pdf too. parquet: residuals.parquet too, which is written again
+    as long as it is there.
+    """
 
     language: str = "en"
     pdf: bool = False
@@ -38,6 +42,7 @@ class ReportOptions:
 
 
 ENGLISH_PAGE = ReportOptions()
+PARQUET = "residuals.parquet"
 
 
 def write_results(
@@ -68,16 +73,18 @@ def make_results(
 ) -> dict[str, Path]:
     """Make everything in ``place/results``; the paths by file name. Raises as :func:`write_results`.
 
+    place: in the folder whose results these replace.
     solution: of :func:`survey.solution.dictionary.solution_dict`, with the statistics.
     """
     results = place / RESULTS
+    parquet = options.parquet or (place.parent / RESULTS / PARQUET).is_file()  # there: not to be old
     page = report_html(adjustment, run, solution, statistics, options.language)
     pdf = report_pdf(page) if options.pdf else b""
     results.mkdir(parents=True, exist_ok=True)
     makers: Mapping[str, Callable[[], bytes]] = {
         "covariance.npz": lambda: covariance_npz(adjustment, run.sigmas),
         "residuals.csv": lambda: image_residuals_csv(adjustment),
-        **({"residuals.parquet": lambda: image_residuals_parquet(adjustment)} if options.parquet else {}),
+        **({PARQUET: lambda: image_residuals_parquet(adjustment)} if parquet else {}),
         "residuals_other.csv": lambda: other_residuals_csv(adjustment),
         "report.html": page.encode,
         **({"report.pdf": lambda: pdf} if options.pdf else {}),

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, Estimate, GlobalTest
 from adjust.native.text import Words, number_rows
-from survey.report.results import write_results
+from survey.report.results import ReportOptions, write_results
 from survey.solution.covariances import covariance_npz, read_covariances
 from survey.solution.dictionary import RunInfo, correlated, solution_dict, solution_json
 from survey.solution.frames import AdjustedFrames, table_from_mount
@@ -358,6 +358,16 @@ def test_parquet_has_what_the_csv_has(adjustment: Adjustment) -> None:
     for name in list(columns)[4:-1]:
         written = np.array([float(row[name]) if row[name] else np.nan for row in rows])
         np.testing.assert_allclose(np.array(columns[name], dtype=float), written, atol=6e-5)
+
+
+def test_parquet_is_written_on_request_and_then_never_old(adjustment: Adjustment, tmp_path: Path) -> None:
+    assert "residuals.parquet" not in write_results(tmp_path, adjustment, RUN)
+    asked = write_results(tmp_path, adjustment, RUN, options=ReportOptions(parquet=True))
+    asked["residuals.parquet"].write_bytes(b"of another run")
+    again = write_results(tmp_path, adjustment, RUN)["residuals.parquet"]
+    assert again.read_bytes() == image_residuals_parquet(adjustment)
+    again.unlink()
+    assert "residuals.parquet" not in write_results(tmp_path, adjustment, RUN)
 
 
 def test_numbers_too_large_for_fixed_decimals_are_written_in_full(adjustment: Adjustment) -> None:
