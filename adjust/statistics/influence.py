@@ -7,6 +7,7 @@ import numpy as np
 from adjust.graph.datum import in_world
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.parallel import side_by_side
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Influence
 from adjust.statistics.system import LinearSystem
@@ -20,7 +21,7 @@ def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, F
     rows: image points first, then all others.
     """
     system = condensed.system
-    n_points = sum(len(b.uv) for b in system.precision.graph.survey.image_blocks)
+    n_points = condensed.n_points
     right = np.zeros((len(system.columns), len(rows)))
     for i, row in enumerate(rows):
         if row < n_points:
@@ -35,23 +36,23 @@ def influences(
     condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]
 ) -> tuple[Influence, ...]:
     """The unknown and the position that each bias moves most; in the order of ``rows``."""
-    system, out = condensed.system, list[Influence]()
-    sigmas = np.where(system.sigmas > 0.0, system.sigmas, np.inf)
+    system = condensed.system
+    c, sigmas = system.columns, np.where(system.sigmas > 0.0, system.sigmas, np.inf)
     places, coordinates, starts = _positions(system)
-    for first in range(0, len(rows), _CHUNK):
-        part = rows[first : first + _CHUNK]
+    _ = system.normal  # factored before the threads ask for it
+
+    def of(first: int) -> list[Influence]:
+        part, out = rows[first : first + _CHUNK], list[Influence]()
         dx = shifts(condensed, part, bias)
         ratio = np.abs(dx) / sigmas[:, None]
-        worst = ratio.argmax(axis=0)
         length, furthest = _furthest(dx, coordinates, starts)
-        for i, row in enumerate(part):
-            j = int(worst[i])
+        for i, (row, j) in enumerate(zip(part, ratio.argmax(axis=0).tolist(), strict=True)):
             name = places[int(furthest[i])] if places else ()
-            out.append(
-                Influence(row, system.columns.names[j], system.columns.components[j], system.columns.units[j],
-                          float(dx[j, i]), float(ratio[j, i]), name, float(length[i]))
-            )  # fmt: skip
-    return tuple(out)
+            out.append(Influence(row, c.names[j], c.components[j], c.units[j], float(dx[j, i]), float(ratio[j, i]),
+                                 name, float(length[i])))  # fmt: skip
+        return out
+
+    return tuple(x for part in side_by_side(of, range(0, len(rows), _CHUNK)) for x in part)
 
 
 def _positions(system: LinearSystem) -> tuple[list[ParameterName], IntArray, IntArray]:

@@ -8,8 +8,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import scipy
 from gtsam import Values
 from scipy import sparse
@@ -368,11 +370,14 @@ def _all_columns(graph: AdjustmentGraph, columns: Columns, name: ParameterName) 
     return out
 
 
+_Numbers = npt.NDArray[np.integer[Any]]
+
+
 class Entries:
     """Dense blocks gathered into one sparse matrix; columns of -1 are left out."""
 
     def __init__(self) -> None:
-        self.parts: list[tuple[IntArray, IntArray, FloatArray]] = []
+        self.parts: list[tuple[_Numbers, _Numbers, FloatArray]] = []
 
     def add(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
         """Values (r, c) at these rows and columns."""

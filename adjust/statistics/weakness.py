@@ -6,6 +6,7 @@ import numpy as np
 
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.parallel import side_by_side
 from adjust.precision.s_transformation import without_datum_rows
 from adjust.statistics.result import Correlation, PrincipalComponent, WeakDirection, WeakPart
 from adjust.statistics.system import DENSE, FEW, LinearSystem, linear_system
@@ -63,19 +64,20 @@ def correlations(
     among = np.arange(len(c)) if names is None else index
     number = np.full(len(c), -1)
     number[index] = np.arange(len(index))
-    sigma = np.sqrt(np.maximum(_variances(system, among), 1e-300))
+    sigma = np.sqrt(np.maximum(_variances(system, np.arange(len(c))), 1e-300))
+    _ = system.normal  # factored before the threads ask for it
 
     def above(first: int) -> list[tuple[int, int, float]]:
         part = index[first : first + _AT_A_TIME]
         C = covariance_columns(system, part)[among]
-        C /= sigma[:, None]
-        C /= np.sqrt(np.maximum(_variances(system, part), 1e-300))
+        C /= sigma[among, None]
+        C /= sigma[part]
         a, b = np.nonzero(np.abs(C) >= limit)
         i, j = among[a], part[b]
         kept = np.where(number[i] < 0, True, number[i] < number[j])  # each pair once, nothing with itself
         return list(zip(i[kept].tolist(), j[kept].tolist(), C[a, b][kept].tolist(), strict=True))
 
-    found = [x for part in map(above, range(0, len(index), _AT_A_TIME)) for x in part]
+    found = [x for part in side_by_side(above, range(0, len(index), _AT_A_TIME)) for x in part]
     if names is None and len(index) < len(c):
         found += _within(system, number, limit)
     order = sorted(found, key=lambda x: (-abs(x[2]), x[0], x[1]))[:_MOST]
