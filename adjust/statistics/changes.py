@@ -223,12 +223,14 @@ class ChangeSearch:
         Y = self.system.normal.solve(X)
         P = _from_runs_on(_by_run(u, u.B))
         g = _from_runs_on(_by_run(u, e[:, None]))[:, :, 0]
-        every = (X.T @ Y).reshape(J, q, J, q)
-        twice = np.cumsum(np.cumsum(every[::-1, :, ::-1], axis=0), axis=2)[::-1, :, ::-1]
-        taken = np.einsum("jqjr->jqr", twice)[1 if J > 1 else 0 :]
+        taken, X_on, Y_on = np.empty((J, q, q)), np.zeros((len(X), q)), np.zeros((len(X), q))
+        for j in reversed(range(J)):
+            X_on += X[:, j * q : (j + 1) * q]
+            Y_on += Y[:, j * q : (j + 1) * q]
+            taken[j] = X_on.T @ Y_on
         size = np.sqrt(np.einsum("jqq->jq", P))
         scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
-        M = (P - taken) * scale[:, :, None] * scale[:, None, :]
+        M = (P - taken[1 if J > 1 else 0 :]) * scale[:, :, None] * scale[:, None, :]
         return _Candidates(u, 0.5 * (M + M.transpose(0, 2, 1)), g * scale, scale, Y)
 
     def _chosen(self, c: _Candidates, j: int, before: Sequence[_Chosen]) -> _Chosen:
@@ -276,7 +278,7 @@ def _by_run(u: Unit, other: FloatArray) -> FloatArray:
 
 
 def _from_runs_on(of_runs: FloatArray) -> FloatArray:
-    """Of what runs have (J, ...) the sums from the second on, the third on, ... (J - 1, ...); of one run what it has."""
+    """Of what runs have (J, ...) the sums from the second, the third, ... on (J - 1, ...); of one run what it has."""
     return np.asarray(np.cumsum(of_runs[::-1], axis=0)[::-1][1 if len(of_runs) > 1 else 0 :])
 
 
