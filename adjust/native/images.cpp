@@ -2,6 +2,8 @@
 #include "calibration.h"
 #include "chains.h"
 #include "planes.h"
+#include "point_tests.h"
+#include "text.h"
 #include "reduction.h"
 
 extern "C" __attribute__((visibility("default"))) const Entry *images() {
@@ -15,6 +17,8 @@ extern "C" __attribute__((visibility("default"))) const Entry *images() {
         entry<refine_views>("refine_views"), entry<errors_of_views>("errors_of_views"),
         entry<offsets_of_views>("offsets_of_views"), entry<homographies>("homographies"),
         entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<turns_by>("turns_by"),
-        entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), {nullptr, nullptr, nullptr}};
+        entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), entry<residual_tests>("residual_tests"),
+        entry<controlled_directions>("controlled_directions"), entry<point_tests>("point_tests"),
+        entry<bias_ellipses>("bias_ellipses"), entry<number_rows>("number_rows"), {nullptr, nullptr, nullptr}};
     return table;
 }

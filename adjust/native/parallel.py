@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -58,3 +59,10 @@ def run_split(kernel: Callable[..., object], runs: list[IntArray], *arguments: o
     pool = _pool(len(runs))
     for future in [pool.submit(kernel, run, *arguments) for run in runs]:
         future.result()
+
+
+def run_ranges(kernel: Callable[..., object], n: int, *arguments: object) -> None:
+    """Call ``kernel(first, last, *arguments)`` for ranges that make up 0 .. n, side by side; items do not meet."""
+    count = 1 if n < _WORTHWHILE else workers()
+    edges = [n * i // count for i in range(count + 1)]
+    side_by_side(lambda ends: kernel(*ends, *arguments), list(pairwise(edges)))

@@ -7,7 +7,7 @@ Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, ch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
@@ -25,7 +25,8 @@ from adjust.model.result import (
     ParameterName,
     ReadingResiduals,
 )
-from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
+from adjust.native.point_tests import AdjustedPoints, residual_tests
 from adjust.observations.images.batch import whitened_squares
 from adjust.observations.images.bundle_hidden import BundleHidden
 from adjust.observations.listed import ObservationFactor
@@ -35,9 +36,6 @@ from adjust.testing.distributions import chi2
 
 if TYPE_CHECKING:
     from adjust.observations.pairs import PairStatistics
-
-_AT_A_TIME = 8192
-"""Image points tested together: what is computed on the way stays in the second cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +163,19 @@ class Precision:
         return found
 
     @cached_property
+    def _images(self) -> tuple[FloatArray, FloatArray]:
+        graph = self.graph
+        v, M = graph.images.statistics(self.tree)
+        influence = zip(graph.bundles, self.bundle_influence, strict=True)
+        return (graph.joined(v, [b.unsorted(b.residuals_px()) for b in graph.bundles]),
+                graph.joined(M, [b.unsorted(of_b) for b, of_b in influence]))  # fmt: skip
+
+    @property
+    def image_points(self) -> AdjustedPoints:
+        """All image points, in the order of ``Survey.image_blocks``, with what their tests take."""
+        return AdjustedPoints(*self._images, self.graph.square_roots(), self.graph.used())
+
+    @cached_property
     def pairs(self) -> "PairStatistics":
         """Statistics of the pairs between fixed stations. Raises ValueError where there are none."""
         if self.graph.pairs is None:
@@ -242,47 +253,9 @@ def noise_of(item: ObservationFactor) -> gtsam.noiseModel.Gaussian:
 
 def image_residuals(precision: Precision) -> ImageResiduals:
     """Residuals and their statistics of all image points, in the order of ``Survey.image_blocks``."""
-    graph = precision.graph
-    images = graph.images
-    residual, influence = images.statistics(precision.tree)
-    known = _test(residual, influence, images.W_all, images.used)
-    unknown = [
-        tuple(b.unsorted(a) for a in _test(b.residuals_px(), influence, b.W_all, b.used))
-        for b, influence in zip(graph.bundles, precision.bundle_influence, strict=True)
-    ]
-    ptr = np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks])
-    return ImageResiduals(ptr, *(np.asarray(graph.joined(a, more)) for a, *more in zip(known, *unknown, strict=True)))
-
-
-def _test(v: FloatArray, M: FloatArray, W: FloatArray, used: BoolArray) -> tuple[Any, ...]:
-    n = len(v)
-    redundancy, standardized, test = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for start in range(0, n, _AT_A_TIME):
-            part = slice(start, start + _AT_A_TIME)
-            _fill_test(v[part], M[part], W[part], used[part], redundancy[part], standardized[part], test[part])
-    return v, redundancy, standardized, test, used
-
-
-def _fill_test(
-    v: FloatArray, M: FloatArray, W: FloatArray, used: BoolArray, redundancy: FloatArray, standardized: FloatArray,
-    test: FloatArray,
-) -> None:  # fmt: skip
-    sign = np.where(used, -1.0, 1.0)
-    (v0, v1), (m00, m01, m11), (w00, w01, w11) = v.T, M.T, W.T
-    q00, q01, q11 = 1.0 + sign * m00, sign * m01, 1.0 + sign * m11
-    redundancy[:, 0], redundancy[:, 1] = q00, q11
-    redundancy[~used] = 0.0
-    e0, e1 = w00 * v0 + w01 * v1, w11 * v1
-    det = q00 * q11 - q01 * q01
-    test[:] = np.where(det > 1e-9, (q11 * e0 * e0 - 2 * q01 * e0 * e1 + q00 * e1 * e1) / det, np.nan)
-    # covariance of the residuals in pixels: W^-1 Q W^-T with W upper triangular
-    i00, i11 = 1.0 / w00, 1.0 / w11
-    i01 = -w01 * i00 * i11
-    su = np.sqrt(np.maximum(0.0, i00 * i00 * q00 + 2 * i00 * i01 * q01 + i01 * i01 * q11))
-    sv = np.sqrt(np.maximum(0.0, i11 * i11 * q11))
-    standardized[:, 0] = np.where(su > 1e-9 * i00, v0 / su, np.nan)
-    standardized[:, 1] = np.where(sv > 1e-9 * i11, v1 / sv, np.nan)
+    points = precision.image_points
+    ptr = np.cumsum([0] + [len(b.uv) for b in precision.graph.survey.image_blocks])
+    return ImageResiduals(ptr, points.v, *residual_tests(points), points.used)
 
 
 def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:

@@ -73,6 +73,11 @@ class CondensedSystem:
         kept = columns >= 0
         return columns[kept], (local @ graph.images.local_from_keys(which)[0])[:, kept]
 
+    @property
+    def n_points(self) -> int:
+        """Image points."""
+        return int(self._places[0][-1])
+
     @cached_property
     def _places(self) -> tuple[IntArray, dict[int, int]]:
         """First image point of every block, and the place of blocks of known targets among these."""

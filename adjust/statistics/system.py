@@ -8,8 +8,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import scipy
 from scipy import sparse
 
@@ -123,9 +125,19 @@ class LinearSystem:
     @cached_property
     def sigmas(self) -> FloatArray:
         """A priori sigmas (n,) of the unknowns, in the survey's datum."""
-        by_name, out = self.precision.graph.unknowns.by_name, np.zeros(len(self.columns))
-        for name, at in self.columns.at.items():
-            out[at] = np.sqrt(np.diag(self.precision.cov(by_name[name].key)))[self.columns.free[name]]
+        out = np.zeros(len(self.columns))
+        for k in {len(at) for at in self.columns.at.values()}:
+            mine = np.array([at for at in self.columns.at.values() if len(at) == k])
+            out[mine] = np.sqrt(np.diagonal(self.own_covariances(mine), axis1=1, axis2=2))
+        return out
+
+    def own_covariances(self, columns: IntArray) -> FloatArray:
+        """A priori covariances (u, k, k) in the survey's datum of unknowns whose free components are columns (u, k)."""
+        by_name, out = self.precision.graph.unknowns.by_name, np.empty((*columns.shape, columns.shape[1]))
+        for i, first in enumerate(columns[:, 0].tolist() if columns.size else []):
+            name = self.columns.names[first]
+            free = self.columns.free[name]
+            out[i] = self.precision.cov(by_name[name].key)[free[:, None], free]
         return out
 
 
@@ -357,11 +369,14 @@ def _all_columns(graph: AdjustmentGraph, columns: Columns, name: ParameterName) 
     return out
 
 
+_Numbers = npt.NDArray[np.integer[Any]]
+
+
 class Entries:
     """Dense blocks gathered into one sparse matrix; columns of -1 are left out."""
 
     def __init__(self) -> None:
-        self.parts: list[tuple[IntArray, IntArray, FloatArray]] = []
+        self.parts: list[tuple[_Numbers, _Numbers, FloatArray]] = []
 
     def add(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
         """Values (r, c) at these rows and columns."""
@@ -372,8 +387,8 @@ class Entries:
 
     def add_blocks(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
         """Values (b, r, c) at rows (b, r) and columns (b, c)."""
-        down = np.broadcast_to(rows[:, :, None], values.shape)
-        across = np.broadcast_to(columns[:, None, :], values.shape)
+        down = np.broadcast_to(rows[:, :, None].astype(np.int32), values.shape)
+        across = np.broadcast_to(columns[:, None, :].astype(np.int32), values.shape)
         kept = across >= 0
         self.parts.append((down[kept], across[kept], values[kept]))
 
@@ -386,6 +401,11 @@ class Entries:
         if not self.parts:
             return sparse.csr_matrix(shape)
         r, c, v = (np.concatenate(x) for x in zip(*self.parts, strict=True))
+        if (r[1:] >= r[:-1]).all():  # row by row already
+            ptr = np.searchsorted(r, np.arange(shape[0] + 1))
+            out = sparse.csr_matrix((v, c, ptr), shape=shape)
+            out.sum_duplicates()
+            return out
         return sparse.csr_matrix((v, (r, c)), shape=shape)
 
 

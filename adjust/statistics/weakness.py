@@ -6,6 +6,7 @@ import numpy as np
 
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.parallel import side_by_side
 from adjust.precision.s_transformation import without_datum_rows
 from adjust.statistics.result import Correlation, PrincipalComponent, WeakDirection, WeakPart
 from adjust.statistics.system import DENSE, FEW, LinearSystem, linear_system
@@ -63,19 +64,20 @@ def correlations(
     among = np.arange(len(c)) if names is None else index
     number = np.full(len(c), -1)
     number[index] = np.arange(len(index))
-    sigma = np.sqrt(np.maximum(_variances(system, among), 1e-300))
+    sigma = np.sqrt(np.maximum(_variances(system, np.arange(len(c))), 1e-300))
+    _ = system.normal  # factored before the threads ask for it
 
     def above(first: int) -> list[tuple[int, int, float]]:
         part = index[first : first + _AT_A_TIME]
         C = covariance_columns(system, part)[among]
-        C /= sigma[:, None]
-        C /= np.sqrt(np.maximum(_variances(system, part), 1e-300))
+        C /= sigma[among, None]
+        C /= sigma[part]
         a, b = np.nonzero(np.abs(C) >= limit)
         i, j = among[a], part[b]
         kept = np.where(number[i] < 0, True, number[i] < number[j])  # each pair once, nothing with itself
         return list(zip(i[kept].tolist(), j[kept].tolist(), C[a, b][kept].tolist(), strict=True))
 
-    found = [x for part in map(above, range(0, len(index), _AT_A_TIME)) for x in part]
+    found = [x for part in side_by_side(above, range(0, len(index), _AT_A_TIME)) for x in part]
     if names is None and len(index) < len(c):
         found += _within(system, number, limit)
     order = sorted(found, key=lambda x: (-abs(x[2]), x[0], x[1]))[:_MOST]
@@ -91,15 +93,15 @@ def _variances(system: LinearSystem, index: IntArray) -> FloatArray:
 
 def _within(system: LinearSystem, number: IntArray, limit: float) -> list[tuple[int, int, float]]:
     """Pairs of components of one unknown that is not compared with others."""
-    by_name, out = system.precision.graph.unknowns.by_name, list[tuple[int, int, float]]()
-    for name, at in system.columns.at.items():
-        if len(at) > 1 and (number[at] < 0).all():
-            free = system.columns.free[name]
-            Q = system.precision.cov(by_name[name].key)[np.ix_(free, free)]
-            d = np.sqrt(np.maximum(np.diag(Q), 1e-300))
-            C = np.triu(Q / np.outer(d, d), 1)
-            a, b = np.nonzero(np.abs(C) >= limit)
-            out += zip(at[a].tolist(), at[b].tolist(), C[a, b].tolist(), strict=True)
+    apart = [at for at in system.columns.at.values() if len(at) > 1 and (number[at] < 0).all()]
+    out = list[tuple[int, int, float]]()
+    for k in sorted({len(at) for at in apart}):
+        columns = np.array([at for at in apart if len(at) == k])
+        C = system.own_covariances(columns)
+        d = np.sqrt(np.maximum(np.diagonal(C, axis1=1, axis2=2), 1e-300))
+        C = np.triu(C / (d[:, :, None] * d[:, None, :]), 1)
+        i, a, b = np.nonzero(np.abs(C) >= limit)
+        out += zip(columns[i, a].tolist(), columns[i, b].tolist(), C[i, a, b].tolist(), strict=True)
     return out
 
 

@@ -20,7 +20,9 @@ from adjust.native import (
     loops,
     navigation,
     pairs,
+    point_tests,
     reduction,
+    text,
     trees,
     views,
     vision,
@@ -51,7 +53,9 @@ from tests.adjust.navigation import (
 from tests.adjust.terrestrial_networks import measured, polar_network
 from tests.adjust.test_image_reduction import near, warped_stereo
 
-_MODULES = (lenses, images, trees, reduction, bundles, navigation, views, vision, loops, pairs, elimination)
+_MODULES = (
+    lenses, images, trees, reduction, bundles, navigation, views, vision, loops, pairs, elimination, point_tests, text,
+)  # fmt: skip
 FUNCTIONS = {f.name: f for module in _MODULES for f in vars(module).values() if isinstance(f, Function)}
 """All functions of the core that have a face in Python."""
 _KEPT = 2
@@ -109,6 +113,13 @@ def _images() -> None:
     graph, done = h.solved(survey, near(truth))
     precision = Precision(graph, done)
     image_residuals(precision)
+    points, lambda0 = precision.image_points, np.array([17.0, 19.0])
+    n = len(points.v)
+    point_tests.controlled_directions(points, np.zeros(n, dtype=np.int64))
+    point_tests.point_tests(points, lambda0, tuple(np.zeros((n,) if i < 5 else (n, 2)) for i in range(9)))
+    point_tests.bias_ellipses(points, lambda0)
+    words = text.Words.of(["a", "bc", ""])
+    text.number_rows(words, np.array([0, 1, 2]), words, np.array([1, 1, 0]), points.v[:3], [3, 0])
     names = list(graph.unknowns.by_name)
     precision.joint([names[0], names[-1]])
     batch = graph.images

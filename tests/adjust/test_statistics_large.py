@@ -8,8 +8,8 @@ from scipy import sparse
 
 from adjust.adjustment import adjust
 from adjust.model.result import Adjustment
+from adjust.native import parallel
 from adjust.observations.images import batch as batch_module
-from adjust.statistics import reliability as reliability_module
 from adjust.statistics import system as system_module
 from adjust.statistics import weakness
 from adjust.statistics.budget import uncertainty_budget
@@ -127,21 +127,22 @@ def test_threads_and_portions_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
         found = reliability(adjustment, system=condensed)
         listed = correlations(adjustment, 0.5, system=condensed.system)
         tests = [x for x in vars(found.tests).values() if isinstance(x, np.ndarray)]
+        tests += [found.tests.p, found.tests.p_posterior, found.tests.p_w, found.tests.p_tau]
         ellipses = [found.ellipses.major, found.ellipses.minor, found.ellipses.direction]
         rows = [condensed.system.A.toarray(), condensed.e, condensed.lens, condensed.camera, condensed.shape]
         shifts = np.array([x.shift for x in found.influences])
         return [*tests, *ellipses, *rows, shifts, np.array([x.coefficient for x in listed])]
 
-    monkeypatch.setattr(reliability_module, "_AT_ONCE", 300)
+    monkeypatch.setattr(parallel, "_WORTHWHILE", 300)
     monkeypatch.setattr(system_module, "_AT_ONCE", 7)
     monkeypatch.setattr(batch_module, "_AT_ONCE", 200)
     found = []
     for threads in ("1", "3"):
         monkeypatch.setenv("LABSURVEY_THREADS", threads)
         found.append(everything())
-    monkeypatch.setattr(reliability_module, "_AT_ONCE", 50_000)
+    monkeypatch.setattr(parallel, "_WORTHWHILE", 50_000)
     found.append(everything())
-    assert len(found[0][0]) > 300
+    assert len(found[0][0]) > 900
     for others in found[1:]:
         for a, b in zip(found[0], others, strict=True):
             np.testing.assert_array_equal(a, b)

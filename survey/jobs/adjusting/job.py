@@ -89,7 +89,7 @@ def adjust_job(
     clock, folder = Clock(), Path(folder)
     target = folder if out is None else Path(out)
     chosen = None if method == "joint" else method
-    said = said or command_line("adjust", folder, redetect=redetect, method=chosen, out=out)
+    said = said or command_line("adjust", folder, redetect=redetect, parquet=report.parquet, method=chosen, out=out)
     with changing(target) as place:
 
         def detected() -> None:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from markupsafe import Markup
 
 from adjust.model.result import ObservationResidual
@@ -48,9 +49,11 @@ COLUMNS = (
 _NAMES = ("Kind", "Group", "Where", "Point", "Component", "Unit", "Unit of σ")
 _SORTED_BY = COLUMNS.index("w")
 _BY_SIZE = {"Residual", "w", "Gross error"}
-_Row = tuple[tuple[str, ...], tuple[float, ...]]
-"""Names in the order of ``_NAMES``; observed, adjusted, sigma, residual, redundancy, w, whether used, the factors to
-the units of values and of sigmas, 0 ordinary, 1 suspect or 2 not used, observation and component in the tests."""
+_N_VALUES = 12
+_Rows = tuple[npt.NDArray[np.object_], FloatArray]
+"""Of n rows: names (7, n) in the order of ``_NAMES``; values (12, n): observed, adjusted, sigma, residual, redundancy,
+w, whether used, the factors to the units of values and of sigmas, 0 ordinary, 1 suspect or 2 not used, observation and
+component in the tests."""
 
 
 def _flag(used: bool, suspect: bool) -> str:
@@ -181,18 +184,21 @@ def every_observation(c: Context) -> Markup:
     w = np.concatenate([c.adjustment.image_residuals.standardized.ravel(), others_w])
     if not len(w):
         return Markup()
-    rows = [
-        _every_image(c, *divmod(k, 2)) if k < n_image
-        else _every_other(c, int(observation[k - n_image]), int(component[k - n_image]))
-        for k in worst(w, MOST).tolist()
-    ]  # fmt: skip
-    names = dict(zip(_NAMES, zip(*(row[0] for row in rows), strict=True), strict=True))
-    values = np.array([row[1] for row in rows], dtype=float).T
+    chosen = worst(w, MOST)
+    of_image = chosen < n_image
+    parts = (
+        (of_image, _every_image(c, *divmod(chosen[of_image], 2))),
+        (~of_image, _every_other(c, *(x[chosen[~of_image] - n_image] for x in (observation, component)))),
+    )
+    texts, values = np.empty((len(_NAMES), len(chosen)), dtype=object), np.empty((_N_VALUES, len(chosen)))
+    for mine, (part_texts, part_values) in parts:
+        texts[:, mine], values[:, mine] = part_texts, part_values
+    names = dict(zip(_NAMES, texts.tolist(), strict=True))
     numbers = _numbers(values) | _reliability(c, values)
     columns = [
         _coded(names[x]) if x in _NAMES else _numeric(x, numbers[x], _digits(x, numbers, values)) for x in COLUMNS
     ]
-    data = {"rows": len(rows), "columns": columns, "flags": values[9].astype(int).tolist()}
+    data = {"rows": len(chosen), "columns": columns, "flags": values[9].astype(int).tolist()}
     said = t(
         "Every observation, one row per component, largest |w| first. w: Baarda's standardized residual. Gross error: "
         "estimated. MDB: the bias of this component alone that its test finds with the stated power; λ̄: how many of "
@@ -201,8 +207,8 @@ def every_observation(c: Context) -> Markup:
     if c.statistics is not None:
         power = c.statistics.reliability.criteria.options.power
         said += " " + t("Power {power} %.", power=fixed(100 * power, 0))
-    if len(w) > len(rows):
-        shown = {"shown": count(len(rows)), "n": count(len(w))}
+    if len(w) > len(chosen):
+        shown = {"shown": count(len(chosen)), "n": count(len(w))}
         said += " " + t("The worst {shown} of {n}; all in residuals.csv and residuals_other.csv.", **shown)
     table = part("all_observations", heads(_left(x) for x in COLUMNS), _SORTED_BY, of="report.html")
     return section("all-observations", "All observations", table + json_script("all-data", data), said)
@@ -219,14 +225,10 @@ def _coded(values: Sequence[str]) -> dict[str, Any]:
 
 
 def _numeric(name: str, values: FloatArray, digits: IntArray) -> dict[str, Any]:
-    out: list[Any] = []
-    for value, places in zip(values.tolist(), digits.tolist(), strict=True):
-        if not np.isfinite(value):
-            out.append(None)
-        elif places > 0:
-            out.append(round(value, places))
-        else:
-            out.append(round(value))
+    power = 10.0 ** np.maximum(digits, 0)
+    out: list[Any] = (np.rint(values * power) / power).tolist()
+    for i in np.flatnonzero(~np.isfinite(values) | (digits <= 0)).tolist():
+        out[i] = round(out[i]) if np.isfinite(values[i]) else None
     return {"values": out, "size": name in _BY_SIZE}
 
 
@@ -242,18 +244,35 @@ def _digits(name: str, numbers: dict[str, FloatArray], values: FloatArray) -> In
     return np.asarray(np.clip(np.nan_to_num(places, nan=4.0), 0, 9).astype(np.int64))
 
 
-def _every_image(c: Context, k: int, i: int) -> _Row:
-    found, block = c.adjustment.image_residuals, c.adjustment.survey.image_blocks[c.rows.block[k]]
-    where = f"{block.camera_id} · {block.epoch_id} · {block.target_id or 'points'}"
-    point = c.rows.point_ids[c.rows.point[k]]
-    observed, residual, used = c.rows.uv[k, i], found.residuals[k, i], bool(found.used[k])
-    return (t("image point"), group_name(block.group), where, point, "uv"[i], "px", "px"), (
+def _every_image(c: Context, k: IntArray, i: IntArray) -> _Rows:
+    """Of components i of image points k."""
+    found, blocks = c.adjustment.image_residuals, c.adjustment.survey.image_blocks
+    seen, block = np.unique(c.rows.block[k], return_inverse=True)
+    of_block = [(group_name(b.group), f"{b.camera_id} · {b.epoch_id} · {b.target_id or 'points'}")
+                for b in (blocks[j] for j in seen.tolist())]  # fmt: skip
+    group, where = (np.array(x, dtype=object)[block] for x in zip(*of_block, strict=True)) if of_block else ("", "")
+    point = [c.rows.point_ids[j] for j in c.rows.point[k].tolist()]
+    texts = np.empty((len(_NAMES), len(k)), dtype=object)
+    for at, column in enumerate((t("image point"), group, where, point, np.array(["u", "v"])[i], "px", "px")):
+        texts[at] = column
+    observed, residual, used = c.rows.uv[k, i], found.residuals[k, i], found.used[k]
+    values = np.stack([
         observed, observed + residual, c.rows.sigmas[k, i], residual, found.redundancy[k, i], found.standardized[k, i],
-        used, 1.0, 1.0, 2 if not used else int(c.suspect[k]), k, i,
-    )  # fmt: skip
+        used, np.ones(len(k)), np.ones(len(k)), np.where(used, c.suspect[k], 2), k, i,
+    ])  # fmt: skip
+    return texts, values
 
 
-def _every_other(c: Context, k: int, i: int) -> _Row:
+def _every_other(c: Context, observation: IntArray, component: IntArray) -> _Rows:
+    """Of these components of other observations."""
+    rows = [_other_values(c, k, i) for k, i in zip(observation.tolist(), component.tolist(), strict=True)]
+    texts, values = np.empty((len(_NAMES), len(rows)), dtype=object), np.empty((_N_VALUES, len(rows)))
+    for j, (row, numbers) in enumerate(rows):
+        texts[:, j], values[:, j] = row, numbers
+    return texts, values
+
+
+def _other_values(c: Context, k: int, i: int) -> tuple[tuple[str, ...], tuple[float, ...]]:
     o = c.adjustment.other_residuals[k]
     unit, factor = unit_for_people(o.components[i], o.units[i])
     sigma_unit, sigma_factor = sigma_unit_for_people(o.units[i])
