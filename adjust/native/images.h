@@ -223,13 +223,16 @@ inline void block_rows(Ints which, const Batch &B, Out<double, 3> out) {
 }
 
 // Turns rows B (its columns one after the other, of a whole number of vectors) into the upper triangular R (k, k) above
-// them by reflections (Householder; Golub and Van Loan 2013, 5.2), which leave nothing of B.
+// them by reflections (Householder; Golub and Van Loan 2013, 5.2), which leave nothing of B. What is left of a column that
+// others make up is rounding: no direction to reflect along.
 inline void add_rows(double (*R)[MAX_LOCAL + N_SHAPE], double *const *B, int k, int rows) {
     for (int j = 0; j < k; ++j) {
         V squares = {};
         for (int p = 0; p < rows; p += W) squares += load(B[j] + p) * load(B[j] + p);
         const double below = sum(squares), a = R[j][j];
-        if (below == 0.0) continue;
+        double whole = below;
+        for (int i = 0; i <= j; ++i) whole += R[i][j] * R[i][j];
+        if (below <= 1e-28 * whole) continue;
         const double beta = a < 0.0 ? root(a * a + below) : -root(a * a + below), head = a - beta, tau = (beta - a) / beta;
         for (int c = j + 1; c < k; ++c) {
             V dot = {};
