@@ -16,6 +16,8 @@ from adjust.native.trees import TREE, TreeArrays
 SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP = 0, 1, 2, 3
 MAX_LOCAL = 23
 """Local unknowns and residual of a block, at most."""
+N_SHAPE = 4
+"""Parameters of a target's shape."""
 
 BLOCKS = "ptr[B+1] camera[B] warp_id[B] n_warp[B]"
 LENSES = "kind[c] values[c,14] constants[c,4] n_free[c] n_map[c] source[c,14] column[c,14] factor[c,14]"
@@ -28,6 +30,7 @@ _evaluate_chains = Function(
 _normal_equations = Function("normal_equations", f"which[*] {_BATCH} H[B,m,m] chi[B] depth[B]")
 _errors = Function("errors", f"which[*] {_BATCH} chi[B] depth[B]")
 _block_rows = Function("block_rows", f"which[g] {_BATCH} out[g,*,*]")
+_condensed_rows = Function("condensed_rows", f"which[g] {_BATCH} factors[g,*,{N_SHAPE}] out[g,*,*]")
 _serve = Function(
     "serve", f"which[*] {BLOCKS} {LENSES} {SEGMENTS} {CHAINED} width[B] at[B] H[B,m,m] flat[*] r[B,m]"
 )
@@ -149,6 +152,15 @@ def errors(which: IntArray, at: BlocksAt, chi: FloatArray, depth: FloatArray) ->
 def block_rows(which: IntArray, at: BlocksAt, out: FloatArray) -> None:
     """Whitened rows (g, 2 n, n_lens + 6 + n_warp + 1) of g blocks of one size over local unknowns, residual last."""
     _block_rows(which, *at.arrays, out)
+
+
+def condensed_rows(which: IntArray, at: BlocksAt, factors: FloatArray, out: FloatArray) -> None:
+    """Of g blocks of one size rows (g, m, n_lens + 6 + n_warp + 4 + 1) with the normal equations of all their rows.
+
+    Columns: local unknowns, the four of the shape, residual. factors: (g, n, 4), by what the derivatives by x, y, z and
+    z again of every point are multiplied for the shape. m: as many as columns, or as rows where these are fewer.
+    """
+    _condensed_rows(which, *at.arrays, factors, out)
 
 
 def serve(

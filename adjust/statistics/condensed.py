@@ -15,6 +15,7 @@ from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.images import N_SHAPE
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
 from adjust.observations.images.batch import warp_shape
@@ -32,7 +33,6 @@ from adjust.statistics.system import (
     columns_of_blocks,
 )
 
-N_SHAPE = 4
 _FLAT = 1e-9
 
 
@@ -174,22 +174,13 @@ def _condensed_rows(
     graph: AdjustmentGraph, mine: IntArray, shapes: Mapping[str | None, FloatArray]
 ) -> FloatArray:
     """Rows (g, k, lens + pose + warp + shape + 1) of g blocks with equally many points and columns."""
-    images = graph.images
-    local = images.rows(mine)
-    n = local.shape[1] // 2
-    none = np.zeros((0, N_SHAPE))
-    factors = np.zeros((len(mine), n, N_SHAPE))
-    for i, b in enumerate(mine):
-        given = shapes.get(images.blocks[b].target_id, none)
+    blocks, none = graph.images.blocks, np.zeros((0, N_SHAPE))
+    factors = np.zeros((len(mine), len(blocks[mine[0]].uv), N_SHAPE))
+    for i, b in enumerate(mine.tolist()):
+        given = shapes.get(blocks[b].target_id, none)
         if len(given):
-            factors[i] = given[images.blocks[b].point_idx]
-    nl = images.state.lenses.n_free[images.camera[mine]]
-    pose = nl[:, None] + 3 + np.array([0, 1, 2, 2])
-    by_point = np.take_along_axis(local, np.broadcast_to(pose[:, None], (len(mine), 2 * n, N_SHAPE)), axis=2)
-    rows = np.concatenate([local[:, :, :-1], by_point * np.repeat(factors, 2, axis=1), local[:, :, -1:]], axis=2)
-    used = images.used[images.ptr[mine][:, None] + np.arange(n)]
-    rows *= np.repeat(used, 2, axis=1)[:, :, None]
-    return np.asarray(np.linalg.qr(rows, mode="r")) if rows.shape[1] > rows.shape[2] else rows
+            factors[i] = given[blocks[b].point_idx]
+    return graph.images.condensed_rows(mine, factors)
 
 
 def _of_cameras(R: FloatArray, t: FloatArray) -> FloatArray:

@@ -124,6 +124,7 @@ def _images() -> None:
     precision.joint([names[0], names[-1]])
     batch = graph.images
     batch.rows(np.array([0]))
+    batch.condensed_rows(np.array([0]), np.ones((1, len(batch.blocks[0].uv), 4)))
     batch.local_from_keys(np.array([0]))
     solve_network(pose_networks.simulate(3, 2).network).precision.pairs  # noqa: B018  # is computed when asked for
     loop_basis(topology([(a + b, a, b) for a, b in ("AB", "BC", "CA", "CD", "DA")]))
