@@ -101,8 +101,8 @@ class Function:
         """Of every argument: name, shape, dtype, flags needed (of a number: whether it is whole), zeros that follow."""
         self._fitting: set[tuple[tuple[int, ...], ...]] = set()
         """Shapes of all arrays of a call that were found to fit together."""
-        self._known: list[tuple[Callable[[], Any], tuple[int, ...], int]] = []
-        """Of every argument: the array given last (a weak reference), its shape and its address."""
+        self._known: list[tuple[Callable[[], Any], int]] = []
+        """Of every argument: the array given last and its address. NumPy moves no array that is weakly referred to."""
 
     def using(self, instructions: str | None) -> "Function":
         """The same function with a set of vector instructions; that in use for None."""
@@ -133,7 +133,7 @@ class Function:
              (0,) * (4 - len(shape)))
             for (name, shape), kind in zip(self._declared, self._kinds, strict=True)
         ]  # fmt: skip
-        self._known = [(_nothing, (), 0)] * len(dims)
+        self._known = [(_nothing, 0)] * len(dims)
         self._run = run
         return run
 
@@ -153,10 +153,10 @@ class Function:
             if not isinstance(value, np.ndarray) or value.dtype != dtype:
                 raise TypeError(f"{self.name}: {name} must be an array of {dtype.name}, not {_told(value)}")
             shapes.append(given := value.shape)
-            last, shape, at = known[i]
-            if last() is not value or shape != given or value.flags.num & needed != needed:
+            last, at = known[i]
+            if last() is not value or value.flags.num & needed != needed:
                 at = self._address(name, needed, value)
-                known[i] = ref(value), given, at
+                known[i] = ref(value), at
             packed += (at, *given, *rest)
         if (together := tuple(shapes)) not in self._fitting:
             self._check(shapes)

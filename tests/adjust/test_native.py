@@ -173,6 +173,28 @@ def test_an_argument_that_does_not_fit_is_named(argument: str, value: Any, error
         _TRY(*_given(**{argument: value}))
 
 
+def test_what_has_changed_since_the_last_call_is_seen() -> None:
+    """An array that is given again, and shapes that fitted once."""
+    given = _given()
+    q, residuals, rows = given[3], given[5], given[6]
+    assert _TRY(*given) == 0
+    q[:] = [[0.1, 0.2, 2.0]]
+    assert _TRY(*given) == 0
+    expected = residuals.copy()
+    with pytest.raises(ValueError, match="cannot resize"):  # which would move what it holds
+        q.resize((1000, 3), refcheck=False)
+    q.shape = (15, 1)
+    with pytest.raises(ValueError, match=r"lens_rows: q must be \(n, 3\), not \(15, 1\)"):
+        _TRY(*given)
+    q.shape = (5, 3)
+    residuals[:] = 0.0
+    assert _TRY(*given) == 0
+    np.testing.assert_array_equal(residuals, expected)
+    rows.setflags(write=False)
+    with pytest.raises(ValueError, match="lens_rows: rows must be contiguous and writable"):
+        _TRY(*given)
+
+
 def test_what_is_only_read_may_be_locked_and_numbers_may_be_numpys() -> None:
     assert _TRY(*_given(q=_locked(np.ones((5, 3))), kind=np.int64(BROWN))) == 0
 
