@@ -142,13 +142,12 @@ def _exchanges_among(state: _State, near: _Near) -> list[Exchange]:
     n, here = len(near.mine), 2 ** len(near.mine) - 1  # what is out stands first
     if not np.isfinite(J[here]):
         return []
-    out = []
-    for s in np.flatnonzero(J < J[here] + _EVEN).tolist():
+    more, out = J - J[here], []
+    for s in np.flatnonzero(more < _EVEN).tolist():
         if s != here:
-            chosen = [bool(s >> i & 1) for i in range(len(near.pool))]
-            kept = tuple(x for x, gone in zip(near.pool[:n], chosen, strict=False) if not gone)
-            instead = tuple(x for x, goes in zip(near.pool[n:], chosen[n:], strict=True) if goes)
-            out.append(Exchange(kept, instead, float(J[s] - J[here])))
+            kept, instead = (tuple(x for i, x in enumerate(near.pool) if (s >> i & 1) == goes and (i < n) != goes)
+                             for goes in (False, True))  # fmt: skip
+            out.append(Exchange(kept, instead, float(more[s])))
     return out
 
 
