@@ -22,6 +22,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
 from adjust.observations.images.bundles import BundleBatch
+from adjust.observations.terrestrial.layout import Chunk
 from adjust.precision.precision import Precision
 from adjust.precision.s_transformation import without_datum_rows
 
@@ -125,8 +126,16 @@ class LinearSystem:
     def sigmas(self) -> FloatArray:
         """A priori sigmas (n,) of the unknowns, in the survey's datum."""
         by_name, out = self.precision.graph.unknowns.by_name, np.zeros(len(self.columns))
+        of_size: dict[int, list[ParameterName]] = {}
         for name, at in self.columns.at.items():
-            out[at] = np.sqrt(np.diag(self.precision.cov(by_name[name].key)))[self.columns.free[name]]
+            if by_name[name].key in self.precision.hidden:
+                out[at] = np.sqrt(np.diag(self.precision.cov(by_name[name].key)))[self.columns.free[name]]
+            else:
+                of_size.setdefault(by_name[name].dim, []).append(name)
+        for dim, names in of_size.items():
+            found = self.precision.covs(np.array([by_name[name].key for name in names]), dim)
+            for name, sigma in zip(names, np.sqrt(np.einsum("nii->ni", found)), strict=True):
+                out[self.columns.at[name]] = sigma[self.columns.free[name]]
         return out
 
 
@@ -486,9 +495,16 @@ def _reading_rows(precision: Precision, n: int, key_columns: KeyColumns) -> Rows
     if batch is None:
         return sparse.csr_matrix((0, n)), np.zeros(0)
     e, entries = batch.unweighted(precision.solved.values).copy(), Entries()
-    for c, chunk in enumerate(batch.layout.chunks):
+    alike: dict[tuple[int, ...], list[Chunk]] = {}
+    for chunk in batch.layout.chunks:
         if chunk.keys:  # those between held positions have none
-            entries.add(chunk.rows, np.concatenate([key_columns[k] for k in chunk.keys]), batch.jacobian(c))
+            alike.setdefault((len(chunk.rows), *chunk.dims), []).append(chunk)
+    for (k, *dims), chunks in alike.items():
+        rows, at = np.array([c.rows for c in chunks]), np.array([c.start for c in chunks])
+        for i, dim in enumerate(dims):
+            blocks = batch.J[at[:, None] + np.arange(k * dim)].reshape(len(at), k, dim)
+            entries.add_blocks(rows, np.array([key_columns[c.keys[i]] for c in chunks]), blocks)
+            at += k * dim
     return entries.matrix((len(e), n)), e
 
 

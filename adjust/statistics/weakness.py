@@ -93,7 +93,8 @@ def correlations(
         C = columns(part)[among]
         C /= sigma[:, None]
         C /= np.sqrt(np.maximum(_variances(system, part), 1e-300))
-        a, b = np.nonzero(np.abs(C) >= limit)
+        high = np.abs(C) >= limit
+        a, b = np.nonzero(high) if high.any() else np.zeros((2, 0), dtype=np.int64)
         i, j = among[a], part[b]
         kept = np.where(number[i] < 0, True, number[i] < number[j])  # each pair once, nothing with itself
         return list(zip(i[kept].tolist(), j[kept].tolist(), C[a, b][kept].tolist(), strict=True))

@@ -4,11 +4,9 @@ import os
 import re
 import resource
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
@@ -123,26 +121,33 @@ def sizes(session: Session) -> None:
     session.say("", f"Exponents of growth of processor time, from the size before, one thread: {'; '.join(grown)}.")
 
 
+_LAUNCH = """import resource, subprocess, sys
+try:
+    code = subprocess.call(sys.argv[2:], timeout=float(sys.argv[1]))
+except subprocess.TimeoutExpired:
+    code = None
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, code)"""
+"""A small program that runs a command: what starts a large one from a large one would count its own memory too."""
+
+
 def _adjusted(lab: Path, threads: str) -> tuple[list[str], float, float]:
     """The cells of a whole ``labsurvey adjust``, its wall and its processor seconds; both 0 where it was stopped."""
     command = [sys.executable, "-m", "survey", "adjust", str(lab), "--quiet"]
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     begin = time.perf_counter()
-    child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True,
-                             env={**environment, "LABSURVEY_THREADS": threads})  # fmt: skip
-    stop = threading.Timer(2.0 * LONGEST_S, child.kill)
-    stop.start()
-    said = child.stdout.read() if child.stdout is not None else ""
-    _, status, used = os.wait4(child.pid, 0)
-    child.returncode, wall = os.waitstatus_to_exitcode(status), time.perf_counter() - begin
-    stop.cancel()
-    if child.returncode == -signal.SIGKILL:
+    run = subprocess.run([sys.executable, "-c", _LAUNCH, str(2.0 * LONGEST_S), *command], check=True, text=True,
+                         stdout=subprocess.PIPE, env={**environment, "LABSURVEY_THREADS": threads})  # fmt: skip
+    wall = time.perf_counter() - begin
+    *said, used = run.stdout.strip().splitlines()
+    cpu, mb, code = used.split()
+    if code == "None":
         return [f"stopped after {wall:.0f}", *[""] * (2 + len(_STEPS))], 0.0, 0.0
-    if child.returncode not in (0, 3):
-        raise RuntimeError(f"{' '.join(command)}: exit code {child.returncode}")
-    steps = dict(re.findall(r"(\w+) ([\d.]+) s", said.strip().splitlines()[-1]))
-    cpu = used.ru_utime + used.ru_stime
-    return [f"{wall:.2f}", f"{cpu:.2f}", f"{used.ru_maxrss / 1024:.0f}", *(steps.get(x, "") for x in _STEPS)], wall, cpu
+    if code not in ("0", "3"):
+        raise RuntimeError(f"{' '.join(command)}: exit code {code}")
+    steps = dict(re.findall(r"(\w+) ([\d.]+) s", said[-1]))
+    cells = [f"{wall:.2f}", f"{float(cpu):.2f}", f"{float(mb):.0f}", *(steps.get(x, "") for x in _STEPS)]
+    return cells, wall, float(cpu)
 
 
 def script(session: Session) -> None:
