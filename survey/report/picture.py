@@ -178,9 +178,9 @@ def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, elli
     cov = J @ np.array([spot.cov for spot in scene.spots]).reshape(-1, 3, 3) @ J.swapaxes(1, 2)
     xy, ellipses = view.to_picture(scene.spot_places()), d.half_axes(cov)
     for i, spot in sorted(enumerate(scene.spots), key=lambda s: s[1].kind):
-        colour = d.RED if spot.kind == "point" else d.GREEN
+        colour, size = (d.RED, 2.2) if spot.kind == "point" else (d.GREEN, 3.0)
         parts.append(d.ellipse(xy[i], ellipses[i], colour, colour))
-        parts.append(d.dot(*xy[i], 2.2 if spot.kind == "point" else 3.0, colour))
+        parts.append(d.dot(xy[i, 0], xy[i, 1], size, colour))
     parts += _labels(view, scene, 0.09 * extent)
     step = d.round_below(0.25 * WIDTH / view.unit)
     parts.append(d.scale_bar(2, HEIGHT - 8, step * view.unit, localised(f"{step:g} m")))
