@@ -141,7 +141,7 @@ class LayoutBuilder:
         a = self.arrays
         self.rows = list(zip(*(x.tolist() for x in (a.kind, a.at, a.to, a.second, a.orientation, a.centring,
                                                     a.instrument, a.body)), strict=True))  # fmt: skip
-        self.raised = a.heights[:, 1:].any(axis=1).tolist()
+        self.raised = np.count_nonzero(a.heights[:, 1:], axis=1).tolist()
         self.sights: dict[tuple[int, ...], list[_Sight]] = {}
         self.cells: dict[int, list[tuple[int, int, float]]] = {}
 
