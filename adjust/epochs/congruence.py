@@ -9,19 +9,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy
 from gtsam import Pose3
-from scipy.stats import chi2
-from scipy.stats import f as fisher
 
 from adjust.epochs.congruence_result import Congruence, CongruenceStep, CongruenceTest, Motion
 from adjust.epochs.states import MOTIONS, EpochState, aligned, differences, epoch_state, gauge_rows
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
-from adjust.precision.s_transformation import transformation_matrix
+from adjust.precision.s_transformation import transformed
 from adjust.statistics.relative_precision import ellipsoid
 from adjust.statistics.result import Ellipsoid
 from adjust.testing.criteria import LevelOptions, noncentrality, sidak
+from adjust.testing.distributions import chi2, fisher
 
 _DETERMINED = 1e-9
 
@@ -50,8 +50,8 @@ DEFAULT_CONGRUENCE = CongruenceOptions()
 class _Change:
     """Differences d (n,), their covariance Q (n, n), the motions G (n, k) that do not count, and whose rows are whose.
 
-    owner: (n,) number of the name. component: (n,) of rx ry rz x y z, 0 to 5. weight: (n,) in the datum. nowhere:
-    names of which an epoch knows the rotation alone.
+    owner: (n,) number of the name. component: (n,) of rx ry rz x y z, 0 to 5. weight: (n,) in the datum. held: (n, k)
+    what the datum holds, held' d = 0. nowhere: names of which an epoch knows the rotation alone.
     """
 
     names: tuple[ParameterName, ...]
@@ -61,7 +61,8 @@ class _Change:
     owner: IntArray
     component: IntArray
     weight: FloatArray
-    nowhere: frozenset[ParameterName] = frozenset()
+    held: FloatArray
+    nowhere: frozenset[ParameterName]
 
     def rows(self, stable: Sequence[int]) -> IntArray:
         """Components of these names."""
@@ -78,8 +79,8 @@ class _Change:
                 f"{len(stable)} stable points cannot carry the {self.G.shape[1]} motions that the epochs leave open; "
                 "name more, or hold something in both"
             )
-        S = transformation_matrix(self.G, E)
-        return replace(self, d=S @ self.d, Q=S @ self.Q @ S.T)
+        d, Q = transformed(self.d, self.Q, self.G, E)
+        return replace(self, d=d, Q=Q, held=E[:, None] * self.G)
 
 
 def congruence(
@@ -138,7 +139,7 @@ def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> tuple[float,
     p = float("nan")
     if f1 > 0 and f2 > 0:
         ratio = (first.omega / f1) / (second.omega / f2)
-        p = float(2.0 * min(fisher.cdf(ratio, f1, f2), fisher.sf(ratio, f1, f2)))
+        p = float(2.0 * min(fisher.sf(1.0 / ratio, f2, f1), fisher.sf(ratio, f1, f2)))
     if not scaled or f1 + f2 <= 0:
         return 1.0, float("inf"), p
     return float(np.sqrt((first.omega + second.omega) / (f1 + f2))), float(f1 + f2), p
@@ -174,7 +175,7 @@ def _change(
     component = np.concatenate([before.components(n) for n in names])
     nowhere = frozenset(names[int(i)] for i in owner[~np.isfinite(d)])
     change = _Change(names, d[known], Q[np.ix_(known, known)], G[known], owner[known], component[known],
-                     np.ones(int(known.sum())), nowhere)  # fmt: skip
+                     np.ones(int(known.sum())), np.zeros((int(known.sum()), 0)), nowhere)  # fmt: skip
     return replace(change, weight=_weights(change))
 
 
@@ -188,8 +189,7 @@ def _weights(change: _Change) -> FloatArray:
         return np.ones(len(position))
     Q, G = change.Q, change.G
     if G.shape[1]:
-        S = transformation_matrix(G)
-        Q = S @ Q @ S.T
+        Q = transformed(change.d, Q, G, np.ones(len(G)))[1]
     precision = np.diag(_quadratic(change.d, Q)[2])
     return np.asarray(np.where(position, precision[position].mean(), precision[~position].mean()))
 
@@ -202,6 +202,22 @@ def _quadratic(d: FloatArray, Q: FloatArray) -> tuple[float, int, FloatArray]:
     half = vectors[:, kept] / np.sqrt(values[kept]) / s[:, None]
     y = half.T @ d
     return float(y @ y), int(kept.sum()), half @ half.T
+
+
+def _regular(d: FloatArray, Q: FloatArray, held: FloatArray) -> tuple[float, int]:
+    """The first two of :func:`_quadratic`, by Cholesky's method where nothing is open but the motions ``held`` (n, k).
+
+    Q held = 0 and held' d = 0: with N that spans these in sigmas, Q^+ is inv(Q + N N') on d.
+    """
+    s = np.sqrt(np.maximum(np.diag(Q), 1e-300))
+    N = np.linalg.qr(s[:, None] * held)[0]
+    full = Q / np.outer(s, s) + N @ N.T
+    norm = float(np.abs(full).sum(axis=0).max(initial=0.0))
+    factor, lost = scipy.linalg.lapack.dpotrf(full.T, lower=0, clean=0, overwrite_a=1) if len(d) else (full, 1)
+    if lost or scipy.linalg.lapack.dpocon(factor, norm)[0] < _DETERMINED:
+        return _quadratic(d, Q)[:2]
+    y = scipy.linalg.lapack.dtrtrs(factor, d / s, lower=0, trans=1)[0]
+    return float(y @ y), len(d) - held.shape[1]
 
 
 def _test(statistic: float, freedom: int, pooled: tuple[float, float, float], level: float) -> CongruenceTest:
@@ -218,7 +234,7 @@ def _global(
 ) -> CongruenceTest:
     here = change.transformed(stable)
     rows = here.rows(stable)
-    statistic, rank, _ = _quadratic(here.d[rows], here.Q[np.ix_(rows, rows)])
+    statistic, rank = _regular(here.d[rows], here.Q[np.ix_(rows, rows)], here.held[rows])
     # what the datum takes away is no information, whatever rounding leaves of it
     rank = min(rank, max(0, len(rows) - change.G.shape[1]))
     return _test(statistic, rank, pooled, alpha)

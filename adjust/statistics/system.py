@@ -23,6 +23,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
 from adjust.observations.images.bundles import BundleBatch
+from adjust.observations.terrestrial.layout import Chunk
 from adjust.precision.precision import Precision
 from adjust.precision.s_transformation import without_datum_rows
 
@@ -134,10 +135,19 @@ class LinearSystem:
     def own_covariances(self, columns: IntArray) -> FloatArray:
         """A priori covariances (u, k, k) in the survey's datum of unknowns whose free components are columns (u, k)."""
         by_name, out = self.precision.graph.unknowns.by_name, np.empty((*columns.shape, columns.shape[1]))
-        for i, first in enumerate(columns[:, 0].tolist() if columns.size else []):
-            name = self.columns.names[first]
+        of_size: dict[int, list[int]] = {}
+        names = [self.columns.names[first] for first in columns[:, 0].tolist()] if columns.size else []
+        for i, name in enumerate(names):
             free = self.columns.free[name]
-            out[i] = self.precision.cov(by_name[name].key)[free[:, None], free]
+            if by_name[name].key in self.precision.hidden:
+                out[i] = self.precision.cov(by_name[name].key)[free[:, None], free]
+            else:
+                of_size.setdefault(by_name[name].dim, []).append(i)
+        for dim, rows in of_size.items():
+            found = self.precision.covs(np.array([by_name[names[i]].key for i in rows]), dim)
+            for i, Q in zip(rows, found, strict=True):
+                free = self.columns.free[names[i]]
+                out[i] = Q[free[:, None], free]
         return out
 
 
@@ -494,9 +504,16 @@ def _reading_rows(precision: Precision, n: int, key_columns: KeyColumns) -> Rows
     if batch is None:
         return sparse.csr_matrix((0, n)), np.zeros(0)
     e, entries = batch.unweighted(precision.solved.values).copy(), Entries()
-    for c, chunk in enumerate(batch.layout.chunks):
+    alike: dict[tuple[int, ...], list[Chunk]] = {}
+    for chunk in batch.layout.chunks:
         if chunk.keys:  # those between held positions have none
-            entries.add(chunk.rows, np.concatenate([key_columns[k] for k in chunk.keys]), batch.jacobian(c))
+            alike.setdefault((len(chunk.rows), *chunk.dims), []).append(chunk)
+    for (k, *dims), chunks in alike.items():
+        rows, at = np.array([c.rows for c in chunks]), np.array([c.start for c in chunks])
+        for i, dim in enumerate(dims):
+            blocks = batch.J[at[:, None] + np.arange(k * dim)].reshape(len(at), k, dim)
+            entries.add_blocks(rows, np.array([key_columns[c.keys[i]] for c in chunks]), blocks)
+            at += k * dim
     return entries.matrix((len(e), n)), e
 
 

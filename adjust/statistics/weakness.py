@@ -1,6 +1,6 @@
 """What is badly determined, by name: correlations, unknowns that replace each other, the weakest deformation."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -15,8 +15,10 @@ _MOST = 200
 _SHARE = 0.1
 _AT_A_TIME = 64
 """Columns of the covariance matrix that are compared in one go: as many as a solution takes at once."""
+_WHOLE = 10_000
+"""Unknowns up to which the whole covariance matrix is taken from the tree, of which 800 MB are the most."""
 _WORK = 20_000_000
-"""Correlations that are looked at in surveys of more than ``DENSE`` unknowns."""
+"""Correlations that are looked at in surveys of still more unknowns, or of hidden ones."""
 _KRYLOV, _RESTARTS = 40, 50
 
 
@@ -41,12 +43,34 @@ def compared_columns(system: LinearSystem) -> IntArray:
     What is there at one epoch alone comes after, and points last; as many as ``_WORK`` allows.
     """
     n, columns = len(system.columns), system.columns
-    if n <= DENSE:
+    if n <= DENSE or _in_tree(system):
         return np.arange(n)
     epochs = {b.epoch_id for b in system.precision.graph.survey.image_blocks}
     rank = {name: 2 if len(name) == 3 and name[2] in epochs else 1 if name[0] == "point" else 0 for name in columns.at}
     ordered = columns.of(sorted(columns.at, key=lambda name: rank[name]))
     return ordered[: max(_WORK // n, 1)]
+
+
+def _in_tree(system: LinearSystem) -> bool:
+    """Whether the whole covariance matrix can be had from the tree."""
+    return system.precision.tree.n <= _WHOLE and not system.precision.hidden
+
+
+def _some_columns(system: LinearSystem) -> Callable[[IntArray], FloatArray]:
+    """What gives some columns (n, k) of the covariance matrix where very many are wanted."""
+    if len(system.columns) <= DENSE or not _in_tree(system):
+        _ = system.normal  # factored before threads ask for it
+        return lambda part: covariance_columns(system, part)
+    precision, c = system.precision, system.columns
+    by_name, t = precision.graph.unknowns.by_name, precision.transformation
+    keys = {name: by_name[name].key for name in c.at}
+    rows = np.concatenate([precision.tree.rows([key])[c.free[name]] for name, key in keys.items()])
+    Q = precision.tree.full()
+    if t is None:
+        return lambda part: Q[rows[part]][:, rows].T
+    G, W = (np.concatenate([of[key][c.free[name]] for name, key in keys.items()]) for of in (t.motions, t.spread))
+    out = G @ t.core - W
+    return lambda part: Q[rows[part]][:, rows].T + out @ G[part].T - G @ W[part].T
 
 
 def correlations(
@@ -65,14 +89,15 @@ def correlations(
     number = np.full(len(c), -1)
     number[index] = np.arange(len(index))
     sigma = np.sqrt(np.maximum(_variances(system, np.arange(len(c))), 1e-300))
-    _ = system.normal  # factored before the threads ask for it
+    columns = _some_columns(system)
 
     def above(first: int) -> list[tuple[int, int, float]]:
         part = index[first : first + _AT_A_TIME]
-        C = covariance_columns(system, part)[among]
+        C = columns(part)[among]
         C /= sigma[among, None]
         C /= sigma[part]
-        a, b = np.nonzero(np.abs(C) >= limit)
+        high = np.abs(C) >= limit
+        a, b = np.nonzero(high) if high.any() else np.zeros((2, 0), dtype=np.int64)
         i, j = among[a], part[b]
         kept = np.where(number[i] < 0, True, number[i] < number[j])  # each pair once, nothing with itself
         return list(zip(i[kept].tolist(), j[kept].tolist(), C[a, b][kept].tolist(), strict=True))

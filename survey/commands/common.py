@@ -19,7 +19,7 @@ from survey.folder.kept import require_project as require_project
 from survey.folder.messages import message, shown
 
 DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
-_OBJECTS = 100_000  # new ones before Python looks for cycles: loading modules makes many and no cycles
+_OBJECTS = 250_000  # new ones before Python looks for cycles: loading modules makes many and no cycles
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # writing does not say which file
 
 

@@ -5,16 +5,20 @@ Rows are made by the core: a million image points take a fraction of a second.
 
 import csv
 import io
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import isfinite
 from typing import Any
 
 import numpy as np
 
-from adjust.model.result import Adjustment, ImageResiduals
+from adjust.model.observations import Reading
+from adjust.model.result import Adjustment, ImageResiduals, ReadingResiduals
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.parallel import side_by_side
 from adjust.native.text import Words, number_rows
+from adjust.observations.terrestrial.statistics import reading_names, reading_unit
 from survey.folder.text import cell_text
 from survey.project.tables.arrow import parquet_bytes
 from survey.project.tables.reading import TextColumn
@@ -127,10 +131,10 @@ def _quoted(word: str) -> str:
 def other_residuals_csv(adjustment: Adjustment) -> bytes:
     """``residuals_other.csv``: values in mm and degrees, residuals and sigmas in mm and arcseconds."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    writer, readings = csv.writer(out, lineterminator="\n"), adjustment.reading_residuals
     writer.writerow(OTHER_COLUMNS.split(","))
-    units: dict[tuple[str, str], tuple[str, float, str, float]] = {}
-    for o in adjustment.other_residuals:
+    n = len(adjustment.other_residuals) - (0 if readings is None else len(readings.observed))
+    for o in adjustment.other_residuals[:n]:
         of, used = (o.kind, cell_text(o.group), cell_text(" ".join(o.ids))), int(o.used)
         values = (np.asarray(x, dtype=float).tolist()
                   for x in (o.observed, o.adjusted, o.residual, o.sigma, o.redundancy, o.standardized))  # fmt: skip
@@ -138,14 +142,34 @@ def other_residuals_csv(adjustment: Adjustment) -> bytes:
         for component, unit, observed, adjusted, residual, sigma, *numbers in zip(
             o.components, o.units, *values, strict=True
         ):
-            if (component, unit) not in units:
-                units[component, unit] = *unit_for_people(component, unit), *sigma_unit_for_people(unit)
-            value_unit, factor, small_unit, small = units[component, unit]
+            value_unit, factor, small_unit, small = _units(component, unit)
             writer.writerow((
                 *of, component, value_unit, _number(observed * factor), _number(adjusted * factor), small_unit,
                 _number(residual * small), _number(sigma * small), *map(_number, numbers), test, used,
             ))  # fmt: skip
+    if readings is not None:
+        writer.writerows(_reading_rows(adjustment.survey.readings, readings))
     return out.getvalue().encode()
+
+
+def _reading_rows(readings: Sequence[Reading], found: ReadingResiduals) -> Iterator[tuple[str | int, ...]]:
+    """The same of readings, which are many and have one component, column by column."""
+    kinds = [r.kind for r in readings]
+    value_units, factors, small_units, smalls = zip(*(_units(k, reading_unit(k)) for k in kinds), strict=True)
+    factor, small = np.array(factors), np.array(smalls)
+    observed, adjusted, residual, sigma, *numbers = (
+        list(map(_number, x.tolist()))
+        for x in (found.observed * factor, found.adjusted * factor, found.residual * small, found.sigma * small,
+                  found.redundancy, found.standardized, found.test)
+    )  # fmt: skip
+    groups, ids = [cell_text(r.group) for r in readings], [cell_text(" ".join(reading_names(r))) for r in readings]
+    return zip(kinds, groups, ids, kinds, value_units, observed, adjusted, small_units, residual, sigma, *numbers,
+               found.used.astype(int).tolist(), strict=True)  # fmt: skip
+
+
+@lru_cache
+def _units(component: str, unit: str) -> tuple[str, float, str, float]:
+    return *unit_for_people(component, unit), *sigma_unit_for_people(unit)
 
 
 def _number(value: float) -> str:

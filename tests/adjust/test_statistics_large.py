@@ -91,6 +91,7 @@ def test_correlations_of_a_large_survey_leave_out_only_what_they_say(monkeypatch
     n = len(system.columns)
     monkeypatch.setattr(weakness, "DENSE", 10)
     monkeypatch.setattr(weakness, "_WORK", n_once * n)
+    monkeypatch.setattr(weakness, "_WHOLE", 10)
     assert len(weakness.compared_columns(system)) == n_once
     found = correlations(adjustment, 0.8, system=system)
     key = lambda x: frozenset([(x.a, x.a_component), (x.b, x.b_component)])  # noqa: E731  # said twice
@@ -101,6 +102,22 @@ def test_correlations_of_a_large_survey_leave_out_only_what_they_say(monkeypatch
     assert len(got) > 10
     for k, value in got.items():
         assert value == pytest.approx(expected[k], abs=1e-6)
+
+
+def test_correlations_from_the_tree_are_those_of_the_normal_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a datum held by observations, and of inner constraints: all of them, nothing is left out."""
+    for adjustment in (lab(), free()):
+        system = condensed_system(precision_of(adjustment)).system
+        every = correlations(adjustment, 0.5, system=system)
+        with monkeypatch.context() as m:
+            m.setattr(weakness, "DENSE", 10)
+            m.setattr(weakness, "covariance_columns", None)
+            assert len(weakness.compared_columns(system)) == len(system.columns)
+            found = correlations(adjustment, 0.5, system=system)
+        assert len(found) == len(every) > 10
+        for x, y in zip(sorted(found, key=str), sorted(every, key=str), strict=True):
+            assert (x.a, x.a_component, x.b, x.b_component) == (y.a, y.a_component, y.b, y.b_component)
+            assert x.coefficient == pytest.approx(y.coefficient, abs=1e-6)
 
 
 def test_the_budget_is_that_of_all_rows() -> None:

@@ -250,7 +250,8 @@ def test_round_numbers_of_scale_bars() -> None:
 
 def test_ellipse_has_the_axes_of_its_covariance() -> None:
     turn = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
-    words = drawing.ellipse(np.array([10.0, 20.0]), turn @ np.diag([900.0, 100.0]) @ turn.T, "red", "red")
+    (axes,) = drawing.half_axes((turn @ np.diag([900.0, 100.0]) @ turn.T)[None])
+    words = drawing.ellipse(np.array([10.0, 20.0]), axes, "red", "red")
     assert 'rx="30.0" ry="10.0"' in words
     angle = float(re.search(r"rotate\((.*?)\)", words)[1])  # type: ignore[index]  # it is there
     assert angle % 180 == pytest.approx(np.degrees(0.5), abs=0.1)

@@ -30,6 +30,10 @@ from adjust.testing.distributions import chi2
 from adjust.testing.gross_errors import Search, State, Verdicts, best_back_first
 
 _ROUNDS = 12
+_GLOBAL = 100.0**2
+"""Factor of variances from which not single observations are wrong, but a unit, a sense or a name of them all."""
+_BETTER = 0.25
+"""What a round must bring it down to, to go on all the same: large errors show only once some of them are out."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +83,7 @@ class OutlierSearch:
         notes += tuple(a.text() for a in self.alternatives)
         notes += tuple(
             f"group {g}: its typical observation contradicts the rest; sigmas {np.sqrt(f):.1f} times as large explain "
-            "that better than wrong observations do, and none was left out for it; check its sigmas, and those of what "
-            "it is compared with, or estimate variance components"
+            f"that better than wrong observations do, and none was left out for it; {_to_check(f)}"
             for g, f in self.widened
         )
         return notes + tuple(
@@ -91,6 +94,12 @@ class OutlierSearch:
         if suspect.group in self.cautious:
             return f"stays, for the residuals of group {suspect.group} are together far smaller than its sigmas say"
         return "cannot be left out"
+
+
+def _to_check(factor: float) -> str:
+    if factor > _GLOBAL:
+        return "check its units, the sense of its angles and the names in it"
+    return "check its sigmas, and those of what it is compared with, or estimate variance components"
 
 
 def _said_of_pair(o: ObservationResidual, d: Decision) -> str:
@@ -111,14 +120,18 @@ def search_outliers(
     now = first or adjust(survey, start, options.adjust, progress)
     images = options.kinds is None or "image" in options.kinds
     survey = as_given(now.survey, survey) if options.adjust.reject_points and not images else now.survey
-    round_ = _Round(now, options, images)
+    round_ = first_round = _Round(now, options, images)
     found, given = round_.found, round_.snooping.used
     log: list[Decision] = []
     seen: set[frozenset[int]] = {frozenset()}
     needed: set[int] = set()
     out: tuple[int, ...] = ()
+    first, worst = now, np.inf
     while True:
         state = round_.searched((*out, *sorted(needed)), log)
+        if round_.contradicted > _BETTER * worst:
+            return first_round.without_search(first)
+        worst = round_.contradicted if round_.contradicted else worst
         new = tuple(o for o in state.solution.out if o not in needed)
         if frozenset(new) in seen:
             new = tuple(sorted({*new, *out}))  # turning in circles: the cautious choice
@@ -167,7 +180,7 @@ class _Round:
             allowed &= [self._name(o)[0] in options.kinds for o in range(len(allowed))]
         self.snooping = Snooping(system, allowed, first, 0 if images else 2 * points)
         tests = self.snooping.tests()
-        self.cautious, self.factor = tests.cautious, np.ones(len(tests.omega))
+        self.cautious, self.factor, self.contradicted = tests.cautious, np.ones(len(tests.omega)), 0.0
         self.snooping.candidates = allowed & ~self.cautious[tests.group]
         self.n_tests = int(np.count_nonzero(tests.freedom > 0)) + (0 if images else points)
 
@@ -201,7 +214,7 @@ class _Round:
         search = replace(self._search(), said=said)
         state = search.settled(search.judged(now, now.tests()))
         for _ in range(2 * len(now.sizes) + 2):
-            found = better_set(state.solution, self._limits())
+            found = None if self.contradicted else better_set(state.solution, self._limits())
             if found is None:
                 break
             log += [self._decision("readmitted", o, state.solution, "exchange") for o in found.kept]
@@ -231,6 +244,8 @@ class _Round:
             ratio = tests.statistic[mine] / chi2.ppf(0.5, tests.freedom[mine])
             if np.mean(ratio > 1.0) > 0.5 + 1.5 / np.sqrt(n[g]):  # three sigmas of a fair coin
                 self.factor[g] = max(1.0, float(np.median(ratio)))
+        most = float(self.factor.max())
+        self.contradicted = most if most > _GLOBAL else 0.0
         few, search = (n > 0) & (n < MANY), self._search()
         state = search.judged(now, tests)
         if not few[tests.group[tests.used & (state.over > 1.0)]].any():
@@ -259,6 +274,12 @@ class _Round:
         p = float(chi2.sf(v.statistic / factor, max(v.freedom, 1)))
         group = now.system.group_names[g]
         return Decision(action, kind, group, ids, v.statistic, v.freedom, p, limit, v.error, self.number, how)
+
+    def without_search(self, adjustment: Adjustment) -> OutlierSearch:
+        """Nothing left out: no set of single observations explains what contradicts."""
+        self.factor = self._factor(self.snooping)
+        state = self._search().judged(self.snooping, self.snooping.tests())
+        return replace(self.result(state, (), (), [], False, adjustment), suspects=())
 
     def result(
         self, state: State[Snooping], out: Iterable[int], needed: Iterable[int], log: list[Decision], converged: bool,
