@@ -56,8 +56,8 @@ def fix_one_gauge(network: FrameNetwork, observations: list[ChainObservation]) -
     if not free:
         return None
     slot = min(free)[1]
-    value = partial_pose(network.unknowns.parameters.get(network.names[slot]))
-    network.known[slot] = IDENTITY if value is None else value
+    value = partial_pose(network.parameters.get(network.names[slot]))
+    network.set(slot, IDENTITY if value is None else value)
     network.gauged.append(slot)
     return slot
 
@@ -117,7 +117,7 @@ def frames_of(network: FrameNetwork, name: ParameterName) -> tuple[Node, Node]:
 def _rank(network: FrameNetwork, slot: int) -> int:
     """What is set first: a pose with some prior, a fixed target in the world, the mount, a fixed station, a camera."""
     name = network.names[slot]
-    if partial_pose(network.unknowns.parameters.get(name)) is not None:
+    if partial_pose(network.parameters.get(name)) is not None:
         return 0
     if name[0] == "carrier_from_target" and network.frames.targets[name[1]].station_id is None and len(name) == 2:
         return 1
@@ -127,6 +127,6 @@ def _rank(network: FrameNetwork, slot: int) -> int:
 
 def world_is_free(network: FrameNetwork, survey: Survey) -> bool:
     """Whether nothing given holds the world, so that it may still be moved as a whole."""
-    touching = [s for s, name in network.names.items() if ("world",) in frames_of(network, name)]
-    held = any(s in network.fixed for s in touching)
+    touching = [s for s, name in enumerate(network.names) if ("world",) in frames_of(network, name)]
+    held = bool(network.fixed[touching].any())
     return not held and not any(p.x_in_world.value is not None for p in survey.points)

@@ -6,7 +6,6 @@ import numpy as np
 from scipy.sparse import coo_array
 
 from adjust.model.errors import SurveyError
-from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import inverse, rotation_log
@@ -52,8 +51,8 @@ def solve_motion(network: FrameNetwork, degenerate: bool = True) -> str | None:
             second, first, _ = solve_ax_zb(group.motions, group.products)
         except SurveyError:
             continue
-        _set(network, group.second, second)
-        _set(network, group.first, inverse(first))
+        network.set(group.second[0], second, group.second[1])
+        network.set(group.first[0], inverse(first), group.first[1])
         return f"{_text(network, group.first)} and {_text(network, group.second)} from {len(group.motions)} motions"
     note = _shared(network, groups, False) or _together(network)
     return note or (_shared(network, groups, True) if degenerate else None)
@@ -73,7 +72,7 @@ def _shared(network: FrameNetwork, groups: list[_Group], minimum_norm: bool) -> 
             x, _ = solve_ax_xb(a, b, minimum_norm)
         except SurveyError:
             continue
-        _set(network, link, x)
+        network.set(link[0], x, link[1])
         how = "turns about one axis only: smallest consistent solution" if minimum_norm else f"{len(a)} motions"
         return f"{_text(network, link)} from {how}"
     return None
@@ -106,7 +105,7 @@ def _together(network: FrameNetwork) -> str | None:
             continue
         for i, side in alone:
             pose = inverse(solved[0][list(first).index(i)]) if side == 0 else solved[1][list(second).index(i)]
-            _set(network, found.rows[i][0], pose)
+            network.set(found.rows[i][0][0], pose, found.rows[i][0][1])
         names = " and ".join(_text(network, found.rows[i][0]) for i, _ in alone)
         return f"{names} from {len(found.motions)} views of {len(second)} things by {len(first)} together"
     return None
@@ -204,11 +203,5 @@ def _groups(network: FrameNetwork) -> list[_Group]:
     return groups
 
 
-def _set(network: FrameNetwork, link: tuple[int, bool], value: FloatArray) -> None:
-    slot, inverted = link
-    network.known[slot] = inverse(value) if inverted else value
-
-
 def _text(network: FrameNetwork, link: tuple[int, bool]) -> str:
-    name: ParameterName = network.names[link[0]]
-    return " ".join(name)
+    return " ".join(network.names[link[0]])

@@ -1,6 +1,6 @@
 """All poses of the network together: a short least squares on the chains, each weighted by what its view can tell."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +31,7 @@ class _Chains:
     roots: FloatArray
 
 
-def polish(network: FrameNetwork, movable: set[int], views: Mapping[int, View], iterations: int = 6) -> None:
+def polish(network: FrameNetwork, movable: BoolArray, views: Iterable[View], iterations: int = 6) -> None:
     """Move the movable poses to the minimum of the chains' misfit in px, robustly; nothing else changes.
 
     Source: pose-graph least squares with each measured pose weighted by the normal matrix of its image points, which is
@@ -40,17 +40,17 @@ def polish(network: FrameNetwork, movable: set[int], views: Mapping[int, View], 
     items = [
         o
         for o in network.observations
-        if not o.rotation_only and not network.unknown_links(o.chain) and any(k.slot in movable for k in o.chain)
+        if not o.rotation_only and not network.open_slots(o.chain) and any(movable[k.slot] for k in o.chain)
     ]
     if not items:
         return
     slots = sorted({k.slot for o in items for k in o.chain})
-    moving = [slot for slot in slots if slot in movable]
-    chains = _arrays(network, items, slots, moving, views)
+    moving = [slot for slot in slots if movable[slot]]
+    chains = _arrays(network, items, slots, moving, {v.block_idx: v for v in views})
     places = np.array([slots.index(slot) + 1 for slot in moving], dtype=np.int64)
-    poses = np.stack([np.eye(4)] + [network.known[slot] for slot in slots])
+    poses = np.concatenate([np.eye(4)[None], network.pose[slots]])
     poses = _minimise(chains, poses, places, network.lever, iterations)
-    network.known.update({slot: poses[place] for slot, place in zip(moving, places, strict=True)})
+    network.pose[moving] = poses[places]
 
 
 def _arrays(

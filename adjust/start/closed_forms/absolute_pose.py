@@ -20,6 +20,8 @@ def view_poses(x: FloatArray, rays: FloatArray, ptr: IntArray) -> tuple[FloatArr
     :func:`pose_solutions` finds them: unrefined, in no order and not checked for what lies in front.
     """
     both, planar = plane_poses(x, rays, ptr)
+    if planar.all():
+        return both.reshape(-1, 4, 4), np.repeat(np.arange(len(both)), 2), {}
     found, failed = list(both), {}
     for i in np.flatnonzero(~planar).tolist():
         part = slice(ptr[i], ptr[i + 1])
