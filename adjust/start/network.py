@@ -15,7 +15,7 @@ from gtsam import Pose3
 from adjust.frames.unknowns import Chain, FrameTree, Link
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Survey, Table
-from adjust.spatial.averaging import mean_pose, pose_distance
+from adjust.spatial.averaging import mean_poses, pose_distance
 from adjust.spatial.rigid import inverse, rigid, rotation_exp
 
 IDENTITY = np.eye(4)
@@ -169,7 +169,7 @@ class FrameNetwork:
                 ready = np.setdiff1d(ready, np.where(unknown[both], chains.slots[both], -1).max(axis=1))
                 using = _runs(first, ready)
             telling = using[left[row[using]] == 1]
-            self._determine(observations, chains.part(row[telling]), row[telling], column[telling], rotation_only)
+            self._determine(observations, chains.part(row[telling]), row[telling], column[telling])
             unknown[row[using], column[using]] = False
             np.subtract.at(left, row[using], 1)
             support[ready] = 0
@@ -180,40 +180,42 @@ class FrameNetwork:
         return found
 
     def _determine(
-        self, every: Sequence[ChainObservation], chains: _Chains, rows: IntArray, at: IntArray, rotation_only: bool
+        self, every: Sequence[ChainObservation], chains: _Chains, rows: IntArray, at: IntArray
     ) -> None:
-        """Set the slots at the positions (n,) of the chains of observations ``rows`` (n,), sorted by slot."""
+        """Set the slots at the positions (n,) of the chains of observations ``rows`` (n,), sorted by slot.
+
+        To the robust mean over all observations that isolate a slot; the likelier solution where just one does, and of
+        two the alternatives in which they agree.
+        """
         observations = [every[i] for i in rows.tolist()]
         value, begins = self._isolate(observations, chains, at)
-        slots, first = np.unique(chains.slots[np.arange(len(at)), at], return_index=True)
-        ends = np.append(first, len(at))
-        single = np.diff(ends) == 1
-        self.pose[slots[single]] = value[begins[first[single]]]
-        for k in np.flatnonzero(~single).tolist():
-            mine = range(ends[k], ends[k + 1])
-            said = [(observations[i], value[begins[i] : begins[i + 1]]) for i in mine]
-            self.pose[slots[k]] = self._mean(said, rotation_only)
+        slot, full = chains.slots[np.arange(len(at)), at], np.array([not o.rotation_only for o in observations])
+        # full poses say more than rotations; a whole image is wrong less often than the ends of a pair are exchanged
+        telling = full | ~np.isin(slot, slot[full])
+        image = np.array([o.block_idx >= 0 for o in observations])
+        order = np.lexsort((~image, slot))
+        order = order[telling[order]]
+        slots, first, count = np.unique(slot[order], return_index=True, return_counts=True)
+        self.pose[slots] = value[begins[order[first]]]
         self.has[slots] = True
-
-    def _mean(self, said: list[tuple[ChainObservation, FloatArray]], rotation_only: bool = False) -> FloatArray:
-        """Robust mean over all observations that isolate a slot; the likelier solution where just one does.
-
-        said: with each what it says of the slot (k, 4, 4).
-        """
-        if rotation_only:  # full poses say more than rotations
-            said = [s for s in said if not s[0].rotation_only] or said
-        # images before pairs: a whole image is wrong less often than the ends of a pair are exchanged
-        offers = [offer for _, offer in sorted(said, key=lambda s: s[0].block_idx < 0)]
-        if len(offers) == 1:
-            return np.asarray(offers[0][0])
-        if len(offers) == 2:  # the pair of solutions in which the two agree
-            d = pose_distance(offers[0][:, None], offers[1][None], self.lever)
-            i, j = np.unravel_index(int(np.argmin(d)), d.shape)
-            if d[i, j] > _CONTRADICTION * self.lever:  # a mean of right and wrong is wrong for certain
-                return np.asarray(offers[0][0])
-            return mean_pose(np.stack([offers[0][i], offers[1][j]]), self.lever)[0]
-        members = np.repeat(np.arange(len(offers)), [len(o) for o in offers])
-        return mean_pose(np.concatenate(offers), self.lever, members)[0]
+        several = [(s, order[a : a + n].tolist()) for s, a, n in zip(slots, first, count, strict=True) if n > 1]
+        parts: list[FloatArray] = []
+        members: list[IntArray] = []
+        meant: list[int] = []
+        for s, mine in several:
+            offers = [value[begins[i] : begins[i + 1]] for i in mine]
+            if len(offers) == 2:
+                d = pose_distance(offers[0][:, None], offers[1][None], self.lever)
+                i, j = np.unravel_index(int(np.argmin(d)), d.shape)
+                if d[i, j] > _CONTRADICTION * self.lever:  # a mean of right and wrong is wrong for certain
+                    continue
+                offers = [offers[0][i : i + 1], offers[1][j : j + 1]]
+            meant.append(s)
+            parts.append(np.concatenate(offers))
+            members.append(np.repeat(np.arange(len(offers)), [len(o) for o in offers]))
+        if meant:
+            ptr = np.cumsum([0] + [len(part) for part in parts])
+            self.pose[meant] = mean_poses(np.concatenate(parts), self.lever, ptr, np.concatenate(members))
 
     def relax(self, movable: BoolArray) -> None:
         """Renew each movable slot as the mean over all observations that contain it once (Gauss-Seidel)."""
@@ -227,7 +229,7 @@ class FrameNetwork:
         row, column = row[order], column[order]
         for mine in np.split(np.arange(len(row)), np.flatnonzero(np.diff(chains.slots[row, column])) + 1):
             if len(mine):
-                self._determine(whole, chains.part(row[mine]), row[mine], column[mine], False)
+                self._determine(whole, chains.part(row[mine]), row[mine], column[mine])
 
 
 def _runs(first: IntArray, wanted: IntArray) -> IntArray:

@@ -5,6 +5,7 @@ One search: of the steps that are possible with what is known by now the safest 
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
@@ -29,7 +30,6 @@ from adjust.start.readings.start import explain
 from adjust.start.readings.steps import Readings
 from adjust.start.settling import block_rms, contradictions, moved_to_coordinates, scaled_to_lengths
 from adjust.start.views import (
-    View,
     Views,
     block_text,
     focal_px,
@@ -99,7 +99,7 @@ def turns_of_views(survey: Survey, turned: Mapping[str, FloatArray]) -> dict[int
         if motions is None or search.network.open_slots(search.chains[i]):
             continue
         camera_from_target = search.network.product(search.chains[i])
-        away = pose_distance(search.alternatives(view), camera_from_target, search.network.lever)
+        away = pose_distance(search.alternatives(i, view.poses), camera_from_target, search.network.lever)
         out[i] = int(np.argmin(away)) // len(view.poses)
     return out
 
@@ -238,19 +238,20 @@ class _Search:
         reasons, notes = untrustworthy(self.views, self.survey, self.reasons)
         self.reasons = {**reasons, **self.reasons}
         self.notes += notes
-        for view in self.views:
-            observation = ChainObservation(self.chains[view.block_idx], self.alternatives(view), view.block_idx)
-            (self.doubtful if view.block_idx in self.reasons else self.network.observations).append(observation)
+        first = pairwise(self.views.first.tolist())
+        for i, (a, b) in zip(self.views.sights.block_idx.tolist(), first, strict=True):
+            observation = ChainObservation(self.chains[i], self.alternatives(i, self.views.poses[a:b]), i)
+            (self.doubtful if i in self.reasons else self.network.observations).append(observation)
         if len(self.views):
             nearest = self.views.poses[self.views.first[:-1], :3, 3]
             self.network.lever = float(np.median(np.linalg.norm(nearest, axis=1)))
 
-    def alternatives(self, view: View) -> FloatArray:
+    def alternatives(self, i: int, poses: FloatArray) -> FloatArray:
         """Poses (k, 4, 4) of a block as named, then after every motion that its target cannot be told from."""
         if not self.turned:
-            return view.poses
-        motions = self.turned.get(str(self.survey.image_blocks[view.block_idx].target_id), ())
-        return np.concatenate([view.poses, *(view.poses @ motion for motion in motions)])
+            return poses
+        motions = self.turned.get(str(self.survey.image_blocks[i].target_id), ())
+        return np.concatenate([poses, *(poses @ motion for motion in motions)])
 
     def solve(self) -> None:
         """Determine lenses, all poses and points, the safest first; what floats is set freely one by one."""

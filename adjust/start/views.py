@@ -181,16 +181,16 @@ def make_views(
     few = [_sample(n) for n in np.diff(ptr).tolist()]
     few_ptr = ends_of([len(r) for r in few])
     rows = np.concatenate(few) + np.repeat(ptr[:-1], np.diff(few_ptr))
-    sample = x[rows], rays[rows], few_ptr
-    poses, of, failed = view_poses(*sample)
-    error, in_front = view_errors(poses, *sample, of)
+    part = x[rows], rays[rows], few_ptr
+    poses, of, failed = view_poses(*part)
+    error, in_front = view_errors(poses, *part, of)
     kept = _likeliest(focal, error, in_front, of)
     poses, of = poses[kept], of[kept]
     if present is not None:
         beside = np.unique(of)
         poses, of = np.concatenate([present[beside], poses]), np.concatenate([beside, of])
-    poses = refine_poses(poses, *sample, _STEPS[0], True, of)
-    error, in_front = view_errors(poses, *sample, of)
+    poses = refine_poses(poses, *part, _STEPS[0], True, of)
+    error, in_front = view_errors(poses, *part, of)
     kept = _likeliest(focal, error, in_front, of)
     poses, error, in_front, of = poses[kept], error[kept], in_front[kept], of[kept]
     more = (np.diff(few_ptr) < np.diff(ptr))[of] & thorough
