@@ -201,7 +201,7 @@ class TiltedSetups:
 
     def _set_freely(self) -> bool:
         """Where nothing is known, the station with the most distances is the world."""
-        if self.known or self._placed():
+        if self.known or self._placed() or np.isfinite(self.positions.points.x).any():
             return False
         count = {ref: sum(np.isfinite(s.distance) for s in mine) for ref, mine in self.sights.items()}
         ref = max(count, key=lambda r: count[r])
