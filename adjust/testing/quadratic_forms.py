@@ -10,7 +10,19 @@ from adjust.model.survey import FloatArray
 from adjust.testing.distributions import chi2, norm
 
 _STEPS = 100
+_DETERMINED = 1e-9
+"""Share of the largest eigenvalue of a correlation matrix that is not rounding; joint ones lose about ten digits."""
 _NEAR = 1e-4
+
+
+def pseudo_square(d: FloatArray, Q: FloatArray) -> tuple[float, int, FloatArray]:
+    """``d' Q^+ d``, the rank of Q, and ``Q^+`` (n, n), of d (n,) with covariance Q; in sigmas, as units do not mix."""
+    s = np.sqrt(np.maximum(np.diag(Q), 1e-300))
+    values, vectors = np.linalg.eigh(Q / np.outer(s, s))
+    kept = values > _DETERMINED * max(1.0, float(values.max(initial=0.0)))
+    half = vectors[:, kept] / np.sqrt(values[kept]) / s[:, None]
+    y = half.T @ d
+    return float(y @ y), int(kept.sum()), half @ half.T
 
 
 def upper_tail(x: float, weights: FloatArray) -> float:

@@ -1,5 +1,6 @@
 """Approximate coordinates of points from readings and distances, where none are given."""
 
+from collections import Counter
 from collections.abc import Mapping
 
 import numpy as np
@@ -9,7 +10,16 @@ from adjust.model.observations import PositionRef
 from adjust.model.survey import FloatArray, Survey
 from adjust.observations.listed import position_text
 from adjust.start.readings.plane import PlaneStart
-from adjust.start.readings.sights import Node, Sights, collect_sights, horizon_axes, node_of, spread_differences, ties
+from adjust.start.readings.sights import (
+    Node,
+    Sights,
+    collect_sights,
+    horizon_axes,
+    node_of,
+    spread,
+    spread_differences,
+    ties,
+)
 from adjust.start.readings.space import spread_space
 from adjust.start.readings.tilted import tilted_sights
 
@@ -75,31 +85,15 @@ def spread_heights(
 
     seeded: whether any height was given; else the first one is zero.
     """
-    edges: dict[Node, list[tuple[Node, float]]] = {}
-
-    def join(a: Node, b: Node, rise: float) -> None:
-        edges.setdefault(a, []).append((b, rise))
-        edges.setdefault(b, []).append((a, -rise))
-
-    for (a, b), rises in sights.rise.items():
-        join(a, b, float(np.median(rises)))
+    steps = [(a, b, float(np.median(rises))) for (a, b), rises in sights.rise.items()]
     for (a, b), angles in sights.zenith.items():
         if a in xy and b in xy and xy[a] != xy[b]:
             d = abs(xy[b] - xy[a])
-            join(a, b, float(np.median([d / np.tan(z) + up for z, up in angles])))
-    out = dict(known)
-    if not out and not seeded and edges:
-        out[max(edges, key=lambda n: (len(edges[n]), n))] = 0.0
-    front = list(out)
-    while front:
-        ways: dict[Node, list[float]] = {}
-        for a in front:
-            for b, rise in edges.get(a, ()):
-                if b not in out:
-                    ways.setdefault(b, []).append(out[a] + rise)
-        out |= {b: float(np.median(values)) for b, values in ways.items()}
-        front = list(ways)
-    return out
+            steps.append((a, b, float(np.median([d / np.tan(z) + up for z, up in angles]))))
+    if not known and not seeded and steps:
+        count = Counter(n for a, b, _ in steps for n in (a, b))
+        known = {max(count, key=lambda n: (count[n], n)): 0.0}
+    return spread(steps, known)
 
 
 def _baselines(survey: Survey, E: FloatArray, xy: dict[Node, complex], height: dict[Node, float]) -> None:

@@ -13,6 +13,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.survey import FloatArray, Survey
 from adjust.native.views import refine_poses, view_errors
+from adjust.observations.terrestrial.batch import circular_median
 from adjust.spatial.rigid import align, inverse, rotation_exp
 from adjust.start.closed_forms.absolute_pose import pose_solutions
 from adjust.start.closed_forms.triangulation import intersect
@@ -146,11 +147,7 @@ class TiltedSetups:
             if s.setup_id == setup_id and s.node in self.known:
                 x = back[:3, :3] @ self.known[s.node] + back[:3, 3]
                 angles.append(np.arctan2(x[1], x[0]) - np.arctan2(s.ray[1], s.ray[0]))
-        if not angles:
-            return None
-        # the one nearest to all others: a wrong point turns nothing
-        apart = np.abs(np.angle(np.exp(1j * np.subtract.outer(angles, angles)))).sum(axis=1)
-        return float(angles[int(np.argmin(apart))])
+        return circular_median(np.array(angles)) if angles else None
 
     def _stations(self, fewest: int) -> bool:
         """Poses of stations from the known points that one of their set-ups sees."""
