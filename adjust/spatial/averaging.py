@@ -52,7 +52,7 @@ def mean_poses(
         distance = pose_distance(here, mean[live[of]], lever)
         chosen = least(distance, member[rows])
         first = np.searchsorted(of[chosen], np.arange(len(live)))
-        scale = np.maximum(3.0 * _medians(distance[chosen], of[chosen], first), 1e-12)
+        scale = np.maximum(3.0 * medians(distance[chosen], of[chosen], len(live)), 1e-12)
         weights = 1.0 / (1.0 + (distance[chosen] / scale[of[chosen]]) ** 2) ** 2
         total = np.add.reduceat(weights[:, None, None] * here[chosen, :3], first)
         step = rigid(nearest_rotation(total[..., :3]), total[..., 3] / np.add.reduceat(weights, first)[:, None])
@@ -70,9 +70,10 @@ def least(values: FloatArray, owner: IntArray) -> IntArray:
     return np.asarray(order[np.flatnonzero(np.diff(owner[order], prepend=-1))])
 
 
-def _medians(values: FloatArray, owner: IntArray, first: IntArray) -> FloatArray:
-    """Medians (k,) of values (n,) sorted by owner, whose first ones lie at ``first`` (k,)."""
-    ordered, size = values[np.lexsort((values, owner))], np.diff(np.append(first, len(values)))
+def medians(values: FloatArray, owner: IntArray, k: int) -> FloatArray:
+    """Of the values (n,) of each of k owners (n,); of one without any the number means nothing."""
+    ordered, size = np.append(values[np.lexsort((values, owner))], 0.0), np.bincount(owner, minlength=k)
+    first = np.cumsum(size) - size
     return np.asarray(0.5 * (ordered[first + (size - 1) // 2] + ordered[first + size // 2]))
 
 

@@ -38,24 +38,39 @@ class ChainObservation(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Chains:
+class Chains:
     """Chains padded to L links: slots (n, L), -1 behind the end, which of them (n, L) are inverted."""
 
     slots: IntArray
     inverted: BoolArray
 
-    def part(self, rows: IntArray) -> "_Chains":
-        return _Chains(self.slots[rows], self.inverted[rows])
+    @staticmethod
+    def of(chains: Sequence[Chain]) -> "Chains":
+        """Side by side."""
+        sizes = [len(chain) for chain in chains]
+        slots = np.full((len(chains), max(sizes, default=0)), -1, dtype=np.int64)
+        inverted = np.zeros(slots.shape, dtype=np.bool_)
+        inside = np.arange(slots.shape[1]) < np.array(sizes, dtype=np.int64)[:, None]
+        slots[inside] = [link.slot for chain in chains for link in chain]
+        inverted[inside] = [link.inverse for chain in chains for link in chain]
+        return Chains(slots, inverted)
 
+    def part(self, rows: IntArray) -> "Chains":
+        """Some (m,) of them."""
+        return Chains(self.slots[rows], self.inverted[rows])
 
-def _padded(chains: Sequence[Chain]) -> _Chains:
-    sizes = [len(chain) for chain in chains]
-    slots = np.full((len(chains), max(sizes, default=0)), -1, dtype=np.int64)
-    inverted = np.zeros(slots.shape, dtype=np.bool_)
-    inside = np.arange(slots.shape[1]) < np.array(sizes, dtype=np.int64)[:, None]
-    slots[inside] = [link.slot for chain in chains for link in chain]
-    inverted[inside] = [link.inverse for chain in chains for link in chain]
-    return _Chains(slots, inverted)
+    def once(self, wanted: BoolArray) -> BoolArray:
+        """Where (n, L) they pass a slot that is ``wanted`` (slots,), but none of those that they pass twice."""
+        out = (self.slots >= 0) & wanted[self.slots]
+        for j in range(out.shape[1]):
+            out[:, j] &= (self.slots == self.slots[:, j : j + 1]).sum(axis=1) == 1
+        return out
+
+    def by_slot(self, where: BoolArray) -> tuple[IntArray, IntArray]:
+        """Rows and columns of the links ``where`` (n, L), sorted by slot."""
+        row, column = np.nonzero(where)
+        order = np.argsort(self.slots[row, column], kind="stable")
+        return row[order], column[order]
 
 
 class FrameNetwork:
@@ -100,10 +115,10 @@ class FrameNetwork:
 
     def products(self, chains: Sequence[Chain]) -> FloatArray:
         """The products (n, 4, 4) of chains that are wholly known."""
-        padded = _padded(chains)
+        padded = Chains.of(chains)
         return self._products(padded, padded.slots >= 0)
 
-    def _products(self, chains: _Chains, taken: BoolArray) -> FloatArray:
+    def _products(self, chains: Chains, taken: BoolArray) -> FloatArray:
         """Products (n, 4, 4) of those links that are ``taken`` (n, L)."""
         out = np.tile(IDENTITY, (len(taken), 1, 1))
         for column in range(taken.shape[1]):
@@ -123,7 +138,7 @@ class FrameNetwork:
         return not all(self.has[link.slot] for link in chain)
 
     def _isolate(
-        self, observations: Sequence[ChainObservation], chains: _Chains, at: IntArray
+        self, observations: Sequence[ChainObservation], chains: Chains, at: IntArray
     ) -> tuple[FloatArray, IntArray]:
         """What observations say of the slot at the position (n,) of their chain, all other links being known.
 
@@ -148,14 +163,11 @@ class FrameNetwork:
         if self.has.all():
             return False
         observations = [o for o in self.observations if rotation_only or not o.rotation_only]
-        chains = _padded([o.chain for o in observations])
-        unknown = (chains.slots >= 0) & ~self.has[chains.slots]
+        chains = Chains.of([o.chain for o in observations])
         # a slot that a chain passes twice cannot be isolated
-        ordered = np.sort(np.where(unknown, chains.slots, -1), axis=1)
-        unknown[((np.diff(ordered, axis=1) == 0) & (ordered[:, 1:] >= 0)).any(axis=1)] = False
-        row, column = np.nonzero(unknown)
-        order = np.argsort(chains.slots[row, column], kind="stable")
-        row, column = row[order], column[order]
+        unknown = (chains.slots >= 0) & ~self.has[chains.slots]
+        unknown[(unknown & ~chains.once(~self.has)).any(axis=1)] = False
+        row, column = chains.by_slot(unknown)
         first = np.searchsorted(chains.slots[row, column], np.arange(len(self.has) + 1))
         left = unknown.sum(axis=1)
         support = np.bincount(chains.slots[row, column][left[row] == 1], minlength=len(self.has))
@@ -180,7 +192,7 @@ class FrameNetwork:
         return found
 
     def _determine(
-        self, every: Sequence[ChainObservation], chains: _Chains, rows: IntArray, at: IntArray
+        self, every: Sequence[ChainObservation], chains: Chains, rows: IntArray, at: IntArray
     ) -> None:
         """Set the slots at the positions (n,) of the chains of observations ``rows`` (n,), sorted by slot.
 
@@ -220,13 +232,8 @@ class FrameNetwork:
     def relax(self, movable: BoolArray) -> None:
         """Renew each movable slot as the mean over all observations that contain it once (Gauss-Seidel)."""
         whole = [o for o in self.observations if not o.rotation_only and not self.open_slots(o.chain)]
-        chains = _padded([o.chain for o in whole])
-        once = (chains.slots >= 0) & movable[chains.slots]
-        for j in range(once.shape[1]):
-            once[:, j] &= (chains.slots == chains.slots[:, j : j + 1]).sum(axis=1) == 1
-        row, column = np.nonzero(once)
-        order = np.argsort(chains.slots[row, column], kind="stable")
-        row, column = row[order], column[order]
+        chains = Chains.of([o.chain for o in whole])
+        row, column = chains.by_slot(chains.once(movable))
         for mine in np.split(np.arange(len(row)), np.flatnonzero(np.diff(chains.slots[row, column])) + 1):
             if len(mine):
                 self._determine(whole, chains.part(row[mine]), row[mine], column[mine])
