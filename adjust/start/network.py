@@ -176,7 +176,8 @@ class FrameNetwork:
             ready = np.flatnonzero(2 * support >= most)
             using = _runs(first, ready)
             # of two that one chain joins the second is better off after the first
-            both = np.flatnonzero((left == 2) & (np.bincount(row[using], minlength=len(left)) == 2))
+            both, times = np.unique(row[using], return_counts=True)
+            both = both[(times == 2) & (left[both] == 2)]
             if len(both):
                 ready = np.setdiff1d(ready, np.where(unknown[both], chains.slots[both], -1).max(axis=1))
                 using = _runs(first, ready)
