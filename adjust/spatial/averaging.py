@@ -5,7 +5,7 @@ import numpy as np
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.rigid import nearest_rotation, rigid
 
-_MEDOID_LIMIT = 150  # more candidates than this are thinned out for the quadratic search of the medoid
+_MEDOID_LIMIT = 75  # more candidates than this are thinned out for the quadratic search of the medoid
 _AT_ONCE = 1000  # means whose medoids are found together
 _SETTLED = 1e-4  # of the scale: a further step tells nothing that the motions do
 

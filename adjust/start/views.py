@@ -137,10 +137,14 @@ def rays_by_block(
     """Rays (n, 3) of the image points ``seen`` (n, 2) px of some blocks, and the reason for each that has none."""
     rays: dict[int, FloatArray] = {}
     failed: dict[int, str] = {}
-    for camera in survey.cameras:
-        mine = {i: uv for i, uv in seen.items() if survey.image_blocks[i].camera_id == camera.camera_id and len(uv)}
-        found = rays_of_images(camera, lenses[camera.camera_id], list(mine.values())) if mine else []
-        for i, of_block in zip(mine, found, strict=True):
+    mine: dict[str, list[int]] = {}
+    for i, uv in seen.items():
+        if len(uv):
+            mine.setdefault(survey.image_blocks[i].camera_id, []).append(i)
+    for camera in (c for c in survey.cameras if c.camera_id in mine):
+        of_camera = mine[camera.camera_id]
+        found = rays_of_images(camera, lenses[camera.camera_id], [seen[i] for i in of_camera])
+        for i, of_block in zip(of_camera, found, strict=True):
             if isinstance(of_block, SurveyError):
                 failed[i] = str(of_block)
             else:
