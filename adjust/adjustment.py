@@ -19,7 +19,6 @@ from adjust.precision.precision import Precision, global_test, group_summaries, 
 from adjust.start import Start, find_start
 from adjust.start.choice import Begun, adjusted_from_own_start
 from adjust.start.given import GivenStarts, given_starts, moved_onto
-from adjust.start.readings.joint import find_all, needs_points
 from adjust.start.robust import limit, screen
 
 
@@ -126,7 +125,7 @@ def _trusted(survey: Survey, given: GivenStarts, options: AdjustOptions) -> Begu
 
 def _found(survey: Survey, given: GivenStarts) -> Start:
     """Start values; of a free network where the given ones were, though they may have been left aside."""
-    found = find_all(survey) if needs_points(survey) else find_start(survey)
+    found = find_start(survey)
     moved = survey.datum.kind == "inner" and not given_starts(survey) and given
     return moved_onto(found, given, survey) if moved else found
 

@@ -20,7 +20,6 @@ from adjust.model.observations import PositionRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.start import find_start
-from adjust.start.readings.joint import find_all, needs_points
 from adjust.statistics.outliers.supported import supported
 
 _CELLS = (8, 6)
@@ -69,7 +68,7 @@ def _expected(survey: Survey) -> tuple[Adjustment | None, list[Finding]]:
     """The precision to be expected, or why there is none."""
     try:
         survey = supported(survey)[0]
-        found = find_all(survey) if needs_points(survey) else find_start(survey)
+        found = find_start(survey)
         return expect(survey, start_values(found)), []
     except IndeterminateError as error:
         return None, [Finding("problem", "undetermined", (), str(error), "measure or fix what is named")]

@@ -13,7 +13,7 @@ from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.start.lenses import Sighting, start_lens
-from adjust.start.views import Sight, View, all_rays, focal_px, make_views, target_points, used_rows
+from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block, target_points, used_rows
 
 CAP = 25.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
@@ -32,7 +32,7 @@ class Case:
     @cached_property
     def views(self) -> Mapping[int, View]:
         """Every block of a target with enough points, as rays and poses ``camera_from_target``, each by itself."""
-        return single_views(self.survey, self.lenses)
+        return {v.block_idx: v for v in single_views(self.survey, self.lenses)}
 
     @cached_property
     def lenses(self) -> Mapping[str, FloatArray]:
@@ -126,24 +126,16 @@ def own_lenses(survey: Survey) -> dict[str, FloatArray]:
     return found
 
 
-def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> dict[int, View]:
-    """Every block of a target with three used points or more that has a pose, by its position."""
+def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
+    """Every block of a target with three used points or more that has a pose."""
     points = {t.target_id: target_points(t) for t in survey.targets}
-    cameras = {c.camera_id: c for c in survey.cameras}
-    known = replace(
-        survey,
-        image_blocks=tuple(b for b in survey.image_blocks if b.camera_id in lenses),
-    )
-    where = [i for i, b in enumerate(survey.image_blocks) if b.camera_id in lenses]
-    rays, _ = all_rays(known, dict(lenses))
-    sights = []
-    for k, i in enumerate(where):
-        block = survey.image_blocks[i]
-        used = used_rows(block)
-        if block.target_id is not None and k in rays and used.sum() >= 3:
-            x = points[block.target_id][block.point_idx[used]]
-            sights.append(Sight(i, x, rays[k][used], focal_px(cameras[block.camera_id], lenses[block.camera_id])))
-    return {v.block_idx: v for v in make_views(sights)[0]}
+    known = replace(survey, cameras=tuple(c for c in survey.cameras if c.camera_id in lenses))
+    focal = {c.camera_id: focal_px(c, lenses[c.camera_id]) for c in known.cameras}
+    blocks = {i: b for i, b in enumerate(survey.image_blocks) if b.target_id is not None}
+    rays, _ = rays_by_block(known, lenses, {i: b.uv[used_rows(b)] for i, b in blocks.items()})
+    seen = {i: points[str(blocks[i].target_id)][blocks[i].point_idx[used_rows(blocks[i])]] for i in rays}
+    sights = joined([(i, x, rays[i], focal[blocks[i].camera_id]) for i, x in seen.items() if len(x) >= 3])
+    return make_views(sights)[0]
 
 
 def with_lenses(survey: Survey, result: Adjustment) -> Survey:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy
 from gtsam import Pose3
 
 from adjust.epochs.congruence_result import Congruence, CongruenceStep, CongruenceTest, Motion
@@ -22,8 +21,7 @@ from adjust.statistics.relative_precision import ellipsoid
 from adjust.statistics.result import Ellipsoid
 from adjust.testing.criteria import LevelOptions, noncentrality, sidak
 from adjust.testing.distributions import chi2, fisher
-
-_DETERMINED = 1e-9
+from adjust.testing.quadratic_forms import pseudo_square, pseudo_square_beside
 
 
 @dataclass(frozen=True)
@@ -138,8 +136,9 @@ def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> tuple[float,
     f1, f2 = first.redundancy, second.redundancy
     p = float("nan")
     if f1 > 0 and f2 > 0:
-        ratio = (first.omega / f1) / (second.omega / f2)
-        p = float(2.0 * min(fisher.sf(1.0 / ratio, f2, f1), fisher.sf(ratio, f1, f2)))
+        a, b = np.float64(first.omega / f1), np.float64(second.omega / f2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            p = float(2.0 * min(fisher.sf(b / a, f2, f1), fisher.sf(a / b, f1, f2)))
     if not scaled or f1 + f2 <= 0:
         return 1.0, float("inf"), p
     return float(np.sqrt((first.omega + second.omega) / (f1 + f2))), float(f1 + f2), p
@@ -190,34 +189,8 @@ def _weights(change: _Change) -> FloatArray:
     Q, G = change.Q, change.G
     if G.shape[1]:
         Q = transformed(change.d, Q, G, np.ones(len(G)))[1]
-    precision = np.diag(_quadratic(change.d, Q)[2])
+    precision = np.diag(pseudo_square(change.d, Q)[2])
     return np.asarray(np.where(position, precision[position].mean(), precision[~position].mean()))
-
-
-def _quadratic(d: FloatArray, Q: FloatArray) -> tuple[float, int, FloatArray]:
-    """D' Q^+ d, the rank, and Q^+; in sigmas, because radians and metres do not compare."""
-    s = np.sqrt(np.maximum(np.diag(Q), 1e-300))
-    values, vectors = np.linalg.eigh(Q / np.outer(s, s))
-    kept = values > _DETERMINED * max(1.0, float(values.max(initial=0.0)))
-    half = vectors[:, kept] / np.sqrt(values[kept]) / s[:, None]
-    y = half.T @ d
-    return float(y @ y), int(kept.sum()), half @ half.T
-
-
-def _regular(d: FloatArray, Q: FloatArray, held: FloatArray) -> tuple[float, int]:
-    """The first two of :func:`_quadratic`, by Cholesky's method where nothing is open but the motions ``held`` (n, k).
-
-    Q held = 0 and held' d = 0: with N that spans these in sigmas, Q^+ is inv(Q + N N') on d.
-    """
-    s = np.sqrt(np.maximum(np.diag(Q), 1e-300))
-    N = np.linalg.qr(s[:, None] * held)[0]
-    full = Q / np.outer(s, s) + N @ N.T
-    norm = float(np.abs(full).sum(axis=0).max(initial=0.0))
-    factor, lost = scipy.linalg.lapack.dpotrf(full.T, lower=0, clean=0, overwrite_a=1) if len(d) else (full, 1)
-    if lost or scipy.linalg.lapack.dpocon(factor, norm)[0] < _DETERMINED:
-        return _quadratic(d, Q)[:2]
-    y = scipy.linalg.lapack.dtrtrs(factor, d / s, lower=0, trans=1)[0]
-    return float(y @ y), len(d) - held.shape[1]
 
 
 def _test(statistic: float, freedom: int, pooled: tuple[float, float, float], level: float) -> CongruenceTest:
@@ -234,7 +207,7 @@ def _global(
 ) -> CongruenceTest:
     here = change.transformed(stable)
     rows = here.rows(stable)
-    statistic, rank = _regular(here.d[rows], here.Q[np.ix_(rows, rows)], here.held[rows])
+    statistic, rank = pseudo_square_beside(here.d[rows], here.Q[np.ix_(rows, rows)], here.held[rows])
     # what the datum takes away is no information, whatever rounding leaves of it
     rank = min(rank, max(0, len(rows) - change.G.shape[1]))
     return _test(statistic, rank, pooled, alpha)
@@ -281,7 +254,7 @@ def _shares(change: _Change, stable: Sequence[int]) -> dict[int, float]:
     here = change.transformed(stable)
     rows = here.rows(stable)
     d = here.d[rows]
-    _, _, P = _quadratic(d, here.Q[np.ix_(rows, rows)])
+    _, _, P = pseudo_square(d, here.Q[np.ix_(rows, rows)])
     gradient, owner, out = P @ d, here.owner[rows], {}
     for i in stable:
         mine = np.flatnonzero(owner == i)
@@ -292,7 +265,7 @@ def _shares(change: _Change, stable: Sequence[int]) -> dict[int, float]:
 
 def _single(here: _Change, i: int, pooled: tuple[float, float, float], level: float) -> CongruenceTest:
     rows = here.rows([i])
-    statistic, rank, _ = _quadratic(here.d[rows], here.Q[np.ix_(rows, rows)])
+    statistic, rank, _ = pseudo_square(here.d[rows], here.Q[np.ix_(rows, rows)])
     return _test(statistic, rank, pooled, level)
 
 
@@ -323,7 +296,7 @@ def _motion(
     turn, rotation_test = np.zeros(3), None
     if isinstance(before.value(name), Pose3):
         turning = np.flatnonzero(place < 3)
-        statistic, rank, _ = _quadratic(d[turning], Q[np.ix_(turning, turning)])
+        statistic, rank, _ = pseudo_square(d[turning], Q[np.ix_(turning, turning)])
         turn, rotation_test = full[:3], _test(statistic, rank, pooled, level)
     if name in here.nowhere:
         nan = np.full((3, 3), np.nan)

@@ -206,8 +206,9 @@ def unit_rays(model: LensModel, values: FloatArray, constants: FloatArray, uv: F
     """Unit vectors (n, 3) in the camera frame of image points (n, 2) px, up to 180 degrees for the fisheye."""
     uv = np.ascontiguousarray(uv, dtype=np.float64)
     if model.kind != kernels.FISHEYE:
-        directions = np.column_stack([rays(model, values, constants, uv), np.ones(len(uv))])
-        unit: FloatArray = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        tangents, unit = rays(model, values, constants, uv), np.empty((len(uv), 3))
+        unit[:, 2] = 1.0 / np.sqrt(1.0 + tangents[:, 0] ** 2 + tangents[:, 1] ** 2)
+        unit[:, :2] = tangents * unit[:, 2:]
         return unit
     distorted = _affine_inverse(values, uv)
     theta_d = np.hypot(distorted[:, 0], distorted[:, 1])

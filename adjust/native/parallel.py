@@ -36,6 +36,8 @@ def split_blocks(ptr: IntArray) -> list[IntArray]:
     """Block numbers in runs of about equal numbers of points: one run for small batches, else one per worker."""
     n, total = len(ptr) - 1, int(ptr[-1])
     count = 1 if total < _WORTHWHILE else min(n, workers())
+    if count <= 1:
+        return [np.arange(n)] if n else []
     edges = np.searchsorted(ptr, np.linspace(0, total, count + 1)[1:-1])
     return [run.astype(np.int64) for run in np.split(np.arange(n), edges) if len(run)]
 
