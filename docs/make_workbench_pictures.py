@@ -12,7 +12,8 @@ from typing import Any
 from playwright.sync_api import sync_playwright
 
 from survey.workbench.guard import new_token
-from survey.workbench.server import Listening, Server
+from survey.workbench.live import Listening
+from survey.workbench.server import Server
 from survey.workbench.session import Workbench
 
 CHROMIUM = "/usr/bin/chromium"

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from survey.workbench.guard import new_token
-from survey.workbench.server import Listening, Server
+from survey.workbench.live import Listening
+from survey.workbench.server import Server
 from survey.workbench.session import Workbench
 
 _ENDINGS = {signal.SIGINT, signal.SIGTERM}

@@ -8,11 +8,13 @@ from urllib.parse import quote
 import numpy as np
 from gtsam import Pose3
 
+from adjust.diagnosis.hypothesis import Place
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from survey.folder.text import suggestion
 from survey.project.observed import name_of_residual
+from survey.report.language import message
 from survey.report.scene import scene_of
 from survey.solution.changes import snapshot
 from survey.solution.dictionary import plain, solution_dict
@@ -26,6 +28,10 @@ from survey.workbench.session import Workbench
 _MOST_FINDINGS = 100
 _MOST_FITTING = 20
 _IN_WARNING = re.compile(r"camera (?P<camera>\S+) at epoch (?P<epoch>[^\s,:]+)")
+
+
+ANCHORED = ("image", "obs", "point", "reading", "param", "camera", "epoch", "target", "group", "station", "table")
+"""Kinds of things that have a place on the page."""
 
 
 def anchor(kind: str, text: str) -> str:
@@ -49,9 +55,10 @@ def state(bench: Workbench) -> dict[str, Any]:
         "version": bench.version, "folder": str(bench.folder), "title": now.project.title,
         "read_only": bench.read_only, "lock": bench.holder(), "changed_files": bench.changed_files(),
         "unsaved": bench.n_unsaved, "undo": bench.undoable, "redo": bench.redoable,
-        "solution": None if solved is None else {**snapshot(solved).summary, "mode": now.mode, "seconds": now.seconds,
-                                                 "sigmas": bench.scale.sigmas},
-        "warnings": [] if solved is None else solved.warnings,
+        "solution": None if solved is None else _summary(solved) | {
+            "mode": now.mode, "seconds": now.seconds, "sigmas": bench.scale.sigmas},
+        "warnings": [] if solved is None else [message(w) for w in solved.warnings],
+        "failure": None if bench.failure is None else message(str(bench.failure)),
         "exclusions": [{"name": str(e.name), "what": e.name.what, "id": e.name.id, "reason": e.reason,
                         "author": e.author, "time": e.time, "line": e.line} for e in now.exclusions.values()],
         "tree": _tree(bench),
@@ -61,6 +68,11 @@ def state(bench: Workbench) -> dict[str, Any]:
         "datum": {"kind": now.project.survey.datum.kind, "points": now.project.survey.datum.points,
                   "stations": now.project.survey.datum.stations},
     }))  # fmt: skip
+
+
+def _summary(solved: Adjustment) -> dict[str, Any]:
+    found = dict(snapshot(solved).summary)
+    return found | {"reason": message(str(found["reason"]))}
 
 
 def _tree(bench: Workbench) -> dict[str, Any]:
@@ -117,21 +129,51 @@ def parameters(bench: Workbench) -> dict[str, Any]:
 
 
 def findings(bench: Workbench) -> dict[str, Any]:
-    """The verdict, warnings, and what is suspect or was left out by this run, worst first, each with its remedies."""
-    now = bench.situation
-    solved = now.solved
+    """The verdict, warnings, and what is suspect or was left out by this run, worst first, each with its remedies.
+
+    remedies: what the diagnosis says would mend it; also of a survey that cannot be adjusted, of which nothing else is
+    known.
+    """
+    solved = bench.situation.adjustment
+    known: dict[str, Any] = {"verdict": "failed", "reason": message(str(bench.failure or "")), "warnings": [],
+                             "causes": [], "n_failing": 0, "findings": []}  # fmt: skip
+    if solved is not None:
+        known = _of_solution(bench, solved)
+    return dict(plain({"version": bench.version, **known, "remedies": remedies(bench)}))
+
+
+def remedies(bench: Workbench) -> list[dict[str, Any]]:
+    """The candidates of the diagnosis, the best first: cause, change, evidence, and whether a program can do it."""
+    out = []
+    for number, candidate in enumerate(bench.remedies, start=1):
+        h = candidate.hypothesis
+        out.append({
+            "number": number, "name": h.name, "cause": h.cause, "change": h.change, "possible": bool(h.edits),
+            "anchor": _anchor_of(h.place), "explained": candidate.explained, "statistic": candidate.statistic,
+            "critical": candidate.critical, "probability": candidate.probability, "sigma0": candidate.sigma0,
+        })  # fmt: skip
+    return out
+
+
+def _anchor_of(place: Place) -> str | None:
+    """Where a hypothesis sits, as a place of the page."""
+    return anchor(place.kind, "/".join(place.ids)) if place.kind in ANCHORED and place.ids else None
+
+
+def _of_solution(bench: Workbench, solved: Adjustment) -> dict[str, Any]:
     image_limit, limit = limits(solved)
     found = [*_of_points(bench, image_limit), *_of_readings(bench, limit)]
     worst = sorted(found, key=lambda f: -(f["share"] or 0.0))
     failing = [f for f in worst if f["why"] == BY_THIS_RUN or (f["share"] or 0.0) > 1.0]
     fitting = [f for f in worst if f["why"] == IN_USE and (f["share"] or 0.0) <= 1.0]
+    told = bench.diagnosis.lines if bench.diagnosis is not None else ()
     causes = [w.removeprefix("probable cause: ") for w in solved.warnings if w.startswith("probable cause")]
     shown = [*_of_images(bench, failing), *failing[:_MOST_FINDINGS], *fitting[:_MOST_FITTING]]
-    return dict(plain({
-        "version": bench.version, **{k: snapshot(solved).summary[k] for k in ("verdict", "reason")},
-        "warnings": [{"text": w, "anchors": _anchors_in(w)} for w in solved.warnings], "causes": causes,
-        "n_failing": len(failing), "findings": shown,
-    }))  # fmt: skip
+    return {
+        **{k: v for k, v in _summary(solved).items() if k in ("verdict", "reason")},
+        "warnings": [{"text": message(w), "anchors": _anchors_in(w)} for w in solved.warnings],
+        "causes": [message(c) for c in causes if c not in told], "n_failing": len(failing), "findings": shown,
+    }  # fmt: skip
 
 
 def _anchors_in(text: str) -> list[str]:

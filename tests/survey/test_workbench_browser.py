@@ -16,8 +16,9 @@ import pytest
 from survey.examples import write_example
 from survey.report.language import catalogue
 from survey.workbench.guard import new_token
+from survey.workbench.live import Listening
 from survey.workbench.rows import columns
-from survey.workbench.server import WEB, Listening, Server
+from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
 from tests.survey.test_report_browser import CONTRAST, need_browser
 

@@ -14,7 +14,8 @@ from starlette.websockets import WebSocketDisconnect
 from websockets.sync.client import connect
 
 from survey.cli import main
-from survey.workbench.server import Listening, Server
+from survey.workbench.live import Listening
+from survey.workbench.server import Server
 from survey.workbench.session import Workbench
 from tests.survey.test_workbench import exclusions, wrong_point
 

@@ -29,6 +29,8 @@ export class FindingsView {
       make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
       (findings.warnings ?? []).length ? make("ul", { class: "problems" }, ...findings.warnings.map((w) => make("li", {}, w.text, ...w.anchors.flatMap((to) => [" ", link(to, decodeURIComponent(to.replace(/^#\w+=/, "")))])))) : null,
       ...causes.map((cause) => this.cause(cause)),
+      findings.remedies?.length ? make("h2", {}, t("What would mend it")) : null,
+      ...(findings.remedies ?? []).map((remedy) => this.remedy(remedy)),
       make("h2", {}, t("Suspects"), " ", make("span", { class: "quiet" }, count(findings.n_suspects ?? suspects.length))),
       suspects.length ? this.suspects(t("Suspects, worst first"), suspects) : make("p", { class: "quiet" }, t("Nothing disagrees with the others.")),
       state.exclusions.length ? this.exclusions(state.exclusions) : null,
@@ -39,6 +41,13 @@ export class FindingsView {
   }
 
   cause(text) { return make("p", { class: "cause" }, make("b", {}, t("Probable cause")), " ", text); }
+
+  /** A cause that was tried: what it explains, and one click that carries it out. */
+  remedy(r) {
+    const evidence = t("explains {share} % of the misfit; sigma0 becomes {sigma0}; test {test}, limit {limit}; probability {sure} %", { share: number(100 * r.explained, 0), sigma0: number(r.sigma0, 3), test: significant(r.statistic, 3), limit: significant(r.critical, 3), sure: number(100 * r.probability, 0) });
+    return make("div", { class: "cause remedy" }, make("p", {}, make("b", {}, `${r.number}. ${r.cause}`), "; ", r.change, r.anchor ? [" ", link(r.anchor, t("show"))] : null), make("p", { class: "quiet" }, evidence),
+      this.bench.state.read_only ? null : r.possible ? button(t("Apply"), () => this.actions.remedy(r.number), r.number === 1 ? "m" : "", { "aria-label": `${t("Apply")}: ${r.cause}` }) : make("p", { class: "quiet" }, t("Only you can do that.")));
+  }
 
   suspects(title, rows) {
     return plainTable(title, [t("observation"), "w", t("share of limit"), "r", t("residual"), ""],
