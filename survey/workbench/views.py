@@ -27,7 +27,9 @@ from survey.workbench.session import Workbench
 
 _MOST_FINDINGS = 100
 _MOST_FITTING = 20
-_IN_WARNING = re.compile(r"camera (?P<camera>\S+) at epoch (?P<epoch>[^\s,:]+)")
+_CAUSE = "probable cause: "
+_IN_WARNING = re.compile(r"camera '?(?P<camera>[^\s',]+)'?(?: at|,) epoch '?(?P<epoch>[^\s',:]+)|"
+                         r"table (?P<table>\S+), epoch (?P<read>[^\s,:]+)")  # fmt: skip
 
 
 ANCHORED = ("image", "obs", "point", "reading", "param", "camera", "epoch", "target", "group", "station", "table")
@@ -167,17 +169,25 @@ def _of_solution(bench: Workbench, solved: Adjustment) -> dict[str, Any]:
     failing = [f for f in worst if f["why"] == BY_THIS_RUN or (f["share"] or 0.0) > 1.0]
     fitting = [f for f in worst if f["why"] == IN_USE and (f["share"] or 0.0) <= 1.0]
     told = bench.diagnosis.lines if bench.diagnosis is not None else ()
-    causes = [w.removeprefix("probable cause: ") for w in solved.warnings if w.startswith("probable cause")]
+    causes = [w.removeprefix(_CAUSE) for w in solved.warnings if w.startswith(_CAUSE)]
     shown = [*_of_images(bench, failing), *failing[:_MOST_FINDINGS], *fitting[:_MOST_FITTING]]
     return {
         **{k: v for k, v in _summary(solved).items() if k in ("verdict", "reason")},
-        "warnings": [{"text": message(w), "anchors": _anchors_in(w)} for w in solved.warnings],
-        "causes": [message(c) for c in causes if c not in told], "n_failing": len(failing), "findings": shown,
+        "warnings": [_said(w) for w in solved.warnings if not w.startswith(_CAUSE)],
+        "causes": [_said(c) for c in causes if c not in told], "n_failing": len(failing), "findings": shown,
     }  # fmt: skip
 
 
 def _anchors_in(text: str) -> list[str]:
-    return [anchor("image", f"{m['camera']}/{m['epoch']}") for m in _IN_WARNING.finditer(text)]
+    return [
+        anchor("reading", f"table_angles:{m['table']}/{m['read']}") if m["table"] else
+        anchor("image", f"{m['camera']}/{m['epoch']}") for m in _IN_WARNING.finditer(text)
+    ]  # fmt: skip
+
+
+def _said(text: str) -> dict[str, Any]:
+    """A message in the reader's language, with the places it names."""
+    return {"text": message(text), "anchors": _anchors_in(text)}
 
 
 def _of_points(bench: Workbench, limit: float) -> Iterable[dict[str, Any]]:

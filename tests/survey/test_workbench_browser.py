@@ -25,7 +25,8 @@ from tests.survey.test_report_browser import CONTRAST, need_browser
 WRONG = ("tX05", "X", "board", "c40")  # an image point that is moved by 4 px
 NAME = "X/tX05/board/c40"
 SECONDS = 30.0
-VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations")
+VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations",
+         "settings")  # fmt: skip
 ROWS = "Number(document.querySelector('#tables [role=grid]').getAttribute('aria-rowcount'))"
 
 
@@ -217,10 +218,23 @@ def test_readable_on_desk_and_phone(browser: Any, address: str, scheme: str, wid
     assert page.complaints == []
 
 
+def test_the_datum_is_chosen_and_taken_back(page: Page, folder: Path) -> None:
+    p, before = page.page, (folder / "survey.toml").read_text()
+    p.locator("#right .chooser select").select_option("settings")
+    p.locator("#right").get_by_label("Datum", exact=True).select_option("inner")
+    page.done(lambda: p.locator("#set-datum").click())
+    text = (folder / "survey.toml").read_text()
+    assert 'kind = "inner"' in text or "Not done" in p.inner_text("#message")
+    if text != before:
+        page.done(lambda: p.locator("#undo").click())
+    assert (folder / "survey.toml").read_text() == before
+
+
 def test_german(page: Page) -> None:
     p = page.page
     p.keyboard.press("g")
     page.wait("document.documentElement.lang === 'de'")
+    page.wait("document.querySelector('#left .verdict').textContent.includes('Globaltest')")  # the server's words
     assert "Redundanz" in page.facts()
     assert p.evaluate("document.querySelector('#facts').textContent.match(/sigma0 \\d,\\d{4}/) !== null")
 

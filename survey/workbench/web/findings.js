@@ -6,6 +6,9 @@ import { anchor, current, select } from "./store.js";
 import { rowOf, rowsOfImage } from "./source.js";
 import { placeOf } from "./tree.js";
 
+/** The places that a message names. */
+const places = (said) => said.anchors.flatMap((to) => [" ", link(to, decodeURIComponent(to.replace(/^#\w+=/, "")), { data: { id: decodeURIComponent(to.replace(/^#\w+=/, "")) } })]);
+
 export class FindingsView {
   /** @param {any} bench @param {any} actions */
   constructor(bench, actions) {
@@ -27,7 +30,7 @@ export class FindingsView {
     const suspects = findings.suspects ?? [], causes = findings.causes ?? [];
     fill(this.element, 
       make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
-      (findings.warnings ?? []).length ? make("ul", { class: "problems" }, ...findings.warnings.map((w) => make("li", {}, w.text, ...w.anchors.flatMap((to) => [" ", link(to, decodeURIComponent(to.replace(/^#\w+=/, "")))])))) : null,
+      (findings.warnings ?? []).length ? make("ul", { class: "problems" }, ...findings.warnings.map((w) => make("li", {}, w.text, ...places(w)))) : null,
       ...causes.map((cause) => this.cause(cause)),
       findings.remedies?.length ? make("h2", {}, t("What would mend it")) : null,
       ...(findings.remedies ?? []).map((remedy) => this.remedy(remedy)),
@@ -40,7 +43,7 @@ export class FindingsView {
       findings.largest?.length ? this.suspects(t("Largest within the limit"), findings.largest) : null);
   }
 
-  cause(text) { return make("p", { class: "cause" }, make("b", {}, t("Probable cause")), " ", text); }
+  cause(cause) { return make("p", { class: "cause" }, make("b", {}, t("Probable cause")), " ", cause.text, ...places(cause)); }
 
   /** A cause that was tried: what it explains, and one click that carries it out. */
   remedy(r) {
