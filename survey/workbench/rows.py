@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from adjust.model.observations import FrameRef, ImageBlock
+from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from survey.project.observed import Hits, Observed, name_of_residual
@@ -194,6 +194,10 @@ def _component(o: ObservationResidual, k: int, limit: float) -> dict[str, Any]:
 
 def _joins(item: Any) -> list[str]:
     """What a reading joins, as tables write it."""
+    return [frame_text(one) if isinstance(one, FrameRef) else position_text(one) for one in refs_of(item)]
+
+
+def refs_of(item: Any) -> list[FrameRef | PositionRef]:
+    """The frames and positions that a reading is about."""
     values = (getattr(item, name, None) for name in ("positions", "at", "to", "a", "b", "second", "position", "frame"))
-    refs = [one for value in values for one in (value if isinstance(value, tuple) else (value,)) if one is not None]
-    return [frame_text(one) if isinstance(one, FrameRef) else position_text(one) for one in refs]
+    return [one for value in values for one in (value if isinstance(value, tuple) else (value,)) if one is not None]

@@ -26,6 +26,7 @@ from survey.workbench import cameras, pictures, views
 from survey.workbench.bodies import Body, BodyError, distance_of, json_of
 from survey.workbench.gate import LONGEST_BODY, Guard, TooLongError
 from survey.workbench.live import Live
+from survey.workbench.network import network
 from survey.workbench.session import Workbench
 from survey.workbench.situation import CancelledError, ChangedError
 
@@ -54,6 +55,7 @@ class Server:
             "/api/readings": self._view(views.readings), "/api/parameters": self._view(views.parameters),
             "/api/scene": self._view(views.scene), "/api/findings": self._view(views.findings),
             "/api/changes": self._view(_changes), "/api/loops": self._view(views.loops),
+            "/api/network": self._view(network),
             "/api/table_residuals": self._view(views.table_residuals), "/api/camera/{camera}": self._camera,
             "/api/camera/{camera}/difference": self._difference, "/api/runs": self._view(views.runs),
             "/api/compare": self._compare,

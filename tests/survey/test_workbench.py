@@ -23,6 +23,7 @@ from survey.project import read
 from survey.solution.changes import snapshot, solution_changes
 from survey.solution.runs import MOST, list_runs, load_run
 from survey.workbench import views
+from survey.workbench.network import network
 from survey.workbench.pictures import picture
 from survey.workbench.rows import BY_PEOPLE, IN_USE, columns, point_rows
 from survey.workbench.session import Workbench
@@ -465,3 +466,27 @@ def test_what_cannot_be_adjusted_has_its_remedies_too(mine, monkeypatch):
     assert len(bench.remedies) == 1
     bench.redo()
     assert bench.adjustment.sigma0 < 2
+
+
+def test_the_network_of_readings_is_where_the_solution_is(tmp_path):
+    """A caliper's line is as long as its adjusted distance; a reading that was spoilt is the one beyond the limit."""
+    write_example("total-station", tmp_path / "lab")
+    path = tmp_path / "lab/observations/distances.csv"
+    lines = path.read_text().splitlines()
+    at = lines[0].split(",").index("value_mm")
+    cells = lines[2].split(",")
+    wrong, cells[at] = f"distances:{cells[0]}", repr(float(cells[at]) + 3.0)
+    path.write_text("\n".join([*lines[:2], ",".join(cells), *lines[3:]]) + "\n")
+    bench = Workbench(tmp_path / "lab")
+    bench.adjust()
+    found = network(bench)
+    assert found["n_nowhere"] == 0
+    adjusted = {o.ids[0]: o.adjusted[0] for o in bench.adjustment.other_residuals if o.kind == "distance"}
+    ends = {x["id"].split(":")[1]: np.array(x["x"]) for x in found["lines"] if x["table"] == "distances"}
+    assert adjusted.keys() == ends.keys()
+    for name, (a, b) in ends.items():
+        assert np.linalg.norm(b - a) == pytest.approx(adjusted[name], abs=1e-9)
+    assert [x["id"] for x in found["lines"] if (x["share"] or 0) > 1] == [wrong]
+    readings = bench.situation.everything.survey.readings
+    assert {s["id"]: s["n"] for s in found["setups"]} == {k: sum(r.setup_id == k for r in readings)
+                                                        for k in {r.setup_id for r in readings}}  # fmt: skip

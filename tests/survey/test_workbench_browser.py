@@ -26,7 +26,7 @@ WRONG = ("tX05", "X", "board", "c40")  # an image point that is moved by 4 px
 NAME = "X/tX05/board/c40"
 SECONDS = 30.0
 VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations",
-         "settings")  # fmt: skip
+         "settings", "network")  # fmt: skip
 ROWS = "Number(document.querySelector('#tables [role=grid]').getAttribute('aria-rowcount'))"
 
 
@@ -172,7 +172,7 @@ def test_every_view_is_drawn(page: Page, view: str) -> None:
         page.wait("document.querySelectorAll('#right canvas').length >= 4 || "
                   "document.querySelector('#right p.warn').textContent")  # fmt: skip
         assert p.inner_text("#right p.warn") == ""
-    if view in ("scene", "plan", "south", "east"):
+    if view in ("scene", "plan", "south", "east", "network"):
         inked = """(() => { const c = document.querySelector('#right canvas'), d = c.getContext('2d')
             .getImageData(0, 0, c.width, c.height).data; let n = 0; for (let i = 3; i < d.length; i += 4) n += d[i] > 0;
             return n > 300; })()"""

@@ -50,7 +50,7 @@ class Clicks:
         self.page, self.n = page, 0
 
     def __call__(self, selector: str, text: str = "", renews: bool = False) -> None:
-        found = self.page.page.locator(selector, has_text=text).first if text else self.page.page.locator(selector).first
+        found = self.page.page.locator(selector, has_text=text or None).first
         self.n += 1
         if renews:
             self.page.done(found.click)
@@ -76,8 +76,8 @@ def page(tmp_path: Path) -> Iterator[tuple[Page, Path]]:
     token = new_token()
     bench = Workbench(folder)
     bench.adjust()
-    with Listening(Server(bench, token), "127.0.0.1", 0) as listening, need_playwright().sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
+    with Listening(Server(bench, token), "127.0.0.1", 0) as listening, need_playwright().sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
         found = Page(browser, f"{listening.address}#token={token}", 1280)
         yield found, folder
         browser.close()

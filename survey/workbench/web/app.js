@@ -12,6 +12,7 @@ import { ImageView } from "./image.js";
 import { SceneView } from "./scene.js";
 import { CompareView, HistoryView } from "./compare.js";
 import { CameraView, CorrelationsView, LoopsView, TableAnglesView } from "./relations.js";
+import { NetworkView } from "./network.js";
 import { SettingsView } from "./settings.js";
 import { chosenNames, drawInspector } from "./inspector.js";
 import { findingsOf, parametersOf, readingsOf, sceneOf, shiftsOf, sizesOf, stateOf } from "./shapes.js";
@@ -31,6 +32,7 @@ const VIEWS = {
   angles: ["Angles", () => new TableAnglesView(bench)],
   loops: ["Loops", () => new LoopsView(bench)],
   correlations: ["Correlations", () => new CorrelationsView(bench)],
+  network: ["Network", () => new NetworkView(bench)],
   settings: ["Datum and sigmas", () => new SettingsView(bench, actions)],
 };
 const PANES = ["left", "right"];
@@ -229,6 +231,7 @@ function drawTable(fresh) {
   if (wanted && wanted !== tableName && followed !== current().ids[0]) { tableName = wanted; table = null; }
   followed = current().ids[0];
   if (!table) {
+    if (fresh && tableName === "points" && !bench.points.n) tableName = "readings";
     const data = tableData();
     table = new Table(t(TABLES[tableName]), data, { sort: data.sort, onselect: (rows, quiet) => selectRows(data.kind, rows, quiet), onenter: (row) => { selectRows(data.kind, [row], false); actions.show("image", "right"); } });
     const tab = (name, title) => make("button", { type: "button", role: "tab", "aria-selected": name === tableName, onclick: () => { tableName = name; table = null; drawTable(false); } }, t(title));

@@ -7,7 +7,7 @@ import { rowsOfPoint } from "./source.js";
 
 /** Right and up of the flat views, by axes of the world. */
 const FLAT = { plan: [0, 1], south: [0, 2], east: [1, 2] };
-const NAMES = { plan: "Plan", south: "Elevation from the south", east: "Elevation from the east" };
+export const NAMES = { plan: "Plan", south: "Elevation from the south", east: "Elevation from the east" };
 const CIRCLE = Array.from({ length: 33 }, (_, k) => [Math.cos((k * Math.PI) / 16), Math.sin((k * Math.PI) / 16)]);
 const MOST = 1e5; // points drawn at once
 
