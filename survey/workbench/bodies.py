@@ -1,11 +1,17 @@
 """What a request says, checked."""
 
 import json
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 from starlette.requests import Request
 
 from adjust.model.errors import SurveyError
+from survey.workbench.jobs import Told
+from survey.workbench.session import Workbench
+
+if TYPE_CHECKING:
+    from survey.detection import ImageReport
 
 
 def distance_of(request: Request) -> float:
@@ -51,9 +57,9 @@ class Body:
         """A text, empty where there is none."""
         return str(self._value(key, "", (str,), "a text"))
 
-    def number(self, key: str) -> float:
+    def number(self, key: str, default: float | None = None) -> float:
         """A number."""
-        return float(self._value(key, None, (int, float), "a number"))
+        return float(self._value(key, default, (int, float), "a number"))
 
     def names(self, key: str) -> list[str]:
         """Texts, none where there are none."""
@@ -83,3 +89,22 @@ class Body:
                 raise BodyError("changes: expected {what, id, excluded}")
             names[0 if c["excluded"] else 1].append(name)
         return names
+
+
+def _plan(bench: Workbench, body: Body, _: Any) -> Told:
+    from survey.planning.job import PlanRequest
+
+    wanted = tuple(body.text("wanted").split())
+    return bench.plan(PlanRequest(wanted, int(body.number("add", 5.0)), navigation=body.flag("navigation", False),
+                                  place=int(body.number("place", 0.0))))  # fmt: skip
+
+
+JOBS: Mapping[str, Callable[[Workbench, Body, "Callable[[ImageReport], None]"], Told]] = {
+    "detect": lambda bench, body, found: bench.detect(everything=body.flag("all", False), told=found),
+    "plan": _plan,
+    "navigate": lambda bench, body, _: bench.navigate(body.text("station"), body.number("interval_s", 0.0) or None),
+    "add": lambda bench, body, _: bench.add(body.text("folder")),
+    "compare": lambda bench, body, _: bench.compare_with(body.text("folder")),
+    "batch": lambda bench, body, _: bench.batch(body.names("folders")),
+}
+"""The jobs of a page by their names, with what it asks of them."""

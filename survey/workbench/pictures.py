@@ -11,11 +11,13 @@ import cv2
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from survey.detection import ImageReport
 from survey.detection.gray import Gray8, Gray32, gray_values, read_image
 from survey.project.detected import DetectedImage
 
 _QUALITY = 85
 _LARGEST_SIDE = 4096
+_MOST_SHOWN = 400
 
 
 def picture(images: Mapping[tuple[str, str], Path], key: tuple[str, str], size: int | None) -> tuple[bytes, str]:
@@ -54,3 +56,11 @@ def etag(known: DetectedImage | None, path: Path, size: int | None) -> str:
     same = known is not None and (known.size, known.mtime_ns) == (status.st_size, status.st_mtime_ns)
     text = known.sha256 if same and known is not None else f"{path.name} {status.st_size} {status.st_mtime_ns}"
     return f'"{hashlib.sha256(f"{text} {size}".encode()).hexdigest()[:32]}"'
+
+
+def found_in(report: ImageReport) -> dict[str, Any]:
+    """What detection found in an image, for a page that shows its picture: size, up to ``_MOST_SHOWN`` places (px)."""
+    found = [d.uv for d in report.detections.values()] + ([report.spots.uv] if report.spots is not None else [])
+    uv = np.concatenate([*found, np.zeros((0, 2))])
+    return {"image": f"{report.camera_id}/{report.epoch_id}", "status": report.status, "message": report.message,
+            "n": len(uv), "size": report.image_size, "uv": np.round(uv[:_MOST_SHOWN], 1).tolist()}  # fmt: skip

@@ -20,10 +20,11 @@ from starlette.types import ASGIApp
 
 from adjust.model.errors import SurveyError
 from survey.folder.locking import BusyError
+from survey.folder.text import suggestion
 from survey.report.language import LANGUAGES, message, speaking
 from survey.solution.runs import pin_run
 from survey.workbench import cameras, pictures, views
-from survey.workbench.bodies import Body, BodyError, distance_of, json_of
+from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of
 from survey.workbench.gate import LONGEST_BODY, Guard, TooLongError
 from survey.workbench.live import Live
 from survey.workbench.network import network
@@ -66,7 +67,7 @@ class Server:
             "/api/definition": self._definition, "/api/remedy": self._remedy,
             "/api/undo": self._act("undo"), "/api/redo": self._act("redo"), "/api/save": self._save,
             "/api/runs/{number:int}/restore": self._restore, "/api/runs/{number:int}/pin": self._pin,
-            "/api/reload": self._reload, "/api/cancel": self._cancel,
+            "/api/jobs/{name}": self._job, "/api/reload": self._reload, "/api/cancel": self._cancel,
         }  # fmt: skip
         routes = [Route(path, self._said(f), methods=["GET"]) for path, f in get.items()]
         routes += [Route(path, self._said(f), methods=["POST"]) for path, f in post.items()]
@@ -275,6 +276,15 @@ class Server:
     async def _save(self, _request: Request) -> Response:
         outcome = await self._run("save", self.bench.save)
         return JSONResponse(outcome.summary())
+
+    async def _job(self, request: Request) -> Response:
+        """One of ``JOBS``; what it said, and the state after it."""
+        name, body = request.path_params["name"], Body(await json_of(request))
+        if name not in JOBS:
+            raise SurveyError(f"there is no job {name!r}; {suggestion(name, JOBS)}")
+        found = lambda report: self.live.post({"type": "detected"} | pictures.found_in(report))  # noqa: E731
+        told = await self._run(name, lambda: JOBS[name](self.bench, body, found))
+        return JSONResponse(told.as_dict() | {"state": await asyncio.to_thread(views.state, self.bench)})
 
     async def _cancel(self, _request: Request) -> Response:
         self.bench.cancel()

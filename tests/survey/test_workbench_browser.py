@@ -26,7 +26,7 @@ WRONG = ("tX05", "X", "board", "c40")  # an image point that is moved by 4 px
 NAME = "X/tX05/board/c40"
 SECONDS = 30.0
 VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations",
-         "settings", "network")  # fmt: skip
+         "settings", "network", "jobs")  # fmt: skip
 ROWS = "Number(document.querySelector('#tables [role=grid]').getAttribute('aria-rowcount'))"
 
 
@@ -249,6 +249,10 @@ def said_by_the_page() -> set[str]:
     found |= set(re.findall(r': \["([^"]+)"', views[0]))
     for line in re.findall(r"const (?:REGIONS|TABLES) = .*", app):
         found |= set(re.findall(r'(?:", |: )"([^"]+)"', line))
+    jobs = re.search(r"const JOBS = \[.*?\n\];", sources["jobs.js"], re.DOTALL)
+    assert jobs is not None
+    found |= set(re.findall(r'\["\w+", "([^"]+)"', jobs[0]))
+    found |= set(re.findall(r'(?m)^  \["\w+", "[^"]+", "([^"]+)"', jobs[0]))
     found |= {f"key {does}" for does in re.findall(r'\["[^"]+", "([^"]+)", \(\)', app)}
     found |= set(re.findall(r'"([^"]+)"', re.findall(r"const WHY = .*", sources["inspector.js"])[0]))
     return found | set(re.findall(r': "([^"]+)"', re.findall(r"const NAMES = .*", sources["scene.js"])[0]))

@@ -13,12 +13,13 @@ import { SceneView } from "./scene.js";
 import { CompareView, HistoryView } from "./compare.js";
 import { CameraView, CorrelationsView, LoopsView, TableAnglesView } from "./relations.js";
 import { NetworkView } from "./network.js";
+import { JobsView } from "./jobs.js";
 import { SettingsView } from "./settings.js";
 import { chosenNames, drawInspector } from "./inspector.js";
 import { findingsOf, parametersOf, readingsOf, sceneOf, shiftsOf, sizesOf, stateOf } from "./shapes.js";
 
 /** Everything the views show; new values replace old ones, nothing is changed in place. */
-const bench = { state: null, points: null, limit: 1, readings: [], parameters: [], findings: {}, scene: null, sizes: {}, leftOut: new Map(), shifts: new Map() };
+const bench = { state: null, points: null, limit: 1, readings: [], parameters: [], findings: {}, scene: null, sizes: {}, leftOut: new Map(), shifts: new Map(), told: {}, toldAt: 0, arrived: [], drawn: null };
 const VIEWS = {
   findings: ["Findings", () => new FindingsView(bench, actions)],
   image: ["Image", () => new ImageView(bench)],
@@ -33,6 +34,7 @@ const VIEWS = {
   loops: ["Loops", () => new LoopsView(bench)],
   correlations: ["Correlations", () => new CorrelationsView(bench)],
   network: ["Network", () => new NetworkView(bench)],
+  jobs: ["Jobs", () => new JobsView(bench, actions)],
   settings: ["Datum and sigmas", () => new SettingsView(bench, actions)],
 };
 const PANES = ["left", "right"];
@@ -77,6 +79,8 @@ const actions = {
 
   setting: (change) => act(() => post("definition", { base: bench.state.version, ...change })),
   remedy: (number) => act(() => post("remedy", { base: bench.state.version, number })),
+  /** Another job: what it said is kept, what it drew is shown in the scene. */
+  job: (name, ask) => act(async () => { const told = await ask(); bench.told[name] = told; bench.toldAt++; bench.drawn = told.drawn; return told; }, t("Done.")),
   undo: () => bench.state.undo.length && act(() => post("undo", { base: bench.state.version })),
   redo: () => bench.state.redo.length && act(() => post("redo", { base: bench.state.version })),
   adjust: (mode = "warm") => act(() => post("adjust", { base: bench.state.version, mode })),
@@ -345,6 +349,7 @@ function told(message) {
   if (message.type === "progress") working(t("step {n}, v'Pv {omega}", { n: message.step ?? message.iteration ?? 0, omega: significant(message.omega, 5) }));
   else if (message.type === "state" && !busy && bench.state) { working(""); renew(null); }
   else if (message.type === "error") { working(""); renew(null); }
+  else if (message.type === "detected") { bench.arrived.push(message); viewOf(JobsView)?.arrive(message); working(t("detecting {image}", { image: message.image })); }
   else if (message.type === "folder" && message.changed?.length && !busy) changedOutside(message.changed);
   else if (message.type === "lost") document.body.classList.add("lost");
   else if (message.type === "connected") { document.body.classList.remove("lost"); if (!bench.state?.solved) renew(null); }

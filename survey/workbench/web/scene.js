@@ -127,6 +127,7 @@ export class SceneView {
     for (const shot of scene.shots) this.shot(context, line, to, shot, chosen.image ? shot.image === chosen.image : chosen.cameras.has(shot.camera) && shot.main);
     this.rays(context, line, chosen);
     for (const spot of scene.spots) this.spot(context, line, to, spot, chosen.points.has(spot.id));
+    if (this.bench.drawn) this.told_(context, line, to);
     this.labels(context, to);
     this.ruler(context, width, height);
     this.told.textContent = t("ellipsoids × {k}", { k: significant(this.factor, 2) });
@@ -224,6 +225,29 @@ export class SceneView {
     context.fill();
     const shift = this.bench.shifts?.get(spot.id);
     if (shift) { context.lineWidth = 2; context.strokeStyle = colour("warn"); line([spot.x, spot.x.map((x, k) => x + this.factor * shift[k])]); }
+  }
+
+  /** What a job has drawn: cameras and lines of a plan, a path with its ellipsoids, motions (enlarged as the ellipsoids are). */
+  told_(context, line, to) {
+    const { cameras, points, lines, path } = this.bench.drawn;
+    context.strokeStyle = colour("soft");
+    for (const [image, pose] of Object.entries(cameras)) {
+      this.shot(context, line, to, { camera: image.split("/")[0], image, pose, main: true, half: this.bench.scene.cameras[image.split("/")[0]]?.half_angles_rad ?? [0.4, 0.3] }, true);
+      const [u, v] = to([pose[3], pose[7], pose[11]]);
+      context.fillText(image, u + 7, v + 12);
+    }
+    context.strokeStyle = context.fillStyle = colour("soft");
+    context.lineWidth = 2.2;
+    for (const { x } of lines) line(x);
+    for (const { id, x } of points) { const [u, v] = to(x); context.beginPath(); context.arc(u, v, 6, 0, 7); context.stroke(); context.fillText(id, u + 8, v + 12); }
+    context.lineWidth = 1.4;
+    line(path.map((p) => p.x));
+    for (const { x, cov, status } of path) {
+      const [u, v] = to(x), axes = axesOf([cov.slice(0, 3), cov.slice(3, 6), cov.slice(6, 9)].map((row) => row.map((c) => c ?? 0)));
+      context.strokeStyle = colour(status === "fixed" ? "soft" : "point-bad");
+      for (const [a, b] of [[0, 1], [0, 2], [1, 2]]) line(CIRCLE.map(([c, s]) => x.map((y, k) => y + this.factor * (c * axes[a][k] + s * axes[b][k]))));
+      context.fillRect(u - 2, v - 2, 4, 4);
+    }
   }
 
   labels(context, to) {
