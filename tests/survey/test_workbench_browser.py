@@ -313,3 +313,25 @@ def test_what_others_write_is_told_and_loaded(page: Page, folder: Path) -> None:
     page.wait("document.querySelector('#message').textContent.includes('survey.toml')")
     page.done(lambda: p.locator("#message button").click())
     assert p.inner_text("#title").startswith("again ")
+
+
+def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path) -> None:
+    """From a folder of images in which nothing was looked for to an adjusted project, in the page alone."""
+    write_example("one-camera", tmp_path / "lab")
+    names = sorted((tmp_path / "lab/images").glob("*/*"))
+    for name in names[6:]:
+        name.unlink()
+    token = new_token()
+    with Listening(Server(Workbench(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
+        page = Page(browser, f"{listening.address}#token={token}&view=findings,jobs", 1280)
+        p = page.page
+        assert "nothing to adjust" in p.inner_text("#left .verdict")
+        page.done(lambda: p.get_by_label("Run: Detect").click())
+        page.wait("document.querySelectorAll('#right .arrived canvas').length === 6")
+        assert p.inner_text("#right .told").startswith(str(tmp_path))
+        assert "sigma0" in page.facts()
+        assert p.evaluate(ROWS) > 100
+        p.locator("#right .arrived button").first.click()
+        page.wait("location.hash.startsWith('#image=')")
+        page.context.close()
+    assert [text for text in page.complaints if "409" not in text] == []

@@ -41,7 +41,7 @@ const PANES = ["left", "right"];
 const REGIONS = [["tree", "Project"], ["left", "First view"], ["right", "Second view"], ["tables", "Tables"], ["inspector", "Details"]];
 const shown = { left: null, right: null };
 const TABLES = { points: "Image points", readings: "Readings", parameters: "Parameters", exclusions: "Excluded by people" };
-let followed = "", table = null, tableName = "points", lastPane = "right", busy = false;
+let followed = "", table = null, tableName = "points", lastPane = "right", asked = false, busy = false; // asked: for a table by its tab
 
 // what may be done
 
@@ -234,11 +234,12 @@ function drawTable(fresh) {
   const wanted = TABLE_OF[current().kind];
   if (wanted && wanted !== tableName && followed !== current().ids[0]) { tableName = wanted; table = null; }
   followed = current().ids[0];
+  const first = bench.points.n ? "points" : "readings";
+  if (!asked && fresh && tableName !== first) { tableName = first; table = null; }
   if (!table) {
-    if (fresh && tableName === "points" && !bench.points.n) tableName = "readings";
     const data = tableData();
     table = new Table(t(TABLES[tableName]), data, { sort: data.sort, onselect: (rows, quiet) => selectRows(data.kind, rows, quiet), onenter: (row) => { selectRows(data.kind, [row], false); actions.show("image", "right"); } });
-    const tab = (name, title) => make("button", { type: "button", role: "tab", "aria-selected": name === tableName, onclick: () => { tableName = name; table = null; drawTable(false); } }, t(title));
+    const tab = (name, title) => make("button", { type: "button", role: "tab", "aria-selected": name === tableName, onclick: () => { asked = true; tableName = name; table = null; drawTable(false); } }, t(title));
     by("tables").replaceChildren(make("div", { role: "tablist", "aria-label": t("Tables"), class: "tabs" }, ...Object.entries(TABLES).map(([name, title]) => tab(name, title))), table.element);
   } else if (fresh) table.renew(tableData());
   const { kind, ids } = current();
