@@ -18,9 +18,10 @@ from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, kept_r
 from survey.project.project import DEFINITION_FILE, RESULTS
 from survey.solution.dictionary import plain
 from survey.solution.frames import AdjustedFrames
+from survey.solution.quantities import scale_of
 from survey.solution.runs import remove_empty
 from survey.workbench.deciding import Deciding
-from survey.workbench.places import Places
+from survey.workbench.places import Places, scene_values
 
 if TYPE_CHECKING:  # detection brings in OpenCV, planning much else
     from survey.detection import ImageReport
@@ -34,19 +35,21 @@ class Drawn:
     """What a job adds to the scene, in the world (m).
 
     cameras: ``world_from_camera`` by image. points: with covariances (3, 3) m^2. lines: ends by name. path: positions
-    in order, each with its covariance and status.
+    in order, each with its covariance and status. scene: everything, where there is no solution that shows it.
     """
 
     cameras: Mapping[str, Pose3] = field(default_factory=dict)
     points: Sequence[tuple[str, FloatArray, FloatArray]] = ()
     lines: Sequence[tuple[str, Sequence[FloatArray]]] = ()
     path: Sequence[tuple[str, FloatArray, FloatArray, str]] = ()
+    scene: Mapping[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """As plain values."""
         return dict(plain({
             "cameras": {name: pose.matrix()[:3].ravel() for name, pose in self.cameras.items()},
             "points": [{"id": name, "x": x, "cov": cov.ravel()} for name, x, cov in self.points],
+            "scene": self.scene,
             "lines": [{"id": name, "x": x} for name, x in self.lines],
             "path": [{"id": name, "x": x, "cov": cov.ravel(), "status": s} for name, x, cov, s in self.path],
         }))  # fmt: skip
@@ -201,4 +204,6 @@ def _chosen(outcome: "PlanningOutcome") -> Drawn:
     lines = [(c.name, x) for c in chosen for kind in (c.pairs, c.distances, c.readings, c.coordinate_differences)
              for item in kind for x in places.lines(item)]  # fmt: skip
     known = {k: p for k, p in poses.items() if p is not None}
-    return Drawn(known, [(k, x, np.zeros((3, 3))) for k, x in points if x is not None], lines[:_MOST_LINES])
+    everything = scene_values(outcome.expected, scale_of(outcome.expected, "a_priori"))
+    return Drawn(known, [(k, x, np.zeros((3, 3))) for k, x in points if x is not None], lines[:_MOST_LINES],
+                 scene=everything)  # fmt: skip

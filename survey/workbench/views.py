@@ -10,18 +10,16 @@ from gtsam import Pose3
 
 from adjust.diagnosis.hypothesis import Place
 from adjust.model.errors import SurveyError
-from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from survey.folder.text import suggestion
 from survey.project.observed import name_of_residual
 from survey.report.language import message
-from survey.report.scene import scene_of
 from survey.solution.changes import snapshot
 from survey.solution.dictionary import plain, solution_dict
-from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import ARCSEC_PER_RAD, sigma_unit_for_people, sigmas_of, status_of, unit_for_people
 from survey.solution.runs import list_runs
 from survey.solution.verdict import suspects
+from survey.workbench.places import scene_values
 from survey.workbench.rows import BY_THIS_RUN, IN_USE, columns, reading_rows
 from survey.workbench.session import Workbench
 
@@ -244,23 +242,7 @@ def runs(bench: Workbench) -> dict[str, Any]:
 
 def scene(bench: Workbench) -> dict[str, Any]:
     """Cameras, targets, tables, points and stations in the world (m), covariances (m^2) as sigmas are given."""
-    adjustment, scale = bench.adjustment, bench.scale
-    drawn, frames = scene_of(adjustment, scale), AdjustedFrames(adjustment)
-    images = {}
-    for camera, epoch in dict.fromkeys((b.camera_id, b.epoch_id) for b in adjustment.survey.image_blocks):
-        pose = frames.world_from(FrameRef("camera", camera, epoch))
-        if pose is not None:
-            images[f"{camera}/{epoch}"] = pose.matrix()[:3].ravel()
-    return dict(plain({
-        "version": bench.version, "ellipsoid": scale.ellipsoid, "images": images,
-        "cameras": {s.label: {"index": s.camera_idx, "half_angles_rad": s.half_angles} for s in drawn.shots},
-        "spots": [{"id": s.label, "kind": s.kind, "x": s.x, "cov": s.cov.ravel()} for s in drawn.spots],
-        "outlines": [{"target": label, "x": x} for label, x in drawn.outlines],
-        "clouds": [{"target": label, "x": x} for label, x in drawn.clouds],
-        "tables": [{"id": table, "world_from_table": pose.matrix()[:3].ravel(), "axes": axes}
-                   for table, pose, axes in drawn.tables],
-        "moves": drawn.moves, "n_left_out": drawn.n_left_out,
-    }))  # fmt: skip
+    return {"version": bench.version, **scene_values(bench.adjustment, bench.scale)}
 
 
 def loops(bench: Workbench) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import { chosenNames, drawInspector } from "./inspector.js";
 import { findingsOf, parametersOf, readingsOf, sceneOf, shiftsOf, sizesOf, stateOf } from "./shapes.js";
 
 /** Everything the views show; new values replace old ones, nothing is changed in place. */
-const bench = { state: null, points: null, limit: 1, readings: [], parameters: [], findings: {}, scene: null, sizes: {}, leftOut: new Map(), shifts: new Map(), told: {}, toldAt: 0, arrived: [], drawn: null };
+const bench = { state: null, points: null, limit: 1, readings: [], parameters: [], findings: {}, scene: null, sizes: {}, leftOut: new Map(), shifts: new Map(), told: {}, toldAt: 0, arrived: [], drawn: null, planned: null };
 const VIEWS = {
   findings: ["Findings", () => new FindingsView(bench, actions)],
   image: ["Image", () => new ImageView(bench)],
@@ -80,7 +80,7 @@ const actions = {
   setting: (change) => act(() => post("definition", { base: bench.state.version, ...change })),
   remedy: (number) => act(() => post("remedy", { base: bench.state.version, number })),
   /** Another job: what it said is kept, what it drew is shown in the scene. */
-  job: (name, ask) => act(async () => { const told = await ask(); bench.told[name] = told; bench.toldAt++; bench.drawn = told.drawn; return told; }, t("Done.")),
+  job: (name, ask) => act(async () => { const told = await ask(); bench.told[name] = told; bench.toldAt++; bench.drawn = told.drawn; if (told.drawn.scene) bench.planned = sceneOf(told.drawn.scene); return told; }, t("Done.")),
   undo: () => bench.state.undo.length && act(() => post("undo", { base: bench.state.version })),
   redo: () => bench.state.redo.length && act(() => post("redo", { base: bench.state.version })),
   adjust: (mode = "warm") => act(() => post("adjust", { base: bench.state.version, mode })),

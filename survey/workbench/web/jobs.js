@@ -67,7 +67,7 @@ export class JobsView {
   }
 }
 
-const hasDrawing = (drawn) => drawn.path.length || drawn.points.length || drawn.lines.length || Object.keys(drawn.cameras).length;
+const hasDrawing = (drawn) => drawn.scene || drawn.path.length || drawn.points.length || drawn.lines.length || Object.keys(drawn.cameras).length;
 
 function valueOf(kind, input) {
   if (kind === "flag") return input.checked;

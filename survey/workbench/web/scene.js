@@ -29,9 +29,12 @@ export class SceneView {
     this.measure();
   }
 
+  /** The solution, or what is planned where there is none. */
+  get scene() { return this.bench.scene ?? this.bench.planned; }
+
   /** Middle and size of everything. */
   measure() {
-    const { scene } = this.bench;
+    const { scene } = this;
     if (!scene) return;
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
     const places = [...scene.spots.map((spot) => spot.x), ...scene.shots.map((shot) => [shot.pose[3], shot.pose[7], shot.pose[11]]), ...scene.outlines.flatMap((line) => line.x)];
@@ -108,7 +111,7 @@ export class SceneView {
   }
 
   paint(context, width, height) {
-    const { scene } = this.bench;
+    const { scene } = this;
     if (!scene || !this.middle || !Number.isFinite(this.reach)) return;
     const to = this.projection(width, height);
     this.to = to;
@@ -153,7 +156,7 @@ export class SceneView {
   clouds(context, to) {
     context.fillStyle = colour("quiet");
     let left = MOST;
-    for (const cloud of this.bench.scene.clouds ?? []) for (const x of cloud.x) { if (left-- <= 0) return; const [u, v] = to(x); context.fillRect(u - 1, v - 1, 2, 2); }
+    for (const cloud of this.scene.clouds ?? []) for (const x of cloud.x) { if (left-- <= 0) return; const [u, v] = to(x); context.fillRect(u - 1, v - 1, 2, 2); }
   }
 
   /** Cameras and points that the selection means. */
@@ -173,8 +176,8 @@ export class SceneView {
 
   /** The image that stands for the place of this one: of equal places only one is drawn. */
   placeOf(camera, epoch) {
-    const pose = this.bench.scene.poses[`${camera}/${epoch}`];
-    return this.bench.scene.shots.find((shot) => shot.camera === camera && pose && shot.pose.every((x, k) => Math.abs(x - pose[k]) < 1e-4))?.image ?? "";
+    const pose = this.scene.poses[`${camera}/${epoch}`];
+    return this.scene.shots.find((shot) => shot.camera === camera && pose && shot.pose.every((x, k) => Math.abs(x - pose[k]) < 1e-4))?.image ?? "";
   }
 
   /** A camera: its frustum at its first image and where it is chosen, a small mark at every other place. */
@@ -198,7 +201,7 @@ export class SceneView {
 
   /** Lines of sight to the points that are chosen, from every image that saw them. */
   rays(context, line, chosen) {
-    const { scene, points } = this.bench;
+    const { scene } = this, { points } = this.bench;
     context.strokeStyle = colour("point-here");
     context.lineWidth = 1;
     context.setLineDash([5, 4]);
@@ -232,7 +235,7 @@ export class SceneView {
     const { cameras, points, lines, path } = this.bench.drawn;
     context.strokeStyle = colour("soft");
     for (const [image, pose] of Object.entries(cameras)) {
-      this.shot(context, line, to, { camera: image.split("/")[0], image, pose, main: true, half: this.bench.scene.cameras[image.split("/")[0]]?.half_angles_rad ?? [0.4, 0.3] }, true);
+      this.shot(context, line, to, { camera: image.split("/")[0], image, pose, main: true, half: this.scene.cameras[image.split("/")[0]]?.half_angles_rad ?? [0.4, 0.3] }, true);
       const [u, v] = to([pose[3], pose[7], pose[11]]);
       context.fillText(image, u + 7, v + 12);
     }
@@ -251,7 +254,7 @@ export class SceneView {
   }
 
   labels(context, to) {
-    const { scene } = this.bench, taken = [];
+    const { scene } = this, taken = [];
     context.font = "11px system-ui, sans-serif";
     context.lineJoin = "round";
     const first = new Map(scene.shots.filter((shot) => shot.main !== false).map((shot) => [shot.camera, { id: shot.camera, x: [shot.pose[3], shot.pose[7], shot.pose[11]] }]));
@@ -282,7 +285,7 @@ export class SceneView {
 
   nearest(x, y) {
     if (!this.to) return null;
-    const { scene } = this.bench, things = [...scene.spots.map((s) => ({ kind: s.kind === "point" ? "point" : "station", id: s.id, x: s.x, spot: s })),
+    const { scene } = this, things = [...scene.spots.map((s) => ({ kind: s.kind === "point" ? "point" : "station", id: s.id, x: s.x, spot: s })),
       ...scene.shots.map((s) => ({ kind: "image", id: s.image, x: [s.pose[3], s.pose[7], s.pose[11]] })), ...scene.outlines.map((o) => ({ kind: "target", id: o.id, x: o.x[0] }))];
     let best = null, least = 12;
     for (const thing of things) { const [u, v] = this.to(thing.x), far = Math.hypot(u - x, v - y); if (far < least) { least = far; best = thing; } }
