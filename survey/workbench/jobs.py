@@ -147,14 +147,15 @@ class Jobs(Deciding):
 
     def batch(self, folders: Sequence[str | Path] = ()) -> Told:
         """Adjust several projects (none: all beside this one), side by side; each has its results afterwards."""
-        from survey.notebook.batch import adjust_many
+        from survey.batch.run import BatchOptions, run_batch
+        from survey.batch.tables import summary_table
 
         self._check(None)
         chosen = [self._other(f) for f in folders] or sorted(
             p.parent for p in self.folder.resolve().parent.glob(f"*/{DEFINITION_FILE}"))  # fmt: skip
-        found = adjust_many(chosen)
-        return Told(repr(found), {"folders": [str(r.folder) for r in found.records],
-                                  "states": [str(r.state) for r in found.records]})  # fmt: skip
+        found = run_batch(chosen, BatchOptions(progress=False))
+        return Told(summary_table(found), {"folders": [str(r.folder) for r in found],
+                                           "states": [str(r.state) for r in found]})  # fmt: skip
 
     def _other(self, folder: str | Path) -> Path:
         """Another project folder; a relative one lies beside this one. Raises SurveyError."""

@@ -1,9 +1,7 @@
 """What the views of the workbench show, as plain values: state, findings, parameters, scene, exclusions."""
 
-import re
 from collections.abc import Iterable
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 from gtsam import Pose3
@@ -14,6 +12,7 @@ from adjust.model.result import Adjustment
 from survey.folder.text import suggestion
 from survey.project.observed import name_of_residual
 from survey.report.language import message
+from survey.solution.anchors import ANCHORED, anchor, anchors_in
 from survey.solution.changes import snapshot
 from survey.solution.dictionary import plain, solution_dict
 from survey.solution.quantities import ARCSEC_PER_RAD, sigma_unit_for_people, sigmas_of, status_of, unit_for_people
@@ -26,17 +25,6 @@ from survey.workbench.session import Workbench
 _MOST_FINDINGS = 100
 _MOST_FITTING = 20
 _CAUSE = "probable cause: "
-_IN_WARNING = re.compile(r"camera '?(?P<camera>[^\s',]+)'?(?: at|,) epoch '?(?P<epoch>[^\s',:]+)|"
-                         r"table (?P<table>\S+), epoch (?P<read>[^\s,:]+)")  # fmt: skip
-
-
-ANCHORED = ("image", "obs", "point", "reading", "param", "camera", "epoch", "target", "group", "station", "table")
-"""Kinds of things that have a place on the page."""
-
-
-def anchor(kind: str, text: str) -> str:
-    """The part of an address that names a thing: ``#image=X/hX05``."""
-    return f"#{kind}={quote(text, safe='/:@,.-_')}"
 
 
 def limits(adjustment: Adjustment | None) -> tuple[float, float]:
@@ -176,16 +164,9 @@ def _of_solution(bench: Workbench, solved: Adjustment) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _anchors_in(text: str) -> list[str]:
-    return [
-        anchor("reading", f"table_angles:{m['table']}/{m['read']}") if m["table"] else
-        anchor("image", f"{m['camera']}/{m['epoch']}") for m in _IN_WARNING.finditer(text)
-    ]  # fmt: skip
-
-
 def _said(text: str) -> dict[str, Any]:
     """A message in the reader's language, with the places it names."""
-    return {"text": message(text), "anchors": _anchors_in(text)}
+    return {"text": message(text), "anchors": anchors_in(text)}
 
 
 def _of_points(bench: Workbench, limit: float) -> Iterable[dict[str, Any]]:

@@ -15,6 +15,7 @@ import pytest
 
 from survey.examples import write_example
 from survey.report.language import catalogue
+from survey.report.terminal import summary_text
 from survey.workbench.guard import new_token
 from survey.workbench.live import Listening
 from survey.workbench.rows import columns
@@ -192,6 +193,18 @@ def test_the_table_is_a_grid_of_rows_in_sight(page: Page) -> None:
     p.keyboard.press("ArrowDown")
     p.keyboard.press("Shift+ArrowDown")
     page.wait("(location.hash.match(/obs=/g) ?? []).length === 2")
+
+
+def test_places_that_the_terminal_names_are_places_of_the_page(page: Page, folder: Path) -> None:
+    bench = Workbench(folder, read_only=True)
+    bench.adjust()
+    said = summary_text(bench.adjustment, bench.run())
+    places = re.findall(r"(?m)  (#\w+=\S+)$", said)
+    assert {place.partition("=")[0] for place in places} >= {"#image", "#reading"}
+    for place in places:
+        page.page.evaluate(f"location.hash = {json.dumps(place)}")
+        page.wait(f"document.querySelector('#inspector .anchor')?.textContent === {json.dumps(place)}")
+        assert "There is no such" not in page.page.inner_text("#inspector")
 
 
 def test_nothing_of_a_project_becomes_markup(page: Page) -> None:
