@@ -28,6 +28,7 @@ from survey.commands.planning import declare_plan
 from survey.commands.reporting import declare_report
 from survey.commands.running import declare_runs
 from survey.commands.schema import declare_schema
+from survey.commands.starting import declare_init
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "TEST_FAILED", "USAGE", "build_parser", "main"]
 
@@ -45,6 +46,7 @@ Exit codes: 0 done, 1 error in the project, 2 wrong usage, 3 solved, but somethi
 """
 _COMMANDS = (
     declare_adjust,
+    declare_init,
     declare_open,
     declare_detect,
     declare_report,

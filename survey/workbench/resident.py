@@ -52,7 +52,7 @@ class Resident:
         self.failure: SurveyError | None = None
         self._values, self._lock, self._cancel = KnownValues(), threading.RLock(), threading.Event()
         self._statistics: tuple[int, Statistics] | None = None
-        self._rows: tuple[int, PointRows] | None = None
+        self._rows: tuple[Situation, PointRows] | None = None
         self.situation = self._read()
 
     def _read(self) -> Situation:
@@ -76,12 +76,12 @@ class Resident:
 
     @property
     def rows(self) -> PointRows:
-        """All image points with the solution."""
-        with self._lock:
-            if self._rows is None or self._rows[0] != self.version:
-                now = self.situation
-                self._rows = self.version, point_rows(now.survey, now.now, now.adjustment)
-            return self._rows[1]
+        """All image points with the solution, also while the next one is adjusted."""
+        kept, now = self._rows, self.situation
+        if kept is None or kept[0] is not now:
+            kept = now, point_rows(now.survey, now.now, now.adjustment)
+            self._rows = kept
+        return kept[1]
 
     @property
     def statistics(self) -> Statistics:

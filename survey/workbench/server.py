@@ -114,6 +114,8 @@ class Server:
     async def _run(self, what: str, work: Callable[[], Any]) -> Any:
         """In the one thread, in turn; pages hear of the new state where there is one."""
         version = self.bench.version
+        if version == 0 and what == "view":  # what there is, while the first solution is waited for
+            return await asyncio.to_thread(work)
 
         def working() -> Any:
             self._running = what

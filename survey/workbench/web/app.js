@@ -135,8 +135,8 @@ const parts = (solved) => Promise.all([points(), get("readings"), solved ? get("
 async function renew(answer) {
   const raw = answer?.state ?? (answer?.version !== undefined && answer.exclusions ? answer : await get("state"));
   const state = stateOf(raw);
-  const fresh = !bench.state || bench.state.version !== state.version || (state.failure && !bench.points);
-  if (fresh && (state.solved || state.failure)) {
+  const fresh = !bench.state || bench.state.version !== state.version || (state.failure ?? "") !== (bench.state.failure ?? "");
+  if (fresh) {
     const [columns, readings, parameters, findings, scene] = await parts(state.solved);
     const before = bench.scene;
     Object.assign(bench, { state, points: columns, readings: readingsOf(readings), limit: readings.limit, parameters: parameters ? parametersOf(parameters) : [], findings: findingsOf(findings, raw), scene: scene && sceneOf(scene), sizes: sizesOf(raw) });

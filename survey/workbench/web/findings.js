@@ -29,7 +29,7 @@ export class FindingsView {
   draw(state, findings) {
     const suspects = findings.suspects ?? [], causes = findings.causes ?? [];
     fill(this.element, 
-      make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
+      state.waiting ? make("p", { class: "verdict" }, t("adjusting …")) : make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
       (findings.warnings ?? []).length ? make("ul", { class: "problems" }, ...findings.warnings.map((w) => make("li", {}, w.text, ...places(w)))) : null,
       ...causes.map((cause) => this.cause(cause)),
       findings.remedies?.length ? make("h2", {}, t("What would mend it")) : null,
@@ -93,10 +93,10 @@ export const verdictText = (verdict) => ({ passed: `✓ ${t("verdict passed")}`,
 export function drawHeader(state) {
   by("title").textContent = state.title;
   document.title = `${state.title} · labsurvey`;
-  by("verdict").className = state.verdict;
-  by("verdict").textContent = verdictText(state.verdict);
+  by("verdict").className = state.waiting ? "" : state.verdict;
+  by("verdict").textContent = state.waiting ? "" : verdictText(state.verdict);
   const fact = (name, value) => make("span", {}, make("span", { class: "quiet" }, `${name} `), value);
-  fill(by("facts"), fact("sigma0", number(state.sigma0, 4)), fact(t("redundancy"), count(state.redundancy)),
+  fill(by("facts"), ...(state.solved ? [fact("sigma0", number(state.sigma0, 4)), fact(t("redundancy"), count(state.redundancy))] : []),
     fact(t("excluded"), count(state.exclusions.length)), state.n_not_used ? fact(t("not used"), count(state.n_not_used)) : null, state.unsaved ? fact(t("unsaved"), count(state.unsaved)) : null, state.read_only ? make("span", { class: "pill" }, t("for reading only")) : null);
 }
 
