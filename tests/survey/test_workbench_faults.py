@@ -43,6 +43,13 @@ def _misread(row: dict[str, str]) -> dict[str, str]:
     return row
 
 
+def write_spoilt(folder: Path) -> None:
+    """A head on a table with the three mistakes."""
+    write_example("head", folder)
+    _rows(folder / "observations/image_points.csv", _spoilt)
+    _rows(folder / "observations/table_angles.csv", _misread)
+
+
 class Clicks:
     """Clicks on a page, counted."""
 
@@ -70,9 +77,7 @@ class Clicks:
 def page(tmp_path: Path) -> Iterator[tuple[Page, Path]]:
     """A page of a head on a table with the three mistakes."""
     folder = tmp_path / "lab"
-    write_example("head", folder)
-    _rows(folder / "observations/image_points.csv", _spoilt)
-    _rows(folder / "observations/table_angles.csv", _misread)
+    write_spoilt(folder)
     token = new_token()
     bench = Workbench(folder)
     bench.adjust()

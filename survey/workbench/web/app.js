@@ -35,7 +35,7 @@ const VIEWS = {
   correlations: ["Correlations", () => new CorrelationsView(bench)],
   network: ["Network", () => new NetworkView(bench)],
   jobs: ["Jobs", () => new JobsView(bench, actions)],
-  settings: ["Datum and sigmas", () => new SettingsView(bench, actions)],
+  settings: ["Datum", () => new SettingsView(bench, actions)],
 };
 const PANES = ["left", "right"];
 const REGIONS = [["tree", "Project"], ["left", "First view"], ["right", "Second view"], ["tables", "Tables"], ["inspector", "Details"]];

@@ -30,10 +30,10 @@ export class FindingsView {
     const suspects = findings.suspects ?? [], causes = findings.causes ?? [];
     fill(this.element, 
       state.waiting ? make("p", { class: "verdict" }, t("adjusting …")) : make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
-      (findings.warnings ?? []).length ? make("ul", { class: "problems" }, ...findings.warnings.map((w) => make("li", {}, w.text, ...places(w)))) : null,
       ...causes.map((cause) => this.cause(cause)),
       findings.remedies?.length ? make("h2", {}, t("What would mend it")) : null,
       ...(findings.remedies ?? []).map((remedy) => this.remedy(remedy)),
+      (findings.warnings ?? []).length ? make("ul", { class: "problems" }, ...findings.warnings.map((w) => make("li", {}, w.text, ...places(w)))) : null,
       state.solved ? make("h2", {}, t("Suspects"), " ", make("span", { class: "quiet" }, count(findings.n_suspects ?? suspects.length))) : null,
       !state.solved ? null : suspects.length ? this.suspects(t("Suspects, worst first"), suspects) : make("p", { class: "quiet" }, t("Nothing disagrees with the others.")),
       state.exclusions.length ? this.exclusions(state.exclusions) : null,
