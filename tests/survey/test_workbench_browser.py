@@ -207,6 +207,11 @@ def test_places_that_the_terminal_names_are_places_of_the_page(page: Page, folde
         assert "There is no such" not in page.page.inner_text("#inspector")
 
 
+def test_the_address_of_a_run_shows_the_history(page: Page) -> None:
+    page.page.evaluate("location.hash = '#run=12'")
+    page.wait("document.querySelector('#right h2')?.textContent === 'History'")
+
+
 def test_nothing_of_a_project_becomes_markup(page: Page) -> None:
     p = page.page
     assert p.inner_text("#title") == "<img src=x onerror=window.ran=1>"

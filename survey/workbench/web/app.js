@@ -173,9 +173,9 @@ function drawAll(fresh) {
   drawInspector(bench, actions);
 }
 
-/** Views of the two panes: from the address, else findings beside an image (without images the scene). */
+/** Views of the two panes: from the address, else findings beside an image (without images the scene), a run in the history. */
 function panes() {
-  const first = ["findings", bench.points?.images.length ? "image" : "scene"];
+  const first = ["findings", current().run ? "history" : bench.points?.images.length ? "image" : "scene"];
   return PANES.map((_, k) => (VIEWS[current().view[k]] ? current().view[k] : first[k]));
 }
 
