@@ -24,6 +24,7 @@ from survey.commands.opening import declare_open, declare_runs
 from survey.commands.parser import Parser, name_commands
 from survey.commands.planning import declare_check, declare_plan
 from survey.commands.reporting import declare_report
+from survey.commands.starting import declare_init
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "TEST_FAILED", "USAGE", "build_parser", "main"]
 
@@ -41,6 +42,7 @@ Exit codes: 0 done, 1 error in the project, 2 wrong usage, 3 solved, but somethi
 """
 _COMMANDS = (
     declare_adjust,
+    declare_init,
     declare_open,
     declare_detect,
     declare_report,

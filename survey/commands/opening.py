@@ -13,7 +13,7 @@ def declare_open(commands: Any, shaped: dict[str, Any]) -> None:
     parser = commands.add_parser(
         "open",
         help="look at a project in the browser: find what is wrong, leave it out, adjust again",
-        usage="labsurvey open lab   (labsurvey open FOLDER [--port N] [--read-only] [--no-browser])",
+        usage="labsurvey open lab   (labsurvey open FOLDER [--at PLACE] [--port N] [--read-only] [--no-browser])",
         description="Serves the workbench of a project on this machine alone, under an address that holds a token, "
         "until Ctrl-C. What is decided there goes to observations/exclusions.csv and survey.toml at once; results and "
         "runs are written by Save.\n\nFrom another machine: ssh -L 8790:127.0.0.1:8790 THIS_MACHINE",
@@ -21,6 +21,7 @@ def declare_open(commands: Any, shaped: dict[str, Any]) -> None:
         **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
+    parser.add_argument("--at", metavar="PLACE", default="", help="what to show first: '#image=X/hX05', '#point=B07'")
     parser.add_argument("--port", type=not_negative, default=8790, metavar="N", help="0 takes a free one")
     parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="loopback: 127.0.0.1 or ::1")
     parser.add_argument("--read-only", action="store_true", help="look only; nothing can be changed")
@@ -57,7 +58,7 @@ def _open(arguments: argparse.Namespace) -> int:
     if read_only and not arguments.read_only:
         say(arguments, f"{arguments.folder}: cannot be written; it is open for reading only")
     open_folder(arguments.folder, host, arguments.port, read_only, not arguments.no_browser,
-                lambda line: say(arguments, line))  # fmt: skip
+                lambda line: say(arguments, line), arguments.at)  # fmt: skip
     return DONE
 
 

@@ -346,7 +346,7 @@ def test_summary_for_the_terminal(adjustment: Adjustment) -> None:
     worst = max(float(np.abs(o.standardized).max()) for o in adjustment.other_residuals)
     assert f"{worst:.2f}" in lines[lines.index("  largest standardized residuals") + 1]
     assert lines[-1] == "  solve 1.50 s"
-    axes = [float(line.split()[-1]) for line in lines[-5:-2]]
+    axes = [float(line.split()[-2]) for line in lines[-5:-2]]
     assert axes == sorted(axes, reverse=True)
 
 

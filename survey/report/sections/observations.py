@@ -15,6 +15,7 @@ from markupsafe import Markup
 
 from adjust.model.result import ObservationResidual
 from adjust.model.survey import FloatArray, IntArray
+from survey.project.observed import name_of_residual
 from survey.report.context import Context, other_components, worst
 from survey.report.language import group_name, known, t
 from survey.report.markup import (
@@ -198,7 +199,11 @@ def every_observation(c: Context) -> Markup:
     columns = [
         _coded(names[x]) if x in _NAMES else _numeric(x, numbers[x], _digits(x, numbers, values)) for x in COLUMNS
     ]
-    data = {"rows": len(chosen), "columns": columns, "flags": values[9].astype(int).tolist()}
+    n_images = len(c.adjustment.image_residuals.test)
+    readings = ["" if k < n_images else name_of_residual(c.adjustment.other_residuals[k - n_images])
+                for k in values[10].astype(int).tolist()]  # fmt: skip
+    data = {"rows": len(chosen), "columns": columns, "flags": values[9].astype(int).tolist(),
+            "places": _coded(readings), "at": [COLUMNS.index("Where"), COLUMNS.index("Point")]}  # fmt: skip
     said = t(
         "Every observation, one row per component, largest |w| first. w: Baarda's standardized residual. Gross error: "
         "estimated. MDB: the bias of this component alone that its test finds with the stated power; λ̄: how many of "
