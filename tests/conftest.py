@@ -44,6 +44,12 @@ def _daily(config: pytest.Config) -> bool:
     return bool(config.option.markexpr.strip() == "not slow")
 
 
+@pytest.fixture
+def undiagnosed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What does not fit is not explained by trial: for tests on numbers, where that takes most of the time."""
+    monkeypatch.setattr("survey.jobs.adjusting.probable_causes._diagnosis", lambda *_: None)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Whole jobs are slow."""
     for item in items:
