@@ -17,7 +17,6 @@ class Sight:
     """A block of world points: positions (n,) in the survey's points, rays (n, 3) in the camera, camera_from_world."""
 
     block_idx: int
-    camera_id: str
     text: str
     rows: IntArray
     rays: FloatArray

@@ -224,8 +224,7 @@ class _Search:
         focal = {c.camera_id: focal_px(c, self.lenses[c.camera_id]) for c in self.survey.cameras}
         none = np.zeros((0, 3))
         self.points.sights = [
-            Sight(i, blocks[i].camera_id, block_text(blocks[i]), row, rays.get(i, none), focal[blocks[i].camera_id],
-                  self.chains[i])
+            Sight(i, block_text(blocks[i]), row, rays.get(i, none), focal[blocks[i].camera_id], self.chains[i])
             for i, row in rows.items() if i not in failed
         ]  # fmt: skip
         # fewer than three points give no pose, but may well serve in the adjustment
