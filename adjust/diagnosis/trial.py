@@ -11,6 +11,9 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 
+NOISE = 1.2
+"""Variance factor up to which what is left is noise."""
+
 
 @dataclass(frozen=True)
 class Misfit:
@@ -41,13 +44,22 @@ class Trial:
 
 
 def tried(hypothesis: Hypothesis, case: Case) -> Trial:
-    """The survey of a hypothesis adjusted as its case is; no change of what the case holds."""
+    """The survey of a hypothesis adjusted from the values of its case, and where that does not fit as its case was."""
     survey = hypothesis.changed()
-    try:
-        result = None if survey is None else case.run(survey)
-    except SurveyError:
-        result = None
-    return Trial(hypothesis, misfit_of(result, survey or case.survey), result)
+    if survey is None:
+        return Trial(hypothesis, misfit_of(None, case.survey), None)
+    best = Trial(hypothesis, misfit_of(None, survey), None)
+    for run in (case.warm, case.run) if case.linear is not None else (case.run,):
+        try:
+            result = run(survey)
+        except SurveyError:
+            continue
+        misfit = misfit_of(result, survey)
+        if best.result is None or misfit.omega < best.misfit.omega:
+            best = Trial(hypothesis, misfit, result)
+        if best.misfit.unused == 0 and misfit.omega < NOISE * misfit.redundancy:
+            break
+    return best
 
 
 def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
