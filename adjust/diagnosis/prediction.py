@@ -71,7 +71,8 @@ class Prediction:
     def uv(self, i: int, altered: Altered | None = None) -> FloatArray | None:
         """(n, 2) px of block i; None where a value is not known, or a point lies behind the camera.
 
-        altered: other values, by the name of the unknown: of a pose, a lens, a point.
+        altered: other values, by the name of the unknown: of a pose, a lens, a point. ("station_body", id) and
+        ("target_body", id): motions of bodies whose poses are held, in their own frames.
         """
         block, other = self.survey.image_blocks[i], altered or {}
         pose, lens = self.pose(i, other), self._value(("lens", block.camera_id), other)
@@ -99,7 +100,20 @@ class Prediction:
             if value is None:
                 return None
             out = out @ (inverse(value) if link.inverse else value)
-        return out
+        return self._moved_body(self.survey.image_blocks[i], out, altered)
+
+    def _moved_body(self, block: ImageBlock, pose: FloatArray, altered: Altered) -> FloatArray:
+        station = altered.get(("station_body", self._stations[block.camera_id]))
+        if isinstance(station, Pose3):
+            own = adjusted_pose(self.survey, self.result, ("station_from_camera", block.camera_id))
+            own = np.eye(4) if own is None else own
+            pose = inverse(own) @ inverse(station.matrix()) @ own @ pose
+        target = altered.get(("target_body", block.target_id or ""))
+        return pose @ target.matrix() if isinstance(target, Pose3) else pose
+
+    @cached_property
+    def _stations(self) -> dict[str, str]:
+        return {c.camera_id: c.station_id for c in self.survey.cameras}
 
     def _value(self, name: ParameterName, altered: Altered) -> FloatArray | None:
         found = altered.get(name)

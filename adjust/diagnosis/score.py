@@ -4,7 +4,7 @@ With whitened rows ``e + A dx`` and the derivative B of e by the change, ``g = B
 v'Pv falls by ``g' inv(M) g``, and the change is ``-inv(M) g`` (score test, Rao 1948; model errors, Baarda 1968).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -42,6 +42,10 @@ def score(g: FloatArray, BB: FloatArray, AB: FloatArray, QAB: FloatArray) -> Sco
     return Score(-cov @ g, cov, float((along**2 / values[kept]).sum()), int(kept.sum()))
 
 
+Part = tuple[IntArray, FloatArray]
+"""Rows (r,) of a linear system, and the derivatives (r, k) of their whitened residuals by a change."""
+
+
 @dataclass(frozen=True, eq=False)
 class Linear:
     """An adjustment as a linear system, for scores."""
@@ -77,37 +81,50 @@ class Linear:
         at = self.system.columns.at.get(name, np.zeros(0, dtype=np.int64))
         return at if not components else at[[self.system.columns.components[i] in components for i in at]]
 
-    def of_rows(self, rows: IntArray, B: FloatArray) -> Score:
-        """Of a change with derivatives B (r, k) of these rows, which are in use."""
-        kept = self._used[rows] > 0.0
-        rows, B = rows[kept], B[kept]
+    def parts(self, columns: IntArray, rows: Sequence[IntArray]) -> list[Part]:
+        """Rows with their derivatives by unknowns."""
+        J = self.A[:, columns]
+        return [(r, J[r].toarray()) for r in rows]
+
+    def image_parts(self, shifts: Mapping[int, FloatArray]) -> list[Part]:
+        """By image block a shift (n, 2, k) px of its points, in the order of the blocks."""
+        ptr, W = self.result.image_residuals.block_ptr, self.system.precision.graph.square_roots()
+        out = []
+        for i, D in sorted(shifts.items()):
+            w = W[ptr[i] : ptr[i + 1], :, None]
+            B = np.stack([w[:, 0] * D[:, 0] + w[:, 1] * D[:, 1], w[:, 2] * D[:, 1]], axis=1)
+            rows = np.arange(2 * ptr[i], 2 * ptr[i + 1])
+            out.append((rows, self._used[rows, None] * B.reshape(-1, B.shape[2])))
+        return out
+
+    def of_parts(self, parts: Sequence[Part]) -> Score:
+        """Of a change of all of them."""
+        if not parts:
+            return Score(np.zeros(0), np.zeros((0, 0)), 0.0, 0)
+        rows, B = (np.concatenate(x) for x in zip(*parts, strict=True))
+        B = self._used[rows, None] * B
         AB = np.asarray(self.A[rows].T @ B)
         return score(B.T @ self.e[rows], B.T @ B, AB, times_covariance(self.system, AB))
 
-    def steps(self, columns: IntArray, parts: Sequence[IntArray]) -> dict[int, Score]:
-        """An unknown with another value from part t of its rows on: the scores of t, at most ``_CUTS`` of them.
-
-        parts: rows, in the order of time.
-        """
+    def steps(self, parts: Sequence[Part]) -> dict[int, Score]:
+        """A change from part t on: the scores of t, at most ``_CUTS`` of them. parts: in the order of time."""
         cuts = list(range(2, len(parts) - 1))[:: max(1, (len(parts) - 3) // _CUTS)]
-        g, BB, AB = self._by_part(columns, parts)
+        g, BB, AB = self._by_part(parts)
         QAB = times_covariance(self.system, np.concatenate(list(AB), axis=1)) if len(AB) else np.zeros((0, 0))
         QAB = QAB.reshape(len(QAB), len(parts), -1).transpose(1, 0, 2)
         return {t: score(g[t:].sum(0), BB[t:].sum(0), AB[t:].sum(0), QAB[t:].sum(0)) for t in cuts}
 
-    def drift(self, columns: IntArray, parts: Sequence[IntArray]) -> Score:
-        """An unknown that changes in proportion to time, by ``theta`` from the first part to the last."""
+    def drift(self, parts: Sequence[Part]) -> Score:
+        """A change in proportion to time, by ``theta`` from the first part to the last."""
         t = drift_times(len(parts))[:, None]
-        g, BB, AB = self._by_part(columns, parts)
+        g, BB, AB = self._by_part(parts)
         whole = (t[:, :, None] * AB).sum(0)
         return score((t * g).sum(0), (t[:, :, None] ** 2 * BB).sum(0), whole, times_covariance(self.system, whole))
 
-    def _by_part(self, columns: IntArray, parts: Sequence[IntArray]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        J = self.A[:, columns]
-        B = [J[rows].toarray() for rows in parts]
-        g = np.array([b.T @ self.e[rows] for b, rows in zip(B, parts, strict=True)])
-        AB = np.array([self.A[rows].T @ b for b, rows in zip(B, parts, strict=True)])
-        return g, np.array([b.T @ b for b in B]), AB
+    def _by_part(self, parts: Sequence[Part]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        g = np.array([B.T @ self.e[rows] for rows, B in parts])
+        AB = np.array([self.A[rows].T @ B for rows, B in parts])
+        return g, np.array([B.T @ B for _, B in parts]), AB
 
 
 def drift_times(n: int) -> FloatArray:

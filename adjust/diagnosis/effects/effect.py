@@ -81,25 +81,18 @@ Shifts = Mapping[int, FloatArray]
 
 def of_shifts(linear: Linear, shifts: Shifts) -> Score:
     """The score of shifts of the image points of ``linear.result.survey``."""
-    ptr, W = linear.result.image_residuals.block_ptr, linear.system.precision.graph.square_roots()
-    rows, B = [np.zeros(0, dtype=np.int64)], []
-    for i, D in sorted(shifts.items()):
-        w = W[ptr[i] : ptr[i + 1], :, None]
-        own = np.stack([w[:, 0] * D[:, 0] + w[:, 1] * D[:, 1], w[:, 2] * D[:, 1]], axis=1)
-        rows.append(np.arange(2 * ptr[i], 2 * ptr[i + 1]))
-        B.append(own.reshape(-1, own.shape[2]))
-    return linear.of_rows(np.concatenate(rows), np.concatenate(B))
+    return linear.of_parts(linear.image_parts(shifts))
 
 
 def of_others(linear: Linear, kind: str, shifts: Mapping[tuple[str, ...], FloatArray]) -> Score:
     """The score of shifts (d, k) in the tangents of observations of a kind, by their ids."""
-    rows, B = [np.zeros(0, dtype=np.int64)], []
+    parts = []
     for i, o in enumerate(linear.system.precision.graph.others):
         if o.kind == kind and o.ids in shifts:
             at = linear.system.n_image + i
-            rows.append(np.arange(linear.system.ptr[at], linear.system.ptr[at + 1]))
-            B.append(np.asarray(noise_of(o).R()) @ shifts[o.ids])
-    return linear.of_rows(np.concatenate(rows), np.concatenate(B))
+            rows = np.arange(linear.system.ptr[at], linear.system.ptr[at + 1])
+            parts.append((rows, np.asarray(noise_of(o).R()) @ shifts[o.ids]))
+    return linear.of_parts(parts)
 
 
 def shifted_back(survey: Survey, shifts: Shifts, theta: FloatArray) -> Survey:
