@@ -86,8 +86,8 @@ def diagnose(case: Case, families: Sequence[Family] | None = None, most: int = M
 def _done(trials: Sequence[Trial], following: float) -> bool:
     """Whether one explains everything down to the noise, and what follows has much less evidence."""
     return any(
-        t.result is not None and t.misfit.unused == 0 and t.misfit.omega < NOISE * t.misfit.redundancy
-        and following < _FAINT * t.hypothesis.evidence
+        t.result is not None and t.misfit.unused + t.misfit.dropped == 0
+        and t.misfit.omega < NOISE * t.misfit.redundancy and following < _FAINT * t.hypothesis.evidence
         for t in trials
     )  # fmt: skip
 

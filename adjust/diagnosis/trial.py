@@ -1,6 +1,6 @@
 """One hypothesis, tried: its survey adjusted, and what is left unexplained."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,12 @@ class Misfit:
     unused: int
     count: int
     redundancy: int
+    dropped: int = 0
+
+    @property
+    def cost(self) -> float:
+        """What explanations are compared by."""
+        return self.omega + 2.0 * self.dropped
 
     @property
     def excess(self) -> float:
@@ -48,13 +54,14 @@ def tried(hypothesis: Hypothesis, case: Case) -> Trial:
     survey = hypothesis.changed()
     if survey is None:
         return Trial(hypothesis, misfit_of(None, case.survey), None)
-    best = Trial(hypothesis, misfit_of(None, survey), None)
+    dropped = max(0, misfit_of(None, case.survey).count - misfit_of(None, survey).count)
+    best = Trial(hypothesis, replace(misfit_of(None, survey), dropped=dropped), None)
     for run in (case.warm, case.run) if case.linear is not None else (case.run,):
         try:
             result = run(survey)
-        except SurveyError:
+        except (SurveyError, RuntimeError):  # the latter from GTSAM, where a hypothesis fits nothing at all
             continue
-        misfit = misfit_of(result, survey)
+        misfit = replace(misfit_of(result, survey), dropped=dropped)
         if best.result is None or misfit.omega < best.misfit.omega:
             best = Trial(hypothesis, misfit, result)
         if best.misfit.unused == 0 and misfit.omega < NOISE * misfit.redundancy:

@@ -56,6 +56,8 @@ def _hypotheses(survey: Survey, target: str, ratio: float, sigma: float) -> Iter
 
 def well_known(ratio: float, sigma: float) -> tuple[float, str]:
     """The nearest factor that explains itself, and how it comes about; the ratio and "" where none is near."""
+    if not ratio > 0.0:
+        return ratio, ""
     near = max(_NEAR, _CLEAR * sigma / ratio)
     known = [(f, f": {why}") for f, why in KNOWN if abs(np.log(ratio / f)) < near]
     return min(known, key=lambda item: abs(np.log(ratio / item[0])), default=(ratio, ""))
