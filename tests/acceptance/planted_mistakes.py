@@ -2,7 +2,7 @@
 
 ``python -m tests.acceptance.planted_mistakes RESULTS`` runs what RESULTS (a file of lines) does not have yet, and
 prints the outcomes: named first, among three, another one first, refused with the right reason, silent. ``--part 1/2``
-runs every second one, ``--again NAME`` runs a mistake once more, ``--page FILE`` writes the table as a page.
+runs every second one, ``--again NAME`` (of a mistake, or an outcome) runs what is known once more.
 """
 
 import argparse
@@ -92,7 +92,6 @@ def main() -> None:
     parser.add_argument("results", type=Path)
     parser.add_argument("--part", default="1/1")
     parser.add_argument("--again", action="append", default=[], help="name of a mistake, or an outcome")
-    parser.add_argument("--page", type=Path)
     said = parser.parse_args()
     first, of = (int(x) for x in said.part.split("/"))
     run(said.results, (first, of), said.again)
