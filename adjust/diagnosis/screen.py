@@ -68,7 +68,7 @@ def screen(survey: Survey, start: StartValues | None = None) -> Screen | None:
         vectors = {n: v for n, v in start.vectors.items() if n[0] != "orientation"}
         graph = GraphBuilder(survey, start.lenses).build(replace(start, vectors=vectors))
         return Screen(graph, start)
-    except SurveyError:
+    except (SurveyError, RuntimeError):  # GTSAM raises the latter where a convention that is not meant fits nothing
         return None
 
 
