@@ -200,18 +200,21 @@ def _gates(system: System, seen: Sightings, prior: Prior, ahead: BoolArray) -> t
 
     ahead (c, m): the others are infinitely far.
     """
-    m = ahead.shape[1]
-    distance, log_det = np.empty((len(seen.uv), m)), np.empty((len(seen.uv), m))
-    for c in np.unique(seen.camera).tolist():
-        predicted, H, M, _ = evaluate(system, prior.pose, np.full(m, c), np.arange(m), np.zeros((m, 2)))
-        H, common = H.reshape(m, 2, 6), (H @ prior.B + M).reshape(m, 2, -1)
-        base = H @ prior.cov @ H.transpose(0, 2, 1) + common @ common.transpose(0, 2, 1)
-        mine = np.flatnonzero(seen.camera == c)
-        S = base + seen.cov[mine][:, None]
-        det = S[:, :, 0, 0] * S[:, :, 1, 1] - S[:, :, 0, 1] ** 2
-        x, y = np.moveaxis(predicted.reshape(m, 2) - seen.uv[mine][:, None], 2, 0)
-        square = (S[:, :, 1, 1] * x * x - 2.0 * S[:, :, 0, 1] * x * y + S[:, :, 0, 0] * y * y) / det
-        distance[mine], log_det[mine] = np.where(ahead[c], square, np.inf), np.log(4.0 * np.pi**2 * det)
+    shape = len(seen.uv), ahead.shape[1]
+    distance, log_det = np.full(shape, np.inf), np.zeros(shape)
+    near_by = ahead & (np.bincount(seen.camera, minlength=len(ahead)) > 0)[:, None]
+    camera, beacon = map(np.ascontiguousarray, np.nonzero(near_by))
+    n = len(beacon)
+    predicted, H, M, _ = evaluate(system, prior.pose, camera, beacon, np.zeros((n, 2)))
+    common = (H @ prior.B + M).reshape(n, 2, -1)
+    by_pose = (H @ prior.cov).reshape(n, 2, 6)
+    base = by_pose @ H.reshape(n, 2, 6).transpose(0, 2, 1) + common @ common.transpose(0, 2, 1)
+    spot, near = np.nonzero(seen.camera[:, None] == camera)
+    (xx, xy), (_, yy) = (base[near] + seen.cov[spot]).transpose(1, 2, 0)
+    x, y = (predicted.reshape(n, 2)[near] - seen.uv[spot]).T
+    det = xx * yy - xy * xy
+    distance[spot, beacon[near]] = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / det
+    log_det[spot, beacon[near]] = np.log(4.0 * np.pi**2 * det)
     return distance, log_det
 
 
