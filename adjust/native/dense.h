@@ -30,6 +30,10 @@ inline void product_columns(const double *A, int64_t lda, const double *B, int64
     for (; i < n; ++i) product_tile<1, K>(A + i * lda, lda, B, ldb, C + i * ldc, ldc, inner);
 }
 inline int64_t padded(int64_t n) { return (n + 2 * W - 1) / (2 * W) * (2 * W); }
+
+// As wide as the widest vectors pad it, so that room taken by one set of instructions serves every other.
+constexpr int64_t WIDEST = 16;
+inline int64_t padded_most(int64_t n) { return (n + WIDEST - 1) / WIDEST * WIDEST; }
 inline void product(const double *A, int64_t lda, const double *B, int64_t ldb, double *C, int64_t ldc, int64_t n, int64_t m, int64_t inner) {
     int64_t j = 0;
     for (; j + W < m; j += 2 * W) product_columns<2>(A, lda, B + j, ldb, C + j, ldc, n, inner);

@@ -142,7 +142,7 @@ inline int64_t elimination_room(Ints key_ptr, Ints n_front) {
     int64_t most = 0;
     for (int64_t c = 0; c < n_front.n[0]; ++c) {
         const int64_t nf = POSE * n_front[c], n = POSE * (key_ptr[c + 1] - key_ptr[c]);
-        most = larger(most, nf * padded(n) + (n - nf) * padded(n - nf) + 2 * W);
+        most = larger(most, nf * padded_most(n) + (n - nf) * padded_most(n - nf) + WIDEST);
     }
     return most;
 }

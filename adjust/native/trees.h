@@ -82,15 +82,17 @@ inline int64_t invert_cliques(Ints front, Ints width, Ints at, Out<double, 1> da
     return -1;
 }
 
-inline int64_t room_for_rows(int64_t nf, int64_t ns) {
-    const int64_t pf = padded(nf), ps = padded(ns);
+inline int64_t room_for_rows(int64_t nf, int64_t ns, int64_t pf, int64_t ps) {
     return 3 * nf * pf + ns * (ps + pf) + nf * ps;
 }
 
 // Numbers of scratch that covariance_rows takes.
 inline int64_t covariance_room(Ints front, Ints width) {
     int64_t most = 0;
-    for (int64_t c = 0; c < front.n[0]; ++c) most = larger(most, room_for_rows(front[c], width[c] - front[c]));
+    for (int64_t c = 0; c < front.n[0]; ++c) {
+        const int64_t nf = front[c], ns = width[c] - nf;
+        most = larger(most, room_for_rows(nf, ns, padded_most(nf), padded_most(ns)));
+    }
     return most;
 }
 
@@ -100,7 +102,7 @@ inline void covariance_rows(const Tree &t, Ints n_front, Vector data, Out<double
         const int64_t nf = t.front[c], n = t.width[c], ns = n - nf, pf = padded(nf), ps = padded(ns);
         const double *A = data.data + t.at[c];
         double *C = t.cov.data + t.at[c];
-        std::memset(work.data, 0, sizeof(double) * room_for_rows(nf, ns));
+        std::memset(work.data, 0, sizeof(double) * room_for_rows(nf, ns, pf, ps));
         double *P = work.data, *X = P + nf * pf, *Z = X + nf * pf, *Q = Z + nf * pf, *turned = Q + ns * ps, *Y = turned + ns * pf;
         for (int64_t i = 0; i < nf; ++i)
             for (int64_t j = i; j < nf; ++j) P[j * pf + i] = A[i * n + j];
