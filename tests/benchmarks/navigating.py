@@ -1,4 +1,4 @@
-"""Navigation of 60 epochs: ``PYTHONPATH=FOLDER python tests/benchmarks/navigating.py``, FOLDER this or another checkout.
+"""Navigation of 60 epochs, of this checkout or of another: ``PYTHONPATH=FOLDER python tests/benchmarks/navigating.py``.
 
 A head of three cameras turns among 60 beacons; spots with names, and without names and a tenth of them false.
 """
