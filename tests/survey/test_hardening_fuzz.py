@@ -16,6 +16,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 CORPUS = ROOT / "tests" / "fuzz" / "corpus"
 NO_READERS = {
+    "survey/commands/opening.py:_open": "a browser",
     "survey/batch/cache.py:fingerprint": "hashes whatever is there",
     "survey/batch/journal.py:Journal.__init__": "opens to write",
     "survey/batch/worker.py:Worker._answer": "a pipe from a process of its own",
