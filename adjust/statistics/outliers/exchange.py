@@ -26,6 +26,8 @@ _LINKED = 0.15
 """Correlation of two tests from which an error of one shows in the other."""
 _EVEN = 2.0 * float(np.log(20.0))
 """Difference of J up to which an explanation is less than 20 times as likely as another one."""
+_FEW = 12
+"""Rejected observations up to which all sets are gone through; of more, only where one of them might come back."""
 _MOST = 600
 """Rejected components beyond which sets are not compared any more: the survey itself is wrong then."""
 _ROOM = 1e8
@@ -140,6 +142,8 @@ def _exchanges(state: _State, o: int) -> list[Exchange]:
 def _exchanges_among(state: _State, near: _Near) -> list[Exchange]:
     limits = state.limits[near.pool]
     here = tuple(i for i, x in enumerate(near.pool) if x in near.mine)
+    if len(state.rows) > _FEW and not _may_come_back(near, limits, here):
+        return []
     J = {s: v for size in range(len(near.pool) + 1) for s, v in _criteria(near, limits, size)}
     if here not in J:
         return []
@@ -149,6 +153,19 @@ def _exchanges_among(state: _State, near: _Near) -> list[Exchange]:
             kept = tuple(near.pool[i] for i in here if i not in s)
             out.append(Exchange(kept, tuple(near.pool[i] for i in s if i not in here), value - J[here]))
     return out
+
+
+def _may_come_back(near: _Near, limits: FloatArray, here: tuple[int, ...]) -> bool:
+    """Whether one of those that are out fits nearly as well with all others of the pool out, whose limits count not."""
+
+    def share(s: list[int]) -> float:
+        at = np.concatenate([np.zeros(0, dtype=np.int64), *(near.at[i] for i in s)])
+        R = near.R[np.ix_(at, at)] + CONTROLLED**2 * np.eye(len(at))
+        return float(near.g[at] @ np.linalg.solve(R, near.g[at]))
+
+    most = share(list(here)) - float(limits[list(here)].sum()) - _EVEN
+    everyone = range(len(near.pool))
+    return any(share([j for j in everyone if j != i]) > most for i in here)
 
 
 def _criteria(near: _Near, limits: FloatArray, size: int) -> list[tuple[tuple[int, ...], float]]:
