@@ -11,6 +11,7 @@ import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.pose_network.network import PoseNetwork
+from adjust.pose_network.solve import minimize
 from adjust.pose_network.start import (
     find_network_start,
     rotation_residuals,
@@ -20,7 +21,7 @@ from adjust.pose_network.start import (
     translation_sigmas,
 )
 from adjust.spatial.rigid_motions import Motions
-from adjust.testing.criteria import MANY, typical_factor
+from adjust.testing.criteria import MANY, limits, typical_factor
 from adjust.testing.distributions import chi2
 
 _TRUNCATION = float(chi2.isf(1e-4, 3))
@@ -28,6 +29,7 @@ _SLACK = 4.0  # positions inherit what is left in the rotations of the first sta
 _LEAST = 1e-6  # pairs that are sorted out keep this weight, so that the network holds together
 _GROWTH = 2.0
 _PLAINLY = 25.0
+_BACK = 5
 
 
 def _graduated(
@@ -73,9 +75,12 @@ def graduated_weights(network: PoseNetwork, factor: float = 1.0) -> FloatArray:
     return _graduated(network, positions, factor * _SLACK * _TRUNCATION, weights)
 
 
-def graduated_start(network: PoseNetwork) -> tuple[FloatArray, FloatArray]:
-    """``world_from_station`` (N, 3, 3), (N, 3) from the pairs that agree with each other."""
-    return find_network_start(network, np.maximum(graduated_weights(network), _LEAST))
+def graduated_start(
+    network: PoseNetwork, weights: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """``world_from_station`` (N, 3, 3), (N, 3) from the pairs that agree with each other; weights: where known."""
+    weights = graduated_weights(network) if weights is None else weights
+    return find_network_start(network, np.maximum(weights, _LEAST))
 
 
 def plainly_contradictory(network: PoseNetwork) -> bool:
@@ -83,19 +88,40 @@ def plainly_contradictory(network: PoseNetwork) -> bool:
     rows = np.flatnonzero(network.used)
     if len(rows) < MANY:
         return False
-    R, t = find_network_start(network)
-    d, here = network.dim, Motions(R, None if network.rotation_only else t)
-    measured = network.arrays.motions
-    measured = measured if d == 6 else Motions(measured.rotation)
-    residual = (measured.inverse() @ here[network.b_idx].inverse() @ here[network.a_idx]).log()
-    squares = np.square(np.einsum("nij,nj->ni", network.whitening, residual)[rows]).sum(axis=1)
-    freedom = np.where(network.is_pose, 6, 3)[rows]
+    squares, freedom = _squares(network, *find_network_start(network))[rows], network.sizes[rows]
     return bool(squares.mean() > _PLAINLY * freedom.mean() * max(1.0, typical_factor(squares, freedom)))
 
 
-def suspected_pairs(network: PoseNetwork, factor: float = 1.0) -> BoolArray:
-    """Pairs (E,) in use that do not agree with the others, and can all go at once. factor: of all variances."""
-    return network.used & ~_connected(network, graduated_weights(network, factor))
+def _squares(network: PoseNetwork, R: FloatArray, t: FloatArray) -> FloatArray:
+    """Whitened squares (E,) of all pairs with the stations there."""
+    rotations_only = network.rotation_only
+    here, measured = Motions(R, None if rotations_only else t), network.arrays.motions
+    measured = Motions(measured.rotation) if rotations_only else measured
+    residual = (measured.inverse() @ here[network.b_idx].inverse() @ here[network.a_idx]).log()
+    return np.asarray(np.square(np.einsum("nij,nj->ni", network.whitening, residual)).sum(axis=1))
+
+
+def disagreeing(
+    network: PoseNetwork, family_alpha: float, factor: float = 1.0
+) -> tuple[BoolArray, tuple[FloatArray, FloatArray]]:
+    """Pairs (E,) in use that do not agree with the others, and can all go at once; the solution of the others.
+
+    Graduated non-convexity sorts out; from the least squares of the rest all that fits comes back, for a square of the
+    residual that does not reach the limit of a test cannot fail it. factor: of all variances.
+    """
+    weights = graduated_weights(network, factor)
+    used, at = _connected(network, weights), graduated_start(network, weights)
+    limit = limits(family_alpha, network.sizes, int(network.used.sum()))
+    for _ in range(_BACK):
+        found = minimize(network.with_used(used), at)
+        at = found.rotations, found.translations
+        squares = _squares(network, *at)
+        typical = typical_factor(squares[used], network.sizes[used]) if used.sum() >= MANY else 1.0
+        back = network.used & ~used & (squares <= max(factor, typical) * limit)
+        if not back.any():
+            break
+        used |= back
+    return network.used & ~used, at
 
 
 def _connected(network: PoseNetwork, weights: FloatArray) -> BoolArray:

@@ -76,6 +76,11 @@ class PoseNetwork:
         return 3 if self.rotation_only else 6
 
     @property
+    def sizes(self) -> IntArray:
+        """Components (E,) that each pair measured."""
+        return np.where(self.is_pose, 6, 3)
+
+    @property
     def whitening(self) -> FloatArray:
         """W (E, dim, dim), upper triangular, with W'W the inverse covariance; zero rows where nothing was measured."""
         return self.arrays.whitening[:, : self.dim, : self.dim]

@@ -70,8 +70,7 @@ def solve_network(
 def as_solution(network: PoseNetwork, minimum: Minimum) -> NetworkSolution:
     """The minimum with its counts."""
     used, graph, solved = network.used, minimum.graph, minimum.solved
-    sizes = np.where(network.is_pose, 6, 3)[used]
-    n_observations = int(sizes.sum()) + sum(len(i.components) for i in graph.singles if i.kind == "prior")
+    n_observations = int(network.sizes[used].sum()) + sum(len(i.components) for i in graph.singles if i.kind == "prior")
     defect = 0 if solved.datum is None else solved.datum.defect
     redundancy = n_observations - graph.unknowns.n_unknowns + defect
     return NetworkSolution(

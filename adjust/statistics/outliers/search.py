@@ -12,18 +12,19 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+from gtsam import Pose3, Rot3
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import IndeterminateError, NotConvergedError
-from adjust.model.result import Adjustment, ObservationResidual
+from adjust.model.result import Adjustment, ObservationResidual, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.precision.precision import Precision
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.outliers.candidates import Candidates, as_given, candidates, without
 from adjust.statistics.outliers.exchange import Exchange, better_set, equal_sets
 from adjust.statistics.outliers.snooping import Snooping, Verdict
-from adjust.statistics.outliers.watched import WatchedSnooping, watchable, watched
+from adjust.statistics.outliers.watched import FOLLOWED, WatchedSnooping, watchable, watched
 from adjust.statistics.reliability import observation_name
 from adjust.statistics.result import Alternative, Decision
 from adjust.statistics.system import groups_of_others, linear_system, precision_of
@@ -106,14 +107,22 @@ def _said_of_pair(o: ObservationResidual, d: Decision) -> str:
     return f"left out: pair {o.ids[0]}: off by {turn:.4g} deg{shift}, test {d.statistic:.1f}, p {d.p:.2g}"
 
 
+@dataclass(frozen=True, eq=False)
+class Disagreeing:
+    """Pairs (E,) of a network that do not agree with the others, and where these put the stations."""
+
+    pairs: BoolArray
+    start: StartValues
+
+
 def search_outliers(
     survey: Survey, start: StartValues | None = None, options: SearchOptions = DEFAULT_SEARCH,
     progress: Callable[[int, float], None] | None = None, first: Adjustment | None = None,
-    wrong: BoolArray | None = None,
+    wrong: Disagreeing | None = None,
 ) -> OutlierSearch:  # fmt: skip
     """Adjust a survey without its gross errors. first: its adjustment, where there is one.
 
-    wrong: pairs (E,) that the search begins without. What the survey does not use stays out. Raises as
+    wrong: pairs that the search begins without. What the survey does not use stays out. Raises as
     :func:`adjust.adjustment.adjust`.
     """
     def solved(part: Survey, start: StartValues | None) -> Adjustment:
@@ -124,16 +133,22 @@ def search_outliers(
         now = first or solved(survey, start)
         survey = as_given(now.survey, survey) if options.adjust.reject_points and not images else now.survey
     else:
-        now = solved(_with_pairs(survey, wrong), start)
+        now = solved(_with_pairs(survey, wrong.pairs), wrong.start)
         found = candidates(precision_of(now).graph, images)
-        given, out = _used(now, found), found.of("pairs", np.flatnonzero(wrong))
+        given, out = _used(now, found), found.of("pairs", np.flatnonzero(wrong.pairs))
         given[list(out)] = True
+        now, out = _taken_back(now, out, options, lambda these, now: solved(
+            without(survey, found, these), values_of(now)))  # fmt: skip
     round_ = _Round(now, options, images, given)
     found, given = round_.found, round_.given
-    if not out and round_.crowded and (wrong := disagreeing_pairs(now.survey, float(round_.factor.max()))) is not None:
-        now, out = _left_out(now, (), found.of("pairs", np.flatnonzero(wrong)), lambda these, now: solved(
-            without(survey, found, these), values_of(now)))  # fmt: skip
-        round_ = _Round(now, options, images, given)
+    if wrong is None and round_.crowded:
+        wrong = disagreeing_pairs(now.survey, float(round_.factor.max()))
+        if wrong is not None:
+            mine, begin = found.of("pairs", np.flatnonzero(wrong.pairs)), wrong.start
+            now, out = _left_out(now, (), mine, lambda these, _: solved(without(survey, found, these), begin))
+            now, out = _taken_back(now, out, options, lambda these, now: solved(
+                without(survey, found, these), values_of(now)))  # fmt: skip
+            round_ = _Round(now, options, images, given)
     log: list[Decision] = []
     seen: set[frozenset[int]] = {frozenset()}
     needed: set[int] = set()
@@ -154,20 +169,26 @@ def search_outliers(
         round_ = _Round(now, options, images, given, round_.number + 1, round_.index)
 
 
-def disagreeing_pairs(survey: Survey, factor: float = 1.0, only_if_plain: bool = False) -> BoolArray | None:
-    """Pairs (E,) that do not agree with the others of a network, found without a solution; None for other surveys.
+def disagreeing_pairs(survey: Survey, factor: float = 1.0, only_if_plain: bool = False) -> Disagreeing | None:
+    """What of a network does not agree, found before its tests; None for other surveys.
 
     factor: of all variances. only_if_plain: None, too, where it is not plain from averaged rotations that some do not.
     """
     if not survey.pairs:
         return None
     from adjust.pose_network.from_survey import network_of_pairs  # here: a survey without pairs starts without it
-    from adjust.pose_network.graduated import plainly_contradictory, suspected_pairs
+    from adjust.pose_network.graduated import disagreeing, plainly_contradictory
 
     network = network_of_pairs(survey)
     if network is None or (only_if_plain and not plainly_contradictory(network)):
         return None
-    return suspected_pairs(network, factor)
+    try:
+        pairs, (R, t) = disagreeing(network, DEFAULT_SEARCH.family_alpha, factor)
+    except (IndeterminateError, NotConvergedError):
+        return None
+    names: list[ParameterName] = [("world_from_station", s) for s in network.station_ids]
+    poses = {n: Pose3(Rot3(a), b) for n, a, b in zip(names, R, t, strict=True)}
+    return Disagreeing(pairs, StartValues({}, poses, {})) if pairs.any() else None
 
 
 def _with_pairs(survey: Survey, wrong: BoolArray) -> Survey:
@@ -190,6 +211,22 @@ def _left_out(
                 if o not in out:
                     now, out = _left_out(now, out, (*out, o), leave)
         return now, out
+
+
+def _taken_back(
+    now: Adjustment, out: tuple[int, ...], options: SearchOptions,
+    leave: Callable[[tuple[int, ...], Adjustment], Adjustment],
+) -> tuple[Adjustment, tuple[int, ...]]:  # fmt: skip
+    """Of more than can be followed one by one all that fits comes back at once, until little does."""
+    for _ in range(_ROUNDS):
+        tests = _tests_of_all(now)
+        limit = limits(options.family_alpha, tests.freedom, int(np.count_nonzero(tests.freedom > 0)))
+        fits = tests.statistic <= limit * _typical(tests)[tests.group]
+        left = tuple(o for o in out if not fits[o])
+        if len(out) <= FOLLOWED or len(left) == len(out):
+            break
+        now, out = leave(left, now), left
+    return now, out
 
 
 class _Round:
@@ -218,7 +255,7 @@ class _Round:
             self._watch(self._everything, allowed, before)
         tests = self._all(self.snooping.tests())
         self.n_tests = int(np.count_nonzero(tests.freedom > 0)) + points
-        self.cautious, self.factor = tests.cautious, self._typical(tests)
+        self.cautious, self.factor = tests.cautious, _typical(tests)
         self.snooping.candidates &= ~self.cautious[self.snooping.group]
         self._at = {o: i for i, o in enumerate(self.index.tolist())}
 
@@ -230,7 +267,7 @@ class _Round:
 
     def _watch(self, tests: Verdicts, allowed: BoolArray, before: IntArray) -> None:
         n = int(np.count_nonzero(tests.freedom > 0))
-        limit = limits(self.options.family_alpha, tests.freedom, n) * self._typical(tests)[tests.group]
+        limit = limits(self.options.family_alpha, tests.freedom, n) * _typical(tests)[tests.group]
         over = np.where(tests.freedom > 0, tests.statistic / limit, 0.0)
         self.index = watched(over, tests.used, allowed & (tests.freedom > 0), before)
         self.snooping = WatchedSnooping(self.now, self.index, self.given)
@@ -307,7 +344,7 @@ class _Round:
         """By how much the sigmas (squared) of every group (G,) are too small, where that cannot be chance; else 1."""
         mine = now.tests()
         tests = self._all(mine)
-        self.factor = self._typical(tests)
+        self.factor = _typical(tests)
         n = np.bincount(tests.group[tests.used & (tests.freedom > 0)], minlength=len(self.factor))
         few, search = (n > 0) & (n < MANY), self._search()
         state = search.judged(now, mine)
@@ -317,18 +354,6 @@ class _Round:
         if best is None or not best.failing.any():
             return self.factor
         return np.maximum(self.factor, np.where(few, best.supposed, 1.0))
-
-    @staticmethod
-    def _typical(tests: Verdicts) -> FloatArray:
-        """Of groups (G,) of many the factor that their typical test shows."""
-        factor = np.ones(len(tests.omega))
-        n = np.bincount(tests.group[tests.used & (tests.freedom > 0)], minlength=len(factor))
-        for g in np.flatnonzero(n >= MANY).tolist():
-            mine = tests.used & (tests.group == g) & (tests.freedom > 0)
-            ratio = tests.statistic[mine] / chi2.ppf(0.5, tests.freedom[mine])
-            if np.mean(ratio > 1.0) > 0.5 + 1.5 / np.sqrt(n[g]):  # three sigmas of a fair coin
-                factor[g] = max(1.0, float(np.median(ratio)))
-        return factor
 
     def _suspected(self, state: State[Snooping]) -> list[int]:
         """Whom a robust solution suspects, worst first."""
@@ -390,6 +415,18 @@ class _Round:
             for part in (x.kept, x.instead)
         )
         return Alternative(kept, instead, float(np.exp(0.5 * x.more)))
+
+
+def _typical(tests: Verdicts) -> FloatArray:
+    """Of groups (G,) of many the factor that their typical test shows."""
+    factor = np.ones(len(tests.omega))
+    n = np.bincount(tests.group[tests.used & (tests.freedom > 0)], minlength=len(factor))
+    for g in np.flatnonzero(n >= MANY).tolist():
+        mine = tests.used & (tests.group == g) & (tests.freedom > 0)
+        ratio = tests.statistic[mine] / chi2.ppf(0.5, tests.freedom[mine])
+        if np.mean(ratio > 1.0) > 0.5 + 1.5 / np.sqrt(n[g]):  # three sigmas of a fair coin
+            factor[g] = max(1.0, float(np.median(ratio)))
+    return factor
 
 
 def _used(now: Adjustment, found: Candidates) -> BoolArray:

@@ -15,7 +15,7 @@ from adjust.precision.precision import ObservationRows, Precision
 from adjust.statistics.outliers.snooping import CAUCHY, Snooping
 from adjust.statistics.system import Entries, groups_of_others, precision_of
 
-_MOST = 120
+FOLLOWED = 120
 """Observations that fail, or that are out, of which so many are watched at once."""
 _NEAREST, _NEAR = 30, 0.5
 """Of the others those with the largest tests, from this share of their limit."""
@@ -35,7 +35,7 @@ def watched(over: FloatArray, used: BoolArray, allowed: BoolArray, before: IntAr
     """Whom to watch, by their tests over the limit (M,): what fails, what is out, the nearest, and ``before`` again."""
     wrong = np.where(used, over > 1.0, over <= 1.0)
     urgent = np.lexsort((-np.where(used, over, 1.0 / np.maximum(over, 1e-300)), ~wrong))
-    urgent = urgent[(allowed & (wrong | ~used))[urgent]][:_MOST]
+    urgent = urgent[(allowed & (wrong | ~used))[urgent]][:FOLLOWED]
     near = np.flatnonzero(allowed & used & ~wrong & (over > _NEAR))
     near = near[np.argsort(-over[near], kind="stable")][:_NEAREST]
     return np.unique(np.concatenate([urgent, near, before]))
