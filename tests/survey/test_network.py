@@ -250,6 +250,39 @@ def test_a_wrong_pair_in_a_survey_with_other_observations_is_left_out():
     assert not kept.global_test.passed
 
 
+def _with_loose_reading(survey):
+    """With a distance of no weight between two stations: no survey of pairs alone any more."""
+    ends = [PositionRef(None, FrameRef("station", f"S{i}")) for i in (1, 2)]
+    return replace(survey, distances=(Distance("d", *ends, 1.0, 1e6),))
+
+
+@pytest.mark.parametrize("beside", ["distance", "point"])
+def test_a_survey_of_pairs_is_one_with_anything_beside(beside):
+    """Estimates, covariances, tests, exclusions, decisions and variance components, whatever else is observed."""
+    survey, _ = _network(7, combinations(range(7), 2), 2.0)
+    wrong = dict.fromkeys((3, 11), Pose3(Rot3.Rz(0.02), np.array([0.05, 0.0, 0.0])))
+    pairs = [replace(p, b_from_a=p.b_from_a.compose(wrong[i])) if i in wrong else p for i, p in enumerate(survey.pairs)]
+    survey = replace(survey, pairs=tuple(pairs))
+    options = CleanOptions(variance_components=True)
+    other = _with_loose_reading(survey) if beside == "distance" else _mixed(survey)
+    one, two = (adjust_cleaned(each, options) for each in (survey, other))
+    assert [p.pair_id for p in one.survey.pairs if not p.used] == [survey.pairs[i].pair_id for i in wrong]
+    assert [p.used for p in one.survey.pairs] == [p.used for p in two.survey.pairs]
+    for name, estimate in one.estimates.items():
+        np.testing.assert_allclose(estimate.value.matrix(), two.estimates[name].value.matrix(), atol=1e-8)
+        np.testing.assert_allclose(estimate.cov, two.estimates[name].cov, rtol=1e-4, atol=1e-14)
+    theirs = {o.ids: o for o in two.other_residuals}
+    for o in one.other_residuals:
+        assert o.test == pytest.approx(theirs[o.ids].test, rel=1e-4)
+        np.testing.assert_allclose(o.redundancy, theirs[o.ids].redundancy, atol=1e-6)
+    assert {(d.action, d.ids) for d in one.decisions} == {(d.action, d.ids) for d in two.decisions}
+    mine, same = ({c.group: c for c in x.variance_components.components} for x in (one, two))
+    assert mine["pair"].factor == pytest.approx(same["pair"].factor, rel=1e-4)
+    assert mine["pair"].factor == pytest.approx(4.0, rel=0.4)
+    told = [{w for w in x.warnings if w.startswith("left out: pair ")} for x in (one, two)]
+    assert len(told[0]) == len(told[1]) == len(wrong)
+
+
 def test_sigmas_too_small_throughout_reject_no_pair():
     survey, _ = _network(12, combinations(range(12), 2), 5.0)
     for each in (survey, _mixed(survey)):

@@ -149,7 +149,7 @@ def search_outliers(
             now, out = _taken_back(now, out, options, lambda these, now: solved(
                 without(survey, found, these), values_of(now)))  # fmt: skip
             round_ = _Round(now, options, images, given)
-    log: list[Decision] = []
+    log = [round_.rejected(o, round_.snooping, "robust") for o in out]
     seen: set[frozenset[int]] = {frozenset()}
     needed: set[int] = set()
     while True:
@@ -378,15 +378,15 @@ class _Round:
         name = self.snooping.group_names[group]
         return Decision(action, kind, name, ids, v.statistic, v.freedom, p, limit, v.error, self.number, how)
 
-    def _rejected(self, o: int, now: Snooping) -> Decision:
+    def rejected(self, o: int, now: Snooping, how: str = "test") -> Decision:
         """Of an observation that is out, watched or not."""
         every = self._everything
         if o in self._at or every is None:
-            return self._decision("rejected", self._at[o], now, "test")
+            return self._decision("rejected", self._at[o], now, how)
         r = self.now.other_residuals[o]
         e = np.linalg.norm(precision_of(self.now).rows(precision_of(self.now).graph.others[o]).e)
         verdict = Verdict(r.test, int(every.freedom[o]), float(e))
-        return self._told("rejected", o, verdict, int(every.group[o]), "test")
+        return self._told("rejected", o, verdict, int(every.group[o]), how)
 
     def result(
         self, state: State[Snooping], out: Iterable[int], needed: Iterable[int], log: list[Decision], converged: bool,
@@ -397,7 +397,7 @@ class _Round:
         used[[*(self._at[o] for o in out if o in self._at), *kept]] = False
         now = state.solution.using(used)
         last, names = self._search().judged(now, now.tests()), now.group_names
-        rejected = [self._rejected(o, now) for o in out]
+        rejected = [self.rejected(o, now) for o in out]
         suspects = [*np.flatnonzero(last.tests.used & (last.over > 1.0)).tolist(), *kept]
         suspects.sort(key=lambda i: -float(last.over[i]))
         mine = {names[g] for g in np.unique(now.group[now.candidates]).tolist()}
