@@ -22,6 +22,9 @@ from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.network import survey_of as survey_of_network
 from adjust.pose_network.solve import minimize
 from adjust.spatial.rigid_motions import Motions
+from adjust.statistics.condensed import condensed_system
+from adjust.statistics.outliers.snooping import Snooping
+from adjust.statistics.outliers.watched import WatchedSnooping
 from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from tests.adjust.chordal import chordal_cost, minimize_chordal
 from tests.adjust.pose_networks import exp6, network_jacobians, simulate
@@ -446,3 +449,43 @@ def test_a_place_without_a_step_on_the_way_is_no_verdict_on_the_pairs(monkeypatc
     at, calls[:] = 1, []
     with pytest.raises(IndeterminateError):
         minimize(sim.network)
+
+
+@pytest.mark.parametrize("rotations_only", [False, True])
+def test_following_only_what_fails_finds_what_following_all_does(
+    rotations_only: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sim = simulate(6, 5, seed=1, wrong=2, extra=25, rotations_only=rotations_only)
+    every = screened(sim.network)
+    monkeypatch.setattr("adjust.statistics.outliers.watched._LARGE", 0.0)
+    made = []
+    monkeypatch.setattr("adjust.statistics.outliers.search.WatchedSnooping",
+                        lambda *a: made.append(WatchedSnooping(*a)) or made[-1])  # fmt: skip
+    few = screened(sim.network)
+    assert left_out(few) == left_out(every) == set(sim.wrong)
+    assert few.omega == pytest.approx(every.omega, rel=1e-9)
+    assert 0 < len(made[-1].used) < sim.network.n_pairs
+    assert [w for w in few.warnings if w.startswith("left out")] == [
+        w for w in every.warnings if w.startswith("left out")]  # fmt: skip
+
+
+def test_tests_of_what_is_followed_are_those_of_all() -> None:
+    survey = survey_of_network(simulate(4, 3, seed=3, extra=8).network)
+    pairs = tuple(replace(p, used=i not in (2, 9)) for i, p in enumerate(survey.pairs))
+    now = adjust(replace(survey, pairs=pairs))  # two that the survey uses are out for now
+    given = np.ones(len(pairs), dtype=bool)
+    system = replace(condensed_system(now.precision).system, used=given)
+    every, index = Snooping(system, given), np.array([1, 2, 5, 9, 12])
+    few = WatchedSnooping(now, index, given)
+    for out in ([], [1], [1, 3]):
+        states = [s.using(~np.isin(np.arange(len(s.used)), at)) for s, at in ((every, index[out]), (few, out))]
+        theirs, mine = (s.tests() for s in states)
+        assert mine.statistic == pytest.approx(theirs.statistic[index], rel=1e-6)
+        assert mine.freedom.tolist() == theirs.freedom[index].tolist()
+        assert states[1].omega == pytest.approx(states[0].omega, rel=1e-9)
+        assert states[1].left == states[0].left
+        for i, o in enumerate(index.tolist()):
+            assert states[1].verdict(i) == pytest.approx(states[0].verdict(o), rel=1e-6)
+    both = every, WatchedSnooping(now, np.arange(len(pairs)), given)
+    squares = [s.robust_squares(np.full(len(pairs), 6), np.ones(1)) for s in both]
+    assert squares[1] == pytest.approx(squares[0], rel=0.02)  # they end where weights change by less than 0.01
