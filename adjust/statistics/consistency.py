@@ -34,9 +34,9 @@ def consistency(
 ) -> Consistency:
     """Test every part, and look for changes; ``alpha`` is the error probability of all of it together.
 
-    condensed: the system of this adjustment; None for a large network of pairs, of which the groups are tested. Where the
-    global test fails because residuals are too large, every part is tested against the rest: else wrong sigmas would
-    make everything suspect. Groups whose variance was estimated from these residuals are not tested for it.
+    condensed: the system of this adjustment; None for a large network of pairs, of which the groups are tested. Where
+    the global test fails because residuals are too large, every part is tested against the rest: else wrong sigmas
+    would make everything suspect. Groups whose variance was estimated from these residuals are not tested for it.
     """
     test = adjustment.global_test
     if test is None:
