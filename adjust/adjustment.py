@@ -11,7 +11,7 @@ from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.graph.solver import Solved, SolveOptions, settled, solve
 from adjust.lenses.models import MODELS, camera_constants, monotone_radius_px, principal_point_px
-from adjust.model.errors import NotConvergedError
+from adjust.model.errors import NotConvergedError, listed
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, Survey
@@ -20,7 +20,6 @@ from adjust.precision.precision import Precision, global_test, group_summaries, 
 from adjust.start import Start, find_start
 from adjust.start.choice import Begun, adjusted_from_own_start
 from adjust.start.given import GivenStarts, given_starts, moved_onto
-from adjust.start.readings.joint import find_all, needs_points
 from adjust.start.robust import limit, screen
 
 if TYPE_CHECKING:
@@ -129,10 +128,9 @@ def rejections(survey: Survey, given: Survey) -> tuple[str, ...]:
         names = [ids[int(i)] for i in block.point_idx[~block.used] if int(i) not in old]
         if not names:
             continue
-        more = f" and {len(names) - 8} more" if len(names) > 8 else ""
         out.append(
             f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}: left out as "
-            f"gross errors: {', '.join(names[:8])}{more}"
+            f"gross errors: {listed(names, 8)}"
         )
     return tuple(out)
 
@@ -166,7 +164,7 @@ def _trusted(survey: Survey, given: GivenStarts, options: AdjustOptions) -> Begu
 
 def _found(survey: Survey, given: GivenStarts) -> Start:
     """Start values; of a free network where the given ones were, though they may have been left aside."""
-    found = find_all(survey) if needs_points(survey) else find_start(survey)
+    found = find_start(survey)
     moved = survey.datum.kind == "inner" and not given_starts(survey) and given
     return moved_onto(found, given, survey) if moved else found
 
@@ -236,33 +234,33 @@ def assemble(
 def estimates(precision: Precision) -> dict[ParameterName, Estimate]:
     """Every parameter, free or held, with its covariance."""
     graph, values = precision.graph, precision.solved.values
-    u, out = graph.unknowns, {}
+    u, out, found = graph.unknowns, dict[ParameterName, Estimate](), precision.every_cov()
     for name, slot in u.slot_of.items():
         if name[0] == "table_motion":
             continue
         key = u.slot_key[slot]
         pose = u.slot_pose[slot] if key is None else values.atPose3(key)
-        cov = np.zeros((6, 6)) if key is None else precision.cov(key)
+        cov = np.zeros((6, 6)) if key is None else found[key]
         status = u.status(key, u.parameters[name].treatment, 6)
         out[name] = Estimate(name, pose, POSE_COMPONENTS, POSE_UNITS, cov, status)
     for name, vector in u.vectors.items():
         cov = np.zeros((len(vector.names),) * 2)
         if vector.key is not None:
-            cov = vector.matrix @ precision.cov(vector.key) @ vector.matrix.T
+            cov = vector.matrix @ found[vector.key] @ vector.matrix.T
         out[name] = Estimate(name, vector.full(values), vector.names, vector.units, cov, vector.status)
     for point in graph.survey.points:
         name = ("point", point.point_id)
         treatment = point.x_in_world.treatment
         free = u.by_name.get(name)
         x = u.held_points[point.point_id] if free is None else np.asarray(values.atPoint3(free.key))
-        cov = np.zeros((3, 3)) if free is None else precision.cov(free.key)
+        cov = np.zeros((3, 3)) if free is None else found[free.key]
         status = u.status(free.key if free else None, treatment, 3)
         out[name] = Estimate(name, x, ("x", "y", "z"), ("m",) * 3, cov, status)
     for name, unknown in u.by_name.items():
         if name[0] == "table_angles":
             n = unknown.dim
             out[name] = Estimate(name, np.asarray(values.atVector(unknown.key)), unknown.components, ("rad",) * n,
-                                 precision.cov(unknown.key), ("free",) * n)  # fmt: skip
+                                 found[unknown.key], ("free",) * n)  # fmt: skip
     return out
 
 

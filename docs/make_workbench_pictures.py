@@ -1,43 +1,84 @@
 """Pictures of the page of ``labsurvey open``, by Chromium.
 
-Run: python docs/make_workbench_pictures.py FOLDER docs/pictures
-FOLDER is a project that is adjusted, such as that of: labsurvey example full-lab FOLDER.
+Run in the project's folder: python -m docs.make_workbench_pictures FOLDER docs/pictures
+FOLDER is a project, such as that of: labsurvey example full-lab FOLDER. The others are made on the way.
 """
 
 import sys
+import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from playwright.sync_api import sync_playwright
 
+from adjust.model.errors import SurveyError
+from survey.examples import write_example
 from survey.workbench.guard import new_token
-from survey.workbench.server import Listening, Server
+from survey.workbench.live import Listening
+from survey.workbench.server import Server
 from survey.workbench.session import Workbench
+from tests.survey.test_workbench_faults import write_spoilt
 
 CHROMIUM = "/usr/bin/chromium"
-PICTURES = {  # name: place, width, colours
-    "workbench": ("", 1280, "light"),
-    "workbench-scene": ("point=B07&view=camera,scene", 1280, "dark"),
-    "workbench-phone": ("view=findings,image", 390, "dark"),
+Act = Callable[[Any], None]
+
+
+def _nothing(_page: Any) -> None:
+    pass
+
+
+def _detect(page: Any) -> None:
+    page.get_by_label("Run: Detect").click()
+    page.wait_for_timeout(9000)
+
+
+# name: place, width, colours, what is done before
+OF_FOLDER: dict[str, tuple[str, int, str, Act]] = {
+    "workbench": ("", 1280, "light", _nothing),
+    "workbench-scene": ("point=B07&view=camera,scene", 1280, "dark", _nothing),
+    "workbench-phone": ("view=findings,image", 390, "dark", _nothing),
+}
+OF_EXAMPLES: dict[str, tuple[str, str, int, str, Act]] = {
+    "workbench-remedy": ("spoilt", "view=findings,angles", 1280, "light", _nothing),
+    "workbench-network": ("total-station", "view=settings,network", 1280, "dark", _nothing),
+    "workbench-detect": ("one-camera", "view=jobs,image", 1280, "light", _detect),
 }
 
 
 def main(folder: Path, out: Path) -> None:
     """Write every picture as a PNG."""
-    bench, token = Workbench(folder, read_only=True), new_token()
-    bench.adjust()
-    with Listening(Server(bench, token), "127.0.0.1", 0) as listening, sync_playwright() as playwright:
+    with sync_playwright() as playwright, tempfile.TemporaryDirectory() as place:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        for name, (place, width, colours) in PICTURES.items():
-            size = {"width": width, "height": 800}
-            context = browser.new_context(viewport=size, color_scheme=colours, locale="en-GB")
-            page = context.new_page()
-            page.goto(f"{listening.address}#token={token}&{place}")
-            settled(page)
-            page.screenshot(path=out / f"{name}.png")
-            context.close()
+        for name, how in OF_FOLDER.items():
+            picture(browser, folder, out / f"{name}.png", *how)
+        for name, (example, *how) in OF_EXAMPLES.items():
+            mine = Path(place) / name / "lab"
+            if example == "spoilt":
+                write_spoilt(mine)
+            else:
+                write_example(example, mine)
+            picture(browser, mine, out / f"{name}.png", *how)
         browser.close()
+
+
+def picture(browser: Any, folder: Path, out: Path, place: str, width: int, colours: str, act: Act) -> None:
+    """One picture of a place, after something was done there."""
+    bench, token = Workbench(folder), new_token()
+    try:
+        bench.adjust()
+    except SurveyError as error:
+        print(f"{folder}: {error}", file=sys.stderr)
+    with Listening(Server(bench, token), "127.0.0.1", 0) as listening:
+        size = {"width": width, "height": 800}
+        context = browser.new_context(viewport=size, color_scheme=colours, locale="en-GB")
+        page = context.new_page()
+        page.goto(f"{listening.address}#token={token}&{place}")
+        settled(page)
+        act(page)
+        page.screenshot(path=out)
+        context.close()
 
 
 def settled(page: Any, seconds: float = 20.0) -> None:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from adjust.model.errors import SurveyError
     from survey.examples import write_example
     from survey.jobs.pairs import PairsOutcome, station_pairs
+    from survey.jobs.starting import start_project
     from survey.notebook.batch import Batch, adjust_many
     from survey.notebook.covariance import Covariance
     from survey.notebook.plots import Plot
@@ -45,6 +46,7 @@ _PLACES = {
     "problem": "survey.notebook.steps",
     "read": "survey.notebook.steps",
     "solve": "survey.notebook.steps",
+    "start_project": "survey.jobs.starting",
     "station_pairs": "survey.jobs.pairs",
     "write_example": "survey.examples",
     "write_project": "survey.project",
@@ -68,6 +70,7 @@ __all__ = [
     "problem",
     "read",
     "solve",
+    "start_project",
     "station_pairs",
     "write_example",
     "write_project",

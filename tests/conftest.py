@@ -31,13 +31,23 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         from adjust.native.parallel import cores
 
         os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")  # of each process
-        option.numprocesses = cores() + 1  # one waits for a table or a camera
+        option.numprocesses = cores() + (not _daily(config))  # one waits for a table or a camera
         option.dist = "worksteal"  # neighbours stay together, so that what they share is made once
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Nothing of the whole jobs is imported for the daily loop."""
-    return True if collection_path == ACCEPTANCE and config.option.markexpr.strip() == "not slow" else None
+    return True if collection_path == ACCEPTANCE and _daily(config) else None
+
+
+def _daily(config: pytest.Config) -> bool:
+    return bool(config.option.markexpr.strip() == "not slow")
+
+
+@pytest.fixture
+def undiagnosed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What does not fit is not explained by trial: for tests on numbers, where that takes most of the time."""
+    monkeypatch.setattr("survey.jobs.adjusting.probable_causes._diagnosis", lambda *_: None)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

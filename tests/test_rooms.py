@@ -3,6 +3,7 @@
 import ast
 import configparser
 import itertools
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -121,3 +122,21 @@ def test_the_page_on_architecture_has_the_rooms_of_the_contract_in_its_order(pac
     next(lines)
     rows = list(itertools.takewhile(lambda line: line.startswith("|"), lines))
     assert [row.split("`")[1] for row in rows] == [room for room in _floors(package) if room != "__main__"]
+
+
+_MOST = 16
+"""Modules of a folder that are still seen at a glance, ``__init__`` not counted."""
+
+
+def _crowded(root: Path) -> dict[str, int]:
+    count = Counter(path.parent.relative_to(root).as_posix() for path in _modules(root).values()
+                    if path.name != "__init__.py")  # fmt: skip
+    return {folder: n for folder, n in count.items() if n > _MOST}
+
+
+def test_no_folder_has_more_modules_than_are_seen_at_a_glance(tmp_path: Path) -> None:
+    assert _crowded(ROOT) == {}
+    (tmp_path / "survey").mkdir()
+    for k in range(_MOST + 1):
+        (tmp_path / "survey" / f"m{k}.py").touch()
+    assert _crowded(tmp_path) == {"survey": _MOST + 1}

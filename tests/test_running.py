@@ -15,7 +15,7 @@ TESTS = Path(__file__).parent
 def _asked(*words: str, **said: Any) -> tuple[int | None, str]:
     """Number of processes and way of sharing after pytest was called with these paths and options."""
     unsaid: dict[str, Any] = {"numprocesses": None, "dist": "no", "tx": []}
-    others = {"usepdb": False, "collectonly": False, "trace": False}
+    others = {"usepdb": False, "collectonly": False, "trace": False, "markexpr": ""}
     config: Any = SimpleNamespace(option=SimpleNamespace(**(unsaid | others | said)), args=words)
     conftest.pytest_cmdline_main(config)
     return config.option.numprocesses, config.option.dist
@@ -23,6 +23,7 @@ def _asked(*words: str, **said: Any) -> tuple[int | None, str]:
 
 def test_folders_run_side_by_side_and_files_alone() -> None:
     assert _asked(str(TESTS)) == _asked(str(TESTS / "adjust"), str(TESTS / "survey")) == (cores() + 1, "worksteal")
+    assert _asked(str(TESTS), markexpr="not slow") == (cores(), "worksteal")
     assert _asked(str(TESTS / "test_docs.py")) == _asked(f"{__file__}::test_a_tenth") == (None, "no")
 
 

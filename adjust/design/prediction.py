@@ -91,8 +91,7 @@ class Predictor:
         fewest = seeing.fewest_points if block.target_id is not None else 1
         if int(keep.sum()) < fewest:
             return None
-        used = None if block.used is None else block.used[keep]
-        return replace(block, point_idx=block.point_idx[keep], uv=uv[keep], cov=block.cov[keep], used=used)
+        return replace(block, uv=uv).part(keep)
 
     def _facing(self, block: ImageBlock, seeing: Seeing) -> BoolArray:
         target = self.targets[str(block.target_id)]

@@ -15,12 +15,11 @@ from adjust.adjustment import start_values
 from adjust.design.expectation import expect, weak_directions
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.units.conventions import LENGTH_RATIOS
-from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.observations import PositionRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.start import find_start
-from adjust.start.readings.joint import find_all, needs_points
 from adjust.statistics.outliers.supported import supported
 
 _CELLS = (8, 6)
@@ -69,7 +68,7 @@ def _expected(survey: Survey) -> tuple[Adjustment | None, list[Finding]]:
     """The precision to be expected, or why there is none."""
     try:
         survey = supported(survey)[0]
-        found = find_all(survey) if needs_points(survey) else find_start(survey)
+        found = find_start(survey)
         return expect(survey, start_values(found)), []
     except IndeterminateError as error:
         return None, [Finding("problem", "undetermined", (), str(error), "measure or fix what is named")]
@@ -125,7 +124,7 @@ def _points(survey: Survey, used: Mapping[str, int], expected: Adjustment | None
     bare = [p.point_id for p in survey.points if p.x_in_world.treatment == "free"
             and 0 < used.get(p.point_id, 0) <= 3 - len(p.x_in_world.held)]  # fmt: skip
     if bare and expected is not None:
-        yield Finding("weak", "no redundancy", tuple(bare), f"points without redundancy: {_names(bare)}",
+        yield Finding("weak", "no redundancy", tuple(bare), f"points without redundancy: {listed(bare, 6)}",
                       "observe each once more, best from another direction: an error there shows nowhere")  # fmt: skip
 
 
@@ -145,13 +144,13 @@ def _epochs(survey: Survey) -> Iterator[Finding]:
     rig = len({station_of[c] for cs in seen.values() for c in cs}) < len({c for cs in seen.values() for c in cs})
     if rig and lonely and len(lonely) > 0.5 * len(seen):
         yield Finding("weak", "epochs without partners", tuple(lonely),
-                      f"{len(lonely)} of {len(seen)} epochs are seen by one camera alone: {_names(lonely)}",
+                      f"{len(lonely)} of {len(seen)} epochs are seen by one camera alone: {listed(lonely, 6)}",
                       "they join no cameras; check the names of files, or take epochs that two see")  # fmt: skip
     read = {t.epoch_id: t.table_id for t in survey.table_readings}
     blind = [e for e in read if e not in seen]
     if blind and survey.image_blocks:
         yield Finding("weak", "epochs without partners", tuple(blind),
-                      f"{len(blind)} table readings have no image of their epoch: {_names(blind)}",
+                      f"{len(blind)} table readings have no image of their epoch: {listed(blind, 6)}",
                       "check the names of epochs in table_angles.csv and of the image files")  # fmt: skip
 
 
@@ -179,7 +178,7 @@ def _images(case: Case) -> Iterator[Finding]:
          "turn it towards the camera: 20 to 50 deg is best"),
     ):  # fmt: skip
         if names:
-            yield Finding("weak", kind, tuple(names), f"{len(names)} images: {found}: {_names(names)}", remedy)
+            yield Finding("weak", kind, tuple(names), f"{len(names)} images: {found}: {listed(names, 6)}", remedy)
 
 
 def _spacing(uv: FloatArray) -> float:
@@ -249,7 +248,7 @@ def _sigmas(survey: Survey) -> Iterator[Finding]:
         usual = float(np.median([s for _, s in found]))
         odd = [n for n, s in found if not usual / _ODD_SIGMA < s < usual * _ODD_SIGMA]
         if odd:
-            yield Finding("problem", "suspicious sigma", tuple(odd), f"{kind} {_names(odd)}: the sigma is more than "
+            yield Finding("problem", "suspicious sigma", tuple(odd), f"{kind} {listed(odd, 6)}: the sigma is more than "
                           f"{_ODD_SIGMA:.0f} times off that of the others", "check its unit")  # fmt: skip
     yield from _lengths(survey)
 
@@ -281,7 +280,3 @@ def _weak(expected: Adjustment) -> Iterator[Finding]:
         yield Finding("weak", "weak geometry", tuple(parts), f"{', '.join(parts)} replace each other "
                       f"({direction.factor:.0f} times worse together than each alone)",
                       "hold one of them, give it a prior, or measure from other directions")  # fmt: skip
-
-
-def _names(names: list[str]) -> str:
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")

@@ -3,17 +3,22 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.adjustment import adjust
+from adjust.adjustment import AdjustOptions, adjust
+from adjust.graph.assembly import values_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.start.lenses import Sighting, start_lens
-from adjust.start.views import Sight, View, all_rays, focal_px, make_views, target_points, used_rows
+from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block, target_points, used_rows
+
+if TYPE_CHECKING:
+    from adjust.diagnosis.score import Linear
 
 CAP = 25.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
@@ -32,7 +37,7 @@ class Case:
     @cached_property
     def views(self) -> Mapping[int, View]:
         """Every block of a target with enough points, as rays and poses ``camera_from_target``, each by itself."""
-        return single_views(self.survey, self.lenses)
+        return {v.block_idx: v for v in single_views(self.survey, self.lenses)}
 
     @cached_property
     def lenses(self) -> Mapping[str, FloatArray]:
@@ -64,6 +69,31 @@ class Case:
         return sorted(ids, key=lambda owner: -share[owner])
 
     @cached_property
+    def linear(self) -> "Linear | None":
+        """The adjustment with all images in use, as a linear system; None where there is none."""
+        from adjust.diagnosis.score import Linear  # here: what fails as a whole needs none
+
+        if self.result is None or not self.result.redundancy > 0:
+            return None
+        if _is_whole(self.survey, self.result):
+            return Linear(self.result)
+        try:
+            return Linear(adjust(self.survey, None, AdjustOptions(reject_blocks=False)))
+        except SurveyError:
+            return None
+
+    def warm(self, survey: Survey) -> Adjustment:
+        """A survey that is much like this one, adjusted from the values of this one; as :attr:`run` does without any.
+
+        SurveyError where that fails.
+        """
+        linear = self.linear
+        start = None if linear is None else values_of(linear.result)
+        if start is None or any(c.camera_id not in start.lenses for c in survey.cameras):
+            return self.run(survey)
+        return adjust(survey, start, AdjustOptions(reject_blocks=False))
+
+    @cached_property
     def block_misfit(self) -> FloatArray:
         """(b,) bounded sum of squares of the image points of each block over their sigmas; all of it, unadjusted."""
         return block_misfits(self.survey, self.result)
@@ -75,6 +105,12 @@ class Case:
         for i, view in self.views.items():
             out[i] = view.error_px[0]
         return out
+
+
+def _is_whole(survey: Survey, result: Adjustment) -> bool:
+    """Whether every image point and observation in use takes part."""
+    given = sum(int(used_rows(b).sum()) for b in survey.image_blocks)
+    return given == int(result.image_residuals.used.sum()) and survey.n_others_used == result.survey.n_others_used
 
 
 def without(survey: Survey, field_name: str, owner: str) -> Survey:
@@ -126,24 +162,16 @@ def own_lenses(survey: Survey) -> dict[str, FloatArray]:
     return found
 
 
-def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> dict[int, View]:
-    """Every block of a target with three used points or more that has a pose, by its position."""
+def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
+    """Every block of a target with three used points or more that has a pose."""
     points = {t.target_id: target_points(t) for t in survey.targets}
-    cameras = {c.camera_id: c for c in survey.cameras}
-    known = replace(
-        survey,
-        image_blocks=tuple(b for b in survey.image_blocks if b.camera_id in lenses),
-    )
-    where = [i for i, b in enumerate(survey.image_blocks) if b.camera_id in lenses]
-    rays, _ = all_rays(known, dict(lenses))
-    sights = []
-    for k, i in enumerate(where):
-        block = survey.image_blocks[i]
-        used = used_rows(block)
-        if block.target_id is not None and k in rays and used.sum() >= 3:
-            x = points[block.target_id][block.point_idx[used]]
-            sights.append(Sight(i, x, rays[k][used], focal_px(cameras[block.camera_id], lenses[block.camera_id])))
-    return {v.block_idx: v for v in make_views(sights)[0]}
+    known = replace(survey, cameras=tuple(c for c in survey.cameras if c.camera_id in lenses))
+    focal = {c.camera_id: focal_px(c, lenses[c.camera_id]) for c in known.cameras}
+    blocks = {i: b for i, b in enumerate(survey.image_blocks) if b.target_id is not None}
+    rays, _ = rays_by_block(known, lenses, {i: b.uv[used_rows(b)] for i, b in blocks.items()})
+    seen = {i: points[str(blocks[i].target_id)][blocks[i].point_idx[used_rows(blocks[i])]] for i in rays}
+    sights = joined([(i, x, rays[i], focal[blocks[i].camera_id]) for i, x in seen.items() if len(x) >= 3])
+    return make_views(sights)[0]
 
 
 def with_lenses(survey: Survey, result: Adjustment) -> Survey:

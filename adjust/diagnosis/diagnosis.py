@@ -8,16 +8,21 @@ from typing import Any
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.ranking import Candidate, ranked
-from adjust.diagnosis.trial import Misfit, Trial, misfit_of, tried
+from adjust.diagnosis.trial import NOISE, Misfit, Trial, misfit_of, tried
 from adjust.model.errors import SurveyError
 
 MOST_TRIALS = 10
 _SHOWN = 3
-_NOISE = 1.2  # variance factor
 _FAINT = 0.2
 
-FAMILIES: tuple[str, ...] = ("images", "targets", "bodies", "names", "units", "time", "weights")
-"""Rooms of this one, each with ``hypotheses(case) -> Iterable[Hypothesis]``: what cheap evidence makes worth a try."""
+FAMILIES: tuple[tuple[str, ...], ...] = (
+    ("effects", "images", "names", "units", "time", "weights"),
+    ("bodies", "targets"),
+)
+"""Rooms of this one, each with ``hypotheses(case) -> Iterable[Hypothesis]``: what cheap evidence makes worth a try.
+
+The second ones adjust to find theirs: they are asked where what the first ones found does not explain everything.
+"""
 
 Family = Callable[[Case], Iterable[Hypothesis]]
 
@@ -56,29 +61,33 @@ def diagnose(case: Case, families: Sequence[Family] | None = None, most: int = M
 
     families: those of ``FAMILIES`` where None. most: adjustments at most. Nothing is repaired, nothing is written.
     """
-    formed = [h for family in (_all_families() if families is None else families) for h in _formed(family, case)]
-    formed = _in_turn(formed)
     base = misfit_of(case.result, case.survey)
     trials: list[Trial] = []
-    queue, names, left = list(formed), [], most
-    while queue and left > 0 and not _done(trials, queue[0]):
-        first = queue.pop(0)
-        names.append(first.name)
-        left -= 1
-        trial = tried(first, case)
-        more = list(first.follow(trial.result)) if first.follow is not None and trial.result is not None else []
-        same = [replace(trial, hypothesis=h) for h in more if h.survey is first.survey]
-        trials += same or [trial]
-        queue[:0] = [h for h in more if h.survey is not first.survey]
-    looked_at = sum(h.looked_at for h in formed)
+    names: list[str] = []
+    left, looked_at = most, 0
+    for rooms in _all_families() if families is None else [families]:
+        formed = [h for family in rooms for h in _formed(family, case)]
+        looked_at += sum(h.looked_at for h in formed)
+        queue = _in_turn(formed)
+        while queue and left > 0 and not _done(trials, queue[0].evidence):
+            first = queue.pop(0)
+            names.append(first.name)
+            left -= 1
+            trial = tried(first, case)
+            more = list(first.follow(trial.result)) if first.follow is not None and trial.result is not None else []
+            same = [replace(trial, hypothesis=h) for h in more if h.survey is first.survey]
+            trials += same or [trial]
+            queue[:0] = [h for h in more if h.survey is not first.survey]
+        if _done(trials, 0.0):
+            break
     return Diagnosis(ranked(base, trials, looked_at), tuple(dict.fromkeys(names)), base)
 
 
-def _done(trials: Sequence[Trial], following: Hypothesis) -> bool:
-    """Whether one explains everything down to the noise, and what follows is much less evident."""
+def _done(trials: Sequence[Trial], following: float) -> bool:
+    """Whether one explains everything down to the noise, and what follows has much less evidence."""
     return any(
-        t.result is not None and t.misfit.unused == 0 and t.misfit.omega < _NOISE * t.misfit.redundancy
-        and following.evidence < _FAINT * t.hypothesis.evidence
+        t.result is not None and t.misfit.unused + t.misfit.dropped == 0
+        and t.misfit.omega < NOISE * t.misfit.redundancy and following < _FAINT * t.hypothesis.evidence
         for t in trials
     )  # fmt: skip
 
@@ -93,8 +102,8 @@ def _in_turn(formed: Sequence[Hypothesis]) -> list[Hypothesis]:
     return [h for _, h in sorted(turns, key=lambda item: item[0])]
 
 
-def _all_families() -> list[Family]:
-    return [import_module(f"adjust.diagnosis.{name}").hypotheses for name in FAMILIES]
+def _all_families() -> list[list[Family]]:
+    return [[import_module(f"adjust.diagnosis.{name}").hypotheses for name in rooms] for rooms in FAMILIES]
 
 
 def _formed(family: Family, case: Case) -> list[Hypothesis]:

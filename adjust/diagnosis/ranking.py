@@ -58,7 +58,7 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
 
 
 def _cost(trial: Trial) -> float:
-    return trial.misfit.omega + trial.hypothesis.penalty
+    return trial.misfit.cost + trial.hypothesis.penalty
 
 
 def _probabilities(base: Misfit, trials: Sequence[Trial], scale: float) -> FloatArray:

@@ -14,7 +14,6 @@ from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, Survey
 from adjust.start import find_start
-from adjust.start.readings.joint import find_all, needs_points
 
 _MEDIAN = 0.455  # of chi-square with one degree of freedom
 
@@ -65,11 +64,11 @@ def screen(survey: Survey, start: StartValues | None = None) -> Screen | None:
     """The survey at given or at its own start values; None where none can be found."""
     try:
         if start is None:
-            start = start_values(find_all(survey) if needs_points(survey) else find_start(survey))
+            start = start_values(find_start(survey))
         vectors = {n: v for n, v in start.vectors.items() if n[0] != "orientation"}
         graph = GraphBuilder(survey, start.lenses).build(replace(start, vectors=vectors))
         return Screen(graph, start)
-    except SurveyError:
+    except (SurveyError, RuntimeError):  # GTSAM raises the latter where a convention that is not meant fits nothing
         return None
 
 

@@ -1,6 +1,6 @@
 """One hypothesis, tried: its survey adjusted, and what is left unexplained."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,9 @@ from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
+
+NOISE = 1.2
+"""Variance factor up to which what is left is noise."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,12 @@ class Misfit:
     unused: int
     count: int
     redundancy: int
+    dropped: int = 0
+
+    @property
+    def cost(self) -> float:
+        """What explanations are compared by."""
+        return self.omega + 2.0 * self.dropped
 
     @property
     def excess(self) -> float:
@@ -41,13 +50,23 @@ class Trial:
 
 
 def tried(hypothesis: Hypothesis, case: Case) -> Trial:
-    """The survey of a hypothesis adjusted as its case is; no change of what the case holds."""
+    """The survey of a hypothesis adjusted from the values of its case, and where that does not fit as its case was."""
     survey = hypothesis.changed()
-    try:
-        result = None if survey is None else case.run(survey)
-    except SurveyError:
-        result = None
-    return Trial(hypothesis, misfit_of(result, survey or case.survey), result)
+    if survey is None:
+        return Trial(hypothesis, misfit_of(None, case.survey), None)
+    dropped = max(0, misfit_of(None, case.survey).count - misfit_of(None, survey).count)
+    best = Trial(hypothesis, replace(misfit_of(None, survey), dropped=dropped), None)
+    for run in (case.warm, case.run) if case.linear is not None else (case.run,):
+        try:
+            result = run(survey)
+        except (SurveyError, RuntimeError):  # the latter from GTSAM, where a hypothesis fits nothing at all
+            continue
+        misfit = replace(misfit_of(result, survey), dropped=dropped)
+        if best.result is None or misfit.omega < best.misfit.omega:
+            best = Trial(hypothesis, misfit, result)
+        if best.misfit.unused == 0 and misfit.omega < NOISE * misfit.redundancy:
+            break
+    return best
 
 
 def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:

@@ -10,20 +10,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from gtsam import Pose3
-from scipy.stats import chi2
-from scipy.stats import f as fisher
 
 from adjust.epochs.congruence_result import Congruence, CongruenceStep, CongruenceTest, Motion
 from adjust.epochs.states import MOTIONS, EpochState, aligned, differences, epoch_state, gauge_rows
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
-from adjust.precision.s_transformation import transformation_matrix
+from adjust.precision.s_transformation import transformed
 from adjust.statistics.relative_precision import ellipsoid
 from adjust.statistics.result import Ellipsoid
 from adjust.testing.criteria import LevelOptions, noncentrality, sidak
-
-_DETERMINED = 1e-9
+from adjust.testing.distributions import chi2, fisher
+from adjust.testing.quadratic_forms import pseudo_square, pseudo_square_beside
 
 
 @dataclass(frozen=True)
@@ -50,8 +48,8 @@ DEFAULT_CONGRUENCE = CongruenceOptions()
 class _Change:
     """Differences d (n,), their covariance Q (n, n), the motions G (n, k) that do not count, and whose rows are whose.
 
-    owner: (n,) number of the name. component: (n,) of rx ry rz x y z, 0 to 5. weight: (n,) in the datum. nowhere:
-    names of which an epoch knows the rotation alone.
+    owner: (n,) number of the name. component: (n,) of rx ry rz x y z, 0 to 5. weight: (n,) in the datum. held: (n, k)
+    what the datum holds, held' d = 0. nowhere: names of which an epoch knows the rotation alone.
     """
 
     names: tuple[ParameterName, ...]
@@ -61,7 +59,8 @@ class _Change:
     owner: IntArray
     component: IntArray
     weight: FloatArray
-    nowhere: frozenset[ParameterName] = frozenset()
+    held: FloatArray
+    nowhere: frozenset[ParameterName]
 
     def rows(self, stable: Sequence[int]) -> IntArray:
         """Components of these names."""
@@ -78,8 +77,8 @@ class _Change:
                 f"{len(stable)} stable points cannot carry the {self.G.shape[1]} motions that the epochs leave open; "
                 "name more, or hold something in both"
             )
-        S = transformation_matrix(self.G, E)
-        return replace(self, d=S @ self.d, Q=S @ self.Q @ S.T)
+        d, Q = transformed(self.d, self.Q, self.G, E)
+        return replace(self, d=d, Q=Q, held=E[:, None] * self.G)
 
 
 def congruence(
@@ -137,8 +136,9 @@ def _pooled(first: Adjustment, second: Adjustment, scaled: bool) -> tuple[float,
     f1, f2 = first.redundancy, second.redundancy
     p = float("nan")
     if f1 > 0 and f2 > 0:
-        ratio = (first.omega / f1) / (second.omega / f2)
-        p = float(2.0 * min(fisher.cdf(ratio, f1, f2), fisher.sf(ratio, f1, f2)))
+        a, b = np.float64(first.omega / f1), np.float64(second.omega / f2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            p = float(2.0 * min(fisher.sf(b / a, f2, f1), fisher.sf(a / b, f1, f2)))
     if not scaled or f1 + f2 <= 0:
         return 1.0, float("inf"), p
     return float(np.sqrt((first.omega + second.omega) / (f1 + f2))), float(f1 + f2), p
@@ -174,7 +174,7 @@ def _change(
     component = np.concatenate([before.components(n) for n in names])
     nowhere = frozenset(names[int(i)] for i in owner[~np.isfinite(d)])
     change = _Change(names, d[known], Q[np.ix_(known, known)], G[known], owner[known], component[known],
-                     np.ones(int(known.sum())), nowhere)  # fmt: skip
+                     np.ones(int(known.sum())), np.zeros((int(known.sum()), 0)), nowhere)  # fmt: skip
     return replace(change, weight=_weights(change))
 
 
@@ -188,20 +188,9 @@ def _weights(change: _Change) -> FloatArray:
         return np.ones(len(position))
     Q, G = change.Q, change.G
     if G.shape[1]:
-        S = transformation_matrix(G)
-        Q = S @ Q @ S.T
-    precision = np.diag(_quadratic(change.d, Q)[2])
+        Q = transformed(change.d, Q, G, np.ones(len(G)))[1]
+    precision = np.diag(pseudo_square(change.d, Q)[2])
     return np.asarray(np.where(position, precision[position].mean(), precision[~position].mean()))
-
-
-def _quadratic(d: FloatArray, Q: FloatArray) -> tuple[float, int, FloatArray]:
-    """D' Q^+ d, the rank, and Q^+; in sigmas, because radians and metres do not compare."""
-    s = np.sqrt(np.maximum(np.diag(Q), 1e-300))
-    values, vectors = np.linalg.eigh(Q / np.outer(s, s))
-    kept = values > _DETERMINED * max(1.0, float(values.max(initial=0.0)))
-    half = vectors[:, kept] / np.sqrt(values[kept]) / s[:, None]
-    y = half.T @ d
-    return float(y @ y), int(kept.sum()), half @ half.T
 
 
 def _test(statistic: float, freedom: int, pooled: tuple[float, float, float], level: float) -> CongruenceTest:
@@ -218,7 +207,7 @@ def _global(
 ) -> CongruenceTest:
     here = change.transformed(stable)
     rows = here.rows(stable)
-    statistic, rank, _ = _quadratic(here.d[rows], here.Q[np.ix_(rows, rows)])
+    statistic, rank = pseudo_square_beside(here.d[rows], here.Q[np.ix_(rows, rows)], here.held[rows])
     # what the datum takes away is no information, whatever rounding leaves of it
     rank = min(rank, max(0, len(rows) - change.G.shape[1]))
     return _test(statistic, rank, pooled, alpha)
@@ -265,7 +254,7 @@ def _shares(change: _Change, stable: Sequence[int]) -> dict[int, float]:
     here = change.transformed(stable)
     rows = here.rows(stable)
     d = here.d[rows]
-    _, _, P = _quadratic(d, here.Q[np.ix_(rows, rows)])
+    _, _, P = pseudo_square(d, here.Q[np.ix_(rows, rows)])
     gradient, owner, out = P @ d, here.owner[rows], {}
     for i in stable:
         mine = np.flatnonzero(owner == i)
@@ -276,7 +265,7 @@ def _shares(change: _Change, stable: Sequence[int]) -> dict[int, float]:
 
 def _single(here: _Change, i: int, pooled: tuple[float, float, float], level: float) -> CongruenceTest:
     rows = here.rows([i])
-    statistic, rank, _ = _quadratic(here.d[rows], here.Q[np.ix_(rows, rows)])
+    statistic, rank, _ = pseudo_square(here.d[rows], here.Q[np.ix_(rows, rows)])
     return _test(statistic, rank, pooled, level)
 
 
@@ -307,7 +296,7 @@ def _motion(
     turn, rotation_test = np.zeros(3), None
     if isinstance(before.value(name), Pose3):
         turning = np.flatnonzero(place < 3)
-        statistic, rank, _ = _quadratic(d[turning], Q[np.ix_(turning, turning)])
+        statistic, rank, _ = pseudo_square(d[turning], Q[np.ix_(turning, turning)])
         turn, rotation_test = full[:3], _test(statistic, rank, pooled, level)
     if name in here.nowhere:
         nan = np.full((3, 3), np.nan)

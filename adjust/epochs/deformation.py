@@ -22,9 +22,7 @@ from adjust.spatial.rigid_motions import right_jacobian_inverse
 from adjust.spatial.rotation_forms import euler_cov_from_tangent, euler_from_matrix
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
-
-# smallest eigenvalue of the correlation matrix that still counts as determined; joint covariances lose about ten digits
-_DETERMINED = 1e-9
+from adjust.testing.quadratic_forms import pseudo_square
 
 
 @dataclass(frozen=True)
@@ -178,13 +176,7 @@ def _tangent_cov(R: FloatArray, t: FloatArray, before: FloatArray, after: FloatA
 
 def _test(d: FloatArray, cov: FloatArray) -> DeformationTest:
     """Of (k,) components with their covariance (k, k), in the directions that have any."""
-    sigmas = np.sqrt(np.diag(cov))
-    some = sigmas > 0.0
-    if not some.any():
+    statistic, freedom, _ = pseudo_square(d, cov) if np.isfinite(cov).all() else (np.nan, 0, cov)
+    if freedom == 0:
         return DeformationTest(float("nan"), 0, float("nan"))
-    # in sigmas, because radians and metres do not compare
-    values, vectors = np.linalg.eigh(cov[np.ix_(some, some)] / np.outer(sigmas[some], sigmas[some]))
-    kept = values > _DETERMINED
-    y = vectors.T[kept] @ (d[some] / sigmas[some])
-    statistic, freedom = float(y @ (y / values[kept])), int(kept.sum())
     return DeformationTest(statistic, freedom, float(chi2.sf(statistic, freedom)))

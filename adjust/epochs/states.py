@@ -158,13 +158,12 @@ def moved(state: EpochState, motion: FloatArray) -> EpochState:
     R, s = Rot3.Expmap(motion[3:6]).matrix(), float(np.exp(motion[6]))
     # the tangent of a pose, on the right, turns along
     blocks = [np.diag([1.0] * 3 + [s] * 3) if isinstance(v, Pose3) else s * R for v in state.values]
-    J = np.zeros_like(state.cov)
-    at = 0
-    for block in blocks:
-        k = slice(at, at + len(block))
-        J[k, k] = block
-        at = k.stop
-    return replace(state, values=tuple(moved_value(v, motion) for v in state.values), cov=J @ state.cov @ J.T)
+    ends = np.cumsum(state.sizes)[:-1]
+
+    def rows(cov: FloatArray) -> FloatArray:
+        return np.concatenate([block @ part for block, part in zip(blocks, np.split(cov, ends), strict=True)])
+
+    return replace(state, values=tuple(moved_value(v, motion) for v in state.values), cov=rows(rows(state.cov).T))
 
 
 def aligned(before: EpochState, after: EpochState, directions: FloatArray, reference: Sequence[int]) -> EpochState:

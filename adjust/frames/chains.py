@@ -8,6 +8,7 @@ forward link i reaches T through ``Ad((A_{i+1} ... A_n)^-1)``; of an inverted li
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.native.images import fill_chains
 
 
 def adjoint_of_inverse(R: FloatArray, t: FloatArray) -> FloatArray:
@@ -28,26 +29,8 @@ def evaluate_chains(
     slot_R (S, 3, 3), slot_t (S, 3): poses by slot. Chain b has the links ``link_ptr[b]:link_ptr[b + 1]``.
     """
     n = len(link_ptr) - 1
-    R, t, C = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.empty((len(link_slot), 6, 6))
-    back = np.swapaxes(slot_R, 1, 2)
-    both_R = np.concatenate([slot_R, back])
-    both_t = np.concatenate([slot_t, -(back @ slot_t[:, :, None])[:, :, 0]])
-    pose_of = np.where(link_inverse, link_slot + len(slot_R), link_slot)
-    lengths = np.diff(link_ptr)
-    for step in range(int(lengths.max(initial=0))):  # from the last link to the first
-        some = np.flatnonzero(lengths > step)
-        link = link_ptr[some + 1] - 1 - step
-        inverse, Ra = link_inverse[link], both_R[pose_of[link]]
-        before_R, before_t, now_t = R[some], t[some], both_t[pose_of[link]]
-        if step:
-            now_R, now_t = Ra @ before_R, (Ra @ before_t[:, :, None])[:, :, 0] + now_t
-        else:
-            now_R = Ra
-        R[some], t[some] = now_R, now_t
-        before_R[inverse], before_t[inverse] = now_R[inverse], now_t[inverse]
-        by = adjoint_of_inverse(before_R, before_t)
-        by[inverse] *= -1.0
-        C[link] = by
+    R, t, C = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((len(link_slot), 6, 6))
+    fill_chains(slot_R, slot_t, link_ptr, link_slot, link_inverse, R, t, C)
     return R, t, C
 
 

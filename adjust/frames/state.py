@@ -24,6 +24,7 @@ class State:
 
     slot_R (S, 3, 3), slot_t (S, 3): poses of all slots. D (table slots, 6, 6): derivative of a table's motion by its
     free angles and free geometry, ``angles`` columns first. lenses: see LensArrays. warp (targets, 2) m.
+    points (P, 3) m: the free ones in the order of their keys, ``point_rows`` says where.
     """
 
     def __init__(self, survey: Survey, unknowns: Unknowns) -> None:
@@ -50,6 +51,9 @@ class State:
         self._pose_keys = {key for _, key in self._free_slots}
         self.evaluation = 0
         self.served = False
+        keys = sorted(u.key for name, u in unknowns.by_name.items() if name[0] == "point")
+        self.point_rows = {key: row for row, key in enumerate(keys)}
+        self.points = np.zeros((len(keys), 3))
         self._slots_by_key = np.array([s for s, _ in sorted(self._free_slots, key=lambda x: x[1])], dtype=np.int64)
 
     def _lens_arrays(self, survey: Survey) -> LensArrays:
@@ -95,6 +99,7 @@ class State:
         self.outdate()
         if slots is None:
             self._load_poses(values)
+            self._load_points(values)
             self._move_tables(values, self.unknowns.table_slots.values())
         else:
             asked = list(slots)
@@ -114,6 +119,12 @@ class State:
             return
         for slot, key in self._free_slots:
             self._set(slot, values.atPose3(key))
+
+    def _load_points(self, values: gtsam.Values) -> None:
+        """All free points, likewise."""
+        if len(self.points):
+            x = gtsam.utilities.extractPoint3(values)
+            self.points[:] = x if len(x) == len(self.points) else [values.atPoint3(key) for key in self.point_rows]
 
     def _load_lenses(self, values: gtsam.Values) -> None:
         for i, lens_map in enumerate(self.lens_maps):

@@ -1,6 +1,6 @@
 """From a survey and its start values to one GTSAM factor graph."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
@@ -29,7 +29,8 @@ from adjust.observations.factors import (
 from adjust.observations.geometry.building import GeometryFactors, position_refs
 from adjust.observations.images.batch import ImageBatch, warp_shape
 from adjust.observations.images.bundle_points import add_point_factors
-from adjust.observations.images.bundles import BundleBatch
+from adjust.observations.images.bundles import BundleBatch, may_be_hidden
+from adjust.observations.images.helmert_blocks import helmert_blocks
 from adjust.observations.images.reduction import PoseReduction, reduction
 from adjust.observations.listed import ObservationFactor, frame_text, position_text
 from adjust.observations.terrestrial.batch import TerrestrialBatch
@@ -85,6 +86,8 @@ class AdjustmentGraph:
 
     ``graph`` has every observation as a factor on its unknowns and nothing else; ``system`` is a view of it for the
     solver, in which points and poses that nothing else touches are reduced.
+    bundles: image blocks of unknown points, in parts that are reduced each by itself. image_order: of every image block
+    its number in the survey and its part: 0 in ``images``, i in the bundle before the i-th.
     reduction: of the poses that only image points touch; None where it would not pay. pairs: those between two fixed
     stations, ``others[first_pair + pairs.rows[e]]`` the e-th; singles: the others that are in no batch.
     """
@@ -94,10 +97,10 @@ class AdjustmentGraph:
     state: State
     start: gtsam.Values
     images: ImageBatch
-    bundle: BundleBatch | None
-    image_order: list[tuple[int, bool]]
+    bundles: tuple[BundleBatch, ...]
+    image_order: list[tuple[int, int]]
     singles: list[ObservationFactor]
-    others_graph: gtsam.NonlinearFactorGraph
+    singles_graph: gtsam.NonlinearFactorGraph
     terrestrial: TerrestrialBatch | None = None
     reduction: PoseReduction | None = None
     pairs: "PairBatch | None" = None
@@ -113,35 +116,60 @@ class AdjustmentGraph:
         return [within[i] if i in within else next(rest) for i in range(len(within) + len(self.singles))]
 
     @cached_property
+    def others_graph(self) -> gtsam.NonlinearFactorGraph:
+        """The factors of :attr:`others` that take part, and what holds single components."""
+        if self.pairs is None:
+            return self.singles_graph
+        graph = gtsam.NonlinearFactorGraph(self.singles_graph)
+        self.pairs.add_factors(graph)
+        return graph
+
+    @cached_property
+    def only_pairs(self) -> bool:
+        """Whether nothing but pairs between fixed stations is observed, and whole poses (priors) beside them."""
+        if self.pairs is None or self.survey.image_blocks or self.terrestrial is not None or self.unknowns.held:
+            return False
+        alone = [item.factor.keys() for item in self.singles if item.used and item.factor.size()]
+        if any(len(keys) > 1 for keys in alone) or any(u.kind != "pose" for u in self.unknowns.by_key.values()):
+            return False
+        return self.pairs.seen() | {keys[0] for keys in alone} == set(self.unknowns.by_key)
+
+    def keys(self, reduction: PoseReduction | None) -> list[int]:
+        """The unknowns of :meth:`view`, in ascending order."""
+        return sorted(self.unknowns.by_key) if self.only_pairs else list(self.view(reduction).keyVector())
+
+    @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """All factors on all unknowns, right at any values and in any of GTSAM's algorithms."""
-        if self.bundle is None:
+        if not self.bundles:
             return self._unreduced
         graph = self._factors(None)
-        add_point_factors(self.bundle, graph)
+        for bundle in self.bundles:
+            add_point_factors(bundle, graph)
         return graph
 
     @cached_property
     def _reduced(self) -> gtsam.NonlinearFactorGraph:
-        graph = self._factors(self.reduction)
-        if self.bundle is not None:
-            self.bundle.add_factor(graph)
+        graph = self._with_bundles(self.reduction)
         if self.reduction is not None:
             self.reduction.add_factor(graph)
         return graph
 
     @cached_property
     def _unreduced(self) -> gtsam.NonlinearFactorGraph:
-        graph = self._factors(None)
-        if self.bundle is not None:
-            self.bundle.add_factor(graph)
+        return self._with_bundles(None)
+
+    def _with_bundles(self, reduction: PoseReduction | None) -> gtsam.NonlinearFactorGraph:
+        graph = self._factors(reduction)
+        for bundle in self.bundles:
+            bundle.add_factor(graph)
         return graph
 
     @property
     def system(self) -> gtsam.NonlinearFactorGraph:
         """What the solver linearises, as long as :attr:`reduction` finds inverses: a view of ``graph``.
 
-        Of the same chi-square, with what :attr:`reduction` and :attr:`bundle` reduce eliminated already.
+        Of the same chi-square, with what :attr:`reduction` and :attr:`bundles` reduce eliminated already.
         """
         return self.view(self.reduction)
 
@@ -182,8 +210,8 @@ class AdjustmentGraph:
             self.images.serve(None if reduction is None else reduction.others)
         if self.terrestrial is not None:
             self.terrestrial.prepare(values, jacobians)
-        if self.bundle is not None:
-            self.bundle.prepare(values, jacobians, damping)
+        for bundle in self.bundles:
+            bundle.prepare(values, jacobians, damping)
         return Evaluation(values, damping, reduction, self.state.evaluation)
 
     def _reduced_here(self, damping: float) -> PoseReduction | None:
@@ -198,8 +226,10 @@ class AdjustmentGraph:
 
     def objective(self, at: Evaluation) -> float:
         """Weighted square sum v'Pv of the last evaluation."""
-        images = float(self.images.chi.sum()) + (self.bundle.chi_square if self.bundle is not None else 0.0)
+        images = float(self.images.chi.sum()) + sum(bundle.chi_square for bundle in self.bundles)
         readings = self.terrestrial.chi_square if self.terrestrial is not None else 0.0
+        if self.only_pairs and self.pairs is not None:
+            return float(np.sum(self.pairs.rows_here()[0] ** 2)) + 2.0 * float(self.singles_graph.error(at.values))
         with self.state.serving():
             return images + readings + 2.0 * float(self.others_graph.error(at.values))
 
@@ -214,54 +244,48 @@ class AdjustmentGraph:
         readings, change = self.terrestrial.with_sigmas_at(values)
         return (self if readings is self.terrestrial else replace(self, terrestrial=readings)), change
 
-    def _split(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rows (N, ...) in the order of ``Survey.image_blocks``, for the image batch and for the bundle."""
-        ptr = np.cumsum([0] + [len(b.uv) for b in self.survey.image_blocks])
-        parts: tuple[list[FloatArray], list[FloatArray]] = ([], [])
-        for i, free in self.image_order:
-            parts[int(free)].append(rows[ptr[i] : ptr[i + 1]])
-        known, unknown = (np.concatenate(p) if p else rows[:0] for p in parts)
-        return known, unknown
+    @cached_property
+    def image_rows(self) -> IntArray:
+        """Where the image points (N,), in the order of the survey's blocks, stand in those of all parts one by one."""
+        lengths, part = np.array([(len(self.survey.image_blocks[i].uv), p) for i, p in self.image_order] or [(0, 0)]).T
+        order = np.argsort(part, kind="stable")
+        first = np.empty(len(part), dtype=np.int64)
+        first[order] = np.cumsum(lengths[order]) - lengths[order]
+        ends = np.cumsum(lengths)
+        return np.asarray(np.arange(ends[-1]) + np.repeat(first - (ends - lengths), lengths))
 
-    def _joined(self, known: _Rows, unknown: _Rows) -> _Rows:
-        if self.bundle is None:
-            return known
-        out, at = [], [0, 0]
-        for i, free in self.image_order:
-            n = len(self.survey.image_blocks[i].uv)
-            source = unknown if free else known
-            out.append(source[at[int(free)] : at[int(free)] + n])
-            at[int(free)] += n
-        return np.concatenate(out) if out else known
+    def joined(self, of_images: _Rows, of_bundles: Sequence[_Rows]) -> _Rows:
+        """Rows (N, ...) of all image points in the order of ``Survey.image_blocks``, from those of every part."""
+        return np.concatenate([of_images, *of_bundles])[self.image_rows] if self.bundles else of_images
 
     def used(self) -> BoolArray:
         """Which image points (N,) take part, in the order of ``Survey.image_blocks``."""
-        none: BoolArray = np.zeros(0, dtype=np.bool_)
-        return self._joined(self.images.used, none if self.bundle is None else self.bundle.unsorted(self.bundle.used))
+        return self.joined(self.images.used, [b.unsorted(b.used) for b in self.bundles])
 
     def square_roots(self) -> FloatArray:
         """Square root information (N, 3) of the image points: w00, w01, w11, as ``Survey.image_blocks`` are ordered."""
-        none = np.zeros((0, 3))
-        return self._joined(self.images.W_all, none if self.bundle is None else self.bundle.unsorted(self.bundle.W_all))
+        return self.joined(self.images.W_all, [b.unsorted(b.W_all) for b in self.bundles])
 
     def set_weights(self, weights: FloatArray) -> None:
         """Weights (N,) of the image points, on top of their covariance; zero leaves a point out."""
-        known, unknown = self._split(weights)
+        by_part = np.empty_like(weights)
+        by_part[self.image_rows] = weights
+        sizes = [self.images.n_points, *(len(b.uv) for b in self.bundles)]
+        known, *unknown = np.split(by_part, np.cumsum(sizes)[:-1])
         self.images.set_weights(known)
-        if self.bundle is not None:
-            self.bundle.set_weights(unknown)
+        for bundle, part in zip(self.bundles, unknown, strict=True):
+            bundle.set_weights(part)
 
     def whitened_squares(self, values: gtsam.Values) -> FloatArray:
         """Weighted squares v' inv(Q_ll) v (N,) of all image points at ``values``, whatever their weight."""
         self.prepare(values, jacobians=False)
-        bundle = self.bundle.whitened_squares(values) if self.bundle is not None else np.zeros(0)
-        return self._joined(self.images.whitened_squares(), bundle)
+        return self.joined(self.images.whitened_squares(), [b.whitened_squares() for b in self.bundles])
 
     def behind_camera(self) -> list[ImageBlock]:
         """Blocks with a point behind their camera at the prepared values."""
         found = [self.images.blocks[b] for b in np.flatnonzero(self.images.depth <= 0.0)]
-        if self.bundle is not None:
-            found += [b for b, z in zip(self.bundle.blocks, self.bundle.depth, strict=True) if z <= 0.0]
+        for bundle in self.bundles:
+            found += [b for b, z in zip(bundle.blocks, bundle.depth, strict=True) if z <= 0.0]
         if not found:
             return found
         fisheye = {c.camera_id for c in self.survey.cameras if c.lens.model == "fisheye"}
@@ -312,8 +336,6 @@ class GraphBuilder:
         for item in self.others:
             if item.used:
                 others.add(item.factor)
-        if pairs is not None:
-            pairs.add_factors(others)
         for factor in self._holds():
             others.add(factor)
         known = [(i, b) for i, free, b in split if not free]
@@ -328,20 +350,44 @@ class GraphBuilder:
         outside |= readings.keys if readings is not None else set()
         of_images = set(images.of_blocks.key.tolist())
         unknown = [(i, b) for i, free, b in split if free]
-        bundle = None
-        if unknown:
-            bundle = BundleBatch(
-                self.unknowns, state, [b for _, b in unknown], [chains[i] for i, _ in unknown], self.point_ids,
-                outside | of_images,
-            )  # fmt: skip
+        parts = self._parts([b for _, b in unknown], [chains[i] for i, _ in unknown], outside | of_images)
+        bundles = tuple(
+            BundleBatch(self.unknowns, state, [unknown[k][1] for k in part], [chains[unknown[k][0]] for k in part],
+                        self.point_ids, outside | of_images | shared)
+            for part, shared in parts
+        )  # fmt: skip
+        for bundle in bundles:
             outside |= set(bundle.order) | set(bundle.point_key.values())
         # a free datum is found and completed with all unknowns in sight
         reduced = None if survey.datum.kind == "inner" else reduction(images, self.unknowns, outside)
-        order = [(i, free) for i, free, _ in split]
+        part_of = {unknown[k][0]: p for p, (part, _) in enumerate(parts, 1) for k in part}
+        order = [(i, part_of.get(i, 0)) for i, _, _ in split]
         return AdjustmentGraph(
-            survey, self.unknowns, state, values, images, bundle, order, self.others, others, readings, reduced,
+            survey, self.unknowns, state, values, images, bundles, order, self.others, others, readings, reduced,
             pairs, first_pair,
         )  # fmt: skip
+
+    def _parts(
+        self, blocks: Sequence[ImageBlock], chains: Sequence[Chain], outside: set[int]
+    ) -> list[tuple[list[int], set[int]]]:
+        """Image blocks of unknown points by number, in parts, and the keys of the points that others see too."""
+        if not blocks:
+            return []
+        number: dict[tuple[int, ...], int] = {}
+        keys = [tuple(key for link in chain for key in self.unknowns.link_keys(link.slot)) for chain in chains]
+        may_hide = [tuple(k for k in mine if k not in outside and may_be_hidden(self.unknowns, k)) for mine in keys]
+        owner = np.array([number.setdefault(h or (-1, *k), len(number)) for h, k in zip(may_hide, keys, strict=True)])
+        hidden = np.array([6.0 if pose[:1] != (-1,) else 0.0 for pose in number])
+        point_key = [self.unknowns.by_name.get(("point", p)) for p in self.point_ids]
+        free = np.array([u is not None and u.key not in outside for u in point_key])
+        seen = [b.point_idx[free[b.point_idx]] for b in blocks]
+        part = helmert_blocks(owner, seen, hidden)
+        count = np.zeros(len(free), dtype=np.int64)
+        parts = [np.flatnonzero(part == p).tolist() for p in range(int(part.max()) + 1)]
+        for mine in parts:
+            count[np.unique(np.concatenate([blocks[k].point_idx for k in mine]))] += 1
+        shared = {u.key for u, n in zip(point_key, count, strict=True) if u is not None and n > 1}
+        return [(mine, shared) for mine in parts]
 
     def _register_points(self) -> None:
         for point in self.survey.points:

@@ -8,6 +8,7 @@ motions G. The adjusted shape does not depend on either datum.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
@@ -23,6 +24,9 @@ from adjust.observations.geometry.motions import MOVED, vector_motions
 from adjust.observations.terrestrial.motions import MOVED as READINGS_MOVED
 from adjust.observations.terrestrial.motions import reading_motions
 from adjust.spatial.motions import motions_of, points_motions, poses_at, poses_motions
+
+if TYPE_CHECKING:
+    from adjust.graph.pair_normals import PairLinear
 
 BLIND = 1e-8
 """Length of the whitened Jacobian times a scaled direction that is not seen; rounding reaches 1e-13."""
@@ -115,7 +119,7 @@ class InnerDatum:
         """Number of undetermined motions."""
         return int(self.directions.shape[1])
 
-    def add_to(self, linear: gtsam.GaussianFactorGraph) -> None:
+    def add_to(self, linear: "gtsam.GaussianFactorGraph | PairLinear") -> None:
         """Hold the minimal datum's components at their values."""
         for key, (components, weights) in self.minimal.items():
             dim = self.rows[key].shape[1] if key in self.rows else 3 if self.kinds[key] == "point" else 6

@@ -12,17 +12,22 @@ class Elimination:
     ordering: gtsam.Ordering
     use_qr: bool = False
 
-    def solution(self, linear: gtsam.GaussianFactorGraph) -> gtsam.VectorValues | None:
-        """The solution; None where this method finds the system indeterminate."""
+    def solution(self, linear: gtsam.GaussianFactorGraph) -> tuple[gtsam.VectorValues, float] | None:
+        """The solution and by how much it lowers chi-square; None where this method finds the system indeterminate."""
         try:
-            return linear.optimize(self.ordering, gtsam.EliminateQR) if self.use_qr else linear.optimize(self.ordering)
+            how = (self.ordering, gtsam.EliminateQR) if self.use_qr else (self.ordering,)
+            delta = linear.optimize(*how)
         except RuntimeError as error:  # GTSAM's exception for it has no type of its own in Python
             if "ndetermin" not in str(error):
                 raise
             return None
+        return delta, -float(delta.dot(linear.gradientAtZero()))
 
-    def tree(self, linear: gtsam.GaussianFactorGraph) -> gtsam.GaussianBayesTree:
-        """The Bayes tree."""
-        if self.use_qr:
-            return linear.eliminateMultifrontal(self.ordering, gtsam.EliminateQR)
-        return linear.eliminateMultifrontal(self.ordering)
+    def tree(self, linear: gtsam.GaussianFactorGraph) -> tuple[gtsam.GaussianBayesTree, gtsam.VectorValues] | None:
+        """The Bayes tree and its solution; None as above."""
+        try:
+            how = (self.ordering, gtsam.EliminateQR) if self.use_qr else (self.ordering,)
+            tree = linear.eliminateMultifrontal(*how)
+            return tree, tree.optimize()
+        except RuntimeError:
+            return None

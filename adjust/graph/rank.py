@@ -6,7 +6,7 @@ import numpy as np
 from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import BLIND, Stacking, gauge, independent_rows, stacking, times, visible_keys
-from adjust.model.errors import IndeterminateError
+from adjust.model.errors import IndeterminateError, listed
 from adjust.model.survey import FloatArray, Station
 from adjust.observations.images.bundle_hidden import BundleHidden
 
@@ -18,11 +18,11 @@ _READABLE = {"rx": "rotation x", "ry": "rotation y", "rz": "rotation z", "tx": "
 
 def unobserved_unknowns(graph: AdjustmentGraph) -> list[str]:
     """Unknowns that occur in no factor at all."""
-    seen = set(graph.system.keyVector())
+    seen = set(graph.keys(graph.reduction))
     if graph.reduction is not None:
         seen |= set(graph.reduction.hidden)
-    if graph.bundle is not None:
-        seen |= set(graph.bundle.hidden_poses) | {graph.bundle.point_key[i] for i in graph.bundle.reduced}
+    for bundle in graph.bundles:
+        seen |= set(bundle.hidden_poses) | {bundle.point_key[i] for i in bundle.reduced}
     return [readable(u) for u in graph.unknowns.by_name.values() if u.key not in seen]
 
 
@@ -73,7 +73,7 @@ def null_space(
         return V, scale
     _, s, Vt = np.linalg.svd(_rows_along(linear, stack, V, graph), full_matrices=False)
     # what is hidden in a bundle follows from its normal equations, to about the root of their rounding
-    limit = BLIND if graph is None or graph.bundle is None else BLIND_BUNDLE
+    limit = BLIND if graph is None or not graph.bundles else BLIND_BUNDLE
     return V @ Vt[s < limit].T, scale
 
 
@@ -107,13 +107,14 @@ def _rows_along(
     linear: gtsam.GaussianFactorGraph, stack: Stacking, V: FloatArray, graph: AdjustmentGraph | None
 ) -> FloatArray:
     """The whitened Jacobian times V; a bundle's part from its image points, not through its normal equations."""
-    bundle = graph.bundle if graph is not None else None
-    if bundle is None:
+    bundles = graph.bundles if graph is not None else ()
+    if not bundles:
         return times(linear, stack, V)
-    out = [BundleHidden(bundle).rows_along(V[stack.index(bundle.interface)])]
+    out = [BundleHidden(bundle).rows_along(V[stack.index(bundle.interface)]) for bundle in bundles]
+    condensed = {tuple(bundle.interface) for bundle in bundles}
     for i in range(linear.size()):
         factor = linear.at(i)
-        if list(factor.keys()) != bundle.interface:
+        if tuple(factor.keys()) not in condensed:
             out.append(factor.jacobian()[0] @ V[stack.index(factor.keys())])
     return np.concatenate(out)
 
@@ -251,9 +252,8 @@ def _rest(graph: AdjustmentGraph, stack: Stacking, null: FloatArray, lines: list
     for vector in (null @ np.linalg.inv(null[pivots])).T:
         texts = _moving(graph, stack, vector)
         names += texts
-        more = f" and {len(texts) - 6} more" if len(texts) > 6 else ""
         lines.append(
-            f"{'; '.join(texts[:6])}{more}: they move together without changing any observation; measure or hold one"
+            f"{listed(texts, 6, '; ')}: they move together without changing any observation; measure or hold one"
             if len(texts) > 1
             else f"{texts[0]}: the observations do not determine it; measure or hold it"
         )

@@ -14,8 +14,10 @@ from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.graph.datum import InnerDatum, inner_datum, normal_diagonal, stacking, visible_keys
 from adjust.graph.divergence import describe_divergence
 from adjust.graph.elimination import Elimination
+from adjust.graph.pair_normals import PairLinear, PairNormals
 from adjust.graph.rank import describe_null_space, unobserved_unknowns
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
+from adjust.native.elimination import PoseTree
 from adjust.observations.images.reduction import Leaves
 
 _SIGMA_ROUNDS, _SIGMA_CHANGE = 3, 1e-6
@@ -33,6 +35,8 @@ _LEAST_GAIN = 0.1
 """Share of the promised decrease of chi-square that a step must bring."""
 _STATIONARY = 1e-2
 """Sigmas that a step moves at most where the rank of the system is judged."""
+_NEAR, _SHRINKING = 1.0, 0.25
+"""Sigmas that a step moves at most, and its share of the one before, where one factor of pairs serves the next step."""
 
 Progress = Callable[[int, float], None]
 
@@ -56,18 +60,17 @@ class SolveOptions:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The minimum and how it was reached. linear: GTSAM's graph linearised there; tree: what it was eliminated to."""
+    """The minimum and how it was reached. tree: what the system there was eliminated to, by QR or Cholesky."""
 
     values: gtsam.Values
-    linear: gtsam.GaussianFactorGraph
-    tree: gtsam.GaussianBayesTree
-    elimination: Elimination
+    tree: gtsam.GaussianBayesTree | PoseTree
+    use_qr: bool
     omega: float
     iterations: int
     max_step: float
     datum: InnerDatum | None
     leaves: Leaves | None = None
-    """The poses that were reduced before, as cliques of the Bayes tree of ``linear``."""
+    """The poses that were reduced before, as cliques of the Bayes tree."""
 
 
 class _Loop:
@@ -86,12 +89,14 @@ class _Loop:
         self.moved = self.before = np.inf
         self.judging = True
         self._orderings: dict[bool, gtsam.Ordering] = {}
+        self.linear: gtsam.GaussianFactorGraph | PairLinear
         self.at = self._evaluated(start)
         self.omega = graph.objective(self.at)
         if not np.isfinite(self.omega) and graph.terrestrial is not None:
             graph.terrestrial.require_directions()
         self.behind = self._images_behind()
         self.datum = inner_datum(graph, self.at)
+        self.pairs = PairNormals(graph, self._last_keys()) if graph.only_pairs else None
         self._linearize()
         self.best, self.waited = (self.at, self.omega), 0
         self.steps: list[float] = []
@@ -104,7 +109,7 @@ class _Loop:
 
     def _linearize(self) -> None:
         """``linear``: the system at the present values, with the minimal datum where the survey has an inner one."""
-        self.linear = self.graph.linearized(self.at)
+        self.linear = self.graph.linearized(self.at) if self.pairs is None else self.pairs.linearized(self.at)
         if self.datum is not None:
             self.datum.add_to(self.linear)
 
@@ -116,9 +121,9 @@ class _Loop:
         decrease = 0.0
         if self.at.reduction is not None:
             decrease += self.at.reduction.complete(delta)
-        if self.graph.bundle is not None:
-            self.graph.bundle.complete(delta)
-            decrease += self.graph.bundle.hidden_decrease
+        for bundle in self.graph.bundles:
+            bundle.complete(delta)
+            decrease += bundle.hidden_decrease
         if self.datum is not None:
             delta = self.datum.completed(self.graph, self.at.values, delta)
         return delta, decrease
@@ -132,20 +137,31 @@ class _Loop:
             self._orderings[reduced] = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(system, last)
         return Elimination(self._orderings[reduced], self.use_qr)
 
-    def step(self) -> gtsam.VectorValues:
-        """The (damped) step. Raises IndeterminateError where there is none, by name where that is judged."""
-        system = self.linear if self.damping == 0.0 else damped(self.graph, self.linear, self.damping)
-        delta = self.elimination.solution(system)
-        if delta is None:
-            return self._weak_step()
-        if not np.isfinite(delta.norm()):
-            raise SurveyError("the normal equations have no finite solution; check the sigmas and start values")
-        return delta
+    def step(self) -> tuple[gtsam.VectorValues, float]:
+        """The (damped) step, and by how much it lowers chi-square to first order.
 
-    def _weak_step(self) -> gtsam.VectorValues:
-        """The step of a system that GTSAM finds indeterminate; raises where it is."""
+        Raises IndeterminateError where there is none, by name where that is judged.
+        """
+        if isinstance(self.linear, PairLinear):
+            system = self.linear if self.damping == 0.0 else self.linear.damped(self.damping)
+            found = self.linear.normals.solution(system)
+        else:
+            graph = self.linear if self.damping == 0.0 else damped(self.graph, self.linear, self.damping)
+            found = self.elimination.solution(graph)
+        if found is None:
+            return self._weak_step()
+        if not np.isfinite(found[0].norm()):
+            raise SurveyError("the normal equations have no finite solution; check the sigmas and start values")
+        return found
+
+    def _weak_step(self) -> tuple[gtsam.VectorValues, float]:
+        """The step of a system that Cholesky finds indeterminate; raises where it is."""
         if self.use_qr or not self.judging:
             raise IndeterminateError("the normal equations have no solution here")
+        if isinstance(self.linear, PairLinear):  # with GTSAM's factors what is weak is named, or solved by QR
+            self.pairs = None
+            self._linearize()
+            return self.step()
         if self.at.reduction is not None:  # what is weak is judged, and named, with all unknowns in sight
             self.reduced = False
             self.at = self._evaluated(self.at.values)
@@ -159,8 +175,14 @@ class _Loop:
         self.use_qr = True  # weak, but determined: GTSAM's Cholesky refuses pivots that QR still resolves
         return self.step()
 
+    def _tree(self) -> tuple[gtsam.GaussianBayesTree | PoseTree, gtsam.VectorValues] | None:
+        """The Bayes tree of the system as it is now, and its solution; None where the elimination finds none."""
+        if isinstance(self.linear, PairLinear):
+            return self.linear.normals.tree(self.linear)
+        return self.elimination.tree(self.linear)
+
     def _last_keys(self) -> list[int]:
-        by_key, all_keys = self.graph.unknowns.by_key, list(self.graph.view(self.at.reduction).keyVector())
+        by_key, all_keys = self.graph.unknowns.by_key, self.graph.keys(self.at.reduction)
         keys = [k for k in all_keys if k in by_key and by_key[k].name[0] in _LATE]
         if self.options.determined and self.graph.pairs is not None:
             # far stations eliminated last would have lost nearly all of their information by then
@@ -201,8 +223,7 @@ class _Loop:
 
     def _proposed(self) -> tuple[gtsam.VectorValues, float]:
         """The step of all unknowns from here, and by how much it lowers chi-square to first order, at least."""
-        delta = self.step()
-        decrease = -float(delta.dot(self.linear.gradientAtZero()))
+        delta, decrease = self.step()
         delta, hidden = self.completed(delta)
         return delta, decrease + hidden
 
@@ -263,6 +284,8 @@ class _Loop:
         """The next step's length and damping, from what the last one gained; ready to be linearised."""
         self.judging = self.moved < _STATIONARY
         used = self.damping
+        if self.pairs is not None:
+            self.pairs.kept = used == 0.0 and self.moved < min(_NEAR, _SHRINKING * self.before)
         if used == 0.0:
             self.length = min(1.0, 2.0 * self.length) if gain > 0.75 else self.length
         elif gain > 0.5:
@@ -289,6 +312,8 @@ class _Loop:
     def _damp(self, iteration: int) -> None:
         """From the present values once more, with shorter steps."""
         self.length, self.waited, self.steps = 1.0, 0, []
+        if self.pairs is not None:
+            self.pairs.kept = False
         while True:
             self.damping = max(self.damping * 10.0, self.options.first_damping)
             if self.damping > 1e8:
@@ -313,16 +338,17 @@ class _Loop:
             self.datum = inner_datum(self.graph, self.at)  # about the solution, where the covariances belong
         self._linearize()
         # the covariances need this linearisation anyway: its step costs one elimination and brings the last digits
-        try:
-            tree = self.elimination.tree(self.linear)
-            step = tree.optimize()
-        except RuntimeError:  # judged by the next elimination
-            step = self.step()
-            tree = self.elimination.tree(self.linear)
+        found = self._tree()
+        if found is None:
+            self.step()  # which judges, or finds how to eliminate
+            found = self._tree()
+        if found is None:
+            raise IndeterminateError("the normal equations have no solution here")
+        tree, step = found
         delta, _ = self.completed(step)
         leaves = None if self.at.reduction is None else self.at.reduction.leaves()
         return Solved(
-            self.at.values.retract(delta), self.linear, tree, self.elimination, self.omega, iteration, self.moved,
+            self.at.values.retract(delta), tree, self.use_qr, self.omega, iteration, self.moved,
             self.datum, leaves,
         )  # fmt: skip
 

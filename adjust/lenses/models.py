@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.lenses.radial import RadialProfile, invert_radius, radial_profile
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.survey import BoolArray, Camera, FloatArray
 from adjust.native import lenses as kernels
 from adjust.native.parallel import run_split, split_blocks
@@ -206,8 +206,9 @@ def unit_rays(model: LensModel, values: FloatArray, constants: FloatArray, uv: F
     """Unit vectors (n, 3) in the camera frame of image points (n, 2) px, up to 180 degrees for the fisheye."""
     uv = np.ascontiguousarray(uv, dtype=np.float64)
     if model.kind != kernels.FISHEYE:
-        directions = np.column_stack([rays(model, values, constants, uv), np.ones(len(uv))])
-        unit: FloatArray = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        tangents, unit = rays(model, values, constants, uv), np.empty((len(uv), 3))
+        unit[:, 2] = 1.0 / np.sqrt(1.0 + tangents[:, 0] ** 2 + tangents[:, 1] ** 2)
+        unit[:, :2] = tangents * unit[:, 2:]
         return unit
     distorted = _affine_inverse(values, uv)
     theta_d = np.hypot(distorted[:, 0], distorted[:, 1])
@@ -251,9 +252,7 @@ def _arrays(*arrays: FloatArray) -> tuple[FloatArray, ...]:
 def _pixels(uv: FloatArray, which: BoolArray, shown: int = 5) -> str:
     """Some of the named pixels, for a message."""
     bad = uv[which]
-    text = ", ".join(f"({u:.1f}, {v:.1f})" for u, v in bad[:shown])
-    more = f" and {len(bad) - shown} more" if len(bad) > shown else ""
-    return f"pixels {text}{more}"
+    return f"pixels {listed([f'({u:.1f}, {v:.1f})' for u, v in bad], shown)}"
 
 
 def _require_invertible(

@@ -1,5 +1,7 @@
 """What a user can cause and mend; everything else is a bug and keeps its traceback."""
 
+from collections.abc import Sequence
+
 
 class SurveyError(Exception):
     """Something in the survey that its owner can put right; the message says where, what was found and what to do."""
@@ -26,3 +28,8 @@ class DiagnosedError(SurveyError):
     def __init__(self, message: str, diagnosis: object) -> None:
         super().__init__(message)
         self.diagnosis = diagnosis
+
+
+def listed(names: Sequence[str], most: int, between: str = ", ") -> str:
+    """The first names of a message, and how many more there are."""
+    return between.join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,6 +1,6 @@
 """What was observed: values with their covariance and the group they belong to, as frozen values."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -47,6 +47,15 @@ class ImageBlock:
     cov: FloatArray
     used: BoolArray | None = None
     group: str = "image"
+
+    def part(self, rows: IntArray | BoolArray) -> "ImageBlock":
+        """These image points of it alone."""
+        used = None if self.used is None else self.used[rows]
+        return replace(self, point_idx=self.point_idx[rows], uv=self.uv[rows], cov=self.cov[rows], used=used)
+
+    def in_use(self) -> "ImageBlock":
+        """Less what is predicted and tested only."""
+        return self if self.used is None else replace(self.part(self.used), used=None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,12 +1,15 @@
 // What Python calls of lenses, image points, views, planes, trees, reduced poses and simulated networks.
 #include "calibration.h"
+#include "chains.h"
 #include "planes.h"
+#include "point_tests.h"
+#include "text.h"
 #include "reduction.h"
 
 extern "C" __attribute__((visibility("default"))) const Entry *images() {
     static constexpr Entry table[] = {
-        entry<lens_rows>("lens_rows"), entry<tangents_of>("tangents_of"), entry<normal_equations>("normal_equations"), entry<errors>("errors"),
-        entry<block_rows>("block_rows"), entry<serve>("serve"), entry<local_by_keys>("local_by_keys"),
+        entry<evaluate_chains>("evaluate_chains"), entry<lens_rows>("lens_rows"), entry<tangents_of>("tangents_of"), entry<normal_equations>("normal_equations"), entry<errors>("errors"),
+        entry<block_rows>("block_rows"), entry<condensed_rows>("condensed_rows"), entry<serve>("serve"), entry<local_by_keys>("local_by_keys"),
         entry<all_statistics>("all_statistics"), entry<reduce_poses>("reduce_poses"), entry<pose_steps>("pose_steps"),
         entry<leaf_rows>("leaf_rows"), entry<tree_block>("tree_block"), entry<invert_cliques>("invert_cliques"),
         entry<covariance_room>("covariance_room"), entry<covariance_rows>("covariance_rows"),
@@ -14,6 +17,8 @@ extern "C" __attribute__((visibility("default"))) const Entry *images() {
         entry<refine_views>("refine_views"), entry<errors_of_views>("errors_of_views"),
         entry<offsets_of_views>("offsets_of_views"), entry<homographies>("homographies"),
         entry<plane_poses>("plane_poses"), entry<fit_lens>("fit_lens"), entry<turns_by>("turns_by"),
-        entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), {nullptr, nullptr, nullptr}};
+        entry<turns_of>("turns_of"), entry<row_influences>("row_influences"), entry<residual_tests>("residual_tests"),
+        entry<controlled_directions>("controlled_directions"), entry<point_tests>("point_tests"),
+        entry<bias_ellipses>("bias_ellipses"), entry<number_rows>("number_rows"), {nullptr, nullptr, nullptr}};
     return table;
 }

@@ -9,22 +9,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.library import Function
 from adjust.native.trees import TREE, TreeArrays
 
 SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP = 0, 1, 2, 3
 MAX_LOCAL = 23
 """Local unknowns and residual of a block, at most."""
+N_SHAPE = 4
+"""Parameters of a target's shape."""
 
 BLOCKS = "ptr[B+1] camera[B] warp_id[B] n_warp[B]"
 LENSES = "kind[c] values[c,14] constants[c,4] n_free[c] n_map[c] source[c,14] column[c,14] factor[c,14]"
 SEGMENTS = "segment_ptr[B+1] segment_kind[S] link[S] table[S] start[S] n[S] place[S]"
 _BATCH = f"{BLOCKS} X[3,N] shape[2,N] uv[2,N] W[3,N] {LENSES} R[B,3,3] t[B,3] warp[*,2]"
 CHAINED = "C[*,6,6] D[*,6,*]"
+_evaluate_chains = Function(
+    "evaluate_chains", "slot_R[S,3,3] slot_t[S,3] ptr[B+1] slot[L] inverse[L] R[B,3,3] t[B,3] C[L,6,6]"
+)
 _normal_equations = Function("normal_equations", f"which[*] {_BATCH} H[B,m,m] chi[B] depth[B]")
 _errors = Function("errors", f"which[*] {_BATCH} chi[B] depth[B]")
 _block_rows = Function("block_rows", f"which[g] {_BATCH} out[g,*,*]")
+_condensed_rows = Function("condensed_rows", f"which[g] {_BATCH} factors[g,*,{N_SHAPE}] out[g,*,*]")
 _serve = Function(
     "serve", f"which[*] {BLOCKS} {LENSES} {SEGMENTS} {CHAINED} width[B] at[B] H[B,m,m] flat[*] r[B,m]"
 )
@@ -121,6 +127,14 @@ class KeyArrays(NamedTuple):
     place: IntArray
 
 
+def fill_chains(
+    slot_R: FloatArray, slot_t: FloatArray, ptr: IntArray, slot: IntArray, inverse: BoolArray, R: FloatArray,
+    t: FloatArray, C: FloatArray,
+) -> None:  # fmt: skip
+    """Poses R (B, 3, 3), t (B, 3) of chains and their derivatives C (links, 6, 6) by every link."""
+    _evaluate_chains(slot_R, slot_t, ptr, slot, inverse, R, t, C)
+
+
 def normal_equations(which: IntArray, at: BlocksAt, H: FloatArray, chi: FloatArray, depth: FloatArray) -> None:
     """For each listed block: normal matrix H[b] (symmetric) of its local unknowns and, last, the residual.
 
@@ -138,6 +152,15 @@ def errors(which: IntArray, at: BlocksAt, chi: FloatArray, depth: FloatArray) ->
 def block_rows(which: IntArray, at: BlocksAt, out: FloatArray) -> None:
     """Whitened rows (g, 2 n, n_lens + 6 + n_warp + 1) of g blocks of one size over local unknowns, residual last."""
     _block_rows(which, *at.arrays, out)
+
+
+def condensed_rows(which: IntArray, at: BlocksAt, factors: FloatArray, out: FloatArray) -> None:
+    """Of g blocks of one size rows (g, m, n_lens + 6 + n_warp + 4 + 1) with the normal equations of all their rows.
+
+    Columns: local unknowns, the four of the shape, residual. factors: (g, n, 4), by what the derivatives by x, y, z and
+    z again of every point are multiplied for the shape. m: as many as columns, or as rows where these are fewer.
+    """
+    _condensed_rows(which, *at.arrays, factors, out)
 
 
 def serve(

@@ -13,6 +13,7 @@ from functools import cache
 from operator import index
 from pathlib import Path
 from typing import Any
+from weakref import ref
 
 import numpy as np
 
@@ -23,10 +24,15 @@ _KINDS = {kind: np.dtype(of) for kind, of in
 _ORDERED, _WRITEABLE = 0x0101, 0x0400  # flags of NumPy's arrays: row by row and aligned; may be written to
 _begins: Callable[[Any], Any] = (ctypes.c_char * 0).from_buffer
 """At the first byte of an array that may be written to, in a quarter of the time of ``ndarray.ctypes``."""
+_MOST_SHAPES = 64
 _FOLDER = Path(__file__).parent
 _FAMILIES = ("images", "bundles", "navigation", "vision")
 SETS = ("base", "avx2", "avx512")
 """Sets of vector instructions for which the library may have been built, the widest last."""
+
+
+def _nothing() -> None:
+    """What was given before the first call."""
 
 
 class _Entry(ctypes.Structure):
@@ -93,6 +99,10 @@ class Function:
         self._kinds = ""
         self._expected: list[tuple[str, tuple[_Dimension, ...], np.dtype[Any] | None, int, tuple[int, ...]]] = []
         """Of every argument: name, shape, dtype, flags needed (of a number: whether it is whole), zeros that follow."""
+        self._fitting: set[tuple[tuple[int, ...], ...]] = set()
+        """Shapes of all arrays of a call that were found to fit together."""
+        self._known: list[tuple[Callable[[], Any], int]] = []
+        """Of every argument: the array given last and its address. NumPy moves no array that is weakly referred to."""
 
     def using(self, instructions: str | None) -> "Function":
         """The same function with a set of vector instructions; that in use for None."""
@@ -123,6 +133,7 @@ class Function:
              (0,) * (4 - len(shape)))
             for (name, shape), kind in zip(self._declared, self._kinds, strict=True)
         ]  # fmt: skip
+        self._known = [(_nothing, 0)] * len(dims)
         self._run = run
         return run
 
@@ -131,25 +142,45 @@ class Function:
         run = self._run or self._open()
         if len(arguments) != len(self._declared):
             raise TypeError(f"{self.name} takes {len(self._declared)} arguments, {len(arguments)} were given")
-        sizes: dict[str, int] = {}
         packed: list[int] = []
-        for (name, shape, dtype, needed, rest), value in zip(self._expected, arguments, strict=True):
+        shapes: list[tuple[int, ...]] = []
+        known = self._known
+        for i, value in enumerate(arguments):
+            name, _, dtype, needed, rest = self._expected[i]
             if dtype is None:
                 packed += (self._number(name, needed, value), *rest)
                 continue
             if not isinstance(value, np.ndarray) or value.dtype != dtype:
                 raise TypeError(f"{self.name}: {name} must be an array of {dtype.name}, not {_told(value)}")
-            given = value.shape
-            if len(given) != len(shape) or not _fits(shape, given, sizes):
-                raise ValueError(f"{self.name}: {name} must be ({', '.join(map(_text, shape))}), not {given}"
-                                 f" with {sizes}")  # fmt: skip
-            flags = value.flags.num
-            if flags & needed != needed:
-                raise ValueError(f"{self.name}: {name} must be contiguous{' and writable' * (needed != _ORDERED)}")
-            at = ctypes.addressof(_begins(value)) if flags & _WRITEABLE else value.ctypes.data
+            shapes.append(given := value.shape)
+            last, at = known[i]
+            if last() is not value or value.flags.num & needed != needed:
+                at = self._address(name, needed, value)
+                known[i] = ref(value), at
             packed += (at, *given, *rest)
+        if (together := tuple(shapes)) not in self._fitting:
+            self._check(shapes)
+            if len(self._fitting) >= _MOST_SHAPES:
+                self._fitting.clear()
+            self._fitting.add(together)
         kept = array("q", packed)
         return run(kept.buffer_info()[0])
+
+    def _address(self, name: str, needed: int, value: np.ndarray[Any, Any]) -> int:
+        """Where an array begins, which must be row by row."""
+        flags = value.flags.num
+        if flags & needed != needed:
+            raise ValueError(f"{self.name}: {name} must be contiguous{' and writable' * (needed != _ORDERED)}")
+        return ctypes.addressof(_begins(value)) if flags & _WRITEABLE else value.ctypes.data
+
+    def _check(self, given: list[tuple[int, ...]]) -> None:
+        """Whether the shapes of all arrays fit together."""
+        sizes: dict[str, int] = {}
+        arrays = (argument for argument in self._expected if argument[2] is not None)
+        for (name, shape, *_), found in zip(arrays, given, strict=True):
+            if len(found) != len(shape) or not _fits(shape, found, sizes):
+                raise ValueError(f"{self.name}: {name} must be ({', '.join(map(_text, shape))}), not {found}"
+                                 f" with {sizes}")  # fmt: skip
 
     def _number(self, name: str, whole: int, value: Any) -> int:
         """The bits of a number."""

@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -31,10 +32,15 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def split_blocks(ptr: IntArray) -> list[IntArray]:
-    """Block numbers in runs of about equal numbers of points: one run for small batches, else one per worker."""
+def split_blocks(ptr: IntArray, parts: int = 0) -> list[IntArray]:
+    """Block numbers in runs of about equal numbers of points: one run for small batches, else one per worker.
+
+    parts: so many instead, whatever the number of workers, where what the runs give is added up.
+    """
     n, total = len(ptr) - 1, int(ptr[-1])
-    count = 1 if total < _WORTHWHILE else min(n, workers())
+    count = 1 if total < _WORTHWHILE else min(n, parts or workers())
+    if count <= 1:
+        return [np.arange(n)] if n else []
     edges = np.searchsorted(ptr, np.linspace(0, total, count + 1)[1:-1])
     return [run.astype(np.int64) for run in np.split(np.arange(n), edges) if len(run)]
 
@@ -51,10 +57,11 @@ def side_by_side(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -
 
 def run_split(kernel: Callable[..., object], runs: list[IntArray], *arguments: object) -> None:
     """Call ``kernel(run, *arguments)`` for every run, side by side."""
-    if len(runs) <= 1:
-        for run in runs:
-            kernel(run, *arguments)
-        return
-    pool = _pool(len(runs))
-    for future in [pool.submit(kernel, run, *arguments) for run in runs]:
-        future.result()
+    side_by_side(lambda run: kernel(run, *arguments), runs)
+
+
+def run_ranges(kernel: Callable[..., object], n: int, *arguments: object) -> None:
+    """Call ``kernel(first, last, *arguments)`` for ranges that make up 0 .. n, side by side; items do not meet."""
+    count = 1 if n < _WORTHWHILE else workers()
+    edges = [n * i // count for i in range(count + 1)]
+    side_by_side(lambda ends: kernel(*ends, *arguments), list(pairwise(edges)))

@@ -73,11 +73,7 @@ inline int64_t invert_cliques(Ints front, Ints width, Ints at, Out<double, 1> da
             if (!(magnitude(A[i * n + i]) > 0.0)) return c;
         for (int64_t i = nf - 1; i >= 0; --i) {
             for (int64_t j = i; j < n; ++j) x[j] = j >= nf ? A[i * n + j] : 0.0;
-            for (int64_t k = i + 1; k < nf; ++k) {
-                const double f = A[i * n + k];
-                const double *from = A + k * n;
-                for (int64_t j = k; j < n; ++j) x[j] += f * from[j];
-            }
+            for (int64_t k = i + 1; k < nf; ++k) add_multiple(A[i * n + k], A + k * n + k, x + k, n - k);
             const double d = 1.0 / A[i * n + i];
             A[i * n + i] = d;
             for (int64_t j = i + 1; j < n; ++j) A[i * n + j] = -d * x[j];

@@ -20,10 +20,11 @@ from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, FrameTree, Unkno
 from adjust.model.observations import Pair
 from adjust.model.result import ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.native.pairs import pair_jacobians, pair_rows
 from adjust.native.trees import KeyCovariances
 from adjust.observations.factors import Jacobians, custom
 from adjust.observations.listed import ObservationFactor, frame_text
-from adjust.spatial.rigid_motions import Motions, exp, right_jacobian_inverse
+from adjust.spatial.rigid_motions import Motions, exp
 from adjust.testing.distributions import chi2
 
 UNCONTROLLED = 1e-4
@@ -164,6 +165,7 @@ class PairBatch:
     unknowns: Unknowns
     state: State
     noise: NoiseCache = field(default_factory=NoiseCache)
+    _here: tuple[int, tuple[FloatArray, FloatArray, FloatArray]] | None = None
 
     def __post_init__(self) -> None:
         keys = np.array([_HELD if k is None else k for k in self.unknowns.slot_key], dtype=np.int64)
@@ -197,6 +199,29 @@ class PairBatch:
     def both_held(self) -> BoolArray:
         """Pairs (E,) between two held bodies."""
         return np.asarray((self.a_key == _HELD) & (self.b_key == _HELD), dtype=np.bool_)
+
+    @cached_property
+    def active(self) -> IntArray:
+        """Which pairs are in use and have a free end."""
+        return np.flatnonzero(self.arrays.used & ~self.both_held)
+
+    @cached_property
+    def _measured(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Rotations, translations and whitening of these."""
+        rows, arrays = self.active, self.arrays
+        return arrays.rotations[rows], np.nan_to_num(arrays.translations[rows]), arrays.whitening[rows]
+
+    def rows_here(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of the active pairs: whitened residuals (k, 6), derivatives (k, 6, 6) by b and by a, at the state of now."""
+        state = self.state
+        if self._here is None or self._here[0] != state.evaluation:
+            poses = self.a_slot[self.active], self.b_slot[self.active], state.slot_R, state.slot_t
+            self._here = state.evaluation, pair_rows(*poses, *self._measured)
+        return self._here[1]
+
+    def seen(self) -> set[int]:
+        """The variables of the active pairs."""
+        return set(np.concatenate([self.a_key[self.active], self.b_key[self.active]]).tolist()) - {_HELD}
 
     def keys(self) -> set[int]:
         """The variables of all pairs, used or not."""
@@ -241,9 +266,9 @@ class PairBatch:
     def jacobians(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Residuals (E, 6), derivatives (E, 6, 6) by b and by a, and Ad(b_from_a^-1) (E, 6, 6), unweighted."""
         self.state.load(values)
-        R, t = self.state.slot_R, self.state.slot_t
-        a, b = (Motions(R[slots], t[slots]) for slots in (self.a_slot, self.b_slot))
-        return pair_jacobians(self.arrays.motions, b.inverse() @ a)
+        state = self.state
+        shift = np.nan_to_num(self.arrays.translations)
+        return pair_jacobians(self.a_slot, self.b_slot, state.slot_R, state.slot_t, self.arrays.rotations, shift)
 
     def statistics(self, tree: KeyCovariances, values: gtsam.Values) -> PairStatistics:
         """Statistics of all pairs, in use or not; they do not depend on the datum of ``tree``."""
@@ -291,13 +316,6 @@ class PairBatch:
                 sigma[e, :k], stats.redundancy[e, :k], standardized[e, :k], float(stats.test[e]), item.used,
             ))  # fmt: skip
         return out
-
-
-def pair_jacobians(measured: Motions, b_from_a: Motions) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Residuals (E, dim), their derivatives (E, dim, dim) by b and by a, and Ad(b_from_a^-1) (E, dim, dim)."""
-    residual = (measured.inverse() @ b_from_a).log()
-    by_a, turn = right_jacobian_inverse(residual), b_from_a.inverse().adjoint()
-    return residual, -by_a @ turn, by_a, turn
 
 
 def _quadratic(Q: FloatArray, v: FloatArray) -> tuple[FloatArray, IntArray]:

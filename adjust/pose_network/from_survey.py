@@ -4,7 +4,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.observations.pairs import pair_arrays
 from adjust.pose_network.network import PoseNetwork, check_determined, pose_network
@@ -32,9 +32,8 @@ def network_of_pairs(survey: Survey) -> PoseNetwork | None:
     if lost:
         if beside:
             return None
-        more = f" and {len(lost) - 8} more" if len(lost) > 8 else ""
         raise IndeterminateError(
-            f"no measured pair ties {', '.join(lost[:8])}{more} to the datum; measure a pair to the rest, hold the "
+            f"no measured pair ties {listed(lost, 8)} to the datum; measure a pair to the rest, hold the "
             "station, or leave it out", tuple(lost),
         )  # fmt: skip
     if not beside:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from gtsam import Pose3, Rot3
 from scipy.sparse import coo_array
 
-from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Station, Survey, Treatment
 from adjust.observations.pairs import PairArrays
@@ -244,9 +244,8 @@ def check_determined(network: PoseNetwork, used: BoolArray | None = None) -> Non
         if lost:
             ids = tuple(network.station_ids[i] for i in lost)
             what = "the position of " if poses_only else ""
-            more = f" and {len(ids) - _FEW} more" if len(ids) > _FEW else ""
             raise IndeterminateError(
-                f"no measured pair ties {what}{', '.join(ids[:_FEW])}{more} to the datum; measure a pair to the rest, "
+                f"no measured pair ties {what}{listed(ids, _FEW)} to the datum; measure a pair to the rest, "
                 "hold a station of that part, or leave it out", ids,
             )  # fmt: skip
 

@@ -50,7 +50,7 @@ class Minimum:
         batch, values = self.graph.pairs, self.solved.values
         if batch is None:
             raise ValueError("a network has pairs")
-        omega = 2.0 * float(self.graph.others_graph.error(values))
+        omega = self.graph.omega(values)
         between_held = np.flatnonzero(batch.arrays.used & batch.both_held)
         if len(between_held):  # these have no factor
             white = batch.arrays.whitening[between_held] @ batch.jacobians(values)[0][between_held, :, None]

@@ -7,7 +7,7 @@ Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, ch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
@@ -25,7 +25,8 @@ from adjust.model.result import (
     ParameterName,
     ReadingResiduals,
 )
-from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.model.survey import FloatArray, IntArray
+from adjust.native.point_tests import AdjustedPoints, residual_tests
 from adjust.observations.images.batch import whitened_squares
 from adjust.observations.images.bundle_hidden import BundleHidden
 from adjust.observations.listed import ObservationFactor
@@ -35,9 +36,6 @@ from adjust.testing.distributions import chi2
 
 if TYPE_CHECKING:
     from adjust.observations.pairs import PairStatistics
-
-_AT_A_TIME = 8192
-"""Image points tested together: what is computed on the way stays in the second cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +62,11 @@ class Precision:
         dims = {key: unknown.dim for key, unknown in graph.unknowns.by_key.items()}
         self.tree = TreeCovariance(solved.tree, dims, solved.leaves)
         self.hidden: dict[int, FloatArray] = {}
-        self.bundle_influence = np.zeros((0, 3))
-        self._hidden = None if graph.bundle is None else BundleHidden(graph.bundle)
-        if self._hidden is not None:
-            self._add_hidden(self._hidden)
+        self.bundle_influence: list[FloatArray] = []
+        """Whitened A Q A' (K, 3) of the image points of every bundle, in its sorted order."""
+        self._hidden = [BundleHidden(bundle) for bundle in graph.bundles]
+        for hidden in self._hidden:
+            self._add_hidden(hidden)
         self.by_conditions: Mapping[str, FloatArray] = {}
         """Covariances (k, k) of adjusted pairs by id, where they are from the conditions of their loops."""
         self.transformation: STransformation | None = None
@@ -77,7 +76,7 @@ class Precision:
 
     def products(self, rows: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
         """Covariance, as solved, times the transpose of ``rows`` (k, dim per key): (dim, k) for every unknown."""
-        tree, below = self.tree, self._hidden
+        tree = self.tree
         k = next(iter(rows.values())).shape[0]
         right = np.zeros((tree.n, k))
         hidden = {}
@@ -86,12 +85,12 @@ class Precision:
                 hidden[key] = row.T
             else:
                 right[tree.rows([key])] += row.T
-        if below is not None:
+        for below in self._hidden if hidden else ():
             right[tree.rows(below.batch.interface)] += below.transposed(hidden, k)
         product = tree.times(right)
         at = tree.places()
         out = {key: product[place] for key, place in at.items()}
-        if below is not None:
+        for below in self._hidden:
             out |= below.products(product[tree.rows(below.batch.interface)], hidden)
         return out
 
@@ -107,8 +106,8 @@ class Precision:
 
     def _add_hidden(self, hidden: BundleHidden) -> None:
         bundle = hidden.batch
-        Q, points, self.bundle_influence = hidden.covariances(self.tree.joint(bundle.interface), self.solved.values)
-        self.bundle_order_cov = Q
+        Q, points, influence = hidden.covariances(self.tree.joint(bundle.interface))
+        self.bundle_influence.append(influence)
         for key in bundle.hidden_poses:
             at = bundle.key_at[key]
             self.hidden[key] = Q[at : at + 6, at : at + 6]
@@ -133,19 +132,19 @@ class Precision:
         Raises KeyError for a name that is not an unknown.
         """
         keys = [self.graph.unknowns.by_name[name].key for name in names]
-        hidden = [k for k in keys if k in self.hidden]
-        if not hidden or self._hidden is None:
+        below = [(b, hidden) for b in self._hidden if (hidden := [k for k in keys if b.hides(k)])]
+        if not below:
             return self._in_datum(keys, self.tree.joint(keys))
-        bundle = self._hidden.batch
         seen = [k for k in keys if k not in self.hidden]
-        outer = list(dict.fromkeys(bundle.interface + seen))
+        outer = list(dict.fromkeys([k for b, _ in below for k in b.batch.interface] + seen))
         Q, at = self.tree.joint(outer), stacking(self.graph, outer)
-        M, own = self._hidden.from_interface(hidden)
-        interface, mine = at.index(bundle.interface), stacking(self.graph, hidden)
         L = np.zeros((sum(self.tree.dims[k] for k in keys), at.n))
         scatter, place = np.zeros((len(L), len(L))), stacking(self.graph, keys)
-        L[np.ix_(place.index(hidden), interface)] = M[mine.index(hidden)]
-        scatter[np.ix_(place.index(hidden), place.index(hidden))] = own
+        for b, hidden in below:
+            M, own = b.from_interface(hidden)
+            mine = place.index(hidden)
+            L[np.ix_(mine, at.index(b.batch.interface))] = M
+            scatter[np.ix_(mine, mine)] = own
         if seen:
             L[place.index(seen), at.index(seen)] = 1.0
         return self._in_datum(keys, L @ Q @ L.T + scatter)
@@ -164,6 +163,19 @@ class Precision:
         return found
 
     @cached_property
+    def _images(self) -> tuple[FloatArray, FloatArray]:
+        graph = self.graph
+        v, M = graph.images.statistics(self.tree)
+        influence = zip(graph.bundles, self.bundle_influence, strict=True)
+        return (graph.joined(v, [b.unsorted(b.residuals_px()) for b in graph.bundles]),
+                graph.joined(M, [b.unsorted(of_b) for b, of_b in influence]))  # fmt: skip
+
+    @property
+    def image_points(self) -> AdjustedPoints:
+        """All image points, in the order of ``Survey.image_blocks``, with what their tests take."""
+        return AdjustedPoints(*self._images, self.graph.square_roots(), self.graph.used())
+
+    @cached_property
     def pairs(self) -> "PairStatistics":
         """Statistics of the pairs between fixed stations. Raises ValueError where there are none."""
         if self.graph.pairs is None:
@@ -178,8 +190,11 @@ class Precision:
         return [i for i in range(len(self.graph.others)) if i not in within]
 
     def covs(self, keys: IntArray, dim: int) -> FloatArray:
-        """Covariances (n, dim, dim) of many unknowns of the same dimension, none of them hidden."""
-        Q = self.tree.pairs(keys, np.full(len(keys), -1), dim)[:, :dim, :dim]
+        """Covariances (n, dim, dim) of many unknowns of the same dimension."""
+        Q = np.empty((len(keys), dim, dim))
+        below = np.array([k in self.hidden for k in keys.tolist()], dtype=np.bool_)
+        Q[below] = np.array([self.hidden[k] for k in keys[below].tolist()]).reshape(-1, dim, dim)
+        Q[~below] = self.tree.marginals(keys[~below], dim)
         t = self.transformation
         if t is not None:
             G, W = (np.array([of[k] for k in keys.tolist()]) for of in (t.motions, t.spread))
@@ -189,6 +204,13 @@ class Precision:
             if held := list(self.graph.unknowns.held.get(key, ())):
                 Q[i, held], Q[i, :, held] = 0.0, 0.0
         return Q
+
+    def every_cov(self) -> dict[int, FloatArray]:
+        """Covariance (dim, dim) of every unknown."""
+        of_dim: dict[int, list[int]] = {}
+        for key, unknown in self.graph.unknowns.by_key.items():
+            of_dim.setdefault(unknown.dim, []).append(key)
+        return {k: Q for dim, keys in of_dim.items() for k, Q in zip(keys, self.covs(np.array(keys), dim), strict=True)}
 
     def pair_covariances(self) -> dict[str, FloatArray]:
         """Covariances (k, k) of the adjusted pairs by id, a priori, in the tangent in frame a."""
@@ -231,64 +253,9 @@ def noise_of(item: ObservationFactor) -> gtsam.noiseModel.Gaussian:
 
 def image_residuals(precision: Precision) -> ImageResiduals:
     """Residuals and their statistics of all image points, in the order of ``Survey.image_blocks``."""
-    graph = precision.graph
-    images, bundle = graph.images, graph.bundle
-    residual, influence = images.statistics(precision.tree)
-    parts = [_test(residual, influence, images.W_all, images.used)]
-    if bundle is not None:
-        stats = _test(bundle.residuals_px(), precision.bundle_influence, bundle.W_all, bundle.used)
-        back = np.empty(len(bundle.sorted), dtype=np.int64)
-        back[bundle.sorted] = np.arange(len(back))
-        parts.append(tuple(a[back] for a in stats))
-    return _merge(graph, parts)
-
-
-def _test(v: FloatArray, M: FloatArray, W: FloatArray, used: BoolArray) -> tuple[Any, ...]:
-    n = len(v)
-    redundancy, standardized, test = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for start in range(0, n, _AT_A_TIME):
-            part = slice(start, start + _AT_A_TIME)
-            _fill_test(v[part], M[part], W[part], used[part], redundancy[part], standardized[part], test[part])
-    return v, redundancy, standardized, test, used
-
-
-def _fill_test(
-    v: FloatArray, M: FloatArray, W: FloatArray, used: BoolArray, redundancy: FloatArray, standardized: FloatArray,
-    test: FloatArray,
-) -> None:  # fmt: skip
-    sign = np.where(used, -1.0, 1.0)
-    (v0, v1), (m00, m01, m11), (w00, w01, w11) = v.T, M.T, W.T
-    q00, q01, q11 = 1.0 + sign * m00, sign * m01, 1.0 + sign * m11
-    redundancy[:, 0], redundancy[:, 1] = q00, q11
-    redundancy[~used] = 0.0
-    e0, e1 = w00 * v0 + w01 * v1, w11 * v1
-    det = q00 * q11 - q01 * q01
-    test[:] = np.where(det > 1e-9, (q11 * e0 * e0 - 2 * q01 * e0 * e1 + q00 * e1 * e1) / det, np.nan)
-    # covariance of the residuals in pixels: W^-1 Q W^-T with W upper triangular
-    i00, i11 = 1.0 / w00, 1.0 / w11
-    i01 = -w01 * i00 * i11
-    su = np.sqrt(np.maximum(0.0, i00 * i00 * q00 + 2 * i00 * i01 * q01 + i01 * i01 * q11))
-    sv = np.sqrt(np.maximum(0.0, i11 * i11 * q11))
-    standardized[:, 0] = np.where(su > 1e-9 * i00, v0 / su, np.nan)
-    standardized[:, 1] = np.where(sv > 1e-9 * i11, v1 / sv, np.nan)
-
-
-def _merge(graph: AdjustmentGraph, parts: list[tuple[Any, ...]]) -> ImageResiduals:
-    if len(parts) == 1:
-        return ImageResiduals(graph.images.ptr, *(np.asarray(part) for part in parts[0]))
-    ptr = np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks])
-    n_points = int(ptr[-1])
-    out: list[Any] = [np.zeros((n_points, 2)) for _ in range(3)]
-    out += [np.zeros(n_points), np.zeros(n_points, dtype=np.bool_)]
-    at = [0, 0]
-    for i, (_, free) in enumerate(graph.image_order):
-        n = int(ptr[i + 1] - ptr[i])
-        source = slice(at[int(free)], at[int(free)] + n)
-        for a, part in zip(out, parts[int(free)], strict=True):
-            a[ptr[i] : ptr[i + 1]] = part[source]
-        at[int(free)] += n
-    return ImageResiduals(ptr, *out)
+    points = precision.image_points
+    ptr = np.cumsum([0] + [len(b.uv) for b in precision.graph.survey.image_blocks])
+    return ImageResiduals(ptr, points.v, *residual_tests(points), points.used)
 
 
 def other_residuals(precision: Precision) -> tuple[ObservationResidual, ...]:

@@ -42,13 +42,17 @@ def s_transformation(
     return STransformation(motions, spread, 0.5 * (core + core.T))
 
 
-def transformation_matrix(motions: FloatArray, weights: FloatArray | None = None) -> FloatArray:
-    """``S = I - G (G'EG)^-1 G'E`` (n, n) of motions G (n, k) to the datum of weights E (n,), all the same if not given.
+def transformed(
+    d: FloatArray, Q: FloatArray, motions: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """``S d`` and ``S Q S'`` with ``S = I - G (G'EG)^-1 G'E``, from motions G (n, k) to the datum of weights E (n,).
 
     Raises numpy's LinAlgError where the weighted components do not carry the motions.
     """
-    EG = motions if weights is None else weights[:, None] * motions
-    return np.asarray(np.eye(len(motions)) - motions @ np.linalg.solve(motions.T @ EG, EG.T))
+    EG = weights[:, None] * motions
+    B = np.linalg.solve(motions.T @ EG, EG.T)
+    half = Q - motions @ (B @ Q)
+    return d - motions @ (B @ d), half - (half @ B.T) @ motions.T
 
 
 def without_datum_rows(

@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.elimination import PoseTree
 from adjust.native.trees import TreeArrays, covariance_rows, fill_block, invert_cliques, joint_blocks, solve_cliques
 from adjust.observations.images.reduction import Leaves
 
@@ -19,8 +20,32 @@ from adjust.observations.images.reduction import Leaves
 class TreeCovariance:
     """Marginal and joint covariances. ``dims`` gives the dimension of every key; keys are also counted 0, 1, ..."""
 
-    def __init__(self, tree: gtsam.GaussianBayesTree, dims: Mapping[int, int], leaves: Leaves | None = None) -> None:
+    def __init__(
+        self, tree: gtsam.GaussianBayesTree | PoseTree, dims: Mapping[int, int], leaves: Leaves | None = None
+    ) -> None:
         self.dims = dims
+        if isinstance(tree, PoseTree):
+            self._take(tree)
+        else:
+            self._flatten(tree, leaves)
+        self._first = np.concatenate([[0], np.cumsum(self._dims)]).astype(np.int64)
+        if invert_cliques(self._front, self._width, self._at, self._data) >= 0:
+            raise ZeroDivisionError("the Bayes tree is singular")
+        self.arrays = TreeArrays(self._home, self._key_ptr, self._keys, self._dims, self._front, self._width, self._at,
+                                 np.empty_like(self._data))  # fmt: skip
+        """What the compiled look-up of two keys' covariance needs."""
+        covariance_rows(self.arrays, self._n_front, self._data)
+
+    def _take(self, tree: PoseTree) -> None:
+        pattern = tree.pattern
+        self.number = {key: i for i, key in enumerate(tree.keys.tolist())}
+        self._dims = np.full(len(tree.keys), 6)
+        self._keys, self._key_ptr, self._n_front = pattern.keys, pattern.key_ptr, pattern.n_front
+        self._front, self._width, self._at = pattern.front, pattern.width, pattern.at[:-1]
+        self._parents, self._home, self._data = pattern.parents, pattern.home, tree.data.copy()
+
+    def _flatten(self, tree: gtsam.GaussianBayesTree, leaves: Leaves | None) -> None:
+        dims = self.dims
         blocks, clique_keys, fronts, parents = _collect(tree)
         front, width = ([b.shape[i] for b in blocks] for i in (0, 1))
         data = [b.ravel() for b in blocks]
@@ -36,7 +61,6 @@ class TreeCovariance:
         order = list(dict.fromkeys(k for keys in clique_keys for k in keys))
         self.number = {key: i for i, key in enumerate(order)}
         self._dims = np.array([dims[k] for k in order], dtype=np.int64)
-        self._first = np.concatenate([[0], np.cumsum(self._dims)]).astype(np.int64)
         self._keys = np.array([self.number[k] for keys in clique_keys for k in keys], dtype=np.int64)
         self._key_ptr = np.cumsum([0] + [len(keys) for keys in clique_keys]).astype(np.int64)
         self._front, self._width = np.array(front, dtype=np.int64), np.array(width, dtype=np.int64)
@@ -48,12 +72,6 @@ class TreeCovariance:
         for c in range(len(front)):
             start = self._key_ptr[c]
             self._home[self._keys[start : start + self._n_front[c]]] = c
-        if invert_cliques(self._front, self._width, self._at, self._data) >= 0:
-            raise ZeroDivisionError("the Bayes tree is singular")
-        self.arrays = TreeArrays(self._home, self._key_ptr, self._keys, self._dims, self._front, self._width, self._at,
-                                 np.empty_like(self._data))  # fmt: skip
-        """What the compiled look-up of two keys' covariance needs."""
-        covariance_rows(self.arrays, self._n_front, self._data)
 
     def _frontal_keys(self, fronts: list[int]) -> IntArray:
         """Number of frontal keys of every clique, from the number of its frontal rows."""
@@ -73,9 +91,13 @@ class TreeCovariance:
 
     def marginal(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
-        n = self.number[key]
-        along = np.arange(self._dims[n])
-        cov: FloatArray = self.arrays.cov[self._own[n] + self.arrays.width[self._home[n]] * along[:, None] + along]
+        return np.asarray(self.marginals(np.array([key]), int(self.dims[key]))[0])
+
+    def marginals(self, keys: IntArray, dim: int) -> FloatArray:
+        """Covariances (n, dim, dim) of unknowns of one dimension."""
+        n, along = np.array([self.number[k] for k in keys.tolist()], dtype=np.int64), np.arange(dim)
+        first, width = self._own[n], self._width[self._home[n]]
+        cov: FloatArray = self.arrays.cov[first[:, None, None] + width[:, None, None] * along[:, None] + along]
         return cov
 
     @cached_property

@@ -10,9 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
+from adjust.model.errors import listed
 from adjust.model.survey import IntArray
 from adjust.pose_network.cycles import loop_labels
 from adjust.relay.network import Topology
+
+_NAMED = 12
 
 
 @dataclass(frozen=True)
@@ -57,16 +60,12 @@ class Counts:
             f"{self.conditions_per_unknown:.2f} per measured pair",
         ]
         if self.n_parts > 1:
-            lines += [f"part {i + 1}: {_named(part)}" for i, part in enumerate(self.parts[:10])]
+            lines += [f"part {i + 1}: {listed(part, _NAMED)}" for i, part in enumerate(self.parts[:10])]
             lines += [f"and {self.n_parts - 10} more parts"] if self.n_parts > 10 else []
         if self.uncontrolled_pairs:
-            lines.append(f"uncontrolled (close no loop): {_named(self.uncontrolled_pairs)}")
-        lines += [f"errors seen but not told apart: {_named(group)}" for group in self.inseparable_pairs[:10]]
+            lines.append(f"uncontrolled (close no loop): {listed(self.uncontrolled_pairs, _NAMED)}")
+        lines += [f"errors seen but not told apart: {listed(group, _NAMED)}" for group in self.inseparable_pairs[:10]]
         return "\n".join(lines)
-
-
-def _named(ids: tuple[str, ...], most: int = 12) -> str:
-    return ", ".join(ids[:most]) + (f" and {len(ids) - most} more" if len(ids) > most else "")
 
 
 def count(topology: Topology, loop_equations: int = 3) -> Counts:

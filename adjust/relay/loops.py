@@ -76,18 +76,21 @@ def loop_basis(topology: Topology, kind: LoopKind = "shortest", budget: int = SE
     in_tree[forest.by[forest.by >= 0]] = True
     chords = np.flatnonzero(~in_tree)
     first = topology.a_idx[chords]
-    tree = forest_loops(topology.a_idx, topology.b_idx, forest, chords)
-    if kind == "tree" or not len(chords):
-        return _basis(topology, tree, first, False, "loops of a spanning tree", chords)
-    if len(chords) > MAX_SHORTEST_LOOPS:
-        note = f"loops of a spanning tree: more than {MAX_SHORTEST_LOOPS} loops are too many for the shortest ones"
-        return _basis(topology, tree, first, False, note, chords)
+
+    def tree(kept: IntArray) -> list[list[int]]:  # these may be as long as the network is wide
+        return forest_loops(topology.a_idx, topology.b_idx, forest, kept)
+
+    many = len(chords) > MAX_SHORTEST_LOOPS
+    if kind == "tree" or not len(chords) or many:
+        too_many = f": more than {MAX_SHORTEST_LOOPS} loops are too many for the shortest ones"
+        note = too_many if many and kind != "tree" else ""
+        return _basis(topology, tree(chords), first, False, f"loops of a spanning tree{note}", chords)
     loops, start, led = shortest_loops(walk, chords, budget)
     if len(start) == len(chords):
         return _basis(topology, loops, start, True, "shortest independent loops")
-    kept = np.flatnonzero(~led).tolist()
+    kept = np.flatnonzero(~led)
     note = f"the {len(start)} shortest loops, and {len(kept)} of a spanning tree: the search used up its budget"
-    return _basis(topology, [*loops, *(tree[k] for k in kept)], [*start, *first[kept].tolist()], False, note)
+    return _basis(topology, [*loops, *tree(chords[kept])], [*start, *first[kept].tolist()], False, note)
 
 
 def _basis(

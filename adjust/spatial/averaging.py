@@ -5,7 +5,8 @@ import numpy as np
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.rigid import nearest_rotation, rigid
 
-_MEDOID_LIMIT = 150  # more candidates than this are thinned out for the quadratic search of the medoid
+_MEDOID_LIMIT = 75  # more candidates than this are thinned out for the quadratic search of the medoid
+_AT_ONCE = 1000  # means whose medoids are found together
 _SETTLED = 1e-4  # of the scale: a further step tells nothing that the motions do
 
 
@@ -20,43 +21,78 @@ def pose_distance(a: FloatArray, b: FloatArray, lever: float) -> FloatArray:
 def mean_pose(
     poses: FloatArray, lever: float, members: IntArray | None = None, iterations: int = 20
 ) -> tuple[FloatArray, FloatArray]:
-    """Robust mean (4, 4) of rigid motions (n, 4, 4), and the distance (n,) m of each from it.
-
-    The start is the medoid; then reweighted chordal means (Hartley et al., IJCV 103, 2013) with Geman-McClure weights
-    1 / (1 + (d / s)^2)^2, s three times the median distance. Nearly half of the motions may be wrong.
-    members: (n,) numbers; motions of equal number are alternatives of one observation, of which the nearest counts.
-    """
-    index = np.arange(len(poses)) if members is None else np.unique(members, return_inverse=True)[1]
-    mean = _medoid(poses, lever, index)
-    for _ in range(iterations):
-        distance = pose_distance(poses, mean, lever)
-        chosen = _nearest(distance, index)
-        scale = max(3.0 * float(np.median(distance[chosen])), 1e-12)
-        weights = np.zeros(len(poses))
-        weights[chosen] = 1.0 / (1.0 + (distance[chosen] / scale) ** 2) ** 2
-        r = nearest_rotation(poses[:, :3, :3], weights)
-        step = rigid(r, weights @ poses[:, :3, 3] / weights.sum())
-        moved, mean = float(pose_distance(step, mean, lever)), step
-        if moved < _SETTLED * scale:
-            break
+    """One mean (4, 4) as :func:`mean_poses` has it, and the distance (n,) m of each motion from it."""
+    order = np.arange(len(poses)) if members is None else np.argsort(members, kind="stable")
+    sorted_members = None if members is None else members[order]
+    mean = mean_poses(poses[order], lever, np.array([0, len(poses)]), sorted_members, iterations)[0]
     return mean, pose_distance(poses, mean, lever)
 
 
-def _nearest(distance: FloatArray, index: IntArray) -> IntArray:
-    """Position of the nearest alternative of each observation."""
-    order = np.lexsort((distance, index))
-    first = np.concatenate([[True], np.diff(index[order]) > 0])
-    return np.asarray(order[first])
+def mean_poses(
+    poses: FloatArray, lever: float, ptr: IntArray, members: IntArray | None = None, iterations: int = 20
+) -> FloatArray:
+    """Robust means (k, 4, 4) of rigid motions (n, 4, 4), those of each mean one after the other by ptr (k + 1,).
+
+    The start is the medoid; then reweighted chordal means (Hartley et al., IJCV 103, 2013) with Geman-McClure weights
+    1 / (1 + (d / s)^2)^2, s three times the median distance. Nearly half of the motions may be wrong.
+    members: (n,) numbers in order; neighbours of equal number are alternatives of one observation, the nearest counts.
+    """
+    owner, new = np.repeat(np.arange(len(ptr) - 1), np.diff(ptr)), np.ones(len(poses), dtype=np.bool_)
+    if members is not None:
+        new[1:] = (np.diff(members) != 0) | (np.diff(owner) != 0)
+    member = np.cumsum(new) - 1
+    mean = np.concatenate([
+        poses[_medoids(poses, lever, part, member)]
+        for part in np.split(np.column_stack([ptr[:-1], ptr[1:]]), range(_AT_ONCE, len(ptr) - 1, _AT_ONCE))
+    ])  # fmt: skip
+    live = np.arange(len(mean))
+    for _ in range(iterations):
+        rows = np.isin(owner, live) if len(live) < len(mean) else np.ones(len(owner), dtype=np.bool_)
+        of, here = np.searchsorted(live, owner[rows]), poses[rows]
+        distance = pose_distance(here, mean[live[of]], lever)
+        chosen = least(distance, member[rows])
+        first = np.searchsorted(of[chosen], np.arange(len(live)))
+        scale = np.maximum(3.0 * medians(distance[chosen], of[chosen], len(live)), 1e-12)
+        weights = 1.0 / (1.0 + (distance[chosen] / scale[of[chosen]]) ** 2) ** 2
+        total = np.add.reduceat(weights[:, None, None] * here[chosen, :3], first)
+        step = rigid(nearest_rotation(total[..., :3]), total[..., 3] / np.add.reduceat(weights, first)[:, None])
+        going = pose_distance(step, mean[live], lever) >= _SETTLED * scale
+        mean[live] = step
+        live = live[going]
+        if not len(live):
+            break
+    return mean
 
 
-def _medoid(poses: FloatArray, lever: float, index: IntArray) -> FloatArray:
-    """The motion with the least sum of distances to the nearest alternatives of all observations."""
-    step = max(1, -(-len(poses) // _MEDOID_LIMIT))
-    trial = poses[::step]
-    keep = np.isin(index, index[::step])
-    others, groups = poses[keep], np.unique(index[keep], return_inverse=True)[1]
-    d = pose_distance(trial[:, None], others[None], lever)
-    best = np.full((len(trial), int(groups.max()) + 1), np.inf)
-    for column, group in enumerate(groups):
-        best[:, group] = np.minimum(best[:, group], d[:, column])
-    return np.asarray(trial[int(np.argmin(best.sum(axis=1)))])
+def least(values: FloatArray, owner: IntArray) -> IntArray:
+    """Position of the least of the values (n,) of each owner (n,), in the order of the owners' numbers."""
+    order = np.lexsort((values, owner))
+    return np.asarray(order[np.flatnonzero(np.diff(owner[order], prepend=-1))])
+
+
+def medians(values: FloatArray, owner: IntArray, k: int) -> FloatArray:
+    """Of the values (n,) of each of k owners (n,); of one without any the number means nothing."""
+    ordered, size = np.append(values[np.lexsort((values, owner))], 0.0), np.bincount(owner, minlength=k)
+    first = np.cumsum(size) - size
+    return np.asarray(0.5 * (ordered[first + (size - 1) // 2] + ordered[first + size // 2]))
+
+
+def _medoids(poses: FloatArray, lever: float, spans: IntArray, member: IntArray) -> IntArray:
+    """Of each span (k, 2) of motions that with the least sum of distances to the nearest ones of all members."""
+    low, size = spans[0, 0], spans[:, 1] - spans[:, 0]
+    owner, step = np.repeat(np.arange(len(spans)), size), np.maximum(1, -(-size // _MEDOID_LIMIT))
+    place = np.arange(len(owner)) - (spans[:, 0] - low)[owner]
+    trial = np.flatnonzero(place % step[owner] == 0)
+    own = member[low : spans[-1, 1]]
+    kept = np.flatnonzero(np.isin(own, own[trial]))
+    counts = np.bincount(owner[kept], minlength=len(spans))
+    begin = np.cumsum(counts) - counts
+    n = counts[owner[trial]]
+    first = np.cumsum(n) - n
+    other = kept[np.repeat(begin[owner[trial]] - first, n) + np.arange(n.sum())]
+    d = pose_distance(poses[low + np.repeat(trial, n)], poses[low + other], lever)
+    changes = np.diff(own[other], prepend=-1) != 0
+    changes[first] = True
+    runs = np.flatnonzero(changes)
+    sums = np.add.reduceat(np.minimum.reduceat(d, runs), np.searchsorted(runs, first))
+    return np.asarray(low + trial[least(sums, owner[trial])])

@@ -4,7 +4,6 @@ Closed forms, how knowledge spreads from frame to frame, readings by themselves,
 What is solved to the end belongs to :mod:`adjust.adjustment`.
 """
 
-from adjust.start.result import Start
-from adjust.start.search import find_start, turns_of_views
+from adjust.start.search import Start, find_start, turns_of_views
 
 __all__ = ["Start", "find_start", "turns_of_views"]

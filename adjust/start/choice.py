@@ -7,7 +7,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.graph.assembly import StartValues, values_of
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.start.given import GivenStarts, given_starts, without_starts
@@ -120,10 +120,9 @@ def _turned_away(given: GivenStarts, result: Adjustment) -> bool:
 def _said(given: GivenStarts, what: str, error: SurveyError | None) -> str:
     names = list(given.points) if "points" in what else []
     names += [" ".join(n) for n in given.poses] if "poses" in what else []
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     why = f": {str(error).splitlines()[0]}" if error is not None else ""
     return (
-        f"start values: those given for {what} ({', '.join(names[:_SHOWN])}{more}) lead to no solution that fits{why}; "
+        f"start values: those given for {what} ({listed(names, _SHOWN)}) lead to no solution that fits{why}; "
         "they were found anew from the observations: check what was given"
     )
 
@@ -171,5 +170,4 @@ def _with_far(result: Adjustment, found: Apart) -> Adjustment:
 
 def _some(found: Apart) -> str:
     order = [int(i) for i in np.argsort(-found.distances) if found.far[i]]
-    more = f" and {len(order) - _SHOWN} more" if len(order) > _SHOWN else ""
-    return ", ".join(f"{found.ids[i]} ({found.distances[i]:.4g} m)" for i in order[:_SHOWN]) + more
+    return listed([f"{found.ids[i]} ({found.distances[i]:.4g} m)" for i in order], _SHOWN)

@@ -1,6 +1,6 @@
 """What no observation can tell: where a frame lies that only unknown poses reach. One is set, the rest follow."""
 
-from dataclasses import dataclass
+from typing import TypeVar
 
 from adjust.model.result import ParameterName
 from adjust.model.survey import Survey
@@ -10,28 +10,30 @@ Node = tuple[str, ...]
 End = tuple[int, bool]  # a slot and its side: False the frame on the left of its name, True the one on the right
 _BOUND: End = (-1, False)
 _POINTS: End = (-2, False)
+_T = TypeVar("_T")
 
 
-@dataclass(eq=False)
 class _Classes:
     """Union-find over slot ends that a chain joins, with the known slots it passes in between."""
 
-    parent: dict[End, End]
-    between: dict[End, set[int]]
-
-    def find(self, end: End) -> End:
-        self.parent.setdefault(end, end)
-        while self.parent[end] != end:
-            self.parent[end] = self.parent[self.parent[end]]
-            end = self.parent[end]
-        return end
+    def __init__(self) -> None:
+        self.parent: dict[End, End] = {}
+        self.between: dict[End, set[int]] = {}
 
     def join(self, a: End, b: End, known: list[int]) -> None:
-        a, b = self.find(a), self.find(b)
-        if a != b:
-            self.parent[max(a, b)] = min(a, b)
-            self.between.setdefault(min(a, b), set()).update(self.between.pop(max(a, b), set()))
-        self.between.setdefault(min(a, b), set()).update(known)
+        a, b = sorted((found(self.parent, a), found(self.parent, b)))
+        self.parent[b] = a
+        passed = self.between.pop(b, set())
+        self.between.setdefault(a, set()).update(passed, known)
+
+
+def found(parent: dict[_T, _T], member: _T) -> _T:
+    """The member that stands for the class of another, which is its own where it is new."""
+    root = parent.setdefault(member, member)
+    while parent[root] != root:
+        root = parent[root]
+    parent[member] = root
+    return root
 
 
 def fix_one_gauge(network: FrameNetwork, observations: list[ChainObservation]) -> int | None:
@@ -41,12 +43,12 @@ def fix_one_gauge(network: FrameNetwork, observations: list[ChainObservation]) -
     start may choose it. Ends of unknown poses between which chains pass by known poses belong to one such frame, unless
     an observation ends there, or the known poses between form a ring (as a turning table does): then it is observable.
     """
-    classes = _Classes({}, {})
+    classes = _Classes()
     for observation in observations:
         _join_chain(classes, network, observation)
     members: dict[End, set[End]] = {}
     for end in list(classes.parent):
-        members.setdefault(classes.find(end), set()).add(end)
+        members.setdefault(found(classes.parent, end), set()).add(end)
     free = []
     for root, ends in members.items():
         slots = sorted({slot for slot, _ in ends if slot >= 0})
@@ -56,8 +58,8 @@ def fix_one_gauge(network: FrameNetwork, observations: list[ChainObservation]) -
     if not free:
         return None
     slot = min(free)[1]
-    value = partial_pose(network.unknowns.parameters.get(network.names[slot]))
-    network.known[slot] = IDENTITY if value is None else value
+    value = partial_pose(network.parameters.get(network.names[slot]))
+    network.set(slot, IDENTITY if value is None else value)
     network.gauged.append(slot)
     return slot
 
@@ -81,15 +83,8 @@ def _join_chain(classes: _Classes, network: FrameNetwork, observation: ChainObse
 
 def _has_ring(network: FrameNetwork, slots: set[int]) -> bool:
     parent: dict[Node, Node] = {}
-
-    def find(node: Node) -> Node:
-        parent.setdefault(node, node)
-        while parent[node] != node:
-            node = parent[node]
-        return node
-
     for slot in sorted(slots):
-        left, right = (find(node) for node in frames_of(network, network.names[slot]))
+        left, right = (found(parent, node) for node in frames_of(network, network.names[slot]))
         if left == right:
             return True
         parent[left] = right
@@ -117,7 +112,7 @@ def frames_of(network: FrameNetwork, name: ParameterName) -> tuple[Node, Node]:
 def _rank(network: FrameNetwork, slot: int) -> int:
     """What is set first: a pose with some prior, a fixed target in the world, the mount, a fixed station, a camera."""
     name = network.names[slot]
-    if partial_pose(network.unknowns.parameters.get(name)) is not None:
+    if partial_pose(network.parameters.get(name)) is not None:
         return 0
     if name[0] == "carrier_from_target" and network.frames.targets[name[1]].station_id is None and len(name) == 2:
         return 1
@@ -127,6 +122,6 @@ def _rank(network: FrameNetwork, slot: int) -> int:
 
 def world_is_free(network: FrameNetwork, survey: Survey) -> bool:
     """Whether nothing given holds the world, so that it may still be moved as a whole."""
-    touching = [s for s, name in network.names.items() if ("world",) in frames_of(network, name)]
-    held = any(s in network.fixed for s in touching)
+    touching = [s for s, name in enumerate(network.names) if ("world",) in frames_of(network, name)]
+    held = bool(network.fixed[touching].any())
     return not held and not any(p.x_in_world.value is not None for p in survey.points)

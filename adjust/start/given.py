@@ -1,6 +1,6 @@
 """Start values that came with a survey: which there are, the survey without them, and a start moved onto them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -10,8 +10,7 @@ from gtsam import Pose3
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Station, Survey, Target
 from adjust.spatial.rigid import align
-from adjust.start.network import as_pose3, given_pose
-from adjust.start.result import Start
+from adjust.start.search import Start
 
 _P = TypeVar("_P", PoseParameter, PointParameter)
 _IN_WORLD = ("world_from_station", "world_from_table")
@@ -50,12 +49,6 @@ def _pose_parameters(survey: Survey) -> dict[ParameterName, PoseParameter]:
     return out
 
 
-def given_poses(survey: Survey) -> dict[ParameterName, Pose3]:
-    """All poses that have a value, held ones too (at identity where they have none), but open priors."""
-    out = {name: given_pose(parameter) for name, parameter in _pose_parameters(survey).items()}
-    return {name: as_pose3(matrix) for name, matrix in out.items() if matrix is not None}
-
-
 def without_starts(survey: Survey, points: bool, poses: bool) -> Survey:
     """The survey without the start values of its free points, of its free poses, or of both."""
     if points:
@@ -68,25 +61,12 @@ def _bare(parameter: _P) -> _P:
     return replace(parameter, value=None) if _is_start(parameter) else parameter
 
 
-def with_poses(survey: Survey, poses: Mapping[ParameterName, Pose3]) -> Survey:
-    """The survey with these poses as start values where it has none."""
-
-    def valued(name: ParameterName, parameter: PoseParameter) -> PoseParameter:
-        return replace(parameter, value=poses[name]) if parameter.value is None and name in poses else parameter
-
-    return _rewritten(survey, valued, [name for name in poses if len(name) == 3])
-
-
-def _rewritten(
-    survey: Survey, new: Callable[[ParameterName, PoseParameter], PoseParameter],
-    in_epochs: Sequence[ParameterName] = (),
-) -> Survey:  # fmt: skip
-    """The survey with ``new(name, parameter)`` for every pose, and for those in epochs that it did not list."""
+def _rewritten(survey: Survey, new: Callable[[ParameterName, PoseParameter], PoseParameter]) -> Survey:
+    """The survey with ``new(name, parameter)`` for every pose."""
 
     def moved(owner: Station | Target, kind: str, owner_id: str) -> dict[str, Any]:
         pose = getattr(owner, kind)
-        listed = dict.fromkeys(n[2] for n in in_epochs if n[:2] == (kind, owner_id))
-        epochs = {e: new((kind, owner_id, e), owner.epochs.get(e, pose)) for e in {**owner.epochs, **listed}}
+        epochs = {e: new((kind, owner_id, e), parameter) for e, parameter in owner.epochs.items()}
         return {kind: new((kind, owner_id), pose), "epochs": epochs}
 
     return replace(

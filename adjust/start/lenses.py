@@ -20,11 +20,11 @@ from adjust.native.lenses import fit_lens
 from adjust.native.views import homographies
 from adjust.start.closed_forms.absolute_pose import best_poses
 from adjust.start.closed_forms.zhang import pinhole_from_homographies
-from adjust.start.views import rays_of_images
+from adjust.start.views import ends_of, rays_of_images
 
 _MOST_IMAGES = 30
 _SCAN_IMAGES = 8
-_MOST_SCREENED = 120
+_MOST_SCREENED = 60
 _GOOD_START = 0.01  # of the image width: with less error a closed form needs no scan beside it
 _LEVELS = ("focal centre k1 k2", "focal centre k1", "focal k1", "focal")
 _SIMPLE_PX = 2.0
@@ -137,8 +137,7 @@ class _LensSearch:
 
     def _screen(self, flat: Sequence[Sighting]) -> tuple[dict[int, FloatArray | None], dict[int, str]]:
         """Images that fit a plane, with their homographies where determined; a wrong point order misses by far."""
-        counts = [len(s.x) for s in flat]
-        ptr, uv = np.cumsum([0, *counts]), np.concatenate([s.uv for s in flat])
+        ptr, uv = ends_of([len(s.x) for s in flat]), np.concatenate([s.uv for s in flat])
         h, misses, found = homographies(np.concatenate([self._plane[id(s.x)] for s in flat]), uv, ptr, 1)
         span = np.maximum.reduceat(uv, ptr[:-1]) - np.minimum.reduceat(uv, ptr[:-1])
         misfit = misses[:, 1] / np.maximum(np.hypot(*span.T), 1e-9)
@@ -153,6 +152,8 @@ class _LensSearch:
 
     def _focal_length(self, maps: Sequence[FloatArray], chosen: Sequence[Sighting]) -> tuple[FloatArray, str]:
         trials: list[tuple[FloatArray, str]] = []
+        errors: list[float] = []
+        trial_images = _every(chosen, _SCAN_IMAGES)
         for variants in (("full",), ("centred", "square")) if maps and self.model.name != "fisheye" else ():
             try:
                 found = pinhole_from_homographies(np.array(maps), self.size, variants)
@@ -160,8 +161,7 @@ class _LensSearch:
                 continue
             centre = found.values[2:] if found.variant == "full" else None
             trials.append((self._values(found.values[0], found.values[1], centre), f"Zhang, {found.variant}"))
-        trial_images = _every(chosen, _SCAN_IMAGES)
-        errors = [self._error_px(values, trial_images) for values, _ in trials]
+            errors.append(self._error_px(trials[-1][0], trial_images))
         if errors and min(errors) < _GOOD_START * max(self.size):
             return trials[int(np.argmin(errors))]
         low, high = (0.15, 2.0) if self.model.name == "fisheye" else (0.35, 8.0)
@@ -202,8 +202,10 @@ class _LensSearch:
         rays = rays_of_images(self.camera, values, [s.uv for s in images])
         some = [i for i, r in enumerate(rays) if not isinstance(r, SurveyError)]
         poses, errors = np.tile(np.eye(4), (len(images), 1, 1)), np.full(len(images), np.inf)
-        found = best_poses([images[i].x for i in some], [np.asarray(rays[i]) for i in some], refinements)
-        poses[some], errors[some] = found
+        if some:
+            seen, x = (np.concatenate([part[i] for i in some]) for part in (rays, [s.x for s in images]))
+            ptr = ends_of([len(images[i].x) for i in some])
+            poses[some], errors[some] = best_poses(x, seen, ptr, refinements)
         return poses, errors
 
     def _refine(self, start: FloatArray, how: str, chosen: Sequence[Sighting], excluded: dict[int, str]) -> LensStart:

@@ -1,12 +1,11 @@
 """Two unknown poses at once, from the known motion between them: the hand-eye and robot-world problems."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array
 
 from adjust.model.errors import SurveyError
-from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import inverse, rotation_log
@@ -46,16 +45,17 @@ def solve_motion(network: FrameNetwork, degenerate: bool = True) -> str | None:
     in a row; with all turns about one axis (where ``degenerate`` ones will do) the smallest of the consistent solutions
     is taken, since a start need only be consistent.
     """
-    groups = _groups(network)
+    found = _rows_of_poses(network)
+    groups = _groups(found)
     for group in sorted(groups, key=lambda g: -g.spread()):
         try:
             second, first, _ = solve_ax_zb(group.motions, group.products)
         except SurveyError:
             continue
-        _set(network, group.second, second)
-        _set(network, group.first, inverse(first))
+        network.set(group.second[0], second, group.second[1])
+        network.set(group.first[0], inverse(first), group.first[1])
         return f"{_text(network, group.first)} and {_text(network, group.second)} from {len(group.motions)} motions"
-    note = _shared(network, groups, False) or _together(network)
+    note = _shared(network, groups, False) or _together(network, found)
     return note or (_shared(network, groups, True) if degenerate else None)
 
 
@@ -73,7 +73,7 @@ def _shared(network: FrameNetwork, groups: list[_Group], minimum_norm: bool) -> 
             x, _ = solve_ax_xb(a, b, minimum_norm)
         except SurveyError:
             continue
-        _set(network, link, x)
+        network.set(link[0], x, link[1])
         how = "turns about one axis only: smallest consistent solution" if minimum_norm else f"{len(a)} motions"
         return f"{_text(network, link)} from {how}"
     return None
@@ -94,9 +94,9 @@ class _RowsOfPoses:
     products: list[FloatArray]
 
 
-def _together(network: FrameNetwork) -> str | None:
+def _together(network: FrameNetwork, every: _RowsOfPoses) -> str | None:
     """Everything on what moves and everything around it at once; a note, or None where that determines nothing."""
-    for found in _connected(_rows_of_poses(network)):
+    for found in _connected(every):
         first, inside = np.unique(found.first, return_inverse=True)
         second, outside = np.unique(found.second, return_inverse=True)
         alone = [(i, 0) for i in first if len(found.rows[i]) == 1]
@@ -106,7 +106,7 @@ def _together(network: FrameNetwork) -> str | None:
             continue
         for i, side in alone:
             pose = inverse(solved[0][list(first).index(i)]) if side == 0 else solved[1][list(second).index(i)]
-            _set(network, found.rows[i][0], pose)
+            network.set(found.rows[i][0][0], pose, found.rows[i][0][1])
         names = " and ".join(_text(network, found.rows[i][0]) for i, _ in alone)
         return f"{names} from {len(found.motions)} views of {len(second)} things by {len(first)} together"
     return None
@@ -134,22 +134,14 @@ def _solved_views(
 
 def _rows_of_poses(network: FrameNetwork) -> _RowsOfPoses:
     rows: dict[tuple[tuple[int, bool], ...], int] = {}
-    out = _RowsOfPoses([], [], [], np.zeros((0, 4, 4)), [])
-    motions = []
-    for observation in network.observations:
-        split = _split(network, observation)
-        if split is None:
-            continue
-        (a, b), (c, d) = split
-        chain = observation.chain
-        for side, (start, end) in ((out.first, (a, b)), (out.second, (c, d))):
-            row = tuple((link.slot, link.inverse) for link in chain[start:end])
-            side.append(rows.setdefault(row, len(rows)))
-        motions.append(network.product(chain[b:c]))
-        outer = inverse(network.product(chain[:a])), inverse(network.product(chain[d:]))
-        out.products.append(outer[0] @ observation.poses @ outer[1])
-    out.rows.extend(rows)
-    return replace(out, motions=np.array(motions).reshape(-1, 4, 4))
+    split = [(o, ends) for o in network.observations if (ends := _split(network, o)) is not None]
+    unknown = [tuple((k.slot, k.inverse) for k in o.chain[a:b]) for o, ends in split for a, b in ends]
+    numbers = [rows.setdefault(row, len(rows)) for row in unknown]
+    motions = network.products([o.chain[ends[0][1] : ends[1][0]] for o, ends in split])
+    before = inverse(network.products([o.chain[: ends[0][0]] for o, ends in split]))
+    after = inverse(network.products([o.chain[ends[1][1] :] for o, ends in split]))
+    products = [x @ o.poses @ y for (o, _), x, y in zip(split, before, after, strict=True)]
+    return _RowsOfPoses(list(rows), numbers[::2], numbers[1::2], motions, products)
 
 
 def _split(network: FrameNetwork, observation: ChainObservation) -> tuple[tuple[int, int], tuple[int, int]] | None:
@@ -182,33 +174,20 @@ def _connected(found: _RowsOfPoses) -> list[_RowsOfPoses]:
     return parts
 
 
-def _groups(network: FrameNetwork) -> list[_Group]:
-    found: dict[tuple[tuple[int, bool], tuple[int, bool]], list[tuple[FloatArray, FloatArray, bool]]] = {}
-    for observation in network.observations:
-        chain = observation.chain
-        missing = network.unknown_links(chain)
-        if len(missing) != 2 or observation.rotation_only:
-            continue
-        i, j = missing
-        motion = network.product(chain[i + 1 : j])
-        outer = inverse(network.product(chain[:i])), inverse(network.product(chain[j + 1 :]))
-        key = ((chain[i].slot, chain[i].inverse), (chain[j].slot, chain[j].inverse))
-        product = outer[0] @ observation.poses[0] @ outer[1]
-        found.setdefault(key, []).append((motion, product, len(observation.poses) == 1))
+def _groups(found: _RowsOfPoses) -> list[_Group]:
+    """Chains that lack the same two single poses, together."""
+    alike: dict[tuple[tuple[int, bool], tuple[int, bool]], list[int]] = {}
+    for i, (first, second) in enumerate(zip(found.first, found.second, strict=True)):
+        if len(found.rows[first]) == len(found.rows[second]) == 1:
+            alike.setdefault((found.rows[first][0], found.rows[second][0]), []).append(i)
     groups = []
-    for (first, second), rows in sorted(found.items()):
-        clear = [r for r in rows if r[2]]
+    for (a, b), mine in sorted(alike.items()):
+        clear = [i for i in mine if len(found.products[i]) == 1]
         # views with two near-equal poses only where the clear ones do not suffice
-        rows = clear if len(clear) >= max(4, len(rows) // 3) else rows
-        groups.append(_Group(first, second, np.array([r[0] for r in rows]), np.array([r[1] for r in rows])))
+        mine = clear if len(clear) >= max(4, len(mine) // 3) else mine
+        groups.append(_Group(a, b, found.motions[mine], np.array([found.products[i][0] for i in mine])))
     return groups
 
 
-def _set(network: FrameNetwork, link: tuple[int, bool], value: FloatArray) -> None:
-    slot, inverted = link
-    network.known[slot] = inverse(value) if inverted else value
-
-
 def _text(network: FrameNetwork, link: tuple[int, bool]) -> str:
-    name: ParameterName = network.names[link[0]]
-    return " ".join(name)
+    return " ".join(network.names[link[0]])

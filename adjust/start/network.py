@@ -6,16 +6,16 @@ between them (:mod:`adjust.start.motion`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.unknowns import Chain, FrameTree, Unknowns
+from adjust.frames.unknowns import Chain, FrameTree, Link
 from adjust.model.errors import SurveyError
-from adjust.model.result import ParameterName
-from adjust.model.survey import FloatArray, PoseParameter, Survey, Table
-from adjust.spatial.averaging import mean_pose, pose_distance
+from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Survey, Table
+from adjust.spatial.averaging import mean_poses, pose_distance
 from adjust.spatial.rigid import inverse, rigid, rotation_exp
 
 IDENTITY = np.eye(4)
@@ -23,174 +23,228 @@ _CONTRADICTION = np.deg2rad(10.0)
 """Two poses that differ by more, as an angle at the typical distance, have no mean."""
 
 
-@dataclass(frozen=True, eq=False)
-class ChainObservation:
+class ChainObservation(NamedTuple):
     """The chain's product is one of ``poses`` (k, 4, 4), likeliest first.
 
+    block_idx: the block of image points, -1 for others. rotation_only: the translation of the product is unknown.
     ends: whether the two ends of the chain are bound to what was seen (False: to points that are unknown themselves).
-    rotation_only: the translation of the product is unknown. block_idx: the block of image points, -1 for a pair.
     """
 
     chain: Chain
     poses: FloatArray
-    text: str
     block_idx: int = -1
     rotation_only: bool = False
     ends: tuple[bool, bool] = (True, True)
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """Chains padded to L links: slots (n, L), -1 behind the end, which of them (n, L) are inverted."""
+
+    slots: IntArray
+    inverted: BoolArray
+
+    @staticmethod
+    def of(chains: Sequence[Chain]) -> "Chains":
+        """Side by side."""
+        sizes = [len(chain) for chain in chains]
+        slots = np.full((len(chains), max(sizes, default=0)), -1, dtype=np.int64)
+        inverted = np.zeros(slots.shape, dtype=np.bool_)
+        inside = np.arange(slots.shape[1]) < np.array(sizes, dtype=np.int64)[:, None]
+        slots[inside] = [link.slot for chain in chains for link in chain]
+        inverted[inside] = [link.inverse for chain in chains for link in chain]
+        return Chains(slots, inverted)
+
+    def part(self, rows: IntArray) -> "Chains":
+        """Some (m,) of them."""
+        return Chains(self.slots[rows], self.inverted[rows])
+
+    def once(self, wanted: BoolArray) -> BoolArray:
+        """Where (n, L) they pass a slot that is ``wanted`` (slots,), but none of those that they pass twice."""
+        out = (self.slots >= 0) & wanted[self.slots]
+        for j in range(out.shape[1]):
+            out[:, j] &= (self.slots == self.slots[:, j : j + 1]).sum(axis=1) == 1
+        return out
+
+    def by_slot(self, where: BoolArray) -> tuple[IntArray, IntArray]:
+        """Rows and columns of the links ``where`` (n, L), sorted by slot."""
+        row, column = np.nonzero(where)
+        order = np.argsort(self.slots[row, column], kind="stable")
+        return row[order], column[order]
+
+
 class FrameNetwork:
     """Slots by number (see :class:`adjust.frames.unknowns.Unknowns`) with what is known of them; filled step by step.
 
-    known: values (4, 4). fixed: slots that were given. gauged: slots that were set freely. lever: m, typical distance
-    of target and camera, which weighs turns against shifts.
+    names: (n) by slot. pose: (n, 4, 4), of those that ``has`` (n,) says are known. fixed: (n,) those that were given.
+    gauged: slots that were set freely. lever: m, typical distance of target and camera, which weighs turns against
+    shifts.
     """
 
-    unknowns: Unknowns
-    frames: FrameTree
-    names: dict[int, ParameterName] = field(default_factory=dict)
-    known: dict[int, FloatArray] = field(default_factory=dict)
-    fixed: set[int] = field(default_factory=set)
-    gauged: list[int] = field(default_factory=list)
-    observations: list[ChainObservation] = field(default_factory=list)
-    lever: float = 1.0
-
-    def register(self, survey: Survey) -> None:
-        """Take over the slots made since the last call: given values, table motions."""
+    def __init__(self, frames: FrameTree, survey: Survey) -> None:
+        """Take over the slots made by now: given values, table motions."""
+        self.frames, self.parameters = frames, frames.unknowns.parameters
+        self.names = list(frames.unknowns.slot_of)
+        n = len(self.names)
+        self.pose, self.has = np.tile(IDENTITY, (n, 1, 1)), np.zeros(n, dtype=np.bool_)
+        self.observations: list[ChainObservation] = []
+        self.gauged: list[int] = []
+        self.lever = 1.0
         readings = {(r.table_id, r.epoch_id): r.angles for r in survey.table_readings}
         tables = {t.table_id: t for t in survey.tables}
-        for name, slot in self.unknowns.slot_of.items():
-            if slot in self.names:
-                continue
-            self.names[slot] = name
+        for slot, name in enumerate(self.names):
             if name[0] == "table_motion":
                 value: FloatArray | None = table_from_mount(tables[name[1]], readings[(name[1], name[2])])
             else:
-                value = given_pose(self.unknowns.parameters[name])
+                value = given_pose(self.parameters[name])
             if value is not None:
-                self.known[slot] = value
-                self.fixed.add(slot)
+                self.set(slot, value)
+        self.fixed = self.has.copy()
 
-    def link_pose(self, slot: int, inverted: bool) -> FloatArray:
-        """The known pose of a link."""
-        return inverse(self.known[slot]) if inverted else self.known[slot]
+    def set(self, slot: int, value: FloatArray, inverted: bool = False) -> None:
+        """Let a slot, or its inverse, be known."""
+        self.pose[slot], self.has[slot] = inverse(value) if inverted else value, True
+
+    def set_link(self, link: Link, value: FloatArray) -> None:
+        """Let the pose of a link be known."""
+        self.set(link.slot, value, link.inverse)
 
     def product(self, chain: Chain) -> FloatArray:
         """The product (4, 4) of a chain that is wholly known."""
-        pose = IDENTITY
-        for link in chain:
-            pose = pose @ self.link_pose(link.slot, link.inverse)
-        return pose
+        return np.asarray(self.products([chain])[0])
 
     def products(self, chains: Sequence[Chain]) -> FloatArray:
         """The products (n, 4, 4) of chains that are wholly known."""
-        forward = np.array([IDENTITY, *self.known.values()])
-        both = np.concatenate([forward, inverse(forward)])
-        place = {slot: i + 1 for i, slot in enumerate(self.known)}
-        longest = max((len(chain) for chain in chains), default=0)
-        rows = np.zeros((longest, len(chains)), dtype=np.int64)
-        for n, chain in enumerate(chains):
-            for i, link in enumerate(chain):
-                rows[i, n] = place[link.slot] + (len(forward) if link.inverse else 0)
-        out = np.tile(IDENTITY, (len(chains), 1, 1))
-        for row in rows:
-            out = out @ both[row]
+        padded = Chains.of(chains)
+        return self._products(padded, padded.slots >= 0)
+
+    def _products(self, chains: Chains, taken: BoolArray) -> FloatArray:
+        """Products (n, 4, 4) of those links that are ``taken`` (n, L)."""
+        out = np.tile(IDENTITY, (len(taken), 1, 1))
+        for column in range(taken.shape[1]):
+            rows = np.flatnonzero(taken[:, column])
+            step, turned = self.pose[chains.slots[rows, column]], chains.inverted[rows, column]
+            if turned.any():
+                step[turned] = inverse(step[turned])
+            out[rows] = out[rows] @ step
         return out
 
     def unknown_links(self, chain: Chain) -> list[int]:
         """Positions in the chain of the links that are unknown."""
-        return [i for i, link in enumerate(chain) if link.slot not in self.known]
+        return [i for i, link in enumerate(chain) if not self.has[link.slot]]
 
-    def isolate(self, items: Sequence[tuple[ChainObservation, int]]) -> list[FloatArray]:
-        """What observations say of the slot at a position of their chain, (k, 4, 4), all other links being known."""
-        before = inverse(self.products([o.chain[:i] for o, i in items]))
-        after = inverse(self.products([o.chain[i + 1 :] for o, i in items]))
-        counts = [len(o.poses) for o, _ in items]
-        poses = np.concatenate([o.poses for o, _ in items])
-        value = np.repeat(before, counts, axis=0) @ poses @ np.repeat(after, counts, axis=0)
-        turned = np.repeat([o.chain[i].inverse for o, i in items], counts)
+    def open_slots(self, chain: Chain) -> bool:
+        """Whether any link of the chain is unknown."""
+        return not all(self.has[link.slot] for link in chain)
+
+    def _isolate(
+        self, observations: Sequence[ChainObservation], chains: Chains, at: IntArray
+    ) -> tuple[FloatArray, IntArray]:
+        """What observations say of the slot at the position (n,) of their chain, all other links being known.
+
+        (m, 4, 4), and where those of each begin (n + 1,).
+        """
+        column = np.arange(chains.slots.shape[1])
+        inside = chains.slots >= 0
+        before = inverse(self._products(chains, inside & (column < at[:, None])))
+        after = inverse(self._products(chains, inside & (column > at[:, None])))
+        counts = [len(o.poses) for o in observations]
+        value = np.concatenate([o.poses for o in observations])
+        value = np.repeat(before, counts, axis=0) @ value @ np.repeat(after, counts, axis=0)
+        turned = np.repeat(chains.inverted[np.arange(len(at)), at], counts)
         value[turned] = inverse(value[turned])
-        return np.split(value, np.cumsum(counts)[:-1])
+        return value, np.concatenate([[0], np.cumsum(counts)])
 
     def propagate(self, rotation_only: bool = False) -> bool:
-        """Determine what is alone unknown in its chains, until nothing is; whether anything was found."""
-        if self.known.keys() >= self.names.keys():
+        """Determine what is alone unknown in its chains, until nothing is; whether anything was found.
+
+        What many observations determine goes first: it is the safer ground for the rest.
+        """
+        if self.has.all():
             return False
-        missing: list[set[int]] = []
-        using: dict[int, list[int]] = {}
-        waiting: dict[int, list[int]] = {}
-        for n, observation in enumerate(self.observations):
-            slots = [link.slot for link in observation.chain if link.slot not in self.known]
-            # a slot that a chain passes twice cannot be isolated
-            missing.append(set(slots) if len(set(slots)) == len(slots) else {-1})
-            for slot in missing[n]:
-                using.setdefault(slot, []).append(n)
-            self._queue(n, missing[n], waiting, rotation_only)
-        found = bool(waiting)
-        while waiting:
-            # what many observations determine goes first: it is the safer ground for the rest
-            most = max(len(w) for w in waiting.values())
-            ready = sorted(s for s, w in waiting.items() if 2 * len(w) >= most)
-            offers = self._offers([(n, slot) for slot in ready for n in waiting[slot]])
-            for slot in ready:
-                numbers = waiting.pop(slot)
-                offers |= self._offers([(n, slot) for n in numbers if n not in offers])  # from slots just found
-                items = [(self.observations[n], offers[n]) for n in numbers]
-                self.known[slot] = self._mean(items, rotation_only)
-                for n in using[slot]:
-                    missing[n].discard(slot)
-                    self._queue(n, missing[n], waiting, rotation_only)
+        observations = [o for o in self.observations if rotation_only or not o.rotation_only]
+        chains = Chains.of([o.chain for o in observations])
+        # a slot that a chain passes twice cannot be isolated
+        unknown = (chains.slots >= 0) & ~self.has[chains.slots]
+        unknown[(unknown & ~chains.once(~self.has)).any(axis=1)] = False
+        row, column = chains.by_slot(unknown)
+        first = np.searchsorted(chains.slots[row, column], np.arange(len(self.has) + 1))
+        left = unknown.sum(axis=1)
+        support = np.bincount(chains.slots[row, column][left[row] == 1], minlength=len(self.has))
+        found = False
+        while (most := int(support.max(initial=0))) > 0:
+            ready = np.flatnonzero(2 * support >= most)
+            using = _runs(first, ready)
+            # of two that one chain joins the second is better off after the first
+            both, times = np.unique(row[using], return_counts=True)
+            both = both[(times == 2) & (left[both] == 2)]
+            if len(both):
+                ready = np.setdiff1d(ready, np.where(unknown[both], chains.slots[both], -1).max(axis=1))
+                using = _runs(first, ready)
+            telling = using[left[row[using]] == 1]
+            self._determine(observations, chains.part(row[telling]), row[telling], column[telling])
+            unknown[row[using], column[using]] = False
+            np.subtract.at(left, row[using], 1)
+            support[ready] = 0
+            alone = np.unique(row[using])
+            alone = alone[left[alone] == 1]
+            np.add.at(support, chains.slots[alone, np.argmax(unknown[alone], axis=1)], 1)
+            found = True
         return found
 
-    def _offers(self, wanted: Sequence[tuple[int, int]]) -> dict[int, FloatArray]:
-        """What observations, by number, say of a slot of their chain."""
-        if not wanted:
-            return {}
-        items = [
-            (o, next(i for i, link in enumerate(o.chain) if link.slot == slot))
-            for o, slot in ((self.observations[n], slot) for n, slot in wanted)
-        ]
-        return dict(zip((n for n, _ in wanted), self.isolate(items), strict=True))
+    def _determine(
+        self, every: Sequence[ChainObservation], chains: Chains, rows: IntArray, at: IntArray
+    ) -> None:
+        """Set the slots at the positions (n,) of the chains of observations ``rows`` (n,), sorted by slot.
 
-    def _queue(self, n: int, missing: set[int], waiting: dict[int, list[int]], rotation_only: bool) -> None:
-        if len(missing) == 1 and -1 not in missing and self.observations[n].rotation_only <= rotation_only:
-            waiting.setdefault(next(iter(missing)), []).append(n)
-
-    def _mean(self, said: list[tuple[ChainObservation, FloatArray]], rotation_only: bool = False) -> FloatArray:
-        """Robust mean over all observations that isolate a slot; the likelier solution where just one does.
-
-        said: with each what it says of the slot (k, 4, 4).
+        To the robust mean over all observations that isolate a slot; the likelier solution where just one does, and of
+        two the alternatives in which they agree.
         """
-        if rotation_only:  # full poses say more than rotations
-            said = [s for s in said if not s[0].rotation_only] or said
-        # images before pairs: a whole image is wrong less often than the ends of a pair are exchanged
-        offers = [offer for _, offer in sorted(said, key=lambda s: s[0].block_idx < 0)]
-        if len(offers) == 1:
-            return np.asarray(offers[0][0])
-        if len(offers) == 2:  # the pair of solutions in which the two agree
-            d = pose_distance(offers[0][:, None], offers[1][None], self.lever)
-            i, j = np.unravel_index(int(np.argmin(d)), d.shape)
-            if d[i, j] > _CONTRADICTION * self.lever:  # a mean of right and wrong is wrong for certain
-                return np.asarray(offers[0][0])
-            return mean_pose(np.stack([offers[0][i], offers[1][j]]), self.lever)[0]
-        members = np.repeat(np.arange(len(offers)), [len(o) for o in offers])
-        return mean_pose(np.concatenate(offers), self.lever, members)[0]
+        observations = [every[i] for i in rows.tolist()]
+        value, begins = self._isolate(observations, chains, at)
+        slot, full = chains.slots[np.arange(len(at)), at], np.array([not o.rotation_only for o in observations])
+        # full poses say more than rotations; a whole image is wrong less often than the ends of a pair are exchanged
+        telling = full | ~np.isin(slot, slot[full])
+        image = np.array([o.block_idx >= 0 for o in observations])
+        order = np.lexsort((~image, slot))
+        order = order[telling[order]]
+        slots, first, count = np.unique(slot[order], return_index=True, return_counts=True)
+        self.pose[slots] = value[begins[order[first]]]
+        self.has[slots] = True
+        several = [(s, order[a : a + n].tolist()) for s, a, n in zip(slots, first, count, strict=True) if n > 1]
+        parts: list[FloatArray] = []
+        members: list[IntArray] = []
+        meant: list[int] = []
+        for s, mine in several:
+            offers = [value[begins[i] : begins[i + 1]] for i in mine]
+            if len(offers) == 2:
+                d = pose_distance(offers[0][:, None], offers[1][None], self.lever)
+                i, j = np.unravel_index(int(np.argmin(d)), d.shape)
+                if d[i, j] > _CONTRADICTION * self.lever:  # a mean of right and wrong is wrong for certain
+                    continue
+                offers = [offers[0][i : i + 1], offers[1][j : j + 1]]
+            meant.append(s)
+            parts.append(np.concatenate(offers))
+            members.append(np.repeat(np.arange(len(offers)), [len(o) for o in offers]))
+        if meant:
+            ptr = np.cumsum([0] + [len(part) for part in parts])
+            self.pose[meant] = mean_poses(np.concatenate(parts), self.lever, ptr, np.concatenate(members))
 
-    def relax(self, movable: set[int], rounds: int = 1) -> None:
+    def relax(self, movable: BoolArray) -> None:
         """Renew each movable slot as the mean over all observations that contain it once (Gauss-Seidel)."""
-        by_slot: dict[int, list[tuple[ChainObservation, int]]] = {}
-        for observation in self.observations:
-            if observation.rotation_only or self.unknown_links(observation.chain):
-                continue
-            slots = [link.slot for link in observation.chain]
-            for i, slot in enumerate(slots):
-                if slot in movable and slots.count(slot) == 1:
-                    by_slot.setdefault(slot, []).append((observation, i))
-        for _ in range(rounds):
-            for slot in sorted(by_slot):
-                offers = self.isolate(by_slot[slot])
-                self.known[slot] = self._mean([(o, x) for (o, _), x in zip(by_slot[slot], offers, strict=True)])
+        whole = [o for o in self.observations if not o.rotation_only and not self.open_slots(o.chain)]
+        chains = Chains.of([o.chain for o in whole])
+        row, column = chains.by_slot(chains.once(movable))
+        for mine in np.split(np.arange(len(row)), np.flatnonzero(np.diff(chains.slots[row, column])) + 1):
+            if len(mine):
+                self._determine(whole, chains.part(row[mine]), row[mine], column[mine])
+
+
+def _runs(first: IntArray, wanted: IntArray) -> IntArray:
+    """The numbers from ``first[i]`` up to ``first[i + 1]`` of all wanted i, one after the other."""
+    sizes = first[wanted + 1] - first[wanted]
+    ends = np.cumsum(sizes)
+    return np.asarray(np.repeat(first[wanted] - ends + sizes, sizes) + np.arange(ends[-1] if len(ends) else 0))
 
 
 def given_pose(parameter: PoseParameter) -> FloatArray | None:

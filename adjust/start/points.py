@@ -1,100 +1,25 @@
-"""World points and the cameras that see them: resection from known points and intersection from known cameras."""
+"""World points and the cameras that see them: resection from known points, intersection from known cameras.
+
+And a second camera from image points alone: relative orientation, with a length that is not yet known.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
-from adjust.frames.unknowns import Chain
-from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
-from adjust.spatial.rigid import inverse
-from adjust.start import views as single
+from adjust.model.survey import BoolArray, FloatArray
+from adjust.spatial.rigid import inverse, rigid
 from adjust.start.closed_forms.triangulation import intersect
 from adjust.start.network import ChainObservation, FrameNetwork
-from adjust.start.views import View, block_text, make_views, used_rows
+from adjust.start.positions import PointField, Sight
+from adjust.start.views import View, joined, make_views
 
 PARALLAX = (np.deg2rad(3.0), np.deg2rad(0.3), 0.0)
 """What an intersection needs, rad; the next only where nothing goes on with the first."""
 _TOGETHER = 4  # points that the cameras of a station must see together
-
-
-@dataclass(frozen=True, eq=False)
-class Sight:
-    """A block of world points: positions (n,) in the survey's points, rays (n, 3) in the camera, camera_from_world."""
-
-    block_idx: int
-    camera_id: str
-    text: str
-    rows: IntArray
-    rays: FloatArray
-    focal_px: float
-    chain: Chain
-
-
-@dataclass(eq=False)
-class PointField:
-    """The world's points, (n, 3) m: nan until known. ``given`` (n,): coordinates that came with the survey.
-
-    rough (n,): given ones that nothing but a start value tells. They stay unknown, and may be intersected, while there
-    is firmer ground to go on from (targets), until they are ``released``.
-    """
-
-    x: FloatArray
-    given: BoolArray
-    rough: BoolArray
-    sights: list[Sight] = field(default_factory=list)
-    released: bool = False
-
-    @property
-    def known(self) -> BoolArray:
-        """Which points (n,) have coordinates by now that may be used."""
-        known = np.isfinite(self.x[:, 0])
-        return np.asarray(known if self.released else known & ~self.rough)
-
-    def release(self) -> bool:
-        """Use the rough ones from now on; whether that is news."""
-        news = not self.released and bool(self.rough.any())
-        self.released = True
-        return news
-
-    def place(self, rows: BoolArray, x: FloatArray) -> None:
-        """Set coordinates that were found; they are no given ones any more."""
-        self.x[rows] = x[rows]
-        self.given[rows] = self.rough[rows] = False
-
-    def add(self, survey: Survey, block_idx: int, rays: FloatArray, focal_px: float, chain: Chain) -> None:
-        """Take in a block of world points."""
-        block = survey.image_blocks[block_idx]
-        used = used_rows(block)
-        rows = np.asarray(block.point_idx, dtype=np.int64)[used]
-        self.sights.append(Sight(block_idx, block.camera_id, block_text(block), rows, rays[used], focal_px, chain))
-
-    def seen(self) -> BoolArray:
-        """Which points (n,) any block sees."""
-        out = np.zeros(len(self.x), dtype=bool)
-        for sight in self.sights:
-            out[sight.rows] = True
-        return out
-
-
-def point_field(survey: Survey) -> PointField:
-    """The points of a survey, given or observed; those with a start value are rough where targets are seen."""
-    x = np.full((len(survey.points), 3), np.nan)
-    index = {p.point_id: i for i, p in enumerate(survey.points)}
-    for observed in survey.coordinates:
-        finite = np.all(np.isfinite(np.diag(observed.cov)).reshape(-1, 3), axis=1).tolist()
-        for ref, value, whole in zip(observed.positions, observed.values, finite, strict=True):
-            if ref.frame is None and ref.point_id in index and observed.used and whole:
-                x[index[ref.point_id]] = value
-    firm = np.isfinite(x[:, 0])
-    for i, point in enumerate(survey.points):
-        known = point.x_in_world.treatment != "free" or bool(point.x_in_world.held)
-        if point.x_in_world.value is not None and (known or not firm[i]):  # what was observed tells more than a start
-            x[i] = point.x_in_world.value
-            firm[i] |= known
-    given = np.asarray(np.isfinite(x[:, 0]))
-    boards = any(b.target_id is not None for b in survey.image_blocks)
-    return PointField(x, given, given & ~firm, released=not boards)
+_SHARED = 8
+_TRIALS = 30  # pairs of images that are tried, those with the most common points first
+_THRESHOLD_PX = 3.0
 
 
 def resect(network: FrameNetwork, points: PointField) -> bool:
@@ -107,19 +32,15 @@ def resect(network: FrameNetwork, points: PointField) -> bool:
     if not views and _resect_together(network, points):
         return True
     views = views or _views([s for i, s in sights.items() if seen[i] == 3], points)
-    for view in views:
-        sight = sights[view.block_idx]
-        network.observations.append(ChainObservation(sight.chain, view.poses, sight.text, view.block_idx))
+    network.observations += [ChainObservation(sights[v.block_idx].chain, v.poses, v.block_idx) for v in views]
     return bool(views)
 
 
-def _views(sights: Sequence[Sight], points: PointField, present: Sequence[FloatArray] | None = None) -> list[View]:
+def _views(sights: Sequence[Sight], points: PointField, present: FloatArray | None = None) -> list[View]:
     """Views of the known points; not those on a line, or none in front: other blocks may do."""
-    seen = []
-    for s in sights:
-        rows = points.known[s.rows]
-        seen.append(single.Sight(s.block_idx, points.x[s.rows][rows], s.rays[rows], s.focal_px))
-    return make_views(seen, present)[0]
+    known = points.known
+    seen = [(s.block_idx, points.x[s.rows[k]], s.rays[k], s.focal_px) for s in sights for k in (known[s.rows],)]
+    return list(make_views(joined(seen), present)[0]) if seen else []
 
 
 def _resect_together(network: FrameNetwork, points: PointField) -> bool:
@@ -134,7 +55,7 @@ def _resect_together(network: FrameNetwork, points: PointField) -> bool:
     for (slot, inverted), group in sorted(groups.items(), key=lambda item: item[0]):
         pose = _generalised_pose(network, points, group)
         if pose is not None:
-            network.known[slot] = inverse(pose) if inverted else pose
+            network.set(slot, pose, inverted)
             found = True
     return found
 
@@ -174,18 +95,14 @@ def _generalised_pose(
 
 def intersect_points(network: FrameNetwork, points: PointField, parallax: float, renew: bool = False) -> int:
     """Intersect the unknown points (all but the given ones with ``renew``) from the cameras known; how many are new."""
-    origins, directions, rows = [], [], []
-    for sight in points.sights:
-        if network.unknown_links(sight.chain):
-            continue
-        world_from_camera = inverse(network.product(sight.chain))
-        directions.append(sight.rays @ world_from_camera[:3, :3].T)
-        origins.append(np.broadcast_to(world_from_camera[:3, 3], sight.rays.shape))
-        rows.append(sight.rows)
-    if not rows:
+    placed = [s for s in points.sights if not network.open_slots(s.chain)]
+    if not placed:
         return 0
-    row = np.concatenate(rows)
-    found = intersect(np.concatenate(origins), np.concatenate(directions), row, len(points.x))
+    row = np.concatenate([s.rows for s in placed])
+    world_from_camera = np.repeat(inverse(network.products([s.chain for s in placed])), [len(s.rows) for s in placed],
+                                  axis=0)  # fmt: skip
+    directions = (world_from_camera[:, :3, :3] @ np.concatenate([s.rays for s in placed])[:, :, None])[..., 0]
+    found = intersect(world_from_camera[:, :3, 3], directions, row, len(points.x))
     ahead = np.ones(len(points.x), dtype=bool)
     behind = np.bincount(row, weights=found.residual > np.pi / 2, minlength=len(points.x))
     ahead &= 2 * behind < np.bincount(row, minlength=len(points.x))
@@ -196,17 +113,82 @@ def intersect_points(network: FrameNetwork, points: PointField, parallax: float,
     return int(new.sum())
 
 
-def improve(network: FrameNetwork, points: PointField, movable: set[int]) -> None:
+def improve(network: FrameNetwork, points: PointField, movable: BoolArray) -> None:
     """One round: every block's pose from all points now known, the movable poses from these, and the points again."""
     known = points.known
-    placed = [s for s in points.sights if not network.unknown_links(s.chain) and known[s.rows].sum() >= 4]
+    placed = [s for s in points.sights if not network.open_slots(s.chain) and known[s.rows].sum() >= 4]
     sights = {s.block_idx: s for s in placed}
-    views = _views(placed, points, list(network.products([s.chain for s in placed])))
-    renewed = {
-        v.block_idx: ChainObservation(sights[v.block_idx].chain, v.poses, sights[v.block_idx].text, v.block_idx)
-        for v in views
-    }
+    views = _views(placed, points, network.products([s.chain for s in placed]))
+    renewed = {v.block_idx: ChainObservation(sights[v.block_idx].chain, v.poses, v.block_idx) for v in views}
     network.observations = [renewed.pop(o.block_idx, o) for o in network.observations] + list(renewed.values())
-    touched = {link.slot for view in views for link in sights[view.block_idx].chain}
+    touched = np.zeros(len(movable), dtype=np.bool_)
+    touched[[link.slot for view in views for link in sights[view.block_idx].chain]] = True
     network.relax(movable & touched)
     intersect_points(network, points, PARALLAX[1], renew=True)
+
+
+def orient_second(network: FrameNetwork, points: PointField) -> str | None:
+    """Give a pose to one more image of unknown points, relative to one that has a pose; a note, or None.
+
+    The distance of the two cameras is set to one metre. Source: Nister, PAMI 26(6), 2004 (five points, in OpenCV, with
+    RANSAC of a fixed seed); of the most connected pairs the one with the best product of inliers and parallax is taken.
+    """
+    ready = [s for s in points.sights if not network.unknown_links(s.chain)]
+    waiting = [s for s in points.sights if len(network.unknown_links(s.chain)) == 1]
+    pairs = [(len(np.intersect1d(a.rows, b.rows)), i, j) for i, a in enumerate(ready) for j, b in enumerate(waiting)]
+    best: tuple[float, Sight, Sight, FloatArray] | None = None
+    for shared, i, j in sorted(pairs, key=lambda p: (-p[0], p[1], p[2]))[:_TRIALS]:
+        if shared < _SHARED:
+            break
+        found = _relative_pose(ready[i], waiting[j])
+        if found is not None and (best is None or found[0] > best[0]):
+            best = (found[0], ready[i], waiting[j], found[1])
+    if best is None:
+        return None
+    _, first, second, second_from_first = best
+    camera_from_world = second_from_first @ network.product(first.chain)
+    position = network.unknown_links(second.chain)[0]
+    before = network.product(second.chain[:position])
+    after = network.product(second.chain[position + 1 :])
+    value = inverse(before) @ camera_from_world @ inverse(after)
+    network.set_link(second.chain[position], value)
+    return f"{second.text}: oriented relative to {first.text}, one metre apart until a length says otherwise"
+
+
+def _relative_pose(first: Sight, second: Sight) -> tuple[float, FloatArray] | None:
+    """Score and pose (4, 4) second_from_first with unit distance, or None."""
+    import cv2  # here: networks without images start without it
+
+    _, i, j = np.intersect1d(first.rows, second.rows, return_indices=True)
+    ahead = (first.rays[i, 2] > 0.1) & (second.rays[j, 2] > 0.1)
+    a, b = first.rays[i][ahead], second.rays[j][ahead]
+    if len(a) < _SHARED:
+        return None
+    xy = [r[:, :2] / r[:, 2:] for r in (a, b)]
+    threshold = _THRESHOLD_PX / min(first.focal_px, second.focal_px)
+    essential, inliers = cv2.findEssentialMat(
+        xy[0], xy[1], cameraMatrix=np.eye(3), method=cv2.RANSAC, prob=0.9999, threshold=threshold
+    )
+    if essential is None or essential.shape != (3, 3):
+        return None
+    count, turn, shift, mask = cv2.recoverPose(essential, xy[0], xy[1], cameraMatrix=np.eye(3), mask=inliers)
+    if count < _SHARED:
+        return None
+    pose = rigid(np.asarray(turn, dtype=float), np.asarray(shift, dtype=float)[:, 0])
+    good = mask.ravel() > 0
+    return count * float(np.clip(_parallax(pose, a[good], b[good]), 0.0, np.deg2rad(15.0))), pose
+
+
+def _parallax(second_from_first: FloatArray, a: FloatArray, b: FloatArray) -> float:
+    """Median angle of corresponding rays, rad."""
+    first_from_second = inverse(second_from_first)
+    n = len(a)
+    origins = np.concatenate([np.zeros((n, 3)), np.tile(first_from_second[:3, 3], (n, 1))])
+    directions = np.concatenate([a, b @ first_from_second[:3, :3].T])
+    return float(np.median(intersect(origins, directions, np.tile(np.arange(n), 2), n, iterations=0).parallax))
+
+
+def scale_lengths(network: FrameNetwork, points: PointField, factor: float) -> None:
+    """Multiply the translations of all poses and all points that are not given."""
+    network.pose[network.has & ~network.fixed, :3, 3] *= factor
+    points.x[~points.given] *= factor

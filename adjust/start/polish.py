@@ -1,6 +1,6 @@
 """All poses of the network together: a short least squares on the chains, each weighted by what its view can tell."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +9,7 @@ from scipy.sparse import csc_array
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
 from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log, skew
-from adjust.start.network import ChainObservation, FrameNetwork
+from adjust.start.network import ChainObservation, Chains, FrameNetwork
 from adjust.start.views import View
 
 _DAMPING = 1e-7  # of the diagonal: what the observations leave open stays where it is
@@ -17,21 +17,20 @@ _GROSS_PX = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Chains:
-    """n observations as arrays, chains padded to L links and alternatives to k.
+class _Misfits:
+    """n observations as arrays, chains padded to L links and alternatives to k; a pose behind all others is identity.
 
-    rows: (n, L) positions in the array of poses, 0 the identity. inverted: (n, L). columns: (n, L) number of the
-    movable pose, -1 for none. measured: (n, k, 4, 4), the likeliest repeated as padding. roots: (n, 6, 6).
+    columns: (n, L) number of the movable pose, -1 for none. measured: (n, k, 4, 4), the likeliest repeated as padding.
+    roots: (n, 6, 6).
     """
 
-    rows: IntArray
-    inverted: BoolArray
+    chains: Chains
     columns: IntArray
     measured: FloatArray
     roots: FloatArray
 
 
-def polish(network: FrameNetwork, movable: set[int], views: Mapping[int, View], iterations: int = 6) -> None:
+def polish(network: FrameNetwork, movable: BoolArray, views: Iterable[View], iterations: int = 6) -> None:
     """Move the movable poses to the minimum of the chains' misfit in px, robustly; nothing else changes.
 
     Source: pose-graph least squares with each measured pose weighted by the normal matrix of its image points, which is
@@ -40,39 +39,21 @@ def polish(network: FrameNetwork, movable: set[int], views: Mapping[int, View], 
     items = [
         o
         for o in network.observations
-        if not o.rotation_only and not network.unknown_links(o.chain) and any(k.slot in movable for k in o.chain)
+        if not o.rotation_only and not network.open_slots(o.chain) and any(movable[k.slot] for k in o.chain)
     ]
     if not items:
         return
-    slots = sorted({k.slot for o in items for k in o.chain})
-    moving = [slot for slot in slots if slot in movable]
-    chains = _arrays(network, items, slots, moving, views)
-    places = np.array([slots.index(slot) + 1 for slot in moving], dtype=np.int64)
-    poses = np.stack([np.eye(4)] + [network.known[slot] for slot in slots])
-    poses = _minimise(chains, poses, places, network.lever, iterations)
-    network.known.update({slot: poses[place] for slot, place in zip(moving, places, strict=True)})
-
-
-def _arrays(
-    network: FrameNetwork,
-    items: Sequence[ChainObservation],
-    slots: Sequence[int],
-    moving: Sequence[int],
-    views: Mapping[int, View],
-) -> _Chains:
-    n, longest = len(items), max(len(o.chain) for o in items)
-    rows, columns = np.zeros((n, longest), dtype=np.int64), np.full((n, longest), -1, dtype=np.int64)
-    inverted = np.zeros((n, longest), dtype=bool)
-    place, number = {s: i + 1 for i, s in enumerate(slots)}, {s: i for i, s in enumerate(moving)}
-    alternatives = max(len(o.poses) for o in items)
-    measured = np.empty((n, alternatives, 4, 4))
-    for i, o in enumerate(items):
-        for j, link in enumerate(o.chain):
-            rows[i, j], inverted[i, j], columns[i, j] = place[link.slot], link.inverse, number.get(link.slot, -1)
-        measured[i] = o.poses[0]
-        measured[i, : len(o.poses)] = o.poses
-    roots = np.array([_root_information(network.lever, o, views.get(o.block_idx)) for o in items])
-    return _Chains(rows, inverted, columns, measured, roots)
+    chains, of_block = Chains.of([o.chain for o in items]), {v.block_idx: v for v in views}
+    moving = np.unique(chains.slots[chains.slots >= 0])
+    moving = moving[movable[moving]]
+    number = np.full(len(network.has) + 1, -1)
+    number[moving] = np.arange(len(moving))
+    roots = np.array([_root_information(network.lever, o, of_block.get(o.block_idx)) for o in items])
+    most = max(len(o.poses) for o in items)
+    measured = np.array([np.concatenate([o.poses, np.tile(o.poses[:1], (most - len(o.poses), 1, 1))]) for o in items])
+    misfits = _Misfits(chains, number[chains.slots], measured, roots)
+    poses = np.concatenate([network.pose, np.eye(4)[None]])
+    network.pose[moving] = _minimise(misfits, poses, moving, network.lever, iterations)[moving]
 
 
 def _root_information(lever: float, observation: ChainObservation, view: View | None) -> FloatArray:
@@ -97,11 +78,11 @@ def _tangent_axes(rays: FloatArray) -> FloatArray:
     return np.stack([np.stack(first, axis=-1), np.stack(second, axis=-1)], axis=-2)
 
 
-def _minimise(chains: _Chains, poses: FloatArray, places: IntArray, lever: float, iterations: int) -> FloatArray:
+def _minimise(misfits: _Misfits, poses: FloatArray, places: IntArray, lever: float, iterations: int) -> FloatArray:
     """Gauss-Newton with Cauchy weights on the poses at ``places``, as long as it lowers the misfit."""
     best, best_cost, scale = poses, np.inf, np.inf
     for _ in range(iterations + 1):
-        residuals, jacobians = _residuals(chains, poses, lever)
+        residuals, jacobians = _residuals(misfits, poses, lever)
         size = np.linalg.norm(residuals, axis=1)
         # the scale may only shrink: far from the minimum everything counts, near it gross errors do not
         scale = min(scale, max(3.0 * float(np.median(size)), _GROSS_PX))
@@ -109,27 +90,28 @@ def _minimise(chains: _Chains, poses: FloatArray, places: IntArray, lever: float
         if not cost < best_cost * (1 - 1e-6):
             break
         best, best_cost = poses, cost
-        step = _step(chains.columns, residuals, jacobians, 1.0 / (1.0 + (size / scale) ** 2), len(places))
+        step = _step(misfits.columns, residuals, jacobians, 1.0 / (1.0 + (size / scale) ** 2), len(places))
         poses = poses.copy()
         poses[places] = poses[places] @ rigid(rotation_exp(step[:, :3]), step[:, 3:])
     return best
 
 
-def _residuals(chains: _Chains, poses: FloatArray, lever: float) -> tuple[FloatArray, FloatArray]:
+def _residuals(misfits: _Misfits, poses: FloatArray, lever: float) -> tuple[FloatArray, FloatArray]:
     """Residuals (n, 6) and derivatives (n, L, 6, 6) by each link's pose, moved on its right."""
-    n, longest = chains.rows.shape
+    chains = misfits.chains
+    n, longest = chains.slots.shape
     backwards = inverse(poses)
     before = np.tile(np.eye(4), (n, 1, 1))
     jacobians = np.empty((n, longest, 6, 6))
     for j in range(longest):
         turned = chains.inverted[:, j, None, None]
-        after = before @ np.where(turned, backwards[chains.rows[:, j]], poses[chains.rows[:, j]])
+        after = before @ np.where(turned, backwards[chains.slots[:, j]], poses[chains.slots[:, j]])
         jacobians[:, j] = np.where(turned, -_adjoint(before), _adjoint(after))
         before = after
-    nearest = np.argmin(pose_distance(chains.measured, before[:, None], lever), axis=1)
-    miss = before @ inverse(chains.measured[np.arange(n), nearest])
+    nearest = np.argmin(pose_distance(misfits.measured, before[:, None], lever), axis=1)
+    miss = before @ inverse(misfits.measured[np.arange(n), nearest])
     residuals = np.concatenate([rotation_log(miss[:, :3, :3]), miss[:, :3, 3]], axis=1)
-    return (chains.roots @ residuals[:, :, None])[..., 0], chains.roots[:, None] @ jacobians
+    return (misfits.roots @ residuals[:, :, None])[..., 0], misfits.roots[:, None] @ jacobians
 
 
 def _adjoint(pose: FloatArray) -> FloatArray:

@@ -1,46 +1,69 @@
-"""From a survey to start values: lenses, the pose of every view, then the network of frames and points."""
+"""From a survey to start values: lenses, the pose of every view, then what each observation tells of frames and points.
+
+One search: of the steps that are possible with what is known by now the safest is taken, until nothing is left.
+"""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
-from gtsam import Pose3
+from gtsam import Pose3, Rot3
 
-from adjust.frames.unknowns import Chain, FrameTree, Unknowns
+from adjust.frames.unknowns import FrameTree, Unknowns
 from adjust.model.errors import SurveyError
-from adjust.model.observations import ImageBlock, PositionRef
 from adjust.model.result import ParameterName
-from adjust.model.survey import FloatArray, Survey
-from adjust.native.views import view_offsets
+from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.observations.geometry.building import frame_refs, position_refs
 from adjust.observations.terrestrial.building import reading_refs
 from adjust.spatial.averaging import pose_distance
-from adjust.spatial.rigid import align, rigid
-from adjust.start.gauge import fix_one_gauge, frames_of, world_is_free
+from adjust.spatial.rigid import rigid
+from adjust.start.gauge import fix_one_gauge
 from adjust.start.lenses import Sighting, start_lens
 from adjust.start.motion import solve_motion
 from adjust.start.network import ChainObservation, FrameNetwork, as_pose3, partial_pose
-from adjust.start.pairs import network_start
-from adjust.start.points import PARALLAX, PointField, improve, intersect_points, point_field, resect
+from adjust.start.points import PARALLAX, improve, intersect_points, orient_second, resect
 from adjust.start.polish import polish
-from adjust.start.relative import orient_second, scale_lengths
-from adjust.start.result import Start
-from adjust.start.undetermined import undetermined
+from adjust.start.positions import PointField, Positions, Sight, point_field, undetermined
+from adjust.start.readings.start import explain
+from adjust.start.readings.steps import Readings
+from adjust.start.settling import block_rms, contradictions, moved_to_coordinates, scaled_to_lengths
 from adjust.start.views import (
-    Sight,
-    View,
-    all_rays,
+    Views,
     block_text,
     focal_px,
+    joined,
     make_views,
+    rays_by_block,
     target_points,
     untrustworthy,
-    used_rows,
 )
 
 _ROUNDS = 3
 _POLISH_PX = 2.0  # below this the robust means are a good start already
-_OFF = 10.0  # a block this many times worse than the typical one contradicts the others
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Start values for every parameter that the survey needs.
+
+    lenses: full vectors (n,) by camera. poses: by parameter name. points: (3,) m by point id. vectors: table_angles,
+    table_geometry and warp by parameter name. excluded_blocks: positions in ``Survey.image_blocks`` of what is not
+    trusted, each with its reason. orphans: poses that only such blocks reach; they have a value here, but nothing in an
+    adjustment without these blocks determines them: leave the blocks out altogether, or hold the poses. block_rms_px:
+    misfit of every block at the start, px (nan where it has no rays).
+    """
+
+    lenses: Mapping[str, FloatArray]
+    poses: Mapping[ParameterName, Pose3]
+    points: Mapping[str, FloatArray]
+    vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
+    excluded_blocks: tuple[int, ...] = ()
+    reasons: tuple[str, ...] = ()
+    orphans: tuple[ParameterName, ...] = ()
+    block_rms_px: tuple[float, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def find_start(survey: Survey) -> Start:
@@ -51,12 +74,10 @@ def find_start(survey: Survey) -> Start:
     are named in ``excluded_blocks`` and do not take part. What no observation tells (the datum) is chosen.
     Raises SurveyError naming each parameter that nothing determines, and what is missing.
     """
-    network = network_start(survey)
+    network = _network_start(survey)
     if network is not None:
         return network
     search = _Search(survey)
-    search.find_lenses()
-    search.find_views()
     search.solve()
     search.settle()
     return search.result()
@@ -70,13 +91,12 @@ def turns_of_views(survey: Survey, turned: Mapping[str, FloatArray]) -> dict[int
     Raises SurveyError as :func:`find_start`.
     """
     search = _Search(survey, turned)
-    search.find_lenses()
-    search.find_views()
     search.solve()
     out = {}
-    for i, view in search.views.items():
+    for view in search.views:
+        i = view.block_idx
         motions = turned.get(str(survey.image_blocks[i].target_id))
-        if motions is None or search.network.unknown_links(search.chains[i]):
+        if motions is None or search.network.open_slots(search.chains[i]):
             continue
         camera_from_target = search.network.product(search.chains[i])
         away = pose_distance(search.alternatives(i, view.poses), camera_from_target, search.network.lever)
@@ -84,166 +104,221 @@ def turns_of_views(survey: Survey, turned: Mapping[str, FloatArray]) -> dict[int
     return out
 
 
+def _network_start(survey: Survey) -> Start | None:
+    """Averaged rotations and linear positions of the pairs that agree; None where there is more than pairs.
+
+    Surveys of rotations alone, whose positions stay open, are left to the general search, too. Raises
+    IndeterminateError naming the stations that no pair ties to the others.
+    """
+    if not survey.is_pose_network or not any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
+        return None
+    # here: a survey without pairs starts without it
+    from adjust.pose_network.from_survey import network_from_survey
+    from adjust.pose_network.graduated import graduated_start
+    from adjust.pose_network.network import check_determined
+
+    network = network_from_survey(survey, any_datum=True)
+    check_determined(network)
+    R, t = graduated_start(network)
+    notes = (f"{network.n_stations} stations from averaged rotations and linear positions of the pairs that agree",)
+    poses: dict[ParameterName, Pose3] = {
+        ("world_from_station", s): Pose3(Rot3(R[i]), t[i]) for i, s in enumerate(network.station_ids)
+    }
+    return Start({}, poses, {}, notes=notes)
+
+
 class _Search:
     """The state of one search. turned: see :func:`turns_of_views`."""
 
     def __init__(self, survey: Survey, turned: Mapping[str, FloatArray] = MappingProxyType({})) -> None:
-        self.survey = survey
-        self.turned = turned
-        self.targets = {t.target_id: t for t in survey.targets}
-        self.target_x: dict[str, FloatArray] = {}
-        self.seen_x: dict[tuple[str, bytes], FloatArray] = {}
-        self.cameras = {c.camera_id: c for c in survey.cameras}
-        unknowns = Unknowns()
-        self.network = FrameNetwork(unknowns, FrameTree(survey, unknowns))
-        self.chains: list[Chain] = [self.network.frames.of_image(block) for block in survey.image_blocks]
+        self.survey, self.turned = survey, turned
+        frames = FrameTree(survey, Unknowns())
+        self.chains = [frames.of_image(block) for block in survey.image_blocks]
+        self.doubtful: list[ChainObservation] = []
+        pairs = self._pairs(frames)
+        self._register_positions(frames)
+        self.network = FrameNetwork(frames, survey)
+        self.network.observations = pairs
         self.points: PointField = point_field(survey)
+        self.positions = Positions(survey, self.network, self.points)
+        self.readings = Readings(survey, self.positions)
         self.lenses: dict[str, FloatArray] = {}
         self.reasons: dict[int, str] = {}
         self.notes: list[str] = []
-        self.views: dict[int, View] = {}
-        self.rms: FloatArray = np.full(len(survey.image_blocks), np.nan)
-        self.doubtful: list[ChainObservation] = []
         self.motion_solved = False
         self.scale_free = False
-        self._register_pairs_and_positions()
-        self.network.register(survey)
+        self.views: Views
+        self.rms: FloatArray
 
-    def _register_pairs_and_positions(self) -> None:
+    def _pairs(self, frames: FrameTree) -> list[ChainObservation]:
+        """What pairs say; those not in use are doubtful."""
+        out: list[ChainObservation] = []
         for pair in self.survey.pairs:
-            chain = self.network.frames.relative(pair.a, pair.b)
             full = isinstance(pair.b_from_a, Pose3)
             matrix = pair.b_from_a.matrix()
             pose = np.asarray(matrix, dtype=float) if full else rigid(matrix, np.zeros(3))
-            observation = ChainObservation(chain, pose[None], f"pair {pair.pair_id!r}", rotation_only=not full)
-            (self.network.observations if pair.used else self.doubtful).append(observation)
+            observation = ChainObservation(frames.relative(pair.a, pair.b), pose[None], rotation_only=not full)
+            (out if pair.used else self.doubtful).append(observation)
+        return out
+
+    def _register_positions(self, frames: FrameTree) -> None:
         refs = [ref for d in self.survey.distances for ref in (d.a, d.b)]
         refs += [ref for c in self.survey.coordinates for ref in c.positions]
         refs += position_refs(self.survey) + reading_refs(self.survey)
         for frame in [*frame_refs(self.survey), *(ref.frame for ref in refs if ref.frame is not None)]:
-            self.network.frames.world_from(frame)
+            frames.world_from(frame)
 
-    def _seen_of_target(self, block: ImageBlock, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points (n, 3) m of a block's target and their ``rows``, where used; one array for all that show the same."""
-        used = block.used
-        index = block.point_idx if used is None else block.point_idx[used_rows(block)]
-        target_id = str(block.target_id)
-        key = (target_id, index.tobytes())
-        if key not in self.seen_x:
-            if target_id not in self.target_x:
-                self.target_x[target_id] = target_points(self.targets[target_id])
-            self.seen_x[key] = self.target_x[target_id][index]
-        return self.seen_x[key], rows if used is None else rows[used_rows(block)]
+    def _read_first(self) -> None:
+        """Readings go before images where they have something to begin with. Raises SurveyError where all is lost."""
+        blocks = self.survey.image_blocks
+        if blocks and not any(np.isfinite(x).any() for x in self.readings.given.values()):
+            return
+        while self.readings.advance(firm=False):
+            pass
+        lacking = [p.point_id for p, x in zip(self.survey.points, self.points.x, strict=True) if np.isnan(x).any()]
+        if lacking and not blocks:
+            raise explain(self.survey, lacking)
 
-    def find_lenses(self) -> None:
-        """Lens values of every camera, given or from its images of known points."""
-        sightings: dict[str, list[Sighting]] = {c.camera_id: [] for c in self.survey.cameras}
-        known = self.points.known
+    def _seen(self) -> tuple[dict[int, Sighting], dict[int, IntArray]]:
+        """What the blocks show of targets, one array for all that show the same; points and rows of the others."""
+        whole = {t.target_id: target_points(t) for t in self.survey.targets}
+        parts: dict[tuple[str, bytes], FloatArray] = {}
+        seen, world = {}, {}
         for i, block in enumerate(self.survey.image_blocks):
-            if block.camera_id not in self.cameras or (block.target_id and block.target_id not in self.targets):
-                continue  # the chain has already named it
-            if block.target_id is not None:
-                x, uv = self._seen_of_target(block, block.uv)
-                sightings[block.camera_id].append(Sighting(i, x, uv))
-            else:
-                rows = used_rows(block) & known[block.point_idx]
-                sightings[block.camera_id].append(Sighting(i, self.points.x[block.point_idx[rows]], block.uv[rows]))
+            index, uv = block.point_idx, block.uv
+            if block.used is not None:
+                index, uv = index[block.used], uv[block.used]
+            if block.target_id is None:
+                seen[i], world[i] = Sighting(i, np.zeros((0, 3)), uv), np.asarray(index, dtype=np.int64)
+                continue
+            key = (block.target_id, index.tobytes())
+            if key not in parts:
+                parts[key] = whole[block.target_id][index]
+            seen[i] = Sighting(i, parts[key], uv)
+        return seen, world
+
+    def _find_lenses(self, seen: Mapping[int, Sighting], rows: Mapping[int, IntArray]) -> None:
+        """Lens values of every camera, given or from its images of known points."""
+        known, mine = self.points.known, dict[str, list[Sighting]]()
+        for i, s in seen.items():
+            if i in rows:
+                some = known[rows[i]]
+                s = Sighting(i, self.points.x[rows[i][some]], s.uv[some])
+            if len(s.x):
+                mine.setdefault(self.survey.image_blocks[i].camera_id, []).append(s)
         for camera in self.survey.cameras:
-            mine = [s for s in sightings[camera.camera_id] if len(s.x)]
-            if not mine and camera.lens.values is None and self.points.release():
-                self.find_lenses()  # no target shows it: the points as they are given have to do
+            if camera.camera_id not in mine and camera.lens.values is None and self.points.release():
+                self._find_lenses(seen, rows)  # no target shows it: the points as they are given have to do
                 return
-            found = start_lens(camera, mine)
+            found = start_lens(camera, mine.get(camera.camera_id, []))
             self.lenses[camera.camera_id] = found.values
             self.notes.append(f"camera {camera.camera_id!r}: {found.note}")
             for i, reason in found.excluded.items():
                 self.reasons[i] = f"{block_text(self.survey.image_blocks[i])}: {reason}"
 
-    def find_views(self) -> None:
+    def _find_views(self, seen: Mapping[int, Sighting], rows: Mapping[int, IntArray]) -> None:
         """Rays of all blocks and poses of all targets seen; blocks that cannot be trusted are set aside."""
-        rays, failed = all_rays(self.survey, self.lenses)
+        blocks = self.survey.image_blocks
+        rays, failed = rays_by_block(self.survey, self.lenses, {i: s.uv for i, s in seen.items()})
         focal = {c.camera_id: focal_px(c, self.lenses[c.camera_id]) for c in self.survey.cameras}
-        sights: list[Sight] = []
-        for i, block in enumerate(self.survey.image_blocks):
-            if i in failed:
-                self.reasons.setdefault(i, f"{block_text(block)}: {failed[i]}")
-            elif block.target_id is None:
-                self.points.add(self.survey, i, rays[i], focal[block.camera_id], self.chains[i])
-            elif len(block.uv):
-                x, mine = self._seen_of_target(block, rays[i])
-                if len(x) >= 3:  # fewer give no pose, but may well serve in the adjustment
-                    sights.append(Sight(i, x, mine, focal[block.camera_id]))
-        refined, without = make_views(sights)
-        for i, reason in without.items():
-            self.reasons.setdefault(i, f"{block_text(self.survey.image_blocks[i])}: {reason}")
-        reasons, notes = untrustworthy([v for v in refined if v.block_idx not in self.reasons], self.survey)
+        none = np.zeros((0, 3))
+        self.points.sights = [
+            Sight(i, block_text(blocks[i]), row, rays.get(i, none), focal[blocks[i].camera_id], self.chains[i])
+            for i, row in rows.items() if i not in failed
+        ]  # fmt: skip
+        # fewer than three points give no pose, but may well serve in the adjustment
+        sights = joined([
+            (i, seen[i].x, r, focal[blocks[i].camera_id]) for i, r in rays.items() if len(r) >= 3 and i not in rows
+        ])  # fmt: skip
+        self.views, without = make_views(sights, thorough=False)
+        for i, reason in (failed | without).items():
+            self.reasons.setdefault(i, f"{block_text(blocks[i])}: {reason}")
+        reasons, notes = untrustworthy(self.views, self.survey, self.reasons)
         self.reasons = {**reasons, **self.reasons}
         self.notes += notes
-        self.views = {v.block_idx: v for v in refined}
-        for i, view in self.views.items():
-            text = block_text(self.survey.image_blocks[i])
-            observation = ChainObservation(self.chains[i], self.alternatives(i, view.poses), text, i)
+        first = pairwise(self.views.first.tolist())
+        for i, (a, b) in zip(self.views.sights.block_idx.tolist(), first, strict=True):
+            observation = ChainObservation(self.chains[i], self.alternatives(i, self.views.poses[a:b]), i)
             (self.doubtful if i in self.reasons else self.network.observations).append(observation)
-        distances = [float(np.linalg.norm(v.poses[0][:3, 3])) for v in refined]
-        self.network.lever = float(np.median(distances)) if distances else 1.0
+        if len(self.views):
+            nearest = self.views.poses[self.views.first[:-1], :3, 3]
+            self.network.lever = float(np.median(np.linalg.norm(nearest, axis=1)))
 
     def alternatives(self, i: int, poses: FloatArray) -> FloatArray:
         """Poses (k, 4, 4) of a block as named, then after every motion that its target cannot be told from."""
+        if not self.turned:
+            return poses
         motions = self.turned.get(str(self.survey.image_blocks[i].target_id), ())
         return np.concatenate([poses, *(poses @ motion for motion in motions)])
 
     def solve(self) -> None:
-        """Determine all poses and points, the safest first; what floats is set freely one by one."""
+        """Determine lenses, all poses and points, the safest first; what floats is set freely one by one."""
+        self._read_first()
+        seen, rows = self._seen()
+        self._find_lenses(seen, rows)
+        self._find_views(seen, rows)
         while self._advance():
             pass
         self.network.observations += self.doubtful
         # a pose that only distrusted blocks show still needs some value
         while self._advance():
             pass
-        self.network.observations = [o for o in self.network.observations if o not in self.doubtful]
+        told = {id(o) for o in self.doubtful}
+        self.network.observations = [o for o in self.network.observations if id(o) not in told]
         while self._use_open_prior():
             while self._advance():
                 pass
-        missing = undetermined(self.survey, self.network, self.points)
+        waiting = {link.slot for chain in self.readings.waiting() for link in chain}
+        slots = [s for s in np.flatnonzero(~self.network.has).tolist() if s not in waiting]
+        lost = np.flatnonzero(~self.points.known & (self.points.seen() | ~self.readings.concerned))
+        missing = undetermined(self.survey, self.network, self.points, slots, lost.tolist())
         if missing:
             raise SurveyError(missing)
 
     def _use_open_prior(self) -> bool:
         """Start a pose that no image or pair reaches at the mean of its prior, though that leaves components open."""
         network = self.network
-        for slot, name in sorted(network.names.items()):
-            value = None if slot in network.known else partial_pose(network.unknowns.parameters.get(name))
+        for slot in np.flatnonzero(~network.has).tolist():
+            value = partial_pose(network.parameters.get(network.names[slot]))
             if value is not None:
-                network.known[slot] = value
-                self.notes.append(f"{' '.join(name)}: starts at the mean of its prior, no image or pair reaches it")
+                network.set(slot, value)
+                name = " ".join(network.names[slot])
+                self.notes.append(f"{name}: starts at the mean of its prior, no image or pair reaches it")
                 return True
         return False
 
     def _advance(self) -> bool:
         """One step, the first of the list that is possible; whether there was one."""
         network, points = self.network, self.points
-        if network.known.keys() >= network.names.keys() and points.known.all():
+        if network.has.all() and points.known.all():
             return False
-        if network.propagate():
-            return True
-        for parallax in PARALLAX:
-            if intersect_points(network, points, parallax) or resect(network, points):
-                return True
-        floating = network.observations + self._unseen_chains()
-        slot = fix_one_gauge(network, floating)
+        return (
+            network.propagate()
+            or any(intersect_points(network, points, parallax) or resect(network, points) for parallax in PARALLAX)
+            or self._set_freely()
+            or self._from_motion()
+            or points.release()
+            or network.propagate(rotation_only=True)
+            or self._orient()
+            # lengths mean nothing where the scale is not known yet
+            or (not self.scale_free and self.readings.advance())
+        )
+
+    def _set_freely(self) -> bool:
+        slot = fix_one_gauge(self.network, self.network.observations + self._unseen_chains())
         if slot is not None:
-            self.notes.append(f"{' '.join(network.names[slot])}: set freely, no observation tells it")
-            return True
-        note = solve_motion(network, degenerate=points.released)
+            self.notes.append(f"{' '.join(self.network.names[slot])}: set freely, no observation tells it")
+        return slot is not None
+
+    def _from_motion(self) -> bool:
+        note = solve_motion(self.network, degenerate=self.points.released)
         if note is not None:
             self.notes.append(note)
             self.motion_solved = True
-            return True
-        if points.release():
-            return True
-        if network.propagate(rotation_only=True):
-            return True
-        note = orient_second(network, points) if not points.known.any() else None
+        return note is not None
+
+    def _orient(self) -> bool:
+        note = orient_second(self.network, self.points) if not self.points.known.any() else None
         if note is not None:
             self.notes.append(note)
             self.scale_free = True
@@ -254,7 +329,7 @@ class _Search:
         have = {o.block_idx for o in self.network.observations}
         bound = bool(self.points.known.any() or self.points.rough.any())
         return [
-            ChainObservation(s.chain, np.zeros((0, 4, 4)), s.text, s.block_idx, ends=(True, bound))
+            ChainObservation(s.chain, np.zeros((0, 4, 4)), s.block_idx, ends=(True, bound))
             for s in self.points.sights
             if s.block_idx not in have
         ]
@@ -262,116 +337,47 @@ class _Search:
     def settle(self) -> None:
         """Renew what was found from all observations together, and set aside the blocks that contradict the rest."""
         network = self.network
-        movable = set(network.known) - network.fixed - (set() if self.scale_free else set(network.gauged))
+        gauged = np.isin(np.arange(len(network.has)), network.gauged)
+        movable = network.has & ~network.fixed & (~gauged | self.scale_free)
         # a field that grew from one pair has errors that only fade from round to round
         rounds = _ROUNDS * (4 if self.scale_free else 1)
         for _ in range(rounds if self.points.sights else 0):
             improve(network, self.points, movable)
-        moved = set(network.known) - network.fixed - set(network.gauged)
-        self.rms = self._block_rms()
+        self.rms = block_rms(network, self.chains, self.views, self.points)
         polished = self.motion_solved or np.nanmax(self.rms, initial=0.0) > _POLISH_PX
         if polished:
-            polish(network, moved, self.views)
-        scaled, shifted = self._settle_scale(), self._move_to_coordinates()
-        if polished or scaled or shifted:
-            self.rms = self._block_rms()
-        self._set_aside_contradictions()
+            polish(network, network.has & ~network.fixed & ~gauged, self.views)
+        changed = [
+            scaled_to_lengths(self.survey, self.positions) if self.scale_free and not len(self.views) else None,
+            moved_to_coordinates(self.survey, self.positions),
+        ]
+        self.notes += [note for note in changed if note]
+        if polished or any(changed):
+            self.rms = block_rms(network, self.chains, self.views, self.points)
+        self.reasons |= contradictions(self.survey, self.points, self.rms, self.reasons)
+        self._read_last()
 
-    def _settle_scale(self) -> bool:
-        """The scale of a network of relative orientations, from observed distances or coordinates; whether there is."""
-        if not self.scale_free or self.views:
-            return False
-        ratios = []
-        for distance in self.survey.distances:
-            a, b = self._place(distance.a), self._place(distance.b)
-            if distance.used and a is not None and b is not None and np.linalg.norm(a - b) > 0:
-                ratios.append(distance.value / float(np.linalg.norm(a - b)))
-        observed, present = self._observed_positions()
-        if not ratios and len(observed) > 1:
-            ratios = [float(np.std(observed, axis=0).max() / max(np.std(present, axis=0).max(), 1e-12))]
-        if ratios:
-            slots = [s for s in self.network.known if s not in self.network.fixed]
-            scale_lengths(self.network, self.points, float(np.median(ratios)), slots)
-            self.notes.append(f"scale from {len(ratios)} observed length(s)")
-        return bool(ratios)
-
-    def _observed_positions(self) -> tuple[FloatArray, FloatArray]:
-        """Observed coordinates (m, 3) and where their positions are at present (m, 3)."""
-        rows = []
-        for item in self.survey.coordinates:
-            finite = np.all(np.isfinite(np.diag(item.cov)).reshape(-1, 3), axis=1).tolist()
-            for ref, value, whole in zip(item.positions, item.values, finite, strict=True):
-                place = self._place(ref) if item.used and whole else None
-                if place is not None:
-                    rows.append((value, place))
-        return np.array([r[0] for r in rows]).reshape(-1, 3), np.array([r[1] for r in rows]).reshape(-1, 3)
-
-    def _move_to_coordinates(self) -> bool:
-        """Move the whole world onto observed coordinates where nothing given holds it; whether it moved."""
-        if not world_is_free(self.network, self.survey) or self.points.given.any():
-            return False
-        observed, present = self._observed_positions()
-        if not len(observed):
-            return False
-        new_from_old = align(observed, present)
-        for slot, name in self.network.names.items():
-            if frames_of(self.network, name)[0] == ("world",):
-                self.network.known[slot] = new_from_old @ self.network.known[slot]
-        self.points.x = self.points.x @ new_from_old[:3, :3].T + new_from_old[:3, 3]
-        self.notes.append(f"world moved onto {len(observed)} observed positions")
-        return True
-
-    def _place(self, ref: PositionRef) -> FloatArray | None:
-        """Present world coordinates (3,) of a position."""
-        if ref.frame is None:
-            index = next((i for i, p in enumerate(self.survey.points) if p.point_id == ref.point_id), None)
-            return None if index is None or not self.points.known[index] else self.points.x[index]
-        world_from_frame = self.network.product(tuple(self.network.frames.world_from(ref.frame)))
-        local = np.zeros(3)
-        if ref.point_id is not None:
-            target = self.targets[ref.frame.frame_id]
-            local = target_points(target)[target.point_ids.index(ref.point_id)]
-        return np.asarray(world_from_frame[:3, :3] @ local + world_from_frame[:3, 3])
-
-    def _set_aside_contradictions(self) -> None:
-        rms = self.rms
-        trusted = [i for i in range(len(rms)) if i not in self.reasons and np.isfinite(rms[i])]
-        if not trusted:
-            return
-        # blocks of points that are where a start value puts them are measured by their own kind
-        rough = {s.block_idx for s in self.points.sights if self.points.rough[s.rows].any()}
-        kinds = [[i for i in trusted if (i in rough) == kind and np.isfinite(rms[i])] for kind in (False, True)]
-        typical = [float(np.median(rms[kind])) if kind else 0.0 for kind in kinds]
-        for i in range(len(rms)):
-            limit = max(15.0, _OFF * typical[i in rough])
-            if i not in self.reasons and rms[i] > limit:
-                what = "has points behind the camera" if np.isinf(rms[i]) else f"is {rms[i]:.1f} px off"
-                text = block_text(self.survey.image_blocks[i])
-                self.reasons[i] = (
-                    f"{text}: {what} where the other blocks put it (typical: {typical[i in rough]:.1f} px)"
-                )
-
-    def _block_rms(self) -> FloatArray:
-        """Robust misfit of every block at the present values: 1.2 times the median offset, px."""
-        rms = np.full(len(self.survey.image_blocks), np.nan)
-        sights = {s.block_idx: s for s in self.points.sights}
-        blocks = [i for i in range(len(self.chains)) if i in self.views or i in sights]
-        if not blocks:
-            return rms
-        seen = [self.views.get(i) or sights[i] for i in blocks]
-        x = [s.x if isinstance(s, View) else self.points.x[s.rows] for s in seen]
-        ptr = np.cumsum([0] + [len(part) for part in x])
-        poses = self.network.products([self.chains[i] for i in blocks])
-        medians = view_offsets(poses, np.concatenate(x), np.concatenate([s.rays for s in seen]), ptr)[1]
-        # the median of a circular normal's radius is 1.18 sigma, its rms 1.41 sigma
-        rms[blocks] = 1.2 * np.array([s.focal_px for s in seen]) * medians
-        return rms
+    def _read_last(self) -> None:
+        """What only readings reach. Raises SurveyError naming what they do not."""
+        while not self.network.has.all() or not self.points.known.all():
+            if not self.network.propagate() and not self.readings.advance():
+                break
+        lost = [self.survey.points[i].point_id for i in np.flatnonzero(~self.points.known)]
+        if lost:
+            raise explain(self.survey, lost)
+        unmet = sorted({" ".join(self.network.names[link.slot]) for chain in self.readings.waiting() for link in chain
+                        if not self.network.has[link.slot]})  # fmt: skip
+        if unmet:
+            raise SurveyError(
+                f"no start value can be found for {', '.join(unmet)}: the set-ups that stand there are not levelled, "
+                "and see too few points whose places are known (3 by direction and zenith angle); give a start pose"
+            )
 
     def result(self) -> Start:
         """The start values under their names."""
-        network, survey = self.network, self.survey
+        network, survey, rms = self.network, self.survey, self.rms
         poses: dict[ParameterName, Pose3] = {
-            name: as_pose3(network.known[slot]) for slot, name in network.names.items() if name[0] != "table_motion"
+            name: as_pose3(network.pose[slot]) for slot, name in enumerate(network.names) if name[0] != "table_motion"
         }
         vectors: dict[ParameterName, FloatArray] = {}
         for table in survey.tables:
@@ -381,15 +387,15 @@ class _Search:
         for target in survey.targets:
             if target.warp is not None:
                 vectors[("warp", target.target_id)] = np.array(target.warp.values, dtype=float)
-        rms = self.rms
-        good = [rms[i] for i in range(len(rms)) if i not in self.reasons and np.isfinite(rms[i])]
-        if good:
+        order = tuple(sorted(self.reasons))
+        good = np.delete(rms, order)
+        good = good[np.isfinite(good)]
+        if len(good):
             self.notes.append(
                 f"{len(good)} blocks in the start, misfit median {np.median(good):.2f} px, worst {np.max(good):.2f} px;"
                 f" {len(self.reasons)} left out"
             )
-        order = tuple(sorted(self.reasons))
-        points = {p.point_id: self.points.x[i] for i, p in enumerate(survey.points) if self.points.known[i]}
+        points = {p.point_id: x for p, x in zip(survey.points, self.points.x, strict=True)}
         reasons = tuple(self.reasons[i] for i in order)
         return Start(
             self.lenses, poses, points, vectors, order, reasons, self._orphans(), tuple(rms.tolist()), tuple(self.notes)
@@ -397,9 +403,10 @@ class _Search:
 
     def _orphans(self) -> tuple[ParameterName, ...]:
         """Poses that only distrusted blocks reach."""
+        if not self.reasons:
+            return ()
         chains = [chain for i, chain in enumerate(self.chains) if i not in self.reasons]
         chains += [o.chain for o in self.network.observations if o.block_idx < 0]
         reached = {link.slot for chain in chains for link in chain}
         doubted = {link.slot for i in self.reasons for link in self.chains[i]}
-        names = self.network.names
-        return tuple(names[slot] for slot in sorted(doubted - reached - self.network.fixed))
+        return tuple(self.network.names[slot] for slot in sorted(doubted - reached) if not self.network.fixed[slot])

@@ -1,8 +1,9 @@
 """Blocks of image points as rays, and the camera poses that each explains by itself."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,21 +22,78 @@ _GROSS_SHARE = 0.2  # more gross points than this make a whole block untrustwort
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """One block as rays. x: (n, 3) m in the target. rays: (n, 3) unit in the camera. focal_px: turns angles into px."""
+class View:
+    """One image and what explains it. x: (n, 3) m in the target. rays: (n, 3) unit in the camera.
+
+    focal_px: turns angles into px. poses: (k, 4, 4) camera_from_target, likeliest first; error_px: (k,).
+    """
 
     block_idx: int
     x: FloatArray
     rays: FloatArray
     focal_px: float
+    poses: FloatArray
+    error_px: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class View(Sight):
-    """A block with what explains it. poses: (k, 4, 4) camera_from_target, likeliest first; error_px: (k,)."""
+class Sights:
+    """Images as rays, one after the other by ptr (B + 1,): x (N, 3) m in the target, rays (N, 3) unit in the camera.
 
+    block_idx: (B,) their positions in the survey. focal_px: (B,) turns angles into px.
+    """
+
+    block_idx: IntArray
+    x: FloatArray
+    rays: FloatArray
+    ptr: IntArray
+    focal_px: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.block_idx)
+
+    def only(self, kept: BoolArray) -> "Sights":
+        """Some (B,) of them."""
+        if kept.all():
+            return self
+        rows, sizes = np.repeat(kept, np.diff(self.ptr)), np.diff(self.ptr)[kept]
+        return Sights(self.block_idx[kept], self.x[rows], self.rays[rows], ends_of(sizes), self.focal_px[kept])
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Images that some pose explains: poses (K, 4, 4) camera_from_target, image after image by first (B + 1,).
+
+    The likeliest of each comes first. error_px: (K,).
+    """
+
+    sights: Sights
     poses: FloatArray
     error_px: FloatArray
+    first: IntArray
+
+    def __len__(self) -> int:
+        return len(self.sights)
+
+    def __iter__(self) -> Iterator[View]:
+        s = self.sights
+        ends = zip(pairwise(s.ptr.tolist()), pairwise(self.first.tolist()), strict=True)
+        for i, ((a, b), (c, d)) in enumerate(ends):
+            yield View(int(s.block_idx[i]), s.x[a:b], s.rays[a:b], s.focal_px[i], self.poses[c:d], self.error_px[c:d])
+
+
+def ends_of(sizes: Sequence[int] | IntArray) -> IntArray:
+    """Where parts of these sizes end, one after the other, and 0 before them."""
+    return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)])
+
+
+def joined(items: Sequence[tuple[int, FloatArray, FloatArray, float]]) -> Sights:
+    """Images, each as its position in the survey, x (n, 3), rays (n, 3) and principal distance in px."""
+    blocks, x, rays, focal = zip(*items, strict=True) if items else ((), (), (), ())
+    none = [np.zeros((0, 3))]
+    ptr = ends_of([len(part) for part in x])
+    return Sights(np.array(blocks, dtype=np.int64), np.concatenate(x or none), np.concatenate(rays or none), ptr,
+                  np.array(focal, dtype=np.float64))  # fmt: skip
 
 
 def used_rows(block: ImageBlock) -> BoolArray:
@@ -73,15 +131,20 @@ def focal_px(camera: Camera, values: FloatArray) -> float:
     return focal_length_px(model, values, camera_constants(camera))
 
 
-def all_rays(survey: Survey, lenses: dict[str, FloatArray]) -> tuple[dict[int, FloatArray], dict[int, str]]:
-    """Rays (n, 3) of all rows of every block, and the reason for each block that has none."""
+def rays_by_block(
+    survey: Survey, lenses: Mapping[str, FloatArray], seen: Mapping[int, FloatArray]
+) -> tuple[dict[int, FloatArray], dict[int, str]]:
+    """Rays (n, 3) of the image points ``seen`` (n, 2) px of some blocks, and the reason for each that has none."""
     rays: dict[int, FloatArray] = {}
     failed: dict[int, str] = {}
-    cameras = {c.camera_id: c for c in survey.cameras}
-    for camera_id, values in lenses.items():
-        mine = {i: b.uv for i, b in enumerate(survey.image_blocks) if b.camera_id == camera_id and len(b.uv)}
-        found = rays_of_images(cameras[camera_id], values, list(mine.values()))
-        for i, of_block in zip(mine, found, strict=True):
+    mine: dict[str, list[int]] = {}
+    for i, uv in seen.items():
+        if len(uv):
+            mine.setdefault(survey.image_blocks[i].camera_id, []).append(i)
+    for camera in (c for c in survey.cameras if c.camera_id in mine):
+        of_camera = mine[camera.camera_id]
+        found = rays_of_images(camera, lenses[camera.camera_id], [seen[i] for i in of_camera])
+        for i, of_block in zip(of_camera, found, strict=True):
             if isinstance(of_block, SurveyError):
                 failed[i] = str(of_block)
             else:
@@ -96,7 +159,8 @@ def rays_of_images(
     if not images:
         return []
     try:
-        return np.split(rays_of(camera, values, np.concatenate(images)), np.cumsum([len(uv) for uv in images])[:-1])
+        rays = rays_of(camera, values, np.concatenate(images))
+        return [rays[a:b] for a, b in pairwise(ends_of([len(uv) for uv in images]).tolist())]
     except SurveyError as error:  # some pixel of some image: find out which
         return [error] if len(images) == 1 else [rays_of_images(camera, values, [uv])[0] for uv in images]
 
@@ -108,46 +172,40 @@ def _sample(n: int) -> IntArray:
 
 
 def make_views(
-    sights: Sequence[Sight], present: Sequence[FloatArray] | None = None
-) -> tuple[list[View], dict[int, str]]:
+    sights: Sights, present: FloatArray | None = None, thorough: bool = True
+) -> tuple[Views, dict[int, str]]:
     """Views with the likeliest poses that explain each by itself, and for every block that has none the reason.
 
-    present: poses (4, 4) that are to be tried beside those found. All are refined in one go, robustly, first on a
-    sample of each view's points, then in a few more steps on all of them.
+    present: (B, 4, 4) poses that are to be tried beside those found. All are refined in one go, robustly, on a sample
+    of each view's points; ``thorough``: then in a few more steps on all of them.
     """
-    if not sights:
-        return [], {}
-    sizes, focal = [len(s.x) for s in sights], np.array([s.focal_px for s in sights])
-    x, rays = (np.concatenate([getattr(s, name) for s in sights]) for name in ("x", "rays"))
-    ptr = np.cumsum([0, *sizes])
-    few = [_sample(n) for n in sizes]
-    few_ptr = np.cumsum([0] + [len(r) for r in few])
+    if not len(sights):
+        return Views(sights, np.zeros((0, 4, 4)), np.zeros(0), np.zeros(1, dtype=np.int64)), {}
+    x, rays, ptr, focal = sights.x, sights.rays, sights.ptr, sights.focal_px
+    few = [_sample(n) for n in np.diff(ptr).tolist()]
+    few_ptr = ends_of([len(r) for r in few])
     rows = np.concatenate(few) + np.repeat(ptr[:-1], np.diff(few_ptr))
-    sample = x[rows], rays[rows], few_ptr
-    poses, of, failed = view_poses(*sample)
-    error, in_front = view_errors(poses, *sample, of)
+    part = x[rows], rays[rows], few_ptr
+    poses, of, failed = view_poses(*part)
+    error, in_front = view_errors(poses, *part, of)
     kept = _likeliest(focal, error, in_front, of)
     poses, of = poses[kept], of[kept]
-    if present is not None and len(of):
+    if present is not None:
         beside = np.unique(of)
-        poses, of = np.concatenate([np.array(present)[beside], poses]), np.concatenate([beside, of])
-    poses = refine_poses(poses, *sample, _STEPS[0], True, of)
-    error, in_front = view_errors(poses, *sample, of)
+        poses, of = np.concatenate([present[beside], poses]), np.concatenate([beside, of])
+    poses = refine_poses(poses, *part, _STEPS[0], True, of)
+    error, in_front = view_errors(poses, *part, of)
     kept = _likeliest(focal, error, in_front, of)
     poses, error, in_front, of = poses[kept], error[kept], in_front[kept], of[kept]
-    more = (np.diff(few_ptr) < sizes)[of]
+    more = (np.diff(few_ptr) < np.diff(ptr))[of] & thorough
     if more.any():
         poses[more] = refine_poses(poses[more], x, rays, ptr, _STEPS[1], True, of[more])
         error[more], in_front[more] = view_errors(poses[more], x, rays, ptr, of[more])
         kept = _likeliest(focal, error, in_front, of)
         poses, error, of = poses[kept], error[kept], of[kept]
-    error_px, ends = error * focal[of], np.searchsorted(of, np.arange(len(sights) + 1)).tolist()
-    views = [
-        View(s.block_idx, s.x, s.rays, s.focal_px, poses[a:b], error_px[a:b])
-        for s, a, b in zip(sights, ends, ends[1:], strict=False)
-        if b > a
-    ]
-    return views, {sights[i].block_idx: reason for i, reason in failed.items()}
+    counts = np.bincount(of, minlength=len(sights))
+    views = Views(sights.only(counts > 0), poses, error * focal[of], ends_of(counts[counts > 0]))
+    return views, {int(sights.block_idx[i]): reason for i, reason in failed.items()}
 
 
 def _likeliest(focal: FloatArray, error: FloatArray, in_front: BoolArray, of: IntArray) -> IntArray:
@@ -163,32 +221,31 @@ def _likeliest(focal: FloatArray, error: FloatArray, in_front: BoolArray, of: In
     return np.asarray(order[first | (in_front & (error <= limit))])
 
 
-def untrustworthy(views: Sequence[View], survey: Survey) -> tuple[dict[int, str], list[str]]:
-    """Reasons against blocks that no pose explains, and notes on blocks with single gross points.
+def untrustworthy(
+    views: Views, survey: Survey, refused: Collection[int] = ()
+) -> tuple[dict[int, str], list[str]]:
+    """Reasons against blocks that no pose explains, and notes on blocks with single gross points; not of those refused.
 
     The limit of a camera is ten times the median error of its blocks, but at least 3 px.
     """
     reasons: dict[int, str] = {}
     notes: list[str] = []
-    if not views:
+    sights, blocks = views.sights, survey.image_blocks
+    ptr, focal = sights.ptr, sights.focal_px
+    judged = ~np.isin(sights.block_idx, list(refused))
+    if not judged.any():
         return reasons, notes
-    ptr = np.cumsum([0] + [len(v.x) for v in views])
-    offsets, medians = view_offsets(
-        np.array([v.poses[0] for v in views]), np.concatenate([v.x for v in views]),
-        np.concatenate([v.rays for v in views]), ptr,
-    )  # fmt: skip
-    focal = np.array([v.focal_px for v in views])
+    offsets, medians = view_offsets(views.poses[views.first[:-1]], sights.x, sights.rays, ptr)
     worst = np.maximum.reduceat(offsets, ptr[:-1]) * focal
-    by_camera: dict[str, list[int]] = {}
-    for i, view in enumerate(views):
-        by_camera.setdefault(survey.image_blocks[view.block_idx].camera_id, []).append(i)
-    for mine in by_camera.values():
+    cameras = np.array([blocks[i].camera_id for i in sights.block_idx.tolist()])
+    for camera_id in dict.fromkeys(cameras.tolist()):
+        mine = np.flatnonzero((cameras == camera_id) & judged)
         limit = max(3.0, 10.0 * float(np.median(medians[mine] * focal[mine])))
-        for i in (i for i in mine if worst[i] > limit):
-            view, bad = views[i], offsets[ptr[i] : ptr[i + 1]] * focal[i] > limit
-            text = block_text(survey.image_blocks[view.block_idx])
+        for i in mine[worst[mine] > limit].tolist():
+            bad, block_idx = offsets[ptr[i] : ptr[i + 1]] * focal[i] > limit, int(sights.block_idx[i])
+            text = block_text(blocks[block_idx])
             if bad.mean() > _GROSS_SHARE:
-                reasons[view.block_idx] = (
+                reasons[block_idx] = (
                     f"{text}: {int(bad.sum())} of {len(bad)} points are more than {limit:.1f} px off the best pose"
                     " (mis-detected, or points in the wrong order)"
                 )

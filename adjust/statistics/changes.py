@@ -58,7 +58,7 @@ class Unit:
 class _Candidates:
     """A unit's possible changes (J, ...), scaled so that B'B has a unit diagonal: M (J, q, q), g (J, q), scale (J, q).
 
-    Y: (J, n, q) Q A'B.
+    Y: (n, j q) Q A'B of the j runs by themselves, one after the other; a change has the sum of those from its run on.
     """
 
     unit: Unit
@@ -98,6 +98,7 @@ class ChangeSearch:
         rows = s.used[s.row_of]
         step = s.normal.solve(np.asarray(s.A[rows].T @ s.e[rows]))
         self.A, self.e = s.A, s.e - s.A @ step
+        self.epoch, self.epochs = _coded([b.epoch_id for b in adjustment.survey.image_blocks])
         n = len(s.columns)
         units, self.runs = list(self._units(_MOST_RUNS)), _MOST_RUNS
         most = min(_WORK / s.normal.cost, _ROOM / max(n, 1))
@@ -109,7 +110,7 @@ class ChangeSearch:
 
     def left_out(self) -> tuple[str, ...]:
         """For people: between which epochs no change was looked for."""
-        longest = max((len(set(self._epoch_names(rows))) for _, _, rows in self._owners()), default=0)
+        longest = max((len(np.unique(self._epochs_of(rows))) for _, _, rows in self._owners()), default=0)
         if longest <= self.runs:
             return ()
         return (f"changes of cameras and targets were looked for at {self.runs - 1} of {longest - 1} borders between "
@@ -161,10 +162,9 @@ class ChangeSearch:
                 mine = np.array([n == name for n in names], dtype=np.bool_)
                 yield kind, name, np.flatnonzero(mine[of_row])
 
-    def _epoch_names(self, rows: IntArray) -> list[str]:
+    def _epochs_of(self, rows: IntArray) -> IntArray:
         """Of every image row."""
-        blocks = self.adjustment.survey.image_blocks
-        return [blocks[b].epoch_id for b in self.condensed.block[rows].tolist()]
+        return np.asarray(self.epoch[self.condensed.block[rows]])
 
     def _units(self, most_runs: int) -> Iterator[Unit]:
         c, survey = self.condensed, self.adjustment.survey
@@ -172,7 +172,7 @@ class ChangeSearch:
         poses = tuple(zip(POSE_COMPONENTS, POSE_UNITS, strict=True))
         whole = {t.target_id: t.x_in_target for t in survey.targets}
         for kind, name, rows in self._owners():
-            run, first = _runs(self._epoch_names(rows), most_runs)
+            run, first = _runs(self._epochs_of(rows), self.epochs, most_runs)
             if kind == "camera":
                 lens = vectors[("lens", name)]
                 free = tuple((x, lens.units[lens.names.index(x)]) for x in lens.free) if lens.key is not None else ()
@@ -199,7 +199,7 @@ class ChangeSearch:
             W = [np.asarray(noise_of(others[i]).R()) for i in mine]
             rows = np.concatenate([np.arange(s.ptr[s.n_image + i], s.ptr[s.n_image + i + 1]) for i in mine])
             epochs = [others[i].ids[1] for i, w in zip(mine, W, strict=True) for _ in range(len(w))]
-            run, first = _runs(epochs, most_runs)
+            run, first = _runs(*_coded(epochs), most_runs)
             axes = tuple(others[mine[0]].components)
             if len(first) > 1:
                 zeros = tuple((x, "rad") for x in axes)
@@ -221,15 +221,16 @@ class ChangeSearch:
         wide = sparse.csr_matrix((u.B.ravel(), columns, np.arange(len(u.rows) + 1) * q), (len(u.rows), J * q))
         X = (A.T @ wide).toarray()
         Y = self.system.normal.solve(X)
-        P = _by_run(u, u.B)
-        g = _by_run(u, e[:, None])[:, :, 0]
-        X, Y = (x.reshape(-1, J, q).transpose(1, 0, 2) for x in (X, Y))
-        X, Y, P, g = (np.cumsum(x[::-1], axis=0)[::-1] for x in (X, Y, P, g))
-        kept = slice(1, None) if J > 1 else slice(None)
-        X, Y, P, g = X[kept], Y[kept], P[kept], g[kept]
+        P = _from_runs_on(_by_run(u, u.B))
+        g = _from_runs_on(_by_run(u, e[:, None]))[:, :, 0]
+        taken, X_on, Y_on = np.empty((J, q, q)), np.zeros((len(X), q)), np.zeros((len(X), q))
+        for j in reversed(range(J)):
+            X_on += X[:, j * q : (j + 1) * q]
+            Y_on += Y[:, j * q : (j + 1) * q]
+            taken[j] = X_on.T @ Y_on
         size = np.sqrt(np.einsum("jqq->jq", P))
         scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
-        M = (P - X.transpose(0, 2, 1) @ Y) * scale[:, :, None] * scale[:, None, :]
+        M = (P - taken[1 if J > 1 else 0 :]) * scale[:, :, None] * scale[:, None, :]
         return _Candidates(u, 0.5 * (M + M.transpose(0, 2, 1)), g * scale, scale, Y)
 
     def _chosen(self, c: _Candidates, j: int, before: Sequence[_Chosen]) -> _Chosen:
@@ -237,7 +238,8 @@ class ChangeSearch:
         u, B = c.unit, np.zeros((len(self.e), c.unit.B.shape[1]))
         mine = u.run >= (j + 1 if len(u.epochs) > 1 else 0)
         B[u.rows[mine]] = u.B[mine] * c.scale[j]
-        X, Y = np.asarray(self.A.T @ B), c.Y[j] * c.scale[j]
+        of_runs = c.Y.reshape(len(c.Y), -1, u.B.shape[1])[:, (j + 1 if len(u.epochs) > 1 else 0) :]
+        X, Y = np.asarray(self.A.T @ B), of_runs.sum(axis=1) * c.scale[j]
         shares = [x.inverse @ (x.B.T @ B - x.X.T @ Y) for x in before]
         for x, share in zip(before, shares, strict=True):
             B, X = B - x.B @ share, X - x.X @ share
@@ -253,15 +255,20 @@ def _by_runs(u: Unit) -> Unit:
     return replace(u, rows=u.rows[order], B=u.B[order], run=u.run[order])
 
 
-def _runs(epochs: Sequence[str], most: int) -> tuple[IntArray, tuple[str, ...]]:
+def _coded(epochs: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
+    """Number (k,) of every epoch among the different ones, and these in natural order."""
+    names = tuple(sorted(set(epochs), key=natural))
+    number = {e: i for i, e in enumerate(names)}
+    return np.array([number[e] for e in epochs], dtype=np.int64), names
+
+
+def _runs(epochs: IntArray, names: Sequence[str], most: int) -> tuple[IntArray, tuple[str, ...]]:
     """Number (k,) of the run of epochs that each belongs to, at most so many, and the first epoch of every run."""
-    names = sorted(set(epochs), key=natural)
-    n = min(most, len(names))
-    number = {e: i * n // len(names) for i, e in enumerate(names)}
-    first: dict[int, str] = {}
-    for e in names:
-        first.setdefault(number[e], e)
-    return np.array([number[e] for e in epochs], dtype=np.int64), tuple(first.values())
+    there, place = np.unique(epochs, return_inverse=True)
+    n = min(most, len(there))
+    number = np.arange(len(there)) * n // max(len(there), 1)
+    first = there[np.searchsorted(number, np.arange(n))]
+    return number[place.reshape(-1)], tuple(names[i] for i in first.tolist())
 
 
 def _by_run(u: Unit, other: FloatArray) -> FloatArray:
@@ -270,11 +277,16 @@ def _by_run(u: Unit, other: FloatArray) -> FloatArray:
     return np.array([u.B[i:j].T @ other[i:j] for i, j in pairwise(first.tolist())])
 
 
+def _from_runs_on(of_runs: FloatArray) -> FloatArray:
+    """Of what runs have (J, ...) the sums from the second, the third, ... on (J - 1, ...); of one run what it has."""
+    return np.asarray(np.cumsum(of_runs[::-1], axis=0)[::-1][1 if len(of_runs) > 1 else 0 :])
+
+
 def _given(c: _Candidates, known: _Chosen) -> _Candidates:
     """Candidates with M and g where one more change is part of the model."""
-    u, J = c.unit, len(c.unit.epochs)
-    direct = np.cumsum(_by_run(u, known.B[u.rows])[::-1], axis=0)[::-1][1 if J > 1 else 0 :]
-    K = (direct - c.Y.transpose(0, 2, 1) @ known.X) * c.scale[:, :, None]
+    u = c.unit
+    across = _by_run(u, known.B[u.rows]) - (c.Y.T @ known.X).reshape(len(u.epochs), u.B.shape[1], -1)
+    K = _from_runs_on(across) * c.scale[:, :, None]
     M = c.M - K @ known.inverse @ K.transpose(0, 2, 1)
     return replace(c, M=0.5 * (M + M.transpose(0, 2, 1)), g=c.g - K @ known.amounts)
 

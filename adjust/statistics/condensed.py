@@ -15,6 +15,7 @@ from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.images import N_SHAPE
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
 from adjust.observations.images.batch import warp_shape
@@ -32,7 +33,6 @@ from adjust.statistics.system import (
     columns_of_blocks,
 )
 
-N_SHAPE = 4
 _FLAT = 1e-9
 
 
@@ -73,11 +73,16 @@ class CondensedSystem:
         kept = columns >= 0
         return columns[kept], (local @ graph.images.local_from_keys(which)[0])[:, kept]
 
+    @property
+    def n_points(self) -> int:
+        """Image points."""
+        return int(self._places[0][-1])
+
     @cached_property
     def _places(self) -> tuple[IntArray, dict[int, int]]:
         """First image point of every block, and the place of blocks of known targets among these."""
         graph = self.system.precision.graph
-        known = [i for i, free in graph.image_order if not free]
+        known = [i for i, part in graph.image_order if not part]
         return np.cumsum([0] + [len(b.uv) for b in graph.survey.image_blocks]), {i: b for b, i in enumerate(known)}
 
 
@@ -92,8 +97,10 @@ def condensed_system(precision: Precision) -> CondensedSystem:
         graph = precision.graph
         columns.update(key_columns)
         parts = [_known(graph, n, key_columns, kept, blocks, numbers)]
-        if graph.bundle is not None:
-            parts.append(_unknown(precision, graph.bundle, n, key_columns, kept, blocks, numbers))
+        for part, bundle in enumerate(graph.bundles, 1):
+            number = np.array([i for i, p in graph.image_order if p == part], dtype=np.int64)
+            parts.append(_unknown(bundle, number, n, key_columns, kept, blocks))
+            numbers.append(number)
         A = sparse.vstack([p.A for p in parts]).tocsr()
         e, lengths, used = (np.concatenate([getattr(p, x) for p in parts]) for x in ("e", "lengths", "used"))
         return ImageRows(A, e, lengths, used, [g for p in parts for g in p.groups])
@@ -114,7 +121,7 @@ def _known(
 ) -> ImageRows:  # fmt: skip
     """Blocks of known targets, those of the same size together."""
     images, entries = graph.images, Entries()
-    number = np.array([i for i, free in graph.image_order if not free], dtype=np.int64)
+    number = np.array([i for i, part in graph.image_order if not part], dtype=np.int64)
     shapes: dict[str | None, FloatArray] = {}
     shapes.update({t.target_id: _shape_factors(t.x_in_target) for t in graph.survey.targets})
     columns, sets = columns_of_blocks(graph, key_columns), images.alike()
@@ -167,22 +174,13 @@ def _condensed_rows(
     graph: AdjustmentGraph, mine: IntArray, shapes: Mapping[str | None, FloatArray]
 ) -> FloatArray:
     """Rows (g, k, lens + pose + warp + shape + 1) of g blocks with equally many points and columns."""
-    images = graph.images
-    local = images.rows(mine)
-    n = local.shape[1] // 2
-    none = np.zeros((0, N_SHAPE))
-    factors = np.zeros((len(mine), n, N_SHAPE))
-    for i, b in enumerate(mine):
-        given = shapes.get(images.blocks[b].target_id, none)
+    blocks, none = graph.images.blocks, np.zeros((0, N_SHAPE))
+    factors = np.zeros((len(mine), len(blocks[mine[0]].uv), N_SHAPE))
+    for i, b in enumerate(mine.tolist()):
+        given = shapes.get(blocks[b].target_id, none)
         if len(given):
-            factors[i] = given[images.blocks[b].point_idx]
-    nl = images.state.lenses.n_free[images.camera[mine]]
-    pose = nl[:, None] + 3 + np.array([0, 1, 2, 2])
-    by_point = np.take_along_axis(local, np.broadcast_to(pose[:, None], (len(mine), 2 * n, N_SHAPE)), axis=2)
-    rows = np.concatenate([local[:, :, :-1], by_point * np.repeat(factors, 2, axis=1), local[:, :, -1:]], axis=2)
-    used = images.used[images.ptr[mine][:, None] + np.arange(n)]
-    rows *= np.repeat(used, 2, axis=1)[:, :, None]
-    return np.asarray(np.linalg.qr(rows, mode="r")) if rows.shape[1] > rows.shape[2] else rows
+            factors[i] = given[blocks[b].point_idx]
+    return graph.images.condensed_rows(mine, factors)
 
 
 def _of_cameras(R: FloatArray, t: FloatArray) -> FloatArray:
@@ -204,15 +202,14 @@ def _shape_factors(x: FloatArray) -> FloatArray:
 
 
 def _unknown(
-    precision: Precision, bundle: BundleBatch, n: int, key_columns: KeyColumns, kept: dict[str, list[FloatArray]],
-    blocks: list[IntArray], numbers: list[IntArray],
+    bundle: BundleBatch, number: IntArray, n: int, key_columns: KeyColumns, kept: dict[str, list[FloatArray]],
+    blocks: list[IntArray],
 ) -> ImageRows:  # fmt: skip
     """Blocks of unknown points, whose rows differ in the columns of their points: as they are, two per point."""
-    A, e = bundle_rows(precision.graph, n, key_columns, precision.solved.values)
+    A, e = bundle_rows(bundle, n, key_columns)
     order = bundle_order(bundle)
     used = np.repeat(bundle.unsorted(bundle.used), 2).astype(float)
     local = bundle.A.reshape(-1, MAX_LENS + 7)[order] * used[:, None]
-    number = np.array([i for i, free in precision.graph.image_order if free], dtype=np.int64)
     lengths = 2 * np.diff(bundle.block_ptr)
     of_row = np.repeat(np.arange(len(lengths)), lengths)
     pose = local[:, MAX_LENS : MAX_LENS + 6]
@@ -223,7 +220,6 @@ def _unknown(
     kept["camera"].append(np.einsum("ni,nij->nj", pose, by_camera[of_row]))
     kept["shape"].append(np.zeros((len(local), N_SHAPE)))
     blocks.append(number[of_row])
-    numbers.append(number)
     groups = [b.group for b in bundle.blocks]
     A = sparse.diags(used) @ A
     return ImageRows(A.tocsr(), e * used, lengths.astype(np.int64), np.ones(len(groups), dtype=np.bool_), groups)

@@ -6,7 +6,8 @@ import numpy as np
 
 from adjust.graph.datum import in_world
 from adjust.model.result import ParameterName
-from adjust.model.survey import FloatArray
+from adjust.model.survey import FloatArray, IntArray
+from adjust.native.parallel import side_by_side
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Influence
 from adjust.statistics.system import LinearSystem
@@ -20,7 +21,7 @@ def shifts(condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, F
     rows: image points first, then all others.
     """
     system = condensed.system
-    n_points = sum(len(b.uv) for b in system.precision.graph.survey.image_blocks)
+    n_points = condensed.n_points
     right = np.zeros((len(system.columns), len(rows)))
     for i, row in enumerate(rows):
         if row < n_points:
@@ -35,40 +36,42 @@ def influences(
     condensed: CondensedSystem, rows: Sequence[int], bias: Mapping[int, FloatArray]
 ) -> tuple[Influence, ...]:
     """The unknown and the position that each bias moves most; in the order of ``rows``."""
-    system, out = condensed.system, list[Influence]()
-    sigmas = np.where(system.sigmas > 0.0, system.sigmas, np.inf)
-    places = _positions(system)
-    for first in range(0, len(rows), _CHUNK):
-        part = rows[first : first + _CHUNK]
+    system = condensed.system
+    c, sigmas = system.columns, np.where(system.sigmas > 0.0, system.sigmas, np.inf)
+    places, coordinates, starts = _positions(system)
+    _ = system.normal  # factored before the threads ask for it
+
+    def of(first: int) -> list[Influence]:
+        part, out = rows[first : first + _CHUNK], list[Influence]()
         dx = shifts(condensed, part, bias)
         ratio = np.abs(dx) / sigmas[:, None]
-        worst = ratio.argmax(axis=0)
-        length, furthest = _furthest(dx, places)
-        for i, row in enumerate(part):
-            j = int(worst[i])
-            name = places[int(furthest[i])][0] if places else ()
-            out.append(
-                Influence(row, system.columns.names[j], system.columns.components[j], system.columns.units[j],
-                          float(dx[j, i]), float(ratio[j, i]), name, float(length[i]))
-            )  # fmt: skip
-    return tuple(out)
+        length, furthest = _furthest(dx, coordinates, starts)
+        for i, (row, j) in enumerate(zip(part, ratio.argmax(axis=0).tolist(), strict=True)):
+            name = places[int(furthest[i])] if places else ()
+            out.append(Influence(row, c.names[j], c.components[j], c.units[j], float(dx[j, i]), float(ratio[j, i]),
+                                 name, float(length[i])))  # fmt: skip
+        return out
+
+    return tuple(x for part in side_by_side(of, range(0, len(rows), _CHUNK)) for x in part)
 
 
-def _positions(system: LinearSystem) -> list[tuple[ParameterName, list[int]]]:
-    """Unknowns that are positions in the world, with the columns of their coordinates."""
-    out = []
+def _positions(system: LinearSystem) -> tuple[list[ParameterName], IntArray, IntArray]:
+    """Unknowns that are positions in the world, the columns of all their coordinates, where each begins in these."""
+    names, columns, starts = list[ParameterName](), list[int](), list[int]()
+    components = system.columns.components
     for name, at in system.columns.at.items():
         if name[0] == "point" or in_world(system.precision.graph, name):
-            mine = [int(c) for c in at if system.columns.components[c] in ("x", "y", "z", "tx", "ty", "tz")]
+            mine = [c for c in at.tolist() if components[c] in ("x", "y", "z", "tx", "ty", "tz")]
             if mine:
-                out.append((name, mine))
-    return out
+                names.append(name)
+                starts.append(len(columns))
+                columns += mine
+    return names, np.array(columns, dtype=np.int64), np.array(starts, dtype=np.int64)
 
 
-def _furthest(
-    dx: FloatArray, places: Sequence[tuple[ParameterName, list[int]]]
-) -> tuple[FloatArray, FloatArray]:
-    if not places:
-        return np.zeros(dx.shape[1]), np.zeros(dx.shape[1])
-    lengths = np.stack([np.linalg.norm(dx[columns], axis=0) for _, columns in places])
+def _furthest(dx: FloatArray, columns: IntArray, starts: IntArray) -> tuple[FloatArray, IntArray]:
+    """How far the position moves that moves most, and which that is; of every column of dx (n, k)."""
+    if not len(starts):
+        return np.zeros(dx.shape[1]), np.zeros(dx.shape[1], dtype=np.int64)
+    lengths = np.sqrt(np.add.reduceat(dx[columns] ** 2, starts, axis=0))
     return lengths.max(axis=0), lengths.argmax(axis=0)

@@ -5,34 +5,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.arrays import largest
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
-from adjust.native.parallel import side_by_side
+from adjust.native.point_tests import AdjustedPoints, controlled_directions, point_tests
 from adjust.observations.terrestrial.statistics import influences as influences_of_readings
 from adjust.precision.precision import Precision
 from adjust.statistics.condensed import CondensedSystem, condensed_system
 from adjust.statistics.influence import influences
-from adjust.statistics.result import ImageEllipses, Influence, ObservationTests, Reliability
+from adjust.statistics.result import Influence, ObservationTests, Reliability
 from adjust.statistics.system import groups_of_others, precision_of
 from adjust.testing.criteria import Criteria, LevelOptions, criteria
-from adjust.testing.single_tests import (
-    Whitened,
-    component_tests,
-    eigen2,
-    p_normal,
-    p_posterior,
-    p_prior,
-    p_tau,
-    whitened,
-)
+from adjust.testing.single_tests import Whitened, component_tests, whitened
 
 DEFAULT_LEVELS = LevelOptions()
-_AT_ONCE = 50_000
-"""Image points that are tested in one go."""
 LARGEST_NETWORK = 3000
 """Pairs and priors of a pose network above which no influences are named."""
-_OF_ROWS = ("redundancy", "least", "statistic", "p", "p_posterior", "detectable", "external")
-_OF_COMPONENTS = ("w", "p_w", "p_tau", "error", "detectable_component", "bias")
+_OF_ROWS = ("redundancy", "least", "statistic", "detectable", "external")
+_OF_COMPONENTS = ("w", "error", "detectable_component", "bias")
+"""Columns as :func:`adjust.native.point_tests.point_tests` fills them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,27 +52,22 @@ def reliability(
 
     system: of this adjustment, where it is known already.
     """
-    batches = _batches(adjustment, system)
-    sizes = np.zeros(sum(len(b.rows) for b in batches), dtype=np.int64)
+    precision = system.system.precision if system is not None else precision_of(adjustment)
+    points, batches = precision.image_points, [*_others(precision), *_readings(precision)]
+    n_image = len(points.v)
+    sizes = np.full(n_image + sum(len(b.rows) for b in batches), 2, dtype=np.int64)
+    freedom = np.empty_like(sizes)
+    controlled_directions(points, freedom[:n_image])
     for batch in batches:
-        sizes[batch.rows] = batch.x.g.shape[1]
-    ptr = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    n_tests = int(sum(np.count_nonzero(b.x.freedom) for b in batches))
-    found = criteria(options, n_tests, int(sizes.max(initial=1)))
-    tests = _table(adjustment, batches, ptr, found)
-    if adjustment.survey.is_pose_network and len(ptr) > LARGEST_NETWORK:
+        sizes[batch.rows], freedom[batch.rows] = batch.x.g.shape[1], batch.x.freedom
+    found = criteria(options, int(np.count_nonzero(freedom)), int(sizes.max(initial=1)))
+    tests = _table(adjustment, points, batches, np.concatenate([[0], np.cumsum(sizes)]), freedom, found)
+    if adjustment.survey.is_pose_network and len(sizes) > LARGEST_NETWORK:
         most_influences = 0
     return Reliability(
-        found, tests, _ellipses(batches, tests.n_image, found),
-        _influences(adjustment, tests, batches, found, most_influences, system), _uncontrolled(adjustment, tests),
-        adjustment.sigma0, adjustment.redundancy,
+        found, tests, _influences(adjustment, tests, points, batches, most_influences, system),
+        _uncontrolled(adjustment, tests), adjustment.sigma0, adjustment.redundancy, points,
     )  # fmt: skip
-
-
-def _batches(adjustment: Adjustment, system: CondensedSystem | None) -> list[_Batch]:
-    """Image points first."""
-    precision = system.system.precision if system is not None else precision_of(adjustment)
-    return [*_images(precision), *_others(precision), *_readings(precision)]
 
 
 def observation_name(adjustment: Adjustment, row: int) -> tuple[str, tuple[str, ...]]:
@@ -98,53 +84,6 @@ def observation_name(adjustment: Adjustment, row: int) -> tuple[str, tuple[str, 
         return "image", (block.camera_id, block.epoch_id, "points", adjustment.survey.points[point].point_id)
     target = next(t for t in adjustment.survey.targets if t.target_id == block.target_id)
     return "image", (block.camera_id, block.epoch_id, block.target_id, target.point_ids[point])
-
-
-def image_whitened(precision: Precision) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of all image points whitened residuals (N, 2), whitened A Q A' and square root information (N, 2, 2)."""
-    graph, values = precision.graph, precision.solved.values
-    graph.prepare(values, jacobians=True)
-    images, bundle = graph.images, graph.bundle
-    v, M3 = images.statistics(precision.tree)
-    parts = [(v, M3, images.W_all)]
-    if bundle is not None:
-        bundle.whitened_squares(values)
-        found = bundle.residuals_px(), precision.bundle_influence, bundle.W_all
-        parts.append((bundle.unsorted(found[0]), bundle.unsorted(found[1]), bundle.unsorted(found[2])))
-    order = _image_order(precision)
-    v, M3, W3 = (np.concatenate([p[i] for p in parts])[order] for i in range(3))
-    W = np.zeros((len(v), 2, 2))
-    W[:, 0, 0], W[:, 0, 1], W[:, 1, 1] = W3.T
-    M = np.stack([M3[:, :2], M3[:, 1:]], axis=1)
-    return np.einsum("nij,nj->ni", W, v), M, W
-
-
-def _image_order(precision: Precision) -> IntArray:
-    """Where the image points (N,), in the order of the survey's blocks, stand: known targets first, then the bundle."""
-    graph = precision.graph
-    out: list[IntArray] = [np.zeros(0, dtype=np.int64)]
-    at = [0, graph.images.n_points]
-    for i, free in graph.image_order:
-        n = len(graph.survey.image_blocks[i].uv)
-        out.append(np.arange(at[int(free)], at[int(free)] + n))
-        at[int(free)] += n
-    return np.concatenate(out)
-
-
-def _images(precision: Precision) -> list[_Batch]:
-    """All image points, so many in each."""
-    e, M, every = image_whitened(precision)
-    used = precision.graph.used()
-
-    def batch(first: int) -> _Batch:
-        part = slice(first, first + _AT_ONCE)
-        W = every[part]
-        back = np.zeros_like(W)
-        back[:, 0, 0], back[:, 1, 1] = 1.0 / W[:, 0, 0], 1.0 / W[:, 1, 1]
-        back[:, 0, 1] = -W[:, 0, 1] * back[:, 0, 0] * back[:, 1, 1]
-        return _batch(np.arange(first, first + len(W)), whitened(e[part], M[part], used[part]), W, back)
-
-    return side_by_side(batch, range(0, len(e), _AT_ONCE))
 
 
 def _others(precision: Precision) -> list[_Batch]:
@@ -203,45 +142,41 @@ def _readings(precision: Precision) -> list[_Batch]:
 
 
 def _table(
-    adjustment: Adjustment, batches: Sequence[_Batch], ptr: IntArray, found: Criteria
-) -> ObservationTests:
-    M, K = len(ptr) - 1, int(ptr[-1])
-    of_row = {name: np.zeros(M) for name in _OF_ROWS}
-    of_part = {name: np.full(K, np.nan) for name in _OF_COMPONENTS}
-    freedom, used = np.zeros(M, dtype=np.int64), np.zeros(M, dtype=np.bool_)
-
-    def fill(batch: _Batch) -> None:
+    adjustment: Adjustment, points: AdjustedPoints, batches: Sequence[_Batch], ptr: IntArray, freedom: IntArray,
+    found: Criteria,
+) -> ObservationTests:  # fmt: skip
+    M, K, n_image = len(freedom), int(ptr[-1]), len(points.v)
+    columns = {name: np.empty(M) for name in _OF_ROWS} | {name: np.empty(K) for name in _OF_COMPONENTS}
+    of_images = [columns[name][:n_image] for name in _OF_ROWS]
+    of_images += [columns[name][: 2 * n_image].reshape(-1, 2) for name in _OF_COMPONENTS]
+    point_tests(points, np.ascontiguousarray(found.lambda0[:2]), tuple(of_images))
+    used = np.empty(M, dtype=np.bool_)
+    used[:n_image] = points.used
+    for batch in batches:
         rows = batch.rows
         parts = (ptr[rows][:, None] + np.arange(batch.x.g.shape[1])).ravel()
-        freedom[rows], used[rows] = batch.x.freedom, batch.x.used
-        for name, values in _of_rows(batch, adjustment, found).items():
-            of_row[name][rows] = values
-        for name, values in _of_components(batch, adjustment, found).items():
-            of_part[name][parts] = values.ravel()
-
-    side_by_side(fill, batches)
+        used[rows] = batch.x.used
+        for name, values in _of_rows(batch, found).items():
+            columns[name][rows] = values
+        for name, values in _of_components(batch, found).items():
+            columns[name][parts] = values.ravel()
     readings = adjustment.reading_residuals
     if readings is not None:  # of joint readings: the shares of the degrees of freedom, not of a bias that shows
-        of_row["redundancy"][M - len(readings.used) :] = readings.redundancy
-    level = found.alpha[np.maximum(freedom, 1) - 1]
+        columns["redundancy"][M - len(readings.used) :] = readings.redundancy
     blocks = adjustment.survey.image_blocks
     groups, counts = [b.group for b in blocks], [len(b.uv) for b in blocks]
     others = groups_of_others(precision_of(adjustment).graph)
-    groups += others
-    names = tuple(dict.fromkeys(g for g, n in zip(groups, counts + [1] * len(others), strict=True) if n))
+    groups, counts = groups + others, counts + [1] * len(others)
+    names = tuple(dict.fromkeys(g for g, n in zip(groups, counts, strict=True) if n))
     number = {g: i for i, g in enumerate(names)}
-    with np.errstate(invalid="ignore"):
-        fails, fails_posterior = of_row["p"] < level, of_row["p_posterior"] < level
-    sigma0 = adjustment.sigma0 if adjustment.sigma0 > 0.0 else np.nan
     return ObservationTests(
-        n_image=sum(counts), ptr=ptr,
-        group=np.repeat(np.array([number.get(g, 0) for g in groups], dtype=np.int64), counts + [1] * len(others)),
-        group_names=names, used=used, n_components=np.diff(ptr), freedom=freedom, fails=fails,
-        fails_posterior=fails_posterior, tau=of_part["w"] / sigma0, **of_row, **of_part,
+        n_image=n_image, ptr=ptr, group=np.repeat(np.array([number.get(g, 0) for g in groups], dtype=np.int64), counts),
+        group_names=names, used=used, n_components=np.diff(ptr), freedom=freedom, criteria=found,
+        omega=adjustment.omega, total_redundancy=adjustment.redundancy, sigma0=adjustment.sigma0, **columns,
     )  # fmt: skip
 
 
-def _of_rows(batch: _Batch, adjustment: Adjustment, found: Criteria) -> dict[str, FloatArray]:
+def _of_rows(batch: _Batch, found: Criteria) -> dict[str, FloatArray]:
     x, (weakest, _), statistic = batch.x, batch.weakest, batch.x.statistic
     lambda0 = found.lambda0[np.maximum(x.freedom, 1) - 1]
     some = x.freedom > 0
@@ -253,17 +188,14 @@ def _of_rows(batch: _Batch, adjustment: Adjustment, found: Criteria) -> dict[str
         "redundancy": np.where(x.used, np.trace(x.K, axis1=1, axis2=2), 0.0),
         "least": np.clip(x.values.min(axis=1), 0.0, 1.0),
         "statistic": np.where(some, statistic, np.nan),
-        "p": p_prior(statistic, x.freedom),
-        "p_posterior": p_posterior(statistic, x.freedom, x.used, adjustment.omega, adjustment.redundancy),
         "detectable": detectable,
         "external": np.where(x.used, moved, 0.0),
     }
 
 
-def _of_components(batch: _Batch, adjustment: Adjustment, found: Criteria) -> dict[str, FloatArray]:
+def _of_components(batch: _Batch, found: Criteria) -> dict[str, FloatArray]:
     x = batch.x
     single = component_tests(x, batch.W)
-    sigma0 = adjustment.sigma0 if adjustment.sigma0 > 0.0 else np.nan
     weakest, direction = batch.weakest
     size = np.sqrt(found.lambda0[np.maximum(x.freedom, 1) - 1] / weakest)
     with np.errstate(divide="ignore"):
@@ -271,61 +203,40 @@ def _of_components(batch: _Batch, adjustment: Adjustment, found: Criteria) -> di
     some = (x.freedom > 0)[:, None]
     return {
         "w": single.w,
-        "p_w": p_normal(single.w),
-        "p_tau": p_tau(single.w / sigma0, x.used, adjustment.redundancy),
         "error": np.where(some, np.einsum("nij,nj->ni", batch.back, x.error), np.nan),
         "detectable_component": detectable,
         "bias": np.where(some, np.einsum("nij,nj->ni", batch.back, direction * size[:, None]), np.nan),
     }
 
 
-def _ellipses(batches: Sequence[_Batch], n_image: int, found: Criteria) -> ImageEllipses:
-    """Of all image points, which the first batches hold."""
-    parts = side_by_side(lambda b: _ellipses_of(b, found), [b for b in batches if b.rows[0] < n_image])
-    return ImageEllipses(*(np.concatenate([np.zeros(0), *(p[i] for p in parts)]) for i in range(3)))
-
-
-def _ellipses_of(batch: _Batch, found: Criteria) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Major and minor axis (px), direction (rad) of biases b with b' W'KW b = lambda0.
-
-    They are the axes of lambda0 inv(W'KW), inf where uncontrolled.
-    """
-    x = batch.x
-    inverse = np.divide(1.0, x.values, out=np.full_like(x.values, 1e300), where=x.controlled)
-    root = np.einsum("nij,njk->nik", batch.back, x.vectors * np.sqrt(inverse)[:, None, :])
-    largest = np.maximum(np.abs(root).max(axis=(1, 2)), 1e-300)
-    unit = root / largest[:, None, None]  # so that what is not controlled does not overflow
-    values, vectors = eigen2(np.einsum("nij,nkj->nik", unit, unit))
-    size = np.sqrt(found.lambda0[np.maximum(x.freedom, 1) - 1])
-    axes = size[:, None] * largest[:, None] * np.sqrt(np.maximum(values, 0.0))
-    axes = np.where(axes > 1e100, np.inf, axes)
-    lost = x.freedom == 1
-    if lost.any():  # the minor axis drowns beside an infinite major one: it is that of the controlled direction
-        normal = np.stack([-vectors[lost, 1, 0], vectors[lost, 0, 0]], axis=1)
-        K = np.einsum("nji,njk,nkl->nil", batch.W[lost], x.K[lost], batch.W[lost])
-        axes[lost, 1] = size[lost] / np.sqrt(np.einsum("ni,nij,nj->n", normal, K, normal))
-    return axes[:, 0], axes[:, 1], np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0])
-
-
 def _influences(
-    adjustment: Adjustment, tests: ObservationTests, batches: Sequence[_Batch], found: Criteria, most: int,
+    adjustment: Adjustment, tests: ObservationTests, points: AdjustedPoints, batches: Sequence[_Batch], most: int,
     system: CondensedSystem | None,
 ) -> tuple[Influence, ...]:  # fmt: skip
     if most <= 0:
         return ()
     worth = np.where(tests.used & (tests.freedom > 0), tests.external, -1.0)
-    rows = np.argsort(-worth, kind="stable")[:most]
-    rows = rows[worth[rows] > 0.0]
-    if not len(rows):
+    rows = largest(worth, most)
+    rows = rows[worth[rows] > 0.0].tolist()
+    if not rows:
         return ()
-    bias: dict[int, FloatArray] = {}
-    for batch in batches:
-        chosen = np.isin(batch.rows, rows)
-        if chosen.any():
-            weakest, direction = (x[chosen] for x in batch.weakest)
-            size = np.sqrt(found.lambda0[np.maximum(batch.x.freedom[chosen], 1) - 1] / weakest)
-            bias |= dict(zip(batch.rows[chosen].tolist(), direction * size[:, None], strict=True))
-    return influences(system or condensed_system(precision_of(adjustment)), [int(r) for r in rows], bias)
+    W_of = {int(k): W for batch in batches for k, W in zip(*_among(batch, rows), strict=True)}
+    bias = {}
+    for row in rows:
+        own = tests.bias[tests.ptr[row] : tests.ptr[row + 1]]
+        W = _upper(points.W[row]) if row < tests.n_image else W_of[row]
+        bias[row] = W @ own
+    return influences(system or condensed_system(precision_of(adjustment)), rows, bias)
+
+
+def _among(batch: _Batch, rows: Sequence[int]) -> tuple[IntArray, FloatArray]:
+    """Of a batch those of these rows (k,), and their W (k, n, n)."""
+    chosen = np.isin(batch.rows, rows)
+    return batch.rows[chosen], batch.W[chosen]
+
+
+def _upper(w: FloatArray) -> FloatArray:
+    return np.array([[w[0], w[1]], [0.0, w[2]]])
 
 
 def _uncontrolled(adjustment: Adjustment, tests: ObservationTests) -> tuple[str, ...]:

@@ -1,13 +1,17 @@
 """What the statistics of an adjustment give back: tables for a report, all values in SI units, angles in radians."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
+from adjust.model.errors import listed
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.native.point_tests import AdjustedPoints, bias_ellipses
 from adjust.testing.criteria import Criteria
+from adjust.testing.single_tests import p_normal, p_posterior, p_prior, p_tau
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +27,7 @@ class ObservationTests:
     component); of what is not used how certain its prediction is, 1 / (1 + variance of the prediction / its own).
     statistic: (M,) v' inv(Q_vv) v over the controlled directions. p: (M,) a priori (chi-square). p_posterior: (M,)
     with sigma0 estimated (F; the tau-test where there is one component). fails, fails_posterior: (M,) below the level
-    of the criteria.
+    of the criteria. Probabilities are computed when they are asked for.
     detectable: (M,) length of the least detectable bias in sigmas of the observation, over the controlled directions;
     inf where there is none. external: (M,) lambda-bar, how far that bias moves the unknowns: no unknown, and no
     function of them, moves by more than this many of its sigmas; 0 where not used.
@@ -44,19 +48,54 @@ class ObservationTests:
     redundancy: FloatArray
     least: FloatArray
     statistic: FloatArray
-    p: FloatArray
-    p_posterior: FloatArray
-    fails: BoolArray
-    fails_posterior: BoolArray
     detectable: FloatArray
     external: FloatArray
     w: FloatArray
-    tau: FloatArray
-    p_w: FloatArray
-    p_tau: FloatArray
     error: FloatArray
     detectable_component: FloatArray
     bias: FloatArray
+    criteria: Criteria
+    omega: float
+    total_redundancy: int
+    sigma0: float
+
+    @cached_property
+    def p(self) -> FloatArray:
+        """Of the test, a priori (M,)."""
+        return p_prior(self.statistic, self.freedom)
+
+    @cached_property
+    def p_posterior(self) -> FloatArray:
+        """With sigma0 estimated (M,)."""
+        return p_posterior(self.statistic, self.freedom, self.used, self.omega, self.total_redundancy)
+
+    @property
+    def fails(self) -> BoolArray:
+        """Where p is below the level of the criteria (M,)."""
+        return self._below_level(self.p)
+
+    @property
+    def fails_posterior(self) -> BoolArray:
+        """The same of p_posterior (M,)."""
+        return self._below_level(self.p_posterior)
+
+    def _below_level(self, p: FloatArray) -> BoolArray:
+        return np.asarray(np.nan_to_num(p, nan=1.0) < self.criteria.alpha[np.maximum(self.freedom, 1) - 1])
+
+    @property
+    def tau(self) -> FloatArray:
+        """Pope's tau of the components (K,)."""
+        return np.asarray(self.w / (self.sigma0 if self.sigma0 > 0.0 else np.nan))
+
+    @cached_property
+    def p_w(self) -> FloatArray:
+        """Two-sided, of w (K,)."""
+        return p_normal(self.w)
+
+    @cached_property
+    def p_tau(self) -> FloatArray:
+        """Two-sided, of tau (K,)."""
+        return p_tau(self.tau[:, None], np.repeat(self.used, self.n_components), self.total_redundancy)[:, 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,16 +131,22 @@ class Reliability:
     """Tests of all observations, what they could not find, and what is not controlled.
 
     influences: worst external reliability first. uncontrolled: for people, observations of which some direction shows
-    in no residual. sigma0, redundancy: of the a posteriori tests.
+    in no residual. sigma0, redundancy: of the a posteriori tests. image_points: what was tested.
     """
 
     criteria: Criteria
     tests: ObservationTests
-    ellipses: ImageEllipses
     influences: tuple[Influence, ...]
     uncontrolled: tuple[str, ...]
     sigma0: float
     redundancy: int
+    image_points: AdjustedPoints
+
+    @cached_property
+    def ellipses(self) -> ImageEllipses:
+        """Of all image points."""
+        found = bias_ellipses(self.image_points, np.ascontiguousarray(self.criteria.lambda0[:2]))
+        return ImageEllipses(found[:, 0], found[:, 1], found[:, 2])
 
 
 @dataclass(frozen=True)
@@ -231,9 +276,8 @@ class WeakDirection:
 
     def text(self, most: int = 6) -> str:
         """For people."""
-        named = ", ".join(f"{' '.join(p.name)} {p.component} {p.amount:+.2g} {p.unit}" for p in self.parts[:most])
-        more = f" and {len(self.parts) - most} more" if len(self.parts) > most else ""
-        return f"{self.inflation:.3g} times weaker together than alone: {named}{more}"
+        named = [f"{' '.join(p.name)} {p.component} {p.amount:+.2g} {p.unit}" for p in self.parts]
+        return f"{self.inflation:.3g} times weaker together than alone: {listed(named, most)}"
 
 
 @dataclass(frozen=True, eq=False)

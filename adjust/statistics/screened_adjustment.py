@@ -7,7 +7,7 @@ import numpy as np
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues, values_of
-from adjust.model.errors import NotConvergedError, SurveyError
+from adjust.model.errors import NotConvergedError, SurveyError, listed
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
@@ -257,8 +257,7 @@ def uncontrolled_pairs(result: Adjustment) -> tuple[str, ...]:
            if o.kind == "pair" and o.used and float(o.redundancy.max()) < _CONTROLLED]  # fmt: skip
     if not ids:
         return ()
-    named = ", ".join(ids[:12]) + (f" and {len(ids) - 12} more" if len(ids) > 12 else "")
     what = "pair {} closes no loop: nobody would notice an error in it" if len(ids) == 1 else (
         "pairs {} close no loop: nobody would notice an error in them"
     )  # fmt: skip
-    return (what.format(named) + "; measure a second way to what it leads to",)
+    return (what.format(listed(ids, 12)) + "; measure a second way to what it leads to",)

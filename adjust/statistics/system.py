@@ -8,10 +8,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import scipy
-from gtsam import Values
 from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
@@ -22,6 +23,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
 from adjust.observations.images.bundles import BundleBatch
+from adjust.observations.terrestrial.layout import Chunk
 from adjust.precision.precision import Precision
 from adjust.precision.s_transformation import without_datum_rows
 
@@ -124,9 +126,28 @@ class LinearSystem:
     @cached_property
     def sigmas(self) -> FloatArray:
         """A priori sigmas (n,) of the unknowns, in the survey's datum."""
-        by_name, out = self.precision.graph.unknowns.by_name, np.zeros(len(self.columns))
-        for name, at in self.columns.at.items():
-            out[at] = np.sqrt(np.diag(self.precision.cov(by_name[name].key)))[self.columns.free[name]]
+        out = np.zeros(len(self.columns))
+        for k in {len(at) for at in self.columns.at.values()}:
+            mine = np.array([at for at in self.columns.at.values() if len(at) == k])
+            out[mine] = np.sqrt(np.diagonal(self.own_covariances(mine), axis1=1, axis2=2))
+        return out
+
+    def own_covariances(self, columns: IntArray) -> FloatArray:
+        """A priori covariances (u, k, k) in the survey's datum of unknowns whose free components are columns (u, k)."""
+        by_name, out = self.precision.graph.unknowns.by_name, np.empty((*columns.shape, columns.shape[1]))
+        of_size: dict[int, list[int]] = {}
+        names = [self.columns.names[first] for first in columns[:, 0].tolist()] if columns.size else []
+        for i, name in enumerate(names):
+            free = self.columns.free[name]
+            if by_name[name].key in self.precision.hidden:
+                out[i] = self.precision.cov(by_name[name].key)[free[:, None], free]
+            else:
+                of_size.setdefault(by_name[name].dim, []).append(i)
+        for dim, rows in of_size.items():
+            found = self.precision.covs(np.array([by_name[names[i]].key for i in rows]), dim)
+            for i, Q in zip(rows, found, strict=True):
+                free = self.columns.free[names[i]]
+                out[i] = Q[free[:, None], free]
         return out
 
 
@@ -296,7 +317,7 @@ def assembled(precision: Precision, image_rows: Callable[[Precision, int, KeyCol
 def _points_apart(precision: Precision, n: int, key_columns: KeyColumns) -> ImageRows:
     """Every image point an observation of its own."""
     graph = precision.graph
-    A, e = _image_rows(graph, n, key_columns, precision.solved.values)
+    A, e = _image_rows(graph, n, key_columns)
     groups = [b.group for b in graph.survey.image_blocks for _ in range(len(b.uv))]
     return ImageRows(A, e, np.full(len(groups), 2), graph.used(), groups)
 
@@ -358,11 +379,14 @@ def _all_columns(graph: AdjustmentGraph, columns: Columns, name: ParameterName) 
     return out
 
 
+_Numbers = npt.NDArray[np.integer[Any]]
+
+
 class Entries:
     """Dense blocks gathered into one sparse matrix; columns of -1 are left out."""
 
     def __init__(self) -> None:
-        self.parts: list[tuple[IntArray, IntArray, FloatArray]] = []
+        self.parts: list[tuple[_Numbers, _Numbers, FloatArray]] = []
 
     def add(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
         """Values (r, c) at these rows and columns."""
@@ -373,8 +397,8 @@ class Entries:
 
     def add_blocks(self, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
         """Values (b, r, c) at rows (b, r) and columns (b, c)."""
-        down = np.broadcast_to(rows[:, :, None], values.shape)
-        across = np.broadcast_to(columns[:, None, :], values.shape)
+        down = np.broadcast_to(rows[:, :, None].astype(np.int32), values.shape)
+        across = np.broadcast_to(columns[:, None, :].astype(np.int32), values.shape)
         kept = across >= 0
         self.parts.append((down[kept], across[kept], values[kept]))
 
@@ -387,27 +411,24 @@ class Entries:
         if not self.parts:
             return sparse.csr_matrix(shape)
         r, c, v = (np.concatenate(x) for x in zip(*self.parts, strict=True))
+        if (r[1:] >= r[:-1]).all():  # row by row already
+            ptr = np.searchsorted(r, np.arange(shape[0] + 1))
+            out = sparse.csr_matrix((v, c, ptr), shape=shape)
+            out.sum_duplicates()
+            return out
         return sparse.csr_matrix((v, (r, c)), shape=shape)
 
 
 Rows = tuple[sparse.csr_matrix, FloatArray]
 
 
-def _image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns, values: Values) -> Rows:
+def _image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows:
     """Rows of all image points in the order of ``Survey.image_blocks``."""
-    parts = [_known_rows(graph, n, key_columns)]
-    n_known = parts[0][0].shape[0] // 2
-    if graph.bundle is not None:
-        parts.append(bundle_rows(graph, n, key_columns, values))
+    parts = [_known_rows(graph, n, key_columns)] + [bundle_rows(b, n, key_columns) for b in graph.bundles]
+    if len(parts) == 1:
+        return parts[0]
     A, e = sparse.vstack([p[0] for p in parts]).tocsr(), np.concatenate([p[1] for p in parts])
-    source, at = [], [0, n_known]
-    for i, free in graph.image_order:
-        k = len(graph.survey.image_blocks[i].uv)
-        source.append(np.arange(at[int(free)], at[int(free)] + k))
-        at[int(free)] += k
-    if not source or len(parts) == 1:
-        return A, e
-    order = (2 * np.concatenate(source)[:, None] + np.arange(2)).ravel()
+    order = (2 * graph.image_rows[:, None] + np.arange(2)).ravel()
     return A[order], e[order]
 
 
@@ -431,12 +452,9 @@ def _known_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> Rows
     return entries.matrix((len(e), n)), e
 
 
-def bundle_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns, values: Values) -> Rows:
+def bundle_rows(bundle: BundleBatch, n: int, key_columns: KeyColumns) -> Rows:
     """Whitened rows of the image points of unknown points, used or not, in the order of the bundle's blocks."""
-    bundle = graph.bundle
-    if bundle is None:
-        raise ValueError("a survey without unknown points has no such rows")
-    bundle.whitened_squares(values)  # leaves the rows of all points, used or not, with their own weights
+    bundle.whitened_squares()  # leaves the rows of all points, used or not, with their own weights
     k = len(bundle.point)
     local, points = Entries(), Entries()
     for camera in np.unique(bundle.camera_of):
@@ -486,9 +504,16 @@ def _reading_rows(precision: Precision, n: int, key_columns: KeyColumns) -> Rows
     if batch is None:
         return sparse.csr_matrix((0, n)), np.zeros(0)
     e, entries = batch.unweighted(precision.solved.values).copy(), Entries()
-    for c, chunk in enumerate(batch.layout.chunks):
+    alike: dict[tuple[int, ...], list[Chunk]] = {}
+    for chunk in batch.layout.chunks:
         if chunk.keys:  # those between held positions have none
-            entries.add(chunk.rows, np.concatenate([key_columns[k] for k in chunk.keys]), batch.jacobian(c))
+            alike.setdefault((len(chunk.rows), *chunk.dims), []).append(chunk)
+    for (k, *dims), chunks in alike.items():
+        rows, at = np.array([c.rows for c in chunks]), np.array([c.start for c in chunks])
+        for i, dim in enumerate(dims):
+            blocks = batch.J[at[:, None] + np.arange(k * dim)].reshape(len(at), k, dim)
+            entries.add_blocks(rows, np.array([key_columns[c.keys[i]] for c in chunks]), blocks)
+            at += k * dim
     return entries.matrix((len(e), n)), e
 
 

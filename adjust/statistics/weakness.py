@@ -1,11 +1,12 @@
 """What is badly determined, by name: correlations, unknowns that replace each other, the weakest deformation."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.parallel import side_by_side
 from adjust.precision.s_transformation import without_datum_rows
 from adjust.statistics.result import Correlation, PrincipalComponent, WeakDirection, WeakPart
 from adjust.statistics.system import DENSE, FEW, LinearSystem, linear_system
@@ -14,8 +15,10 @@ _MOST = 200
 _SHARE = 0.1
 _AT_A_TIME = 64
 """Columns of the covariance matrix that are compared in one go: as many as a solution takes at once."""
+_WHOLE = 10_000
+"""Unknowns up to which the whole covariance matrix is taken from the tree, of which 800 MB are the most."""
 _WORK = 20_000_000
-"""Correlations that are looked at in surveys of more than ``DENSE`` unknowns."""
+"""Correlations that are looked at in surveys of still more unknowns, or of hidden ones."""
 _KRYLOV, _RESTARTS = 40, 50
 
 
@@ -40,12 +43,34 @@ def compared_columns(system: LinearSystem) -> IntArray:
     What is there at one epoch alone comes after, and points last; as many as ``_WORK`` allows.
     """
     n, columns = len(system.columns), system.columns
-    if n <= DENSE:
+    if n <= DENSE or _in_tree(system):
         return np.arange(n)
     epochs = {b.epoch_id for b in system.precision.graph.survey.image_blocks}
     rank = {name: 2 if len(name) == 3 and name[2] in epochs else 1 if name[0] == "point" else 0 for name in columns.at}
     ordered = columns.of(sorted(columns.at, key=lambda name: rank[name]))
     return ordered[: max(_WORK // n, 1)]
+
+
+def _in_tree(system: LinearSystem) -> bool:
+    """Whether the whole covariance matrix can be had from the tree."""
+    return system.precision.tree.n <= _WHOLE and not system.precision.hidden
+
+
+def _some_columns(system: LinearSystem) -> Callable[[IntArray], FloatArray]:
+    """What gives some columns (n, k) of the covariance matrix where very many are wanted."""
+    if len(system.columns) <= DENSE or not _in_tree(system):
+        _ = system.normal  # factored before threads ask for it
+        return lambda part: covariance_columns(system, part)
+    precision, c = system.precision, system.columns
+    by_name, t = precision.graph.unknowns.by_name, precision.transformation
+    keys = {name: by_name[name].key for name in c.at}
+    rows = np.concatenate([precision.tree.rows([key])[c.free[name]] for name, key in keys.items()])
+    Q = precision.tree.full()
+    if t is None:
+        return lambda part: Q[rows[part]][:, rows].T
+    G, W = (np.concatenate([of[key][c.free[name]] for name, key in keys.items()]) for of in (t.motions, t.spread))
+    out = G @ t.core - W
+    return lambda part: Q[rows[part]][:, rows].T + out @ G[part].T - G @ W[part].T
 
 
 def correlations(
@@ -63,19 +88,21 @@ def correlations(
     among = np.arange(len(c)) if names is None else index
     number = np.full(len(c), -1)
     number[index] = np.arange(len(index))
-    sigma = np.sqrt(np.maximum(_variances(system, among), 1e-300))
+    sigma = np.sqrt(np.maximum(_variances(system, np.arange(len(c))), 1e-300))
+    columns = _some_columns(system)
 
     def above(first: int) -> list[tuple[int, int, float]]:
         part = index[first : first + _AT_A_TIME]
-        C = covariance_columns(system, part)[among]
-        C /= sigma[:, None]
-        C /= np.sqrt(np.maximum(_variances(system, part), 1e-300))
-        a, b = np.nonzero(np.abs(C) >= limit)
+        C = columns(part)[among]
+        C /= sigma[among, None]
+        C /= sigma[part]
+        high = np.abs(C) >= limit
+        a, b = np.nonzero(high) if high.any() else np.zeros((2, 0), dtype=np.int64)
         i, j = among[a], part[b]
         kept = np.where(number[i] < 0, True, number[i] < number[j])  # each pair once, nothing with itself
         return list(zip(i[kept].tolist(), j[kept].tolist(), C[a, b][kept].tolist(), strict=True))
 
-    found = [x for part in map(above, range(0, len(index), _AT_A_TIME)) for x in part]
+    found = [x for part in side_by_side(above, range(0, len(index), _AT_A_TIME)) for x in part]
     if names is None and len(index) < len(c):
         found += _within(system, number, limit)
     order = sorted(found, key=lambda x: (-abs(x[2]), x[0], x[1]))[:_MOST]
@@ -91,15 +118,15 @@ def _variances(system: LinearSystem, index: IntArray) -> FloatArray:
 
 def _within(system: LinearSystem, number: IntArray, limit: float) -> list[tuple[int, int, float]]:
     """Pairs of components of one unknown that is not compared with others."""
-    by_name, out = system.precision.graph.unknowns.by_name, list[tuple[int, int, float]]()
-    for name, at in system.columns.at.items():
-        if len(at) > 1 and (number[at] < 0).all():
-            free = system.columns.free[name]
-            Q = system.precision.cov(by_name[name].key)[np.ix_(free, free)]
-            d = np.sqrt(np.maximum(np.diag(Q), 1e-300))
-            C = np.triu(Q / np.outer(d, d), 1)
-            a, b = np.nonzero(np.abs(C) >= limit)
-            out += zip(at[a].tolist(), at[b].tolist(), C[a, b].tolist(), strict=True)
+    apart = [at for at in system.columns.at.values() if len(at) > 1 and (number[at] < 0).all()]
+    out = list[tuple[int, int, float]]()
+    for k in sorted({len(at) for at in apart}):
+        columns = np.array([at for at in apart if len(at) == k])
+        C = system.own_covariances(columns)
+        d = np.sqrt(np.maximum(np.diagonal(C, axis1=1, axis2=2), 1e-300))
+        C = np.triu(C / (d[:, :, None] * d[:, None, :]), 1)
+        i, a, b = np.nonzero(np.abs(C) >= limit)
+        out += zip(columns[i, a].tolist(), columns[i, b].tolist(), C[i, a, b].tolist(), strict=True)
     return out
 
 

@@ -5,12 +5,41 @@ to its redundancy r, and their squares to half its variance.
 """
 
 import numpy as np
+import scipy.linalg
 
 from adjust.model.survey import FloatArray
 from adjust.testing.distributions import chi2, norm
 
 _STEPS = 100
+_DETERMINED = 1e-9
+"""Share of the largest eigenvalue of a correlation matrix that is not rounding; joint ones lose about ten digits."""
 _NEAR = 1e-4
+
+
+def pseudo_square(d: FloatArray, Q: FloatArray) -> tuple[float, int, FloatArray]:
+    """``d' Q^+ d``, the rank of Q, and ``Q^+`` (n, n), of d (n,) with covariance Q; in sigmas, as units do not mix."""
+    s = np.sqrt(np.maximum(np.diag(Q), 1e-300))
+    values, vectors = np.linalg.eigh(Q / np.outer(s, s))
+    kept = values > _DETERMINED * max(1.0, float(values.max(initial=0.0)))
+    half = vectors[:, kept] / np.sqrt(values[kept]) / s[:, None]
+    y = half.T @ d
+    return float(y @ y), int(kept.sum()), half @ half.T
+
+
+def pseudo_square_beside(d: FloatArray, Q: FloatArray, held: FloatArray) -> tuple[float, int]:
+    """The first two of :func:`pseudo_square`, by Cholesky's method where nothing is open but directions held (n, k).
+
+    Q held = 0 and held' d = 0: with N that spans these in sigmas, Q^+ is inv(Q + N N') on d.
+    """
+    s = np.sqrt(np.maximum(np.diag(Q), 1e-300))
+    N = np.linalg.qr(s[:, None] * held)[0]
+    full = Q / np.outer(s, s) + N @ N.T
+    norm_1 = float(np.abs(full).sum(axis=0).max(initial=0.0))
+    factor, lost = scipy.linalg.lapack.dpotrf(full.T, lower=0, clean=0, overwrite_a=1) if len(d) else (full, 1)
+    if lost or scipy.linalg.lapack.dpocon(factor, norm_1)[0] < _DETERMINED:
+        return pseudo_square(d, Q)[:2]
+    y = scipy.linalg.lapack.dtrtrs(factor, d / s, lower=0, trans=1)[0]
+    return float(y @ y), len(d) - held.shape[1]
 
 
 def upper_tail(x: float, weights: FloatArray) -> float:

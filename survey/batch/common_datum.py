@@ -21,6 +21,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.epochs.states import differences_of, moved_value, origin, value_motions
+from adjust.model.errors import listed
 from adjust.model.survey import FloatArray
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
@@ -122,13 +123,9 @@ def _why(kind: Any, most: Any) -> str:
     if kind[0] != most[0]:
         return "its observations leave other motions open"
     lost, more = sorted(most[1] - kind[1]), sorted(kind[1] - most[1])
-    said = [f"without {_named(lost)}"] if lost else []
-    said += [f"with {_named(more)}"] if more else []
+    said = [f"without {listed(lost, 3)}"] if lost else []
+    said += [f"with {listed(more, 3)}"] if more else []
     return "its datum is carried by other points or stations, " + " and ".join(said)
-
-
-def _named(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _span(datum: FreeDatum) -> tuple[bool, ...]:

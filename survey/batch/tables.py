@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from adjust.model.errors import listed
 from survey.batch.causes import CAUSES
 from survey.batch.control import Chart
 from survey.batch.record import DONE, FAILED, TEST_FAILED, Record
@@ -87,16 +88,12 @@ def findings(trends: Trends, c: Chart, records: Sequence[Record]) -> list[str]:
         unit = f" {c.series.unit}" if c.series.unit else ""
         out.append(f"drifts {c.slope:+.2g} ± {c.slope_sigma:.1g}{unit} per epoch")
     if outside.any():
-        out.append("outside: " + _listed([names[int(epoch[i])] for i in np.flatnonzero(outside)]))
+        out.append("outside: " + listed([names[int(epoch[i])] for i in np.flatnonzero(outside)], 5))
     for run in c.runs:
         words = {"one_side": "on one side of the mean", "rising": "rising", "falling": "falling"}[run.kind]
         first, last = (names[int(epoch[i])] for i in (run.first, run.last))
         out.append(f"{run.last - run.first + 1} in a row {words}: {first} to {last}")
     return out
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def overview_json(records: Sequence[Record], trends: Trends) -> str:

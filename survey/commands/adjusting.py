@@ -4,7 +4,17 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from survey.commands.common import is_set, not_negative, positive, postpone, print_json, require_project, say, tested
+from survey.commands.common import (
+    is_set,
+    not_negative,
+    positive,
+    postpone,
+    print_json,
+    require_project,
+    say,
+    show,
+    tested,
+)
 from survey.commands.parser import project_folder
 
 if TYPE_CHECKING:
@@ -25,6 +35,7 @@ def declare_adjust(commands: Any, shaped: dict[str, Any]) -> None:
     parser.add_argument("folders", nargs="+", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results below DIR, not below FOLDER")
     parser.add_argument("--redetect", action="store_true", help="detect targets again, even where it was done before")
+    parser.add_argument("--parquet", action="store_true", help="write results/residuals.parquet too, numbers in full")
     parser.add_argument(
         "--method", choices=("joint", "published"), default="joint",
         help="published: also the published step-by-step methods (head on a table, measured pairs), beside the joint "
@@ -58,6 +69,8 @@ def _adjust(arguments: argparse.Namespace) -> int:
             arguments.parser.error("--out needs a single FOLDER: the results of several would be mixed up")
         if arguments.method != "joint":
             arguments.parser.error("--method published needs a single FOLDER: it is beside one adjustment")
+        if arguments.parquet:
+            arguments.parser.error("--parquet needs a single FOLDER")
         if arguments.candidate is not None:
             arguments.parser.error("--try needs a single FOLDER: it changes one project")
         if len({folder.resolve() for folder in folders}) < len(folders):
@@ -74,6 +87,7 @@ def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
     postpone()
     require_project(folder, arguments.out)
     from survey.jobs.adjusting.job import adjust_job
+    from survey.report.results import ReportOptions
 
     if arguments.candidate is not None:
         from survey.jobs.adjusting.trying import try_job
@@ -81,13 +95,9 @@ def _adjust_one(folder: Path, arguments: argparse.Namespace) -> int:
         say(arguments, try_job(folder, arguments.candidate))
     outcome = adjust_job(
         folder, out=arguments.out, progress=not is_set(arguments, "quiet"), redetect=arguments.redetect,
-        method=arguments.method,
-    )
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(outcome.text())
-        say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+        method=arguments.method, report=ReportOptions(parquet=arguments.parquet),
+    )  # fmt: skip
+    show(arguments, outcome, outcome.paths.values())
     if is_set(arguments, "verbose"):
         say(arguments, *(f"{step}: {seconds:.2f} s" for step, seconds in outcome.run.seconds.items()))
     return tested(outcome.solution["summary"])

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from survey.commands.common import DONE, TEST_FAILED, is_set, print_json, require_project
+from survey.commands.common import DONE, TEST_FAILED, is_set, require_project, show
 from survey.commands.parser import project_folder
 
 
@@ -30,8 +30,5 @@ def _align(arguments: argparse.Namespace) -> int:
     from survey.jobs.aligning import align_job
 
     outcome = align_job(arguments.folder, out=arguments.out, progress=not is_set(arguments, "quiet"))
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(outcome.text())
+    show(arguments, outcome)
     return DONE if outcome.aligned else TEST_FAILED

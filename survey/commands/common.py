@@ -9,16 +9,17 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import redirect_stdout
-from typing import Any, NoReturn, TextIO, cast
+from pathlib import Path
+from typing import Any, NoReturn, Protocol, TextIO, cast
 
 from adjust.model.errors import SurveyError
 from survey.folder.kept import require_project as require_project
 from survey.folder.messages import message, shown
 
 DONE, FAILED, USAGE, TEST_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
-_OBJECTS = 100_000  # new ones before Python looks for cycles: loading modules makes many and no cycles
+_OBJECTS = 250_000  # new ones before Python looks for cycles: loading modules makes many and no cycles
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # writing does not say which file
 
 
@@ -135,6 +136,25 @@ def say(arguments: argparse.Namespace, *lines: str) -> None:
 def print_json(value: Mapping[str, Any]) -> None:
     """The summary as one JSON object on stdout."""
     print(json.dumps(value, indent=1, allow_nan=False))
+
+
+class Outcome(Protocol):
+    """What a job gives back."""
+
+    def summary(self) -> dict[str, Any]:
+        """As plain values."""
+
+    def text(self) -> str:
+        """For people."""
+
+
+def show(arguments: argparse.Namespace, outcome: Outcome, written: Iterable[Path] = (), then: str = "") -> None:
+    """The outcome as JSON where that is asked for, else in words, ``then`` behind them, and what was written."""
+    if is_set(arguments, "json"):
+        print_json(outcome.summary())
+    else:
+        print(outcome.text() + then)
+        say(arguments, *(f"written: {path}" for path in written))
 
 
 def tested(summary: Mapping[str, Any]) -> int:

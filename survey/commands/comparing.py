@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from survey.commands.common import DONE, is_set, print_json, require_project
+from survey.commands.common import DONE, is_set, require_project, show
 from survey.commands.parser import project_folder
 
 
@@ -29,8 +29,5 @@ def _compare(arguments: argparse.Namespace) -> int:
     from survey.jobs.comparing import compare_job
 
     outcome = compare_job(arguments.first, arguments.second, progress=not is_set(arguments, "quiet"))
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(outcome.text())
+    show(arguments, outcome)
     return DONE

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from survey.commands.common import DONE, is_set, print_json, require_project
+from survey.commands.common import DONE, require_project, show
 from survey.commands.parser import project_folder
 
 FORMATS = (
@@ -55,8 +55,5 @@ def _convert(arguments: argparse.Namespace) -> int:
         arguments.source, arguments.target, format=arguments.format, information=arguments.information,
         block_diagonal=arguments.block_diagonal, station=arguments.station,
     )  # fmt: skip
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(outcome.text() + (f"\nNext: labsurvey adjust {outcome.target}" if outcome.format == "project" else ""))
+    show(arguments, outcome, then=(f"\nNext: labsurvey adjust {outcome.target}" if outcome.format == "project" else ""))
     return DONE

@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from survey.commands.common import DONE, is_set, positive, print_json, require_project, say
+from survey.commands.common import DONE, is_set, positive, require_project, say, show
 from survey.commands.parser import project_folder
 
 
@@ -39,8 +39,5 @@ def _detect(arguments: argparse.Namespace) -> int:
     )
     if is_set(arguments, "verbose"):
         say(arguments, *outcome.messages)
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(f"{outcome.text()}\nNext: labsurvey adjust {arguments.folder}")
+    show(arguments, outcome, then=f"\nNext: labsurvey adjust {arguments.folder}")
     return DONE

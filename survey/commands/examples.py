@@ -1,6 +1,7 @@
-"""The command ``example``."""
+"""The commands ``example`` and ``schema``: a project to begin with, and what a ``survey.toml`` may hold."""
 
 import argparse
+import json
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,23 @@ def declare_example(commands: Any, shaped: dict[str, Any]) -> None:
     parser.set_defaults(run=_example)
 
 
+def declare_schema(commands: Any, shaped: dict[str, Any]) -> None:
+    """Add ``schema`` to the commands."""
+    parser = commands.add_parser(
+        "schema",
+        help="print a JSON schema of survey.toml for editors, or its reference",
+        usage="labsurvey schema --out lab/survey.schema.json   (labsurvey schema [--markdown] [--out FILE])",
+        description="Prints a JSON schema of survey.toml, made from the declarations that check it. With the first\n"
+        "line #:schema ./survey.schema.json in survey.toml, editors complete and check its keys.\n"
+        "With --markdown: the reference of all keys and of all columns of the tables.",
+        epilog="Next: write #:schema ./survey.schema.json above the first line of survey.toml",
+        **shaped,
+    )
+    parser.add_argument("--markdown", action="store_true", help="the reference as a page, not the schema")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write FILE, not to stdout")
+    parser.set_defaults(run=_schema)
+
+
 def _example(arguments: argparse.Namespace) -> int:
     progress = not is_set(arguments, "quiet")
     n = write_example(arguments.name, arguments.folder, seed=arguments.seed, jobs=arguments.jobs, progress=progress)
@@ -36,4 +54,22 @@ def _example(arguments: argparse.Namespace) -> int:
             f"{arguments.folder}: example {arguments.name}{f' with {n} images' if n else ''}\n"
             f"Next: labsurvey adjust {arguments.folder}"
         )
+    return DONE
+
+
+def _schema(arguments: argparse.Namespace) -> int:
+    if arguments.markdown:
+        from survey.project.reference import reference_page
+
+        text = reference_page()
+    else:
+        from survey.project.schema import survey_schema
+
+        text = json.dumps(survey_schema(), indent=1, ensure_ascii=False) + "\n"
+    if arguments.out is None:
+        print(text, end="")
+    else:
+        from survey.folder.text import atomic_write
+
+        atomic_write(arguments.out, text)
     return DONE

@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from survey.commands.common import DONE, is_set, print_json, require_project
+from survey.commands.common import DONE, require_project, show
 from survey.commands.parser import project_folder
 
 NAMES = """\
@@ -65,8 +65,5 @@ def _include(arguments: argparse.Namespace) -> int:
 
 
 def _say(arguments: argparse.Namespace, outcome: Any) -> int:
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(f"{outcome.text()}\nNext: labsurvey adjust {arguments.folder}")
+    show(arguments, outcome, then=f"\nNext: labsurvey adjust {arguments.folder}")
     return DONE

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from survey.commands.common import DONE, is_set, print_json, require_project, say
+from survey.commands.common import DONE, is_set, require_project, say, show
 from survey.commands.parser import project_folder
 
 
@@ -41,9 +41,5 @@ def _navigate(arguments: argparse.Namespace) -> int:
     outcome = navigate_job(arguments.folder, request, out=arguments.out, progress=not is_set(arguments, "quiet"))
     if is_set(arguments, "verbose"):
         say(arguments, *(f"{step}: {seconds:.2f} s" for step, seconds in outcome.seconds.items()))
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-    else:
-        print(outcome.text())
-        say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+    show(arguments, outcome, outcome.paths.values())
     return DONE

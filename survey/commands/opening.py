@@ -1,10 +1,10 @@
-"""The command ``open``."""
+"""The commands ``open`` and ``runs``: the workbench of a project, and the runs it keeps."""
 
 import argparse
 import os
 from typing import Any
 
-from survey.commands.common import DONE, not_negative, say
+from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say
 from survey.commands.parser import project_folder
 
 
@@ -13,7 +13,7 @@ def declare_open(commands: Any, shaped: dict[str, Any]) -> None:
     parser = commands.add_parser(
         "open",
         help="look at a project in the browser: find what is wrong, leave it out, adjust again",
-        usage="labsurvey open lab   (labsurvey open FOLDER [--port N] [--read-only] [--no-browser])",
+        usage="labsurvey open lab   (labsurvey open FOLDER [--at PLACE] [--port N] [--read-only] [--no-browser])",
         description="Serves the workbench of a project on this machine alone, under an address that holds a token, "
         "until Ctrl-C. What is decided there goes to observations/exclusions.csv and survey.toml at once; results and "
         "runs are written by Save.\n\nFrom another machine: ssh -L 8790:127.0.0.1:8790 THIS_MACHINE",
@@ -21,6 +21,7 @@ def declare_open(commands: Any, shaped: dict[str, Any]) -> None:
         **shaped,
     )
     parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
+    parser.add_argument("--at", metavar="PLACE", default="", help="what to show first: '#image=X/hX05', '#point=B07'")
     parser.add_argument("--port", type=not_negative, default=8790, metavar="N", help="0 takes a free one")
     parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="loopback: 127.0.0.1 or ::1")
     parser.add_argument("--read-only", action="store_true", help="look only; nothing can be changed")
@@ -28,9 +29,26 @@ def declare_open(commands: Any, shaped: dict[str, Any]) -> None:
     parser.set_defaults(run=_open)
 
 
-def _open(arguments: argparse.Namespace) -> int:
-    from survey.folder.kept import require_project
+def declare_runs(commands: Any, shaped: dict[str, Any]) -> None:
+    """Add ``runs`` to the commands."""
+    parser = commands.add_parser(
+        "runs",
+        help="the runs of a project: list, compare any two, pin, restore",
+        usage="labsurvey runs lab   (labsurvey runs FOLDER [list | compare A B | pin N | unpin N | restore N])",
+        description="Every run of adjust that changed anything is kept under FOLDER/runs. compare: every parameter in "
+        "sigmas of A, and the verdict. pin: keep it for ever; of the others the last 50 stay. restore: survey.toml and "
+        "exclusions as they were then, where that can be solved.",
+        epilog="Next: labsurvey runs FOLDER compare 1 2",
+        **shaped,
+    )
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="project folder")
+    actions = ("list", "compare", "pin", "unpin", "restore")
+    parser.add_argument("action", nargs="?", choices=actions, default="list", metavar="ACTION", help=", ".join(actions))
+    parser.add_argument("numbers", nargs="*", type=positive, metavar="N", help="numbers of runs")
+    parser.set_defaults(run=_runs)
 
+
+def _open(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder)
     from survey.workbench.guard import loopback_address
     from survey.workbench.opening import open_folder
@@ -40,5 +58,41 @@ def _open(arguments: argparse.Namespace) -> int:
     if read_only and not arguments.read_only:
         say(arguments, f"{arguments.folder}: cannot be written; it is open for reading only")
     open_folder(arguments.folder, host, arguments.port, read_only, not arguments.no_browser,
-                lambda line: say(arguments, line))  # fmt: skip
+                lambda line: say(arguments, line), arguments.at)  # fmt: skip
     return DONE
+
+
+def _runs(arguments: argparse.Namespace) -> int:
+    wanted = {"list": 0, "compare": 2}.get(arguments.action, 1)
+    if len(arguments.numbers) != wanted:
+        arguments.parser.error(f"{arguments.action} takes {wanted} number{'s' * (wanted != 1)} of runs")
+    require_project(arguments.folder)
+    found, text = _done(arguments)
+    if is_set(arguments, "json"):
+        print_json(found)
+    else:
+        print(text)
+    return DONE
+
+
+def _done(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from survey.solution.earlier.changes import solution_changes
+    from survey.solution.earlier.runs import list_runs, load_run, pin_run
+
+    folder, numbers = arguments.folder, arguments.numbers
+    if arguments.action == "compare":
+        changes = solution_changes(*(load_run(folder, n) for n in numbers))
+        return changes.as_dict(), changes.text()
+    if arguments.action in ("pin", "unpin"):
+        run = pin_run(folder, numbers[0], arguments.action == "pin")
+        return run.as_dict(), run.text()
+    if arguments.action == "restore":
+        from survey.workbench.session import Workbench
+
+        bench = Workbench(folder)
+        notes = bench.restore(numbers[0])
+        said = "\n".join([f"restored: run {numbers[0]}", *notes, f"Next: labsurvey adjust {folder}"])
+        return {"restored": numbers[0], "notes": list(notes)}, said
+    runs = list_runs(folder)
+    lines = [r.text() for r in runs] or [f"no run is kept yet; 'labsurvey adjust {folder}' keeps one"]
+    return {"runs": [r.as_dict() for r in runs]}, "\n".join(lines)

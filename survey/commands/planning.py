@@ -1,11 +1,21 @@
-"""The command ``plan``."""
+"""The commands ``plan`` and ``check``: what a survey will give, what it cannot give, before it is adjusted."""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
 from adjust.model.errors import SurveyError
-from survey.commands.common import DONE, is_set, not_negative, positive, print_json, require_project, say
+from survey.commands.common import (
+    DONE,
+    TEST_FAILED,
+    is_set,
+    not_negative,
+    positive,
+    print_json,
+    require_project,
+    say,
+    show,
+)
 from survey.commands.parser import project_folder
 
 _DESCRIPTION = """\
@@ -44,6 +54,23 @@ def declare_plan(commands: Any, shaped: dict[str, Any]) -> None:
     parser.set_defaults(run=_plan)
 
 
+def declare_check(commands: Any, shaped: dict[str, Any]) -> None:
+    """Add ``check`` to the commands."""
+    parser = commands.add_parser(
+        "check",
+        help="what is weak or suspicious in a project, before it is adjusted",
+        usage="labsurvey check lab   (labsurvey check FOLDER)",
+        description="Looks at the observations of FOLDER without adjusting them: what they leave undetermined, points\n"
+        "without redundancy, names that appear once, epochs without partners, images that are badly covered, boards\n"
+        "too far or too flat, suspicious units and sigmas; and what to measure next. Writes nothing.\n"
+        "The exit code is 3 where something would stop or spoil the adjustment.",
+        epilog="Next: labsurvey adjust FOLDER",
+        **shaped,
+    )
+    parser.add_argument("folder", type=project_folder, metavar="FOLDER", help="folder with a survey.toml")
+    parser.set_defaults(run=_check)
+
+
 def _plan(arguments: argparse.Namespace) -> int:
     if arguments.error_analysis:
         return _error_analysis(arguments)
@@ -59,11 +86,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         arguments.jobs, arguments.navigation, arguments.place,
     )  # fmt: skip
     outcome = planning_job(arguments.folder, request, out=arguments.out, progress=not is_set(arguments, "quiet"))
-    if is_set(arguments, "json"):
-        print_json(outcome.summary())
-        return DONE
-    print(outcome.text())
-    say(arguments, *(f"written: {path}" for path in outcome.paths.values()))
+    show(arguments, outcome, outcome.paths.values())
     return DONE
 
 
@@ -73,11 +96,7 @@ def _error_analysis(arguments: argparse.Namespace) -> int:
     result = error_analysis_job(
         arguments.out, n_trials=arguments.trials or 10_000, seed=arguments.seed, rms_px=arguments.pixels
     )
-    if is_set(arguments, "json"):
-        print_json(result.summary())
-        return DONE
-    print(result.text())
-    say(arguments, *(f"written: {path}" for path in result.paths.values()))
+    show(arguments, result, result.paths.values())
     return DONE
 
 
@@ -86,8 +105,18 @@ def _network(arguments: argparse.Namespace) -> int:
     from survey.jobs.network import plan_job
 
     outcome = plan_job(arguments.folder)
+    show(arguments, outcome, then=f"\nNext: labsurvey adjust {arguments.folder}")
+    return DONE
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    require_project(arguments.folder)
+    from survey.planning.checking import check_job
+
+    outcome = check_job(arguments.folder)
     if is_set(arguments, "json"):
         print_json(outcome.summary())
     else:
-        print(f"{outcome.text()}\nNext: labsurvey adjust {arguments.folder}")
-    return DONE
+        print(outcome.text())
+        say(arguments, f"Next: labsurvey adjust {arguments.folder}")
+    return TEST_FAILED if outcome.n_problems else DONE

@@ -1,6 +1,6 @@
 """Many images, in parallel; one that fails is reported and the others go on."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
@@ -36,14 +36,16 @@ class DetectionTask:
 
 
 def detect_images(
-    tasks: Sequence[DetectionTask], jobs: int | None = None, progress: bool = True, pictures: Path | None = None
-) -> list[ImageReport]:
+    tasks: Sequence[DetectionTask], jobs: int | None = None, progress: bool = True, pictures: Path | None = None,
+    told: Callable[[ImageReport], None] | None = None,
+) -> list[ImageReport]:  # fmt: skip
     """Reports of all tasks, in their order.
 
     jobs: processes. None: as many threads as there are processors, and processes instead where these are many and
     images too. Processes are spawned: a script that calls this with more than one guards its main part by
     ``if __name__ == "__main__"``.
     progress: a bar on stderr. pictures: folder for a PNG of each image that was read, with what was found in it.
+    told: called with each report as it comes.
     """
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
@@ -60,6 +62,8 @@ def detect_images(
         for position, report in run(tasks, jobs, pictures):
             reports[position] = report
             bar.update()
+            if told is not None:
+                told(report)
     return [reports[position] for position in range(len(tasks))]
 
 

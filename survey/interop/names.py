@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+from adjust.model.errors import listed
 from adjust.model.observations import PositionRef
 from adjust.model.survey import Survey
 from survey.folder.text import _FORBIDDEN_IN_IDS as FORBIDDEN
@@ -61,7 +62,6 @@ def with_safe_ids(survey: Survey) -> tuple[Survey, tuple[str, ...]]:
         "datum": replace(survey.datum, points=tuple(points.get(p, p) for p in survey.datum.points)),
     }  # fmt: skip
     shown = [f"{old} -> {new}" for old, new in points.items()]
-    more = f" and {len(shown) - 6} more" if len(shown) > 6 else ""
     said = "renamed, because ids have none of / \\ : @ , ; and no = + - in front"
-    note = f"{said}: {', '.join(shown[:6])}{more}" if shown else ""
+    note = f"{said}: {listed(shown, 6)}" if shown else ""
     return replace(survey, **changed), (note,) if note else ()

@@ -19,9 +19,6 @@ from adjust.model.survey import FloatArray
 from survey.folder.replacing import filling
 from survey.folder.text import read_bytes, suggestion
 from survey.interop.cameras import formats as camera_formats
-from survey.interop.cameras.aicon import ENDINGS as AICON_ENDINGS
-from survey.interop.cameras.aicon import read_aicon
-from survey.interop.cameras.dbat import read_dbat
 from survey.interop.cameras.values import CameraValues, camera_values
 from survey.interop.names import with_safe_ids
 from survey.interop.networks.foreign import ForeignNetwork, is_utf8
@@ -34,11 +31,14 @@ from survey.interop.networks.lgc import read_lgc
 from survey.interop.networks.plain_csv import correlated, plain_csv, read_plain_csv
 from survey.interop.networks.sinex import sinex_text
 from survey.interop.networks.values import NetworkValues, left_out, require_network
+from survey.interop.photogrammetry.aicon import ENDINGS as AICON_ENDINGS
+from survey.interop.photogrammetry.aicon import read_aicon
+from survey.interop.photogrammetry.dbat import read_dbat
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.converting_g2o import AS_IN_THE_FILE, project_to_g2o, survey_from_g2o
 from survey.project import AdjustmentOptions, Project, atomic_write, read, write_project
 from survey.project.project import DEFINITION_FILE, RESULTS
-from survey.solution.previous import read_previous
+from survey.solution.earlier.previous import read_previous
 from survey.solution.quantities import scale_of
 
 READERS: dict[str, Callable[[Path], ForeignNetwork]] = {

@@ -15,7 +15,7 @@ from survey.interop.networks.g2o import Information, read_g2o_file, write_g2o
 from survey.jobs.adjusting.warm_start import network_poses
 from survey.project import AdjustmentOptions, read
 from survey.report.results import RESULTS
-from survey.solution.previous import read_previous
+from survey.solution.earlier.previous import read_previous
 
 AS_IN_THE_FILE = AdjustmentOptions(reject_pairs=False)
 """A file's own minimum is that of all its pairs; its owner may let the program look for wrong ones."""

@@ -8,7 +8,7 @@ person decided about a row that is replaced (``used = false``) goes into ``obser
 import getpass
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -110,15 +110,19 @@ def _without_folder(folder: Path, texts: Mapping[str, str]) -> dict[str, str]:
 
 
 def detect_job(
-    folder: Path, *, jobs: int | None = None, pictures: bool = False, progress: bool = True, everything: bool = False
+    folder: Path, *, jobs: int | None = None, pictures: bool = False, progress: bool = True, everything: bool = False,
+    told: "Callable[[ImageReport], None] | None" = None,
 ) -> DetectOutcome:  # fmt: skip
     """Find targets and spots in the images of a project that are new or have changed, and write their tables.
 
     everything: in the others too, but for rows that people have changed since. pictures: also write the images that are
-    looked at, with what was found. Raises SurveyError where there is nothing to look at or to look for.
+    looked at, with what was found. told: called with what became of each image, as it
+    comes. Raises SurveyError where there is nothing to look at or to look for.
     """
     with changing(folder) as place:
-        return detect_in(Path(folder), place, jobs=jobs, pictures=pictures, progress=progress, everything=everything)
+        return detect_in(
+            Path(folder), place, jobs=jobs, pictures=pictures, progress=progress, everything=everything, told=told
+        )
 
 
 @dataclass(eq=False)
@@ -154,8 +158,9 @@ def _state(folder: Path) -> _State:
 
 
 def detect_in(
-    folder: Path, place: Path, *, jobs: int | None, pictures: bool, progress: bool, everything: bool
-) -> DetectOutcome:
+    folder: Path, place: Path, *, jobs: int | None, pictures: bool, progress: bool, everything: bool,
+    told: "Callable[[ImageReport], None] | None" = None,
+) -> DetectOutcome:  # fmt: skip
     """:func:`detect_job` for who is changing the folder already; ``place`` is where what is new is made."""
     from survey.detection import DetectionTask, SpotOptions, detect_images
 
@@ -169,7 +174,7 @@ def detect_in(
     ]  # fmt: skip
     files = {key: file_of(state.definition.images[key], _file_name(key, state)) for key in wanted}
     dropped = _without_image(state, files, everything)
-    reports = detect_images(tasks, jobs=jobs, progress=progress, pictures=place / PICTURES if pictures else None)
+    reports = detect_images(tasks, jobs, progress, place / PICTURES if pictures else None, told)
     blocks, spots = _blocks(state.definition, reports)
     kept = {*state.points.images, *state.spots.images} - set(wanted) - dropped
     wrong = wrong_sizes(folder, state.definition, reports)

@@ -13,8 +13,8 @@ from gtsam import Pose3
 from adjust.lenses.models import MODELS, lens_constants, project
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import Adjustment
+from adjust.model.subsets import only_between
 from adjust.model.survey import FloatArray, Survey
-from survey.jobs.adjusting.subnetwork import only_between
 from survey.project import SpotBlock
 from survey.solution.frames import AdjustedFrames
 

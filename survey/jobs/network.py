@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.observations import Pair
 from survey.folder.replacing import complete, place_for, replace_parts
 from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, made
@@ -19,15 +19,23 @@ from survey.project import Definition, Project, read, read_definition
 from survey.project.merging import Merged, merge, read_copy
 from survey.project.project import OBSERVATIONS_FOLDER
 from survey.project.tables.files import read_table
-from survey.project.tables.pairs import COVARIANCE_COLUMNS, EULER, PAIRS, QUATERNION, SIGMA_COLUMNS, TRANSLATION
+from survey.project.tables.pairs import (
+    COVARIANCE_COLUMNS,
+    EULER,
+    PAIRS,
+    QUATERNION,
+    SIGMA_COLUMNS,
+    TRANSLATION,
+    read_ends,
+)
 from survey.project.tables.reading import Table
-from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame
+from survey.project.tables.references import Names
 from survey.report.results import RESULTS
+from survey.solution.earlier.previous import Move, Previous, change_dict, change_lines, moves, read_previous
 from survey.solution.loops import network_dict, pair_network
-from survey.solution.previous import Move, Previous, moves, read_previous
 
-_MOST_MOVES = 200
 _MOST_SHOWN = 8
+_MOST_NAMED = 12
 
 
 @dataclass(frozen=True)
@@ -61,7 +69,7 @@ class PlanOutcome:
             f"  conditions per pair           {n['conditions_per_pair']:>8.2f}",
         ]
         groups = n["inseparable_pairs"]
-        lines += [f"  errors seen but not told apart: {_named(group)}" for group in groups[:_MOST_SHOWN]]
+        lines += [f"  errors seen but not told apart: {listed(group, _MOST_NAMED)}" for group in groups[:_MOST_SHOWN]]
         lines += [f"  and {len(groups) - _MOST_SHOWN} more such groups"] if len(groups) > _MOST_SHOWN else []
         return "\n".join(lines)
 
@@ -89,14 +97,7 @@ def _planned(table: Table, names: Names) -> tuple[Pair, ...]:
     turns = (*QUATERNION, *EULER, *(c for cs in SIGMA_COLUMNS["rotation"] for c in cs), COVARIANCE_COLUMNS[0])
     shift, turn = _filled(table, shifts), _filled(table, turns)
     out = []
-    for row, (a_text, b_text) in enumerate(zip(table.text("a_id").values(), table.text("b_id").values(), strict=True)):
-        try:
-            a, b = read_frame(a_text, names), read_frame(b_text, names)
-            check_epochs(a, b, names)
-        except NameProblemError as problem:
-            raise table.error(row, f"a_id, b_id: {problem}") from problem
-        if a == b:
-            raise table.error(row, f"a_id, b_id: both are {a_text!r}; a pair joins two different frames")
+    for row, (a, b) in enumerate(read_ends(table, names)):
         rotation_only = bool(turn[row] and not shift[row])
         motion = Rot3() if rotation_only else Pose3()
         out.append(Pair(ids[row], a, b, motion, np.eye(3 if rotation_only else 6), used=used[row]))
@@ -113,21 +114,17 @@ def _problems(definition: Definition, network: dict[str, Any]) -> tuple[str, ...
     out = []
     parts = network["parts"]
     if parts:
-        named = " | ".join(_named(part) for part in parts[:6]) + (" | ..." if len(parts) > 6 else "")
+        named = " | ".join(listed(part, _MOST_NAMED) for part in parts[:6]) + (" | ..." if len(parts) > 6 else "")
         beside = ", unless images join them" if definition.survey.cameras else ""
         out.append(f"the pairs leave {len(parts)} parts that hang together by nothing{beside}: {named}")
     if definition.survey.datum.kind == "given" and not network["given_stations"] and not definition.survey.cameras:
         out.append('no station is held or has a prior; hold one, or write [datum] kind = "inner"')
     if network["uncontrolled_pairs"]:
         out.append(
-            f"close no loop, so that nobody would notice an error in them: {_named(network['uncontrolled_pairs'])}; "
-            "measure a second way to what they lead to"
+            f"close no loop, so that nobody would notice an error in them: "
+            f"{listed(network['uncontrolled_pairs'], _MOST_NAMED)}; measure a second way to what they lead to"
         )
     return tuple(out)
-
-
-def _named(ids: Sequence[str], most: int = 12) -> str:
-    return ", ".join(ids[:most]) + (f" and {len(ids) - most} more" if len(ids) > most else "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,47 +141,24 @@ class AddOutcome:
 
     def summary(self) -> dict[str, Any]:
         """As plain values."""
-        after = self.outcome.solution["summary"]
         return {
             **self.outcome.summary(),
             "added": self.added,
-            "redundancy_before": self.before.summary["redundancy"],
-            "redundancy_after": after["redundancy"],
-            "sigma0_before": self.before.summary["sigma0"],
-            "sigma0_after": after["sigma0"],
+            **change_dict(self.before, self.outcome.solution["summary"], self.moved),
             "start": self.start,
-            "n_moved_over_one_sigma": sum(m.sigmas > 1.0 for m in self.moved),
-            "moved": [
-                {"name": m.name, "moved_mm": m.mm, "moved_arcsec": m.arcsec, "moved_sigmas": m.sigmas}
-                for m in self.moved[:_MOST_MOVES]
-            ],
             "seconds": self.seconds,
         }
 
     def text(self) -> str:
         """For people."""
-        before, after = self.before.summary, self.outcome.solution["summary"]
+        after, how = self.outcome.solution["summary"], f", {self.start}, {self.seconds:.2f} s"
         lines = ["added: " + "; ".join(f"{kind} {_added(what)}" for kind, what in self.added.items())]
-        lines.append(
-            f"redundancy {before['redundancy']} -> {after['redundancy']}, sigma0 {_sigma0(before)} -> {_sigma0(after)}"
-            f", {self.start}, {self.seconds:.2f} s"
-        )
-        far = [m for m in self.moved if m.sigmas > 1.0]
-        lines.append(
-            f"{len(far)} of {len(self.moved)} old stations and points moved by more than one of their sigmas"
-            + ("; the most" if self.moved and not far else "")
-        )
-        for m in (far or self.moved)[:_MOST_SHOWN]:
-            lines.append(f"  {m.name:<20}{m.mm:>10.3f} mm{m.arcsec:>9.1f} arcsec{m.sigmas:>8.2f} sigmas")
+        lines += change_lines(self.before, after, self.moved, how, "old stations and points")
         return "\n".join([*lines, "", self.outcome.text()])
 
 
 def _added(what: Any) -> str:
-    return _named(what) if isinstance(what, list) else str(what)
-
-
-def _sigma0(summary: Any) -> str:
-    return "-" if summary["sigma0"] is None else f"{summary['sigma0']:.3f}"
+    return listed(what, _MOST_NAMED) if isinstance(what, list) else str(what)
 
 
 def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool = True) -> AddOutcome:

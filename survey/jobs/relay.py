@@ -15,6 +15,7 @@ from gtsam import Pose3, Rot3
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment
+from adjust.model.subsets import in_use
 from adjust.model.survey import FloatArray, Survey
 from adjust.relay.eyes.drift import DriftModel, choose_interval, growth, rescaled, sequences
 from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eyes
@@ -24,7 +25,6 @@ from adjust.relay.eyes.trajectories import CommonMotions, TimeOffset, Trajectory
 from adjust.spatial.rigid import rotation_log
 from adjust.spatial.rigid_motions import Motions
 from survey.folder.text import decode, read_bytes
-from survey.jobs.adjusting.subnetwork import in_use
 from survey.project import read
 from survey.project.tables.files import write_table
 from survey.project.tables.observation_columns import pair_columns

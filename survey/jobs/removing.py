@@ -9,7 +9,7 @@ on as long as the rest determines what they hang on.
 
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,7 @@ from survey.project.merging import point_files, read_copy
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.project.reading import read_all
 from survey.report.results import RESULTS
-from survey.solution.previous import Move, Previous, moves, read_previous
-
-_MOST_MOVES, _MOST_SHOWN = 200, 8
+from survey.solution.earlier.previous import Move, Previous, change_dict, change_lines, moves, read_previous
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,22 +50,12 @@ class RemoveOutcome:
 
     def summary(self) -> dict[str, Any]:
         """As plain values."""
-        before = {} if self.before is None else self.before.summary
-        after = self.outcome.solution["summary"]
         return {
             **self.outcome.summary(),
             "removed": list(self.removed),
-            "redundancy_before": before.get("redundancy"),
-            "redundancy_after": after["redundancy"],
-            "sigma0_before": before.get("sigma0"),
-            "sigma0_after": after["sigma0"],
+            **change_dict(self.before, self.outcome.solution["summary"], self.moved),
             "not_compared_because": self.why or None,
             "start": self.start,
-            "n_moved_over_one_sigma": sum(m.sigmas > 1.0 for m in self.moved),
-            "moved": [
-                {"name": m.name, "moved_mm": m.mm, "moved_arcsec": m.arcsec, "moved_sigmas": m.sigmas}
-                for m in self.moved[:_MOST_MOVES]
-            ],
             "seconds": self.seconds,
         }
 
@@ -75,26 +63,11 @@ class RemoveOutcome:
         """For people."""
         lines = [f"removed: {', '.join(self.removed)}"]
         lines.append(f"to take them back: labsurvey include FOLDER {' '.join(self.removed)}, and adjust again")
-        after = self.outcome.solution["summary"]
         if self.before is None:
             lines.append(f"nothing to compare with: {self.why}")
         else:
-            was = self.before.summary
-            lines.append(
-                f"redundancy {was['redundancy']} -> {after['redundancy']}, sigma0 {_sigma0(was)} -> {_sigma0(after)}"
-            )
-            far = [m for m in self.moved if m.sigmas > 1.0]
-            lines.append(
-                f"{len(far)} of {len(self.moved)} stations and points moved by more than one of their sigmas"
-                + ("" if far or not self.moved else "; the most")
-            )
-            for m in (far or self.moved)[:_MOST_SHOWN]:
-                lines.append(f"  {m.name:<20}{m.mm:>10.3f} mm{m.arcsec:>9.1f} arcsec{m.sigmas:>8.2f} sigmas")
+            lines += change_lines(self.before, self.outcome.solution["summary"], self.moved)
         return "\n".join([*lines, "", self.outcome.text()])
-
-
-def _sigma0(summary: Mapping[str, Any]) -> str:
-    return "-" if summary["sigma0"] is None else f"{summary['sigma0']:.3f}"
 
 
 def remove_job(

@@ -14,7 +14,7 @@ from survey.folder.text import atomic_write, choice_hint, suggestion
 from survey.report import charts, picture
 from survey.report.drawing import ON_WHITE, standalone
 from survey.report.scene import enlargement, scene_of
-from survey.report.statistics import standardized_by_group
+from survey.report.sections.statistics import standardized_by_group
 from survey.solution.quantities import Scale
 from survey.solution.residual_tables import image_rows
 from survey.solution.statistics import correlation_matrix

@@ -9,7 +9,7 @@ from gtsam import Pose3
 from adjust.design import Candidate, predict, with_candidates
 from adjust.graph.assembly import StartValues
 from adjust.lenses.models import MODELS, camera_constants, unit_rays
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair, PositionRef, TableReading
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Camera, FloatArray, IntArray, Point, PointParameter, PoseParameter, Station, Survey
@@ -66,7 +66,7 @@ def build_plan(project: Project, plan: Plan, existing: Adjustment | None, notes:
     seen = _seen(everything, start, planned, plan, project)
     dark = [m.epoch_id for m in planned if not any(b.epoch_id == m.epoch_id for b in seen)]
     if dark:
-        said.append(f"planned epochs that show nothing, left out: {_listed(dark)}")
+        said.append(f"planned epochs that show nothing, left out: {listed(dark, 8)}")
     lit = [m for m in planned if m.epoch_id not in dark]
     whole = replace(
         survey,
@@ -81,12 +81,8 @@ def build_plan(project: Project, plan: Plan, existing: Adjustment | None, notes:
     whole = _terrestrial(plan.planned, whole, start, project).added_to(whole)
     candidates, blind = _candidates(whole, everything, start, possible, plan, project, lit)
     if blind:
-        said.append(f"candidates that show nothing, left out: {_listed(blind)}")
+        said.append(f"candidates that show nothing, left out: {listed(blind, 8)}")
     return Planned(whole, start, candidates, len(base.image_blocks), len(lit), tuple(said))
-
-
-def _listed(names: Sequence[str], most: int = 8) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _gather(survey: Survey, existing: Adjustment | None) -> _Values:
@@ -306,7 +302,7 @@ def _reachable(survey: Survey, start: StartValues) -> Survey:
     lost = [p.point_id for p in survey.points if p.point_id not in start.points and p.x_in_world.treatment != "held"]
     if not lost:
         return survey
-    raise SurveyError(f"points without coordinates: {_listed(lost)}; give x_mm, roughly will do")
+    raise SurveyError(f"points without coordinates: {listed(lost, 8)}; give x_mm, roughly will do")
 
 
 def _coordinates(ref: PositionRef, sigma: float) -> Coordinates:

@@ -3,18 +3,15 @@
 import json
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
 from adjust.design import (
     Budget,
-    Selection,
     Tolerance,
     Trials,
-    WeakDirection,
     budget,
     exact,
     expect,
@@ -23,15 +20,16 @@ from adjust.design import (
     tolerances,
     weak_directions,
 )
-from adjust.design.selection import Component, Criterion
+from adjust.design.selection import Criterion
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
 from survey.jobs.adjusting.steps import adjust_project
 from survey.planning.building import Planned, build_plan
-from survey.planning.navigation import NavigationOutcome, plan_navigation
-from survey.planning.plan_file import Plan, read_plan
-from survey.planning.summary import plan_summary, plan_text
+from survey.planning.navigation import plan_navigation
+from survey.planning.page import plan_page
+from survey.planning.plan_file import read_plan
+from survey.planning.summary import PlanningOutcome
 from survey.planning.wanted import required_sigmas, wanted_components
 from survey.project import Project, atomic_write, read
 from survey.project.project import RESULTS
@@ -55,36 +53,6 @@ class PlanRequest:
     workers: int | None = None
     navigation: bool = False
     place: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class PlanningOutcome:
-    """All that is known of a plan."""
-
-    folder: Path
-    title: str
-    plan: Plan
-    planned: Planned
-    expected: Adjustment
-    weak: tuple[WeakDirection, ...]
-    wanted: tuple[Component, ...]
-    selection: Selection | None
-    required: dict[Component, float]
-    budget: Budget | None
-    tolerances: tuple[Tolerance, ...]
-    trials: Trials | None
-    network: dict[str, Any] | None
-    navigation: NavigationOutcome | None
-    seconds: dict[str, float] = field(default_factory=dict)
-    paths: dict[str, Path] = field(default_factory=dict)
-
-    def summary(self) -> dict[str, Any]:
-        """As plain values."""
-        return plan_summary(self)
-
-    def text(self) -> str:
-        """For people."""
-        return plan_text(self)
 
 
 def planning_job(
@@ -163,8 +131,6 @@ def _trials(planned: Planned, expected: Adjustment, request: PlanRequest, progre
 
 
 def _make(outcome: PlanningOutcome, place: Path) -> tuple[str, ...]:
-    from survey.planning.page import plan_page
-
     atomic_write(place / "plan.html", plan_page(outcome))
     content = {k: v for k, v in outcome.summary().items() if k not in ("folder", "written", "seconds")}
     atomic_write(place / "plan.json", json.dumps(content, indent=1, allow_nan=False) + "\n")

@@ -1,13 +1,12 @@
 """A plan as one HTML page that needs nothing but itself."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from gtsam import Pose3
 from markupsafe import Markup
 
 from adjust.design import group_redundancy
-from survey.planning.summary import meets, people, pose_sigmas, tolerance_values
+from survey.planning.navigation import NavigationOutcome
+from survey.planning.summary import PlanningOutcome, meets, people, pose_sigmas, tolerance_values
 from survey.report import drawing as d
 from survey.report.charts import Series, bars, chart, seen_map
 from survey.report.language import esc
@@ -32,10 +31,6 @@ from survey.report.picture import draw, perspective, pictures
 from survey.report.scene import Scene, Spot, scene_of
 from survey.solution.quantities import scale_of
 
-if TYPE_CHECKING:
-    from survey.planning.job import PlanningOutcome
-    from survey.planning.navigation import NavigationOutcome
-
 _MOST_CANDIDATES = 30
 _COLOURS = {"epoch": d.BLUE, "beacon": d.RED, "distance": d.GREEN, "pair": d.ORANGE, "coordinates": d.PURPLE}
 
@@ -46,7 +41,7 @@ def html_page(title: str, heading: str, sections: list[Markup]) -> str:
     return document(title, head + joined(sections, "\n"))
 
 
-def plan_page(o: "PlanningOutcome") -> str:
+def plan_page(o: PlanningOutcome) -> str:
     """The page of a plan."""
     title = o.title or o.folder.resolve().name
     parts = [
@@ -56,7 +51,7 @@ def plan_page(o: "PlanningOutcome") -> str:
     return html_page(f"{title} – plan", "Plan: expected precision before measuring", [p for p in parts if p])
 
 
-def _summary(o: "PlanningOutcome") -> Markup:
+def _summary(o: PlanningOutcome) -> Markup:
     e = o.expected
     cards = [(count(e.n_observations), "observations"), (count(e.n_unknowns), "unknowns"),
              (count(e.redundancy), "redundancy"), (count(o.planned.n_planned_epochs), "planned epochs"),
@@ -75,7 +70,7 @@ def _summary(o: "PlanningOutcome") -> Markup:
     return section("summary", "Summary", body + table(columns, rows), said)
 
 
-def _picture(o: "PlanningOutcome") -> Markup:
+def _picture(o: PlanningOutcome) -> Markup:
     scale = scale_of(o.expected, "a_priori")
     drawn, enlarged = pictures(scene_of(o.expected, scale), scale.ellipsoid)
     said = (
@@ -85,7 +80,7 @@ def _picture(o: "PlanningOutcome") -> Markup:
     return section("picture", "The survey", figures(drawn), said)
 
 
-def _seen(o: "PlanningOutcome") -> Markup:
+def _seen(o: PlanningOutcome) -> Markup:
     blocks = o.planned.survey.image_blocks
     if not blocks:
         return Markup()
@@ -100,7 +95,7 @@ def _seen(o: "PlanningOutcome") -> Markup:
     return section("seen", "What will be seen", element("figure", drawn))
 
 
-def _sigmas(o: "PlanningOutcome") -> Markup:
+def _sigmas(o: PlanningOutcome) -> Markup:
     by_name = o.expected.precision.graph.unknowns.by_name
     rows = []
     for name in (n for n in by_name if len(n) < 3):
@@ -115,7 +110,7 @@ def _sigmas(o: "PlanningOutcome") -> Markup:
     return section("sigmas", "Expected sigmas", table(("<Unknown", "<Sigmas"), rows), said)
 
 
-def _weak(o: "PlanningOutcome") -> Markup:
+def _weak(o: PlanningOutcome) -> Markup:
     rows = [
         (fixed(w.factor, 0), part("lines", [f"{s:+.2f}  {a}: {c}" for a, c, s in w.parts])) for w in o.weak
     ]  # fmt: skip
@@ -126,7 +121,7 @@ def _weak(o: "PlanningOutcome") -> Markup:
     return section("weak", "Weak directions", table(("Factor", "<What moves together"), rows) if rows else "", said)
 
 
-def _selection(o: "PlanningOutcome") -> Markup:
+def _selection(o: PlanningOutcome) -> Markup:
     s = o.selection
     if s is None:
         return Markup()
@@ -157,7 +152,7 @@ def _selection(o: "PlanningOutcome") -> Markup:
     return section("next", "What to add next", body, said)
 
 
-def _tolerances(o: "PlanningOutcome") -> Markup:
+def _tolerances(o: PlanningOutcome) -> Markup:
     if o.budget is None:
         return Markup()
     rows, share = [], o.budget.variances / o.budget.variances.sum(axis=0)
@@ -183,7 +178,7 @@ def _factor(value: float) -> str:
     return "any" if value > 1e6 else general(value, 3)
 
 
-def _trials(o: "PlanningOutcome") -> Markup:
+def _trials(o: PlanningOutcome) -> Markup:
     t = o.trials
     if t is None:
         return Markup()
@@ -205,7 +200,7 @@ def _trials(o: "PlanningOutcome") -> Markup:
     return section("trials", "Monte Carlo", facts + element("figure", drawn))
 
 
-def _navigation(n: "NavigationOutcome") -> Markup:
+def _navigation(n: NavigationOutcome) -> Markup:
     turn, shift = pose_sigmas(n)
     x = np.arange(1.0, len(turn) + 1)
     limits = np.degrees(n.plan.required_rotation), 1e3 * n.plan.required_translation
@@ -245,7 +240,7 @@ def _navigation(n: "NavigationOutcome") -> Markup:
     return section("navigation", "Navigation", body, said)
 
 
-def _room(n: "NavigationOutcome") -> Markup:
+def _room(n: NavigationOutcome) -> Markup:
     scene = Scene()
     beacons = np.asarray(n.beacons.x_in_world)
     for name, x in zip(n.beacons.beacon_ids, beacons, strict=True):
@@ -258,7 +253,7 @@ def _room(n: "NavigationOutcome") -> Markup:
     return draw(scene, perspective(everything), everything, 1.0, 1.0)
 
 
-def _placement(n: "NavigationOutcome") -> Markup:
+def _placement(n: NavigationOutcome) -> Markup:
     p = n.placement
     if p is None:
         return Markup()

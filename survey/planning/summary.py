@@ -1,20 +1,60 @@
 """A plan as plain values and as text for the terminal."""
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from adjust.design import Component, group_redundancy
+from adjust.design import (
+    Budget,
+    Component,
+    Selection,
+    Tolerance,
+    Trials,
+    WeakDirection,
+    group_redundancy,
+)
 from adjust.design.pose_budget import PoseTolerance
+from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
+from survey.planning.building import Planned
+from survey.planning.navigation import NavigationOutcome
+from survey.planning.plan_file import Plan
 from survey.solution.quantities import ARCSEC_PER_RAD, key_of, sigma_unit_for_people
-
-if TYPE_CHECKING:
-    from survey.planning.job import PlanningOutcome
-    from survey.planning.navigation import NavigationOutcome
 
 _MOST = 8
 _PEOPLE = {"rad": ("arcsec", ARCSEC_PER_RAD), "m": ("mm", 1e3), "px": ("px", 1.0)}
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningOutcome:
+    """All that is known of a plan."""
+
+    folder: Path
+    title: str
+    plan: Plan
+    planned: Planned
+    expected: Adjustment
+    weak: tuple[WeakDirection, ...]
+    wanted: tuple[Component, ...]
+    selection: Selection | None
+    required: dict[Component, float]
+    budget: Budget | None
+    tolerances: tuple[Tolerance, ...]
+    trials: Trials | None
+    network: dict[str, Any] | None
+    navigation: NavigationOutcome | None
+    seconds: dict[str, float] = field(default_factory=dict)
+    paths: dict[str, Path] = field(default_factory=dict)
+
+    def summary(self) -> dict[str, Any]:
+        """As plain values."""
+        return plan_summary(self)
+
+    def text(self) -> str:
+        """For people."""
+        return plan_text(self)
 
 
 def people(unit: str) -> tuple[str, float]:
@@ -33,7 +73,7 @@ def sigma_of(component: Component, sigma: float) -> str:
     return f"{factor * sigma:.3g} {unit}".strip()
 
 
-def plan_summary(o: "PlanningOutcome") -> dict[str, Any]:
+def plan_summary(o: PlanningOutcome) -> dict[str, Any]:
     """All figures by name, units in the keys."""
     out: dict[str, Any] = {
         "folder": str(o.folder),
@@ -76,7 +116,7 @@ def plan_summary(o: "PlanningOutcome") -> dict[str, Any]:
     return out
 
 
-def _sigmas(o: "PlanningOutcome") -> dict[str, dict[str, float]]:
+def _sigmas(o: PlanningOutcome) -> dict[str, dict[str, float]]:
     by_name = o.expected.precision.graph.unknowns.by_name
     out = {}
     for name, unknown in by_name.items():
@@ -91,7 +131,7 @@ def _sigmas(o: "PlanningOutcome") -> dict[str, dict[str, float]]:
     return out
 
 
-def _selection(o: "PlanningOutcome") -> dict[str, Any]:
+def _selection(o: PlanningOutcome) -> dict[str, Any]:
     s = o.selection
     if s is None:
         return {}
@@ -112,7 +152,7 @@ def _selection(o: "PlanningOutcome") -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _tolerances(o: "PlanningOutcome") -> dict[str, Any]:
+def _tolerances(o: PlanningOutcome) -> dict[str, Any]:
     if o.budget is None:
         return {}
     met = o.budget.sigmas <= np.array(list(o.required.values())) * (1 + 1e-9)
@@ -134,12 +174,12 @@ def tolerance_values(t: PoseTolerance) -> tuple[str, float, float, float]:
     return unit, factor * t.alone, factor * t.beside, factor * t.shared
 
 
-def pose_sigmas(n: "NavigationOutcome") -> tuple[FloatArray, FloatArray]:
+def pose_sigmas(n: NavigationOutcome) -> tuple[FloatArray, FloatArray]:
     """Largest sigma of rotation (deg) and of translation (mm) of every pose."""
     return np.degrees(n.sigmas[:, :3].max(axis=1)), 1e3 * n.sigmas[:, 3:].max(axis=1)
 
 
-def _navigation(n: "NavigationOutcome") -> dict[str, Any]:
+def _navigation(n: NavigationOutcome) -> dict[str, Any]:
     turn, shift = pose_sigmas(n)
     out: dict[str, Any] = {
         "station": n.station_id,
@@ -168,13 +208,13 @@ def _navigation(n: "NavigationOutcome") -> dict[str, Any]:
     return out
 
 
-def meets(n: "NavigationOutcome") -> FloatArray:
+def meets(n: NavigationOutcome) -> FloatArray:
     """(q,) whether every component of a pose is as precise as required."""
     limit = np.array([n.plan.required_rotation] * 3 + [n.plan.required_translation] * 3)
     return np.asarray((n.sigmas <= limit).all(axis=1))
 
 
-def plan_text(o: "PlanningOutcome") -> str:
+def plan_text(o: PlanningOutcome) -> str:
     """For the terminal, problems first."""
     e = o.expected
     name = o.title or str(o.folder)
@@ -194,7 +234,7 @@ def plan_text(o: "PlanningOutcome") -> str:
     return "\n".join(lines)
 
 
-def _sigma_lines(o: "PlanningOutcome") -> list[str]:
+def _sigma_lines(o: PlanningOutcome) -> list[str]:
     by_name = o.expected.precision.graph.unknowns.by_name
     out = ["  expected sigmas (a priori)"]
     names = [n for n in by_name if len(n) < 3]
@@ -215,7 +255,7 @@ def _sigma_lines(o: "PlanningOutcome") -> list[str]:
     return out
 
 
-def _selection_lines(o: "PlanningOutcome") -> list[str]:
+def _selection_lines(o: PlanningOutcome) -> list[str]:
     s = o.selection
     if s is None:
         return []
@@ -229,7 +269,7 @@ def _selection_lines(o: "PlanningOutcome") -> list[str]:
     return out
 
 
-def _tolerance_lines(o: "PlanningOutcome") -> list[str]:
+def _tolerance_lines(o: PlanningOutcome) -> list[str]:
     if o.budget is None:
         return []
     out = ["", "  required precision"]
@@ -248,7 +288,7 @@ def _factor(value: float) -> str:
     return "any" if value > 1e6 else f"{value:.3g}"
 
 
-def _trial_lines(o: "PlanningOutcome") -> list[str]:
+def _trial_lines(o: PlanningOutcome) -> list[str]:
     t = o.trials
     if t is None:
         return []
@@ -262,7 +302,7 @@ def _trial_lines(o: "PlanningOutcome") -> list[str]:
     ]
 
 
-def _navigation_lines(o: "PlanningOutcome") -> list[str]:
+def _navigation_lines(o: PlanningOutcome) -> list[str]:
     n = o.navigation
     if n is None:
         return []

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
 
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from survey.folder.text import read_bytes
 
 DETECTED_FILE = "detected.json"
@@ -134,8 +134,7 @@ class ImageNews:
 
 def named(keys: Iterable[ImageKey], most: int = 6) -> str:
     """Images by name."""
-    names = ["/".join(key) for key in keys]
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+    return listed(["/".join(key) for key in keys], most)
 
 
 def image_news(

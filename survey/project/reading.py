@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -107,15 +108,15 @@ def read(folder: Path) -> Project:
     return leaving_out(project, in_force(read_exclusions(project.folder / OBSERVATIONS_FOLDER)[0]).values())
 
 
-def read_all(folder: Path, definition_text: str | None = None) -> Project:
+def read_all(folder: Path, texts: Mapping[str, str] = MappingProxyType({})) -> Project:
     """:func:`read`, with what is excluded as if it were not.
 
-    definition_text: what is to stand in survey.toml, not yet written.
+    texts: what is to stand in files of the folder, not yet written, by their paths in it.
     """
     with settled(Path(folder)):
-        definition, root = _read_definition(Path(folder), definition_text)
+        definition, root = _read_definition(Path(folder), texts.get(DEFINITION_FILE))
         place = definition.folder / OBSERVATIONS_FOLDER
-        tables = _read_tables(place)
+        tables = _read_tables(place, {definition.folder / name: text for name, text in texts.items()})
         _, digest = read_exclusions(place)
         known = read_detected(place)
         images = _image_news(definition, tables, known)
@@ -323,8 +324,11 @@ def _check_scales(root: Node, sigmas: Sigmas, tables: dict[str, Table]) -> None:
             raise root.table("sigmas").table("scale").error(problem, group)
 
 
-def _read_tables(folder: Path) -> dict[str, Table]:
-    """All tables in the folder by name; raises where a file is no known table or one is there twice."""
+def _read_tables(folder: Path, instead: Mapping[Path, str]) -> dict[str, Table]:
+    """All tables in the folder by name; raises where a file is no known table or one is there twice.
+
+    instead: what is to stand in some of them, not yet written.
+    """
     tables: dict[str, Table] = {}
     paths = sorted(folder.iterdir()) if folder.is_dir() else []
     for path in paths:
@@ -338,7 +342,7 @@ def _read_tables(folder: Path) -> dict[str, Table]:
             raise SurveyError(f"{path}: unknown table {path.stem!r}; {near}")
         if path.stem in tables:
             raise SurveyError(f"{path}: {tables[path.stem].path.name} is there too; keep one of the two")
-        tables[path.stem] = read_table(path, layout)
+        tables[path.stem] = read_table(path, layout, instead.get(path))
     return tables
 
 

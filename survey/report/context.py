@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from adjust.model.arrays import largest
 from adjust.model.result import Adjustment
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from survey.solution.dictionary import RunInfo
@@ -31,11 +32,7 @@ class Context:
 
 def worst(values: FloatArray, most: int) -> IntArray:
     """Positions of the largest absolute values, largest first, equal ones in their order; NaN comes last."""
-    size = np.nan_to_num(np.abs(values), nan=-1.0)
-    if len(size) > most:  # sorting a million to show a few takes longer than all else
-        among = np.flatnonzero(size >= np.partition(size, len(size) - most)[len(size) - most])
-        return among[np.argsort(-size[among], kind="stable")][:most]
-    return np.argsort(-size, kind="stable")
+    return largest(np.nan_to_num(np.abs(values), nan=-1.0), most)
 
 
 def other_components(adjustment: Adjustment) -> tuple[IntArray, IntArray, FloatArray]:

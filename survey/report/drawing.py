@@ -82,11 +82,16 @@ def dot(x: float, y: float, radius: float, fill: str, more: str = "") -> str:
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="{fill}"{more}/>'
 
 
-def ellipse(centre: FloatArray, cov: FloatArray, fill: str, stroke: str) -> str:
-    """The ellipse ``x' inv(cov) x = 1`` about a centre, in the picture's units."""
+def half_axes(cov: FloatArray) -> FloatArray:
+    """Half axes, the larger first, and direction (degrees) of the ellipses ``x' inv(cov) x = 1``: (n, 3)."""
     variances, vectors = np.linalg.eigh(cov)
-    b, a = np.sqrt(np.clip(variances, 0.0, None))
-    angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+    angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    return np.column_stack([np.sqrt(np.clip(variances, 0.0, None))[:, ::-1], angle])
+
+
+def ellipse(centre: FloatArray, axes: FloatArray, fill: str, stroke: str) -> str:
+    """One of the :func:`half_axes` about a centre, in the picture's units."""
+    a, b, angle = axes
     return (
         f'<ellipse rx="{a:.1f}" ry="{b:.1f}" fill="{fill}" fill-opacity="0.16" stroke="{stroke}" stroke-width="0.9" '
         f'transform="translate({centre[0]:.1f} {centre[1]:.1f}) rotate({angle:.1f})"/>'

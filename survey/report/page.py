@@ -11,11 +11,11 @@ from markupsafe import Markup
 
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
-from survey.report import loops, observations, overview, published, statistics, unknowns
 from survey.report.context import Context
 from survey.report.drawing import DARK
 from survey.report.language import localised, speaking, t
 from survey.report.markup import document, element, joined, json_script, part
+from survey.report.sections import loops, observations, overview, published, statistics, unknowns
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.quantities import scale_of
 from survey.solution.residual_tables import image_rows

@@ -25,11 +25,11 @@ class View:
     stands: bool = False  # shows heights, as the perspective does
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        """Derivative (2, 3) of the picture at a point."""
+        """Derivatives (..., 2, 3) of the picture at points (..., 3)."""
         h = 1e-4
-        steps = np.concatenate([x + h * np.eye(3), x - h * np.eye(3)])
-        xy = self.to_picture(steps)
-        return (xy[:3] - xy[3:]).T / (2 * h)
+        steps = x[..., None, None, :] + h * np.stack([np.eye(3), -np.eye(3)])
+        xy = self.to_picture(steps.reshape(-1, 3)).reshape(*steps.shape[:-1], 2)
+        return np.swapaxes(xy[..., 0, :, :] - xy[..., 1, :, :], -1, -2) / (2 * h)
 
 
 def _fit(xy: FloatArray) -> tuple[float, FloatArray]:
@@ -109,7 +109,7 @@ class _Labels:
     """Places labels beside their points, tries four sides, leaves out what would cover another label."""
 
     def __init__(self, taken: FloatArray) -> None:
-        self.boxes: list[tuple[float, float, float, float]] = [(x - 2, y - 2, x + 2, y + 2) for x, y in taken]
+        self.boxes = np.concatenate([taken - 2, taken + 2], axis=1)
 
     def place(self, xy: FloatArray, words: str, colour: str, size: float = 10.5, gap: float = 5.0) -> str:
         w, h = 0.6 * size * len(words), size
@@ -124,9 +124,9 @@ class _Labels:
             x, y = xy[0] + dx, xy[1] + dy
             box = (x, y - h, x + w, y + 1)
             inside = box[0] > 0 and box[1] > 0 and box[2] < WIDTH and box[3] < HEIGHT
-            free = all(box[0] > b[2] or box[2] < b[0] or box[1] > b[3] or box[3] < b[1] for b in self.boxes)
-            if inside and free:
-                self.boxes.append(box)
+            x0, y0, x1, y1 = self.boxes.T
+            if inside and ((box[0] > x1) | (box[2] < x0) | (box[1] > y1) | (box[3] < y0)).all():
+                self.boxes = np.concatenate([self.boxes, [box]])
                 halo = f' paint-order="stroke" stroke="{d.PAPER}" stroke-width="2.5"'
                 return d.text(x, y, words, size=size, colour=colour, more=halo)
         return ""
@@ -165,21 +165,22 @@ def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, elli
         *_world_axes(view, 0.07 * extent),
     ]
     if view.stands:
-        floor = everything[:, 2].min()
-        for spot in scene.spots:
-            foot = view.to_picture(np.array([spot.x, (*spot.x[:2], floor)]))
-            parts.append(d.polyline(foot, d.FAINT, 0.8, ' stroke-dasharray="2 2"'))
+        feet = scene.spot_places().repeat(2, axis=0)
+        feet[1::2, 2] = everything[:, 2].min()
+        ends = view.to_picture(feet).reshape(-1, 2, 2)
+        parts += [d.polyline(foot, d.FAINT, 0.8, ' stroke-dasharray="2 2"') for foot in ends]
     parts += [d.polygon(view.to_picture(x), d.BODY, d.INK, 1.0, ' fill-opacity="0.18"') for _, x in scene.outlines]
     parts += [d.dot(x, y, 1.2, d.INK) for _, cloud in scene.clouds for x, y in view.to_picture(cloud)]
     parts += [d.dot(x, y, 1.4, d.GREEN, ' fill-opacity="0.6"') for m in scene.moves for x, y in view.to_picture(m)]
     parts += _tables(view, scene, 0.06 * extent)
     parts += [_frustum(view, s, 0.075 * extent) for s in sorted(scene.shots, key=lambda s: s.main)]
-    for spot in sorted(scene.spots, key=lambda s: s.kind):
-        J = view.jacobian(spot.x) * ellipsoid * enlarged
-        colour = d.RED if spot.kind == "point" else d.GREEN
-        x, y = view.to_picture(spot.x)[0]
-        parts.append(d.ellipse(np.array([x, y]), J @ spot.cov @ J.T, colour, colour))
-        parts.append(d.dot(x, y, 2.2 if spot.kind == "point" else 3.0, colour))
+    J = view.jacobian(scene.spot_places()) * ellipsoid * enlarged
+    cov = J @ np.array([spot.cov for spot in scene.spots]).reshape(-1, 3, 3) @ J.swapaxes(1, 2)
+    xy, ellipses = view.to_picture(scene.spot_places()), d.half_axes(cov)
+    for i, spot in sorted(enumerate(scene.spots), key=lambda s: s[1].kind):
+        colour, size = (d.RED, 2.2) if spot.kind == "point" else (d.GREEN, 3.0)
+        parts.append(d.ellipse(xy[i], ellipses[i], colour, colour))
+        parts.append(d.dot(xy[i, 0], xy[i, 1], size, colour))
     parts += _labels(view, scene, 0.09 * extent)
     step = d.round_below(0.25 * WIDTH / view.unit)
     parts.append(d.scale_bar(2, HEIGHT - 8, step * view.unit, localised(f"{step:g} m")))
@@ -188,8 +189,7 @@ def draw(scene: Scene, view: View, everything: FloatArray, enlarged: float, elli
 
 def _labels(view: View, scene: Scene, ahead: float) -> list[str]:
     """Names; those of cameras stand ``ahead`` of them, m."""
-    taken = [view.to_picture(s.x)[0] for s in scene.spots]
-    labels, parts = _Labels(np.array(taken).reshape(-1, 2)), []
+    labels, parts = _Labels(view.to_picture(scene.spot_places())), []
     for label, x in scene.outlines + scene.clouds:
         parts.append(labels.place(view.to_picture(x).mean(axis=0), label, d.INK) if label else "")
     for shot in scene.shots:

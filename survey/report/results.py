@@ -13,7 +13,7 @@ from survey.report import report_html, summary_text
 from survey.report.page import report_pdf
 from survey.solution.covariances import covariance_npz
 from survey.solution.dictionary import RunInfo, solution_dict, solution_json
-from survey.solution.residual_tables import image_residuals_csv, other_residuals_csv
+from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
 from survey.solution.statistics import Statistics
 
 __all__ = [
@@ -30,13 +30,19 @@ __all__ = [
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """language: of report.html, "en" or "de". pdf: write report.pdf too."""
+    """How results are written.
+
+    language: of report.html, "en" or "de". pdf: report.pdf too. parquet: residuals.parquet too, which is written again
+    as long as it is there.
+    """
 
     language: str = "en"
     pdf: bool = False
+    parquet: bool = False
 
 
 ENGLISH_PAGE = ReportOptions()
+PARQUET = "residuals.parquet"
 
 
 def write_results(
@@ -67,15 +73,18 @@ def make_results(
 ) -> dict[str, Path]:
     """Make everything in ``place/results``; the paths by file name. Raises as :func:`write_results`.
 
+    place: in the folder whose results these replace.
     solution: of :func:`survey.solution.dictionary.solution_dict`, with the statistics.
     """
     results = place / RESULTS
+    parquet = options.parquet or (place.parent / RESULTS / PARQUET).is_file()  # there: not to be old
     page = report_html(adjustment, run, solution, statistics, options.language)
     pdf = report_pdf(page) if options.pdf else b""
     results.mkdir(parents=True, exist_ok=True)
     makers: Mapping[str, Callable[[], bytes]] = {
         "covariance.npz": lambda: covariance_npz(adjustment, run.sigmas),
         "residuals.csv": lambda: image_residuals_csv(adjustment),
+        **({PARQUET: lambda: image_residuals_parquet(adjustment)} if parquet else {}),
         "residuals_other.csv": lambda: other_residuals_csv(adjustment),
         "report.html": page.encode,
         **({"report.pdf": lambda: pdf} if options.pdf else {}),

@@ -56,9 +56,13 @@ class Scene:
     moves: list[FloatArray] = field(default_factory=list)
     n_left_out: int = 0
 
+    def spot_places(self) -> FloatArray:
+        """Of all spots, (n, 3)."""
+        return np.array([s.x for s in self.spots]).reshape(-1, 3)
+
     def positions(self) -> FloatArray:
         """Everything with a place, (n, 3)."""
-        parts = [np.array([s.x for s in self.spots]).reshape(-1, 3)]
+        parts = [self.spot_places()]
         parts.append(np.array([np.asarray(s.pose.translation()) for s in self.shots]).reshape(-1, 3))
         parts += [x for _, x in self.outlines + self.clouds]
         parts.append(np.array(self.moves).reshape(-1, 3))

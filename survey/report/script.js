@@ -64,6 +64,21 @@
     }
   }
 
+  // places: "#image=X/hX05", "#obs=...", "#reading=...", "#point=B07" lead here as in the workbench
+  const escaped = (text) => encodeURIComponent(text).replaceAll("%2F", "/").replaceAll("%3A", ":").replaceAll("%2C", ",");
+  const named = (id) => [...document.querySelectorAll("tbody tr")].find((row) => row.cells[0] && row.cells[0].textContent.trim() === id);
+  const goTo = () => {
+    const [, kind, said] = location.hash.match(/^#(\w+)=([^&]*)/) || [];
+    if (!kind) return;
+    let id = said;
+    try { id = decodeURIComponent(said); } catch { /* as it stands */ }
+    const found = (goTo.all && ["image", "obs", "reading"].includes(kind) ? goTo.all(kind, id) : null) || named(id) || named(id.split("/").pop());
+    for (const old of document.querySelectorAll("tr.here")) old.classList.remove("here");
+    if (!found) return;
+    if (found.tagName === "TR") found.classList.add("here");
+    found.scrollIntoView({ block: "center" });
+  };
+
   // all observations: columns of values, a page of rows at a time
   const holder = document.getElementById("all-data");
   if (holder) {
@@ -82,12 +97,38 @@
     const field = document.getElementById("all-filter");
     const only = document.getElementById("all-only");
     const where = document.getElementById("all-where");
+    // the places of the workbench: an image point by its image, target and name, a reading by its table and id
+    const at = { where: data.at[0], point: data.at[1] };
+    const placeOf = (i) => {
+      const reading = data.places.names[data.places.codes[i]];
+      if (reading) return "reading=" + reading;
+      return "obs=image_point:" + [...column[at.where].text(i).split(" · ").filter((x, k) => k < 2 || x !== "points"), column[at.point].text(i)].join("/");
+    };
+    goTo.all = (kind, id) => {
+      if (kind === "image") {
+        field.value = id.replace("/", " ");
+        filter();
+        return table;
+      }
+      const i = order.find((k) => placeOf(k) === kind + "=" + id);
+      if (i === undefined) return null;
+      field.value = "";
+      only.checked = false;
+      filter();
+      page = Math.floor(shown.indexOf(i) / size);
+      draw();
+      return [...table.tBodies[0].rows].find((row) => row.dataset.place === kind + "=" + id);
+    };
     const draw = () => {
       const pages = Math.max(1, Math.ceil(shown.length / size));
       page = Math.min(Math.max(page, 0), pages - 1);
       const rows = shown.slice(page * size, (page + 1) * size).map((i) => {
         const row = make("tr", ["", "suspect", "off"][data.flags[i]]);
         for (const c of column) row.append(make("td", c.names ? "l" : "r", c.text(i)));
+        row.dataset.place = placeOf(i);
+        const link = make("a", "", row.cells[0].textContent);
+        link.href = "#" + placeOf(i).split("=").map(escaped).join("=");
+        row.cells[0].replaceChildren(link);
         const flag = make("td", "l");
         if (data.flags[i]) flag.append(make("span", "pill " + ["", "bad", "soft"][data.flags[i]], words.flags[data.flags[i]]));
         row.append(flag);
@@ -226,4 +267,6 @@
     night.addEventListener("change", draw);
     new ResizeObserver(draw).observe(view); // also when the page is first laid out
   }
+  addEventListener("hashchange", goTo);
+  goTo();
 })();

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 from adjust.model.result import Adjustment
-from survey.report.published import head_rows, worst_pairs
+from survey.project.observed import name_of_residual
+from survey.report.sections.published import head_rows, worst_pairs
+from survey.solution.anchors import anchor, anchors_in
 from survey.solution.dictionary import RunInfo, solution_dict
 
 _WIDTH = 100
@@ -48,7 +50,7 @@ def _head(solution: dict[str, Any]) -> Iterator[str]:
 
 def _warnings(solution: dict[str, Any]) -> Iterator[str]:
     warnings = solution["warnings"]
-    yield from (f"  ! {w}" for w in warnings[:_MOST_WARNINGS])
+    yield from ("  ".join([f"  ! {w}", *anchors_in(w)]) for w in warnings[:_MOST_WARNINGS])
     if len(warnings) > _MOST_WARNINGS:
         yield f"  ! and {len(warnings) - _MOST_WARNINGS} more, see the report"
 
@@ -227,7 +229,8 @@ def _observations(adjustment: Adjustment, limit: float) -> Iterator[str]:
     for k in worst:
         o = adjustment.other_residuals[k]
         flag = "  SUSPECT" if size[k] > limit else ""
-        yield f"  {_cut(f'{o.kind} {chr(32).join(o.ids)}', 44):<44}{size[k]:>8.2f}{flag}"
+        place = anchor("reading", name_of_residual(o))
+        yield f"  {_cut(f'{o.kind} {chr(32).join(o.ids)}', 44):<44}{size[k]:>8.2f}{flag}  {place}"
 
 
 def _points(solution: dict[str, Any]) -> Iterator[str]:
@@ -240,4 +243,4 @@ def _points(solution: dict[str, Any]) -> Iterator[str]:
     for name in worst:
         p = solution["points"][name]
         sigmas = "".join(_number(p[f"sigma_{a}_mm"], 8, 3) for a in "xyz")
-        yield f"  {_cut(name, 32):<32}{sigmas}{sized[name]:>20.3f}"
+        yield f"  {_cut(name, 32):<32}{sigmas}{sized[name]:>20.3f}  {anchor('point', name)}"

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from adjust.epochs.states import datum_carriers, open_directions
-from adjust.model.result import Adjustment, Estimate, GroupSummary
-from adjust.model.survey import FloatArray
+from adjust.model.result import Adjustment, Estimate, GroupSummary, ImageResiduals
+from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.precision import in_conditions
 from adjust.testing.distributions import norm
 from survey.project.detected import DetectedImage
@@ -225,7 +225,7 @@ def _lens(estimate: Estimate, model: str, scale: Scale) -> dict[str, Any]:
 
 
 def _cameras(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
-    moving = _of_epochs(adjustment)
+    moving, sums = _of_epochs(adjustment), _sums_of_blocks(adjustment.image_residuals)
     out: dict[str, Any] = {}
     for camera in adjustment.survey.cameras:
         entry: dict[str, Any] = {"station": camera.station_id, "image_size_px": list(camera.image_size)}
@@ -233,33 +233,39 @@ def _cameras(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
         if lens is not None:
             entry["lens"] = _lens(lens, camera.lens.model, scale)
         entry |= _pose(adjustment, moving, ("station_from_camera", camera.camera_id), "station_from_camera", scale)
-        out[camera.camera_id] = entry | _images(adjustment, camera.camera_id)
+        out[camera.camera_id] = entry | _images(adjustment, camera.camera_id, sums)
     return out
 
 
-def _images(adjustment: Adjustment, camera_id: str) -> dict[str, Any]:
+def _images(adjustment: Adjustment, camera_id: str, sums: tuple[IntArray, FloatArray]) -> dict[str, Any]:
     """Number of used image points and RMS residual, of the camera and of each of its images."""
-    found = adjustment.image_residuals
-    squares: dict[str, list[FloatArray]] = {}
-    for block, first, last in zip(
-        adjustment.survey.image_blocks, found.block_ptr[:-1], found.block_ptr[1:], strict=True
-    ):
-        if block.camera_id == camera_id:
-            used = found.used[first:last]
-            squares.setdefault(block.epoch_id, []).append(found.residuals[first:last][used] ** 2)
-    per_image = {epoch: np.concatenate(parts) for epoch, parts in squares.items()}
-    every = np.concatenate([*per_image.values(), np.empty((0, 2))])
+    blocks = adjustment.survey.image_blocks
+    mine = [i for i, b in enumerate(blocks) if b.camera_id == camera_id]
+    per_image: dict[str, list[float]] = {}
+    for i, n, squares in zip(mine, *(x[mine].tolist() for x in sums), strict=True):
+        of_image = per_image.setdefault(blocks[i].epoch_id, [0, 0.0])
+        of_image[0], of_image[1] = of_image[0] + n, of_image[1] + squares
+    n_all, squares_of_all = (sum(x) for x in zip((0, 0.0), *per_image.values(), strict=True))
     return {
         "n_images": len(per_image),
-        "n_image_points": len(every),
-        "rms_residual_px": _rms(every),
-        "images": {e: {"n_image_points": len(x), "rms_residual_px": _rms(x)} for e, x in per_image.items()},
+        "n_image_points": n_all,
+        "rms_residual_px": _rms(n_all, squares_of_all),
+        "images": {e: {"n_image_points": n, "rms_residual_px": _rms(n, s)} for e, (n, s) in per_image.items()},
     }
 
 
-def _rms(squares: FloatArray) -> float:
-    """Root mean square over both coordinates."""
-    return float(np.sqrt(squares.mean())) if squares.size else float("nan")
+def _sums_of_blocks(found: ImageResiduals) -> tuple[IntArray, FloatArray]:
+    """Points in use and their residuals squared, of every image block (B,)."""
+    squares = np.where(found.used, (found.residuals**2).sum(axis=1), 0.0)
+    B = len(found.block_ptr) - 1
+    block = np.repeat(np.arange(B), np.diff(found.block_ptr))
+    n: IntArray = np.bincount(block[found.used], minlength=B)
+    return n, np.bincount(block, squares, B).astype(np.float64)
+
+
+def _rms(n: float, squares: float) -> float:
+    """Root mean square over both coordinates of n points."""
+    return math.sqrt(squares / (2 * n)) if n else math.nan
 
 
 def _of_epochs(adjustment: Adjustment) -> dict[tuple[str, ...], list[Estimate]]:

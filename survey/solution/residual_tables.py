@@ -1,25 +1,29 @@
 """Residuals as CSV: one row per image point, one row per component of every other observation.
 
-Rows are assembled as matrices of bytes, not line by line: a million image points take about a second.
+Rows are made by the core: a million image points take a fraction of a second.
 """
 
 import csv
 import io
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import isfinite
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from adjust.model.result import Adjustment
-from adjust.model.survey import FloatArray, IntArray, Survey
-from adjust.native.parallel import workers
+from adjust.model.observations import Reading
+from adjust.model.result import Adjustment, ImageResiduals, ReadingResiduals
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.native.parallel import side_by_side
+from adjust.native.text import Words, number_rows
+from adjust.observations.terrestrial.statistics import reading_names, reading_unit
 from survey.folder.text import cell_text
+from survey.project.tables.arrow import parquet_bytes
+from survey.project.tables.reading import TextColumn
 from survey.solution.quantities import sigma_unit_for_people, unit_for_people
 
-Bytes = npt.NDArray[np.uint8]
 IMAGE_COLUMNS = (
     "epoch_id,camera_id,target_id,point_id,u_px,v_px,residual_u_px,residual_v_px,sigma_u_px,sigma_v_px,"
     "redundancy_u,redundancy_v,standardized_u,standardized_v,test,used"
@@ -28,6 +32,7 @@ OTHER_COLUMNS = (
     "kind,group,ids,component,value_unit,observed,adjusted,residual_unit,residual,sigma,redundancy,standardized,test,"
     "used"
 )
+_DECIMALS = (4, 4, 6, 6, 6, 6, 5, 5, 4, 4, 4, 0)
 _CHUNK = 50_000
 
 
@@ -73,73 +78,63 @@ def image_residuals_csv(adjustment: Adjustment) -> bytes:
     """``residuals.csv``; sigmas are those of the observations, a priori; no number is written where there is none."""
     rows, found = image_rows(adjustment), adjustment.image_residuals
     blocks = adjustment.survey.image_blocks
-    by_block = [
-        _text([cell_text(b.epoch_id) for b in blocks]),
-        _text([cell_text(b.camera_id) for b in blocks]),
-        _text([cell_text(b.target_id or "") for b in blocks]),
-    ]
-    points = _text([cell_text(p) for p in rows.point_ids])
-    numbers = (
-        (rows.uv, 4), (found.residuals, 6), (rows.sigmas, 6), (found.redundancy, 5), (found.standardized, 4),
-        (found.test[:, None], 4), (found.used[:, None].astype(float), 0),
-    )  # fmt: skip
+    names = ((cell_text(b.epoch_id), cell_text(b.camera_id), cell_text(b.target_id or "")) for b in blocks)
+    heads = Words.of([",".join(map(_quoted, x)) + "," for x in names])
+    points = Words.of([_quoted(cell_text(p)) for p in rows.point_ids])
+    numbers = _numbers(rows, found)
 
     def text(first: int) -> bytes:
         part = slice(first, first + _CHUNK)
-        columns = [names[rows.block[part]] for names in by_block] + [points[rows.point[part]]]
-        columns += [_fixed(values[part, j], decimals) for values, decimals in numbers for j in range(values.shape[1])]
-        return _join(columns)
+        values: FloatArray = np.column_stack([x[part] for x in numbers]).astype(np.float64)
+        made = number_rows(heads, rows.block[part], points, rows.point[part], values, _DECIMALS)
+        return made if made is not None else _by_one(adjustment, rows, part, values)
 
-    with ThreadPoolExecutor(workers()) as pool:
-        return b"".join([IMAGE_COLUMNS.encode() + b"\n", *pool.map(text, range(0, rows.block.size, _CHUNK))])
-
-
-def _text(words: Sequence[str]) -> Bytes:
-    """Words as rows of bytes, padded with zeros, quoted where CSV needs it."""
-    quoted = ['"' + w.replace('"', '""') + '"' if any(c in w for c in ',"\r\n') else w for w in words] or [""]
-    padded = np.array([w.encode() for w in quoted])
-    width = max(padded.dtype.itemsize, 1)
-    return padded.astype(f"S{width}").view(np.uint8).reshape(len(quoted), width)
+    return b"".join([IMAGE_COLUMNS.encode() + b"\n", *side_by_side(text, range(0, rows.block.size, _CHUNK))])
 
 
-def _fixed(values: FloatArray, decimals: int) -> Bytes:
-    """Numbers as rows of bytes with a fixed number of decimals, padded with zeros; empty where not finite."""
-    finite = np.isfinite(values)
-    magnitude = np.where(finite, np.abs(values), 0.0) * 10.0**decimals
-    if magnitude.size and magnitude.max() > 1e17:
-        return _text([repr(float(v) + 0.0) if ok else "" for v, ok in zip(values, finite, strict=True)])
-    whole = np.rint(magnitude).astype(np.int64)
-    n_digits = max(len(str(int(whole.max()))) if whole.size else 1, decimals + 1)
-    out = np.zeros((values.size, n_digits + 1 + (decimals > 0)), dtype=np.uint8)
-    out[:, 0] = np.where((values < 0.0) & (whole > 0), ord("-"), 0)
-    rest, column = whole.copy(), out.shape[1] - 1
-    for place in range(n_digits):
-        if place == decimals and decimals:
-            out[:, column] = ord(".")
-            column -= 1
-        written = rest > 0 if place > decimals else np.True_
-        rest, digit = np.divmod(rest, 10)
-        out[:, column] = np.where(written, digit + ord("0"), 0)
-        column -= 1
-    out[~finite] = 0
-    return out
+def _numbers(rows: ImageRows, found: ImageResiduals) -> tuple[FloatArray | BoolArray, ...]:
+    """What follows the names in a row."""
+    return rows.uv, found.residuals, rows.sigmas, found.redundancy, found.standardized, found.test, found.used
 
 
-def _join(columns: list[Bytes]) -> bytes:
-    n = columns[0].shape[0]
-    comma, end = np.full((n, 1), ord(","), np.uint8), np.full((n, 1), ord("\n"), np.uint8)
-    parts = [part for column in columns for part in (column, comma)]
-    flat = np.concatenate([*parts[:-1], end], axis=1).ravel()
-    return bytes(flat[flat != 0].tobytes())
+def image_residuals_parquet(adjustment: Adjustment) -> bytes:
+    """``residuals.parquet``: the columns of ``residuals.csv``, its numbers in full, ``used`` as true or false."""
+    rows, blocks = image_rows(adjustment), adjustment.survey.image_blocks
+    names = IMAGE_COLUMNS.split(",")
+    columns: dict[str, Any] = {}
+    for name, words in zip(names, ([b.epoch_id for b in blocks], [b.camera_id for b in blocks],
+                                   [b.target_id or "" for b in blocks]), strict=False):  # fmt: skip
+        index = {word: i for i, word in enumerate(dict.fromkeys(words))}
+        of_block = np.array([index[word] for word in words], dtype=np.int64)
+        columns[name] = TextColumn(tuple(index), of_block[rows.block])
+    columns["point_id"] = TextColumn(rows.point_ids, rows.point)
+    parts = [x.reshape(len(x), -1) for x in _numbers(rows, adjustment.image_residuals)]
+    values = (part[:, j] for part in parts for j in range(part.shape[1]))
+    return parquet_bytes(columns | dict(zip(names[4:], values, strict=True)))
+
+
+def _by_one(adjustment: Adjustment, rows: ImageRows, part: slice, values: FloatArray) -> bytes:
+    """Rows of which some number is too large for fixed decimals: all in full."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    for b, point, row in zip(rows.block[part].tolist(), rows.point[part].tolist(), values.tolist(), strict=True):
+        block = adjustment.survey.image_blocks[b]
+        names = (block.epoch_id, block.camera_id, block.target_id or "", rows.point_ids[point])
+        writer.writerow((*map(cell_text, names), *("" if not isfinite(v) else repr(v) for v in row[:-1]), int(row[-1])))
+    return out.getvalue().encode()
+
+
+def _quoted(word: str) -> str:
+    return '"' + word.replace('"', '""') + '"' if any(c in word for c in ',"\r\n') else word
 
 
 def other_residuals_csv(adjustment: Adjustment) -> bytes:
     """``residuals_other.csv``: values in mm and degrees, residuals and sigmas in mm and arcseconds."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    writer, readings = csv.writer(out, lineterminator="\n"), adjustment.reading_residuals
     writer.writerow(OTHER_COLUMNS.split(","))
-    units: dict[tuple[str, str], tuple[str, float, str, float]] = {}
-    for o in adjustment.other_residuals:
+    n = len(adjustment.other_residuals) - (0 if readings is None else len(readings.observed))
+    for o in adjustment.other_residuals[:n]:
         of, used = (o.kind, cell_text(o.group), cell_text(" ".join(o.ids))), int(o.used)
         values = (np.asarray(x, dtype=float).tolist()
                   for x in (o.observed, o.adjusted, o.residual, o.sigma, o.redundancy, o.standardized))  # fmt: skip
@@ -147,14 +142,34 @@ def other_residuals_csv(adjustment: Adjustment) -> bytes:
         for component, unit, observed, adjusted, residual, sigma, *numbers in zip(
             o.components, o.units, *values, strict=True
         ):
-            if (component, unit) not in units:
-                units[component, unit] = *unit_for_people(component, unit), *sigma_unit_for_people(unit)
-            value_unit, factor, small_unit, small = units[component, unit]
+            value_unit, factor, small_unit, small = _units(component, unit)
             writer.writerow((
                 *of, component, value_unit, _number(observed * factor), _number(adjusted * factor), small_unit,
                 _number(residual * small), _number(sigma * small), *map(_number, numbers), test, used,
             ))  # fmt: skip
+    if readings is not None:
+        writer.writerows(_reading_rows(adjustment.survey.readings, readings))
     return out.getvalue().encode()
+
+
+def _reading_rows(readings: Sequence[Reading], found: ReadingResiduals) -> Iterator[tuple[str | int, ...]]:
+    """The same of readings, which are many and have one component, column by column."""
+    kinds = [r.kind for r in readings]
+    value_units, factors, small_units, smalls = zip(*(_units(k, reading_unit(k)) for k in kinds), strict=True)
+    factor, small = np.array(factors), np.array(smalls)
+    observed, adjusted, residual, sigma, *numbers = (
+        list(map(_number, x.tolist()))
+        for x in (found.observed * factor, found.adjusted * factor, found.residual * small, found.sigma * small,
+                  found.redundancy, found.standardized, found.test)
+    )  # fmt: skip
+    groups, ids = [cell_text(r.group) for r in readings], [cell_text(" ".join(reading_names(r))) for r in readings]
+    return zip(kinds, groups, ids, kinds, value_units, observed, adjusted, small_units, residual, sigma, *numbers,
+               found.used.astype(int).tolist(), strict=True)  # fmt: skip
+
+
+@lru_cache
+def _units(component: str, unit: str) -> tuple[str, float, str, float]:
+    return *unit_for_people(component, unit), *sigma_unit_for_people(unit)
 
 
 def _number(value: float) -> str:

@@ -12,9 +12,9 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Estimate, ParameterName
 from adjust.model.survey import Camera
 from survey.folder.text import suggestion
-from survey.solution.changes import Snapshot
 from survey.solution.dictionary import plain
-from survey.solution.runs import load_run
+from survey.solution.earlier.changes import Snapshot
+from survey.solution.earlier.runs import load_run
 from survey.workbench.session import Workbench
 
 _CELLS = 24

@@ -6,22 +6,26 @@ from collections.abc import Callable
 from pathlib import Path
 
 from survey.workbench.guard import new_token
-from survey.workbench.server import Listening, Server
+from survey.workbench.live import Listening
+from survey.workbench.server import Server
 from survey.workbench.session import Workbench
 
 _ENDINGS = {signal.SIGINT, signal.SIGTERM}
 
 
 def open_folder(
-    folder: Path, host: str, port: int, read_only: bool, browser: bool, say: Callable[[str], None]
+    folder: Path, host: str, port: int, read_only: bool, browser: bool, say: Callable[[str], None], place: str = ""
 ) -> None:
-    """Serve a project until it is interrupted. Raises SurveyError for a project that cannot be read, or a port."""
+    """Serve a project until it is interrupted; place: shown first, such as ``#image=X/hX05``.
+
+    Raises SurveyError for a project that cannot be read, or a port.
+    """
     token = new_token()
     server = Server(Workbench(folder, read_only=read_only), token, f"labsurvey_{port}")
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDINGS)  # in all threads from here on: this one waits for them
     try:
         with Listening(server, host, port) as listening:
-            address = f"{listening.address}#token={token}"
+            address = f"{listening.address}#token={token}" + (f"&{place.lstrip('#')}" if place else "")
             print(address, flush=True)
             say("Ctrl-C ends it")
             if browser:

@@ -5,17 +5,20 @@ import os
 import stat
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 
 from adjust.model.errors import SurveyError
-from survey.detection.gray import Gray8, Gray32, gray_values, read_image
 from survey.project.detected import DetectedImage
+
+if TYPE_CHECKING:  # brings in OpenCV, which a page that shows no picture yet does without
+    from survey.detection import ImageReport
+    from survey.detection.gray import Gray8, Gray32
 
 _QUALITY = 85
 _LARGEST_SIDE = 4096
+_MOST_SHOWN = 400
 
 
 def picture(images: Mapping[tuple[str, str], Path], key: tuple[str, str], size: int | None) -> tuple[bytes, str]:
@@ -23,6 +26,10 @@ def picture(images: Mapping[tuple[str, str], Path], key: tuple[str, str], size: 
 
     Grey values are stretched to 8 bit. Raises KeyError for what is no image, SurveyError for what cannot be read.
     """
+    import cv2
+
+    from survey.detection.gray import gray_values, read_image
+
     path = images[key]
     if not stat.S_ISREG(os.lstat(path).st_mode):
         raise SurveyError(f"{path}: is a link or no file; put the image itself into the project")
@@ -36,12 +43,14 @@ def picture(images: Mapping[tuple[str, str], Path], key: tuple[str, str], size: 
     return _encoded(path, ".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]), "image/jpeg"
 
 
-def _in_8_bit(image: Gray32) -> Gray8:
+def _in_8_bit(image: "Gray32") -> "Gray8":
     low, high = float(image.min()), float(image.max())
     return np.asarray(np.clip((image - low) * (255.0 / max(high - low, 1e-9)), 0, 255), dtype=np.uint8)
 
 
 def _encoded(path: Path, ending: str, image: Any, how: list[int]) -> bytes:
+    import cv2
+
     done, data = cv2.imencode(ending, image, how)
     if not done:
         raise SurveyError(f"{path}: cannot be shown; export it again as PNG")
@@ -54,3 +63,11 @@ def etag(known: DetectedImage | None, path: Path, size: int | None) -> str:
     same = known is not None and (known.size, known.mtime_ns) == (status.st_size, status.st_mtime_ns)
     text = known.sha256 if same and known is not None else f"{path.name} {status.st_size} {status.st_mtime_ns}"
     return f'"{hashlib.sha256(f"{text} {size}".encode()).hexdigest()[:32]}"'
+
+
+def found_in(report: "ImageReport") -> dict[str, Any]:
+    """What detection found in an image, for a page that shows its picture: size, up to ``_MOST_SHOWN`` places (px)."""
+    found = [d.uv for d in report.detections.values()] + ([report.spots.uv] if report.spots is not None else [])
+    uv = np.concatenate([*found, np.zeros((0, 2))])
+    return {"image": f"{report.camera_id}/{report.epoch_id}", "status": report.status, "message": report.message,
+            "n": len(uv), "size": report.image_size, "uv": np.round(uv[:_MOST_SHOWN], 1).tolist()}  # fmt: skip

@@ -20,6 +20,7 @@ from survey.project.observed import Hits, Observed, name_of_residual
 from survey.project.tables.references import frame_text, position_text
 from survey.solution.dictionary import plain
 from survey.solution.quantities import sigma_unit_for_people, unit_for_people
+from survey.workbench.places import refs_of
 
 IN_USE, BY_FILE, BY_PEOPLE, BY_THIS_RUN = 0, 1, 2, 3
 """Why an image point takes no part: it does, a table says used = false, exclusions.csv does, this run left it out."""
@@ -194,6 +195,4 @@ def _component(o: ObservationResidual, k: int, limit: float) -> dict[str, Any]:
 
 def _joins(item: Any) -> list[str]:
     """What a reading joins, as tables write it."""
-    values = (getattr(item, name, None) for name in ("positions", "at", "to", "a", "b", "second", "position", "frame"))
-    refs = [one for value in values for one in (value if isinstance(value, tuple) else (value,)) if one is not None]
-    return [frame_text(one) if isinstance(one, FrameRef) else position_text(one) for one in refs]
+    return [frame_text(one) if isinstance(one, FrameRef) else position_text(one) for one in refs_of(item)]

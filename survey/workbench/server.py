@@ -5,12 +5,10 @@ Everything that it answers is a method of :class:`survey.workbench.session.Workb
 """
 
 import asyncio
-import json
-import socket
-import threading
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
+from contextvars import copy_context
 from pathlib import Path
 from typing import Any
 
@@ -18,146 +16,27 @@ from starlette.applications import Starlette
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.types import ASGIApp
 
 from adjust.model.errors import SurveyError
 from survey.folder.locking import BusyError
-from survey.solution.runs import pin_run
-from survey.workbench import cameras, guard, pictures, views
-from survey.workbench.session import CancelledError, ChangedError, Workbench
+from survey.folder.text import suggestion
+from survey.report.language import LANGUAGES, message, speaking
+from survey.solution.earlier.runs import pin_run
+from survey.workbench import cameras, pictures, views
+from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of
+from survey.workbench.gate import LONGEST_BODY, Guard, TooLongError
+from survey.workbench.live import Live
+from survey.workbench.network import network
+from survey.workbench.session import Workbench
+from survey.workbench.situation import CancelledError, ChangedError
 
 WEB = Path(__file__).parent / "web"
 _KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json",
           ".svg": "image/svg+xml", ".png": "image/png", ".woff2": "font/woff2"}  # fmt: skip
-_LONGEST_BODY = 1 << 20
 _LOOK_S = 2.0
 _MOST_ROWS = 200_000  # of image points at once, where not all are asked for
 _Handler = Callable[[Request], Awaitable[Response]]
-
-
-class Live:
-    """Messages to all pages that are open; ``post`` may be called from any thread."""
-
-    def __init__(self) -> None:
-        self._queues: set[asyncio.Queue[dict[str, Any] | None]] = set()
-        self._loop: asyncio.AbstractEventLoop | None = None
-
-    def begin(self) -> None:
-        """Belong to the loop that runs."""
-        self._loop = asyncio.get_running_loop()
-
-    def post(self, message: dict[str, Any] | None) -> None:
-        """Send to all; None ends them."""
-        if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._put, message)
-
-    def _put(self, message: dict[str, Any] | None) -> None:
-        for queue in self._queues:
-            queue.put_nowait(message)
-
-    async def serve(self, page: WebSocket) -> None:
-        """Until the page or the server goes."""
-        await page.accept()
-        queue: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
-        self._queues.add(queue)
-        gone = asyncio.create_task(_until_gone(page))
-        try:
-            while not gone.done():
-                taken = asyncio.create_task(queue.get())
-                await asyncio.wait({taken, gone}, return_when=asyncio.FIRST_COMPLETED)
-                if not taken.done() or taken.result() is None:
-                    taken.cancel()
-                    break
-                await page.send_text(json.dumps(taken.result()))
-        finally:
-            self._queues.discard(queue)
-            gone.cancel()
-            with suppress(RuntimeError, WebSocketDisconnect):
-                await page.close()
-
-
-async def _until_gone(page: WebSocket) -> None:
-    with suppress(WebSocketDisconnect):
-        while True:
-            await page.receive_text()
-
-
-class Guard:
-    """Refuses everything that does not come from a browser on this machine that has the token.
-
-    token: what requests must bring in the header X-Token; images and the socket by a cookie of the name ``cookie``,
-    which no script can read and no other site sends.
-    """
-
-    def __init__(self, app: ASGIApp, token: str, cookie: str, read_only: bool) -> None:
-        self.app, self.token, self.cookie, self.read_only = app, token, cookie, read_only
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
-        if scope["type"] not in ("http", "websocket"):
-            await self.app(scope, receive, send)
-            return
-        headers = {k.decode("latin-1"): v.decode("latin-1") for k, v in scope["headers"]}
-        refused = self._refused(scope, headers)
-        if refused is not None and scope["type"] == "websocket":
-            await send({"type": "websocket.close", "code": 1008})
-            return
-        answer = _with_headers(send)
-        if refused is not None:
-            await JSONResponse({"error": refused[1]}, refused[0])(scope, receive, answer)
-            return
-        await self.app(scope, _limited(receive) if scope["type"] == "http" else receive, answer)
-
-    def _refused(self, scope: Scope, headers: Mapping[str, str]) -> tuple[int, str] | None:
-        is_socket, path, method = scope["type"] == "websocket", scope["path"], scope.get("method")
-        if not guard.is_from_here(headers.get("host", ""), headers.get("origin"), needed=is_socket):
-            return 403, guard.NOT_FROM_HERE
-        if not (is_socket or path.startswith("/api/")):
-            return None if method in ("GET", "HEAD") else (405, "only GET")
-        by_cookie = is_socket or (method in ("GET", "HEAD") and path.startswith("/api/image/"))
-        if not guard.is_token(headers.get("x-token", ""), self.token) and not (by_cookie and self._in_cookie(headers)):
-            return 403, guard.WRONG_TOKEN
-        if method == "POST" and self.read_only:
-            return 403, "the project is open for reading only"
-        if method == "POST" and headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-            return 415, "the body has to be application/json"
-        return None
-
-    def _in_cookie(self, headers: Mapping[str, str]) -> bool:
-        found = (c.strip().partition("=") for c in headers.get("cookie", "").split(";"))
-        return any(name == self.cookie and guard.is_token(value, self.token) for name, _, value in found)
-
-
-def _with_headers(send: Send) -> Send:
-    async def sending(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            extra = dict(guard.HEADERS)
-            names = {k.lower() for k, _ in message["headers"]}
-            extra |= {} if b"cache-control" in names else {"Cache-Control": "no-store"}
-            message["headers"] = [*message["headers"], *((k.encode(), v.encode()) for k, v in extra.items())]
-        await send(message)
-
-    return sending
-
-
-def _limited(receive: Receive) -> Receive:
-    """A body of so many bytes that were read, whatever was announced."""
-    n = 0
-
-    async def receiving() -> Message:
-        nonlocal n
-        message = await receive()
-        n += len(message.get("body", b""))
-        if n > _LONGEST_BODY:
-            raise _TooLongError
-        return message
-
-    return receiving
-
-
-class _TooLongError(Exception):
-    pass
 
 
 class Server:
@@ -177,6 +56,7 @@ class Server:
             "/api/readings": self._view(views.readings), "/api/parameters": self._view(views.parameters),
             "/api/scene": self._view(views.scene), "/api/findings": self._view(views.findings),
             "/api/changes": self._view(_changes), "/api/loops": self._view(views.loops),
+            "/api/network": self._view(network),
             "/api/table_residuals": self._view(views.table_residuals), "/api/camera/{camera}": self._camera,
             "/api/camera/{camera}/difference": self._difference, "/api/runs": self._view(views.runs),
             "/api/compare": self._compare,
@@ -184,16 +64,20 @@ class Server:
         }  # fmt: skip
         post: dict[str, _Handler] = {
             "/api/preview": self._preview, "/api/exclusions": self._exclusions, "/api/adjust": self._adjust,
-            "/api/definition": self._definition,
+            "/api/definition": self._definition, "/api/remedy": self._remedy,
             "/api/undo": self._act("undo"), "/api/redo": self._act("redo"), "/api/save": self._save,
             "/api/runs/{number:int}/restore": self._restore, "/api/runs/{number:int}/pin": self._pin,
-            "/api/reload": self._reload, "/api/cancel": self._cancel,
+            "/api/jobs/{name}": self._job, "/api/reload": self._reload, "/api/cancel": self._cancel,
         }  # fmt: skip
         routes = [Route(path, self._said(f), methods=["GET"]) for path, f in get.items()]
         routes += [Route(path, self._said(f), methods=["POST"]) for path, f in post.items()]
         routes.append(Route("/{path:path}", self._file, methods=["GET"]))
         app = Starlette(routes=[*routes, WebSocketRoute("/live", self.live.serve)], lifespan=self._lifespan)
         return Guard(app, self.token, self.cookie, self.bench.read_only)
+
+    def end(self) -> None:
+        """Give up what runs."""
+        self.bench.cancel()
 
     @asynccontextmanager
     async def _lifespan(self, _app: Starlette) -> AsyncIterator[None]:
@@ -230,6 +114,8 @@ class Server:
     async def _run(self, what: str, work: Callable[[], Any]) -> Any:
         """In the one thread, in turn; pages hear of the new state where there is one."""
         version = self.bench.version
+        if version == 0 and what == "view":  # what there is, while the first solution is waited for
+            return await asyncio.to_thread(work)
 
         def working() -> Any:
             self._running = what
@@ -239,7 +125,8 @@ class Server:
                 self._running = ""
 
         try:
-            return await asyncio.get_running_loop().run_in_executor(self._worker, working)
+            spoken = copy_context()  # the language of who asks
+            return await asyncio.get_running_loop().run_in_executor(self._worker, spoken.run, working)
         finally:
             if self.bench.version != version or what == "save":
                 self.live.post({"type": "state", "version": self.bench.version, "unsaved": self.bench.n_unsaved})
@@ -248,20 +135,23 @@ class Server:
         """What its owner can mend is an answer of one line."""
 
         async def answering(request: Request) -> Response:
+            asked = request.headers.get("x-language", "en")
+            with speaking(asked if asked in LANGUAGES else "en"):
+                return await said(request)
+
+        async def said(request: Request) -> Response:
             try:
                 return await handler(request)
-            except CancelledError as error:
-                return JSONResponse({"error": str(error), "cancelled": True}, 409)
-            except (ChangedError, BusyError) as error:
-                return JSONResponse({"error": str(error), "version": self.bench.version, "retry": True}, 409)
             except SurveyError as error:
-                return JSONResponse({"error": str(error), "version": self.bench.version}, 409)
+                kind = {"cancelled": True} if isinstance(error, CancelledError) else {}
+                kind |= {"retry": True} if isinstance(error, ChangedError | BusyError) else {}
+                return JSONResponse({"error": message(str(error)), "version": self.bench.version, **kind}, 409)
             except OSError as error:
                 return JSONResponse({"error": f"{error.filename}: {error.strerror}"}, 409)
-            except (_BodyError, ClientDisconnect) as error:
+            except (BodyError, ClientDisconnect) as error:
                 return JSONResponse({"error": f"not understood: {error}"}, 400)
-            except _TooLongError:
-                return JSONResponse({"error": f"more than {_LONGEST_BODY} bytes"}, 413)
+            except TooLongError:
+                return JSONResponse({"error": f"more than {LONGEST_BODY} bytes"}, 413)
 
         return answering
 
@@ -303,11 +193,11 @@ class Server:
         return JSONResponse(found.as_dict(int(most) if most.isdecimal() else None))
 
     async def _camera(self, request: Request) -> Response:
-        camera, distance = request.path_params["camera"], _distance(request)
+        camera, distance = request.path_params["camera"], distance_of(request)
         return JSONResponse(await self._run("view", lambda: cameras.camera_view(self.bench, camera, distance)))
 
     async def _difference(self, request: Request) -> Response:
-        camera, distance, q = request.path_params["camera"], _distance(request), request.query_params
+        camera, distance, q = request.path_params["camera"], distance_of(request), request.query_params
         run = int(q["run"]) if q.get("run", "").isdecimal() else None
         other, bench = q.get("other", ""), self.bench
         return JSONResponse(await self._run("view", lambda: cameras.lens_change(bench, camera, run, other, distance)))
@@ -329,13 +219,13 @@ class Server:
     # acting
 
     async def _preview(self, request: Request) -> Response:
-        body = _Body(await _json(request))
+        body = Body(await json_of(request))
         excluded, included = body.changes()
         names, out = (excluded, True) if excluded else (included, False)
         return JSONResponse(await self._run("view", lambda: self.bench.preview(*names, excluded=out)))
 
     async def _exclusions(self, request: Request) -> Response:
-        body = _Body(await _json(request))
+        body = Body(await json_of(request))
         excluded, included = body.changes()
         return await self._decided(lambda: self.bench.decide(
             exclude=excluded, include=included, reason=body.text("reason"), author=body.text("author"), base=body.base()
@@ -343,7 +233,7 @@ class Server:
 
     async def _definition(self, request: Request) -> Response:
         """One of: {group, factor}, {parameter, treatment}, {datum: kind, points, stations}."""
-        body = _Body(await _json(request))
+        body = Body(await json_of(request))
         base, bench = body.base(), self.bench
         if body.text("group"):
             return await self._decided(lambda: bench.set_sigma_scale(body.text("group"), body.number("factor"), base))
@@ -357,23 +247,28 @@ class Server:
         await self._run("adjust", work)
         return JSONResponse(await asyncio.to_thread(views.state, self.bench) | _changes(self.bench))
 
+    async def _remedy(self, request: Request) -> Response:
+        body = Body(await json_of(request))
+        number, base = int(body.number("number")), body.base()
+        return await self._decided(lambda: self.bench.apply_remedy(number, base))
+
     async def _adjust(self, request: Request) -> Response:
-        mode = _Body(await _json(request)).text("mode")
+        mode = Body(await json_of(request)).text("mode")
         return await self._decided(lambda: self.bench.adjust("cold" if mode == "cold" else "warm"))
 
     def _act(self, verb: str) -> _Handler:
         async def answering(request: Request) -> Response:
-            base = _Body(await _json(request)).base()
+            base = Body(await json_of(request)).base()
             return await self._decided(lambda: getattr(self.bench, verb)(base))
 
         return answering
 
     async def _restore(self, request: Request) -> Response:
-        number, base = request.path_params["number"], _Body(await _json(request)).base()
+        number, base = request.path_params["number"], Body(await json_of(request)).base()
         return await self._decided(lambda: self.bench.restore(number, base))
 
     async def _pin(self, request: Request) -> Response:
-        number, pinned = request.path_params["number"], _Body(await _json(request)).flag("pinned")
+        number, pinned = request.path_params["number"], Body(await json_of(request)).flag("pinned")
         run = await self._run("pin", lambda: pin_run(self.bench.folder, number, pinned))
         return JSONResponse(run.as_dict())
 
@@ -384,6 +279,15 @@ class Server:
         outcome = await self._run("save", self.bench.save)
         return JSONResponse(outcome.summary())
 
+    async def _job(self, request: Request) -> Response:
+        """One of ``JOBS``; what it said, and the state after it."""
+        name, body = request.path_params["name"], Body(await json_of(request))
+        if name not in JOBS:
+            raise SurveyError(f"there is no job {name!r}; {suggestion(name, JOBS)}")
+        found = lambda report: self.live.post({"type": "detected"} | pictures.found_in(report))  # noqa: E731
+        told = await self._run(name, lambda: JOBS[name](self.bench, body, found))
+        return JSONResponse(told.as_dict() | {"state": await asyncio.to_thread(views.state, self.bench)})
+
     async def _cancel(self, _request: Request) -> Response:
         self.bench.cancel()
         return JSONResponse({})
@@ -392,123 +296,3 @@ class Server:
 def _changes(bench: Workbench) -> dict[str, Any]:
     found = bench.changes
     return {"version": bench.version, "changes": None if found is None else found.as_dict(500)}
-
-
-def _distance(request: Request) -> float:
-    """What a request says of how far a point is, m; at infinity where it says nothing. Raises SurveyError."""
-    text = request.query_params.get("distance_m", "inf")
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not value > 0.0:
-        raise SurveyError(f"distance_m: found {text!r}; expected metres, or inf")
-    return value
-
-
-class _BodyError(Exception):
-    pass
-
-
-async def _json(request: Request) -> Any:
-    body = await request.body()
-    try:
-        return json.loads(body or b"{}")
-    except (ValueError, RecursionError) as error:
-        raise _BodyError(str(error)) from error
-
-
-class _Body:
-    """What a request says, checked."""
-
-    def __init__(self, values: Any) -> None:
-        if not isinstance(values, dict):
-            raise _BodyError("expected an object")
-        self._values = values
-
-    def text(self, key: str) -> str:
-        value = self._values.get(key, "")
-        if not isinstance(value, str):
-            raise _BodyError(f"{key}: expected a text")
-        return value
-
-    def number(self, key: str) -> float:
-        value = self._values.get(key)
-        if type(value) not in (int, float):
-            raise _BodyError(f"{key}: expected a number")
-        return float(str(value))
-
-    def names(self, key: str) -> list[str]:
-        value = self._values.get(key, [])
-        if not isinstance(value, list) or not all(isinstance(x, str) for x in value):
-            raise _BodyError(f"{key}: expected a list of names")
-        return value
-
-    def flag(self, key: str) -> bool:
-        value = self._values.get(key, True)
-        if type(value) is not bool:
-            raise _BodyError(f"{key}: expected true or false")
-        return value
-
-    def base(self) -> int | None:
-        value = self._values.get("base")
-        if value is not None and type(value) is not int:
-            raise _BodyError("base: expected the version of a solution")
-        return value
-
-    def changes(self) -> tuple[list[str], list[str]]:
-        """Names to exclude and to include, of ``changes: [{name} or {what, id}, excluded]``."""
-        found = self._values.get("changes", [])
-        if not isinstance(found, list) or not found or not all(isinstance(c, dict) for c in found):
-            raise _BodyError("changes: expected a list of {what, id, excluded}")
-        names: tuple[list[str], list[str]] = ([], [])
-        for c in found:
-            name = c.get("name", c.get("id") if c.get("what") == "reading" else f"{c.get('what')}:{c.get('id')}")
-            if not isinstance(name, str) or type(c.get("excluded")) is not bool:
-                raise _BodyError("changes: expected {what, id, excluded}")
-            names[0 if c["excluded"] else 1].append(name)
-        return names
-
-
-class Listening:
-    """A server in a thread of its own, so that the signals of this one stay ours whatever a library does to them."""
-
-    def __init__(self, server: Server, host: str, port: int) -> None:
-        import uvicorn
-
-        config = uvicorn.Config(server.app(), host=host, port=port, log_level="critical", access_log=False,
-                                ws="websockets-sansio", timeout_graceful_shutdown=1, server_header=False,
-                                ws_max_size=1 << 16)  # fmt: skip
-        self._socket = _bound(host, port)
-        self._server, self._program = server, uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._program.run, args=([self._socket],), daemon=True)
-
-    @property
-    def address(self) -> str:
-        """Where the page is, without the token."""
-        host, port = self._socket.getsockname()[:2]
-        return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
-
-    def __enter__(self) -> "Listening":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Sockets of pages that are still open end first: the server would wait for them."""
-        self._server.bench.cancel()
-        self._server.live.post(None)
-        self._program.should_exit = True
-        self._thread.join(10.0)
-        self._socket.close()
-
-
-def _bound(host: str, port: int) -> socket.socket:
-    found = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
-    try:
-        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        found.bind((host, port))
-        found.listen(128)
-    except OSError as error:
-        found.close()
-        raise guard.port_error(port, error) from error
-    return found

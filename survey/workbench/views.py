@@ -1,36 +1,30 @@
 """What the views of the workbench show, as plain values: state, findings, parameters, scene, exclusions."""
 
-import re
 from collections.abc import Iterable
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 from gtsam import Pose3
 
+from adjust.diagnosis.hypothesis import Place
 from adjust.model.errors import SurveyError
-from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from survey.folder.text import suggestion
 from survey.project.observed import name_of_residual
-from survey.report.scene import scene_of
-from survey.solution.changes import snapshot
+from survey.report.language import message
+from survey.solution.anchors import ANCHORED, anchor, anchors_in
 from survey.solution.dictionary import plain, solution_dict
-from survey.solution.frames import AdjustedFrames
+from survey.solution.earlier.changes import snapshot
+from survey.solution.earlier.runs import list_runs
 from survey.solution.quantities import ARCSEC_PER_RAD, sigma_unit_for_people, sigmas_of, status_of, unit_for_people
-from survey.solution.runs import list_runs
 from survey.solution.verdict import suspects
+from survey.workbench.places import scene_values
 from survey.workbench.rows import BY_THIS_RUN, IN_USE, columns, reading_rows
 from survey.workbench.session import Workbench
 
 _MOST_FINDINGS = 100
 _MOST_FITTING = 20
-_IN_WARNING = re.compile(r"camera (?P<camera>\S+) at epoch (?P<epoch>[^\s,:]+)")
-
-
-def anchor(kind: str, text: str) -> str:
-    """The part of an address that names a thing: ``#image=X/hX05``."""
-    return f"#{kind}={quote(text, safe='/:@,.-_')}"
+_CAUSE = "probable cause: "
 
 
 def limits(adjustment: Adjustment | None) -> tuple[float, float]:
@@ -49,9 +43,10 @@ def state(bench: Workbench) -> dict[str, Any]:
         "version": bench.version, "folder": str(bench.folder), "title": now.project.title,
         "read_only": bench.read_only, "lock": bench.holder(), "changed_files": bench.changed_files(),
         "unsaved": bench.n_unsaved, "undo": bench.undoable, "redo": bench.redoable,
-        "solution": None if solved is None else {**snapshot(solved).summary, "mode": now.mode, "seconds": now.seconds,
-                                                 "sigmas": bench.scale.sigmas},
-        "warnings": [] if solved is None else solved.warnings,
+        "solution": None if solved is None else _summary(solved) | {
+            "mode": now.mode, "seconds": now.seconds, "sigmas": bench.scale.sigmas},
+        "warnings": [] if solved is None else [message(w) for w in solved.warnings],
+        "failure": None if bench.failure is None else message(str(bench.failure)),
         "exclusions": [{"name": str(e.name), "what": e.name.what, "id": e.name.id, "reason": e.reason,
                         "author": e.author, "time": e.time, "line": e.line} for e in now.exclusions.values()],
         "tree": _tree(bench),
@@ -61,6 +56,11 @@ def state(bench: Workbench) -> dict[str, Any]:
         "datum": {"kind": now.project.survey.datum.kind, "points": now.project.survey.datum.points,
                   "stations": now.project.survey.datum.stations},
     }))  # fmt: skip
+
+
+def _summary(solved: Adjustment) -> dict[str, Any]:
+    found = dict(snapshot(solved).summary)
+    return found | {"reason": message(str(found["reason"]))}
 
 
 def _tree(bench: Workbench) -> dict[str, Any]:
@@ -117,25 +117,56 @@ def parameters(bench: Workbench) -> dict[str, Any]:
 
 
 def findings(bench: Workbench) -> dict[str, Any]:
-    """The verdict, warnings, and what is suspect or was left out by this run, worst first, each with its remedies."""
-    now = bench.situation
-    solved = now.solved
+    """The verdict, warnings, and what is suspect or was left out by this run, worst first, each with its remedies.
+
+    remedies: what the diagnosis says would mend it; also of a survey that cannot be adjusted, of which nothing else is
+    known.
+    """
+    solved = bench.situation.adjustment
+    known: dict[str, Any] = {"verdict": "failed", "reason": message(str(bench.failure or "")), "warnings": [],
+                             "causes": [], "n_failing": 0, "findings": []}  # fmt: skip
+    if solved is not None:
+        known = _of_solution(bench, solved)
+    return dict(plain({"version": bench.version, **known, "remedies": remedies(bench)}))
+
+
+def remedies(bench: Workbench) -> list[dict[str, Any]]:
+    """The candidates of the diagnosis, the best first: cause, change, evidence, and whether a program can do it."""
+    out = []
+    for number, candidate in enumerate(bench.remedies, start=1):
+        h = candidate.hypothesis
+        out.append({
+            "number": number, "name": h.name, "cause": h.cause, "change": h.change, "possible": bool(h.edits),
+            "anchor": _anchor_of(h.place), "explained": candidate.explained, "statistic": candidate.statistic,
+            "critical": candidate.critical, "probability": candidate.probability, "sigma0": candidate.sigma0,
+        })  # fmt: skip
+    return out
+
+
+def _anchor_of(place: Place) -> str | None:
+    """Where a hypothesis sits, as a place of the page."""
+    return anchor(place.kind, "/".join(place.ids)) if place.kind in ANCHORED and place.ids else None
+
+
+def _of_solution(bench: Workbench, solved: Adjustment) -> dict[str, Any]:
     image_limit, limit = limits(solved)
     found = [*_of_points(bench, image_limit), *_of_readings(bench, limit)]
     worst = sorted(found, key=lambda f: -(f["share"] or 0.0))
     failing = [f for f in worst if f["why"] == BY_THIS_RUN or (f["share"] or 0.0) > 1.0]
     fitting = [f for f in worst if f["why"] == IN_USE and (f["share"] or 0.0) <= 1.0]
-    causes = [w.removeprefix("probable cause: ") for w in solved.warnings if w.startswith("probable cause")]
+    told = bench.diagnosis.lines if bench.diagnosis is not None else ()
+    causes = [w.removeprefix(_CAUSE) for w in solved.warnings if w.startswith(_CAUSE)]
     shown = [*_of_images(bench, failing), *failing[:_MOST_FINDINGS], *fitting[:_MOST_FITTING]]
-    return dict(plain({
-        "version": bench.version, **{k: snapshot(solved).summary[k] for k in ("verdict", "reason")},
-        "warnings": [{"text": w, "anchors": _anchors_in(w)} for w in solved.warnings], "causes": causes,
-        "n_failing": len(failing), "findings": shown,
-    }))  # fmt: skip
+    return {
+        **{k: v for k, v in _summary(solved).items() if k in ("verdict", "reason")},
+        "warnings": [_said(w) for w in solved.warnings if not w.startswith(_CAUSE)],
+        "causes": [_said(c) for c in causes if c not in told], "n_failing": len(failing), "findings": shown,
+    }  # fmt: skip
 
 
-def _anchors_in(text: str) -> list[str]:
-    return [anchor("image", f"{m['camera']}/{m['epoch']}") for m in _IN_WARNING.finditer(text)]
+def _said(text: str) -> dict[str, Any]:
+    """A message in the reader's language, with the places it names."""
+    return {"text": message(text), "anchors": anchors_in(text)}
 
 
 def _of_points(bench: Workbench, limit: float) -> Iterable[dict[str, Any]]:
@@ -192,23 +223,7 @@ def runs(bench: Workbench) -> dict[str, Any]:
 
 def scene(bench: Workbench) -> dict[str, Any]:
     """Cameras, targets, tables, points and stations in the world (m), covariances (m^2) as sigmas are given."""
-    adjustment, scale = bench.adjustment, bench.scale
-    drawn, frames = scene_of(adjustment, scale), AdjustedFrames(adjustment)
-    images = {}
-    for camera, epoch in dict.fromkeys((b.camera_id, b.epoch_id) for b in adjustment.survey.image_blocks):
-        pose = frames.world_from(FrameRef("camera", camera, epoch))
-        if pose is not None:
-            images[f"{camera}/{epoch}"] = pose.matrix()[:3].ravel()
-    return dict(plain({
-        "version": bench.version, "ellipsoid": scale.ellipsoid, "images": images,
-        "cameras": {s.label: {"index": s.camera_idx, "half_angles_rad": s.half_angles} for s in drawn.shots},
-        "spots": [{"id": s.label, "kind": s.kind, "x": s.x, "cov": s.cov.ravel()} for s in drawn.spots],
-        "outlines": [{"target": label, "x": x} for label, x in drawn.outlines],
-        "clouds": [{"target": label, "x": x} for label, x in drawn.clouds],
-        "tables": [{"id": table, "world_from_table": pose.matrix()[:3].ravel(), "axes": axes}
-                   for table, pose, axes in drawn.tables],
-        "moves": drawn.moves, "n_left_out": drawn.n_left_out,
-    }))  # fmt: skip
+    return {"version": bench.version, **scene_values(bench.adjustment, bench.scale)}
 
 
 def loops(bench: Workbench) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from survey.jobs.adjusting.job import adjust_job
 from survey.jobs.aligning import align_job
 from survey.jobs.converting import convert_job
 from survey.project import read, write_project
-from survey.solution.previous import read_previous
+from survey.solution.earlier.previous import read_previous
 
 Files = Mapping[str, bytes]
 Happens = Callable[[int, str], None]

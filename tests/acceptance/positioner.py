@@ -14,6 +14,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
+from adjust.graph.assembly import values_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair, TableReading
 from adjust.model.result import Adjustment, ObservationResidual
@@ -147,10 +148,12 @@ def blockwise_covariance(
     n = len(joints)
     if not 3 <= n_blocks <= n // 2:
         raise SurveyError(f"{n_blocks} blocks of {n} poses: give at least three blocks of two poses or more")
-    values = []
+    whole = positioner_survey(joints, sensor_from_target, weights)
+    start, values = values_of(adjust(whole)), []
     for block in np.array_split(np.arange(n), n_blocks):
         kept = np.setdiff1d(np.arange(n), block)
-        result = adjust(positioner_survey(joints[kept], sensor_from_target[kept], weights))
+        pairs, readings = (tuple(items[i] for i in kept) for items in (whole.pairs, whole.table_readings))
+        result = adjust(replace(whole, pairs=pairs, table_readings=readings), start)
         estimate = result.estimates[("table_geometry", POSITIONER)]
         if not isinstance(estimate.value, Pose3):
             values.append([estimate.value[estimate.components.index(name)] for name in AXIS_PARAMETERS])

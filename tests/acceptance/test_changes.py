@@ -46,6 +46,7 @@ def test_a_focal_length_that_changes_half_way_is_named(tmp_path, capsys):
     assert "camera A: its lens is not" in (tmp_path / "focal" / "results" / "report.html").read_text()
 
 
+@pytest.mark.usefixtures("undiagnosed")
 def test_another_crop_of_one_camera_is_named_first(tmp_path):
     """Image of camera B shifted by -6 px in u after e018."""
     found = adjusted("crophalf", tmp_path, 3)
@@ -66,6 +67,7 @@ def test_bent_boards_are_named_with_their_sag(tmp_path):
         assert x["shifts"][0]["amount"] == pytest.approx(2e-3, abs=4 * x["shifts"][0]["sigma"])
 
 
+@pytest.mark.usefixtures("undiagnosed")
 def test_boards_that_are_wider_than_given_are_named_and_not_the_table(tmp_path):
     """All are 0.3 % wider in x; the held one, which the rest follows, the other way round: too low."""
     found = adjusted("nonsquare", tmp_path, 3)

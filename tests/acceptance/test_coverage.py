@@ -136,8 +136,7 @@ def statistics(s: Scatter, names: list[ParameterName]) -> tuple[FloatArray, int,
 
 def joint(s: Scatter, names: list[ParameterName]) -> FloatArray:
     """Joint covariance of a class; where a bundle hides some of it, by the dense inverse (which the bundle equals)."""
-    bundle = s.graph.bundle
-    hidden = set() if bundle is None else set(s.precision.hidden)
+    hidden = set(s.precision.hidden)
     by_name = s.graph.unknowns.by_name
     if not any(by_name[n].key in hidden for n in names):
         return s.precision.joint(names)

@@ -5,6 +5,7 @@ The values to meet were computed by an independent least squares (see the data's
 
 import json
 import shutil
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from survey.cli import main
 from tests.data import data_folder
 
+pytestmark = pytest.mark.usefixtures("undiagnosed")
 LENS = {"fx": "px", "fy": "px", "u0": "px", "v0": "px", "k1": "", "k2": "", "p1": "", "p2": ""}
 KEEP_ALL = "\n[adjustment]\nreject_points = false\nreject_pairs = false\n"
 KEEP_CORNERS = "\n[adjustment]\nreject_points = false\n"
@@ -49,6 +51,11 @@ def offsets(solution: dict, expected: dict) -> dict[str, float]:
     return out | dict(zip("xyz", shift / sigmas, strict=True))
 
 
+@cache
+def known(which: str) -> dict:
+    return json.loads((data_folder("calibration", "hand_eye_ds1") / "expected.json").read_text())[which]
+
+
 @pytest.mark.parametrize(
     ("poses", "more", "expected"),
     [
@@ -62,21 +69,22 @@ def offsets(solution: dict, expected: dict) -> dict[str, float]:
 def test_few_poses_give_what_an_independent_adjustment_gives(
     tmp_path: Path, poses: str, more: str, expected: str
 ) -> None:
-    known = json.loads((data_folder("calibration", "hand_eye_ds1") / "expected.json").read_text())[expected]
-    solution = adjusted(tmp_path / "robot", poses, more)
+    solution, published = adjusted(tmp_path / "robot", poses, more), known(expected)
     assert not unused(solution)
     summary = solution["summary"]
-    assert summary["redundancy"] == known["redundancy"]
-    assert summary["sigma0"] == pytest.approx(known["sigma0"], rel=1e-5)
+    assert summary["redundancy"] == published["redundancy"]
+    assert summary["sigma0"] == pytest.approx(published["sigma0"], rel=1e-5)
     # both stop where a step is small; along the optical axis the minimum is flat (condition 1e4)
-    assert {n: x for n, x in offsets(solution, known).items() if abs(x) > 0.02} == {}
+    assert {n: x for n, x in offsets(solution, published).items() if abs(x) > 0.02} == {}
+    if (poses, more) == ("every8", ""):
+        said = "group pair: its typical observation contradicts the rest"
+        assert [w for w in solution["warnings"] if w.startswith(said)]
 
 
 def test_corners_that_are_left_out_move_the_result_by_less_than_its_sigma(tmp_path: Path) -> None:
-    known = json.loads((data_folder("calibration", "hand_eye_ds1") / "expected.json").read_text())["every6"]
     solution = adjusted(tmp_path / "robot", "every6")
     assert not unused(solution)
-    assert max(abs(x) for x in offsets(solution, known).values()) < known["sigma0"]
+    assert max(abs(x) for x in offsets(solution, known("every6")).values()) < known("every6")["sigma0"]
 
 
 @pytest.mark.parametrize(("poses", "pair"), [("every6", "robot18"), ("every8", "robot24"), ("every8", "robot80")])
@@ -86,15 +94,9 @@ def test_a_pose_that_is_wrong_is_still_found_among_few(tmp_path: Path, poses: st
     assert [w for w in solution["warnings"] if w.startswith(f"left out: pair {pair}")]
 
 
-def test_sigmas_too_small_throughout_are_said_and_estimated(tmp_path: Path) -> None:
-    solution = adjusted(tmp_path / "given", "every8")
-    assert [w for w in solution["warnings"] if w.startswith("group pair: its typical observation contradicts the rest")]
-    folder = tmp_path / "estimated"
-    shutil.copytree(data_folder("calibration", "hand_eye_ds1", "every8"), folder)
-    with (folder / "survey.toml").open("a") as stream:
-        stream.write("\n[adjustment]\nvariance_components = true\n")
-    assert main(["adjust", str(folder), "--quiet"]) == 3  # the board is bent, and one image fits worse than the others
-    estimated = json.loads((folder / "results" / "solution.json").read_text())
+def test_sigmas_too_small_throughout_are_estimated(tmp_path: Path) -> None:
+    # the global test fails, for the board is bent, and one image fits worse than the others
+    estimated = adjusted(tmp_path / "robot", "every8", "\n[adjustment]\nvariance_components = true\n")
     changes = {(x["kind"], x["name"], x["what"]) for x in estimated["consistency"]["changes"]}
     assert changes == {("target", "board", "shape")}
     assert not unused(estimated)

@@ -27,7 +27,7 @@ from survey.folder.whole import whole_folder
 from survey.jobs.adjusting.job import adjust_job
 from survey.jobs.removing import remove_job
 from survey.project import read, write_project
-from survey.solution.previous import read_previous
+from survey.solution.earlier.previous import read_previous
 from tests.acceptance.interruptions import (
     CASES,
     Ground,

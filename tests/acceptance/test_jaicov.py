@@ -110,7 +110,7 @@ def test_image_coordinates_with_all_their_digits_change_it_little(source, adjust
 
     from adjust.adjustment import AdjustOptions, adjust
     from adjust.model.survey import Datum
-    from survey.interop.cameras.aicon import read_aicon
+    from survey.interop.photogrammetry.aicon import read_aicon
 
     survey = read_aicon(source / "example.phc").survey
     datum = tuple(name for name, (_, chosen) in published.items() if chosen)

@@ -11,7 +11,7 @@ import pytest
 from survey.cli import main
 from survey.project.writing import write_project
 from survey.simulate.parts import wall_grid
-from tests.acceptance.planted_mistakes import MISTAKES, board_of, camera_of, diagnosed, survey_of
+from tests.acceptance.planted_mistakes import MISTAKES, board_of, diagnosed, survey_of
 
 NAMED = {  # one size of each, in one kind of survey; the whole table is python -m tests.acceptance.planted_mistakes
     ("images mirrored", "stereo"): 0.6,
@@ -25,6 +25,12 @@ NAMED = {  # one size of each, in one kind of survey; the whole table is python 
     ("target stretched", "stereo"): 1.01,
     ("target sheared", "stereo"): 0.01,
     ("target bent", "stereo"): 1.5,
+    ("images copied", "stereo"): 0.6,
+    ("lens drifts", "stereo"): 3.0,
+    ("rows and columns", "stereo"): 0.0,
+    ("cameras not simultaneous", "rig"): 0.1,
+    ("rolling shutter", "rig"): 0.1,
+    ("clock offset", "sweep"): 0.05,
 }
 
 
@@ -34,9 +40,9 @@ def test_planted_mistake_is_named_first(name: str, kind: str) -> None:
     survey, truth = survey_of(kind, 3)
     planted = mistake.plant(survey, truth, NAMED[name, kind])
     first = diagnosed(planted).candidates[0]
-    about = camera_of(survey) if mistake.about == "camera" else board_of(survey)
-    assert (first.hypothesis.name, first.hypothesis.place.ids) == (name, (about,))
-    assert first.explained > 0.9
+    assert (first.hypothesis.name, first.hypothesis.place.ids) == (name, (mistake.about(survey),))
+    # of first and last images of a course nothing is known of speeds: they go, and count as their noise
+    assert first.explained > (0.6 if name in ("rolling shutter", "clock offset") else 0.9)
     assert first.sigma0 < 1.1
 
 

@@ -31,6 +31,7 @@ def test_nothing_is_wrong_and_it_passes(name: str, sigma0: float, redundancy: in
     assert result.warnings == ()
 
 
+@pytest.mark.usefixtures("undiagnosed")
 @pytest.mark.parametrize("name", ["m_ccw_S2", "m_gon_S2", "m_swap_ts2"])
 def test_what_diverges_names_the_set_up(name: str) -> None:
     with pytest.raises(NotConvergedError) as caught:
@@ -40,6 +41,7 @@ def test_what_diverges_names_the_set_up(name: str) -> None:
     assert "undetermined" not in said
 
 
+@pytest.mark.usefixtures("undiagnosed")
 def test_a_mirrored_camera_is_named_and_nothing_is_undetermined() -> None:
     with pytest.raises(SurveyError) as caught:
         adjusted(data_folder("calibration", "wobbling", "mirror"))

@@ -12,7 +12,21 @@ from gtsam import Pose3, Rot3
 
 from adjust.adjustment import adjust
 from adjust.model.survey import PoseParameter
-from adjust.native import bundles, images, lenses, loops, navigation, reduction, trees, views, vision
+from adjust.native import (
+    bundles,
+    elimination,
+    images,
+    lenses,
+    loops,
+    navigation,
+    pairs,
+    point_tests,
+    reduction,
+    text,
+    trees,
+    views,
+    vision,
+)
 from adjust.native.library import Function
 from adjust.navigation import navigate
 from adjust.pose_network import solve_network
@@ -39,7 +53,9 @@ from tests.adjust.navigation import (
 from tests.adjust.terrestrial_networks import measured, polar_network
 from tests.adjust.test_image_reduction import near, warped_stereo
 
-_MODULES = (lenses, images, trees, reduction, bundles, navigation, views, vision, loops)
+_MODULES = (
+    lenses, images, trees, reduction, bundles, navigation, views, vision, loops, pairs, elimination, point_tests, text,
+)  # fmt: skip
 FUNCTIONS = {f.name: f for module in _MODULES for f in vars(module).values() if isinstance(f, Function)}
 """All functions of the core that have a face in Python."""
 _KEPT = 2
@@ -97,12 +113,20 @@ def _images() -> None:
     graph, done = h.solved(survey, near(truth))
     precision = Precision(graph, done)
     image_residuals(precision)
+    points, lambda0 = precision.image_points, np.array([17.0, 19.0])
+    n = len(points.v)
+    point_tests.controlled_directions(points, np.zeros(n, dtype=np.int64))
+    point_tests.point_tests(points, lambda0, tuple(np.zeros((n,) if i < 5 else (n, 2)) for i in range(9)))
+    point_tests.bias_ellipses(points, lambda0)
+    words = text.Words.of(["a", "bc", ""])
+    text.number_rows(words, np.array([0, 1, 2]), words, np.array([1, 1, 0]), points.v[:3], [3, 0])
     names = list(graph.unknowns.by_name)
     precision.joint([names[0], names[-1]])
     batch = graph.images
     batch.rows(np.array([0]))
+    batch.condensed_rows(np.array([0]), np.ones((1, len(batch.blocks[0].uv), 4)))
     batch.local_from_keys(np.array([0]))
-    solve_network(pose_networks.simulate(3, 2).network)
+    solve_network(pose_networks.simulate(3, 2).network).precision.pairs  # noqa: B018  # is computed when asked for
     loop_basis(topology([(a + b, a, b) for a, b in ("AB", "BC", "CA", "CD", "DA")]))
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
     graph, done = h.solved(survey, near(truth))  # nothing to reduce: every block is condensed for itself

@@ -6,9 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from adjust.model.survey import FloatArray
-from adjust.observations.pairs import pair_jacobians
 from adjust.pose_network import PoseNetwork, pose_network
-from adjust.spatial.rigid_motions import Motions
+from adjust.spatial.rigid_motions import Motions, right_jacobian_inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,3 +78,10 @@ def network_jacobians(
     here, measured = world_from_station, network.arrays.motions
     b_from_a = here[network.b_idx].inverse() @ here[network.a_idx]
     return pair_jacobians(measured if network.dim == 6 else Motions(measured.rotation), b_from_a)
+
+
+def pair_jacobians(measured: Motions, b_from_a: Motions) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Residuals (E, dim), their derivatives (E, dim, dim) by b and by a, and Ad(b_from_a^-1) (E, dim, dim)."""
+    residual = (measured.inverse() @ b_from_a).log()
+    by_a, turn = right_jacobian_inverse(residual), b_from_a.inverse().adjoint()
+    return residual, -by_a @ turn, by_a, turn

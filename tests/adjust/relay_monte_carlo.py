@@ -106,9 +106,10 @@ def simulate_complete(options: MonteCarloOptions = MonteCarloOptions()) -> Monte
         measured, information = _measure(rng, true, options)
         weighted = adjust_batch(measured, information, n)
         equal = adjust_batch(measured, np.broadcast_to(np.eye(3) / options.sigma**2, true.shape), n)
-        kept = weighted.settled & equal.settled
-        unsettled += int(np.sum(~kept))
-        sums[0].add(true[kept], measured[kept], np.zeros(int(kept.sum())))
+        settled = weighted.settled & equal.settled
+        unsettled += int(np.sum(~settled))
+        kept = slice(None) if settled.all() else settled
+        sums[0].add(true[kept], measured[kept], np.zeros(int(settled.sum())))
         sums[1].add(true[kept], weighted.b_from_a[kept], weighted.omega[kept])
         sums[2].add(true[kept], equal.b_from_a[kept], equal.omega[kept])
     return MonteCarlo(a, b, sums[0].errors(), sums[1].errors(), sums[2].errors(), unsettled)

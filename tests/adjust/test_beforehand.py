@@ -86,6 +86,7 @@ def test_epochs_that_one_camera_alone_sees() -> None:
     assert len(found["epochs without partners"]) == 24
 
 
+@pytest.mark.slow
 def test_readings_of_a_table_without_images() -> None:
     survey = head_on_table(1, n_table_epochs=4, n_free_epochs=3)[0]
     extra = replace(survey.table_readings[0], epoch_id="t99", angles=np.array([0.1, 0.2]))

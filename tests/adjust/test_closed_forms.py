@@ -268,6 +268,7 @@ def test_zhang_does_not_take_one_view_seen_three_times_for_three():
     assert pinhole_from_homographies(np.repeat(one, 3, axis=0), SIZE).variant != "full"
 
 
+@pytest.mark.slow
 def test_four_points_in_space_have_the_true_pose_among_their_solutions():
     """Their square sum has several minima, of which one solution from all of them may be a wrong one."""
     rng = np.random.default_rng(5)

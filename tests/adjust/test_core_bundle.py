@@ -62,8 +62,7 @@ def test_bundle_equals_the_dense_adjustment(options: dict[str, object], reduced:
     """Values, covariances of lenses, hidden poses, reduced, tied and held points, all redundancy numbers and tests."""
     survey, truth = h.network(1, **options)  # type: ignore[arg-type]  # keywords of all kinds
     precision, _ = h.check_against_dense(survey, near(truth))
-    bundle = precision.graph.bundle
-    assert bundle is not None
+    (bundle,) = precision.graph.bundles
     assert (len(bundle.reduced), len(bundle.tied)) == (reduced, tied)
     assert len(bundle.hidden_poses) == 4
 
@@ -79,8 +78,7 @@ def test_cameras_fixed_to_their_stations(n_cameras: int, alone: bool) -> None:
         assert isinstance(pose, gtsam.Pose3)
         cameras.append(replace(c, station_from_camera=PoseParameter(pose, "held")))
     precision, _ = h.check_against_dense(replace(survey, cameras=tuple(cameras)), near(truth))
-    bundle = precision.graph.bundle
-    assert bundle is not None
+    (bundle,) = precision.graph.bundles
     assert bundle.hidden_poses
     assert bundle.alone == alone
 
@@ -120,8 +118,8 @@ def test_bundle_beside_boards_and_a_table() -> None:
     nights = [b for b in survey.image_blocks if b.target_id is None]
     survey = replace(survey, image_blocks=(*thin, *nights), coordinates=(), distances=survey.distances[:1])
     precision, _ = h.check_against_dense(survey, near(truth))
-    assert precision.graph.bundle is not None
-    assert len(precision.graph.bundle.tied) == 2
+    (bundle,) = precision.graph.bundles
+    assert len(bundle.tied) == 2
 
 
 def test_points_on_the_interface_or_reduced_give_the_same() -> None:
@@ -137,7 +135,7 @@ def test_points_on_the_interface_or_reduced_give_the_same() -> None:
         graph, done = h.solved(replace(survey, **extra), near(truth))
         results.append((graph, done, Precision(graph, done)))
     first, _, p0 = results[0]
-    assert [len(g.bundle.tied) for g, _, _ in results if g.bundle] == [0, 5, 5]
+    assert [len(b.tied) for g, _, _ in results for b in g.bundles] == [0, 5, 5]
     for graph, done, precision in results[1:]:
         assert done.omega == pytest.approx(results[0][1].omega, rel=1e-9)
         for name in first.unknowns.by_name:
@@ -153,8 +151,8 @@ def test_back_substitution_gives_the_dense_step() -> None:
     graph = h.build(survey, start)
     graph.prepare(graph.start, jacobians=True)
     delta = graph.system.linearize(graph.start).optimize()
-    assert graph.bundle is not None
-    graph.bundle.complete(delta)
+    for bundle in graph.bundles:
+        bundle.complete(delta)
     full = h.dense(graph, dict(start.lenses), graph.start)
     A, e = full.A[full.used], full.e[full.used]
     expected = -np.linalg.lstsq(A / np.linalg.norm(A, axis=0), e, rcond=None)[0] / np.linalg.norm(A, axis=0)
@@ -242,8 +240,7 @@ def test_image_rows_along_a_direction_are_the_root_of_the_condensed_normal_equat
     survey, truth = h.network(1)
     graph = graph_at(survey, near(truth))
     graph.prepare(graph.start, jacobians=True)
-    bundle = graph.bundle
-    assert bundle is not None
+    (bundle,) = graph.bundles
     V = np.random.default_rng(3).normal(size=(sum(graph.unknowns.by_key[k].dim for k in bundle.interface), 4))
     R = np.concatenate(bundle.views, axis=1)
     rows = BundleHidden(bundle).rows_along(V)

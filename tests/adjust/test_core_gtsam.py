@@ -139,8 +139,8 @@ def test_all_kinds_of_observations_are_among_these() -> None:
         graph = make()
         kinds |= {item.kind for item in graph.others} | {r.kind for r in graph.survey.readings}
         seen["image"] |= bool(graph.images.blocks)
-        seen["bundle"] |= graph.bundle is not None
-        seen["hidden points"] |= graph.bundle is not None and bool(graph.bundle.reduced)
+        seen["bundle"] |= bool(graph.bundles)
+        seen["hidden points"] |= any(bundle.reduced for bundle in graph.bundles)
         seen["reduced poses"] |= graph.reduction is not None
     assert all(seen.values()), seen
     assert kinds == {
@@ -182,8 +182,8 @@ def test_served_rows_do_not_mix_values() -> None:
         prepared = graph.prepare(graph.start, jacobians=True)
         for i in range(graph.graph.size()):
             graph.graph.at(i).error(far)
-        if graph.bundle is not None:  # whose rows need the derivatives of the table, which these errors have moved
-            assert set(graph.bundle.chains.slot.tolist()) & set(graph.unknowns.table_slots)
+        for bundle in graph.bundles:  # whose rows need the derivatives of the table, which these errors have moved
+            assert set(bundle.chains.slot.tolist()) & set(graph.unknowns.table_slots)
         served = graph.linearized(prepared)
         for i in range(plain.size()):
             (A, b), (C, d) = plain.at(i).jacobian(), served.at(i).jacobian()

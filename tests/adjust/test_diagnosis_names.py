@@ -27,6 +27,7 @@ def called(survey: Survey, a: str, b: str, setup: str | None) -> Survey:
     return replace(survey, readings=readings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plane", [False, True])
 @pytest.mark.parametrize("pair", [("P4", "P6"), ("P5", "P7"), ("P4", "P5")])
 def test_two_points_exchanged_in_one_set_up(plane: bool, pair: tuple[str, str]) -> None:
@@ -36,6 +37,7 @@ def test_two_points_exchanged_in_one_set_up(plane: bool, pair: tuple[str, str]) 
     assert "S2" in first.cause
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plane", [False, True])
 def test_given_points_exchanged(plane: bool) -> None:
     good = hall(plane=plane)
@@ -49,6 +51,7 @@ def test_given_points_exchanged(plane: bool) -> None:
     assert "given points exchanged" in [c.hypothesis.name for c in found[:3]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("axis", "factor"), [(0, 0.1), (1, 10.0), (0, 0.01)])
 def test_a_slipped_decimal_of_a_given_point(axis: int, factor: float) -> None:
     good = hall(3)

@@ -1,6 +1,7 @@
 """Units, senses, zeros, constants and conventions of pairs: planted in networks, and in the poses of a real robot."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ def distance(plane: bool) -> str:
     return "horizontal_distance" if plane else "slope_distance"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plane", [False, True])
 @pytest.mark.parametrize(("factor", "said"), [(1000.0, "millimetres, read as metres"), (1 / 25.4, "are inches"),
                                               (1 / 0.3048, "feet, read as metres")])  # fmt: skip
@@ -37,7 +39,7 @@ def test_distances_of_one_set_up_in_another_unit(plane: bool, factor: float, sai
     assert said in first.cause
 
 
-@pytest.mark.parametrize("plane", [False, True])
+@pytest.mark.parametrize("plane", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("setup", ["S2", None])
 @pytest.mark.parametrize(
     ("wrong", "name"), [(lambda v: v / GON, "unit of angles"), (lambda v: -v, "sense of rotation")]
@@ -49,6 +51,7 @@ def test_directions_in_gon_or_counter_clockwise(plane: bool, setup: str | None, 
     assert first.place.ids == ((setup,) if setup else ("direction",))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mend", [lambda v: np.pi / 2 - v, lambda v: np.pi - v, lambda v: 2 * np.pi - v])
 def test_zenith_angles_from_another_zero(mend) -> None:
     wrong = reread(hall(), lambda r: r.kind == "zenith" and r.setup_id == "S1", mend)
@@ -80,6 +83,7 @@ def test_height_of_an_instrument(metres: float) -> None:
     assert heights[0] == pytest.approx(heights[1], rel=0, abs=0.1 * metres + 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_innocent_networks_are_not_blamed(seed: int) -> None:
     assert diagnosed(hall(seed), units, names, weights).candidates == ()
@@ -88,8 +92,13 @@ def test_innocent_networks_are_not_blamed(seed: int) -> None:
 # -- the poses of a real robot ---------------------------------------------------------------------------------------
 
 
+@cache
+def robots_survey() -> Survey:
+    return read(data_folder("calibration", "hand_eye_ds1", "every6")).survey
+
+
 def robot(change) -> Case:
-    survey = read(data_folder("calibration", "hand_eye_ds1", "every6")).survey
+    survey = robots_survey()
     return Case(replace(survey, pairs=tuple(change(i, p) for i, p in enumerate(survey.pairs))), run=adjust)
 
 

@@ -57,6 +57,7 @@ def test_the_fit_is_a_minimum():
         assert float(((project(second.model, second.values, second.constants, there) - uv) ** 2).sum()) > best
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["brown", "fisheye", "brown_backward"])
 @pytest.mark.parametrize("distance", [np.inf, 1.5])
 def test_uncertainty_is_the_scatter_of_differences(name, distance):

@@ -21,7 +21,7 @@ from tests.adjust.native_calls import FUNCTIONS, Call, calls
 ROOT = Path(__file__).parents[2]
 RUNNABLE = instruction_sets()
 _WORK = ("work", "row")  # scratch, of which nothing is expected afterwards
-_BY_LANES = ("covariance_room",)  # answers with the padded size of scratch
+_BY_LANES = ("covariance_room", "elimination_room")  # answer with the padded size of scratch
 _SUMS_THAT_CANCEL = ("influence",)
 """Shares of a point in large covariances that cancel: what is left is compared, what was summed is larger."""
 _CONDITIONED = {("fit_lens", "cov"): 1e-9}
@@ -171,6 +171,28 @@ def _locked(a: np.ndarray) -> np.ndarray:
 def test_an_argument_that_does_not_fit_is_named(argument: str, value: Any, error: type, text: str) -> None:
     with pytest.raises(error, match=f"lens_rows: {argument} {text}"):
         _TRY(*_given(**{argument: value}))
+
+
+def test_what_has_changed_since_the_last_call_is_seen() -> None:
+    """An array that is given again, and shapes that fitted once."""
+    given = _given()
+    q, residuals, rows = given[3], given[5], given[6]
+    assert _TRY(*given) == 0
+    q[:] = [[0.1, 0.2, 2.0]]
+    assert _TRY(*given) == 0
+    expected = residuals.copy()
+    with pytest.raises(ValueError, match="cannot resize"):  # which would move what it holds
+        q.resize((1000, 3), refcheck=False)
+    q.shape = (15, 1)
+    with pytest.raises(ValueError, match=r"lens_rows: q must be \(n, 3\), not \(15, 1\)"):
+        _TRY(*given)
+    q.shape = (5, 3)
+    residuals[:] = 0.0
+    assert _TRY(*given) == 0
+    np.testing.assert_array_equal(residuals, expected)
+    rows.setflags(write=False)
+    with pytest.raises(ValueError, match="lens_rows: rows must be contiguous and writable"):
+        _TRY(*given)
 
 
 def test_what_is_only_read_may_be_locked_and_numbers_may_be_numpys() -> None:

@@ -14,6 +14,7 @@ from adjust.model.observations import Distance, FrameRef, Pair, PositionRef, Rea
 from adjust.model.survey import FloatArray, Point, PointParameter, Survey
 from adjust.start.robust import limit
 from adjust.statistics.condensed import condensed_system
+from adjust.statistics.outliers import exchange
 from adjust.statistics.outliers.candidates import candidates, without
 from adjust.statistics.outliers.search import SearchOptions, search_outliers
 from adjust.statistics.outliers.snooping import Snooping
@@ -347,3 +348,31 @@ def test_image_points_stay_where_residuals_are_far_below_their_sigmas() -> None:
     right = tuple(replace(b, cov=b.cov / 100.0) for b in blocks)
     bold = adjust(replace(survey, image_blocks=right), h.start_at(truth), options)
     assert np.flatnonzero(~bold.image_residuals.used).tolist() == [3]
+
+
+def test_nothing_is_left_out_where_all_directions_are_in_a_wrong_unit() -> None:
+    """No set of single readings explains that: the search ends after it has seen that leaving out does not help."""
+    survey, start = net.hall(4, n_points=20, n_stations=4, n_tapes=20)
+    wrong = tuple(replace(r, value=0.9 * r.value) if r.kind == "direction" else r for r in survey.readings)
+    first = adjust(replace(survey, readings=wrong), start)
+    found = search_outliers(first.survey, first=first)
+    assert found.adjustment is first
+    assert (found.rejected, found.log, found.suspects) == ((), (), ())
+    assert all(f > 100.0**2 for _, f in found.widened)
+    assert any("direction: its typical observation contradicts" in n and "check its units" in n for n in found.notes)
+
+
+def test_the_criterion_of_every_set_is_that_of_its_own_elimination() -> None:
+    """g' inv(R) g of all sets of observations of one, two and three components; a set that leaves something open."""
+    rng = np.random.default_rng(5)
+    sizes, limits = (1, 2, 3, 1), np.array([7.0, 9.0, 11.0, 5.0])
+    B = rng.standard_normal((7, 7))
+    B[6] = B[0]  # the first and the last check nothing but each other
+    R, g, at = B @ B.T, B @ rng.standard_normal(7), np.split(np.arange(7), np.cumsum(sizes)[:-1])
+    J = exchange._criteria(exchange._Near([0, 1, 2, 3], frozenset({0}), g, R, at), limits)
+    for s in range(16):
+        chosen = [i for i in range(4) if s >> i & 1]
+        rows = np.concatenate([np.zeros(0, dtype=int), *(at[i] for i in chosen)])
+        own, mine = R[np.ix_(rows, rows)], g[rows]
+        expected = np.inf if s & 9 == 9 else limits[chosen].sum() - mine @ np.linalg.solve(own, mine)
+        assert J[s] == pytest.approx(expected, abs=1e-9)

@@ -27,9 +27,9 @@ def test_best_poses_are_those_of_one_view_after_the_other():
     x = [flat, block, line, flat[:5], flat[:3]]
     poses = [rigid(rotation_exp(0.4 * rng.normal(size=3)), np.array([0.1, -0.1, 1.5])) for _ in x]
     rays = [seen(part, pose, rng) for part, pose in zip(x, poses, strict=True)]
-    found, error = best_poses(x, rays, 3)
+    found, error = best_poses(np.concatenate(x), np.concatenate(rays), np.cumsum([0] + [len(part) for part in x]), 3)
     for i in range(len(x)):
-        (alone,), (least,) = best_poses([x[i]], [rays[i]], 3)
+        (alone,), (least,) = best_poses(x[i], rays[i], np.array([0, len(x[i])]), 3)
         if i == 2:
             with pytest.raises(SurveyError, match="line"):
                 pose_solutions(x[i], rays[i])

@@ -8,8 +8,8 @@ from scipy import sparse
 
 from adjust.adjustment import adjust
 from adjust.model.result import Adjustment
+from adjust.native import parallel
 from adjust.observations.images import batch as batch_module
-from adjust.statistics import reliability as reliability_module
 from adjust.statistics import system as system_module
 from adjust.statistics import weakness
 from adjust.statistics.budget import uncertainty_budget
@@ -91,6 +91,7 @@ def test_correlations_of_a_large_survey_leave_out_only_what_they_say(monkeypatch
     n = len(system.columns)
     monkeypatch.setattr(weakness, "DENSE", 10)
     monkeypatch.setattr(weakness, "_WORK", n_once * n)
+    monkeypatch.setattr(weakness, "_WHOLE", 10)
     assert len(weakness.compared_columns(system)) == n_once
     found = correlations(adjustment, 0.8, system=system)
     key = lambda x: frozenset([(x.a, x.a_component), (x.b, x.b_component)])  # noqa: E731  # said twice
@@ -101,6 +102,22 @@ def test_correlations_of_a_large_survey_leave_out_only_what_they_say(monkeypatch
     assert len(got) > 10
     for k, value in got.items():
         assert value == pytest.approx(expected[k], abs=1e-6)
+
+
+def test_correlations_from_the_tree_are_those_of_the_normal_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a datum held by observations, and of inner constraints: all of them, nothing is left out."""
+    for adjustment in (lab(), free()):
+        system = condensed_system(precision_of(adjustment)).system
+        every = correlations(adjustment, 0.5, system=system)
+        with monkeypatch.context() as m:
+            m.setattr(weakness, "DENSE", 10)
+            m.setattr(weakness, "covariance_columns", None)
+            assert len(weakness.compared_columns(system)) == len(system.columns)
+            found = correlations(adjustment, 0.5, system=system)
+        assert len(found) == len(every) > 10
+        for x, y in zip(sorted(found, key=str), sorted(every, key=str), strict=True):
+            assert (x.a, x.a_component, x.b, x.b_component) == (y.a, y.a_component, y.b, y.b_component)
+            assert x.coefficient == pytest.approx(y.coefficient, abs=1e-6)
 
 
 def test_the_budget_is_that_of_all_rows() -> None:
@@ -127,21 +144,22 @@ def test_threads_and_portions_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
         found = reliability(adjustment, system=condensed)
         listed = correlations(adjustment, 0.5, system=condensed.system)
         tests = [x for x in vars(found.tests).values() if isinstance(x, np.ndarray)]
+        tests += [found.tests.p, found.tests.p_posterior, found.tests.p_w, found.tests.p_tau]
         ellipses = [found.ellipses.major, found.ellipses.minor, found.ellipses.direction]
         rows = [condensed.system.A.toarray(), condensed.e, condensed.lens, condensed.camera, condensed.shape]
         shifts = np.array([x.shift for x in found.influences])
         return [*tests, *ellipses, *rows, shifts, np.array([x.coefficient for x in listed])]
 
-    monkeypatch.setattr(reliability_module, "_AT_ONCE", 300)
+    monkeypatch.setattr(parallel, "_WORTHWHILE", 300)
     monkeypatch.setattr(system_module, "_AT_ONCE", 7)
     monkeypatch.setattr(batch_module, "_AT_ONCE", 200)
     found = []
     for threads in ("1", "3"):
         monkeypatch.setenv("LABSURVEY_THREADS", threads)
         found.append(everything())
-    monkeypatch.setattr(reliability_module, "_AT_ONCE", 50_000)
+    monkeypatch.setattr(parallel, "_WORTHWHILE", 50_000)
     found.append(everything())
-    assert len(found[0][0]) > 300
+    assert len(found[0][0]) > 900
     for others in found[1:]:
         for a, b in zip(found[0], others, strict=True):
             np.testing.assert_array_equal(a, b)

@@ -9,7 +9,8 @@ from adjust.adjustment import adjust
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Distance, PositionRef, Reading
 from adjust.model.survey import Datum, Point, PointParameter, Setup, Survey
-from adjust.start.readings.start import find_points, given_points
+from adjust.start.positions import given_points
+from adjust.start.readings.start import find_points
 from tests.adjust.terrestrial_networks import P, Truth, measured, polar_network, start_near
 
 POLAR = (("direction", 1e-5), ("zenith", 1e-5), ("slope_distance", 5e-4))

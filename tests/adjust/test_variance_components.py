@@ -102,6 +102,7 @@ def test_the_estimate_is_the_maximum_of_the_restricted_likelihood(mixed: bool, m
     np.testing.assert_allclose(found.moments.q, found.moments.r, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_planted_factors_over_many_trials() -> None:
     """Four groups with factors 0.25, 1, 9 and 0.5 on top of the sigmas; the noise is drawn anew in the same network."""
     survey, start = net.hall(2, n_points=36, n_stations=5, n_tapes=150)

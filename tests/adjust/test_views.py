@@ -7,7 +7,7 @@ import pytest
 from adjust.native.library import SETS, Function, instruction_set
 from adjust.native.views import homographies, plane_poses, refine_poses, view_errors, view_offsets
 from adjust.spatial.rigid import rigid, rotation_exp, rotation_log
-from adjust.start.views import Sight, make_views
+from adjust.start.views import joined, make_views
 
 
 def board_views(n, seed=3, sigma=0.0):
@@ -198,10 +198,10 @@ def test_few_points_off_a_plane_have_their_pose_in_any_order():
         p = x @ R.T + t
         uv = p[:, :2] / p[:, 2:] + rng.normal(0.0, 0.3 / f, (4, 2))
         rays = np.column_stack([uv, np.ones(4)])
-        views.append(Sight(i, x, rays / np.linalg.norm(rays, axis=1)[:, None], f))
+        views.append((i, x, rays / np.linalg.norm(rays, axis=1)[:, None], f))
         true.append(rigid(R, t))
     for order in ([0, 1, 2, 3], [0, 2, 3, 1], [3, 0, 1, 2], [1, 3, 2, 0]):
-        found, failed = make_views([Sight(s.block_idx, s.x[order], s.rays[order], f) for s in views])
+        found, failed = make_views(joined([(i, x[order], rays[order], f) for i, x, rays, _ in views]))
         assert not failed
         for view, pose in zip(found, true, strict=True):
             off = np.linalg.norm(view.poses[:, :3, 3] - pose[:3, 3], axis=1)

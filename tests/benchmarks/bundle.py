@@ -152,8 +152,9 @@ def survey(case: Bundle) -> Survey:
     camera = Camera("camera", "body", AICON_SIZE if case.aicon else SIZE, lens, held)
     ids = tuple(str(n) for n in case.names)
     blocks = []
+    ends = np.searchsorted(case.image, np.arange(len(case.world_from_camera) + 1))  # images stand in order
     for i in range(len(case.world_from_camera)):
-        k = case.image == i
+        k = slice(ends[i], ends[i + 1])
         blocks.append(
             ImageBlock("camera", f"i{i}", None, case.point[k], case.uv[k], np.eye(2) * case.sigma[k][:, None] ** 2)
         )

@@ -172,7 +172,7 @@ def _image(folder: Path) -> Read:
 def _results(which: str) -> Callable[[Path], Read]:
     def prepare(folder: Path) -> Read:
         from survey.project import read
-        from survey.solution.previous import read_previous
+        from survey.solution.earlier.previous import read_previous
 
         put(folder, adjusted())
         project = read(folder)
@@ -189,7 +189,7 @@ def _results(which: str) -> Callable[[Path], Read]:
 
 def _run(which: str) -> Callable[[Path], Read]:
     def prepare(folder: Path) -> Read:
-        from survey.solution.runs import definition_of, list_runs, load_run
+        from survey.solution.earlier.runs import definition_of, list_runs, load_run
 
         put(folder, adjusted())
         path = folder / "runs/0001" / which

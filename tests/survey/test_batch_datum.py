@@ -50,6 +50,7 @@ def alarming(trends: Trends) -> list[str]:
     return [c.series.name for c in trends.charts if trends.is_alarming(c)]
 
 
+@pytest.mark.slow
 def test_noise_raises_no_alarm_where_every_epoch_has_its_own_free_datum(records: list[Record]) -> None:
     trends = trends_of(records)
     assert alarming(trends) == []

@@ -140,6 +140,7 @@ def test_a_renamed_image_is_not_counted_twice(lab):
     assert rows_of(lab, "e7") == []
 
 
+@pytest.mark.slow
 def test_what_is_added_brings_its_images_and_exclusions(lab, tmp_path):
     new = tmp_path / "new"
     shutil.copytree(lab / "images", new / "images")
@@ -188,6 +189,7 @@ def test_used_false_becomes_an_exclusion_when_its_row_is_replaced(lab, capsys):
     assert (~block.used).sum() == 1
 
 
+@pytest.mark.slow
 def test_points_without_images_and_points_that_were_given_stay(lab):
     (lab / "observations/detected.json").unlink()
     given = points(lab).read_text()

@@ -24,7 +24,7 @@ from survey.project import read
 from survey.project.exclusions import Exclusion, Name
 from survey.project.observed import Observed
 from survey.project.reading import leaving_out, read_all
-from survey.solution.previous import read_previous
+from survey.solution.earlier.previous import read_previous
 
 pytestmark = pytest.mark.slow
 

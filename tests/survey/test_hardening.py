@@ -26,7 +26,7 @@ from survey.jobs.adjusting.job import adjust_job
 from survey.project.declared.node import read_toml
 from survey.project.tables.files import read_table, write_table
 from survey.project.tables.reading import Layout, group_names
-from survey.solution.previous import read_previous
+from survey.solution.earlier.previous import read_previous
 from survey.solution.residual_tables import other_residuals_csv
 from tests.adjust.test_deformation import adjusted, chain, measured
 from tests.fuzz.replaced import unfinished_project

@@ -27,6 +27,7 @@ NO_READERS = {
     "survey/project/tables/rows.py:row_table": "read by read_table before",
     "survey/project/merging.py:read_copy": "the copy of a project that was read before",
     "survey/project/tables/files.py:_last_start": "the line of what could not be read, for the message",
+    "survey/jobs/starting.py:start_project": "copies images that read_image has read before",
     "survey/interop/cameras/colmap.py:reconstruction": "an empty model of pycolmap, to be filled and written",
     "survey/report/page.py:_page": "the program's own script",
     "survey/report/page.py:_by_browser": "a PDF that was just printed",

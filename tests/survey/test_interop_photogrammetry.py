@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from adjust.model.errors import SurveyError
-from survey.interop.cameras.aicon import SIGMA_MM, read_aicon
-from survey.interop.cameras.dbat import read_dbat
+from survey.interop.photogrammetry.aicon import SIGMA_MM, read_aicon
+from survey.interop.photogrammetry.dbat import read_dbat
 from survey.project import read
 from tests.acceptance.published import dbat_survey
 from tests.data import data_folder

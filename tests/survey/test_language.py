@@ -71,6 +71,7 @@ def test_every_text_has_its_translation(language: str) -> None:
     assert wanted - set(catalogue(language).texts) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("language", OTHERS)
 def test_nothing_stale_remains(language: str) -> None:
     near = literals(PAGES)

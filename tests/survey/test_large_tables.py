@@ -17,6 +17,7 @@ from survey.project.tables import arrow as arrow_columns
 from survey.project.tables import files as table_reading
 from survey.project.tables.arrow import csv_columns, csv_rows
 from survey.project.tables.files import read_table, write_table
+from survey.project.tables.image_points import _distinct, ordered
 from survey.project.tables.reading import Layout, Table, TextColumn
 
 LAYOUT = Layout("t", ("a_id",), ("x_mm",), ("group",), ("sigma_mm",))
@@ -135,6 +136,7 @@ def test_arrow_writes_numbers_of_every_size_as_python_does() -> None:
     assert csv_rows({"x": values, "y": values}).decode().splitlines() == [f"{v!r},{v!r}" for v in values.tolist()]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_a_large_table_comes_back_as_it_was_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(4)
@@ -152,6 +154,7 @@ def test_a_large_table_comes_back_as_it_was_written(tmp_path: Path, monkeypatch:
     assert table.text("a_id").values() == ids
 
 
+@pytest.mark.slow
 def test_a_small_table_loads_no_arrow_and_a_large_one_no_pandas(tmp_path: Path) -> None:
     for name, n in (("small", 100), ("large", 150_000)):
         (tmp_path / f"{name}.csv").write_text(HEADER + "p1,1.25,g,0.125\n" * n)
@@ -159,6 +162,7 @@ def test_a_small_table_loads_no_arrow_and_a_large_one_no_pandas(tmp_path: Path) 
 import sys
 from pathlib import Path
 from survey.project.tables.files import read_table, write_table
+from survey.project.tables.image_points import _distinct, ordered
 from survey.project.tables.reading import Layout
 layout = Layout("t", ("a_id",), ("x_mm",), ("group",), ("sigma_mm",))
 for name, seldom in (("small", "pyarrow"), ("large", "pandas")):
@@ -168,3 +172,19 @@ for name, seldom in (("small", "pyarrow"), ("large", "pandas")):
 assert "pyarrow" in sys.modules
 """
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, cwd=Path(__file__).parents[2])
+
+
+@pytest.mark.parametrize("largest", [5, 2**40])
+def test_rows_in_the_order_of_several_codes(largest: int) -> None:
+    """Whether their product fits into a number or not; codes as the other way to number them has them."""
+    rng = np.random.default_rng(1)
+    codes = [rng.choice(np.array([0, 1, 2, largest]), 500) for _ in range(3)]
+    order, same = ordered(*codes)
+    np.testing.assert_array_equal(order, np.lexsort(codes[::-1]))
+    rows = np.stack(codes, axis=1)[order]
+    np.testing.assert_array_equal(same, (rows[1:] == rows[:-1]).all(axis=1))
+    assert same.any()
+    for some in (codes[0], codes[0] % 7, np.zeros(0, dtype=np.int64)):
+        expected = np.unique(some, return_index=True, return_inverse=True)
+        for a, b in zip(_distinct(some), expected, strict=True):
+            np.testing.assert_array_equal(a, b)

@@ -12,9 +12,12 @@ from typing import Any
 import pytest
 
 from adjust.model.errors import SurveyError
-from survey.report import observations, report_html
+from survey.project.observed import name_of_residual
 from survey.report import page as printing
+from survey.report import report_html
 from survey.report.drawing import DARK
+from survey.report.sections import observations
+from survey.solution.anchors import anchor
 from survey.solution.dictionary import RunInfo
 from tests.survey.adjustments import Lab, lab_adjustment
 
@@ -103,7 +106,7 @@ def cells(dom: str, column: int) -> list[str]:
     """The texts of a column of the table of all observations, as shown."""
     table = dom[dom.index('id="all"') :]
     rows = re.findall(r"<tr[^>]*>(.*?)</tr>", table[table.index("<tbody>") : table.index("</tbody>")], re.S)
-    return [re.findall(r"<td[^>]*>(.*?)</td>", row)[column] for row in rows]
+    return [re.sub("<[^>]*>", "", re.findall(r"<td[^>]*>(.*?)</td>", row)[column]) for row in rows]
 
 
 def numbers(texts: list[str]) -> list[float]:
@@ -126,6 +129,32 @@ def test_all_observations_can_be_paged_sorted_and_searched(german: str, tmp_path
     found = dom_after(german, search, tmp_path)
     assert set(cells(found, COMPONENT)) == {"axis2"}
     assert len(cells(found, COMPONENT)) == 6
+
+
+@pytest.mark.parametrize("kind", ["obs", "reading", "image", "point"])
+def test_places_of_the_workbench_lead_to_rows_of_the_report(english: str, tmp_path: Path, kind: str) -> None:
+    adjustment = lab_adjustment(Lab(n_epochs=6, n_beacons=6, blunders=2))
+    block = adjustment.survey.image_blocks[0]
+    target = next(t for t in adjustment.survey.targets if t.target_id == block.target_id)
+    image = f"{block.camera_id}/{block.epoch_id}"
+    name = {
+        "obs": f"image_point:{image}/{block.target_id}/{target.point_ids[int(block.point_idx[3])]}", "image": image,
+        "reading": name_of_residual(next(o for o in adjustment.other_residuals if o.kind == "table")),
+        "point": adjustment.survey.points[0].point_id,
+    }[kind]  # fmt: skip
+    measure = "[...document.querySelectorAll('tr.here')].map((r) => [r.dataset.place ?? '', r.cells[0].textContent])"
+    if kind == "image":
+        measure = "[...document.querySelectorAll('#all tbody tr')].map((r) => [r.dataset.place, ''])"
+    shown = f"(() => {{ location.hash = {json.dumps(anchor(kind, name))}; }})()"
+    page = english.replace("</body>", f"<script>{shown}</script></body>")
+    found = seen(page, measure, tmp_path)
+    assert found
+    if kind == "image":
+        assert all(place.startswith(f"obs=image_point:{name}/") for place, _ in found)
+    elif kind == "point":
+        assert found[0][1] == name
+    else:
+        assert found == [[f"{kind}={name}", found[0][1]]]
 
 
 def test_view_in_space_is_drawn_when_the_page_opens(english: str, tmp_path: Path) -> None:

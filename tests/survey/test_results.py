@@ -9,16 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
+from pyarrow import parquet
 from scipy.spatial.transform import Rotation
 
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, Estimate, GlobalTest
-from survey.report.results import write_results
+from adjust.native.text import Words, number_rows
+from survey.report.results import ReportOptions, write_results
 from survey.solution.covariances import covariance_npz, read_covariances
 from survey.solution.dictionary import RunInfo, correlated, solution_dict, solution_json
 from survey.solution.frames import AdjustedFrames, table_from_mount
 from survey.solution.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry
-from survey.solution.residual_tables import _fixed, image_residuals_csv, other_residuals_csv
+from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
 from survey.solution.verdict import suspects, verdict
 from tests.survey.adjustments import POSE_COMPONENTS, POSE_UNITS, Lab, correlate, lab_adjustment
 
@@ -327,17 +329,55 @@ def test_fixed_numbers_are_what_python_prints(decimals: int) -> None:
         [rng.normal(0, 10.0**k, 50) for k in range(-7, 8)]
         + [[0.0, -0.0, -1e-9, 9.9999999, 99.5, 1e30, np.nan, -np.inf]]
     )
-    for part in (values, values[np.abs(values) < 1e9], np.array([-3.0]), np.empty(0)):
-        words = [bytes(row[row != 0]).decode() for row in _fixed(part, decimals)]
-        assert len(words) == len(part)
+    zero, none = np.zeros(len(values), dtype=np.int64), Words.of([""])
+    assert number_rows(none, zero, none, zero, values[:, None], [decimals]) is None  # 1e30
+    for part in (values[~np.isfinite(values) | (np.abs(values) < 1e9)], np.array([-3.0]), np.empty(0)):
+        found = number_rows(none, zero[: len(part)], none, zero[: len(part)], part[:, None], [decimals])
+        assert found is not None
+        words = [line.removeprefix(",") for line in found.decode().splitlines()]
         for word, value in zip(words, part, strict=True):
             if not np.isfinite(value):
                 assert word == ""
             else:
                 assert float(word) == pytest.approx(value, abs=0.5000001 * 10.0**-decimals)
                 assert not word.startswith("-") or float(word) < 0
-                # a number too large for this is the only reason to write a column another way
-                assert part is values or len(word.partition(".")[2]) == decimals
+                assert len(word.partition(".")[2]) == decimals
+    with pytest.raises(IndexError):
+        number_rows(none, zero + 1, none, zero, values[:, None], [decimals])
+
+
+def test_parquet_has_what_the_csv_has(adjustment: Adjustment) -> None:
+    """Its numbers in full."""
+    columns = parquet.read_table(io.BytesIO(image_residuals_parquet(adjustment))).to_pydict()
+    rows, found = rows_of(image_residuals_csv(adjustment)), adjustment.image_residuals
+    assert list(columns) == list(rows[0])
+    for name in ("epoch_id", "camera_id", "target_id", "point_id"):
+        assert columns[name] == [row[name] for row in rows]
+    np.testing.assert_array_equal(columns["residual_v_px"], found.residuals[:, 1])
+    np.testing.assert_array_equal(columns["used"], found.used)
+    for name in list(columns)[4:-1]:
+        written = np.array([float(row[name]) if row[name] else np.nan for row in rows])
+        np.testing.assert_allclose(np.array(columns[name], dtype=float), written, atol=6e-5)
+
+
+def test_parquet_is_written_on_request_and_then_never_old(adjustment: Adjustment, tmp_path: Path) -> None:
+    assert "residuals.parquet" not in write_results(tmp_path, adjustment, RUN)
+    asked = write_results(tmp_path, adjustment, RUN, options=ReportOptions(parquet=True))
+    asked["residuals.parquet"].write_bytes(b"of another run")
+    again = write_results(tmp_path, adjustment, RUN)["residuals.parquet"]
+    assert again.read_bytes() == image_residuals_parquet(adjustment)
+    again.unlink()
+    assert "residuals.parquet" not in write_results(tmp_path, adjustment, RUN)
+
+
+def test_numbers_too_large_for_fixed_decimals_are_written_in_full(adjustment: Adjustment) -> None:
+    found = adjustment.image_residuals
+    residuals = found.residuals.copy()
+    residuals[1] = 1e30, np.nan
+    rows = rows_of(image_residuals_csv(replace(adjustment, image_residuals=replace(found, residuals=residuals))))
+    assert (float(rows[1]["residual_u_px"]), rows[1]["residual_v_px"], rows[1]["used"]) == (1e30, "", "1")
+    assert [r["point_id"] for r in rows] == [r["point_id"] for r in rows_of(image_residuals_csv(adjustment))]
+    assert float(rows[0]["u_px"]) == adjustment.survey.image_blocks[0].uv[0, 0]
 
 
 def test_other_residuals_have_units_for_people(adjustment: Adjustment) -> None:

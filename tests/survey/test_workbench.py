@@ -10,17 +10,24 @@ import pytest
 from gtsam import Pose3
 
 import survey
-from adjust.model.errors import SurveyError
+from adjust.diagnosis.diagnosis import Diagnosis
+from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place
+from adjust.diagnosis.ranking import Candidate
+from adjust.diagnosis.trial import Misfit
+from adjust.model.errors import DiagnosedError, SurveyError
 from survey.cli import main
+from survey.examples import write_example
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.excluding import exclude_job
 from survey.project import read
-from survey.solution.changes import snapshot, solution_changes
-from survey.solution.runs import MOST, list_runs, load_run
+from survey.solution.earlier.changes import snapshot, solution_changes
+from survey.solution.earlier.runs import MOST, list_runs, load_run
 from survey.workbench import views
+from survey.workbench.network import network
 from survey.workbench.pictures import picture
 from survey.workbench.rows import BY_PEOPLE, IN_USE, columns, point_rows
-from survey.workbench.session import CancelledError, ChangedError, Workbench
+from survey.workbench.session import Workbench
+from survey.workbench.situation import CancelledError, ChangedError
 
 pytestmark = pytest.mark.slow
 
@@ -365,3 +372,121 @@ def test_a_damaged_run_stops_nobody(bench, mine, capsys):
     assert "remove its folder" in capsys.readouterr().err
     shutil.rmtree(mine / f"runs/{n:04d}")
     assert list_runs(mine)[-1].number == n + 1
+
+
+def mirrored(folder, camera, first, width=1280):
+    """The images of a camera from an epoch on mirrored, in the table of image points."""
+    path = folder / "observations/image_points.csv"
+    lines = path.read_text().splitlines()
+    at = {name: k for k, name in enumerate(lines[0].split(","))}
+    for i, line in enumerate(lines[1:], start=1):
+        cells = line.split(",")
+        if cells[at["camera_id"]] == camera and cells[at["epoch_id"]] >= first:
+            cells[at["u_px"]] = repr(width - 1 - float(cells[at["u_px"]]))
+            lines[i] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture
+def spoilt(tmp_path):
+    """A head on a table of which some images are mirrored, and its table of image points as it is then."""
+    write_example("head", tmp_path / "lab")
+    mirrored(tmp_path / "lab", "Y", "tY01")
+    return tmp_path / "lab", (tmp_path / "lab/observations/image_points.csv").read_bytes()
+
+
+def test_a_remedy_is_carried_out_by_one_call_and_taken_back_by_undo(spoilt):
+    folder, before = spoilt
+    bench = Workbench(folder)
+    bench.adjust()
+    table = folder / "observations/image_points.csv"
+    found = views.findings(bench)["remedies"]
+    assert "mirrored" in found[0]["cause"]
+    assert found[0]["possible"]
+    assert 0.9 < found[0]["explained"] <= 1.0
+    assert found[0]["statistic"] > found[0]["critical"]
+    n_used = int(bench.adjustment.image_residuals.used.sum())
+    bench.apply_remedy(1)
+    assert bench.remedies == ()
+    assert int(bench.adjustment.image_residuals.used.sum()) > n_used
+    assert same(bench.adjustment, adjust_project(read(folder), False)) < 1e-5
+    assert table.read_bytes() != before
+    assert (folder / "kept/image_points-1.csv").read_bytes() == before
+    bench.undo()
+    assert table.read_bytes() == before
+    assert len(bench.remedies) == len(found)
+    bench.redo()
+    assert bench.remedies == ()
+    with pytest.raises(SurveyError, match="no cause that it could change"):
+        bench.apply_remedy(1)
+
+
+def test_a_table_that_others_changed_is_not_overwritten_by_undo(spoilt):
+    folder, _ = spoilt
+    bench = Workbench(folder)
+    bench.adjust()
+    bench.apply_remedy(1)
+    table = folder / "observations/image_points.csv"
+    table.write_text(table.read_text() + "# seen\n")
+    with pytest.raises(ChangedError):
+        bench.undo()
+    assert table.read_text().endswith("# seen\n")
+
+
+def test_what_cannot_be_adjusted_has_its_remedies_too(mine, monkeypatch):
+    """The diagnosis of an adjustment that failed; what mends it is taken back to where there was no solution."""
+    import survey.workbench.resident as resident
+
+    epoch = read(mine).survey.image_blocks[0].epoch_id
+    real = resident.adjust_project
+    cause = Hypothesis("moved", "epoch moved", "leave it out", Place("epoch", (epoch,)), read(mine).survey,
+                       (LeaveOut((f"epoch:{epoch}",)),))  # fmt: skip
+
+    def failing(project, *given, **named):
+        if any(b.epoch_id == epoch and (b.used is None or b.used.any()) for b in project.survey.image_blocks):
+            candidates = (Candidate(cause, 0.99, 500.0, 30.0, 1.0, 1.02),)
+            raise DiagnosedError("nothing fits", Diagnosis(candidates, ("moved",), Misfit(1.0, 1.0, 0, 1)))
+        return real(project, *given, **named)
+
+    monkeypatch.setattr(resident, "adjust_project", failing)
+    bench = Workbench(mine)
+    with pytest.raises(SurveyError):
+        bench.adjust()
+    said = views.findings(bench)
+    assert (said["verdict"], said["reason"], said["findings"]) == ("failed", "nothing fits", [])
+    assert said["remedies"][0]["anchor"] == f"#epoch={epoch}"
+    assert views.state(bench)["failure"] == "nothing fits"
+    assert len(views.points(bench)) > 1000
+    bench.apply_remedy(1)
+    assert bench.failure is None
+    assert bench.adjustment.sigma0 < 2
+    assert "tried: epoch moved" in exclusions(mine)[-1]
+    bench.undo()
+    assert views.state(bench)["failure"] == "nothing fits"
+    assert len(bench.remedies) == 1
+    bench.redo()
+    assert bench.adjustment.sigma0 < 2
+
+
+def test_the_network_of_readings_is_where_the_solution_is(tmp_path):
+    """A caliper's line is as long as its adjusted distance; a reading that was spoilt is the one beyond the limit."""
+    write_example("total-station", tmp_path / "lab")
+    path = tmp_path / "lab/observations/distances.csv"
+    lines = path.read_text().splitlines()
+    at = lines[0].split(",").index("value_mm")
+    cells = lines[2].split(",")
+    wrong, cells[at] = f"distances:{cells[0]}", repr(float(cells[at]) + 3.0)
+    path.write_text("\n".join([*lines[:2], ",".join(cells), *lines[3:]]) + "\n")
+    bench = Workbench(tmp_path / "lab")
+    bench.adjust()
+    found = network(bench)
+    assert found["n_nowhere"] == 0
+    adjusted = {o.ids[0]: o.adjusted[0] for o in bench.adjustment.other_residuals if o.kind == "distance"}
+    ends = {x["id"].split(":")[1]: np.array(x["x"]) for x in found["lines"] if x["table"] == "distances"}
+    assert adjusted.keys() == ends.keys()
+    for name, (a, b) in ends.items():
+        assert np.linalg.norm(b - a) == pytest.approx(adjusted[name], abs=1e-9)
+    assert [x["id"] for x in found["lines"] if (x["share"] or 0) > 1] == [wrong]
+    readings = bench.situation.everything.survey.readings
+    assert {s["id"]: s["n"] for s in found["setups"]} == {k: sum(r.setup_id == k for r in readings)
+                                                        for k in {r.setup_id for r in readings}}  # fmt: skip

@@ -15,16 +15,20 @@ import pytest
 
 from survey.examples import write_example
 from survey.report.language import catalogue
+from survey.report.terminal import summary_text
 from survey.workbench.guard import new_token
+from survey.workbench.live import Listening
 from survey.workbench.rows import columns
-from survey.workbench.server import WEB, Listening, Server
+from survey.workbench.server import WEB, Server
 from survey.workbench.session import Workbench
 from tests.survey.test_report_browser import CONTRAST, need_browser
 
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 WRONG = ("tX05", "X", "board", "c40")  # an image point that is moved by 4 px
 NAME = "X/tX05/board/c40"
 SECONDS = 30.0
-VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations")
+VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations",
+         "settings", "network", "jobs")  # fmt: skip
 ROWS = "Number(document.querySelector('#tables [role=grid]').getAttribute('aria-rowcount'))"
 
 
@@ -170,7 +174,7 @@ def test_every_view_is_drawn(page: Page, view: str) -> None:
         page.wait("document.querySelectorAll('#right canvas').length >= 4 || "
                   "document.querySelector('#right p.warn').textContent")  # fmt: skip
         assert p.inner_text("#right p.warn") == ""
-    if view in ("scene", "plan", "south", "east"):
+    if view in ("scene", "plan", "south", "east", "network"):
         inked = """(() => { const c = document.querySelector('#right canvas'), d = c.getContext('2d')
             .getImageData(0, 0, c.width, c.height).data; let n = 0; for (let i = 3; i < d.length; i += 4) n += d[i] > 0;
             return n > 300; })()"""
@@ -190,6 +194,23 @@ def test_the_table_is_a_grid_of_rows_in_sight(page: Page) -> None:
     p.keyboard.press("ArrowDown")
     p.keyboard.press("Shift+ArrowDown")
     page.wait("(location.hash.match(/obs=/g) ?? []).length === 2")
+
+
+def test_places_that_the_terminal_names_are_places_of_the_page(page: Page, folder: Path) -> None:
+    bench = Workbench(folder, read_only=True)
+    bench.adjust()
+    said = summary_text(bench.adjustment, bench.run())
+    places = re.findall(r"(?m)  (#\w+=\S+)$", said)
+    assert {place.partition("=")[0] for place in places} >= {"#image", "#reading"}
+    for place in places:
+        page.page.evaluate(f"location.hash = {json.dumps(place)}")
+        page.wait(f"document.querySelector('#inspector .anchor')?.textContent === {json.dumps(place)}")
+        assert "There is no such" not in page.page.inner_text("#inspector")
+
+
+def test_the_address_of_a_run_shows_the_history(page: Page) -> None:
+    page.page.evaluate("location.hash = '#run=12'")
+    page.wait("document.querySelector('#right h2')?.textContent === 'History'")
 
 
 def test_nothing_of_a_project_becomes_markup(page: Page) -> None:
@@ -216,10 +237,23 @@ def test_readable_on_desk_and_phone(browser: Any, address: str, scheme: str, wid
     assert page.complaints == []
 
 
+def test_the_datum_is_chosen_and_taken_back(page: Page, folder: Path) -> None:
+    p, before = page.page, (folder / "survey.toml").read_text()
+    p.locator("#right .chooser select").select_option("settings")
+    p.locator("#right").get_by_label("Datum", exact=True).select_option("inner")
+    page.done(lambda: p.locator("#set-datum").click())
+    text = (folder / "survey.toml").read_text()
+    assert 'kind = "inner"' in text or "Not done" in p.inner_text("#message")
+    if text != before:
+        page.done(lambda: p.locator("#undo").click())
+    assert (folder / "survey.toml").read_text() == before
+
+
 def test_german(page: Page) -> None:
     p = page.page
     p.keyboard.press("g")
     page.wait("document.documentElement.lang === 'de'")
+    page.wait("document.querySelector('#left .verdict').textContent.includes('Globaltest')")  # the server's words
     assert "Redundanz" in page.facts()
     assert p.evaluate("document.querySelector('#facts').textContent.match(/sigma0 \\d,\\d{4}/) !== null")
 
@@ -234,6 +268,10 @@ def said_by_the_page() -> set[str]:
     found |= set(re.findall(r': \["([^"]+)"', views[0]))
     for line in re.findall(r"const (?:REGIONS|TABLES) = .*", app):
         found |= set(re.findall(r'(?:", |: )"([^"]+)"', line))
+    jobs = re.search(r"const JOBS = \[.*?\n\];", sources["jobs.js"], re.DOTALL)
+    assert jobs is not None
+    found |= set(re.findall(r'\["\w+", "([^"]+)"', jobs[0]))
+    found |= set(re.findall(r'(?m)^  \["\w+", "[^"]+", "([^"]+)"', jobs[0]))
     found |= {f"key {does}" for does in re.findall(r'\["[^"]+", "([^"]+)", \(\)', app)}
     found |= set(re.findall(r'"([^"]+)"', re.findall(r"const WHY = .*", sources["inspector.js"])[0]))
     return found | set(re.findall(r': "([^"]+)"', re.findall(r"const NAMES = .*", sources["scene.js"])[0]))
@@ -294,3 +332,25 @@ def test_what_others_write_is_told_and_loaded(page: Page, folder: Path) -> None:
     page.wait("document.querySelector('#message').textContent.includes('survey.toml')")
     page.done(lambda: p.locator("#message button").click())
     assert p.inner_text("#title").startswith("again ")
+
+
+def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path) -> None:
+    """From a folder of images in which nothing was looked for to an adjusted project, in the page alone."""
+    write_example("one-camera", tmp_path / "lab")
+    names = sorted((tmp_path / "lab/images").glob("*/*"))
+    for name in names[6:]:
+        name.unlink()
+    token = new_token()
+    with Listening(Server(Workbench(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
+        page = Page(browser, f"{listening.address}#token={token}&view=findings,jobs", 1280)
+        p = page.page
+        assert "nothing to adjust" in p.inner_text("#left .verdict")
+        page.done(lambda: p.get_by_label("Run: Detect").click())
+        page.wait("document.querySelectorAll('#right .arrived canvas').length === 6")
+        assert p.inner_text("#right .told").startswith(str(tmp_path))
+        assert "sigma0" in page.facts()
+        assert p.evaluate(ROWS) > 100
+        p.locator("#right .arrived button").first.click()
+        page.wait("location.hash.startsWith('#image=')")
+        page.context.close()
+    assert [text for text in page.complaints if "409" not in text] == []

@@ -3,6 +3,7 @@
 import json
 import shutil
 import threading
+import time
 from contextlib import contextmanager
 from urllib.request import Request, urlopen
 
@@ -14,7 +15,9 @@ from starlette.websockets import WebSocketDisconnect
 from websockets.sync.client import connect
 
 from survey.cli import main
-from survey.workbench.server import Listening, Server
+from survey.report.language import message, speaking
+from survey.workbench.live import Listening
+from survey.workbench.server import Server
 from survey.workbench.session import Workbench
 from tests.survey.test_workbench import exclusions, wrong_point
 
@@ -139,6 +142,7 @@ def test_the_socket_needs_origin_and_token(mine):
             assert "progress" in kinds
 
 
+@pytest.mark.slow
 def test_a_mistake_is_found_seen_left_out_and_taken_back(mine):
     name = wrong_point(mine)
     with page(mine) as client:
@@ -171,6 +175,7 @@ def test_a_mistake_is_found_seen_left_out_and_taken_back(mine):
         assert all(c["sigmas"] < 1e-6 for c in same["components"] if c["sigmas"] is not None)
 
 
+@pytest.mark.slow
 def test_the_command_line_and_two_pages_lose_nothing_of_each_other(mine):
     first, second = image_of(mine), "right/" + image_of(mine).split("/")[1]
     with page(mine) as a, page(mine) as b:
@@ -233,3 +238,49 @@ def test_it_ends_with_pages_still_open(mine):
     assert not any(t.is_alive() and "uvicorn" in t.name for t in threading.enumerate())
     with socket:
         assert list(socket) == []  # closed by the server
+
+
+def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine):
+    """The first adjustment is held at its first step until the observations have been asked for."""
+    bench, seen = Workbench(mine), threading.Event()
+    server = Server(bench, TOKEN)
+    bench.watch = lambda _step, _omega: seen.wait(20.0)
+    with TestClient(server.app(), base_url="http://127.0.0.1:8790") as client:
+        assert client.get("/api/state", headers=HERE).json()["solution"] is None
+        assert client.get("/api/points", headers=HERE).status_code == 200
+        assert client.get("/api/findings", headers=HERE).json()["findings"] == []
+        assert client.get("/api/state", headers=HERE).json()["solution"] is None
+        seen.set()
+        for _ in range(400):
+            state = client.get("/api/state", headers=HERE).json()
+            if state["solution"] is not None:
+                break
+            time.sleep(0.05)
+        assert state["solution"]["verdict"]
+        assert client.get("/api/parameters", headers=HERE).status_code == 200
+
+
+def test_messages_are_in_the_language_that_is_asked_for(mine):
+    with page(mine) as client:
+        english = post(client, "/api/undo", {"base": 1}).json()["error"]
+        german = post(client, "/api/undo", {"base": 1}, **{"X-Language": "de"}).json()["error"]
+        other = post(client, "/api/undo", {"base": 1}, **{"X-Language": "tlh"}).json()["error"]
+        reason, said = (client.get("/api/state", headers=HERE | {"X-Language": x}).json()["solution"]["reason"]
+                        for x in ("de", "en"))  # fmt: skip
+    assert english == other == f"{mine}: there is nothing to undo"
+    assert german == f"{mine}: nichts kann rückgängig gemacht werden"
+    with speaking("de"):
+        assert reason == message(said) != said
+
+
+def test_remedies_jobs_and_the_network_are_asked_for_as_the_page_does(mine):
+    with page(mine) as client:
+        refused = post(client, "/api/remedy", {"base": 1, "number": 1})
+        assert (refused.status_code, "no cause that it could change" in refused.json()["error"]) == (409, True)
+        assert post(client, "/api/remedy", {"base": 1}).status_code == 400
+        unknown = post(client, "/api/jobs/detct", {})
+        assert (unknown.status_code, "detect" in unknown.json()["error"]) == (409, True)
+        assert post(client, "/api/jobs/compare", {"folder": "nowhere"}).status_code == 409
+        assert client.get("/api/network", headers=HERE).json()["lines"] == []
+    with page(mine, read_only=True) as client:
+        assert post(client, "/api/jobs/batch", {}).status_code == 403

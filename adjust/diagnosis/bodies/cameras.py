@@ -34,11 +34,14 @@ class Difference:
     cov: FloatArray
     motion: Pose3
 
-    def vanishes(self, rows: Sequence[int], expected: FloatArray | None = None) -> bool:
-        """Whether these components are as expected (zero where not given), by a chi-square test."""
+    def vanishes(self, rows: Sequence[int], follow: FloatArray | None = None) -> bool:
+        """Whether these components are zero, or follow the first focal length by these factors: a chi-square test."""
+        C = np.eye(len(self.d))
+        if follow is not None:
+            C[:, next(i for i, name in enumerate(self.names) if name in _FOCAL)] -= follow
         at = list(rows)
-        off = (self.d if expected is None else self.d - expected)[at]
-        inverse = np.linalg.pinv(self.cov[np.ix_(at, at)], rcond=1e-14, hermitian=True)
+        off, cov = (C @ self.d)[at], (C @ self.cov @ C.T)[np.ix_(at, at)]
+        inverse = np.linalg.pinv(cov, rcond=1e-14, hermitian=True)
         return float(off @ inverse @ off) < float(chi2.isf(_ALPHA, len(at)))
 
 
@@ -129,8 +132,7 @@ def _named(hypothesis: Hypothesis, found: Difference) -> Hypothesis:
                        cause=f"{begin}its images are shifted by ({shift}) px: another crop of the sensor")  # fmt: skip
     if focal:
         ratio = 1.0 + found.d[focal[0]] / found.before[focal[0]]
-        expected = _resized(found, ratio)
-        if found.vanishes([*focal[1:], *centre, *other, *place], expected):
+        if found.vanishes([*focal[1:], *centre, *other, *place], _resized(found)):
             return replace(hypothesis, name="images resized", parameters=2,
                            cause=f"{begin}its images have {ratio:.5g} times the size")  # fmt: skip
         if found.vanishes([*other, *place]):
@@ -144,12 +146,13 @@ def _named(hypothesis: Hypothesis, found: Difference) -> Hypothesis:
     return hypothesis
 
 
-def _resized(found: Difference, ratio: float) -> FloatArray:
-    """What the difference (n + 6,) is where the image was scaled, the corner of its first pixel staying where it is."""
+def _resized(found: Difference) -> FloatArray:
+    """(n + 6,) by the first focal length's difference, where images were scaled about their corner."""
     out = np.zeros_like(found.d)
+    first = next(found.before[i] for i, name in enumerate(found.names) if name in _FOCAL)
     for i, name in enumerate(found.names):
         if name in _FOCAL:
-            out[i] = (ratio - 1.0) * found.before[i]
+            out[i] = found.before[i] / first
         elif name in ("u0", "v0"):
-            out[i] = (ratio - 1.0) * (found.before[i] + 0.5)
+            out[i] = (found.before[i] + 0.5) / first
     return out

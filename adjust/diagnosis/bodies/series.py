@@ -4,15 +4,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from gtsam import Pose3
 
 from adjust.diagnosis.case import Case
+from adjust.diagnosis.prediction import adjusted_pose, chains_of
 from adjust.diagnosis.table.views import adjoint, view_covariance
-from adjust.frames.chains import table_motion
-from adjust.frames.unknowns import Chain, FrameTree, Unknowns
+from adjust.frames.unknowns import Chain
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import FloatArray, IntArray, Survey
-from adjust.spatial.rigid import inverse, rigid, rotation_log
+from adjust.model.survey import FloatArray, IntArray
+from adjust.spatial.rigid import inverse, rotation_log
 from adjust.testing.distributions import chi2
 
 _CAP = 60.0  # of one comparison of two images, chi-square with six degrees of freedom
@@ -48,18 +47,10 @@ class Step:
     motion: FloatArray | None = None
 
 
-def chains_of(survey: Survey) -> tuple[dict[int, str | tuple[str, ...]], list[Chain]]:
-    """The names of all slots, and the chain ``camera_from_target`` of every block."""
-    unknowns = Unknowns()
-    frames = FrameTree(survey, unknowns)
-    chains = [frames.of_image(block) for block in survey.image_blocks]
-    return {slot: name for name, slot in unknowns.slot_of.items()}, chains
-
-
 def series_of(case: Case, result: Adjustment) -> list[Series]:
     """For every pose of a camera or a target that is the same for several images: what each of them says about it."""
     names, chains = chains_of(case.survey)
-    poses = {slot: _pose(case.survey, result, tuple(name)) for slot, name in names.items()}
+    poses = {slot: adjusted_pose(case.survey, result, tuple(name)) for slot, name in names.items()}
     users: dict[int, list[int]] = {}
     for i, chain in enumerate(chains):
         for link in chain:
@@ -108,7 +99,7 @@ def placed_views(case: Case, result: Adjustment, target_id: str) -> tuple[FloatA
     """
     names, chains = chains_of(case.survey)
     slot = next((s for s, name in names.items() if name == ("carrier_from_target", target_id)), None)
-    poses = {s: _pose(case.survey, result, tuple(name)) for s, name in names.items()}
+    poses = {s: adjusted_pose(case.survey, result, tuple(name)) for s, name in names.items()}
     places, offsets = [], []
     for i, chain in enumerate(chains):
         if slot is None or case.survey.image_blocks[i].target_id != target_id:
@@ -120,26 +111,6 @@ def placed_views(case: Case, result: Adjustment, target_id: str) -> tuple[FloatA
             places.append(c)
             offsets.append(link[:3, 3] - c)
     return np.array(places).reshape(-1, 3), np.array(offsets).reshape(-1, 3)
-
-
-def _pose(survey: Survey, result: Adjustment, name: tuple[str, ...]) -> FloatArray | None:
-    """(4, 4) of a slot; None where the adjustment has no value of it."""
-    if name[0] == "table_motion":
-        angles = result.estimates.get(("table_angles", name[1], name[2]))
-        geometry = result.estimates.get(("table_geometry", name[1]))
-        read = next((r for r in survey.table_readings if (r.table_id, r.epoch_id) == name[1:]), None)
-        if geometry is None or (angles is None and read is None):
-            return None
-        table = next(t for t in survey.tables if t.table_id == name[1])
-        g = dict(zip(geometry.components, np.asarray(geometry.value), strict=True))
-        said = np.asarray(angles.value) if angles is not None else read.angles if read is not None else np.zeros(0)
-        a = [float(v) + g.get(f"zero_{k + 1}", 0.0) for k, v in enumerate(said)]
-        axes = ["xyz".index(x) for x in table.axes]
-        one = [np.array([v]) for v in (a[0], a[-1], g.get("non_orthogonality", 0.0), g.get("axis_offset", 0.0))]
-        R, t, _ = table_motion(axes[0], axes[1] if len(axes) > 1 else -1, *one)
-        return rigid(R[0], t[0])
-    estimate = result.estimates.get(name)
-    return estimate.value.matrix() if estimate is not None and isinstance(estimate.value, Pose3) else None
 
 
 def step_of(series: Series) -> Step | None:

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.images.mirrored import mirrored_images
+from adjust.diagnosis.targets.layout import other_layouts
 
 __all__ = ["hypotheses"]
 
@@ -12,3 +13,4 @@ __all__ = ["hypotheses"]
 def hypotheses(case: Case) -> Iterable[Hypothesis]:
     """What the images of flat targets show of themselves."""
     yield from mirrored_images(case)
+    yield from other_layouts(case)

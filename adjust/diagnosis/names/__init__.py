@@ -6,7 +6,9 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.names.epochs import misplaced_epochs
 from adjust.diagnosis.names.given import wrong_given
+from adjust.diagnosis.names.images import misnamed_images
 from adjust.diagnosis.names.points import exchanged_points
+from adjust.diagnosis.names.setups import rows_of_another_setup
 
 
 def hypotheses(case: Case) -> Iterator[Hypothesis]:
@@ -14,3 +16,5 @@ def hypotheses(case: Case) -> Iterator[Hypothesis]:
     yield from exchanged_points(case)
     yield from wrong_given(case)
     yield from misplaced_epochs(case)
+    yield from misnamed_images(case)
+    yield from rows_of_another_setup(case)

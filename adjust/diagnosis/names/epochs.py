@@ -14,6 +14,7 @@ from gtsam import Pose3, Rot3
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.sequences import Link, Shift, fitted, links, shifts
+from adjust.model.errors import listed
 from adjust.model.observations import FrameRef, ImageBlock, Pair, TableReading
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.averaging import mean_pose
@@ -133,7 +134,7 @@ def _cameras(survey: Survey, link: Link) -> Iterator[Hypothesis]:
 def _listed(some: tuple[str, ...], every: tuple[str, ...]) -> str:
     if some == every[-len(some) :] and len(some) > 1:
         return f"epoch {some[0]} and from it on"
-    return "epoch " + ", ".join(some[:6]) + (f" and {len(some) - 6} more" if len(some) > 6 else "")
+    return f"epoch {listed(some, 6)}"
 
 
 def exchanged_cameras(survey: Survey, a: str, b: str, epochs: tuple[str, ...]) -> Survey:

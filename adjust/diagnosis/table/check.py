@@ -25,7 +25,7 @@ from adjust.diagnosis.table.places import (
 from adjust.diagnosis.table.readings import shared_mistake
 from adjust.diagnosis.table.signs import SignVerdict, given_constants, sign_mistake
 from adjust.diagnosis.table.views import TableViews, table_views
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray, Survey, Table
 from adjust.spatial.rigid import inverse, rotation_log
@@ -163,11 +163,6 @@ def _sign_text(table: Table, verdict: SignVerdict) -> str:
     )
 
 
-def _names(ids: Sequence[str]) -> str:
-    more = f" and {len(ids) - _SHOWN} more" if len(ids) > _SHOWN else ""
-    return ", ".join(ids[:_SHOWN]) + more
-
-
 def _moved_text(views: TableViews, found: Places) -> str:
     moved, second = found.moved or 0, found.second
     first = np.flatnonzero(found.place == moved)
@@ -179,8 +174,8 @@ def _moved_text(views: TableViews, found: Places) -> str:
     D = inverse(found.fit.table_from_place[a]) @ found.fit.table_from_place[b]
     epochs = [views.epoch_ids[e] for e in np.unique(views.epoch[later])]
     return (
-        f"{' '.join(views.outer_ids[moved])} was moved between images: at epochs {_names(epochs)} it stands elsewhere "
-        f"than at the others, {_motion_text(D)}; give it a name of its own there, or leave these epochs out"
+        f"{' '.join(views.outer_ids[moved])} was moved between images: at epochs {listed(epochs, _SHOWN)} it stands "
+        f"elsewhere than at the others, {_motion_text(D)}; give it a name of its own there, or leave these epochs out"
     )
 
 

@@ -178,8 +178,8 @@ def poses_of_views(survey: Survey) -> dict[int, View]:
     seen = dict.fromkeys(b.camera_id for b in survey.image_blocks)
     # those without a pose are named by the search for start values
     found = single_views(survey, {camera_id: own_lens(survey, cameras[camera_id]) for camera_id in seen})
-    reasons, _ = untrustworthy(list(found.values()), survey)
-    return {i: view for i, view in found.items() if i not in reasons}
+    reasons, _ = untrustworthy(found, survey)
+    return {view.block_idx: view for view in found if view.block_idx not in reasons}
 
 
 def _stands(survey: Survey, station_id: str) -> bool:

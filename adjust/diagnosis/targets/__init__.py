@@ -1,17 +1,14 @@
-"""Targets whose points are not where their owner says: wrong size, stretched, sheared, bent."""
+"""Targets of quite another size than their owner says. Small differences in size and shape are effects."""
 
 from collections.abc import Iterable
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
-from adjust.diagnosis.targets.shape import bent_targets, stretched_targets
 from adjust.diagnosis.targets.size import wrong_sizes
 
 __all__ = ["hypotheses"]
 
 
 def hypotheses(case: Case) -> Iterable[Hypothesis]:
-    """The targets with the largest misfit, as of another size, stretched or sheared, and bent."""
+    """The targets that the rest contradicts, as of another size."""
     yield from wrong_sizes(case)
-    yield from stretched_targets(case)
-    yield from bent_targets(case)

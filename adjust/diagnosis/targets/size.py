@@ -47,12 +47,20 @@ def wrong_sizes(case: Case) -> Iterator[Hypothesis]:
 
 
 def _hypotheses(survey: Survey, target: str, ratio: float, sigma: float) -> Iterator[Hypothesis]:
-    near = max(_NEAR, _CLEAR * sigma / ratio)
-    known = [(f, why) for f, why in KNOWN if abs(np.log(ratio / f)) < near]
     clear = ((ratio - 1.0) / sigma) ** 2
-    for factor, why in sorted(known, key=lambda item: abs(np.log(ratio / item[0])))[:1]:
-        yield _hypothesis(survey, target, factor, f": {why}", 1, clear)
+    factor, why = well_known(ratio, sigma)
+    if why:
+        yield _hypothesis(survey, target, factor, why, 1, clear)
     yield _hypothesis(survey, target, ratio, "", 2, 0.9 * clear)
+
+
+def well_known(ratio: float, sigma: float) -> tuple[float, str]:
+    """The nearest factor that explains itself, and how it comes about; the ratio and "" where none is near."""
+    if not ratio > 0.0:
+        return ratio, ""
+    near = max(_NEAR, _CLEAR * sigma / ratio)
+    known = [(f, f": {why}") for f, why in KNOWN if abs(np.log(ratio / f)) < near]
+    return min(known, key=lambda item: abs(np.log(ratio / item[0])), default=(ratio, ""))
 
 
 def _hypothesis(survey: Survey, target: str, factor: float, why: str, parameters: int, clear: float) -> Hypothesis:

@@ -7,12 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.diagnosis.hypothesis import Place
 from adjust.model.observations import ReadingKind
-from adjust.model.survey import FloatArray
+from adjust.model.survey import FloatArray, IntArray
 
 ANGLES: tuple[ReadingKind, ...] = ("direction", "angle", "azimuth", "zenith")
 TURNS: tuple[ReadingKind, ...] = ("direction", "angle", "azimuth")
 LENGTHS: tuple[ReadingKind, ...] = ("slope_distance", "horizontal_distance", "height_difference")
+
+
+@dataclass(frozen=True, eq=False)
+class Scope:
+    """Readings or pairs (rows) that are mended together; text: what they are called."""
+
+    rows: IntArray
+    text: str
+    place: Place
 
 
 @dataclass(frozen=True)

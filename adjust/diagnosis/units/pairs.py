@@ -16,6 +16,7 @@ from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
 from adjust.diagnosis.screen import Screen, screen
 from adjust.diagnosis.sequences import Link, fitted, links, typical, with_pairs
+from adjust.diagnosis.units.conventions import Scope
 from adjust.graph.assembly import values_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair
@@ -125,13 +126,6 @@ CONVENTIONS: tuple[Convention, ...] = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class _Scope:
-    rows: IntArray
-    text: str
-    place: Place
-
-
 def misread_pairs(case: Case) -> Iterator[Hypothesis]:
     """The conventions for which loops, or what the pairs join, speak; the clearest first."""
     survey = case.survey
@@ -141,7 +135,7 @@ def misread_pairs(case: Case) -> Iterator[Hypothesis]:
     judge = _by_hands(survey, hands) if hands else _by_start(case)
     if judge is None:
         return
-    found, looked_at = list[tuple[float, _Scope, Convention, Survey]](), 0
+    found, looked_at = list[tuple[float, Scope, Convention, Survey]](), 0
     for scope in _scopes(survey, judge.worst):
         for convention in CONVENTIONS:
             changed = mended(survey, scope.rows, convention)
@@ -184,21 +178,21 @@ def mended(survey: Survey, rows: IntArray, convention: Convention) -> Survey | N
     return with_pairs(survey, new)
 
 
-def _scopes(survey: Survey, worst: IntArray) -> Iterator[_Scope]:
+def _scopes(survey: Survey, worst: IntArray) -> Iterator[Scope]:
     every = np.array([i for i, p in enumerate(survey.pairs) if p.used], dtype=np.int64)
-    yield _Scope(every, "all measured pairs", Place("pair", ("all",)))
+    yield Scope(every, "all measured pairs", Place("pair", ("all",)))
     groups = list(dict.fromkeys(survey.pairs[i].group for i in every))
     for group in groups if len(groups) > 1 else []:
         rows = np.array([i for i in every if survey.pairs[i].group == group])
-        yield _Scope(rows, f"the pairs of group {group}", Place("group", (group,)))
+        yield Scope(rows, f"the pairs of group {group}", Place("group", (group,)))
     ends = {r.frame_id for i in every for r in (survey.pairs[i].a, survey.pairs[i].b)}
     for frame_id in sorted(ends) if 2 < len(ends) < 40 else []:
         rows = np.array([i for i in every if frame_id in (survey.pairs[i].a.frame_id, survey.pairs[i].b.frame_id)])
         if 1 < len(rows) < len(every):
-            yield _Scope(rows, f"the pairs of {frame_id}", Place("station", (frame_id,)))
+            yield Scope(rows, f"the pairs of {frame_id}", Place("station", (frame_id,)))
     for i in worst[:_SINGLE].tolist():
         pair = survey.pairs[i]
-        yield _Scope(np.array([i]), f"pair {pair.pair_id}: its values", Place("pair", (pair.pair_id,)))
+        yield Scope(np.array([i]), f"pair {pair.pair_id}: its values", Place("pair", (pair.pair_id,)))
 
 
 @dataclass(frozen=True, eq=False)

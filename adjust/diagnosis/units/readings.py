@@ -5,14 +5,14 @@ where there is one). What concerns every reading of its kind may have spoilt the
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.screen import Screen, improvement, screen
-from adjust.diagnosis.units.conventions import ANGLES, LENGTHS, MISREADINGS, SLIPS, TURNS, Misreading
+from adjust.diagnosis.units.conventions import ANGLES, LENGTHS, MISREADINGS, SLIPS, TURNS, Misreading, Scope
 from adjust.graph.assembly import values_of
 from adjust.model.observations import Reading
 from adjust.model.survey import FloatArray, IntArray, Survey
@@ -24,15 +24,6 @@ _CLEARLY = 3.0
 _MOST, _SINGLE = 6, 8
 _LARGE_START = 2500
 """Readings up to which start values are found anew for every hypothesis that concerns all of a kind."""
-
-
-@dataclass(frozen=True, eq=False)
-class Scope:
-    """Readings (rows) that are mended together; text: what they are called."""
-
-    rows: IntArray
-    text: str
-    place: Place
 
 
 def misread_readings(case: Case) -> Iterator[Hypothesis]:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.weights.correlated import correlated_readings
 from adjust.diagnosis.weights.sigmas import odd_sigmas, wrong_factors
 
 
@@ -11,3 +12,4 @@ def hypotheses(case: Case) -> Iterator[Hypothesis]:
     """Of single sigmas, then of groups."""
     yield from odd_sigmas(case)
     yield from wrong_factors(case)
+    yield from correlated_readings(case)

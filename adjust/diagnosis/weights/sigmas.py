@@ -12,6 +12,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey
+from adjust.model.errors import listed
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
 from adjust.statistics.scaling import scaled_survey
@@ -95,7 +96,7 @@ def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[Any], u
     penalty = float(sum(2.0 * np.log(usual / max(o.sigma, 1e-300)) for o in odd))
     ratio = max(max(o.sigma / usual, usual / max(o.sigma, 1e-300)) for o in odd)
     return Hypothesis(
-        "odd sigma", f"{kind} {', '.join(ids[:5])}{f' and {len(ids) - 5} more' if len(ids) > 5 else ''}: the sigma "
+        "odd sigma", f"{kind} {listed(ids, 5)}: the sigma "
         f"is {ratio:.0f} times off the usual one of group {group}", "give the sigma that was meant, or none",
         Place("reading", tuple(ids), "sigma"), replace(case.survey, **changed), (),
         min(ratio, 10.0), penalty=penalty,

@@ -17,6 +17,7 @@ from adjust.frames.unknowns import Chain
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.images import (
+    N_SHAPE,
     BlockArrays,
     BlocksAt,
     ByKeys,
@@ -24,6 +25,7 @@ from adjust.native.images import (
     PointArrays,
     all_statistics,
     block_rows,
+    condensed_rows,
     errors,
     local_by_keys,
     normal_equations,
@@ -110,6 +112,7 @@ class ImageBatch:
         self.used: BoolArray = used_points(blocks)
         self.W_all_columns = np.ascontiguousarray(self.W_all.T)
         self.W = self.W_all_columns * self.used
+        self._weighed: tuple[BoolArray, FloatArray] | None = None
         self.arrays = BlockArrays(self.ptr, self.camera, self.warp_id, self.n_warp)
         self.points = _point_arrays(survey, blocks, x_in_world, warped.keys())
         self._place_keys()
@@ -235,6 +238,23 @@ class ImageBatch:
         out = np.zeros((len(which), 2 * int(self.ptr[b + 1] - self.ptr[b]), int(self.n_rows[b])))
         block_rows(which, self.at(self.W_all_columns), out)
         return out
+
+    def condensed_rows(self, which: IntArray, factors: FloatArray) -> FloatArray:
+        """Rows (g, m, local unknowns, 4 of the shape and 1) of the used points of g blocks that are alike.
+
+        The same normal equations as all their rows; factors as :func:`adjust.native.images.condensed_rows` has them.
+        """
+        k = int(self.n_rows[which[0]]) + N_SHAPE
+        out = np.zeros((len(which), min(2 * factors.shape[1], k), k))
+        condensed_rows(which, self.at(self._used_weights), factors, out)
+        return out
+
+    @property
+    def _used_weights(self) -> FloatArray:
+        """Square root information (3, N) of the points that are used, their weights left aside; else zero."""
+        if self._weighed is None or self._weighed[0] is not self.used:
+            self._weighed = self.used, self.W_all_columns * self.used
+        return self._weighed[1]
 
     def local_from_keys(self, which: IntArray) -> FloatArray:
         """Derivative (g, n_lens + 6 + n_warp, sum of key dims) of the local unknowns of g alike blocks by keys."""

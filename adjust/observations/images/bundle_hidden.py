@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 
-import gtsam
 import numpy as np
 import scipy
 from scipy import sparse
@@ -29,6 +28,12 @@ class BundleHidden:
     def __init__(self, batch: BundleBatch) -> None:
         self.batch = batch
         self._given_interface: tuple[FloatArray, FloatArray] | None = None
+
+        self._keys = {*batch.hidden_poses, *(batch.point_key[i] for i in batch.reduced)}
+
+    def hides(self, key: int) -> bool:
+        """Whether an unknown is one of those hidden here."""
+        return key in self._keys
 
     def rows_along(self, V: FloatArray) -> FloatArray:
         """Whitened Jacobian times directions V (n_interface, k) as rows (2K, k), what is hidden following best.
@@ -68,11 +73,11 @@ class BundleHidden:
             self._given_interface = T / scale[:, None] * b.scale[nh:], P
         return self._given_interface
 
-    def covariances(self, Q_interface: FloatArray, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def covariances(self, Q_interface: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Covariances of everything hidden, from the interface's joint covariance (order ``interface``).
 
         Returns that of all poses and tied points (order ``order``), of the reduced points (P, 3, 3), and the whitened
-        A Q A' (K, 3) of every image point (sorted order). The batch must be prepared with Jacobians at ``values``.
+        A Q A' (K, 3) of every image point (sorted order). The batch must be prepared with Jacobians at the solution.
         """
         b = self.batch
         nh, n = b.n_hidden, b.n_keys
@@ -84,7 +89,7 @@ class BundleHidden:
             Q[nh:, :nh] = Q[:nh, nh:].T
             np.matmul(Q[:nh, nh:], T.T, out=Q[:nh, :nh])
             Q[:nh, :nh] += P
-        b.evaluate_rows(values, b.W_all)
+        b.evaluate_rows(b.W_all)
         return Q, *self._of_points_and_rows(self._local_covariance(Q))
 
     def _local_covariance(self, Q: FloatArray) -> FloatArray:

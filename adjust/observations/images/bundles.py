@@ -46,10 +46,17 @@ BLIND_MOTION = 1e-10
 _Rows = TypeVar("_Rows", FloatArray, BoolArray)
 
 
+def may_be_hidden(unknowns: Unknowns, key: int) -> bool:
+    """Whether an unknown is the pose of a station at one epoch, which image points alone may determine."""
+    name = unknowns.by_key[key].name
+    return name[0] == "world_from_station" and len(name) == 3
+
+
 class BundleBatch:
     """Image blocks of world points, of which some are unknown.
 
-    points: ids in the order of ``point_idx`` of the blocks. outside: keys that other factors touch.
+    points: ids in the order of ``point_idx`` of the blocks. outside: keys that other factors touch. Inside, only the
+    points that these blocks see are numbered.
     """
 
     def __init__(
@@ -64,7 +71,9 @@ class BundleBatch:
         self.unknowns, self.state = unknowns, state
         self.blocks = tuple(blocks)
         self.chains = Chains(chains)
-        self.point_ids = tuple(points)
+        idx = np.concatenate([b.point_idx for b in blocks])
+        present, self._point_of_rows = np.unique(idx, return_inverse=True)
+        self.point_ids = tuple(points[i] for i in present.tolist())
         self.camera = np.array([state.cameras[b.camera_id] for b in blocks], dtype=np.int64)
         self.block_ptr: IntArray = np.cumsum([0] + [len(b.uv) for b in blocks])
         self._choose_interface(outside)
@@ -92,17 +101,12 @@ class BundleBatch:
         pose_keys: list[int] = []
         for slot in self.chains.slot:
             pose_keys += [k for k in self.unknowns.link_keys(int(slot)) if k not in pose_keys]
-        may_hide = [
-            k
-            for k in pose_keys
-            if k not in outside and self.unknowns.by_key[k].name[0] == "world_from_station"
-            and len(self.unknowns.by_key[k].name) == 3
-        ]  # fmt: skip
+        may_hide = [k for k in pose_keys if k not in outside and may_be_hidden(self.unknowns, k)]
         self.hidden_poses = may_hide[1:-1]
         hidden = set(self.hidden_poses)
         lens_keys = [m.key for i, m in enumerate(self.state.lens_maps) if m.key is not None and i in set(self.camera)]
         if not lens_keys and not pose_keys and not self.tied:
-            self.tied = sorted(int(i) for b in self.blocks for i in b.point_idx if int(i) in key_of)[:1]
+            self.tied = sorted(key_of)[:1]
             self.reduced = [i for i in self.reduced if i not in self.tied]
         self.interface = lens_keys + [k for k in pose_keys if k not in hidden] + [key_of[i] for i in self.tied]
         self.order = self.hidden_poses + self.interface
@@ -114,7 +118,7 @@ class BundleBatch:
 
     def _sort_observations(self) -> None:
         block = np.repeat(np.arange(len(self.blocks)), np.diff(self.block_ptr))
-        point = np.concatenate([b.point_idx for b in self.blocks])
+        point = self._point_of_rows
         group = np.full(len(self.point_ids), 0)  # reduced points first, then those that stay, then the held
         group[self.tied] = 1
         group[[i for i in range(len(self.point_ids)) if i not in self.point_key]] = 2
@@ -173,7 +177,8 @@ class BundleBatch:
             self.by_ptr, self.pc_ptr, self.pc_camera, self.pc_of, n_lens, self.lens_at, self.first_pose,
         )  # fmt: skip
         self.chi, self.depth = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
-        self._points_by_key = np.array(sorted(self.point_key, key=self.point_key.__getitem__), dtype=np.int64)
+        self._free = np.array(list(self.point_key), dtype=np.int64)
+        self._free_rows = np.array([self.state.point_rows[key] for key in self.point_key.values()], dtype=np.int64)
 
     def _place_derivatives(self) -> None:
         """Where the derivatives of the local unknowns by the keys stand; which hidden poses own one block alone."""
@@ -227,29 +232,20 @@ class BundleBatch:
 
     # -- evaluation --------------------------------------------------------------------------------------------------
 
-    def evaluate_rows(self, values: gtsam.Values, W: FloatArray) -> None:
-        """Fill A with the rows of all image points at ``values``, whitened by W (K, 3); chi-square and least depths."""
+    def evaluate_rows(self, W: FloatArray) -> None:
+        """Fill A with the rows of all image points at what the state has, whitened by W (K, 3); chi-square, depths."""
         self.state.outdate()
         s, c = self.state, self.chains
-        self._load_points(values)
+        self.world[self._free] = s.points[self._free_rows]
         self.X[:] = self.world[self.point]
         rows(
             self.block, self.camera, s.lenses, c.R, c.t, self.X, self.uv, W, self.A, self.chi, self.depth,
         )  # fmt: skip
 
-    def _load_points(self, values: gtsam.Values) -> None:
-        """The free points: in one call where ``values`` hold no others, which it gives in the order of their keys."""
-        x = gtsam.utilities.extractPoint3(values)
-        if len(x) == len(self._points_by_key):
-            self.world[self._points_by_key] = x
-            return
-        for i, key in self.point_key.items():
-            self.world[i] = values.atPoint3(key)
-
     def prepare(self, values: gtsam.Values, jacobians: bool, damping: float = 0.0) -> None:
         """Evaluate at ``values`` (already loaded into the state). Raises IndeterminateError for undetermined points."""
         self.chains.evaluate(self.state)
-        self.evaluate_rows(values, self.W)
+        self.evaluate_rows(self.W)
         self.chi_square = float(self.chi.sum())
         if jacobians:
             self._condense(values, damping)
@@ -443,9 +439,9 @@ class BundleBatch:
         out[self.sorted] = rows
         return out
 
-    def whitened_squares(self, values: gtsam.Values) -> FloatArray:
-        """Weighted squares v' inv(Q_ll) v (N,) of all image points at ``values``, blocks in their order."""
-        self.evaluate_rows(values, self.W_all)
+    def whitened_squares(self) -> FloatArray:
+        """Weighted squares v' inv(Q_ll) v (N,) of all image points where the batch was prepared, as its blocks are."""
+        self.evaluate_rows(self.W_all)
         return self.unsorted((self.A[:, :, MAX_LENS + 6] ** 2).sum(axis=1))
 
     def add_factor(self, graph: gtsam.NonlinearFactorGraph) -> None:

@@ -23,6 +23,8 @@ from adjust.observations.images.batch import ImageBatch
 from adjust.observations.images.segments import first_seen, ranges
 
 _FEWEST_POSES = 8
+_SUMS = 4
+"""Sums of what the poses leave, so many for any number of threads: the same to the last bit."""
 _WIDEST_INTERFACE = 700
 """Components that the epochs may share: their normal matrix is dense here."""
 _AT_EPOCHS = ("world_from_station", "carrier_from_target")
@@ -89,7 +91,7 @@ class PoseReduction:
         starts = list(accumulate(widths, initial=0))
         self.interface = Interface(tuple(keys), dict(zip(keys, starts, strict=False)), starts[-1])
         self._place(of_pose, owner[k.block[of_pose]], number, np.array(widths, dtype=np.int64), order, block_ptr)
-        runs = split_blocks(np.concatenate([[0], np.cumsum(np.diff(batch.ptr)[order])])[block_ptr])
+        runs = split_blocks(np.concatenate([[0], np.cumsum(np.diff(batch.ptr)[order])])[block_ptr], _SUMS)
         self._turns = [np.append(turn, run) for turn, run in enumerate(runs)]
         self._blocks = order
 

@@ -113,6 +113,10 @@ def reading_arrays(
     )
 
 
+_Sight = tuple[int, int, tuple[int, ...], bool]
+"""First column, number of the position or chain, its keys, and whether it is an unknown point."""
+
+
 @dataclass(eq=False)
 class LayoutBuilder:
     """Groups readings into chunks and finds the place of each derivative; one use."""
@@ -134,6 +138,12 @@ class LayoutBuilder:
         self.centring_maps = list(p.centrings.values())
         self.instrument_maps = [None, *p.instruments.values()]
         self.dims = {key: u.dim for key, u in self.unknowns.by_key.items()}
+        a = self.arrays
+        self.rows = list(zip(*(x.tolist() for x in (a.kind, a.at, a.to, a.second, a.orientation, a.centring,
+                                                    a.instrument, a.body)), strict=True))  # fmt: skip
+        self.raised = np.count_nonzero(a.heights[:, 1:], axis=1).tolist()
+        self.sights: dict[tuple[int, ...], list[_Sight]] = {}
+        self.cells: dict[int, list[tuple[int, int, float]]] = {}
 
     def build(self) -> Layout:
         """The layout."""
@@ -197,9 +207,10 @@ class LayoutBuilder:
         return rows, scipy.linalg.solve_triangular(L, np.diag(1.0 / scale), lower=True)
 
     def _chunk(self, number: int, rows: list[int], whitener: FloatArray | None) -> Chunk:
+        parts = [(r, self._sights(r), self._vectors(r)) for r in rows]
         keys: dict[int, int] = {}
-        for r in rows:
-            for key in self._keys(r):
+        for _, sights, vectors in parts:
+            for key in (*(key for sight in sights for key in sight[2]), *(key for _, key, _ in vectors)):
                 keys.setdefault(key, self.dims[key])
         if not keys and whitener is not None:
             names = ", ".join(repr(self.survey.readings[r].reading_id) for r in rows[:3])
@@ -208,52 +219,48 @@ class LayoutBuilder:
         for key, dim in keys.items():
             at[key] = self.size
             self.size += dim * len(rows)
-        for i, r in enumerate(rows):
-            self._place(number, r, {key: at[key] + i * dim for key, dim in keys.items()})
+        for i, (r, sights, vectors) in enumerate(parts):
+            goal = {key: at[key] + i * dim for key, dim in keys.items()}
+            for column, chain, own, is_point in sights:
+                if is_point:
+                    self.blocks.append((goal[own[0]], r, column))
+                elif own:
+                    mine = {key: goal[key] for key in own}
+                    self.chain_rows.setdefault(number, []).append(ChainRow(r, column, chain, mine))
+            self.singles += [(goal[key] + k, r, column + j, f) for column, key, m in vectors
+                             for j, k, f in self._cells(key, m)]  # fmt: skip
         return Chunk(np.array(rows, dtype=np.int64), tuple(keys), tuple(keys.values()), start, whitener)
 
-    def _sights(self, r: int) -> list[tuple[int, Position]]:
-        a = self.arrays
-        found = [(k.AT, a.at[r]), (k.TO, a.to[r])] + ([(k.SECOND, a.second[r])] if a.second[r] >= 0 else [])
-        return [(column, self.positions[i]) for column, i in found]
+    def _sights(self, r: int) -> list[_Sight]:
+        """The positions of a reading, and the body whose axes it is counted in."""
+        _, at, to, second, *_, body = self.rows[r]
+        found = self.sights.get((at, to, second, body))
+        if found is None:
+            ends = ((k.AT, at), (k.TO, to), (k.SECOND, second))
+            found = [(column, i, tuple(self.positions[i].keys), self.positions[i].point_key is not None)
+                     for column, i in ends if i >= 0]  # fmt: skip
+            if body >= 0:
+                found.append((k.BODY, len(self.positions) + body, tuple(self.bodies[body].keys), False))
+            self.sights[at, to, second, body] = found
+        return found
 
-    def _vectors(self, r: int) -> list[tuple[int, VectorMap]]:
-        """Vectors that take part in a reading and their first columns, those without unknowns left out."""
-        a = self.arrays
-        kind, found = a.kind[r], []
+    def _vectors(self, r: int) -> list[tuple[int, int, VectorMap]]:
+        """Vectors that take part in a reading: first columns and keys; those without unknowns are left out."""
+        kind, *_, orientation, centring, instrument, body = self.rows[r]
+        found: list[tuple[int, VectorMap | None]] = []
         if kind == k.DIRECTION:
-            found.append((k.ORIENTATION, self.orientation_maps[a.orientation[r]]))
-        if a.centring[r] >= 0:
-            found.append((k.CENTRING, self.centring_maps[a.centring[r]]))
-        instrument = self.instrument_maps[a.instrument[r]]
-        if instrument is not None and kind in (*_DISTANCES, k.ZENITH):
-            found.append((k.INSTRUMENT, instrument))
-        tilt = self.parameters.vertical.tilt
-        if tilt is not None and (a.body[r] < 0 or a.heights[r, 1:].any()):
-            found.append((k.TILT, tilt))
-        return [(column, m) for column, m in found if m.key is not None]
+            found.append((k.ORIENTATION, self.orientation_maps[orientation]))
+        if centring >= 0:
+            found.append((k.CENTRING, self.centring_maps[centring]))
+        if kind in (*_DISTANCES, k.ZENITH):
+            found.append((k.INSTRUMENT, self.instrument_maps[instrument]))
+        if body < 0 or self.raised[r]:
+            found.append((k.TILT, self.parameters.vertical.tilt))
+        return [(column, m.key, m) for column, m in found if m is not None and m.key is not None]
 
-    def _keys(self, r: int) -> list[int]:
-        keys = [key for _, position in self._sights(r) for key in position.keys]
-        if self.arrays.body[r] >= 0:
-            keys += self.bodies[self.arrays.body[r]].keys
-        return keys + [m.key for _, m in self._vectors(r) if m.key is not None]
-
-    def _place(self, chunk: int, r: int, goal: dict[int, int]) -> None:
-        for column, position in self._sights(r):
-            if position.point_key is not None:
-                self.blocks.append((goal[position.point_key], r, column))
-            elif position.keys:
-                chain = int(self.arrays.at[r] if column == k.AT else
-                            self.arrays.to[r] if column == k.TO else self.arrays.second[r])  # fmt: skip
-                mine = {key: goal[key] for key in position.keys}
-                self.chain_rows.setdefault(chunk, []).append(ChainRow(r, column, chain, mine))
-        body = int(self.arrays.body[r])
-        if body >= 0 and self.bodies[body].keys:
-            mine = {key: goal[key] for key in self.bodies[body].keys}
-            self.chain_rows.setdefault(chunk, []).append(ChainRow(r, k.BODY, len(self.positions) + body, mine))
-        for column, vector in self._vectors(r):
-            if vector.key is None:
-                continue
-            for i, j in np.argwhere(vector.matrix != 0.0).tolist():
-                self.singles.append((goal[vector.key] + j, r, column + i, float(vector.matrix[i, j])))
+    def _cells(self, key: int, vector: VectorMap) -> list[tuple[int, int, float]]:
+        """Rows, columns and values of what a vector's matrix is made of."""
+        if key not in self.cells:
+            row, column = np.nonzero(vector.matrix)
+            self.cells[key] = list(zip(row.tolist(), column.tolist(), vector.matrix[row, column].tolist(), strict=True))
+        return self.cells[key]

@@ -10,6 +10,7 @@ from typing import overload
 import gtsam
 import numpy as np
 
+from adjust.model.observations import Reading
 from adjust.model.result import ObservationResidual, ReadingResiduals
 from adjust.model.survey import FloatArray, Survey
 from adjust.native.trees import KeyCovariances, row_influences
@@ -82,6 +83,17 @@ def _correlated(
     return sigma_v / sigma, standardized, test, np.diag(root @ Q @ W)
 
 
+def reading_names(reading: Reading) -> tuple[str, ...]:
+    """Its id, and the positions it joins."""
+    refs = (reading.at, reading.to) if reading.second is None else (reading.at, reading.to, reading.second)
+    return (reading.reading_id, *map(position_text, refs))
+
+
+def reading_unit(kind: str) -> str:
+    """Of the values of a kind of reading: rad or m."""
+    return "rad" if kind in _ANGLES else "m"
+
+
 class JoinedResiduals(Sequence[ObservationResidual]):
     """Residuals of single observations, followed by those of all readings, each made when it is asked for."""
 
@@ -112,11 +124,8 @@ class JoinedResiduals(Sequence[ObservationResidual]):
 
     def _reading(self, i: int) -> ObservationResidual:
         reading, a, one = self.survey.readings[i], self.readings, slice(i, i + 1)
-        ids: tuple[str, ...] = (reading.reading_id, position_text(reading.at), position_text(reading.to))
-        if reading.second is not None:
-            ids = (*ids, position_text(reading.second))
         return ObservationResidual(
-            reading.kind, reading.group, ids, (reading.kind,), ("rad" if reading.kind in _ANGLES else "m",),
+            reading.kind, reading.group, reading_names(reading), (reading.kind,), (reading_unit(reading.kind),),
             a.observed[one], a.adjusted[one], a.residual[one], a.sigma[one], a.redundancy[one], a.standardized[one],
             float(a.test[i]), bool(a.used[i]),
         )  # fmt: skip

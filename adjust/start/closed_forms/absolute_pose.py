@@ -1,6 +1,5 @@
 """Poses of a camera from known points and the rays to them: all solutions, many views at once."""
 
-from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
@@ -20,6 +19,8 @@ def view_poses(x: FloatArray, rays: FloatArray, ptr: IntArray) -> tuple[FloatArr
     :func:`pose_solutions` finds them: unrefined, in no order and not checked for what lies in front.
     """
     both, planar = plane_poses(x, rays, ptr)
+    if planar.all():
+        return both.reshape(-1, 4, 4), np.repeat(np.arange(len(both)), 2), {}
     found, failed = list(both), {}
     for i in np.flatnonzero(~planar).tolist():
         part = slice(ptr[i], ptr[i + 1])
@@ -34,15 +35,17 @@ def view_poses(x: FloatArray, rays: FloatArray, ptr: IntArray) -> tuple[FloatArr
     return np.concatenate(found), np.repeat(np.arange(len(found)), [len(f) for f in found]), failed
 
 
-def best_poses(x: Sequence[FloatArray], rays: Sequence[FloatArray], refinements: int) -> tuple[FloatArray, FloatArray]:
+def best_poses(
+    x: FloatArray, rays: FloatArray, ptr: IntArray, refinements: int
+) -> tuple[FloatArray, FloatArray]:
     """Of every view the refined pose (B, 4, 4) with the least error (B,), rms rad, infinite where there is none."""
-    best, least = np.tile(np.eye(4), (len(x), 1, 1)), np.full(len(x), np.inf)
-    if not len(x):
+    n = len(ptr) - 1
+    best, least = np.tile(np.eye(4), (n, 1, 1)), np.full(n, np.inf)
+    if not n:
         return best, least
-    every, seen, ptr = np.concatenate(x), np.concatenate(rays), np.cumsum([0] + [len(part) for part in x])
-    poses, of, _ = view_poses(every, seen, ptr)
-    poses = refine_poses(poses, every, seen, ptr, refinements, of=of)
-    error, in_front = view_errors(poses, every, seen, ptr, of)
+    poses, of, _ = view_poses(x, rays, ptr)
+    poses = refine_poses(poses, x, rays, ptr, refinements, of=of)
+    error, in_front = view_errors(poses, x, rays, ptr, of)
     order = np.lexsort((error, of))
     order = order[in_front[order]]
     views, first = np.unique(of[order], return_index=True)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
+from adjust.spatial.averaging import medians
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +54,7 @@ def _newton_step(x: FloatArray, origins: FloatArray, across: FloatArray, point_o
     distance = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
     offset = (across @ towards[:, :, None])[..., 0] / distance[:, None]
     size = np.linalg.norm(offset, axis=1)
-    scale = np.maximum(3.0 * _medians(size, point_of, n), 1e-12)
+    scale = np.maximum(3.0 * medians(size, point_of, n), 1e-12)
     w = 1.0 / (distance**2 * (1.0 + (size / scale[point_of]) ** 2))
     normal = _sums(w[:, None, None] * across, point_of, n)
     right = _sums((w * distance)[:, None] * offset, point_of, n)
@@ -66,14 +67,4 @@ def _newton_step(x: FloatArray, origins: FloatArray, across: FloatArray, point_o
 def _sums(values: FloatArray, point_of: IntArray, n: int) -> FloatArray:
     out = np.zeros((n, *values.shape[1:]))
     np.add.at(out, point_of, values)
-    return out
-
-
-def _medians(values: FloatArray, point_of: IntArray, n: int) -> FloatArray:
-    order = np.lexsort((values, point_of))
-    count = np.bincount(point_of, minlength=n)
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    out = np.ones(n)
-    some = count > 0
-    out[some] = values[order][(first + count // 2)[some]]
     return out

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from adjust.start.readings.sights import Node, Sights
+from adjust.observations.terrestrial.batch import circular_median
+from adjust.start.readings.sights import Node, Sights, best_of_places
 
 _SURE = 0.15
 """Sine of the angle between two rays below which they do not intersect well."""
@@ -78,9 +79,9 @@ class PlaneStart:
         out = []
         for name, (a, targets) in self.sights.directions.items():
             xy = {a: 0j}
-            for b, angles in targets.items():
+            for b, angle in targets.items():
                 if (a, b) in self.distance:
-                    xy[b] = cmath.rect(self.distance[a, b], circular_median(angles))
+                    xy[b] = cmath.rect(self.distance[a, b], angle)
             if len(xy) > 1:
                 out.append(System(xy, {name: 0.0}))
         return out
@@ -95,12 +96,12 @@ class PlaneStart:
             return System({})
         a, targets = self.sights.directions[name]
         b = next(iter(targets))
-        return System({a: 0j, b: cmath.rect(1.0, circular_median(targets[b]))}, {name: 0.0})
+        return System({a: 0j, b: cmath.rect(1.0, targets[b])}, {name: 0.0})
 
     def _turn_by_azimuth(self, system: System) -> None:
         for (a, b), values in self.sights.azimuths.items():
             if a in system.xy and b in system.xy and system.xy[a] != system.xy[b]:
-                turn = circular_median(values) - cmath.phase(system.xy[b] - system.xy[a])
+                turn = circular_median(np.array(values)) - cmath.phase(system.xy[b] - system.xy[a])
                 move(system, cmath.rect(1.0, turn), 0j)
                 return
 
@@ -155,10 +156,10 @@ class PlaneStart:
         for name, (a, targets) in self.sights.directions.items():
             if name in system.turn or a not in system.xy:
                 continue
-            turns = [cmath.phase(system.xy[b] - system.xy[a]) - angle for b, angles in targets.items()
-                     if b in system.xy and system.xy[b] != system.xy[a] for angle in angles]  # fmt: skip
+            turns = [cmath.phase(system.xy[b] - system.xy[a]) - angle for b, angle in targets.items()
+                     if b in system.xy and system.xy[b] != system.xy[a]]  # fmt: skip
             if turns:
-                system.turn[name] = circular_median(turns)
+                system.turn[name] = circular_median(np.array(turns))
 
     def _rays(self, system: System, node: Node) -> list[tuple[complex, float]]:
         """Points and directions (rad) of the rays that reach a node."""
@@ -166,7 +167,7 @@ class PlaneStart:
         for name in self.sets_to.get(node, ()):
             a, targets = self.sights.directions[name]
             if name in system.turn and a in system.xy:
-                out.append((a, system.xy[a], circular_median(targets[node]) + system.turn[name]))
+                out.append((a, system.xy[a], targets[node] + system.turn[name]))
         if system.absolute:
             out += [(a, system.xy[a], angle) for a, angle in self.azimuths_to.get(node, ()) if a in system.xy]
         return [(z, angle) for _, z, angle in out]
@@ -176,7 +177,7 @@ class PlaneStart:
         for name in self.sets_to.get(node, ()):
             a, targets = self.sights.directions[name]
             if name in system.turn and a in system.xy and (a, node) in self.distance:
-                angle = circular_median(targets[node]) + system.turn[name]
+                angle = targets[node] + system.turn[name]
                 found.append(system.xy[a] + cmath.rect(self.distance[a, node], angle))
         if system.absolute:
             found += [system.xy[a] + cmath.rect(self.distance[a, node], angle)
@@ -208,7 +209,7 @@ class PlaneStart:
         sets = []
         for name in self.sets_at.get(node, ()):
             _, targets = self.sights.directions[name]
-            seen = [(system.xy[b], circular_median(v)) for b, v in targets.items() if b in system.xy]
+            seen = [(system.xy[b], angle) for b, angle in targets.items() if b in system.xy]
             if len(seen) > 1:
                 sets.append(seen)
         if len(rays) + len(circles) + sum(len(s) - 1 for s in sets) < 2:
@@ -217,20 +218,18 @@ class PlaneStart:
 
     def _guess(self, main: System) -> bool:
         """Take the better of two places where nothing is certain: the one from which the rest fits."""
-        for node in sorted(self.nodes - set(main.xy)):
-            found = self.candidates(main, node)
-            if len(found) < 2:
-                continue
-            trials: list[tuple[int, float, int, System]] = []
-            for z in found:
-                trial = main.copy()
-                trial.xy[node] = z
-                self.grow(trial)
-                trials.append((-len(trial.xy), self.misfit(trial), len(trials), trial))
-            best = min(trials, key=lambda t: (t[0], t[1], t[2]))[3]
+
+        def grown(node: Node, z: complex) -> System:
+            trial = main.copy()
+            trial.xy[node] = z
+            self.grow(trial)
+            return trial
+
+        best = best_of_places(self.nodes - set(main.xy), lambda node: self.candidates(main, node), grown,
+                              lambda trial: (-len(trial.xy), self.misfit(trial)))  # fmt: skip
+        if best is not None:
             main.xy, main.turn = best.xy, best.turn
-            return True
-        return False
+        return best is not None
 
     def misfit(self, system: System) -> float:
         """Robust sum of what distances (m) and directions (m across) miss."""
@@ -239,9 +238,9 @@ class PlaneStart:
             if a < b and a in system.xy and b in system.xy:
                 total += min(abs(abs(system.xy[b] - system.xy[a]) - d), 0.1 * d)
         for name, (a, targets) in self.sights.directions.items():
-            for b, angles in targets.items():
+            for b, angle in targets.items():
                 if name in system.turn and a in system.xy and b in system.xy:
-                    off = (system.xy[b] - system.xy[a]) * cmath.rect(1.0, -system.turn[name] - angles[0])
+                    off = (system.xy[b] - system.xy[a]) * cmath.rect(1.0, -system.turn[name] - angle)
                     total += min(abs(off) * abs(cmath.phase(off)), 0.1 * abs(off))
         return total
 
@@ -315,12 +314,3 @@ def middle(points: list[complex]) -> complex:
         return points[0]
     z = np.array(points)
     return points[int(np.argmin(np.abs(z[:, None] - z).sum(axis=1)))]
-
-
-def circular_median(angles: list[float]) -> float:
-    """The angle nearest to all others."""
-    if len(angles) < 3:
-        return angles[0]
-    z = np.array(angles)
-    turns = np.abs((z[:, None] - z + np.pi) % (2.0 * np.pi) - np.pi)
-    return angles[int(np.argmin(turns.sum(axis=1)))]

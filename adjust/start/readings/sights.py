@@ -3,18 +3,23 @@
 Coordinates are taken along the zero of bearings, counter-clockwise of it, and up; horizontal ones as complex numbers.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 
 from adjust.model.observations import PositionRef, Reading
 from adjust.model.survey import FloatArray, Survey
 from adjust.observations.listed import position_text
+from adjust.observations.terrestrial.batch import circular_median
 from adjust.spatial.vertical import plumb
 
 Node = str
 """A world point's id, or the text of a position in a frame that is known."""
+_Value = TypeVar("_Value", bound=Any)
+_Place = TypeVar("_Place")
+_Grown = TypeVar("_Grown")
 
 
 @dataclass(eq=False)
@@ -23,10 +28,10 @@ class Sights:
 
     azimuths: angle from a node to another. level: horizontal distances (m); slope: others, with the height of the
     target's end above the instrument's end less that of the points. rise: height differences between points.
-    zenith: (angle, instrument minus target height). All per ordered pair of nodes (a, b), several values each.
+    zenith: (angle, instrument minus target height). All but directions several values per ordered pair of nodes (a, b).
     """
 
-    directions: dict[str, tuple[Node, dict[Node, list[float]]]] = field(default_factory=dict)
+    directions: dict[str, tuple[Node, dict[Node, float]]] = field(default_factory=dict)
     azimuths: dict[tuple[Node, Node], list[float]] = field(default_factory=dict)
     level: dict[tuple[Node, Node], list[float]] = field(default_factory=dict)
     slope: dict[tuple[Node, Node], list[tuple[float, float]]] = field(default_factory=dict)
@@ -73,18 +78,43 @@ def ties(survey: Survey) -> list[tuple[PositionRef, PositionRef, FloatArray]]:
 
 def spread_differences(survey: Survey, known: dict[Node, FloatArray]) -> bool:
     """Add to ``known``, (3,) m in the world, what lies at the other end of observed differences; whether any does."""
-    edges = [(node_of(a), node_of(b), v) for a, b, v in ties(survey)]
-    first = before = len(known)
-    while edges:
-        for a, b, v in edges:
-            if a in known and b not in known:
-                known[b] = known[a] + v
-            elif b in known and a not in known:
-                known[a] = known[b] - v
-        if len(known) == before:
-            break
-        before = len(known)
-    return before > first
+    before = len(known)
+    known |= spread([(node_of(a), node_of(b), v) for a, b, v in ties(survey)], known)
+    return len(known) > before
+
+
+def spread(steps: Sequence[tuple[Node, Node, _Value]], known: Mapping[Node, _Value]) -> dict[Node, _Value]:
+    """Values of all nodes that steps from one to another, each with its difference, join to known ones.
+
+    The median of all ways of the same length. Numbers or arrays.
+    """
+    near: dict[Node, list[tuple[Node, _Value]]] = {}
+    for a, b, step in steps:
+        near.setdefault(a, []).append((b, step))
+        near.setdefault(b, []).append((a, -step))
+    out: dict[Node, Any] = dict(known)
+    front = list(out)
+    while front:
+        ways: dict[Node, list[_Value]] = {}
+        for a in front:
+            for b, step in near.get(a, ()):
+                if b not in out:
+                    ways.setdefault(b, []).append(out[a] + step)
+        out |= {b: np.median(values, axis=0) for b, values in ways.items()}
+        front = list(ways)
+    return out
+
+
+def best_of_places(
+    nodes: Iterable[Node], places: Callable[[Node], Sequence[_Place]], grown: Callable[[Node, _Place], _Grown],
+    misfit: Callable[[_Grown], tuple[int, float]],
+) -> _Grown | None:  # fmt: skip
+    """Of the first node that can be in several places what grows from the best of them; None where there is none."""
+    for node in sorted(nodes):
+        found = places(node)
+        if len(found) > 1:
+            return min((grown(node, place) for place in found), key=misfit)
+    return None
 
 
 def collect_sights(survey: Survey) -> Sights:
@@ -93,6 +123,7 @@ def collect_sights(survey: Survey) -> Sights:
     sign = -1.0 if survey.bearings.clockwise else 1.0
     tilted = {s.setup_id for s in survey.setups if not s.levelled}
     polar: dict[tuple[str, Node, Node], dict[str, Reading]] = {}
+    sets: dict[str, tuple[Node, dict[Node, list[float]]]] = {}
     angles: list[Reading] = []
     for r in survey.readings:
         if not r.used or r.setup_id in tilted:
@@ -100,7 +131,7 @@ def collect_sights(survey: Survey) -> Sights:
         a, b = node_of(r.at), node_of(r.to)
         out.nodes |= {a, b}
         if r.kind == "direction":
-            _, targets = out.directions.setdefault(f"{r.setup_id}/{a}", (a, {}))
+            _, targets = sets.setdefault(f"{r.setup_id}/{a}", (a, {}))
             targets.setdefault(b, []).append(sign * r.value)
         elif r.kind == "angle":
             angles.append(r)
@@ -114,7 +145,9 @@ def collect_sights(survey: Survey) -> Sights:
             polar.setdefault((r.setup_id, a, b), {})[r.kind] = r
     for (_, a, b), found in polar.items():
         _polar(out, a, b, found)
-    _angles(out, angles, sign)
+    _angles(out, sets, angles, sign)
+    for name, (a, targets) in sets.items():
+        out.directions[name] = a, {b: circular_median(np.array(values)) for b, values in targets.items()}
     for d in survey.distances:
         if d.used:
             a, b = node_of(d.a), node_of(d.b)
@@ -135,7 +168,9 @@ def _polar(out: Sights, a: Node, b: Node, found: Mapping[str, Reading]) -> None:
         out.zenith.setdefault((a, b), []).append((zenith.value, zenith.instrument_height - zenith.target_height))
 
 
-def _angles(out: Sights, angles: list[Reading], sign: float) -> None:
+def _angles(
+    out: Sights, sets: dict[str, tuple[Node, dict[Node, list[float]]]], angles: list[Reading], sign: float
+) -> None:
     """Angles at one node, hung together through their targets, are as good as directions."""
     left = list(angles)
     count = 0
@@ -162,5 +197,5 @@ def _angles(out: Sights, angles: list[Reading], sign: float) -> None:
                     grew = True
             left = rest
         out.nodes |= set(targets)
-        out.directions[f"angles {count} at {a}"] = (a, targets)
+        sets[f"angles {count} at {a}"] = (a, targets)
         count += 1

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from adjust.model.survey import FloatArray
-from adjust.start.readings.sights import Node, Sights
+from adjust.start.readings.sights import Node, Sights, best_of_places
 
 
 def spread_space(sights: Sights, xy: dict[Node, complex], height: dict[Node, float]) -> None:
@@ -49,31 +49,31 @@ def _seed(distance: Mapping[Node, Mapping[Node, float]]) -> dict[Node, FloatArra
 
 def _grow(distance: Mapping[Node, Mapping[Node, float]], known: dict[Node, FloatArray]) -> None:
     """Sure points first; then of two mirrored places the one from which the rest fits."""
-    while True:
-        grew = False
-        for n in sorted(set(distance) - set(known)):
-            found = places(distance[n], known)
+
+    def grown(node: Node, place: FloatArray) -> dict[Node, FloatArray]:
+        return _sure(distance, {**known, node: place})
+
+    def possible(node: Node) -> list[FloatArray]:
+        return places(distance[node], known)
+
+    found: dict[Node, FloatArray] | None = _sure(distance, known)
+    while found is not None:
+        known.update(found)
+        found = best_of_places(
+            set(distance) - set(known), possible, grown, lambda trial: (-len(trial), misfit(distance, trial))
+        )
+
+
+def _sure(distance: Mapping[Node, Mapping[Node, float]], known: Mapping[Node, FloatArray]) -> dict[Node, FloatArray]:
+    """With all points that follow from the known ones without a choice."""
+    out, before = dict(known), -1
+    while len(out) > before:
+        before = len(out)
+        for n in sorted(set(distance) - set(out)):
+            found = places(distance[n], out)
             if len(found) == 1:
-                known[n] = found[0]
-                grew = True
-        if grew:
-            continue
-        for n in sorted(set(distance) - set(known)):
-            found = places(distance[n], known)
-            if len(found) == 2:
-                trials: list[tuple[int, float, int, FloatArray]] = []
-                for x in found:
-                    trial = {**known, n: x}
-                    for m in sorted(set(distance) - set(trial)):
-                        sure = places(distance[m], trial)
-                        if len(sure) == 1:
-                            trial[m] = sure[0]
-                    trials.append((-len(trial), misfit(distance, trial), len(trials), x))
-                known[n] = min(trials, key=lambda t: t[:3])[3]
-                grew = True
-                break
-        if not grew:
-            return
+                out[n] = found[0]
+    return out
 
 
 def places(mine: Mapping[Node, float], known: Mapping[Node, FloatArray]) -> list[FloatArray]:

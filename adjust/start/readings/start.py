@@ -1,34 +1,27 @@
 """Approximate coordinates of points from readings and distances, where none are given."""
 
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import PositionRef
-from adjust.model.survey import FloatArray, Point, Survey
+from adjust.model.survey import FloatArray, Survey
 from adjust.observations.listed import position_text
 from adjust.start.readings.plane import PlaneStart
-from adjust.start.readings.sights import Node, Sights, collect_sights, horizon_axes, node_of, spread_differences, ties
+from adjust.start.readings.sights import (
+    Node,
+    Sights,
+    collect_sights,
+    horizon_axes,
+    node_of,
+    spread,
+    spread_differences,
+    ties,
+)
 from adjust.start.readings.space import spread_space
 from adjust.start.readings.tilted import tilted_sights
-
-
-def given_points(survey: Survey) -> dict[str, FloatArray]:
-    """Coordinates (3,) m that come with the survey, given or observed; nan where a component is not known."""
-    out = {}
-    for observed in survey.coordinates:
-        sigma = np.diag(observed.cov).reshape(-1, 3)
-        for ref, value, variance in zip(observed.positions, observed.values, sigma, strict=True):
-            if ref.frame is None and ref.point_id is not None and observed.used:
-                out[ref.point_id] = np.where(np.isfinite(variance), value, np.nan)
-    for point in survey.points:
-        if point.x_in_world.value is not None:
-            value = np.asarray(point.x_in_world.value, dtype=float)
-            before = out.get(point.point_id, np.full(3, np.nan))
-            out[point.point_id] = np.where(np.isfinite(value), value, before)
-    return out
 
 
 def find_points(
@@ -92,31 +85,15 @@ def spread_heights(
 
     seeded: whether any height was given; else the first one is zero.
     """
-    edges: dict[Node, list[tuple[Node, float]]] = {}
-
-    def join(a: Node, b: Node, rise: float) -> None:
-        edges.setdefault(a, []).append((b, rise))
-        edges.setdefault(b, []).append((a, -rise))
-
-    for (a, b), rises in sights.rise.items():
-        join(a, b, float(np.median(rises)))
+    steps = [(a, b, float(np.median(rises))) for (a, b), rises in sights.rise.items()]
     for (a, b), angles in sights.zenith.items():
         if a in xy and b in xy and xy[a] != xy[b]:
             d = abs(xy[b] - xy[a])
-            join(a, b, float(np.median([d / np.tan(z) + up for z, up in angles])))
-    out = dict(known)
-    if not out and not seeded and edges:
-        out[max(edges, key=lambda n: (len(edges[n]), n))] = 0.0
-    front = list(out)
-    while front:
-        ways: dict[Node, list[float]] = {}
-        for a in front:
-            for b, rise in edges.get(a, ()):
-                if b not in out:
-                    ways.setdefault(b, []).append(out[a] + rise)
-        out |= {b: float(np.median(values)) for b, values in ways.items()}
-        front = list(ways)
-    return out
+            steps.append((a, b, float(np.median([d / np.tan(z) + up for z, up in angles]))))
+    if not known and not seeded and steps:
+        count = Counter(n for a, b, _ in steps for n in (a, b))
+        known = {max(count, key=lambda n: (count[n], n)): 0.0}
+    return spread(steps, known)
 
 
 def _baselines(survey: Survey, E: FloatArray, xy: dict[Node, complex], height: dict[Node, float]) -> None:
@@ -129,23 +106,6 @@ def _baselines(survey: Survey, E: FloatArray, xy: dict[Node, complex], height: d
         for n, x in known.items():
             local = E @ x
             xy[n], height[n] = complex(local[0], local[1]), float(local[2])
-
-
-def with_start(survey: Survey, found: Mapping[str, FloatArray]) -> Survey:
-    """The survey with the found coordinates as start values of the points that have none."""
-    points = []
-    for point in survey.points:
-        value = point.x_in_world.value
-        lacking = value is None or not np.isfinite(np.asarray(value, dtype=float)).all()
-        if lacking and point.point_id in found:
-            point = Point(point.point_id, replace(point.x_in_world, value=found[point.point_id]))
-        points.append(point)
-    return replace(survey, points=tuple(points))
-
-
-def lacking_points(survey: Survey, found: Mapping[str, FloatArray]) -> list[str]:
-    """Points without coordinates."""
-    return [p.point_id for p in survey.points if p.point_id not in found or not np.isfinite(found[p.point_id]).all()]
 
 
 def explain(survey: Survey, lacking: list[str]) -> SurveyError:

@@ -5,20 +5,22 @@ points that it sees and that are known, by resection or by fitting; points follo
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, PositionRef
-from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, Survey
 from adjust.native.views import refine_poses, view_errors
+from adjust.observations.terrestrial.batch import circular_median
 from adjust.spatial.rigid import align, inverse, rotation_exp
 from adjust.start.closed_forms.absolute_pose import pose_solutions
 from adjust.start.closed_forms.triangulation import intersect
-from adjust.start.readings.sights import Node, node_of, spread_differences
+from adjust.start.network import ChainObservation
+from adjust.start.positions import Positions
+from adjust.start.readings.sights import Node, node_of, spread_differences, ties
+from adjust.start.views import target_points
 
 _PARALLAX = np.deg2rad(0.3)
 _TOGETHER = np.deg2rad(75.0)
@@ -34,44 +36,26 @@ class TiltedSight:
     """One target from one set-up: unit ray (3,) in the station's frame, orientation zero; distance m, nan if none."""
 
     setup_id: str
-    node: Node
+    to: PositionRef
     ray: FloatArray
     distance: float
 
-
-@dataclass(eq=False)
-class TiltedStart:
-    """What is known by now: nodes (3,) m in the world, poses (4, 4) of stations and of targets by their reference."""
-
-    known: dict[Node, FloatArray]
-    stations: dict[PositionRef, FloatArray] = field(default_factory=dict)
-    targets: dict[str, FloatArray] = field(default_factory=dict)
-    turns: dict[str, float] = field(default_factory=dict)
-
-    def poses(self) -> dict[ParameterName, Pose3]:
-        """The poses under their names."""
-        out = {station_name(ref): Pose3(np.ascontiguousarray(T)) for ref, T in self.stations.items()}
-        for target_id, T in self.targets.items():
-            out["carrier_from_target", target_id] = Pose3(np.ascontiguousarray(T))
-        return out
-
-
-def station_name(ref: PositionRef) -> ParameterName:
-    """The pose of the station at whose origin a tilted set-up stands."""
-    frame = ref.frame or FrameRef("world")
-    return ("world_from_station", frame.frame_id, *((frame.epoch_id,) if frame.epoch_id else ()))
+    @property
+    def node(self) -> Node:
+        """Of the target."""
+        return node_of(self.to)
 
 
 def tilted_sights(survey: Survey) -> dict[PositionRef, list[TiltedSight]]:
     """The rays of every station with set-ups that are not levelled, from readings in use."""
     tilted = {s.setup_id for s in survey.setups if not s.levelled}
     sign = -1.0 if survey.bearings.clockwise else 1.0
-    found: dict[tuple[PositionRef, str, Node], dict[str, list[float]]] = {}
+    found: dict[tuple[PositionRef, str, PositionRef], dict[str, list[float]]] = {}
     for r in survey.readings:
         if r.used and r.setup_id in tilted and r.at.frame is not None and r.at.frame.kind == "station":
-            found.setdefault((r.at, r.setup_id, node_of(r.to)), {}).setdefault(r.kind, []).append(r.value)
+            found.setdefault((r.at, r.setup_id, r.to), {}).setdefault(r.kind, []).append(r.value)
     out: dict[PositionRef, list[TiltedSight]] = {}
-    for (at, setup_id, node), values in found.items():
+    for (at, setup_id, to), values in found.items():
         mine = out.setdefault(at, [])
         if "direction" not in values or "zenith" not in values:
             continue
@@ -82,75 +66,67 @@ def tilted_sights(survey: Survey) -> dict[PositionRef, list[TiltedSight]]:
         distance = float(np.median(values["slope_distance"])) if "slope_distance" in values else np.nan
         if not np.isfinite(distance) and "horizontal_distance" in values:
             distance = float(np.median(values["horizontal_distance"])) / max(abs(np.sin(zenith)), 1e-6)
-        mine.append(TiltedSight(setup_id, node, ray, distance))
+        mine.append(TiltedSight(setup_id, to, ray, distance))
     return out
 
 
-def find_tilted(
-    survey: Survey, known: Mapping[Node, FloatArray], given: Mapping[ParameterName, Pose3]
-) -> TiltedStart | None:
-    """Stations, points and targets from tilted set-ups, as far as they go; None where there are no such set-ups.
+class TiltedSetups:
+    """Stations, points and targets from tilted set-ups, as steps of the search."""
 
-    known: (3,) m by point, nan for components not known. given: poses with a value. Where nothing at all is known, the
-    station with the most distances is set freely.
-    """
-    sights = tilted_sights(survey)
-    if not sights:
-        return None
-    whole = {n: np.asarray(x, dtype=float) for n, x in known.items() if np.isfinite(x).all()}
-    start = TiltedStart(whole)
-    for ref in sights:
-        pose = given.get(station_name(ref), given.get(station_name(ref)[:2]))
-        if pose is not None:
-            start.stations[ref] = np.asarray(pose.matrix())
-    fixed = {t.target_id for t in survey.targets if t.station_id is None and t.motion == "fixed"}
-    for target_id in fixed:
-        pose = given.get(("carrier_from_target", target_id))
-        if pose is not None:
-            start.targets[target_id] = np.asarray(pose.matrix())
-    search = _Search(survey, sights, start, fixed)
-    search.run()
-    return start
+    def __init__(self, survey: Survey, positions: Positions) -> None:
+        self.survey, self.positions = survey, positions
+        self.sights = tilted_sights(survey)
+        self.turns: dict[str, float] = {}
+        self.known: dict[Node, FloatArray] = {}
+        """Coordinates (3,) m in the world, also of points of targets that are not known themselves."""
+        self._told: set[FrameRef] = set()
+        refs = [ref for mine in self.sights.values() for s in mine for ref in (s.to,)]
+        refs += [ref for a, b, _ in ties(survey) for ref in (a, b)]
+        seen = {ref.frame.frame_id for ref in refs if ref.frame is not None and ref.frame.kind == "target"}
+        self.fixed = [
+            (FrameRef("target", t.target_id), t) for t in survey.targets
+            if t.target_id in seen and t.station_id is None and t.motion == "fixed"
+        ]  # fmt: skip
+        refs += [PositionRef(n, frame) for frame, t in self.fixed for n in t.point_ids]
+        self._refs = {ref: node_of(ref) for ref in refs}
 
-
-@dataclass(eq=False)
-class _Search:
-    survey: Survey
-    sights: dict[PositionRef, list[TiltedSight]]
-    start: TiltedStart
-    fixed: set[str]
-
-    def run(self) -> None:
-        while self._advance():
-            pass
-
-    def _advance(self) -> bool:
+    def advance(self) -> bool:
         """One step, the first of the list that is possible; whether there was one."""
+        if not self.sights:
+            return False
+        self.known |= {self._refs[ref]: x for ref, x in self.positions.of(self._refs).items()}
         return (
-            spread_differences(self.survey, self.start.known) or self._targets() or self._turns()
+            spread_differences(self.survey, self.known) or self._targets() or self._turns()
             or self._stations(_SURE) or self._points() or self._stations(_FEWEST) or self._untold_turns()
             or self._set_freely()
         )  # fmt: skip
 
+    def _placed(self) -> list[tuple[PositionRef, FloatArray]]:
+        """Stations whose pose (4, 4) is known."""
+        network = self.positions.network
+        chains = {ref: self.positions.chain(ref.frame) for ref in self.sights if ref.frame is not None}
+        return [(ref, network.product(chain)) for ref, chain in chains.items() if not network.open_slots(chain)]
+
+    def _tell(self, frame: FrameRef | None, pose: FloatArray) -> bool:
+        """``world_from_frame`` is observed."""
+        if frame is None or frame in self._told:
+            return False
+        self._told.add(frame)
+        network = self.positions.network
+        network.observations.append(ChainObservation(self.positions.chain(frame), pose[None]))
+        network.propagate()
+        return True
+
     def _targets(self) -> bool:
-        """Targets of which three points are known, and from these all their points."""
-        found = False
-        for target in self.survey.targets:
-            if target.target_id not in self.fixed:
-                continue
-            nodes = [node_of(PositionRef(p, FrameRef("target", target.target_id))) for p in target.point_ids]
-            mine = [i for i, n in enumerate(nodes) if n in self.start.known]
-            if target.target_id not in self.start.targets:
-                there = np.array([self.start.known[nodes[i]] for i in mine]).reshape(-1, 3)
-                if not _spans(there):
-                    continue
-                self.start.targets[target.target_id] = align(there, target.x_in_target[mine])
-            T = self.start.targets[target.target_id]
-            for n, x in zip(nodes, target.x_in_target, strict=True):
-                if n not in self.start.known:
-                    self.start.known[n] = T[:3, :3] @ x + T[:3, 3]
-                    found = True
-        return found
+        """Targets of which three points are known."""
+        for frame, target in self.fixed:
+            nodes = [node_of(PositionRef(p, frame)) for p in target.point_ids]
+            mine = [i for i, n in enumerate(nodes) if n in self.known]
+            there = np.array([self.known[nodes[i]] for i in mine]).reshape(-1, 3)
+            unknown = self.positions.network.open_slots(self.positions.chain(frame))
+            if unknown and _spans(there) and self._tell(frame, align(there, target_points(target)[mine])):
+                return True
+        return False
 
     def _setups(self, ref: PositionRef) -> list[str]:
         return list(dict.fromkeys(s.setup_id for s in self.sights[ref]))
@@ -158,36 +134,30 @@ class _Search:
     def _turns(self) -> bool:
         """Orientations of set-ups on stations that are known, from the known points that they see."""
         found = False
-        for ref, T in self.start.stations.items():
+        for ref, T in self._placed():
             for setup_id in self._setups(ref):
-                if setup_id not in self.start.turns and (turn := self._turn(ref, setup_id, T)) is not None:
-                    self.start.turns[setup_id], found = turn, True
+                if setup_id not in self.turns and (turn := self._turn(ref, setup_id, T)) is not None:
+                    self.turns[setup_id], found = turn, True
         return found
 
     def _turn(self, ref: PositionRef, setup_id: str, T: FloatArray) -> float | None:
         back = inverse(T)
         angles = []
         for s in self.sights[ref]:
-            if s.setup_id == setup_id and s.node in self.start.known:
-                x = back[:3, :3] @ self.start.known[s.node] + back[:3, 3]
+            if s.setup_id == setup_id and s.node in self.known:
+                x = back[:3, :3] @ self.known[s.node] + back[:3, 3]
                 angles.append(np.arctan2(x[1], x[0]) - np.arctan2(s.ray[1], s.ray[0]))
-        if not angles:
-            return None
-        # the one nearest to all others: a wrong point turns nothing
-        apart = np.abs(np.angle(np.exp(1j * np.subtract.outer(angles, angles)))).sum(axis=1)
-        return float(angles[int(np.argmin(apart))])
+        return circular_median(np.array(angles)) if angles else None
 
     def _stations(self, fewest: int) -> bool:
         """Poses of stations from the known points that one of their set-ups sees."""
-        found = False
+        found, placed = False, {ref for ref, _ in self._placed()}
         for ref in self.sights:
-            if ref in self.start.stations:
-                continue
-            for setup_id in self._setups(ref):
-                mine = [s for s in self.sights[ref] if s.setup_id == setup_id and s.node in self.start.known]
-                pose = _station_pose(mine, self.start.known, fewest)
+            for setup_id in self._setups(ref) if ref not in placed and ref.frame not in self._told else ():
+                mine = [s for s in self.sights[ref] if s.setup_id == setup_id and s.node in self.known]
+                pose = _station_pose(mine, self.known, fewest)
                 if pose is not None:
-                    self.start.stations[ref], self.start.turns[setup_id], found = pose, 0.0, True
+                    self.turns[setup_id], found = 0.0, self._tell(ref.frame, pose)
                     break
         return found
 
@@ -195,11 +165,11 @@ class _Search:
         """Points that known stations see, by a distance or from two directions."""
         polar: dict[Node, list[FloatArray]] = {}
         origins, directions, names = [], [], []
-        for ref, T in self.start.stations.items():
+        for ref, T in self._placed():
             for s in self.sights[ref]:
-                if s.node in self.start.known or s.setup_id not in self.start.turns:
+                if s.node in self.known or s.setup_id not in self.turns:
                     continue
-                ray = T[:3, :3] @ rotation_exp(np.array([0.0, 0.0, self.start.turns[s.setup_id]])) @ s.ray
+                ray = T[:3, :3] @ rotation_exp(np.array([0.0, 0.0, self.turns[s.setup_id]])) @ s.ray
                 if np.isfinite(s.distance):
                     polar.setdefault(s.node, []).append(T[:3, 3] + s.distance * ray)
                 origins.append(T[:3, 3])
@@ -214,28 +184,27 @@ class _Search:
             met = intersect(np.array(origins)[rows], np.array(directions)[rows], which, len(nodes))
             good = (met.parallax > _PARALLAX) & np.isfinite(met.x[:, 0])
             new |= {n: met.x[i] for n, i in place.items() if good[i]}
-        self.start.known |= new
+        self.known |= new
         return bool(new)
 
     def _untold_turns(self) -> bool:
         """Set-ups on known stations that see no known point: as their station's axes say."""
-        for ref in self.start.stations:
+        for ref, _ in self._placed():
             for setup_id in self._setups(ref)[:1]:
-                if setup_id not in self.start.turns:
-                    self.start.turns[setup_id] = 0.0
+                if setup_id not in self.turns:
+                    self.turns[setup_id] = 0.0
                     return True
         return False
 
     def _set_freely(self) -> bool:
         """Where nothing is known, the station with the most distances is the world."""
-        if self.start.known or self.start.stations:
+        if self.known or self._placed() or np.isfinite(self.positions.points.x).any():
             return False
         count = {ref: sum(np.isfinite(s.distance) for s in mine) for ref, mine in self.sights.items()}
         ref = max(count, key=lambda r: count[r])
         if count[ref] < _FEWEST:
             return False
-        self.start.stations[ref] = np.eye(4)
-        return True
+        return self._tell(ref.frame, np.eye(4))
 
 
 def _spans(x: FloatArray) -> bool:

@@ -10,7 +10,7 @@ size: two of nearly the same J cannot be told apart.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 
@@ -26,8 +26,6 @@ _LINKED = 0.15
 """Correlation of two tests from which an error of one shows in the other."""
 _EVEN = 2.0 * float(np.log(20.0))
 """Difference of J up to which an explanation is less than 20 times as likely as another one."""
-_FEW = 12
-"""Rejected observations up to which all sets are gone through; of more, only where one of them might come back."""
 _MOST = 600
 """Rejected components beyond which sets are not compared any more: the survey itself is wrong then."""
 _ROOM = 1e8
@@ -140,53 +138,36 @@ def _exchanges(state: _State, o: int) -> list[Exchange]:
 
 
 def _exchanges_among(state: _State, near: _Near) -> list[Exchange]:
-    limits = state.limits[near.pool]
-    here = tuple(i for i, x in enumerate(near.pool) if x in near.mine)
-    if len(state.rows) > _FEW and not _may_come_back(near, limits, here):
+    J = _criteria(near, state.limits[near.pool])
+    n, here = len(near.mine), 2 ** len(near.mine) - 1  # what is out stands first
+    if not np.isfinite(J[here]):
         return []
-    J = {s: v for size in range(len(near.pool) + 1) for s, v in _criteria(near, limits, size)}
-    if here not in J:
-        return []
-    out = []
-    for s, value in J.items():
-        if s != here and value < J[here] + _EVEN:
-            kept = tuple(near.pool[i] for i in here if i not in s)
-            out.append(Exchange(kept, tuple(near.pool[i] for i in s if i not in here), value - J[here]))
+    more, out = J - J[here], []
+    for s in np.flatnonzero(more < _EVEN).tolist():
+        if s != here:
+            kept, instead = (tuple(x for i, x in enumerate(near.pool) if (s >> i & 1) == goes and (i < n) != goes)
+                             for goes in (False, True))  # fmt: skip
+            out.append(Exchange(kept, instead, float(more[s])))
     return out
 
 
-def _may_come_back(near: _Near, limits: FloatArray, here: tuple[int, ...]) -> bool:
-    """Whether one of those that are out fits nearly as well with all others of the pool out, whose limits count not."""
+def _criteria(near: _Near, limits: FloatArray) -> FloatArray:
+    """J (2^p,), less omega with all in use, of every set; observation i is in set s where bit i of s is.
 
-    def share(s: list[int]) -> float:
-        at = np.concatenate([np.zeros(0, dtype=np.int64), *(near.at[i] for i in s)])
-        R = near.R[np.ix_(at, at)] + CONTROLLED**2 * np.eye(len(at))
-        return float(near.g[at] @ np.linalg.solve(R, near.g[at]))
-
-    most = share(list(here)) - float(limits[list(here)].sum()) - _EVEN
-    everyone = range(len(near.pool))
-    return any(share([j for j in everyone if j != i]) > most for i in here)
-
-
-def _criteria(near: _Near, limits: FloatArray, size: int) -> list[tuple[tuple[int, ...], float]]:
-    """J, less omega with all in use, of every set of this size that leaves nothing open."""
-    if size == 0:
-        return [((), 0.0)]
-    sets = list(combinations(range(len(near.pool)), size))
-    by_length: dict[int, list[tuple[int, ...]]] = {}
-    for s in sets:
-        by_length.setdefault(sum(len(near.at[i]) for i in s), []).append(s)
-    out = []
-    for alike in by_length.values():
-        rows = np.array([np.concatenate([near.at[i] for i in s]) for s in alike])
-        R, g = near.R[rows[:, :, None], rows[:, None, :]], near.g[rows]
-        values, vectors = np.linalg.eigh(R)
-        along = np.einsum("nij,ni->nj", vectors, g)
-        fine = values[:, 0] > CONTROLLED
-        share = np.sum(along**2 / np.where(fine[:, None], values, 1.0), axis=1)
-        cost = limits[np.array(alike)].sum(axis=1)
-        out += [(s, float(c - x)) for s, c, x, ok in zip(alike, cost, share, fine, strict=True) if ok]
-    return out
+    One observation after the other goes out of all sets of those before it, and takes its share off the R and g of
+    those behind it (as in :mod:`adjust.statistics.outliers.snooping`). inf where a set leaves something open.
+    """
+    J, R, g = np.zeros(1), near.R[None], near.g[None]
+    for k, limit in zip(map(len, near.at), limits.tolist(), strict=True):
+        own, across, behind = R[:, :k, :k], R[:, :k, k:], R[:, k:, k:]
+        fine = np.linalg.eigvalsh(own)[:, 0] > CONTROLLED
+        right = np.concatenate([across, g[:, :k, None]], axis=2)
+        solved = np.linalg.solve(np.where(fine[:, None, None], own, np.eye(k)), right)
+        share = np.einsum("si,si->s", g[:, :k], solved[..., -1])
+        less = across.transpose(0, 2, 1) @ solved
+        J = np.concatenate([J, np.where(fine, J + limit - share, np.inf)])
+        R, g = np.concatenate([behind, behind - less[..., :-1]]), np.concatenate([g[:, k:], g[:, k:] - less[..., -1]])
+    return J
 
 
 def _near(state: _State, o: int, most: int) -> _Near | None:
@@ -235,8 +216,7 @@ def _joined(state: _State, mine: list[int], free: list[int], N: IntArray, of_N: 
     rows = [np.arange(int(ptr[x]), int(ptr[x + 1])) for x in free]
     F = np.concatenate([np.zeros(0, dtype=np.int64), *rows])
     cross = state.B[np.ix_(F, N)] @ of_N
-    R_F = np.hstack([np.zeros((len(F), 0)), *(snooping.start_column(r)[F] for r in rows)])
-    R_F = R_F - state.U[F] @ state.U[F].T + cross @ state.B[np.ix_(F, N)].T
+    R_F = snooping.start_columns(F, F) - state.U[F] @ state.U[F].T + cross @ state.B[np.ix_(F, N)].T
     R = np.block([[of_N, cross.T], [cross, 0.5 * (R_F + R_F.T)]])
     g = np.concatenate([of_N @ state.bias[N], snooping.g[F] + cross @ state.bias[N]])
     pool = [*mine, *free]

@@ -37,6 +37,10 @@ _ROUNDS = 12
 _CROWD = 0.05
 """Share of the observations that fail, from which a network of pairs is first looked at without a solution."""
 _NONE: IntArray = np.zeros(0, dtype=np.int64)
+_GLOBAL = 100.0**2
+"""Factor of variances from which not single observations are wrong, but a unit, a sense or a name of them all."""
+_BETTER = 0.25
+"""What a round must bring it down to, to go on all the same: large errors show only once some of them are out."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +90,7 @@ class OutlierSearch:
         notes += tuple(a.text() for a in self.alternatives)
         notes += tuple(
             f"group {g}: its typical observation contradicts the rest; sigmas {np.sqrt(f):.1f} times as large explain "
-            "that better than wrong observations do, and none was left out for it; check its sigmas, and those of what "
-            "it is compared with, or estimate variance components"
+            f"that better than wrong observations do, and none was left out for it; {_to_check(f)}"
             for g, f in self.widened
         )
         return notes + tuple(
@@ -98,6 +101,12 @@ class OutlierSearch:
         if suspect.group in self.cautious:
             return f"stays, for the residuals of group {suspect.group} are together far smaller than its sigmas say"
         return "cannot be left out"
+
+
+def _to_check(factor: float) -> str:
+    if factor > _GLOBAL:
+        return "check its units, the sense of its angles and the names in it"
+    return "check its sigmas, and those of what it is compared with, or estimate variance components"
 
 
 def _said_of_pair(o: ObservationResidual, d: Decision) -> str:
@@ -139,8 +148,8 @@ def search_outliers(
         given[list(out)] = True
         now, out = _taken_back(now, out, options, lambda these, now: solved(
             without(survey, found, these), values_of(now)))  # fmt: skip
-    round_ = _Round(now, options, images, given)
-    found, given = round_.found, round_.given
+    round_ = first_round = _Round(now, options, images, given)
+    found, given, first_out, worst = round_.found, round_.given, out, np.inf
     if wrong is None and round_.crowded:
         wrong = disagreeing_pairs(now.survey, float(round_.factor.max()))
         if wrong is not None:
@@ -154,6 +163,9 @@ def search_outliers(
     needed: set[int] = set()
     while True:
         state, every = round_.searched((*out, *sorted(needed)), log)
+        if round_.contradicted > _BETTER * worst:
+            return first_round.without_search(first_out)
+        worst = round_.contradicted or worst
         new = tuple(o for o in every if o not in needed)
         if frozenset(new) in seen:
             new = tuple(sorted({*new, *out}))  # turning in circles: the cautious choice
@@ -255,7 +267,7 @@ class _Round:
             self._watch(self._everything, allowed, before)
         tests = self._all(self.snooping.tests())
         self.n_tests = int(np.count_nonzero(tests.freedom > 0)) + points
-        self.cautious, self.factor = tests.cautious, _typical(tests)
+        self.cautious, self.factor, self.contradicted = tests.cautious, _typical(tests), 0.0
         self.snooping.candidates &= ~self.cautious[self.snooping.group]
         self._at = {o: i for i, o in enumerate(self.index.tolist())}
 
@@ -319,7 +331,7 @@ class _Round:
         search = replace(self._search(), said=said)
         state = search.settled(search.judged(now, now.tests()))
         for _ in range(2 * len(now.sizes) + 2):
-            found = better_set(state.solution, self._limits())
+            found = None if self.contradicted else better_set(state.solution, self._limits())
             if found is None:
                 break
             log += [self._decision("readmitted", i, state.solution, "exchange") for i in found.kept]
@@ -346,6 +358,8 @@ class _Round:
         tests = self._all(mine)
         self.factor = _typical(tests)
         n = np.bincount(tests.group[tests.used & (tests.freedom > 0)], minlength=len(self.factor))
+        most = float(self.factor.max(initial=1.0))
+        self.contradicted = most if most > _GLOBAL else 0.0
         few, search = (n > 0) & (n < MANY), self._search()
         state = search.judged(now, mine)
         if not few[mine.group[mine.used & (state.over > 1.0)]].any():
@@ -387,6 +401,12 @@ class _Round:
         e = np.linalg.norm(precision_of(self.now).rows(precision_of(self.now).graph.others[o]).e)
         verdict = Verdict(r.test, int(every.freedom[o]), float(e))
         return self._told("rejected", o, verdict, int(every.group[o]), how)
+
+    def without_search(self, out: Iterable[int]) -> OutlierSearch:
+        """Nothing more left out: no set of single observations explains what contradicts."""
+        self.factor = self._factor(self.snooping)
+        state = self._search().judged(self.snooping, self.snooping.tests())
+        return replace(self.result(state, out, (), [], False, self.now), suspects=())
 
     def result(
         self, state: State[Snooping], out: Iterable[int], needed: Iterable[int], log: list[Decision], converged: bool,

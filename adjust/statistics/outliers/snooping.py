@@ -8,6 +8,7 @@ with the others out.
 
 from collections.abc import Sequence
 from copy import copy
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -168,7 +169,7 @@ class Snooping:
     def leave_out(self, observation: int) -> None:
         """Give the observation a bias of its own."""
         rows = np.arange(int(self.ptr[observation]), int(self.ptr[observation + 1]))
-        column = self.start_column(rows)
+        column = self.start_columns(rows)
         for U, _ in self.columns.values():
             column -= U @ U[rows].T
         own = column[rows]
@@ -190,16 +191,21 @@ class Snooping:
         for o in kept:
             self.leave_out(o)
 
-    def start_column(self, rows: IntArray) -> FloatArray:
-        """Columns (m, k) of R at the start."""
-        out = -np.asarray(self.A @ self.system.normal.solve(self.A[rows].T.toarray()))
-        joint = next(((at, C) for at, C in self.joint if rows[0] in at), None)
-        if joint is None:
-            out[rows, np.arange(len(rows))] += 1.0
-        else:
-            at, C = joint
-            out[at, 0] += C.T @ C[:, int(np.flatnonzero(at == rows[0])[0])]
-        return out
+    def start_columns(self, columns: IntArray, rows: IntArray | slice = slice(None)) -> FloatArray:
+        """Columns (m, k) of R at the start, or some rows of them."""
+        own = self._directions[:, columns][rows].toarray()
+        return np.asarray(own - self.A[rows] @ self.system.normal.solve(self.A[columns].T.toarray()))
+
+    @cached_property
+    def _directions(self) -> sparse.csc_matrix:
+        """C'C (m, m), by which R exceeds the cofactors."""
+        m = self.A.shape[0]
+        alone = np.ones(m)
+        alone[[r for rows, _ in self.joint for r in rows]] = 0.0
+        parts = [(np.arange(m), np.arange(m), alone)]
+        parts += [(np.repeat(rows, len(rows)), np.tile(rows, len(rows)), (C.T @ C).ravel()) for rows, C in self.joint]
+        r, c, v = (np.concatenate(x) for x in zip(*parts, strict=True))
+        return sparse.csc_matrix((v, (r, c)), shape=(m, m))
 
     def _take(self, U: FloatArray, share: FloatArray, sign: float) -> None:
         self.g = self.g - sign * (U @ share)

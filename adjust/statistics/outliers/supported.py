@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from adjust.frames.unknowns import Chain, FrameTree, Unknowns
+from adjust.model.errors import listed
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef
 from adjust.model.result import ParameterName
 from adjust.model.survey import Survey
@@ -213,5 +214,4 @@ def lost_notes(lost: Iterable[ParameterName], text: Callable[[ParameterName], st
     names = [text(name) if text is not None else " ".join(name) for name in lost]
     if not names:
         return ()
-    more = f" and {len(names) - 12} more" if len(names) > 12 else ""
-    return (f"left out, because every observation of it is left out, or too many are: {', '.join(names[:12])}{more}",)
+    return (f"left out, because every observation of it is left out, or too many are: {listed(names, 12)}",)

@@ -7,7 +7,8 @@ import numpy as np
 
 from adjust.model.errors import IndeterminateError
 from adjust.model.result import Adjustment
-from adjust.model.survey import IntArray, Survey
+from adjust.model.subsets import with_points
+from adjust.model.survey import Survey
 
 _PREFIX = "point "
 _MOST = 50
@@ -45,22 +46,5 @@ def _spare(survey: Survey, names: set[str]) -> bool:
 
 
 def without_named_points(survey: Survey, names: set[str]) -> Survey:
-    """The survey without these world points, their image points and the distances to them."""
-    kept = [i for i, p in enumerate(survey.points) if p.point_id not in names]
-    new = np.full(len(survey.points), -1, dtype=np.int64)
-    new[kept] = np.arange(len(kept))
-    blocks = []
-    for b in survey.image_blocks:
-        if b.target_id is not None:
-            blocks.append(b)
-            continue
-        rows: IntArray = np.flatnonzero(new[b.point_idx] >= 0)
-        if len(rows):
-            used = None if b.used is None else b.used[rows]
-            blocks.append(replace(b, point_idx=new[b.point_idx[rows]], uv=b.uv[rows], cov=b.cov[rows], used=used))
-    return replace(
-        survey,
-        points=tuple(survey.points[i] for i in kept),
-        image_blocks=tuple(blocks),
-        distances=tuple(d for d in survey.distances if not {d.a.point_id, d.b.point_id} & names),
-    )
+    """The survey without these world points, and all that was observed of them."""
+    return with_points(survey, [i for i, p in enumerate(survey.points) if p.point_id not in names])

@@ -74,11 +74,10 @@ class WatchedSnooping(Snooping):
         self.out: list[int] = []
         self.columns: dict[int, tuple[FloatArray, FloatArray]] = {}
 
-    def start_column(self, rows: IntArray) -> FloatArray:
-        """Columns (m, k) of R at the start."""
-        out = -self._M[:, rows]
-        out[rows, np.arange(len(rows))] += 1.0
-        return np.asarray(out)
+    def start_columns(self, columns: IntArray, rows: IntArray | slice = slice(None)) -> FloatArray:
+        """Columns (m, k) of R at the start, or some rows of them."""
+        own = np.arange(len(self._M))
+        return np.asarray((own[rows][:, None] == own[columns]) - self._M[rows][:, columns])
 
     def robust_squares(self, freedom: IntArray, factors: FloatArray, rounds: int = 20) -> FloatArray:
         """As of all observations, with those that are not watched as they are: e(w) = inv(I - M (1 - w)) e."""

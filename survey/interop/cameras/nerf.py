@@ -15,10 +15,10 @@ from adjust.model.observations import FrameRef
 from adjust.model.survey import FloatArray, LensParameter, PoseParameter, Survey
 from survey.folder.text import id_problem
 from survey.interop.cameras.lens_maps import BROWN_5, FISHEYE_4, MappedLens, mapped_lens
-from survey.interop.cameras.photogrammetry import moving_camera
 from survey.interop.cameras.rig import lens_of, pose_of
 from survey.interop.cameras.values import CameraValues
 from survey.interop.networks.foreign import ForeignNetwork
+from survey.interop.photogrammetry.conventions import moving_camera
 from survey.interop.safe_yaml import Entry, read_yaml
 
 CHOICES = {"brown": BROWN_5, "fisheye": FISHEYE_4}

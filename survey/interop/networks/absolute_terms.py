@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from adjust.model.errors import listed
 from adjust.model.observations import Reading, ReadingCovariance, ReadingKind
 from adjust.model.survey import Bearings, FloatArray, Survey
 from survey.interop.networks.foreign import MM
@@ -40,15 +41,10 @@ def within_tolerance(survey: Survey, tolerance: float, unit_weight: float) -> tu
         for name, r in gone.items()
     ]
     limit = f"tol-abs = {tolerance / MM:g} mm"
-    note = f"not used (used = false), beyond {limit} from the file's coordinates: {_listed(named)}"
+    note = f"not used (used = false), beyond {limit} from the file's coordinates: {listed(named, _MOST_NAMED)}"
     kept = tuple(replace(r, used=False) if r.reading_id in gone else r for r in survey.readings)
     joint = tuple(c for whole in survey.reading_covariances if len((c := _without(whole, gone)).reading_ids) > 1)
     return replace(survey, readings=kept, reading_covariances=joint), (note, *left)
-
-
-def _listed(named: Sequence[str]) -> str:
-    more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
-    return ", ".join(named[:_MOST_NAMED]) + more
 
 
 def _not_tested(survey: Survey, x: Mapping[str, FloatArray], tolerance: float, n: int) -> tuple[str, ...]:
@@ -68,7 +64,7 @@ def _not_tested(survey: Survey, x: Mapping[str, FloatArray], tolerance: float, n
     if n:
         notes = (f"tol-abs was not applied to {n} readings of points that have no coordinates in the file",)
     if far:
-        notes += (f"tol-abs was not applied to baselines and coordinates; beyond it are {_listed(far)}",)
+        notes += (f"tol-abs was not applied to baselines and coordinates; beyond it are {listed(far, _MOST_NAMED)}",)
     return notes
 
 

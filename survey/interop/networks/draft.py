@@ -7,6 +7,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from adjust.model.errors import listed
 from adjust.model.observations import (
     CoordinateDifferences,
     Coordinates,
@@ -168,8 +169,7 @@ class NetworkDraft:
             if kept:
                 out[name] = replace(point, status=kept)
         if gone:
-            more = f" and {len(gone) - 6} more" if len(gone) > 6 else ""
-            self.notes.append(f"left out, coordinates that nothing observes: {', '.join(gone[:6])}{more}")
+            self.notes.append(f"left out, coordinates that nothing observes: {listed(gone, 6)}")
         return out
 
     def _usable(self, points: Mapping[str, DraftPoint], ends: Iterable[str], axes: str) -> bool:

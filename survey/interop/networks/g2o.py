@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.pose_network.network import PoseNetwork, pose_network
 from survey.folder.text import atomic_write
@@ -181,8 +181,7 @@ def _are(n: int) -> str:
 
 def _lines(edges: list[_Edge], bad: BoolArray) -> str:
     rows = np.flatnonzero(bad).tolist()
-    named = ", ".join(f"{edges[k].i} {edges[k].j} (line {edges[k].line})" for k in rows[:_MOST_NAMED])
-    return named + (f" and {len(rows) - _MOST_NAMED} more" if len(rows) > _MOST_NAMED else "")
+    return listed([f"{edges[k].i} {edges[k].j} (line {edges[k].line})" for k in rows], _MOST_NAMED)
 
 
 def _edge_names(edges: list[_Edge]) -> list[str]:

@@ -20,8 +20,8 @@ from survey.jobs.detecting import author_name, detect_in, detect_job, remember_i
 from survey.project import Project, read
 from survey.project.project import RESULTS
 from survey.report.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, solution_dict, summary_text
+from survey.solution.earlier.runs import record_run, remove_empty
 from survey.solution.quantities import USUAL, scale_of
-from survey.solution.runs import record_run, remove_empty
 from survey.solution.statistics import Statistics, statistics_of
 
 _PACKAGES = ("labsurvey", "gtsam", "numpy", "scipy", "opencv-contrib-python-headless")
@@ -89,7 +89,7 @@ def adjust_job(
     clock, folder = Clock(), Path(folder)
     target = folder if out is None else Path(out)
     chosen = None if method == "joint" else method
-    said = said or command_line("adjust", folder, redetect=redetect, method=chosen, out=out)
+    said = said or command_line("adjust", folder, redetect=redetect, parquet=report.parquet, method=chosen, out=out)
     with changing(target) as place:
 
         def detected() -> None:

@@ -5,15 +5,14 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
-import numpy as np
 from tqdm import tqdm
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, SurveyError
-from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import IntArray, Survey
+from adjust.model.subsets import with_points
+from adjust.model.survey import Survey
 from adjust.statistics.outliers.supported import lost_notes, supported
 from adjust.statistics.outliers.undetermined_points import without_lost_points
 from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
@@ -204,20 +203,6 @@ def seen_points(survey: Survey) -> Survey:
     refs += [o.position for o in survey.on_surfaces]
     refs += [r for x in survey.readings for r in (x.at, x.to, x.second) if r is not None]
     observed |= {r.point_id for r in refs if r.frame is None}
-    kept = tuple(p for p in survey.points if p.point_id in observed or p.x_in_world.treatment != "free")
-    if len(kept) == len(survey.points):
-        return survey
-    ids = {p.point_id: i for i, p in enumerate(kept)}
-    blocks = tuple(
-        b if b.target_id is not None
-        else replace(b, point_idx=_reindexed(survey, b, ids))
-        for b in survey.image_blocks
-    )  # fmt: skip
-    distances = tuple(
-        d for d in survey.distances if all(r.frame is not None or r.point_id in ids for r in (d.a, d.b))
-    )
-    return replace(survey, points=kept, image_blocks=blocks, distances=distances)
-
-
-def _reindexed(survey: Survey, block: ImageBlock, ids: dict[str, int]) -> IntArray:
-    return np.array([ids[survey.points[int(i)].point_id] for i in block.point_idx], dtype=np.int64)
+    return with_points(survey, [
+        i for i, p in enumerate(survey.points) if p.point_id in observed or p.x_in_world.treatment != "free"
+    ])  # fmt: skip

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adjust.frames.unknowns import FrameTree, Unknowns
-from adjust.model.errors import SurveyError
+from adjust.model.errors import SurveyError, listed
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.spatial.rigid import align
 from adjust.start import Start, find_start, turns_of_views
@@ -162,8 +162,7 @@ def _stations_undecided(survey: Survey, target: str, mine: list[int]) -> list[st
         alone += [f"{name[1]} at {name[2]}"] if users and users <= set(mine) else []
     if not alone:
         return []
-    more = f" and {len(alone) - 3} more" if len(alone) > 3 else ""
     return [
         f"target {target!r}: the board looks the same after half a turn, and nothing else tells which way round these "
-        f"stations saw it: {', '.join(alone[:3])}{more}; r0c0 is taken as named"
+        f"stations saw it: {listed(alone, 3)}; r0c0 is taken as named"
     ]

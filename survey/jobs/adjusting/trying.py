@@ -4,8 +4,9 @@ import csv
 import io
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from survey.project import read
 from survey.project.declared.toml_text import key_lines
 
 DEFINITION, KEPT = "survey.toml", "kept"
+FileEdit = ScaleKey | SetKey | ChangeColumns | Rename
 _LENGTHS = ("square_mm", "marker_mm", "gap_mm")
 _NUMBER = re.compile(r"(=\s*)([-+0-9.eE_]+)")
 
@@ -29,7 +31,13 @@ def try_job(folder: Path, number: int, progress: bool = False) -> str:
     Files that are changed are kept as they were below ``kept/``; what is left out becomes rows of ``exclusions.csv``.
     Raises SurveyError where there is no such candidate, or where only a person can do it.
     """
-    candidates = _candidates(folder, progress)
+    chosen = chosen_of(folder, _candidates(folder, progress), number)
+    done = [_carried_out(folder, edit, chosen) for edit in chosen.edits]
+    return "\n".join([f"changed: {chosen.cause}", *(f"  {line}" for line in done)])
+
+
+def chosen_of(folder: Path, candidates: Sequence[Hypothesis], number: int) -> Hypothesis:
+    """Candidate ``number`` (from 1), which a program can carry out; raises SurveyError for others."""
     if not 1 <= number <= len(candidates):
         n = len(candidates)
         found = f"{n} candidate{'s' if n > 1 else ''}" if n else "no cause that it could change"
@@ -37,8 +45,7 @@ def try_job(folder: Path, number: int, progress: bool = False) -> str:
     chosen = candidates[number - 1]
     if not chosen.edits:
         raise SurveyError(f"{folder}: --try {number}: only you can do that: {chosen.change}")
-    done = [_carried_out(folder, edit, chosen) for edit in chosen.edits]
-    return "\n".join([f"changed: {chosen.cause}", *(f"  {line}" for line in done)])
+    return chosen
 
 
 def _candidates(folder: Path, progress: bool) -> list[Hypothesis]:
@@ -51,24 +58,41 @@ def _candidates(folder: Path, progress: bool) -> list[Hypothesis]:
 
 def _carried_out(folder: Path, edit: Edit, chosen: Hypothesis) -> str:
     if isinstance(edit, LeaveOut):
-        exclude_job(folder, edit.names, f"tried: {chosen.cause}")
+        exclude_job(folder, edit.names, reason_of(chosen))
         rows = f"{len(edit.names)} row{'s' if len(edit.names) > 1 else ''}"
         return f"observations/exclusions.csv: {rows} added; labsurvey include takes them back"
-    if isinstance(edit, ScaleKey | SetKey):
-        name, text = DEFINITION, _definition(folder, edit)
-    else:
-        name = f"observations/{edit.table}.csv"
-        text = _table(folder / name, edit, chosen)
-    kept = _kept(folder, name)
+    name, before, text = edited(folder, edit, chosen)
+    kept = kept_name(folder, name)
     with changing(folder, inputs=True) as place:
-        for path, content in ((kept, decode(folder / name, read_bytes(folder / name)[0])), (name, text)):
+        for path, content in ((kept, before), (name, text)):
             (place / path).parent.mkdir(parents=True, exist_ok=True)
             atomic_write(place / path, content)
         replace_parts(folder)
     return f"{name}: changed; as it was: {kept}"
 
 
-def _kept(folder: Path, name: str) -> str:
+def reason_of(chosen: Hypothesis) -> str:
+    """Why something is left out that a candidate leaves out, for ``exclusions.csv``."""
+    return f"tried: {chosen.cause}"
+
+
+def edited(
+    folder: Path, edit: FileEdit, chosen: Hypothesis, texts: Mapping[str, str] = MappingProxyType({})
+) -> tuple[str, str, str]:
+    """The file that an edit changes, by its path in the folder, and its text before and after; nothing is written.
+
+    texts: of files that are to be read instead. Raises SurveyError.
+    """
+    name = DEFINITION if isinstance(edit, ScaleKey | SetKey) else f"observations/{edit.table}.csv"
+    path = folder / name
+    if not path.exists():
+        raise SurveyError(f"{path}: this project has no such table; {chosen.change}")
+    before = texts[name] if name in texts else decode(path, read_bytes(path)[0])
+    return name, before, _definition(path, before, edit) if isinstance(edit, ScaleKey | SetKey) else _table(
+        path, before, edit, chosen)  # fmt: skip
+
+
+def kept_name(folder: Path, name: str) -> str:
     """A name below ``kept/`` that nothing has yet."""
     path = Path(name)
     number = 1
@@ -77,10 +101,8 @@ def _kept(folder: Path, name: str) -> str:
     return f"{KEPT}/{path.stem}-{number}{path.suffix}"
 
 
-def _definition(folder: Path, edit: ScaleKey | SetKey) -> str:
+def _definition(path: Path, text: str, edit: ScaleKey | SetKey) -> str:
     """``survey.toml`` with the change, its comments and order kept."""
-    path = folder / DEFINITION
-    text = decode(path, read_bytes(path)[0])
     where, lines = key_lines(text), text.splitlines(keepends=True)
     if isinstance(edit, ScaleKey):
         keys = [(*edit.path, key) for key in _LENGTHS if (*edit.path, key) in where] or [edit.path]
@@ -115,11 +137,9 @@ def _toml(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
-def _table(path: Path, edit: ChangeColumns | Rename, chosen: Hypothesis) -> str:
+def _table(path: Path, text: str, edit: ChangeColumns | Rename, chosen: Hypothesis) -> str:
     """A table with its rows changed; lines that are not concerned stay as they are."""
-    if not path.exists():
-        raise SurveyError(f"{path}: this project has no such table; {chosen.change}")
-    lines = decode(path, read_bytes(path)[0]).splitlines(keepends=True)
+    lines = text.splitlines(keepends=True)
     begin = next((i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
     header = next(csv.reader([lines[begin]]), []) if begin < len(lines) else []
     names = [name.strip() for name in header]

@@ -20,7 +20,7 @@ from adjust.pose_network.from_survey import network_from_survey, network_of_pair
 from adjust.start import find_start
 from survey.jobs.adjusting.steps import adjust_project
 from survey.project import Project
-from survey.solution.previous import Previous
+from survey.solution.earlier.previous import Previous
 
 WARM, COLD = "from the previous solution", "from the beginning"
 

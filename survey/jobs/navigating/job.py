@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from adjust.adjustment import AdjustOptions, adjust
-from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.navigation import EpochPose, Motion, NavigateOptions, Trajectory, head_and_beacons, navigate
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import natural_key
@@ -170,16 +170,12 @@ def _notes(project: Project, calibration: Calibration) -> tuple[str, ...]:
         notes.append(f"beacons without coordinates, left out: {', '.join(missing)}")
     if calibration.helped_by:
         notes.append(
-            f"calibration: with epochs that were not asked for ({_some(calibration.helped_by)}), because the others do "
-            "not determine the head"
+            f"calibration: with epochs that were not asked for ({listed(calibration.helped_by, 5)}), because the "
+            "others do not determine the head"
         )
     if calibration.reused:
         notes.append(f"calibration: that of {RESULTS}/{CALIBRATION}; what it came from has not changed")
     return tuple(notes)
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def _calibrate(project: Project, station: str, epochs: Sequence[str], there: Path, new: Path) -> Calibration:
@@ -197,8 +193,8 @@ def _calibrate(project: Project, station: str, epochs: Sequence[str], there: Pat
         if not isinstance(error, IndeterminateError):
             raise
         raise SurveyError(
-            f"{project.folder}: the head is not calibrated without the epochs to navigate ({_some(epochs)}); navigate "
-            f"fewer with --epochs, or calibrate with a target\n({error})"
+            f"{project.folder}: the head is not calibrated without the epochs to navigate ({listed(epochs, 5)}); "
+            f"navigate fewer with --epochs, or calibrate with a target\n({error})"
         ) from error
 
 

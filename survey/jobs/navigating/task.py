@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from adjust.model.errors import SurveyError
+from adjust.model.subsets import in_use, points_read, with_points
 from adjust.model.survey import Survey
 from adjust.navigation import NavigationEpoch, Spots
 from adjust.statistics.outliers.supported import supported
 from survey.folder.text import decode, natural_key, read_bytes
-from survey.jobs.adjusting.subnetwork import in_use, only_between, points_read
 from survey.project import Project
 
 
@@ -138,20 +138,7 @@ def _with_known_points(survey: Survey) -> Survey:
         i for i, p in enumerate(survey.points)
         if len(seen.get(i, ())) >= 2 or p.point_id in given or p.x_in_world.treatment != "free"
     ]  # fmt: skip
-    new = {old: k for k, old in enumerate(keep)}
-    ids = {survey.points[i].point_id for i in keep}
-    blocks = []
-    for b in survey.image_blocks:
-        if b.target_id is not None:
-            blocks.append(b)
-            continue
-        rows = np.isin(b.point_idx, keep)
-        if rows.any():
-            used = None if b.used is None else b.used[rows]
-            index = np.array([new[int(i)] for i in b.point_idx[rows]], dtype=np.int64)
-            blocks.append(replace(b, point_idx=index, uv=b.uv[rows], cov=b.cov[rows], used=used))
-    less = only_between(survey, lambda ref: ref.frame is not None or ref.point_id in ids)
-    return replace(less, points=tuple(survey.points[i] for i in keep), image_blocks=tuple(blocks))
+    return with_points(survey, keep)
 
 
 def observed_epoch(

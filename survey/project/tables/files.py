@@ -13,7 +13,7 @@ import numpy as np
 
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray
-from survey.folder.text import LARGEST_NUMBER, atomic_write, decode, formula_problem, read_bytes, utf8
+from survey.folder.text import LARGEST_NUMBER, atomic_write, decode, formula_problem, read_bytes, utf8, with_digest
 from survey.project.tables.arrow import LARGE, csv_columns, csv_rows, parquet_bytes, parquet_columns
 from survey.project.tables.reading import Columns, Layout, Table, TextColumn, check_header, check_rows, first_row
 
@@ -22,9 +22,12 @@ _NUMBERS = re.compile(r"[-+.\deE ]+")  # the components of an axis in one cell
 Chunk = tuple[IntArray, Sequence[Sequence[str]]]
 
 
-def read_table(path: Path, layout: Layout) -> Table:
-    """Read ``.csv`` or ``.parquet``; raises SurveyError with file and line for whatever does not fit the layout."""
-    data, digest = read_bytes(path)
+def read_table(path: Path, layout: Layout, instead: str | None = None) -> Table:
+    """Read ``.csv`` or ``.parquet``; raises SurveyError with file and line for whatever does not fit the layout.
+
+    instead: what is to stand in it, not yet written.
+    """
+    data, digest = read_bytes(path) if instead is None else with_digest(instead.encode())
     if path.suffix == ".parquet":
         columns = parquet_columns(path, data, layout)
         return _table(path, layout, digest, np.arange(1, len(next(iter(columns.values()))) + 1), columns)

@@ -1,11 +1,14 @@
 """Tables of image points into one block per camera, epoch and target, without a step per row."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from adjust.model.observations import ImageBlock
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.survey import BoolArray, FloatArray, IntArray
 from survey.folder.text import natural_key, suggestion
 from survey.project.project import ImagePointsWhere, Sigmas, SpotBlock
 from survey.project.tables.covariance import covariance_from_sigmas
@@ -48,29 +51,23 @@ def read_image_blocks(table: Table, names: Names, sigmas: Sigmas) -> tuple[tuple
     targets, groups = table.text("target_id"), _groups(table)
     rows = _measured(table, cameras, epochs, names, sigmas, groups)
     point_idx = _point_positions(table, targets, names)
-    target = _ranks(targets, blank_last=True)
-    group = _ranks(groups)
-    _refuse_duplicates(table, "point_id", rows, target, point_idx)
-    order = np.lexsort((point_idx, group, target, rows.epoch, rows.camera))
-    keys = np.stack([rows.camera, rows.epoch, target, group])[:, order]
-    used = table.flags("used")
-    blocks, lines = [], []
-    for part in _runs(order, keys):
-        row = part[0]
-        blocks.append(
-            ImageBlock(
-                cameras.names[cameras.codes[row]],
-                epochs.names[epochs.codes[row]],
-                targets.names[targets.codes[row]] or None,
-                point_idx[part],
-                rows.uv[part],
-                rows.cov[part],
-                None if used[part].all() else used[part],
-                groups.names[groups.codes[row]],
-            )
-        )
-        lines.append(table.lines[part])
-    return tuple(blocks), ImagePointsWhere(table.path, tuple(lines))
+    target, group = _ranks(targets, blank_last=True), _ranks(groups)
+    _refuse_duplicates(table, "point_id", rows.camera, rows.epoch, target, point_idx)
+    block = rows.camera, rows.epoch, target, group
+    order = ordered(*block, point_idx)[0]
+    ptr, used = _starts(order, block), table.flags("used")
+    first = order[ptr[:-1]]
+    texts = [TextColumn(c.names, c.codes[first]).values() for c in (cameras, epochs, targets, groups)]
+    place: IntArray | slice = slice(None) if (order == np.arange(len(order))).all() else order
+    point_idx, uv, cov, used, lines = point_idx[place], rows.uv[place], rows.cov[place], used[place], table.lines[place]
+    all_used = np.logical_and.reduceat(used, ptr[:-1]).tolist() if len(first) else []
+    blocks, where = [], []
+    ranges = pairwise(ptr.tolist())
+    for (i, j), whole, camera, epoch, target_id, group_name in zip(ranges, all_used, *texts, strict=True):
+        kept = None if whole else used[i:j]
+        blocks.append(ImageBlock(camera, epoch, target_id or None, point_idx[i:j], uv[i:j], cov[i:j], kept, group_name))
+        where.append(lines[i:j])
+    return tuple(blocks), ImagePointsWhere(table.path, tuple(where))
 
 
 def read_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[SpotBlock, ...]:
@@ -79,22 +76,46 @@ def read_spots(table: Table, names: Names, sigmas: Sigmas) -> tuple[SpotBlock, .
     image = TextColumn(("image",), np.zeros(len(table), dtype=np.int64))
     rows = _measured(table, cameras, epochs, names, sigmas, image)
     spot = _ranks(spots)
-    _refuse_duplicates(table, "spot_id", rows, np.zeros(len(table), dtype=np.int64), spot)
-    order = np.lexsort((spot, rows.epoch, rows.camera))
-    keys = np.stack([rows.camera, rows.epoch])[:, order]
-    blocks = []
-    for part in _runs(order, keys):
+    _refuse_duplicates(table, "spot_id", rows.camera, rows.epoch, spot)
+    order, blocks = ordered(rows.camera, rows.epoch, spot)[0], []
+    for i, j in pairwise(_starts(order, (rows.camera, rows.epoch)).tolist()):
+        part = order[i:j]
         camera_id, epoch_id = (column.names[column.codes[part[0]]] for column in (cameras, epochs))
         spot_ids = tuple(spots.names[code] for code in spots.codes[part].tolist())
         blocks.append(SpotBlock(camera_id, epoch_id, spot_ids, rows.uv[part], rows.cov[part]))
     return tuple(blocks)
 
 
-def _runs(order: IntArray, keys: IntArray) -> list[IntArray]:
-    """The pieces of ``order`` (n,) over which the columns of ``keys`` (k, n) stay the same."""
+def ordered(*codes: IntArray) -> tuple[IntArray, BoolArray]:
+    """Rows (n,) in the order of these codes, the first first; which of them (n - 1,) has the same as the one before.
+
+    Rows that are in order already, as this program writes them, cost next to nothing.
+    """
+    sizes = [int(c.max(initial=0)) + 1 for c in codes]
+    if math.prod(sizes) < 2**62:
+        key = codes[0]
+        for code, size in zip(codes[1:], sizes[1:], strict=True):
+            key = key * size + code
+        order = np.argsort(key, kind="stable")
+        return order, np.diff(key[order]) == 0
+    order = np.lexsort(codes[::-1])
+    return order, ~_changes(order, codes)
+
+
+def _changes(order: IntArray, codes: Sequence[IntArray]) -> BoolArray:
+    """Where along ``order`` (n,) one of the codes changes (n - 1,)."""
+    out: BoolArray = np.zeros(max(len(order) - 1, 0), dtype=np.bool_)
+    for code in codes:
+        of_row = code[order]
+        out |= of_row[1:] != of_row[:-1]
+    return out
+
+
+def _starts(order: IntArray, codes: Sequence[IntArray]) -> IntArray:
+    """Ranges (b + 1,) of ``order`` (n,) over which the codes stay the same."""
     if not len(order):
-        return []
-    return np.split(order, np.flatnonzero((np.diff(keys, axis=1) != 0).any(axis=0)) + 1)
+        return np.zeros(1, dtype=np.int64)
+    return np.concatenate([[0], np.flatnonzero(_changes(order, codes)) + 1, [len(order)]])
 
 
 def _groups(table: Table) -> TextColumn:
@@ -152,9 +173,7 @@ def _covariances(table: Table, default_px: float | None, scale: FloatArray) -> F
 def _point_positions(table: Table, targets: TextColumn, names: Names) -> IntArray:
     """Position (n,) of every row's point in its target, or among the world's points."""
     points = table.ids("point_id")
-    pairs, first, inverse = np.unique(
-        targets.codes * len(points.names) + points.codes, return_index=True, return_inverse=True
-    )
+    pairs, first, inverse = _distinct(targets.codes * len(points.names) + points.codes)
     found = np.empty(len(pairs), dtype=np.int64)
     for i in np.argsort(first).tolist():
         target_code, point_code = divmod(int(pairs[i]), len(points.names))
@@ -169,17 +188,26 @@ def _point_positions(table: Table, targets: TextColumn, names: Names) -> IntArra
             hint = "" if target_id else f"; list it as [points.{point_id}], or set tie_points = true"
             raise table.error(row, f"point_id: {owner}; {suggestion(point_id, known)}{hint}")
         found[i] = known[point_id]
-    return np.asarray(found[inverse.reshape(-1)])
+    return np.asarray(found[inverse])
 
 
-def _refuse_duplicates(table: Table, column: str, rows: _Rows, target: IntArray, point: IntArray) -> None:
-    if not len(point):
-        return
-    keys = rows.camera
-    for part in (rows.epoch, target, point):
-        keys = keys * (int(part.max()) + 1) + part
-    order = np.argsort(keys, kind="stable")
-    same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+def _distinct(codes: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """The different codes, not below zero, where each stands first, and the place of every one among them."""
+    n, size = len(codes), int(codes.max(initial=-1)) + 1
+    if size > 4 * n + 1000:
+        values, first, inverse = np.unique(codes, return_index=True, return_inverse=True)
+        return values, first, inverse.reshape(-1)
+    at = np.full(size, -1)
+    at[codes[::-1]] = np.arange(n)[::-1]  # of those that stand in several places the last is kept: the first of all
+    values = np.flatnonzero(at >= 0)
+    first = at[values]
+    at[values] = np.arange(len(values))
+    return values, first, at[codes]
+
+
+def _refuse_duplicates(table: Table, column: str, *codes: IntArray) -> None:
+    order, same_as_before = ordered(*codes)
+    same = np.flatnonzero(same_as_before)
     if len(same):
         i = same[np.argmin(order[same + 1])]
         name = table.text(column).values()[order[i]]

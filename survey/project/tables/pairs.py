@@ -1,10 +1,12 @@
 """The table of measured pairs: relative rotations and poses, with sigmas or covariances."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
-from adjust.model.observations import Pair
+from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.spatial.rotation_forms import euler_from_matrix, tangent_cov_from_euler
 from survey.folder.text import natural_key
@@ -56,9 +58,18 @@ def read_pairs(table: Table, names: Names, sigmas: Sigmas) -> tuple[Pair, ...]:
     cov = _pair_covariances(table, is_pose, rotations)
     groups, used = group_names(table, "pair"), table.flags("used").tolist()
     translation = to_si(np.stack([table.numbers(name) for name in TRANSLATION], axis=1), "mm")
-    ends = list(zip(table.text("a_id").values(), table.text("b_id").values(), strict=True))
     pairs = []
-    for row, (a_text, b_text) in enumerate(ends):
+    for row, (a, b) in enumerate(read_ends(table, names)):
+        k = 6 if is_pose[row] else 3
+        b_from_a = Pose3(rotations[row], translation[row]) if is_pose[row] else rotations[row]
+        scaled = cov[row, :k, :k] * sigmas.scale.get(groups[row], 1.0) ** 2
+        pairs.append(Pair(pair_ids[row], a, b, b_from_a, scaled, groups[row], used[row]))
+    return tuple(sorted(pairs, key=lambda pair: natural_key(pair.pair_id)))
+
+
+def read_ends(table: Table, names: Names) -> Iterator[tuple[FrameRef, FrameRef]]:
+    """The two frames of every row. Raises SurveyError for what cannot be a pair."""
+    for row, (a_text, b_text) in enumerate(zip(table.text("a_id").values(), table.text("b_id").values(), strict=True)):
         try:
             a, b = read_frame(a_text, names), read_frame(b_text, names)
             check_epochs(a, b, names)
@@ -66,11 +77,7 @@ def read_pairs(table: Table, names: Names, sigmas: Sigmas) -> tuple[Pair, ...]:
             raise table.error(row, f"a_id, b_id: {problem}") from problem
         if a == b:
             raise table.error(row, f"a_id, b_id: both are {a_text!r}; a pair joins two different frames")
-        k = 6 if is_pose[row] else 3
-        b_from_a = Pose3(rotations[row], translation[row]) if is_pose[row] else rotations[row]
-        scaled = cov[row, :k, :k] * sigmas.scale.get(groups[row], 1.0) ** 2
-        pairs.append(Pair(pair_ids[row], a, b, b_from_a, scaled, groups[row], used[row]))
-    return tuple(sorted(pairs, key=lambda pair: natural_key(pair.pair_id)))
+        yield a, b
 
 
 def _pair_rotations(table: Table) -> list[Rot3]:

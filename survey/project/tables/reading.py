@@ -94,7 +94,8 @@ class Table:
 
     def text(self, column: str) -> TextColumn:
         """A text column; blank where the file does not have it."""
-        return self.text_columns.get(column, TextColumn(("",), np.zeros(len(self), dtype=np.int64)))
+        found = self.text_columns.get(column)
+        return TextColumn(("",), np.zeros(len(self), dtype=np.int64)) if found is None else found
 
     def ids(self, column: str) -> TextColumn:
         """A text column whose every entry can be an id."""
@@ -118,7 +119,8 @@ class Table:
 
     def numbers(self, column: str) -> FloatArray:
         """A number column (n,); nan where blank or absent."""
-        return self.number_columns.get(column, np.full(len(self), np.nan))
+        found = self.number_columns.get(column)
+        return np.full(len(self), np.nan) if found is None else found
 
     def positive(self, column: str) -> FloatArray:
         """A number column (n,) whose entries, where not blank, must be positive."""

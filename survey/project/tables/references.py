@@ -57,6 +57,11 @@ class Names:
         """Position of each point id in its target, by target id."""
         return {t.target_id: {name: i for i, name in enumerate(t.point_ids)} for t in self.survey.targets}
 
+    @functools.cached_property
+    def positions(self) -> dict[str, PositionRef]:
+        """Those that were read before, by their text: a network names each of its points many times."""
+        return {}
+
     def ids(self, kind: str) -> list[str]:
         """All ids of a kind of frame."""
         return [frame_id for frame_kind, frame_id in self.bodies if frame_kind == kind]
@@ -87,6 +92,13 @@ def read_frame(text: str, names: Names) -> FrameRef:
 
 def read_position(text: str, names: Names) -> PositionRef:
     """A position: world point, point of a target, or the origin of a frame."""
+    found = names.positions.get(text)
+    if found is None:
+        found = names.positions[text] = _read_position(text, names)
+    return found
+
+
+def _read_position(text: str, names: Names) -> PositionRef:
     if ":" not in text and "@" not in text and text != "world":
         if text not in names.points:
             raise NameProblemError(f"unknown point {text!r}; {_where_points_come_from(text, names)}")

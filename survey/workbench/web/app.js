@@ -12,11 +12,14 @@ import { ImageView } from "./image.js";
 import { SceneView } from "./scene.js";
 import { CompareView, HistoryView } from "./compare.js";
 import { CameraView, CorrelationsView, LoopsView, TableAnglesView } from "./relations.js";
+import { NetworkView } from "./network.js";
+import { JobsView } from "./jobs.js";
+import { SettingsView } from "./settings.js";
 import { chosenNames, drawInspector } from "./inspector.js";
 import { findingsOf, parametersOf, readingsOf, sceneOf, shiftsOf, sizesOf, stateOf } from "./shapes.js";
 
 /** Everything the views show; new values replace old ones, nothing is changed in place. */
-const bench = { state: null, points: null, limit: 1, readings: [], parameters: [], findings: {}, scene: null, sizes: {}, leftOut: new Map(), shifts: new Map() };
+const bench = { state: null, points: null, limit: 1, readings: [], parameters: [], findings: {}, scene: null, sizes: {}, leftOut: new Map(), shifts: new Map(), told: {}, toldAt: 0, arrived: [], drawn: null, planned: null };
 const VIEWS = {
   findings: ["Findings", () => new FindingsView(bench, actions)],
   image: ["Image", () => new ImageView(bench)],
@@ -30,12 +33,15 @@ const VIEWS = {
   angles: ["Angles", () => new TableAnglesView(bench)],
   loops: ["Loops", () => new LoopsView(bench)],
   correlations: ["Correlations", () => new CorrelationsView(bench)],
+  network: ["Network", () => new NetworkView(bench)],
+  jobs: ["Jobs", () => new JobsView(bench, actions)],
+  settings: ["Datum", () => new SettingsView(bench, actions)],
 };
 const PANES = ["left", "right"];
 const REGIONS = [["tree", "Project"], ["left", "First view"], ["right", "Second view"], ["tables", "Tables"], ["inspector", "Details"]];
 const shown = { left: null, right: null };
 const TABLES = { points: "Image points", readings: "Readings", parameters: "Parameters", exclusions: "Excluded by people" };
-let followed = "", table = null, tableName = "points", lastPane = "right", busy = false;
+let followed = "", table = null, tableName = "points", lastPane = "right", asked = false, busy = false; // asked: for a table by its tab
 
 // what may be done
 
@@ -72,6 +78,9 @@ const actions = {
   },
 
   setting: (change) => act(() => post("definition", { base: bench.state.version, ...change })),
+  remedy: (number) => act(() => post("remedy", { base: bench.state.version, number })),
+  /** Another job: what it said is kept, what it drew is shown in the scene. */
+  job: (name, ask) => act(async () => { const told = await ask(); bench.told[name] = told; bench.toldAt++; bench.drawn = told.drawn; if (told.drawn.scene) bench.planned = sceneOf(told.drawn.scene); return told; }, t("Done.")),
   undo: () => bench.state.undo.length && act(() => post("undo", { base: bench.state.version })),
   redo: () => bench.state.redo.length && act(() => post("redo", { base: bench.state.version })),
   adjust: (mode = "warm") => act(() => post("adjust", { base: bench.state.version, mode })),
@@ -119,20 +128,21 @@ function working(text) { by("working").textContent = text; by("working").hidden 
 
 // values and views
 
-const parts = (version) => Promise.all([points(), get("readings"), get("parameters"), get("findings"), get("scene"), version]);
+/** What the server says of this solution; of a survey that cannot be adjusted its observations and what is wrong. */
+const parts = (solved) => Promise.all([points(), get("readings"), solved ? get("parameters") : null, get("findings"), solved ? get("scene") : null]);
 
 /** New values, then every view with them. @param {any} answer a state, or null to ask for it */
 async function renew(answer) {
   const raw = answer?.state ?? (answer?.version !== undefined && answer.exclusions ? answer : await get("state"));
   const state = stateOf(raw);
-  const fresh = !bench.state || bench.state.version !== state.version;
-  if (fresh && state.solved) {
-    const [columns, readings, parameters, findings, scene] = await parts(state.version);
+  const fresh = !bench.state || bench.state.version !== state.version || (state.failure ?? "") !== (bench.state.failure ?? "");
+  if (fresh) {
+    const [columns, readings, parameters, findings, scene] = await parts(state.solved);
     const before = bench.scene;
-    Object.assign(bench, { state, points: columns, readings: readingsOf(readings), limit: readings.limit, parameters: parametersOf(parameters), findings: findingsOf(findings, raw), scene: sceneOf(scene), sizes: sizesOf(raw) });
-    bench.shifts = shiftsOf(before, bench.scene);
+    Object.assign(bench, { state, points: columns, readings: readingsOf(readings), limit: readings.limit, parameters: parameters ? parametersOf(parameters) : [], findings: findingsOf(findings, raw), scene: scene && sceneOf(scene), sizes: sizesOf(raw) });
+    bench.shifts = scene ? shiftsOf(before, bench.scene) : new Map();
     bench.leftOut = leftOut(columns);
-    state.changes = answer?.changes ?? (await get("changes")).changes;
+    state.changes = answer?.changes ?? (state.solved ? (await get("changes")).changes : null);
   } else Object.assign(bench, { state: { ...state, changes: bench.state?.changes } });
   drawAll(fresh);
   if (state.changed_files?.length) changedOutside(state.changed_files);
@@ -163,9 +173,9 @@ function drawAll(fresh) {
   drawInspector(bench, actions);
 }
 
-/** Views of the two panes: from the address, else findings beside an image (without images the scene). */
+/** Views of the two panes: from the address, else findings beside an image (without images the scene), a run in the history. */
 function panes() {
-  const first = ["findings", bench.points?.images.length ? "image" : "scene"];
+  const first = ["findings", current().run ? "history" : bench.points?.images.length ? "image" : "scene"];
   return PANES.map((_, k) => (VIEWS[current().view[k]] ? current().view[k] : first[k]));
 }
 
@@ -224,10 +234,12 @@ function drawTable(fresh) {
   const wanted = TABLE_OF[current().kind];
   if (wanted && wanted !== tableName && followed !== current().ids[0]) { tableName = wanted; table = null; }
   followed = current().ids[0];
+  const first = bench.points.n ? "points" : "readings";
+  if (!asked && fresh && tableName !== first) { tableName = first; table = null; }
   if (!table) {
     const data = tableData();
     table = new Table(t(TABLES[tableName]), data, { sort: data.sort, onselect: (rows, quiet) => selectRows(data.kind, rows, quiet), onenter: (row) => { selectRows(data.kind, [row], false); actions.show("image", "right"); } });
-    const tab = (name, title) => make("button", { type: "button", role: "tab", "aria-selected": name === tableName, onclick: () => { tableName = name; table = null; drawTable(false); } }, t(title));
+    const tab = (name, title) => make("button", { type: "button", role: "tab", "aria-selected": name === tableName, onclick: () => { asked = true; tableName = name; table = null; drawTable(false); } }, t(title));
     by("tables").replaceChildren(make("div", { role: "tablist", "aria-label": t("Tables"), class: "tabs" }, ...Object.entries(TABLES).map(([name, title]) => tab(name, title))), table.element);
   } else if (fresh) table.renew(tableData());
   const { kind, ids } = current();
@@ -251,6 +263,7 @@ const KEYS = [
   ["}", "next image of this epoch", () => viewOf(ImageView)?.next(1, true)], ["{", "previous image of this epoch", () => viewOf(ImageView)?.next(-1, true)],
   ["Enter", "show the image", () => actions.show("image", "right")],
   ["x", "leave out what is chosen (or take it back)", () => actions.toggle()], ["X", "leave out the whole image", () => actions.image()], ["e", "take back what is chosen", () => actions.include(chosenNames())],
+  ["m", "carry out the first remedy", () => { if (bench.findings.remedies?.[0]?.possible && !bench.state.read_only) actions.remedy(1); }],
   ["a", "adjust again", () => actions.adjust("warm")], ["A", "adjust from the beginning", () => actions.adjust("cold")],
   ["u", "undo (also Ctrl-Z)", () => actions.undo()], ["U", "redo (also Ctrl-Shift-Z)", () => actions.redo()], ["s", "save (also Ctrl-S)", () => actions.save()],
   ["f", "filter the table", () => { table?.field.focus(); table?.field.select(); }],
@@ -319,6 +332,8 @@ async function changeLanguage() {
   const to = spoken() === "en" ? "de" : "en";
   localStorage.setItem("language", to);
   await speak(to);
+  bench.state = null; // what the server says is said in its language too
+  await renew(null);
   drawn();
 }
 
@@ -334,7 +349,8 @@ function drawn() {
 function told(message) {
   if (message.type === "progress") working(t("step {n}, v'Pv {omega}", { n: message.step ?? message.iteration ?? 0, omega: significant(message.omega, 5) }));
   else if (message.type === "state" && !busy && bench.state) { working(""); renew(null); }
-  else if (message.type === "error") { working(""); tell(message.error, "bad"); }
+  else if (message.type === "error") { working(""); renew(null); }
+  else if (message.type === "detected") { bench.arrived.push(message); viewOf(JobsView)?.arrive(message); working(t("detecting {image}", { image: message.image })); }
   else if (message.type === "folder" && message.changed?.length && !busy) changedOutside(message.changed);
   else if (message.type === "lost") document.body.classList.add("lost");
   else if (message.type === "connected") { document.body.classList.remove("lost"); if (!bench.state?.solved) renew(null); }
@@ -357,7 +373,7 @@ async function begin() {
   try {
     await renew(null);
     live(told); // its cookie comes with the first answer
-    if (!bench.state.solved && bench.state.running) working(t("adjusting …")); // a message tells when it is done
+    if (!bench.state.solved && !bench.state.failure) working(t("adjusting …")); // a message tells when it is done
   } catch (error) { tell(error.message, "bad"); }
 }
 

@@ -19,7 +19,7 @@ export function make(tag, given = {}, ...children) {
 
 /** New children instead of the old ones; none for null. @param {any} element @param {...(Node|string|null|undefined|false)} children */
 export function fill(element, ...children) {
-  element.replaceChildren(...children.filter((child) => child !== null && child !== undefined && child !== false));
+  element.replaceChildren(...children.flat().filter((child) => child !== null && child !== undefined && child !== false));
   return element;
 }
 

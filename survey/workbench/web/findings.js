@@ -6,6 +6,9 @@ import { anchor, current, select } from "./store.js";
 import { rowOf, rowsOfImage } from "./source.js";
 import { placeOf } from "./tree.js";
 
+/** The places that a message names. */
+const places = (said) => said.anchors.flatMap((to) => [" ", link(to, decodeURIComponent(to.replace(/^#\w+=/, "")), { data: { id: decodeURIComponent(to.replace(/^#\w+=/, "")) } })]);
+
 export class FindingsView {
   /** @param {any} bench @param {any} actions */
   constructor(bench, actions) {
@@ -26,11 +29,13 @@ export class FindingsView {
   draw(state, findings) {
     const suspects = findings.suspects ?? [], causes = findings.causes ?? [];
     fill(this.element, 
-      make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
-      (findings.warnings ?? []).length ? make("ul", { class: "problems" }, ...findings.warnings.map((w) => make("li", {}, w.text, ...w.anchors.flatMap((to) => [" ", link(to, decodeURIComponent(to.replace(/^#\w+=/, "")))])))) : null,
+      state.waiting ? make("p", { class: "verdict" }, t("adjusting …")) : make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
       ...causes.map((cause) => this.cause(cause)),
-      make("h2", {}, t("Suspects"), " ", make("span", { class: "quiet" }, count(findings.n_suspects ?? suspects.length))),
-      suspects.length ? this.suspects(t("Suspects, worst first"), suspects) : make("p", { class: "quiet" }, t("Nothing disagrees with the others.")),
+      findings.remedies?.length ? make("h2", {}, t("What would mend it")) : null,
+      ...(findings.remedies ?? []).map((remedy) => this.remedy(remedy)),
+      (findings.warnings ?? []).length ? make("ul", { class: "problems" }, ...findings.warnings.map((w) => make("li", {}, w.text, ...places(w)))) : null,
+      state.solved ? make("h2", {}, t("Suspects"), " ", make("span", { class: "quiet" }, count(findings.n_suspects ?? suspects.length))) : null,
+      !state.solved ? null : suspects.length ? this.suspects(t("Suspects, worst first"), suspects) : make("p", { class: "quiet" }, t("Nothing disagrees with the others.")),
       state.exclusions.length ? this.exclusions(state.exclusions) : null,
       (findings.groups ?? []).length ? make("h2", {}, t("Groups")) : null,
       (findings.groups ?? []).length ? this.groups(findings.groups) : null,
@@ -38,7 +43,14 @@ export class FindingsView {
       findings.largest?.length ? this.suspects(t("Largest within the limit"), findings.largest) : null);
   }
 
-  cause(text) { return make("p", { class: "cause" }, make("b", {}, t("Probable cause")), " ", text); }
+  cause(cause) { return make("p", { class: "cause" }, make("b", {}, t("Probable cause")), " ", cause.text, ...places(cause)); }
+
+  /** A cause that was tried: what it explains, and one click that carries it out. */
+  remedy(r) {
+    const evidence = t("explains {share} % of the misfit; sigma0 becomes {sigma0}; test {test}, limit {limit}; probability {sure} %", { share: number(100 * r.explained, 0), sigma0: number(r.sigma0, 3), test: significant(r.statistic, 3), limit: significant(r.critical, 3), sure: number(100 * r.probability, 0) });
+    return make("div", { class: "cause remedy" }, make("p", {}, make("b", {}, `${r.number}. ${r.cause}`), "; ", r.change, r.anchor ? [" ", link(r.anchor, t("show"))] : null), make("p", { class: "quiet" }, evidence),
+      this.bench.state.read_only ? null : r.possible ? button(t("Apply"), () => this.actions.remedy(r.number), r.number === 1 ? "m" : "", { "aria-label": `${t("Apply")}: ${r.cause}` }) : make("p", { class: "quiet" }, t("Only you can do that.")));
+  }
 
   suspects(title, rows) {
     return plainTable(title, [t("observation"), "w", t("share of limit"), "r", t("residual"), ""],
@@ -81,10 +93,10 @@ export const verdictText = (verdict) => ({ passed: `✓ ${t("verdict passed")}`,
 export function drawHeader(state) {
   by("title").textContent = state.title;
   document.title = `${state.title} · labsurvey`;
-  by("verdict").className = state.verdict;
-  by("verdict").textContent = verdictText(state.verdict);
+  by("verdict").className = state.waiting ? "" : state.verdict;
+  by("verdict").textContent = state.waiting ? "" : verdictText(state.verdict);
   const fact = (name, value) => make("span", {}, make("span", { class: "quiet" }, `${name} `), value);
-  fill(by("facts"), fact("sigma0", number(state.sigma0, 4)), fact(t("redundancy"), count(state.redundancy)),
+  fill(by("facts"), ...(state.solved ? [fact("sigma0", number(state.sigma0, 4)), fact(t("redundancy"), count(state.redundancy))] : []),
     fact(t("excluded"), count(state.exclusions.length)), state.n_not_used ? fact(t("not used"), count(state.n_not_used)) : null, state.unsaved ? fact(t("unsaved"), count(state.unsaved)) : null, state.read_only ? make("span", { class: "pill" }, t("for reading only")) : null);
 }
 

@@ -7,7 +7,7 @@ import { rowsOfPoint } from "./source.js";
 
 /** Right and up of the flat views, by axes of the world. */
 const FLAT = { plan: [0, 1], south: [0, 2], east: [1, 2] };
-const NAMES = { plan: "Plan", south: "Elevation from the south", east: "Elevation from the east" };
+export const NAMES = { plan: "Plan", south: "Elevation from the south", east: "Elevation from the east" };
 const CIRCLE = Array.from({ length: 33 }, (_, k) => [Math.cos((k * Math.PI) / 16), Math.sin((k * Math.PI) / 16)]);
 const MOST = 1e5; // points drawn at once
 
@@ -29,9 +29,12 @@ export class SceneView {
     this.measure();
   }
 
+  /** The solution, or what is planned where there is none. */
+  get scene() { return this.bench.scene ?? this.bench.planned; }
+
   /** Middle and size of everything. */
   measure() {
-    const { scene } = this.bench;
+    const { scene } = this;
     if (!scene) return;
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
     const places = [...scene.spots.map((spot) => spot.x), ...scene.shots.map((shot) => [shot.pose[3], shot.pose[7], shot.pose[11]]), ...scene.outlines.flatMap((line) => line.x)];
@@ -108,7 +111,7 @@ export class SceneView {
   }
 
   paint(context, width, height) {
-    const { scene } = this.bench;
+    const { scene } = this;
     if (!scene || !this.middle || !Number.isFinite(this.reach)) return;
     const to = this.projection(width, height);
     this.to = to;
@@ -127,6 +130,7 @@ export class SceneView {
     for (const shot of scene.shots) this.shot(context, line, to, shot, chosen.image ? shot.image === chosen.image : chosen.cameras.has(shot.camera) && shot.main);
     this.rays(context, line, chosen);
     for (const spot of scene.spots) this.spot(context, line, to, spot, chosen.points.has(spot.id));
+    if (this.bench.drawn) this.told_(context, line, to);
     this.labels(context, to);
     this.ruler(context, width, height);
     this.told.textContent = t("ellipsoids × {k}", { k: significant(this.factor, 2) });
@@ -152,7 +156,7 @@ export class SceneView {
   clouds(context, to) {
     context.fillStyle = colour("quiet");
     let left = MOST;
-    for (const cloud of this.bench.scene.clouds ?? []) for (const x of cloud.x) { if (left-- <= 0) return; const [u, v] = to(x); context.fillRect(u - 1, v - 1, 2, 2); }
+    for (const cloud of this.scene.clouds ?? []) for (const x of cloud.x) { if (left-- <= 0) return; const [u, v] = to(x); context.fillRect(u - 1, v - 1, 2, 2); }
   }
 
   /** Cameras and points that the selection means. */
@@ -172,8 +176,8 @@ export class SceneView {
 
   /** The image that stands for the place of this one: of equal places only one is drawn. */
   placeOf(camera, epoch) {
-    const pose = this.bench.scene.poses[`${camera}/${epoch}`];
-    return this.bench.scene.shots.find((shot) => shot.camera === camera && pose && shot.pose.every((x, k) => Math.abs(x - pose[k]) < 1e-4))?.image ?? "";
+    const pose = this.scene.poses[`${camera}/${epoch}`];
+    return this.scene.shots.find((shot) => shot.camera === camera && pose && shot.pose.every((x, k) => Math.abs(x - pose[k]) < 1e-4))?.image ?? "";
   }
 
   /** A camera: its frustum at its first image and where it is chosen, a small mark at every other place. */
@@ -197,7 +201,7 @@ export class SceneView {
 
   /** Lines of sight to the points that are chosen, from every image that saw them. */
   rays(context, line, chosen) {
-    const { scene, points } = this.bench;
+    const { scene } = this, { points } = this.bench;
     context.strokeStyle = colour("point-here");
     context.lineWidth = 1;
     context.setLineDash([5, 4]);
@@ -226,8 +230,31 @@ export class SceneView {
     if (shift) { context.lineWidth = 2; context.strokeStyle = colour("warn"); line([spot.x, spot.x.map((x, k) => x + this.factor * shift[k])]); }
   }
 
+  /** What a job has drawn: cameras and lines of a plan, a path with its ellipsoids, motions (enlarged as the ellipsoids are). */
+  told_(context, line, to) {
+    const { cameras, points, lines, path } = this.bench.drawn;
+    context.strokeStyle = colour("soft");
+    for (const [image, pose] of Object.entries(cameras)) {
+      this.shot(context, line, to, { camera: image.split("/")[0], image, pose, main: true, half: this.scene.cameras[image.split("/")[0]]?.half_angles_rad ?? [0.4, 0.3] }, true);
+      const [u, v] = to([pose[3], pose[7], pose[11]]);
+      context.fillText(image, u + 7, v + 12);
+    }
+    context.strokeStyle = context.fillStyle = colour("soft");
+    context.lineWidth = 2.2;
+    for (const { x } of lines) line(x);
+    for (const { id, x } of points) { const [u, v] = to(x); context.beginPath(); context.arc(u, v, 6, 0, 7); context.stroke(); context.fillText(id, u + 8, v + 12); }
+    context.lineWidth = 1.4;
+    line(path.map((p) => p.x));
+    for (const { x, cov, status } of path) {
+      const [u, v] = to(x), axes = axesOf([cov.slice(0, 3), cov.slice(3, 6), cov.slice(6, 9)].map((row) => row.map((c) => c ?? 0)));
+      context.strokeStyle = colour(status === "fixed" ? "soft" : "point-bad");
+      for (const [a, b] of [[0, 1], [0, 2], [1, 2]]) line(CIRCLE.map(([c, s]) => x.map((y, k) => y + this.factor * (c * axes[a][k] + s * axes[b][k]))));
+      context.fillRect(u - 2, v - 2, 4, 4);
+    }
+  }
+
   labels(context, to) {
-    const { scene } = this.bench, taken = [];
+    const { scene } = this, taken = [];
     context.font = "11px system-ui, sans-serif";
     context.lineJoin = "round";
     const first = new Map(scene.shots.filter((shot) => shot.main !== false).map((shot) => [shot.camera, { id: shot.camera, x: [shot.pose[3], shot.pose[7], shot.pose[11]] }]));
@@ -258,7 +285,7 @@ export class SceneView {
 
   nearest(x, y) {
     if (!this.to) return null;
-    const { scene } = this.bench, things = [...scene.spots.map((s) => ({ kind: s.kind === "point" ? "point" : "station", id: s.id, x: s.x, spot: s })),
+    const { scene } = this, things = [...scene.spots.map((s) => ({ kind: s.kind === "point" ? "point" : "station", id: s.id, x: s.x, spot: s })),
       ...scene.shots.map((s) => ({ kind: "image", id: s.image, x: [s.pose[3], s.pose[7], s.pose[11]] })), ...scene.outlines.map((o) => ({ kind: "target", id: o.id, x: o.x[0] }))];
     let best = null, least = 12;
     for (const thing of things) { const [u, v] = this.to(thing.x), far = Math.hypot(u - x, v - y); if (far < least) { least = far; best = thing; } }

@@ -3,7 +3,7 @@
 import { parts } from "./store.js";
 
 /** @param {any} raw answer of /api/state */
-export const stateOf = (raw) => ({ ...raw, ...(raw.solution ?? {}), version: raw.version, title: raw.title || raw.folder, verdict: raw.solution?.verdict ?? "check", solved: raw.solution !== null });
+export const stateOf = (raw) => ({ ...raw, ...(raw.solution ?? {}), version: raw.version, title: raw.title || raw.folder, reason: raw.solution?.reason ?? raw.failure ?? "", verdict: raw.solution?.verdict ?? (raw.failure ? "failed" : "check"), solved: raw.solution !== null, waiting: raw.solution === null && !raw.failure });
 
 /** Image sizes by camera. @param {any} raw */
 export const sizesOf = (raw) => Object.fromEntries(raw.tree.cameras.map((c) => [c.id, c.size]));

@@ -1,6 +1,7 @@
 // What the server says, as values: columns of image points, tables, pictures, live messages.
 
 import { parts } from "./store.js";
+import { spoken } from "./words.js";
 
 let token = "";
 
@@ -20,7 +21,7 @@ export class Refused extends Error {
 }
 
 async function ask(path, given = {}) {
-  const answer = await fetch(path, { ...given, headers: { "X-Token": token, ...given.headers } });
+  const answer = await fetch(path, { ...given, headers: { "X-Token": token, "X-Language": spoken(), ...given.headers } });
   if (answer.ok) return answer;
   const text = await answer.text();
   let said = text;

@@ -1,0 +1,58 @@
+"""Changes that no unknown knows, small enough for the score at the solution: steps, drifts, shifts, clocks, shapes.
+
+What shows only where the adjustment has lost its way altogether belongs to the other rooms, which form it from single
+images and closed forms.
+"""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.effects.bent import bent_targets
+from adjust.diagnosis.effects.clocks import clocks
+from adjust.diagnosis.effects.effect import Effect
+from adjust.diagnosis.effects.pixels import pixels
+from adjust.diagnosis.effects.shapes import shapes
+from adjust.diagnosis.effects.steps import steps
+from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.model.errors import SurveyError
+from adjust.testing.distributions import chi2
+
+_ALPHA = 1e-4
+_SHARE = 0.2  # of the misfit beyond noise, by the linear score: less than a cause has to take away in the end
+_MOST = 6
+
+
+def hypotheses(case: Case) -> Iterator[Hypothesis]:
+    """The few changes that explain most for what they cost, each kind of them once; targets that are bent."""
+    yield from bent_targets(case)
+    yield from _scored(case)
+
+
+def _scored(case: Case) -> Iterator[Hypothesis]:
+    linear = case.linear
+    if linear is None:
+        return
+    effects = [e for make in (steps, pixels, clocks, shapes) for e in _formed(make, case)]
+    excess = linear.result.omega - linear.result.redundancy
+    clear = [e for e in effects if e.first.seen and e.first.drop > _SHARE * excess]
+    if not clear:
+        return
+    redundancy = max(linear.result.redundancy, 1)
+    scale = max(1.0, (linear.result.omega - max(e.first.drop for e in clear)) / redundancy)
+    limit = _ALPHA / max(len(effects), 1)
+    clear = [e for e in clear if e.first.drop > scale * float(chi2.isf(limit, e.first.seen))]
+    best: dict[tuple[str, ...], Effect] = {}
+    for e in sorted(clear, key=lambda e: -e.value(scale, linear.result.n_observations)):
+        best.setdefault((e.hypothesis.name, *e.hypothesis.place.ids), e)
+    for e in list(best.values())[:_MOST]:
+        yield e.formed(case, linear, len(effects))
+
+
+def _formed(make: Callable[[Case], Iterator[Effect]], case: Case) -> list[Effect]:
+    try:
+        with np.errstate(all="ignore"):
+            return list(make(case))
+    except SurveyError:
+        return []

@@ -1,0 +1,104 @@
+"""A change of what was observed, of a size to be estimated; scored at the solution, then tried."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.score import Linear, Score
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray, Survey
+from adjust.precision.precision import noise_of
+
+ROUNDS = 3
+_SMALL = 9.0  # a further drop of v'Pv that is not worth another adjustment
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """hypothesis: without its survey and the size in its words. first: its score.
+
+    score: once more, at another adjustment of the same observations. mended: the survey without it, of size theta (k,),
+    with the values of an adjustment. said: its cause in words, by theta and sigmas. added: theta and a further change.
+    known: a size that explains itself near this one, and what that makes of the hypothesis; None where there is none.
+    """
+
+    hypothesis: Hypothesis
+    first: Score
+    score: Callable[[Linear], Score]
+    mended: Callable[[Adjustment, FloatArray], Survey]
+    said: Callable[[FloatArray, FloatArray], str]
+    added: Callable[[FloatArray, FloatArray], FloatArray] = np.add
+    known: Callable[[FloatArray, FloatArray], tuple[FloatArray, Mapping[str, Any]] | None] = lambda theta, sigmas: None
+
+    def value(self, scale: float, n: int) -> float:
+        """By how much more it explains than its parameters cost (Schwarz 1978), over a variance factor."""
+        return self.first.drop / scale - (self.hypothesis.parameters + self.first.seen) * float(np.log(max(n, 2)))
+
+    def formed(self, case: Case, linear: Linear, looked_at: int) -> Hypothesis:
+        """The hypothesis, whose survey is found by Gauss-Newton over adjustments (Golub and Pereyra 1973)."""
+        found: list[Mapping[str, Any]] = []
+
+        def made() -> Survey | None:
+            theta, result, sigmas = self._estimated(case, linear)
+            known = self.known(theta, sigmas)
+            theta, changes = known or (theta, {"cause": self.said(theta, sigmas)})
+            found.append(changes)
+            return self.mended(result, theta)
+
+        def told(_: Adjustment) -> Sequence[Hypothesis]:
+            return [replace(hypothesis, **found[-1])] if found else []
+
+        sigmas = np.sqrt(np.maximum(np.diag(self.first.cov), 0.0))
+        hypothesis = replace(self.hypothesis, survey=made, cause=self.said(self.first.theta, sigmas),
+                             evidence=self.first.drop, parameters=self.hypothesis.parameters + self.first.seen,
+                             looked_at=looked_at)  # fmt: skip
+        return replace(hypothesis, follow=told)
+
+    def _estimated(self, case: Case, linear: Linear) -> tuple[FloatArray, Adjustment, FloatArray]:
+        """Its size, the adjustment at which that was found, and the sigmas (k,)."""
+        theta, cov, now = self.first.theta, self.first.cov, linear
+        for _ in range(ROUNDS - 1):
+            try:
+                new = Linear(case.warm(self.mended(now.result, theta)))
+                more = self.score(new)
+            except SurveyError:
+                break
+            if more.drop < _SMALL * new.scale:
+                cov, now = more.cov if more.seen else cov, new
+                break
+            theta, cov, now = self.added(theta, more.theta), more.cov, new
+        return theta, now.result, np.sqrt(np.maximum(np.diag(cov), 0.0) * now.scale)
+
+
+Shifts = Mapping[int, FloatArray]
+"""By the position of an image block: (n, 2, k) px that a change of size one has shifted its points by."""
+
+
+def of_shifts(linear: Linear, shifts: Shifts) -> Score:
+    """The score of shifts of the image points of ``linear.result.survey``."""
+    return linear.of_parts(linear.image_parts(shifts))
+
+
+def of_others(linear: Linear, kind: str, shifts: Mapping[tuple[str, ...], FloatArray]) -> Score:
+    """The score of shifts (d, k) in the tangents of observations of a kind, by their ids."""
+    parts = []
+    for i, o in enumerate(linear.system.precision.graph.others):
+        if o.kind == kind and o.ids in shifts:
+            at = linear.system.n_image + i
+            rows = np.arange(linear.system.ptr[at], linear.system.ptr[at + 1])
+            parts.append((rows, np.asarray(noise_of(o).R()) @ shifts[o.ids]))
+    return linear.of_parts(parts)
+
+
+def shifted_back(survey: Survey, shifts: Shifts, theta: FloatArray) -> Survey:
+    """The survey with its image points where they are without these shifts."""
+    blocks = tuple(
+        replace(b, uv=b.uv - shifts[i] @ theta) if i in shifts else b for i, b in enumerate(survey.image_blocks)
+    )
+    return replace(survey, image_blocks=blocks)
+

@@ -1,0 +1,77 @@
+"""Image points that are all shifted alike: the centre of the first pixel at (1/2, 1/2), another region of the sensor.
+
+Shows where something else than the lens tells the principal point: a lens that is held, or one of several detectors.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.effects.effect import Effect, of_shifts, shifted_back
+from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
+from adjust.model.observations import ImageBlock
+from adjust.model.survey import FloatArray, Survey
+
+_HALF = 0.5
+_NEAR = 0.05
+
+
+def pixels(case: Case) -> Iterator[Effect]:
+    """A shift of all images of a camera, of all of a target or of the points of the world, of a group."""
+    linear = case.linear
+    if linear is None:
+        return
+    blocks = case.survey.image_blocks
+    for kind, field in (("camera", "camera_id"), ("target", "target_id"), ("group", "group")):
+        owners = list(dict.fromkeys(getattr(b, field) for b in blocks))
+        for owner in owners if kind == "camera" or len(owners) > 1 else ():
+            yield _of(case, kind, field, owner)
+
+
+def _of(case: Case, kind: str, field: str, owner: str | None) -> Effect:
+    linear, name = case.linear, owner or "points"
+    if linear is None:
+        raise ValueError("a shift is scored at an adjustment")
+    what = f"{kind} {name}" if owner else "the points of the world"
+
+    def shifts(survey: Survey) -> dict[int, FloatArray]:
+        return {i: np.broadcast_to(np.eye(2), (len(b.uv), 2, 2)) for i, b in enumerate(survey.image_blocks)
+                if getattr(b, field) == owner}  # fmt: skip
+
+    def said(theta: FloatArray, sigmas: FloatArray) -> str:
+        by = ", ".join(f"{t:+.2f} +- {s:.2f}" for t, s in zip(theta, sigmas, strict=True))
+        return f"the image points of {what} are shifted by ({by}) px: another region of the sensor, or another origin"
+
+    def known(theta: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, Mapping[str, Any]] | None:
+        half = np.full(2, np.copysign(_HALF, theta[0]))
+        if not (np.abs(theta - half) < _NEAR + 4.0 * sigmas).all():
+            return None
+        centre = "(0.5, 0.5)" if theta[0] > 0.0 else "(-0.5, -0.5)"
+        cause = (f"the image points of {what} count pixels from the corner of the image: the centre of its first pixel "
+                 f"is {centre}, here it is (0, 0)")  # fmt: skip
+        return half, {"name": "pixel origin", "cause": cause, "parameters": 1,
+                      "edits": _edits(case.survey, field, owner, half)}  # fmt: skip
+
+    hypothesis = Hypothesis(
+        "images shifted", "", "subtract that from u_px and v_px, or give the region of the sensor that was read",
+        Place(kind, (name,), "u_px"), case.survey, (), 1.0, 1,
+    )  # fmt: skip
+    return Effect(
+        hypothesis, of_shifts(linear, shifts(linear.result.survey)),
+        lambda at: of_shifts(at, shifts(at.result.survey)),
+        lambda _, theta: shifted_back(case.survey, shifts(case.survey), theta), said, known=known,
+    )  # fmt: skip
+
+
+def _edits(survey: Survey, field: str, owner: str | None, by: FloatArray) -> tuple[ChangeColumns, ...]:
+    if field == "group":
+        return ()
+
+    def mine(b: ImageBlock) -> bool:
+        return bool(getattr(b, field) == owner)
+
+    epochs = tuple(dict.fromkeys(b.epoch_id for b in survey.image_blocks if mine(b)))
+    where = {field: (owner or "",), "epoch_id": epochs}
+    return (ChangeColumns("image_points", ("u_px", "v_px"), np.eye(2), -by, where),)

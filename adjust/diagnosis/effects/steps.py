@@ -1,0 +1,325 @@
+"""Unknowns that are taken for constant and are not: another value from some epoch, or row, on; a drift with time."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.diagnosis.bodies.targets import motion_text
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.effects.effect import Effect
+from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place
+from adjust.diagnosis.prediction import Prediction
+from adjust.diagnosis.score import Linear, Part, Score, drift_times
+from adjust.diagnosis.sequences import with_pairs
+from adjust.model.observations import FrameRef, ImageBlock, Pair
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import FloatArray, IntArray, Survey
+
+FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
+_FEWEST = 4
+_DELTA = 1e-5
+_MOVED = {  # name of the unknown: of the mistake, kind of the thing, what happened to it
+    "station_from_camera": ("camera moved", "camera", "camera {} was moved on its station"),
+    "carrier_from_target": ("target moved", "target", "target {} was moved"),
+    "mount_from_station": ("station moved", "station", "station {} was moved on its table"),
+    "world_from_table": ("table moved", "table", "table {}, or all that stands still around it, was moved"),
+    "world_from_station": ("station moved", "station", "station {} was bumped"),
+    "station_body": ("station moved", "station", "station {} was moved on its table"),
+    "target_body": ("target moved", "target", "target {}, which stands for the world, was moved"),
+    "point": ("point moved", "point", "point {} was moved, or exchanged for another one"),
+    "orientation": ("set-up turned", "setup", "the instrument of set-up {} was turned or bumped"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Course:
+    """An unknown, or some components of it, through time. labels: of its parts."""
+
+    name: ParameterName
+    components: tuple[str, ...]
+    kind: str  # of observation: image, pair, reading
+    labels: tuple[str, ...]
+    parts: tuple[Part, ...]
+
+
+def steps(case: Case) -> Iterator[Effect]:
+    """The best step of every unknown that is the same for several epochs, and the drift of every lens."""
+    linear = case.linear
+    if linear is None:
+        return
+    for course in _courses(linear):
+        if len(course.parts) < _FEWEST:
+            continue
+        found = linear.steps(course.parts)
+        if found:
+            cut = max(found, key=lambda t: found[t].drop)
+            yield _step(case, course, cut, found[cut], len(found))
+        if course.name[0] == "lens":
+            yield _drift(case, course, linear.drift(course.parts))
+
+
+def _courses(linear: Linear) -> Iterator[_Course]:
+    survey, columns = linear.result.survey, linear.system.columns
+    ptr, row_of = linear.system.ptr, linear.system.row_of
+    first_reading = len(ptr) - 1 - len(survey.readings)
+    pairs = {i: k for k, i in enumerate(_other_rows(linear, "pair"))}
+    At = linear.A.tocsc()
+
+    def course(name: ParameterName, kind: str, ids: Mapping[int, str], rows: IntArray) -> _Course:
+        numbers = [i for i in np.unique(row_of[rows]).tolist() if i in ids]
+        of = [np.arange(ptr[i], ptr[i + 1]) for i in numbers]
+        return _Course(name, (), kind, tuple(ids[i] for i in numbers), tuple(linear.parts(columns.at[name], of)))
+
+    for name, at in columns.at.items():
+        if name[0] not in (*_MOVED, "lens") or not len(at) or len(name) > 2 or _is_the_world(survey, name):
+            continue
+        rows = np.unique(At[:, at].indices)
+        if (rows < ptr[linear.system.n_image]).any():
+            yield from _of_images(linear, name, rows)
+        elif name[0] == "world_from_station":
+            yield course(name, "pair", {i: survey.pairs[k].pair_id for i, k in pairs.items()}, rows)
+        elif name[0] == "orientation":
+            ids = {first_reading + k: r.reading_id for k, r in enumerate(survey.readings)}
+            yield course(name, "reading", ids, rows)
+    yield from _of_held(linear)
+
+
+def _is_the_world(survey: Survey, name: ParameterName) -> bool:
+    """Whether a table stands before one target alone: moving either is the same to all observations."""
+    return name[0] == "world_from_table" and len(_standing(survey)) == 1 and not survey.points
+
+
+def _standing(survey: Survey) -> list[str]:
+    return [t.target_id for t in survey.targets if t.motion == "fixed" and t.station_id is None]
+
+
+def _of_images(linear: Linear, name: ParameterName, rows: IntArray) -> Iterator[_Course]:
+    blocks = linear.result.survey.image_blocks
+    ptr = 2 * linear.result.image_residuals.block_ptr
+    epochs = list(dict.fromkeys(b.epoch_id for b in blocks))
+    number = {e: k for k, e in enumerate(epochs)}
+    of = np.repeat([number[b.epoch_id] for b in blocks], np.diff(ptr))
+    images = rows[rows < ptr[-1]]
+    known = np.unique(of[images])
+    by_epoch = [images[of[images] == k] for k in known]
+    for components in (FOCAL, CENTRE) if name[0] == "lens" else ((),):
+        columns = linear.columns(name, components)
+        if len(columns):
+            labels = tuple(epochs[k] for k in known)
+            yield _Course(name, components, "image", labels, tuple(linear.parts(columns, by_epoch)))
+
+
+def _of_held(linear: Linear) -> Iterator[_Course]:
+    """Bodies whose poses are held: the targets that tell the datum, the mounts of stations; by differences."""
+    survey, free = linear.result.survey, linear.system.columns.at
+    still = [t.target_id for t in survey.targets if t.motion == "fixed"]
+    turned = [s.station_id for s in survey.stations if s.motion == "table"]
+    held = [("target_body", t) for t in still if ("carrier_from_target", t) not in free]
+    held += [("station_body", s) for s in turned if ("mount_from_station", s) not in free]
+    prediction = Prediction(survey, linear.result)
+    on_table = {r.epoch_id for r in survey.table_readings}
+    for name in held:
+        by_epoch: dict[str, list[Part]] = {}
+        cameras = {c.camera_id for c in survey.cameras if c.station_id == name[1]}
+        mine = {i for i, b in enumerate(survey.image_blocks) if b.target_id == name[1] or
+                (name[0] == "station_body" and b.camera_id in cameras and b.epoch_id in on_table)}  # fmt: skip
+        for i in sorted(mine):
+            D = _by_motion(prediction, i, name)
+            if D is not None:
+                by_epoch.setdefault(survey.image_blocks[i].epoch_id, []).extend(linear.image_parts({i: D}))
+        parts = tuple((np.concatenate([r for r, _ in p]), np.concatenate([B for _, B in p])) for p in by_epoch.values())
+        yield _Course(name, (), "image", tuple(by_epoch), parts)
+
+
+def _by_motion(prediction: Prediction, i: int, name: ParameterName) -> FloatArray | None:
+    """(n, 2, 6) px by a small motion of a body."""
+    steps = [{name: Pose3.Expmap(s * _DELTA * np.eye(6)[k])} for k in range(6) for s in (1.0, -1.0)]
+    uv = [prediction.uv(i, step) for step in steps]
+    if any(x is None for x in uv):
+        return None
+    both = np.array(uv).reshape(6, 2, -1, 2)
+    return np.asarray(np.moveaxis((both[:, 0] - both[:, 1]) / (2.0 * _DELTA), 0, -1))
+
+
+def _other_rows(linear: Linear, kind: str) -> list[int]:
+    """Numbers in the linear system of all observations of a kind, in the order of the survey."""
+    return [linear.system.n_image + i for i, o in enumerate(linear.system.precision.graph.others) if o.kind == kind]
+
+
+def _step(case: Case, course: _Course, cut: int, first: Score, looked_at: int) -> Effect:
+    since, thing = course.labels[cut], course.name[1]
+    later = course.labels[cut:]
+    name, kind, what = _MOVED.get(course.name[0], ("", "camera", ""))
+    if course.name[0] == "lens":
+        name = "focus touched" if course.components == FOCAL else "images shifted"
+    place = Place(kind, (thing,), epochs=later if course.kind == "image" else ())
+    before = "before epoch" if course.kind == "image" else f"before {course.kind}"
+    names = [c for c in course.components if c in _components(case, course.name)]
+
+    def said(theta: FloatArray, sigmas: FloatArray) -> str:
+        if course.name[0] == "lens":
+            by = ", ".join(f"{n} {t:+.2f} +- {s:.2f}" for n, t, s in zip(names, theta, sigmas, strict=False))
+            why = "focus or zoom was touched" if name == "focus touched" else "another crop of the sensor"
+            return f"camera {thing}: from epoch {since} on its lens is another one by {by} px: {why}"
+        tables = [t.table_id for t in case.survey.tables] if len(_standing(case.survey)) == 1 else []
+        alike = f" (or table {tables[0]}: its images cannot tell)" if name == "target moved" and tables else ""
+        return f"{what.format(thing)} {before} {since}{_amount(course.name[0], theta, sigmas)}{alike}"
+
+    hypothesis = Hypothesis(
+        name, "", f"leave out what was observed from {since} on, or give it a name of its own there", place,
+        case.survey, _edits(case.survey, course, later), 1.0, 1, looked_at,
+    )  # fmt: skip
+    chosen = frozenset(later)
+    return Effect(
+        hypothesis, first,
+        lambda linear: _at(linear, course, lambda parts: linear.steps(parts)[cut]),
+        lambda result, theta: _mended(case.survey, result, course, dict.fromkeys(chosen, 1.0), theta),
+        said, _composed if _is_pose(case, course.name) else np.add,
+    )  # fmt: skip
+
+
+def _drift(case: Case, course: _Course, first: Score) -> Effect:
+    thing, weights = course.name[1], dict(zip(course.labels, drift_times(len(course.labels)), strict=True))
+    names = [c for c in course.components if c in _components(case, course.name)]
+
+    def said(theta: FloatArray, sigmas: FloatArray) -> str:
+        by = ", ".join(f"{n} {t:+.2f} +- {s:.2f}" for n, t, s in zip(names, theta, sigmas, strict=False))
+        return f"camera {thing}: its lens drifts from epoch {course.labels[0]} to {course.labels[-1]} by {by} px"
+
+    hypothesis = Hypothesis(
+        "lens drifts", "", "let the camera warm up, or adjust its lens by blocks of epochs", Place("camera", (thing,)),
+        case.survey, (), 1.0, 0,
+    )  # fmt: skip
+    return Effect(hypothesis, first, lambda linear: _at(linear, course, linear.drift),
+                  lambda result, theta: _mended(case.survey, result, course, weights, theta), said)  # fmt: skip
+
+
+def _at(linear: Linear, course: _Course, score: Callable[[Sequence[Part]], Score]) -> Score:
+    """The score of the same course at another adjustment; what that has left out is no part of it."""
+    for again in _courses(linear):
+        if (again.name, again.components) == (course.name, course.components) and again.labels == course.labels:
+            return score(again.parts)
+    return Score(np.zeros(0), np.zeros((0, 0)), 0.0, 0)
+
+
+def _components(case: Case, name: ParameterName) -> list[str]:
+    linear = case.linear
+    return [] if linear is None else [linear.system.columns.components[i] for i in linear.columns(name)]
+
+
+def _is_pose(case: Case, name: ParameterName) -> bool:
+    linear = case.linear
+    body = name[0].endswith("_body")
+    return body or (linear is not None and isinstance(linear.result.estimates[name].value, Pose3))
+
+
+def _composed(first: FloatArray, more: FloatArray) -> FloatArray:
+    """Two motions in turn, as one tangent."""
+    if len(first) != 6:
+        return np.asarray(first + more)
+    return np.asarray(Pose3.Logmap(Pose3.Expmap(first).compose(Pose3.Expmap(more))))
+
+
+def _amount(kind: str, theta: FloatArray, sigmas: FloatArray) -> str:
+    if kind == "orientation":
+        return f" by {np.degrees(theta[0]) * 3600.0:+.1f} +- {np.degrees(sigmas[0]) * 3600.0:.1f} arcsec"
+    if kind == "point":
+        return f" by ({', '.join(f'{1e3 * t:+.2f}' for t in theta)}) mm"
+    return f" {motion_text(Pose3.Expmap(theta))}" if len(theta) == 6 else ""
+
+
+def _edits(survey: Survey, course: _Course, later: Sequence[str]) -> tuple[Edit, ...]:
+    """What was observed of it since then, left out."""
+    if course.kind == "pair":
+        return (LeaveOut(tuple(f"pairs:{p}" for p in later)),)
+    if course.kind == "reading":
+        return ()
+    thing, chosen = course.name[1], set(later)
+    owner = {"station_from_camera": "camera_id", "lens": "camera_id", "carrier_from_target": "target_id",
+             "target_body": "target_id"}
+    field = owner.get(course.name[0])
+    rows = [b for b in survey.image_blocks if b.epoch_id in chosen and (not field or getattr(b, field) == thing)]
+    if course.name[0] in ("carrier_from_target", "target_body"):
+        return (LeaveOut(tuple(dict.fromkeys(f"target:{b.camera_id}/{b.epoch_id}/{thing}" for b in rows))),)
+    if field:
+        return (LeaveOut(tuple(dict.fromkeys(f"image:{b.camera_id}/{b.epoch_id}" for b in rows))),)
+    return (LeaveOut(tuple(f"epoch:{e}" for e in later)),) if course.name[0] != "point" else ()
+
+
+def _altered(result: Adjustment, course: _Course, theta: FloatArray) -> Pose3 | FloatArray:
+    """The value of the unknown, changed by theta, which counts its free components alone."""
+    if course.name[0].endswith("_body"):
+        return Pose3.Expmap(theta)
+    estimate = result.estimates[course.name]
+    free = [i for i, s in enumerate(estimate.status) if s != "held"]
+    if isinstance(estimate.value, Pose3):
+        xi = np.zeros(6)
+        xi[free] = theta
+        return estimate.value.compose(Pose3.Expmap(xi))
+    value = np.array(estimate.value)
+    chosen = [i for i in free if not course.components or estimate.components[i] in course.components]
+    untied = [i for i in chosen if estimate.status[i] != "tied"]
+    before = value.copy()
+    value[untied] += theta
+    for i in chosen:
+        if i not in untied:  # tied components keep their ratio
+            value[i] *= value[untied[0]] / before[untied[0]]
+    return value
+
+
+def _mended(
+    survey: Survey, result: Adjustment, course: _Course, weights: Mapping[str, float], theta: FloatArray
+) -> Survey:
+    """What was observed under another value of the unknown, as it would have been under the first one."""
+    if course.kind == "image":
+        return _mended_images(survey, result, course, weights, theta)
+    if course.kind == "pair":
+        return with_pairs(survey, _mended_pairs(survey, course, weights, theta))
+    chosen = frozenset(weights)
+    readings = tuple(
+        replace(r, value=r.value + float(theta[0])) if r.reading_id in chosen else r for r in survey.readings
+    )
+    return replace(survey, readings=readings)
+
+
+def _mended_images(
+    survey: Survey, result: Adjustment, course: _Course, weights: Mapping[str, float], theta: FloatArray
+) -> Survey:
+    prediction, blocks = Prediction(survey, result), []
+    values: dict[float, Pose3 | FloatArray] = {}
+    for i, block in enumerate(survey.image_blocks):
+        w = weights.get(block.epoch_id, 0.0)
+        if w and _concerns(block, course):
+            altered = values.setdefault(w, _altered(result, course, w * theta))
+            now, then = prediction.uv(i), prediction.uv(i, {course.name: altered})
+            block = block if now is None or then is None else replace(block, uv=block.uv - then + now)
+        blocks.append(block)
+    return replace(survey, image_blocks=tuple(blocks))
+
+
+def _concerns(block: ImageBlock, course: _Course) -> bool:
+    if course.name[0] in ("lens", "station_from_camera"):
+        return block.camera_id == course.name[1]
+    return course.name[0] not in ("carrier_from_target", "target_body") or block.target_id == course.name[1]
+
+
+def _mended_pairs(
+    survey: Survey, course: _Course, weights: Mapping[str, float], theta: FloatArray
+) -> dict[int, Pair]:
+    """``a_late = a exp(theta)``: measured was ``b_from_a exp(theta)``, or ``exp(-theta) a_from_b``."""
+    out = {}
+    for i, pair in enumerate(survey.pairs):
+        if pair.pair_id not in weights:
+            continue
+        motion = type(pair.b_from_a).Expmap(theta if isinstance(pair.b_from_a, Pose3) else theta[:3])
+        at_a = _is(pair.a, course.name[1])
+        m: Any = pair.b_from_a
+        out[i] = replace(pair, b_from_a=m.compose(motion.inverse()) if at_a else motion.compose(m))
+    return out
+
+
+def _is(ref: FrameRef, station: str) -> bool:
+    return ref.kind == "station" and ref.frame_id == station

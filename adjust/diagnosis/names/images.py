@@ -1,0 +1,155 @@
+"""Images under another name: copies, targets or points called by each other's names, images of another camera.
+
+Evidence: what the adjustment says such a block should show under the other name, against what it shows.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from adjust.diagnosis.case import CAP, Case
+from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place, Rename
+from adjust.diagnosis.prediction import Prediction
+from adjust.model.observations import ImageBlock
+from adjust.model.survey import FloatArray, Survey
+
+_CLEARLY = 3.0
+_POINTS, _TARGETS, _BLOCKS, _MOST = 6, 8, 24, 3
+
+
+def misnamed_images(case: Case) -> Iterator[Hypothesis]:
+    """The clearest of each kind."""
+    yield from _copies(case.survey)
+    if case.result is not None and case.survey.image_blocks:
+        now = np.array([_misfit(Prediction(case.survey, case.result), i) for i in range(len(case.survey.image_blocks))])
+        yield from _targets(case, now)
+        yield from _points(case, now)
+        yield from _cameras(case, now)
+
+
+def _misfit(prediction: Prediction, i: int) -> float:
+    """Of a block, each point bounded; all of it where it cannot be predicted."""
+    squares, n = prediction.squares(i), len(prediction.survey.image_blocks[i].uv)
+    return 2.0 * CAP * n if squares is None else float(np.minimum(squares, 2.0 * CAP).sum())
+
+
+def _renamed(survey: Survey, blocks: dict[int, ImageBlock]) -> Survey:
+    return replace(survey, image_blocks=tuple(blocks.get(i, b) for i, b in enumerate(survey.image_blocks)))
+
+
+def _better(case: Case, now: FloatArray, other: dict[int, ImageBlock]) -> tuple[list[int], float]:
+    """The blocks that are clearly better under their other names, and by how much in all."""
+    if case.result is None:
+        return [], 0.0
+    prediction = Prediction(_renamed(case.survey, other), case.result)
+    gains = {i: (now[i], _misfit(prediction, i)) for i in other}
+    good = [i for i, (a, b) in gains.items() if a > _CLEARLY * b and a > _CLEARLY * 2.0 * len(other[i].uv)]
+    return good, sum(gains[i][0] - gains[i][1] for i in good)
+
+
+def _copies(survey: Survey) -> Iterator[Hypothesis]:
+    """The same image points, to the last digit, in two images: either may be the copy."""
+    seen: dict[bytes, list[int]] = {}
+    for i, block in enumerate(survey.image_blocks):
+        if len(block.uv) > 1:
+            seen.setdefault(block.uv.tobytes(), []).append(i)
+    twice = [blocks for blocks in seen.values() if len(blocks) == 2]
+    ways: dict[tuple[str, str], list[tuple[int, int]]] = {}
+    for a, b in twice:
+        names = survey.image_blocks[a].camera_id, survey.image_blocks[b].camera_id
+        ways.setdefault(names, []).append((a, b))
+    for (first, second), pairs in ways.items():
+        for camera, other, which in ((second, first, 1), (first, second, 0)):
+            gone = {p[which] for p in pairs}
+            epochs = tuple(dict.fromkeys(survey.image_blocks[i].epoch_id for i in sorted(gone)))
+            yield Hypothesis(
+                "images copied", f"camera {camera}: at {len(epochs)} epochs ({epochs[0]} ...) its images are those of "
+                f"camera {other}, to the last digit", "put its own images there, or leave these out",
+                Place("camera", (camera,), epochs=epochs),
+                replace(survey, image_blocks=tuple(b for i, b in enumerate(survey.image_blocks) if i not in gone)),
+                (LeaveOut(tuple(f"image:{camera}/{e}" for e in epochs)),), 1e6 + which, 1, 2,
+                penalty=-4.0 * sum(len(survey.image_blocks[i].uv) for i in gone),  # no accident is so exact
+            )  # fmt: skip
+            if first == second:
+                break
+
+
+def _targets(case: Case, now: FloatArray) -> Iterator[Hypothesis]:
+    survey = case.survey
+    points = {t.target_id: len(t.point_ids) for t in survey.targets if t.motion == "fixed"}
+    found = []
+    pairs = [(a, b) for a, b in combinations(list(points)[:_TARGETS], 2) if points[a] == points[b]]
+    for a, b in pairs:
+        other = {a: b, b: a}
+        blocks = {i: replace(x, target_id=other[str(x.target_id)]) for i, x in enumerate(survey.image_blocks)
+                  if x.target_id in other}  # fmt: skip
+        good, gain = _better(case, now, blocks)
+        if good:  # those, and all from the first of them on: what is spoilt itself may hide the others
+            found.append((gain, (a, b), other, {i: x for i, x in blocks.items() if i >= min(good)}))
+            found.append((0.9 * gain, (a, b), other, {i: blocks[i] for i in good}))
+    yield from _exchanges(survey, found, "targets exchanged", "target_id", "targets", len(pairs))
+
+
+def _points(case: Case, now: FloatArray) -> Iterator[Hypothesis]:
+    survey = case.survey
+    ids = [p.point_id for p in survey.points]
+    share: dict[int, float] = {}
+    for i, block in enumerate(survey.image_blocks):
+        for p in block.point_idx.tolist() if block.target_id is None else ():
+            share[p] = share.get(p, 0.0) + float(now[i]) / len(block.uv)
+    found, pairs = [], list(combinations(sorted(share, key=lambda p: -share[p])[:_POINTS], 2))
+    for a, b in pairs:
+        swap = np.arange(len(ids))
+        swap[[a, b]] = b, a
+        blocks = {i: replace(x, point_idx=swap[x.point_idx]) for i, x in enumerate(survey.image_blocks)
+                  if x.target_id is None and bool(np.isin([a, b], x.point_idx).any())}  # fmt: skip
+        good, gain = _better(case, now, blocks)
+        if good:
+            found.append((gain, (ids[a], ids[b]), {ids[a]: ids[b], ids[b]: ids[a]}, {i: blocks[i] for i in good}))
+    yield from _exchanges(survey, found, "points exchanged", "point_id", "points", len(pairs))
+
+
+_Found = tuple[float, tuple[str, str], dict[str, str], dict[int, ImageBlock]]
+
+
+def _exchanges(
+    survey: Survey, found: Sequence[_Found], name: str, column: str, things: str, looked_at: int
+) -> Iterator[Hypothesis]:
+    for gain, (a, b), other, blocks in sorted(found, key=lambda f: -f[0])[:_MOST]:
+        where = [survey.image_blocks[i] for i in sorted(blocks)]
+        epochs = tuple(dict.fromkeys(x.epoch_id for x in where))
+        cameras = tuple(dict.fromkeys(x.camera_id for x in where))
+        yield Hypothesis(
+            name, f"{things} {a} and {b} are called by each other's names in {len(blocks)} images, the first at epoch "
+            f"{epochs[0]}: wrong names, or they changed places", f"exchange them in {column} of image_points.csv",
+            Place(column.removesuffix("_id"), (a, b), column, epochs), _renamed(survey, blocks),
+            (Rename("image_points", column, other, {"camera_id": cameras, "epoch_id": epochs}),), gain, 1, looked_at,
+        )  # fmt: skip
+
+
+def _cameras(case: Case, now: FloatArray) -> Iterator[Hypothesis]:
+    """All that a camera is said to show at an epoch, under the name of another one that shows nothing then."""
+    survey = case.survey
+    images: dict[tuple[str, str], list[int]] = {}
+    for i, b in enumerate(survey.image_blocks):
+        images.setdefault((b.camera_id, b.epoch_id), []).append(i)
+    bad = sorted(images, key=lambda k: -sum(now[i] for i in images[k]))[:_BLOCKS]
+    found: dict[tuple[str, str], tuple[float, list[str], dict[int, ImageBlock]]] = {}
+    for camera, epoch in bad:
+        for other in (c.camera_id for c in survey.cameras):
+            if (other, epoch) not in images:
+                blocks = {i: replace(survey.image_blocks[i], camera_id=other) for i in images[camera, epoch]}
+                good, gain = _better(case, now, blocks)
+                if len(good) == len(blocks):
+                    before, epochs, chosen = found.get((camera, other), (0.0, [], {}))
+                    found[camera, other] = before + gain, [*epochs, epoch], chosen | blocks
+    for (camera, other), (gain, epochs, chosen) in sorted(found.items(), key=lambda f: -f[1][0])[:_MOST]:
+        yield Hypothesis(
+            "images of another camera", f"the images of camera {camera} at epochs {', '.join(epochs)} are those of "
+            f"camera {other}", f"move them to images/{other}", Place("camera", (camera, other), "", tuple(epochs)),
+            _renamed(survey, chosen),
+            (Rename("image_points", "camera_id", {camera: other}, {"epoch_id": tuple(epochs)}),), gain, 1,
+            len(bad) * len(survey.cameras),
+        )  # fmt: skip

@@ -1,0 +1,66 @@
+"""Readings that share an error which nobody gives: those of a set-up and kind differ together from what they should be.
+
+One variance component beside their own (Searle, Casella, McCulloch 1992, balanced one-way model): the mean squares of
+the means of such sets exceed what independent residuals make by ``n s^2``.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.model.observations import ReadingCovariance
+from adjust.model.survey import FloatArray, IntArray, Survey
+from adjust.testing.distributions import chi2
+
+_ALPHA = 1e-6
+_FEWEST, _SETS = 3, 3
+_TRIED = (1.0, 3.0, 10.0)
+_LAST = 1.5
+"""Evidence: as for sigmas, larger variances fit anything, so what else there is to try is tried first."""
+
+
+def correlated_readings(case: Case) -> Iterator[Hypothesis]:
+    """Of every kind of readings the common error of a set-up."""
+    result, survey = case.result, case.survey
+    if result is None or result.reading_residuals is None or survey.reading_covariances:
+        return
+    if len(result.survey.readings) != len(survey.readings):
+        return
+    w = result.reading_residuals.residual / result.reading_residuals.sigma
+    for kind in dict.fromkeys(r.kind for r in survey.readings if r.kind != "direction"):
+        sets = _sets(survey, kind)
+        if len(sets) < _SETS:
+            continue
+        between = sum(len(s) * float(w[s].mean()) ** 2 for s in sets)
+        if between > float(chi2.isf(_ALPHA, len(sets))):
+            n = float(np.mean([len(s) for s in sets]))
+            common = float(np.sqrt(max(between / len(sets) - 1.0, 0.0) / n))
+            for factor in _TRIED:  # what the unknowns take over of a common error does not show in residuals
+                yield _hypothesis(survey, kind, sets, factor * common)
+
+
+def _sets(survey: Survey, kind: str) -> list[IntArray]:
+    by_setup: dict[str, list[int]] = {}
+    for i, r in enumerate(survey.readings):
+        if r.kind == kind and r.setup_id and r.used:
+            by_setup.setdefault(r.setup_id, []).append(i)
+    return [np.array(rows) for rows in by_setup.values() if len(rows) >= _FEWEST]
+
+
+def _hypothesis(survey: Survey, kind: str, sets: list[IntArray], common: float) -> Hypothesis:
+    joint, penalty = [], 0.0
+    for rows in sets:
+        sigma: FloatArray = np.array([survey.readings[i].sigma for i in rows])
+        cov = np.diag(sigma**2) + common**2 * np.outer(sigma, sigma)
+        joint.append(ReadingCovariance(tuple(survey.readings[i].reading_id for i in rows), cov))
+        penalty += float(np.log1p(len(rows) * common**2))
+    return Hypothesis(
+        "correlated observations", f"the readings of kind {kind} of a set-up have an error in common, about "
+        f"{common:.2g} times their own sigma: they are given as independent",
+        "give their covariance, or free the constant they share (an instrument's offset or index, a height)",
+        Place("group", (kind,), "sigma"), replace(survey, reading_covariances=tuple(joint)), (), _LAST, 1, len(_TRIED),
+        penalty=penalty,
+    )  # fmt: skip

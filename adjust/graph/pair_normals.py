@@ -1,0 +1,120 @@
+"""Normal equations of surveys of nothing but pairs and priors, in the compiled core.
+
+A view of the one graph: the same system as GTSAM's factors give, eliminated in the same order. What is analysed once
+serves every step, and near the solution one factor serves several of them.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from adjust.graph.assembly import AdjustmentGraph, Evaluation
+from adjust.model.survey import FloatArray, IntArray
+from adjust.native.elimination import PoseFactor, PoseTree, clique_pattern, pair_gradient
+
+
+@dataclass(frozen=True, eq=False)
+class PairLinear:
+    """Whitened residuals (E, 6) of pairs and their derivatives (E, 6, 6) by b and by a; what is known of single poses.
+
+    own (N, 6, 6), right (N, 6): that part of the normal equations, poses as :class:`PairNormals` counts them.
+    """
+
+    normals: "PairNormals"
+    white: FloatArray
+    by_b: FloatArray
+    by_a: FloatArray
+    own: FloatArray
+    right: FloatArray
+
+    def add(self, key: int, A: FloatArray, b: FloatArray, _: gtsam.noiseModel.Base) -> None:
+        """An observation of one pose, whitened as GTSAM has it: A (k, 6) and right hand side (k,)."""
+        n = self.normals.number[key]
+        self.own[n] += A.T @ A
+        self.right[n] += A.T @ b
+
+    def damped(self, damping: float) -> "PairLinear":
+        """With Marquardt's damping: every unknown held with ``damping`` times its own diagonal."""
+        diagonal = np.einsum("nii->ni", self.own).copy()
+        for nodes, J in ((self.normals.b, self.by_b), (self.normals.a, self.by_a)):
+            np.add.at(diagonal, nodes[nodes >= 0], (J[nodes >= 0] ** 2).sum(axis=1))
+        return replace(self, own=self.own + damping * np.maximum(diagonal, 1e-12)[:, :, None] * np.eye(6))
+
+    def gradient(self) -> FloatArray:
+        """Right hand side (N, 6) of the normal equations."""
+        g = self.right.copy()
+        pair_gradient(self.normals.b, self.normals.a, self.white, self.by_b, self.by_a, g)
+        return g
+
+
+class PairNormals:
+    """The system of a graph with ``only_pairs``, and its elimination by Cholesky. last: keys to be eliminated last.
+
+    b, a: (E,) numbers of the ends of the pairs in use, -1 for what is held.
+    """
+
+    def __init__(self, graph: AdjustmentGraph, last: Iterable[int]) -> None:
+        if graph.pairs is None:
+            raise ValueError("the survey has no pairs between fixed stations")
+        self.graph, self.batch = graph, graph.pairs
+        self.priors = [item.factor for item in graph.singles if item.used and item.factor.size()]
+        b, a = (keys[self.batch.active] for keys in (self.batch.b_key, self.batch.a_key))
+        symbolic = gtsam.SymbolicFactorGraph()
+        for factor in self.priors:
+            symbolic.push_factor(factor.keys()[0])
+        for ends in zip(b.tolist(), a.tolist(), strict=True):
+            symbolic.push_factor(*(k for k in ends if k >= 0))
+        ordering = gtsam.Ordering.ColamdConstrainedLastSymbolicFactorGraph(symbolic, list(last))
+        keys = np.array([ordering.at(i) for i in range(ordering.size())], dtype=np.int64)
+        b, a = (_numbers(keys, ends) for ends in (b, a))
+        both = (b >= 0) & (a >= 0)
+        pattern = clique_pattern(len(keys), b[both], a[both])
+        self.keys = keys[pattern.order]
+        self.b, self.a = (_numbers(pattern.order, ends) for ends in (b, a))
+        self.number = {key: i for i, key in enumerate(self.keys.tolist())}
+        self.factor = PoseFactor(pattern)
+        self.kept = False
+        """Whether the factor of the step before serves the next one."""
+
+    def linearized(self, at: Evaluation) -> PairLinear:
+        """The system at what was evaluated, once more where something else was in between."""
+        if at.number != self.graph.state.evaluation:
+            self.graph.prepare(at.values, True)
+        n = len(self.keys)
+        linear = PairLinear(self, *self.batch.rows_here(), np.zeros((n, 6, 6)), np.zeros((n, 6)))
+        for factor in self.priors:
+            found = factor.linearize(at.values)
+            linear.add(factor.keys()[0], *found.jacobian(), gtsam.noiseModel.Unit.Create(6))
+        return linear
+
+    def solution(self, linear: PairLinear) -> tuple[gtsam.VectorValues, float] | None:
+        """The solution and by how much it lowers chi-square; None where there is a pose without a pivot."""
+        if not self.kept and not self._eliminated(linear):
+            return None
+        return self._solved(linear)
+
+    def tree(self, linear: PairLinear) -> tuple[PoseTree, gtsam.VectorValues] | None:
+        """The Bayes tree and the solution; None as above."""
+        if not self._eliminated(linear):
+            return None
+        return PoseTree(self.factor.pattern, self.keys, self.factor.data), self._solved(linear)[0]
+
+    def _eliminated(self, linear: PairLinear) -> bool:
+        return self.factor.eliminate(self.b, self.a, linear.by_b, linear.by_a, linear.own) < 0
+
+    def _solved(self, linear: PairLinear) -> tuple[gtsam.VectorValues, float]:
+        g = linear.gradient()
+        x = g.copy()
+        self.factor.solve(x)
+        delta = gtsam.VectorValues()
+        for key, row in zip(self.number, x, strict=True):
+            delta.insert(key, row)
+        return delta, float(np.sum(g * x))
+
+
+def _numbers(keys: IntArray, of: IntArray) -> IntArray:
+    """Where each of these stands in ``keys``; -1 stays."""
+    order = np.argsort(keys)
+    return np.where(of < 0, -1, order[np.searchsorted(keys, np.maximum(of, keys.min()), sorter=order)])

@@ -1,0 +1,128 @@
+// Measured pairs b_from_a of poses: residuals Log(measured^-1 b_from_a) and their derivatives; see adjust.observations.pairs.
+#pragma once
+#include "vectors.h"
+
+namespace {
+
+typedef double Block[6][6];
+
+// Of the inverse right Jacobian of SO(3), and of the coupling block of SE(3), by the squared angle (Sola, Deray and Atchuthan
+// 2018, eqs. 144, 180). Below 0.3 rad the series are exact to the last digit, above it the closed forms lose none.
+inline void motion_coefficients(double square, double (&c)[4]) {
+    if (square < 0.09) {
+        const double x = square;
+        c[0] = 1.0 / 12 + x * (1.0 / 720 + x * (1.0 / 30240 + x * (1.0 / 1209600 + x * (1.0 / 47900160 + x * 691.0 / 1307674368000))));
+        c[1] = 1.0 / 6 - x * (1.0 / 120 - x * (1.0 / 5040 - x * (1.0 / 362880 - x * (1.0 / 39916800 - x / 6227020800))));
+        c[2] = 1.0 / 24 - x * (1.0 / 720 - x * (1.0 / 40320 - x * (1.0 / 3628800 - x * (1.0 / 479001600 - x / 87178291200))));
+        c[3] = 1.0 / 120 - x * (1.0 / 2520 - x * (1.0 / 120960 - x * (1.0 / 9979200 - x * (1.0 / 1245404160 - x / 217945728000))));
+        return;
+    }
+    const double x = root(square), sine = std::sin(x), cosine = std::cos(x), half = 0.5 * x;
+    c[0] = (1.0 - half * std::cos(half) / std::sin(half)) / square;
+    c[1] = (x - sine) / (square * x);
+    c[2] = (square + 2.0 * cosine - 2.0) / (2.0 * square * square);
+    c[3] = (2.0 * x - 3.0 * sine + x * cosine) / (2.0 * square * square * x);
+}
+inline void times3(const Mat &a, const Mat &b, Mat &out) {
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) out[i][j] = a[i][0] * b[0][j] + a[i][1] * b[1][j] + a[i][2] * b[2][j];
+}
+inline void cross_matrix(const double *v, double sign, Mat &out) {
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) out[i][j] = sign * skew(v, i, j);
+}
+
+// One pair: residual, Jr^-1 of it (by_a) and Ad(b_from_a^-1) (turn); the derivative by b is -by_a turn.
+inline void pair_row(In<double, 2> R_a, Vector t_a, In<double, 2> R_b, Vector t_b, In<double, 2> measured, Vector shift, double *residual,
+                     Block &by_a, Block &turn) {
+    Mat present, off;
+    Vec place, arm, back;
+    const Vec d = {t_a[0] - t_b[0], t_a[1] - t_b[1], t_a[2] - t_b[2]};
+    for (int i = 0; i < 3; ++i) {
+        place[i] = R_b(0, i) * d[0] + R_b(1, i) * d[1] + R_b(2, i) * d[2];
+        for (int j = 0; j < 3; ++j) present[i][j] = R_b(0, i) * R_a(0, j) + R_b(1, i) * R_a(1, j) + R_b(2, i) * R_a(2, j);
+    }
+    for (int i = 0; i < 3; ++i) {
+        arm[i] = 0.0;
+        for (int k = 0; k < 3; ++k) arm[i] += measured(k, i) * (place[k] - shift[k]);
+        for (int j = 0; j < 3; ++j) off[i][j] = measured(0, i) * present[0][j] + measured(1, i) * present[1][j] + measured(2, i) * present[2][j];
+    }
+    turn_of(off, residual);
+    const double square = dot3(residual, residual);
+    double c[4];
+    motion_coefficients(square, c);
+    Mat right, P, U, PU, UP, PUP, far, near, Q;
+    for (int i = 0; i < 3; ++i) {
+        residual[3 + i] = 0.0;
+        for (int j = 0; j < 3; ++j) {  // [w]x [w]x = w w' - w^2
+            const double even = c[0] * residual[i] * residual[j] + (i == j ? 1.0 - c[0] * square : 0.0), odd = 0.5 * skew(residual, i, j);
+            right[i][j] = even + odd;
+            residual[3 + i] += (even - odd) * arm[j];
+        }
+    }
+    cross_matrix(residual, -1.0, P);
+    cross_matrix(residual + 3, -1.0, U);
+    times3(P, U, PU), times3(U, P, UP), times3(PU, P, PUP), times3(P, PU, far), times3(UP, P, near);
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j)
+            Q[i][j] = 0.5 * U[i][j] + c[1] * (PU[i][j] + UP[i][j] + PUP[i][j]) + c[2] * (far[i][j] + near[i][j] - 3.0 * PUP[i][j]);
+    times3(PUP, P, far), times3(P, PUP, near);
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) Q[i][j] += c[3] * (far[i][j] + near[i][j]);
+    times3(right, Q, far), times3(far, right, near);
+    for (int i = 0; i < 3; ++i) back[i] = -(present[0][i] * place[0] + present[1][i] * place[1] + present[2][i] * place[2]);
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) {
+            by_a[i][j] = by_a[3 + i][3 + j] = right[i][j], by_a[3 + i][j] = -near[i][j], by_a[i][3 + j] = turn[i][3 + j] = 0.0;
+            turn[i][j] = turn[3 + i][3 + j] = present[j][i], turn[3 + i][j] = 0.0;
+            for (int k = 0; k < 3; ++k) turn[3 + i][j] += skew(back, i, k) * present[j][k];
+        }
+}
+// out = sign A B (n by n), of which A has lower zeros (upper triangular) where it says so.
+inline void times6(double sign, const double *A, bool upper, const Block &B, double *out) {
+    for (int i = 0; i < 6; ++i) {
+        double row[6] = {};
+        for (int k = upper ? i : 0; k < 6; ++k)
+            for (int j = 0; j < 6; ++j) row[j] += A[6 * i + k] * B[k][j];
+        for (int j = 0; j < 6; ++j) out[6 * i + j] = sign * row[j];
+    }
+}
+
+struct Pairs {
+    explicit Pairs(Reader &r) : a(r), b(r), R(r), t(r), measured(r), shift(r) {}
+    Ints a, b;
+    In<double, 3> R;
+    In<double, 2> t;
+    In<double, 3> measured;
+    In<double, 2> shift;
+
+    void row(int64_t e, double *residual, Block &by_a, Block &turn) const {
+        pair_row(R[a[e]], t[a[e]], R[b[e]], t[b[e]], measured[e], shift[e], residual, by_a, turn);
+    }
+};
+
+// Residuals, their derivatives by b and by a, and Ad(b_from_a^-1).
+inline void pair_jacobians(const Pairs &pairs, Out<double, 2> residual, Out<double, 3> by_b, Out<double, 3> by_a, Out<double, 3> turn) {
+    for (int64_t e = 0; e < residual.n[0]; ++e) {
+        Block &A = *reinterpret_cast<Block *>(&by_a(e, 0, 0)), &Ad = *reinterpret_cast<Block *>(&turn(e, 0, 0));
+        pairs.row(e, &residual(e, 0), A, Ad);
+        times6(-1.0, A[0], false, Ad, &by_b(e, 0, 0));
+    }
+}
+// Whitened residuals and derivatives by b and by a, W upper triangular.
+inline void pair_rows(const Pairs &pairs, In<double, 3> W, Out<double, 2> white, Out<double, 3> by_b, Out<double, 3> by_a) {
+    for (int64_t e = 0; e < white.n[0]; ++e) {
+        double residual[6];
+        Block A, Ad;
+        pairs.row(e, residual, A, Ad);
+        times6(1.0, &W(e, 0, 0), true, A, &by_a(e, 0, 0));
+        times6(-1.0, &by_a(e, 0, 0), false, Ad, &by_b(e, 0, 0));
+        for (int i = 0; i < 6; ++i) {
+            double sum = 0.0;
+            for (int j = i; j < 6; ++j) sum += W(e, i, j) * residual[j];
+            white(e, i) = sum;
+        }
+    }
+}
+
+}  // namespace

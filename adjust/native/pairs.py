@@ -1,0 +1,33 @@
+"""Measured pairs of poses: residuals and derivatives; see :mod:`adjust.observations.pairs` and ``pairs.h``."""
+
+import numpy as np
+
+from adjust.model.survey import FloatArray, IntArray
+from adjust.native.library import Function
+
+_PAIRS = "a[E] b[E] R[S,3,3] t[S,3] measured[E,3,3] shift[E,3]"
+_pair_jacobians = Function("pair_jacobians", f"{_PAIRS} residual[E,6] by_b[E,6,6] by_a[E,6,6] turn[E,6,6]")
+_pair_rows = Function("pair_rows", f"{_PAIRS} W[E,6,6] white[E,6] by_b[E,6,6] by_a[E,6,6]")
+
+
+def pair_jacobians(
+    a: IntArray, b: IntArray, R: FloatArray, t: FloatArray, measured: FloatArray, shift: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Residuals (E, 6), derivatives (E, 6, 6) by b and by a, and Ad(b_from_a^-1) (E, 6, 6).
+
+    a, b: (E,) positions of the ends among the poses R (S, 3, 3), t (S, 3) m. measured (E, 3, 3), shift (E, 3) m:
+    ``b_from_a``.
+    """
+    residual, (by_b, by_a, turn) = np.empty((len(a), 6)), np.empty((3, len(a), 6, 6))
+    _pair_jacobians(*map(np.ascontiguousarray, (a, b, R, t, measured, shift)), residual, by_b, by_a, turn)
+    return residual, by_b, by_a, turn
+
+
+def pair_rows(
+    a: IntArray, b: IntArray, R: FloatArray, t: FloatArray, measured: FloatArray, shift: FloatArray,
+    whitening: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """The same whitened by upper triangular matrices (E, 6, 6): residuals (E, 6), derivatives by b and by a."""
+    white, (by_b, by_a) = np.empty((len(a), 6)), np.empty((2, len(a), 6, 6))
+    _pair_rows(*map(np.ascontiguousarray, (a, b, R, t, measured, shift, whitening)), white, by_b, by_a)
+    return white, by_b, by_a

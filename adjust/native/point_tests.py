@@ -1,0 +1,65 @@
+"""Tests and reliability of all image points in the core, in threads: every point by itself (``point_tests.h``)."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from adjust.model.survey import BoolArray, FloatArray, IntArray
+from adjust.native.library import Function
+from adjust.native.parallel import run_ranges
+
+_POINTS = "first last v[N,2] M[N,3] W[N,3] used[N]"
+_residual_tests = Function("residual_tests", f"{_POINTS} redundancy[N,2] standardized[N,2] test[N]")
+_controlled_directions = Function("controlled_directions", f"{_POINTS} freedom[N]")
+_point_tests = Function(
+    "point_tests",
+    f"{_POINTS} lambda0[2] redundancy[N] least[N] statistic[N] detectable[N] external[N] w[N,2] error[N,2] "
+    "detectable_component[N,2] bias[N,2]",
+)
+_bias_ellipses = Function("bias_ellipses", f"{_POINTS} lambda0[2] out[N,3]")
+
+
+class AdjustedPoints(NamedTuple):
+    """Image points (N): residuals v (N, 2) px, predicted minus observed, and what their tests take besides.
+
+    M: whitened A Q A' (N, 3: 00, 01, 11). W: upper triangular square root information (N, 3), 1 / px. used: (N,).
+    """
+
+    v: FloatArray
+    M: FloatArray
+    W: FloatArray
+    used: BoolArray
+
+
+def residual_tests(points: AdjustedPoints) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Redundancy numbers (N, 2), standardized residuals (N, 2) and v' inv(Q_vv) v (N,), as ``ImageResiduals`` has them.
+
+    Baarda (1968), Foerstner (1979); nan where nothing controls the point.
+    """
+    n = len(points.v)
+    out = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
+    run_ranges(_residual_tests, n, *points, *out)
+    return out
+
+
+def controlled_directions(points: AdjustedPoints, freedom: IntArray) -> None:
+    """Into ``freedom`` (N,) in how many directions an error of each point shows in its residuals."""
+    run_ranges(_controlled_directions, len(points.v), *points, freedom)
+
+
+def point_tests(points: AdjustedPoints, lambda0: FloatArray, out: tuple[FloatArray, ...]) -> None:
+    """Into ``out`` redundancy, least, statistic, detectable, external (N,), then w, error, detectable_component, bias.
+
+    The latter (N, 2); all as ``ObservationTests`` has them. lambda0: (2,) of tests with one and two components.
+    """
+    run_ranges(_point_tests, len(points.v), *points, lambda0, *out)
+
+
+def bias_ellipses(points: AdjustedPoints, lambda0: FloatArray) -> FloatArray:
+    """Major and minor axis (px) and direction of the major (rad, x to y) of biases b with b' W'KW b = lambda0: (N, 3).
+
+    Infinite where nothing controls them.
+    """
+    out = np.empty((len(points.v), 3))
+    run_ranges(_bias_ellipses, len(out), *points, lambda0, out)
+    return out

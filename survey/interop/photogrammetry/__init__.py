@@ -1,0 +1,1 @@
+"""Files of photogrammetric bundle adjustments: surveys with their observations."""

@@ -1,0 +1,206 @@
+"""Runs of a project, kept under ``runs/NNNN`` so that any two can be compared and any can come back.
+
+``run.json``: when, by whom, what came out, what was excluded, hashes of all inputs. ``survey.toml``: as it was then.
+``estimates.npz``: every parameter with its covariance a priori. ``solution.json``: as in the results. A run of the
+same inputs, options and versions as the last one is not kept again; of runs that nobody pinned the last ``MOST`` stay.
+Images are never kept.
+"""
+
+import hashlib
+import io
+import json
+import re
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.model.errors import SurveyError
+from adjust.model.result import Adjustment, Estimate, ParameterName
+from survey.folder.arrays import read_arrays
+from survey.folder.replacing import changing, replace_parts
+from survey.folder.text import atomic_write, decode, read_bytes
+from survey.project.exclusions import Exclusion, Name
+from survey.project.project import DEFINITION_FILE
+from survey.solution.dictionary import RunInfo, plain, solution_json
+from survey.solution.earlier.changes import Snapshot, snapshot
+
+RUNS, MOST = "runs", 50
+_RUN, _ESTIMATES, _SOLUTION = "run.json", "estimates.npz", "solution.json"
+_FILES = (_RUN, _ESTIMATES, _SOLUTION, DEFINITION_FILE)
+_ARRAYS = ("parameters", "names", "units", "status", "start", "block", "covariance", "value_start", "values")
+_BROKEN = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError, OSError)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run by its number. summary: verdict, sigma0, redundancy and so on. hashes: of the inputs, by path."""
+
+    number: int
+    time: str
+    author: str
+    command: str
+    pinned: bool
+    summary: Mapping[str, Any]
+    hashes: Mapping[str, str]
+    exclusions: tuple[Exclusion, ...]
+    fingerprint: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """As it stands in ``run.json``."""
+        return {**vars(self), "exclusions": [_exclusion(e) for e in self.exclusions]}
+
+    def text(self) -> str:
+        """One line for people."""
+        sigma0, mark = self.summary.get("sigma0"), "*" if self.pinned else " "
+        shown, verdict = "-" if sigma0 is None else f"{sigma0:.4f}", self.summary.get("verdict", "")
+        return (f"{self.number:4d}{mark} {self.time}  {verdict:<7} sigma0 {shown}  redundancy "
+                f"{self.summary.get('redundancy')}  excluded {len(self.exclusions)}  {self.author}")  # fmt: skip
+
+
+def _exclusion(e: Exclusion) -> dict[str, Any]:
+    return {"what": e.name.what, "id": e.name.id, "reason": e.reason, "author": e.author, "time": e.time,
+            "at": None if e.at is None else list(e.at)}  # fmt: skip
+
+
+def record_run(
+    folder: Path, place: Path, adjustment: Adjustment, run: RunInfo, solution: Mapping[str, Any], author: str
+) -> tuple[str, ...]:
+    """Keep a run: its files made in ``place`` while ``folder`` is being changed; old files that are to go then."""
+    runs, there = _readable(folder), [int(path.parent.name) for path in _places(folder)]
+    of = [dict(run.input_hashes), plain(run.options), dict(run.versions), sorted(solution)]
+    fingerprint = hashlib.sha256(json.dumps(of, sort_keys=True, allow_nan=False).encode()).hexdigest()
+    if runs and runs[-1].fingerprint == fingerprint:
+        return ()
+    number = max(there, default=0) + 1
+    said = Run(number, run.date, author, run.command, False, snapshot(adjustment).summary, dict(run.input_hashes),
+               tuple(one.exclusion for one in run.left_out), fingerprint)  # fmt: skip
+    into = place / RUNS / f"{number:04d}"
+    into.mkdir(parents=True)
+    atomic_write(into / _RUN, json.dumps(said.as_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    atomic_write(into / _SOLUTION, solution_json(dict(solution)))
+    atomic_write(into / _ESTIMATES, _estimates_npz(adjustment.estimates.values()))
+    atomic_write(into / DEFINITION_FILE, read_bytes(folder / DEFINITION_FILE)[0])
+    light = [r.number for r in runs if not r.pinned]
+    return tuple(f"{RUNS}/{n:04d}/{name}" for n in light[: max(0, len(light) + 1 - MOST)] for name in _FILES)
+
+
+def list_runs(folder: Path) -> tuple[Run, ...]:
+    """All runs of a project in their order. Raises SurveyError for one that is not as it was written."""
+    return tuple(_read(path) for path in _places(folder))
+
+
+def _places(folder: Path) -> list[Path]:
+    found = [p for p in (folder / RUNS).glob(f"*/{_RUN}") if re.fullmatch(r"\d{4,9}", p.parent.name)]
+    return sorted(found, key=lambda path: int(path.parent.name))
+
+
+def _readable(folder: Path) -> list[Run]:
+    """Runs that are as they were written: a damaged one must not keep anybody from adjusting."""
+    out = []
+    for path in _places(folder):
+        with suppress(SurveyError):
+            out.append(_read(path))
+    return out
+
+
+def find_run(folder: Path, number: int) -> Run:
+    """A run by its number; raises SurveyError where there is none."""
+    path = folder / RUNS / f"{number:04d}" / _RUN
+    if not path.is_file():
+        known = ", ".join(str(r.number) for r in list_runs(folder)[-12:]) or "none yet; 'labsurvey adjust' keeps one"
+        raise SurveyError(f"{folder}: there is no run {number}; known: {known}")
+    return _read(path)
+
+
+def _read(path: Path) -> Run:
+    try:
+        found = json.loads(read_bytes(path)[0])
+        left = tuple(
+            Exclusion(Name(str(e["what"]), str(e["id"])), str(e["reason"]), str(e["author"]), str(e["time"]),
+                      at=None if e["at"] is None else (float(e["at"][0]), float(e["at"][1])))
+            for e in found["exclusions"]
+        )  # fmt: skip
+        texts = {k: str(found[k]) for k in ("time", "author", "command", "fingerprint")}
+        hashes = {str(k): str(v) for k, v in found["hashes"].items()}
+        return Run(number=int(path.parent.name), pinned=found["pinned"] is True, summary=dict(found["summary"]),
+                   hashes=hashes, exclusions=left, **texts)  # fmt: skip
+    except _BROKEN as error:
+        raise SurveyError(f"{path}: cannot be read as a run ({error}); remove its folder") from error
+
+
+def definition_of(folder: Path, number: int) -> str:
+    """The text of survey.toml at a run."""
+    path = folder / RUNS / f"{find_run(folder, number).number:04d}" / DEFINITION_FILE
+    return decode(path, read_bytes(path)[0])
+
+
+def load_run(folder: Path, number: int) -> Snapshot:
+    """The solution of a run. Raises SurveyError."""
+    run, path = find_run(folder, number), folder / RUNS / f"{number:04d}" / _ESTIMATES
+    try:
+        return Snapshot({e.name: e for e in _estimates(read_arrays(path, _ARRAYS))}, run.summary)
+    except _BROKEN as error:
+        raise SurveyError(f"{path}: cannot be read as a run ({error}); remove its folder") from error
+
+
+def pin_run(folder: Path, number: int, pinned: bool = True) -> Run:
+    """Keep a run for ever, or no longer. Raises SurveyError."""
+    with changing(folder) as place:
+        said = find_run(folder, number).as_dict() | {"pinned": pinned}
+        into = place / RUNS / f"{number:04d}"
+        into.mkdir(parents=True)
+        atomic_write(into / _RUN, json.dumps(said, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+        replace_parts(folder)
+    return find_run(folder, number)
+
+
+def remove_empty(folder: Path, gone: Iterable[str]) -> None:
+    """Folders of runs whose files are gone."""
+    for place in {(folder / name).parent for name in gone}:
+        try:
+            place.rmdir()
+        except OSError:  # somebody keeps a file of their own in it
+            continue
+
+
+def _estimates_npz(estimates: Iterable[Estimate]) -> bytes:
+    every = list(estimates)
+    values = [e.value.matrix()[:3].ravel() if isinstance(e.value, Pose3) else np.asarray(e.value, dtype=float).ravel()
+              for e in every]  # fmt: skip
+    sizes = np.array([len(e.components) for e in every], dtype=np.int64)
+    out = io.BytesIO()
+    np.savez_compressed(
+        out,
+        parameters=np.array(["/".join(e.name) for e in every], dtype=str),
+        names=np.array([c for e in every for c in e.components], dtype=str),
+        units=np.array([u for e in every for u in e.units], dtype=str),
+        status=np.array([s for e in every for s in e.status], dtype=str),
+        start=np.concatenate([[0], np.cumsum(sizes)]),
+        block=np.concatenate([[0], np.cumsum(sizes**2)]),
+        covariance=np.concatenate([*(e.cov.ravel() for e in every), np.empty(0)]),
+        value_start=np.cumsum([0, *map(len, values)]),
+        values=np.concatenate([*values, np.empty(0)]),
+    )
+    return out.getvalue()
+
+
+def _estimates(found: Mapping[str, Any]) -> Iterable[Estimate]:
+    """What :func:`_estimates_npz` wrote: 12 numbers are a pose with 6 components."""
+    start, block, ends = found["start"], found["block"], found["value_start"]
+    for k, name in enumerate(found["parameters"].tolist()):
+        i, j = int(start[k]), int(start[k + 1])
+        value = np.asarray(found["values"][ends[k] : ends[k + 1]], dtype=float)
+        pose = len(value) == 12 and j - i == 6
+        if not pose and len(value) != j - i:
+            raise ValueError(f"{name} has {len(value)} values of {j - i} components")
+        named: ParameterName = tuple(name.split("/"))
+        texts = (tuple(found[x][i:j].tolist()) for x in ("names", "units", "status"))
+        components, units, status = texts
+        cov = found["covariance"][block[k] : block[k + 1]].reshape(j - i, j - i)
+        matrix = np.vstack([value.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]) if pose else np.eye(4)
+        yield Estimate(named, Pose3(matrix) if pose else value, components, units, cov, status)

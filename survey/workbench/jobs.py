@@ -1,0 +1,211 @@
+"""The other jobs of a project, from the page and from Python: what each says, and what of it is drawn in space."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import SurveyError
+from adjust.model.observations import FrameRef
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import FloatArray, PoseParameter
+from survey.folder.replacing import changing, replace_parts
+from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, kept_run, made
+from survey.project.project import DEFINITION_FILE, RESULTS
+from survey.solution.dictionary import plain
+from survey.solution.earlier.runs import remove_empty
+from survey.solution.frames import AdjustedFrames
+from survey.solution.quantities import scale_of
+from survey.workbench.deciding import Deciding
+from survey.workbench.places import Places, scene_values
+
+if TYPE_CHECKING:  # detection brings in OpenCV, planning much else
+    from survey.detection import ImageReport
+    from survey.planning.job import PlanRequest
+    from survey.planning.summary import PlanningOutcome
+
+_MOST_LINES = 300
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What a job adds to the scene, in the world (m).
+
+    cameras: ``world_from_camera`` by image. points: with covariances (3, 3) m^2. lines: ends by name. path: positions
+    in order, each with its covariance and status. scene: everything, where there is no solution that shows it.
+    """
+
+    cameras: Mapping[str, Pose3] = field(default_factory=dict)
+    points: Sequence[tuple[str, FloatArray, FloatArray]] = ()
+    lines: Sequence[tuple[str, Sequence[FloatArray]]] = ()
+    path: Sequence[tuple[str, FloatArray, FloatArray, str]] = ()
+    scene: Mapping[str, Any] | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values."""
+        return dict(plain({
+            "cameras": {name: pose.matrix()[:3].ravel() for name, pose in self.cameras.items()},
+            "points": [{"id": name, "x": x, "cov": cov.ravel()} for name, x, cov in self.points],
+            "scene": self.scene,
+            "lines": [{"id": name, "x": x} for name, x in self.lines],
+            "path": [{"id": name, "x": x, "cov": cov.ravel(), "status": s} for name, x, cov, s in self.path],
+        }))  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What a job said: for people, as plain values, and in the scene."""
+
+    text: str
+    summary: Mapping[str, Any]
+    drawn: Drawn = Drawn()
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values."""
+        return {"text": self.text, "summary": self.summary, "drawn": self.drawn.as_dict()}
+
+
+class Jobs(Deciding):
+    """A project folder with its other jobs; each is the command of the same name, and raises as that does."""
+
+    def save(self) -> AdjustOutcome:
+        """Write ``results`` as ``labsurvey adjust`` does, and a run beside the others. Raises as :meth:`exclude`."""
+        with self._lock:
+            self._check(None)
+            clock = Clock({"adjust": self.situation.seconds})
+            with changing(self.folder) as place:
+                self._require_unchanged()
+                said = command_line("open", self.folder)
+                outcome = made(self.situation.project, self.adjustment, place, clock, command=said)
+                gone = kept_run(self.folder, place, self.situation.project, outcome)
+                replace_parts(self.folder, gone=gone)
+            remove_empty(self.folder, gone)
+            self.n_unsaved = 0
+            return outcome.at(self.folder)
+
+    def detect(self, *, everything: bool = False, told: "Callable[[ImageReport], None] | None" = None) -> Told:
+        """Find targets and spots in images that are new or have changed (everything: in all), and adjust again.
+
+        told: called with what was found in each image as it comes.
+        """
+        from survey.jobs.detecting import detect_job
+
+        self._check(None)
+        outcome = detect_job(self.folder, progress=False, everything=everything, told=told)
+        self.reload()
+        return Told(outcome.text(), outcome.summary())
+
+    def plan(self, request: "PlanRequest | None" = None) -> Told:
+        """Precision before measuring, and what to measure next, as ``plan.toml`` lists it; drawn: what was chosen."""
+        from survey.planning.job import PlanRequest, planning_job
+
+        self._check(None)
+        if not (self.folder / "plan.toml").is_file():
+            raise SurveyError(f"{self.folder / 'plan.toml'}: there is no such file; it says what could be measured")
+        outcome = planning_job(self.folder, request or PlanRequest(), progress=False)
+        return Told(outcome.text(), outcome.summary(), _chosen(outcome))
+
+    def navigate(self, station: str = "", interval_s: float | None = None) -> Told:
+        """A pose for every epoch that shows beacons and no target; drawn: the path with its covariances."""
+        from survey.jobs.navigating.job import NavigateRequest, navigate_job
+
+        self._check(None)
+        outcome = navigate_job(self.folder, NavigateRequest(station or None, interval_s=interval_s), progress=False)
+        poses = [(e, e.world_from_station) for e in outcome.trajectory.epochs]
+        path = [(e.epoch_id, np.asarray(pose.translation()), _in_world(pose, e.cov), str(e.status))
+                for e, pose in poses if pose is not None]  # fmt: skip
+        return Told(outcome.text(), outcome.summary(), Drawn(path=path))
+
+    def add(self, new: str | Path) -> Told:
+        """Let the network grow by the stations or observations of another folder, and adjust again.
+
+        It begins at the results: where they are not those of now, they are saved first.
+        """
+        from survey.jobs.network import add_job
+
+        self._check(None)
+        if self.n_unsaved or not (self.folder / RESULTS / "solution.json").is_file():
+            self.save()
+        outcome = add_job(self.folder, self._other(new), progress=False)
+        self.reload()
+        return Told(outcome.text(), outcome.summary())
+
+    def compare_with(self, other: str | Path) -> Told:
+        """The project as the later of two epochs, and what moved since the other; nothing is written.
+
+        drawn: how points and stations moved.
+        """
+        from survey.jobs.comparing import compare_job
+
+        outcome = compare_job(self._other(other), self.folder, progress=False)
+        before, after = (_positions(a) for a in outcome.adjustments)
+        lines = [(name, [before[name], x]) for name, x in after.items() if name in before]
+        return Told(outcome.text(), outcome.summary(), Drawn(lines=lines))
+
+    def batch(self, folders: Sequence[str | Path] = ()) -> Told:
+        """Adjust several projects (none: all beside this one), side by side; each has its results afterwards."""
+        from survey.batch.run import BatchOptions, run_batch
+        from survey.batch.tables import summary_table
+
+        self._check(None)
+        chosen = [self._other(f) for f in folders] or sorted(
+            p.parent for p in self.folder.resolve().parent.glob(f"*/{DEFINITION_FILE}"))  # fmt: skip
+        found = run_batch(chosen, BatchOptions(progress=False))
+        return Told(summary_table(found), {"folders": [str(r.folder) for r in found],
+                                           "states": [str(r.state) for r in found]})  # fmt: skip
+
+    def _other(self, folder: str | Path) -> Path:
+        """Another project folder; a relative one lies beside this one. Raises SurveyError."""
+        path = self.folder.resolve().parent / Path(folder).expanduser()
+        if not str(folder).strip() or not path.is_dir():
+            raise SurveyError(f"{folder or 'FOLDER'}: there is no such folder; name it as it lies beside {self.folder}")
+        return path
+
+
+def _positions(adjustment: Adjustment) -> dict[str, FloatArray]:
+    """Adjusted points and stations (3,) m by name."""
+    found = {n: e.value for n, e in adjustment.estimates.items() if n[0] in ("point", "world_from_station")}
+    return {"/".join(n): np.asarray(v.translation() if isinstance(v, Pose3) else v) for n, v in found.items()}
+
+
+def _in_world(pose: Pose3, cov: FloatArray) -> FloatArray:
+    """The covariance (3, 3) of a pose's position in the world; cov: (6, 6) in the tangent of the pose."""
+    R = pose.rotation().matrix()
+    return np.asarray(R @ cov[3:, 3:] @ R.T)
+
+
+class _PlannedFrames(AdjustedFrames):
+    """Frames that are still to be: of what is not estimated yet by the values of the plan."""
+
+    def __init__(self, adjustment: Adjustment, start: StartValues) -> None:
+        super().__init__(adjustment)
+        self.start = start
+
+    def pose(self, name: ParameterName, parameter: PoseParameter) -> Pose3 | None:
+        """As of an adjustment, else as planned."""
+        return self.start.poses.get(name) if name not in self.estimates and name in self.start.poses else \
+            super().pose(name, parameter)  # fmt: skip
+
+
+def _chosen(outcome: "PlanningOutcome") -> Drawn:
+    """The candidates that a plan chose: cameras of new epochs, new points, lines of readings, pairs and distances."""
+    from adjust.design.candidates import with_candidates
+
+    steps = () if outcome.selection is None else outcome.selection.steps
+    chosen = [outcome.planned.candidates[s.candidate_idx] for s in steps]
+    survey = with_candidates(outcome.planned.survey, chosen)
+    frames = _PlannedFrames(replace(outcome.expected, survey=survey), outcome.planned.start)
+    places = Places(frames, survey.points)
+    images = {(b.camera_id, b.epoch_id): None for c in chosen for b in c.image_blocks}
+    poses = {"/".join(key): frames.world_from(FrameRef("camera", *key)) for key in images}
+    points = [(p.point_id, outcome.planned.start.points.get(p.point_id)) for c in chosen for p in c.points]
+    lines = [(c.name, x) for c in chosen for kind in (c.pairs, c.distances, c.readings, c.coordinate_differences)
+             for item in kind for x in places.lines(item)]  # fmt: skip
+    known = {k: p for k, p in poses.items() if p is not None}
+    everything = scene_values(outcome.expected, scale_of(outcome.expected, "a_priori"))
+    return Drawn(known, [(k, x, np.zeros((3, 3))) for k, x in points if x is not None], lines[:_MOST_LINES],
+                 scene=everything)  # fmt: skip

@@ -1,0 +1,199 @@
+"""A project in memory that is adjusted again, and again, from the values of everything that was ever solved.
+
+What is decided about it stands in :mod:`survey.workbench.session`.
+"""
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+
+from adjust.diagnosis.diagnosis import Diagnosis
+from adjust.graph.assembly import StartValues
+from adjust.model.errors import DiagnosedError, SurveyError
+from adjust.model.result import Adjustment
+from adjust.model.survey import Survey
+from survey.folder.locking import LOCK, holder_of
+from survey.folder.text import decode, read_bytes
+from survey.jobs.adjusting.steps import adjust_project, seen_points
+from survey.project.exclusions import in_force, read_exclusions
+from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
+from survey.project.reading import leaving_out, read_all
+from survey.solution.earlier.changes import Changes, snapshot, solution_changes
+from survey.solution.quantities import Scale, scale_of
+from survey.solution.statistics import Statistics, statistics_of
+from survey.workbench.rows import PointRows, point_rows
+from survey.workbench.situation import (
+    CancelledError,
+    KnownValues,
+    Mode,
+    Situation,
+    identified_in,
+    in_complex,
+    signature_of,
+    spot_places,
+    used_only,
+)
+
+Watch = Callable[[int, float], None]
+
+
+class Resident:
+    """A project folder, kept in memory. Every method may be called from any thread.
+
+    read_only: nothing is ever written. watch: called with (iteration, v'Pv) while something is adjusted.
+    """
+
+    def __init__(self, folder: str | Path, *, read_only: bool = False, watch: Watch | None = None) -> None:
+        self.folder, self.read_only, self.watch = Path(folder), read_only, watch
+        self.version = 0
+        self.changes: Changes | None = None
+        self.failure: SurveyError | None = None
+        self._values, self._lock, self._cancel = KnownValues(), threading.RLock(), threading.Event()
+        self._statistics: tuple[int, Statistics] | None = None
+        self._rows: tuple[Situation, PointRows] | None = None
+        self.situation = self._read()
+
+    def _read(self) -> Situation:
+        signature = signature_of(self.folder)  # first: what changes while it is read shows as changed afterwards
+        everything = read_all(self.folder)
+        text = decode(self.folder / DEFINITION_FILE, read_bytes(self.folder / DEFINITION_FILE)[0])
+        exclusions = in_force(read_exclusions(self.folder / OBSERVATIONS_FOLDER)[0])
+        return Situation(everything, leaving_out(everything, exclusions.values()), text, exclusions, signature)
+
+    # what is there
+
+    @property
+    def adjustment(self) -> Adjustment:
+        """The solution; raises SurveyError where there is none yet."""
+        return self.situation.solved
+
+    @property
+    def scale(self) -> Scale:
+        """What covariances of unknowns are multiplied with."""
+        return scale_of(self.adjustment, self.situation.project.options.sigmas)
+
+    @property
+    def rows(self) -> PointRows:
+        """All image points with the solution, also while the next one is adjusted."""
+        kept, now = self._rows, self.situation
+        if kept is None or kept[0] is not now:
+            kept = now, point_rows(now.survey, now.now, now.adjustment)
+            self._rows = kept
+        return kept[1]
+
+    @property
+    def statistics(self) -> Statistics:
+        """Reliability, correlations, budgets and so on, computed when first asked for. Raises SurveyError."""
+        with self._lock:
+            if self._statistics is None or self._statistics[0] != self.version:
+                options = self.situation.project.options
+                self._statistics = self.version, statistics_of(self.adjustment, options.tolerances, self.scale)
+            return self._statistics[1]
+
+    def spot_name(self, row: int) -> str:
+        """The name under which a spot that has got a name is left out, by its row; raises IndexError for others."""
+        at, there = row, self.situation.everything
+        at -= sum(len(b.uv) for b in there.survey.image_blocks)
+        for block in self.situation.identified:
+            if 0 <= at < len(block.uv):
+                place, z = (block.camera_id, block.epoch_id), complex(*block.uv[at].tolist())
+                return next(f"spot:{'/'.join(place)}/{name}" for s in there.spots for name, spot in
+                            zip(s.spot_ids, in_complex(s.uv), strict=True)
+                            if (s.camera_id, s.epoch_id) == place and spot == z)  # fmt: skip
+            at -= len(block.uv)
+        raise IndexError(row)
+
+    def changed_files(self) -> tuple[str, ...]:
+        """Files of the project that were written since they were read, by path in the folder."""
+        now, before = signature_of(self.folder), self.situation.signature
+        return tuple(sorted(name for name in {*now, *before} if now.get(name) != before.get(name)))
+
+    def holder(self) -> str | None:
+        """Who writes the folder at the moment."""
+        return holder_of(self.folder / LOCK)
+
+    # adjusting
+
+    def adjust(self, mode: Mode = "warm") -> Changes | None:
+        """Adjust what is in memory; what that changed, None the first time. Raises SurveyError, CancelledError."""
+        with self._lock:
+            try:
+                return self._take(self._solved(self.situation, mode))
+            except CancelledError:
+                raise
+            except SurveyError as error:
+                self.failure = error
+                raise
+
+    def reload(self) -> Changes | None:
+        """Read the folder again and adjust it."""
+        with self._lock:
+            return self._take(self._solved(self._read(), "warm"))
+
+    @property
+    def diagnosis(self) -> Diagnosis | None:
+        """What is wrong, of the last solution; where there is none yet, of the adjustment that failed."""
+        found = self.failure.diagnosis if isinstance(self.failure, DiagnosedError) else None
+        if self.situation.adjustment is not None:
+            found = self.situation.adjustment.diagnosis
+        return found if isinstance(found, Diagnosis) else None
+
+    def cancel(self) -> None:
+        """Give up the adjustment that runs, at its next step."""
+        self._cancel.set()
+
+    def _take(self, new: Situation, failure: SurveyError | None = None) -> Changes | None:
+        before, after, self.situation = self.situation.adjustment, new.adjustment, new
+        self.version, self.failure, self.changes = self.version + 1, failure, None
+        if after is not None:
+            self._values.keep(after)
+            self.changes = None if before is None else solution_changes(snapshot(before), snapshot(after))
+        return self.changes
+
+    def _solved(self, situation: Situation, mode: Mode) -> Situation:
+        self._cancel.clear()
+        begin_s = perf_counter()
+        found, how = self._adjusted(situation, mode)
+        known = situation.known_spots
+        identified = situation.identified
+        if found is None:
+            project = situation.project
+            adjustment, how = adjust_project(project, False, watch=self._step), "cold"
+            identified, known = identified_in(situation.everything, adjustment), spot_places(project.spots)
+        else:
+            adjustment = found
+        return replace(situation, adjustment=adjustment, identified=identified, known_spots=known, mode=how,
+                       seconds=perf_counter() - begin_s)  # fmt: skip
+
+    def _adjusted(self, situation: Situation, mode: Mode) -> tuple[Adjustment | None, Mode]:
+        """From the values of before; None where that does not do."""
+        project = situation.project
+        if mode == "cold" or self.version == 0 or not spot_places(project.spots) <= situation.known_spots:
+            return None, "cold"
+        survey = situation.now
+        named = tuple(used_only(b) for b in survey.image_blocks[len(project.survey.image_blocks) :])
+        blocks = (*project.survey.image_blocks, *(b for b in named if len(b.uv)))
+        survey = replace(project.survey, image_blocks=blocks)
+        survey = seen_points(survey) if project.spots else survey
+        begun: list[bool] = []
+
+        def begin(part: Survey) -> StartValues | None:
+            start = self._values.begin(part)
+            begun.append(start is not None)
+            return start
+
+        try:
+            found = adjust_project(replace(project, survey=survey, spots=()), False, begin, watch=self._step)
+        except CancelledError:
+            raise
+        except SurveyError:  # the values of before may be far from what is asked for now
+            return None, "cold"
+        return found, "warm" if all(begun) else "cold"
+
+    def _step(self, iteration: int, omega: float) -> None:
+        if self._cancel.is_set():
+            raise CancelledError(f"{self.folder}: the adjustment was cancelled; the solution of before stays")
+        if self.watch is not None:
+            self.watch(iteration, omega)

@@ -1,0 +1,127 @@
+"""Networks of pairs in the compiled core against GTSAM's factors and plain arrays."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.pair_normals import PairNormals
+from adjust.graph.solver import damped
+from adjust.native.elimination import clique_pattern
+from adjust.pose_network import solve_network
+from adjust.pose_network.solve import minimize
+from adjust.precision.tree import TreeCovariance
+from adjust.spatial.rigid_motions import Motions
+from tests.adjust import pose_networks
+
+
+def of_network(seed: int, nx: int = 10) -> AdjustmentGraph:
+    return minimize(pose_networks.simulate(nx, 4, seed, extra=nx).network).graph
+
+
+def joined(delta: gtsam.VectorValues, keys: np.ndarray) -> np.ndarray:
+    return np.array([delta.at(int(k)) for k in keys])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_system_is_that_of_gtsams_factors(seed: int) -> None:
+    graph = of_network(seed)
+    assert graph.only_pairs
+    normals = PairNormals(graph, [])
+    rng = np.random.default_rng(seed)
+    for start in (graph.start, graph.start.retract(_shake(graph, rng, 0.1))):  # residuals far from zero
+        at = graph.prepare(start, True)
+        linear, plain = normals.linearized(at), graph.linearized(at)
+        assert graph.objective(at) == pytest.approx(2.0 * graph.others_graph.error(start), rel=1e-10)
+        order = gtsam.Ordering.ColamdGaussianFactorGraph(plain)
+        for mine, theirs in ((linear, plain), (linear.damped(0.3), damped(graph, plain, 0.3))):
+            found = normals.solution(mine)
+            assert found is not None
+            expected = theirs.optimize(order)
+            np.testing.assert_allclose(joined(found[0], normals.keys), joined(expected, normals.keys), atol=1e-9)
+            assert found[1] == pytest.approx(-expected.dot(plain.gradientAtZero()), rel=1e-9)
+
+
+def _shake(graph: AdjustmentGraph, rng: np.random.Generator, size: float) -> gtsam.VectorValues:
+    delta = gtsam.VectorValues()
+    for key in graph.unknowns.by_key:
+        delta.insert(key, size * rng.normal(size=6))
+    return delta
+
+
+@pytest.mark.parametrize("size", [0.0, 0.05, 0.5])
+def test_rows_of_pairs_are_those_of_plain_arrays(size: float) -> None:
+    """On both sides of the angle where series give way to closed forms."""
+    graph = of_network(3)
+    assert graph.pairs is not None
+    values = graph.start.retract(_shake(graph, np.random.default_rng(1), size))
+    found, pairs, state = graph.pairs.jacobians(values), graph.pairs, graph.state
+    a, b = (Motions(state.slot_R[slots], state.slot_t[slots]) for slots in (pairs.a_slot, pairs.b_slot))
+    expected = pose_networks.pair_jacobians(pairs.arrays.motions, b.inverse() @ a)
+    for mine, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(mine, theirs, atol=1e-12 * np.abs(theirs).max())
+
+
+@pytest.mark.parametrize("nx", [1, 3, 20])
+def test_covariances_are_those_of_gtsams_tree(nx: int) -> None:
+    graph = of_network(5, nx)
+    normals = PairNormals(graph, [])
+    at = graph.prepare(graph.start, True)
+    found = normals.tree(normals.linearized(at))
+    assert found is not None
+    dims = dict.fromkeys(graph.unknowns.by_key, 6)
+    mine, theirs = TreeCovariance(found[0], dims), TreeCovariance(graph.linearized(at).eliminateMultifrontal(), dims)
+    keys = list(dims)
+    expected = theirs.joint(keys)
+    np.testing.assert_allclose(mine.joint(keys), expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
+    order = np.concatenate([np.arange(mine.n)[mine.places()[k]] for k in keys])
+    np.testing.assert_allclose(mine.full()[np.ix_(order, order)], mine.joint(keys), rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("n", [1, 2, 25])
+def test_cliques_hold_every_pair_and_every_pose_once(n: int) -> None:
+    rng = np.random.default_rng(n)
+    a = np.concatenate([np.arange(n - 1), rng.integers(0, n, n)])
+    b = np.concatenate([np.arange(1, n), rng.integers(0, n, n)])
+    a, b = a[a != b], b[a != b]
+    pattern = clique_pattern(n, a, b)
+    number = np.argsort(pattern.order)
+    cliques = [pattern.keys[i:j].tolist() for i, j in zip(pattern.key_ptr[:-1], pattern.key_ptr[1:], strict=True)]
+    fronts = [keys[:k] for keys, k in zip(cliques, pattern.n_front.tolist(), strict=True)]
+    assert [k for front in fronts for k in front] == list(range(n))
+    assert all(pattern.home[k] == c for c, front in enumerate(fronts) for k in front)
+    for x, y in zip(number[a].tolist(), number[b].tolist(), strict=True):
+        assert any({x, y} <= set(keys) for keys in cliques)
+    for c, (keys, front) in enumerate(zip(cliques, fronts, strict=True)):
+        above, p = set(keys) - set(front), int(pattern.parents[c])
+        assert p < c
+        assert above <= set(cliques[p]) if p >= 0 else not above  # the running intersection of a tree
+
+
+def test_a_pose_without_a_pivot_has_no_solution() -> None:
+    graph = of_network(1)
+    normals = PairNormals(graph, [])
+    linear = normals.linearized(graph.prepare(graph.start, True))
+    linear.by_b[normals.b == 7], linear.by_a[normals.a == 7] = 0.0, 0.0
+    assert normals.solution(linear) is None
+    assert normals.tree(linear) is None
+
+
+def test_one_factor_serves_several_steps_to_the_same_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    network = pose_networks.simulate(15, 4, 2).network
+    counts = {"eliminated": 0}
+    plain = PairNormals._eliminated
+
+    def counted(self: PairNormals, linear: object) -> bool:
+        counts["eliminated"] += 1
+        return plain(self, linear)  # type: ignore[arg-type]  # passed on
+
+    monkeypatch.setattr(PairNormals, "_eliminated", counted)
+    kept = solve_network(network)
+    saved = kept.iterations + 1 - counts["eliminated"]
+    monkeypatch.setattr("adjust.graph.solver._NEAR", 0.0)
+    fresh = solve_network(network)
+    assert saved > 0
+    sigmas = np.sqrt(np.diagonal(fresh.precision.station_cov, axis1=1, axis2=2))[:, 3:]
+    assert np.all(np.abs(kept.translations - fresh.translations) <= 1e-6 * sigmas)
+    np.testing.assert_allclose(kept.precision.station_cov, fresh.precision.station_cov, rtol=1e-6, atol=1e-15)

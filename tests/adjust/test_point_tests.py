@@ -1,0 +1,129 @@
+"""Tests of image points in the core against the same in NumPy, for points with little control and none."""
+
+import numpy as np
+
+from adjust.native.point_tests import (
+    AdjustedPoints,
+    bias_ellipses,
+    controlled_directions,
+    point_tests,
+    residual_tests,
+)
+from adjust.testing.single_tests import component_tests, whitened
+
+LAMBDA0 = np.array([17.1, 19.4])
+
+
+def some_points(n: int = 4000, seed: int = 1) -> AdjustedPoints:
+    """Of all sorts: correlated, hardly controlled, uncontrolled in one direction or both, not used."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0.0, np.pi, n)
+    shares = np.sort(rng.uniform(0.0, 1.0, (n, 2)), axis=1)
+    shares[: n // 4, 1] = 1.0
+    shares[: n // 8, 0] = 1.0
+    shares[n // 4 : n // 2] = shares[n // 4 : n // 2, :1]  # nothing tells directions apart
+    R = np.stack([np.stack([np.cos(angle), -np.sin(angle)], 1), np.stack([np.sin(angle), np.cos(angle)], 1)], 1)
+    M = np.einsum("nij,nj,nkj->nik", R, shares, R)
+    used = rng.random(n) < 0.7
+    W = np.stack([rng.uniform(1.0, 20.0, n), rng.uniform(-5.0, 5.0, n), rng.uniform(1.0, 20.0, n)], axis=1)
+    return AdjustedPoints(rng.normal(0.0, 0.2, (n, 2)), np.stack([M[:, 0, 0], M[:, 0, 1], M[:, 1, 1]], 1), W, used)
+
+
+def matrices(points: AdjustedPoints) -> tuple[np.ndarray, np.ndarray]:
+    """W and M (n, 2, 2)."""
+    W = np.zeros((len(points.v), 2, 2))
+    W[:, 0, 0], W[:, 0, 1], W[:, 1, 1] = points.W.T
+    return W, np.stack([points.M[:, :2], points.M[:, 1:]], axis=1)
+
+
+def table(points: AdjustedPoints) -> list[np.ndarray]:
+    n = len(points.v)
+    out = tuple(np.full((n,) if i < 5 else (n, 2), 7.0) for i in range(9))
+    point_tests(points, LAMBDA0, out)
+    return list(out)
+
+
+def test_the_table_is_that_of_the_plain_formulas() -> None:
+    points = some_points()
+    W, M = matrices(points)
+    x = whitened(np.einsum("nij,nj->ni", W, points.v), M, points.used)
+    freedom = np.zeros(len(points.v), dtype=np.int64)
+    controlled_directions(points, freedom)
+    np.testing.assert_array_equal(freedom, x.freedom)
+    assert {0, 1, 2} == set(freedom.tolist())
+    redundancy, least, statistic, detectable, external, w, error, component, bias = table(points)
+    np.testing.assert_allclose(redundancy, np.where(x.used, np.trace(x.K, axis1=1, axis2=2), 0.0), atol=1e-12)
+    np.testing.assert_allclose(least, np.clip(x.values.min(axis=1), 0.0, 1.0), atol=1e-12)
+    near = x.values.min(axis=1)
+    clear = (near > 1e-3) | ((near < 1e-9) & (freedom < 2))  # what is hardly controlled has lost its digits
+    some = clear & (freedom > 0)
+    np.testing.assert_allclose(statistic[some], x.statistic[some], rtol=1e-8)
+    assert np.isnan(statistic[freedom == 0]).all()
+    weakest, direction = x.weakest()
+    size = np.sqrt(LAMBDA0[np.maximum(freedom, 1) - 1] / weakest)
+    np.testing.assert_allclose(detectable[some], size[some], rtol=1e-8)
+    assert np.isinf(detectable[freedom == 0]).all()
+    moved = np.where(x.used, size * np.sqrt(np.maximum(1.0 - weakest, 0.0)), 0.0)
+    np.testing.assert_allclose(external[some], moved[some], rtol=1e-6, atol=1e-6)
+    back = np.linalg.inv(W)
+    np.testing.assert_allclose(error[some], np.einsum("nij,nj->ni", back, x.error)[some], rtol=1e-7, atol=1e-9)
+    expected = np.einsum("nij,nj->ni", back, direction * size[:, None])
+    apart = some & (np.diff(x.values, axis=1)[:, 0] > 1e-6)
+    np.testing.assert_allclose(bias[apart], expected[apart], rtol=1e-6, atol=1e-8)
+    K_bias = np.einsum("ni,nji,njk,nkl,nl->n", bias, W, x.K, W, bias)
+    np.testing.assert_allclose(K_bias[some], LAMBDA0[freedom[some] - 1], rtol=1e-7)
+    single = component_tests(x, W)
+    np.testing.assert_allclose(w[some], single.w[some], rtol=1e-7, atol=1e-9)
+    with np.errstate(divide="ignore"):
+        np.testing.assert_allclose(component[some], np.sqrt(LAMBDA0[0] / single.information)[some], rtol=1e-7)
+
+
+def test_residuals_over_their_sigmas() -> None:
+    points = some_points()
+    W, M = matrices(points)
+    Q = np.eye(2) - np.where(points.used, 1.0, -1.0)[:, None, None] * M
+    redundancy, standardized, test = residual_tests(points)
+    np.testing.assert_allclose(redundancy, np.where(points.used[:, None], np.diagonal(Q, axis1=1, axis2=2), 0.0))
+    seen = np.linalg.det(Q) > 1e-3
+    back = np.linalg.inv(W)
+    of_v = back @ Q @ back.transpose(0, 2, 1)
+    squares = [v @ np.linalg.solve(C, v) for v, C in zip(points.v[seen], of_v[seen], strict=True)]
+    np.testing.assert_allclose(test[seen], squares, rtol=1e-8)
+    sigma = np.sqrt(np.diagonal(of_v[seen], axis1=1, axis2=2))
+    np.testing.assert_allclose(standardized[seen], points.v[seen] / sigma, rtol=1e-9)
+    assert np.isnan(test[points.used & (points.M[:, 0] + points.M[:, 2] > 2.0 - 1e-12)]).all()
+
+
+def test_ellipses_hold_the_biases_that_are_just_found() -> None:
+    points = some_points()
+    W, M = matrices(points)
+    x = whitened(np.zeros_like(points.v), M, points.used)
+    N = W.transpose(0, 2, 1) @ x.K @ W
+    major, minor, angle = bias_ellipses(points, LAMBDA0).T
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    clear = x.values.min(axis=1) > 1e-3
+    two = clear & (x.freedom == 2)
+    for axis, unit in ((major, along), (minor, across)):
+        found = axis[two] ** 2 * np.einsum("ni,nij,nj->n", unit, N, unit)[two]
+        np.testing.assert_allclose(found, LAMBDA0[1], rtol=1e-6)
+    assert (major[two] >= minor[two] * (1.0 - 1e-12)).all()
+    one = (x.freedom == 1) & (x.values.min(axis=1) < 1e-9)
+    assert one.any()
+    assert np.isinf(major[one]).all()
+    np.testing.assert_allclose(minor[one] ** 2 * np.einsum("ni,nij,nj->n", across, N, across)[one], LAMBDA0[0],
+                               rtol=1e-6)  # fmt: skip
+    none = x.freedom == 0
+    assert np.isinf(major[none]).all()
+    assert np.isinf(minor[none]).all()
+
+
+def test_every_point_by_itself(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """The same to the bit in any ranges."""
+    points = some_points(20_001)
+    found = []
+    for threads in ("1", "3"):
+        monkeypatch.setenv("LABSURVEY_THREADS", threads)
+        found.append([*table(points), *residual_tests(points), bias_ellipses(points, LAMBDA0)])
+    for a, b in zip(*found, strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -1,0 +1,47 @@
+"""Whole adjustments are the same to the last bit for any number of threads."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from gtsam import Pose3
+
+from adjust.adjustment import adjust
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray
+from tests.benchmarks import bundle
+from tests.benchmarks.building import Plan, build
+from tests.benchmarks.data import calibration
+from tests.benchmarks.data import survey as calibration_survey
+from tests.benchmarks.dissection import survey_of
+
+
+def boards() -> Adjustment:
+    """12,000 image points: the epochs are reduced in several sums."""
+    return adjust(calibration_survey(calibration(2, 60)))
+
+
+def building() -> Adjustment:
+    """Two rooms of 100 stations: two of Helmert's blocks."""
+    rooms = build(Plan(2, 1))
+    return adjust(survey_of(rooms), bundle.start(rooms.bundle))
+
+
+def numbers(found: Adjustment) -> list[FloatArray]:
+    values = [e.value.matrix() if isinstance(e.value, Pose3) else np.asarray(e.value) for e in found.estimates.values()]
+    covariances = [np.asarray(e.cov) for e in found.estimates.values()]
+    points = found.image_residuals
+    return [*values, *covariances, points.residuals, points.redundancy, points.test, np.array([found.omega])]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [boards, building])
+def test_the_same_bits_for_any_number_of_threads(
+    make: Callable[[], Adjustment], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = []
+    for threads in "123":
+        monkeypatch.setenv("LABSURVEY_THREADS", threads)
+        found.append(numbers(make()))
+    for other in found[1:]:
+        assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(found[0], other, strict=True))

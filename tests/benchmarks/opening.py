@@ -1,0 +1,139 @@
+"""How long ``labsurvey open`` takes, from the command to what a click shows, and what the browser holds.
+
+``python -m tests.benchmarks.opening FOLDER`` of a project, or ``--points 1000000`` of a stereo head with so many. Times
+are of the wall and of a machine that does nothing else; a few rounds, the least of each is printed.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import sync_playwright
+
+from survey.project import write_project
+from survey.simulate import stereo
+from tests.survey.test_report_browser import need_browser
+
+POINTS_PER_PAIR = 108
+PATIENCE_S = 120.0
+
+
+def project_of(points: int, place: Path) -> Path:
+    """A stereo head before a board, of about so many image points."""
+    write_project(place / "lab", stereo(3, n_pairs=-(-points // POINTS_PER_PAIR))[0])
+    return place / "lab"
+
+
+def wait(page: Any, expression: str) -> None:
+    """From outside: the content policy of the page forbids evaluating a text in it."""
+    end = time.monotonic() + PATIENCE_S
+    while not page.evaluate(expression):
+        if time.monotonic() > end:
+            raise TimeoutError(expression)
+        time.sleep(0.01)
+
+
+def browser_mb(root: int) -> float:
+    """What the processes of a browser hold by themselves and their share of what they hold together, MB."""
+    parents = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parents[int(path.parent.name)] = int(path.read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+    mine = {root}
+    while more := {pid for pid, above in parents.items() if above in mine} - mine:
+        mine |= more
+    total = 0
+    for pid in mine:
+        try:
+            line = Path(f"/proc/{pid}/cmdline").read_bytes()
+            if b"chrom" in line.split(b"\0")[0]:
+                rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
+                total += int(rollup.split("\nPss:")[1].split()[0])
+        except (OSError, IndexError):
+            continue
+    return total / 1024.0
+
+
+def measured(folder: Path) -> dict[str, float]:
+    """One round: seconds by what was waited for, MB of the browser."""
+    out: dict[str, float] = {}
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
+        page = browser.new_context(viewport={"width": 1280, "height": 800}, locale="en-GB").new_page()
+        empty = browser_mb(os.getpid())
+        begin = time.perf_counter()
+        command = [sys.executable, "-m", "survey", "open", str(folder), "--port", "0", "--no-browser"]
+        server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        try:
+            address = server.stdout.readline().strip() if server.stdout else ""
+            out["address printed, s"] = time.perf_counter() - begin
+            page.goto(address)
+            wait(page, "document.body.dataset.ready !== undefined")
+            out["first view, s"] = time.perf_counter() - begin
+            wait(page, "document.querySelector('#facts').textContent.includes('sigma0')")
+            out["first solution, s"] = time.perf_counter() - begin
+            out |= clicks(page)
+            page.context.new_cdp_session(page).send("HeapProfiler.collectGarbage")
+            out |= {"browser without a page, MB": empty, "browser, MB": browser_mb(os.getpid())}
+        finally:
+            server.terminate()
+            server.wait(20.0)
+            browser.close()
+    return out
+
+
+def clicks(page: Any) -> dict[str, float]:
+    """Of a row to its image, of a table sorted, scrolled and filtered, of a point left out to before and after."""
+    out = {}
+    page.evaluate("delete document.body.dataset.picture")
+    begin = time.perf_counter()
+    page.locator("#tables .rows .row").nth(2).click()
+    wait(page, "document.body.dataset.picture !== undefined && document.querySelector('#inspector h2') !== null")
+    out["click to image, s"] = time.perf_counter() - begin
+    begin = time.perf_counter()
+    page.locator("#tables .row.head button").nth(4).click()
+    out["table sorted, s"] = time.perf_counter() - begin
+    begin = time.perf_counter()
+    page.evaluate("document.querySelector('#tables .scroll').scrollTop = 1e6")
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    out["table scrolled, s"] = time.perf_counter() - begin
+    page.keyboard.press("x")
+    page.keyboard.type("measured")
+    page.evaluate("delete document.body.dataset.done")
+    begin = time.perf_counter()
+    page.keyboard.press("Enter")
+    wait(page, "document.body.dataset.done !== undefined")
+    page.keyboard.press("d")
+    wait(page, "document.querySelector('#left .cards') !== null")
+    out["left out, before and after, s"] = time.perf_counter() - begin
+    page.evaluate("delete document.body.dataset.done")
+    begin = time.perf_counter()
+    page.keyboard.press("u")
+    wait(page, "document.body.dataset.done !== undefined")
+    out["undone, s"] = time.perf_counter() - begin
+    return out
+
+
+def main() -> None:
+    """Prints the least of each over the rounds."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", nargs="?", type=Path)
+    parser.add_argument("--points", type=int, default=0)
+    parser.add_argument("--rounds", type=int, default=3)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place:
+        folder = project_of(given.points, Path(place)) if given.points else given.folder
+        rounds = [measured(folder) for _ in range(given.rounds)]
+    for name in rounds[0]:
+        print(f"{name:<32}{min(one[name] for one in rounds):10.2f}")
+
+
+if __name__ == "__main__":
+    main()
