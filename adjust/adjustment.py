@@ -79,7 +79,7 @@ def _adjusted_network(
 
     What nothing measures is held meanwhile: the positions of a network of rotations.
     """
-    from adjust.pose_network.graduated import graduated_start  # here: as above
+    from adjust.pose_network.agreement import agreeing_start  # here: as above
     from adjust.pose_network.solve import minimize
 
     names: list[ParameterName] = [("world_from_station", s) for s in network.station_ids]
@@ -90,7 +90,7 @@ def _adjusted_network(
     try:
         found = minimize(network, begin, progress=progress)
     except NotConvergedError:
-        found = minimize(network, graduated_start(network), progress=progress)
+        found = minimize(network, agreeing_start(network), progress=progress)
     return replace(assemble(found.graph, found.solved, options, given=given), survey=given)
 
 

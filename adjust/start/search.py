@@ -113,13 +113,13 @@ def _network_start(survey: Survey) -> Start | None:
     if not survey.is_pose_network or not any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
         return None
     # here: a survey without pairs starts without it
+    from adjust.pose_network.agreement import agreeing_start
     from adjust.pose_network.from_survey import network_from_survey
-    from adjust.pose_network.graduated import graduated_start
     from adjust.pose_network.network import check_determined
 
     network = network_from_survey(survey, any_datum=True)
     check_determined(network)
-    R, t = graduated_start(network)
+    R, t = agreeing_start(network)
     notes = (f"{network.n_stations} stations from averaged rotations and linear positions of the pairs that agree",)
     poses: dict[ParameterName, Pose3] = {
         ("world_from_station", s): Pose3(Rot3(R[i]), t[i]) for i, s in enumerate(network.station_ids)

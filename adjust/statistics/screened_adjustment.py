@@ -70,7 +70,7 @@ def _cleaned(
     """Image points are screened before all others."""
     search, wrong = None, None
     if options.reject_pairs and start is None:
-        wrong = disagreeing_pairs(survey, only_if_plain=True)
+        wrong = disagreeing_pairs(survey, only_large=True)
     try:
         first = None if wrong is not None else adjust(survey, start, options.adjust, progress)
     except NotConvergedError:

@@ -17,7 +17,6 @@ from adjust.model.survey import Datum, FloatArray, Point, PointParameter, PosePa
 from adjust.pose_network import pose_network, solve_network
 from adjust.pose_network.cycles import loop_labels
 from adjust.pose_network.from_survey import network_from_survey, network_of_pairs
-from adjust.pose_network.graduated import graduated_weights
 from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.network import survey_of as survey_of_network
 from adjust.pose_network.solve import minimize
@@ -200,22 +199,6 @@ def test_wrong_pairs_are_found_and_named_in_a_small_network() -> None:
         assert result.omega == pytest.approx(clean.omega, rel=1e-9)
         assert result.omega < chi2.isf(1e-4, result.redundancy)
         assert solve_network(sim.network).omega > 100 * result.omega
-
-
-def test_pairs_sorted_out_by_mistake_are_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    sim = simulate(6, 5, seed=1, wrong=2, extra=25)
-    first = graduated_weights(sim.network)
-    first[[n for n in range(5, 15) if sim.network.pair_ids[n] not in sim.wrong]] = 0.0
-    monkeypatch.setattr("adjust.pose_network.graduated.graduated_weights", lambda *_: first)
-    result = screened(sim.network)
-    assert left_out(result) == set(sim.wrong)
-
-
-def test_wrong_pairs_that_passed_the_first_sorting_are_found_by_their_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    sim = simulate(6, 5, seed=1, wrong=2, extra=25)
-    ones = np.ones(sim.network.n_pairs)
-    monkeypatch.setattr("adjust.pose_network.graduated.graduated_weights", lambda *_: ones)
-    assert left_out(screened(sim.network)) == set(sim.wrong)
 
 
 def test_sigmas_that_are_too_small_throughout_make_no_pair_wrong() -> None:

@@ -24,7 +24,7 @@ from adjust.statistics.condensed import condensed_system
 from adjust.statistics.outliers.candidates import Candidates, as_given, candidates, without
 from adjust.statistics.outliers.exchange import Exchange, better_set, equal_sets
 from adjust.statistics.outliers.snooping import Snooping, Verdict
-from adjust.statistics.outliers.watched import FOLLOWED, WatchedSnooping, watchable, watched
+from adjust.statistics.outliers.watched import FOLLOWED, WatchedSnooping, large, watchable, watched
 from adjust.statistics.reliability import observation_name
 from adjust.statistics.result import Alternative, Decision
 from adjust.statistics.system import groups_of_others, linear_system, precision_of
@@ -181,26 +181,29 @@ def search_outliers(
         round_ = _Round(now, options, images, given, round_.number + 1, round_.index)
 
 
-def disagreeing_pairs(survey: Survey, factor: float = 1.0, only_if_plain: bool = False) -> Disagreeing | None:
+def disagreeing_pairs(survey: Survey, factor: float = 1.0, only_large: bool = False) -> Disagreeing | None:
     """What of a network does not agree, found before its tests; None for other surveys.
 
-    factor: of all variances. only_if_plain: None, too, where it is not plain from averaged rotations that some do not.
+    factor: of all variances. only_large: None, too, where a solution with the wrong ones in costs little.
     """
     if not survey.pairs:
         return None
+    from adjust.pose_network.agreement import disagreeing
     from adjust.pose_network.from_survey import network_of_pairs  # here: a survey without pairs starts without it
-    from adjust.pose_network.graduated import disagreeing, plainly_contradictory
 
     network = network_of_pairs(survey)
-    if network is None or (only_if_plain and not plainly_contradictory(network)):
+    if network is None or (only_large and not large(int(network.sizes.sum()), network.n_stations * network.dim)):
         return None
     try:
-        pairs, (R, t) = disagreeing(network, DEFAULT_SEARCH.family_alpha, factor)
+        found = disagreeing(network, DEFAULT_SEARCH.family_alpha, factor)
     except (IndeterminateError, NotConvergedError):
         return None
+    if found is None or not found[0].any():
+        return None
+    pairs, (R, t) = found
     names: list[ParameterName] = [("world_from_station", s) for s in network.station_ids]
     poses = {n: Pose3(Rot3(a), b) for n, a, b in zip(names, R, t, strict=True)}
-    return Disagreeing(pairs, StartValues({}, poses, {})) if pairs.any() else None
+    return Disagreeing(pairs, StartValues({}, poses, {}))
 
 
 def _with_pairs(survey: Survey, wrong: BoolArray) -> Survey:

@@ -25,10 +25,15 @@ _COLUMNS = 96
 """Columns that go through the tree at once."""
 
 
+def large(n_rows: int, n_unknowns: int) -> bool:
+    """Whether the search must not follow all of a survey."""
+    return n_rows * n_unknowns > _LARGE
+
+
 def watchable(now: Adjustment) -> bool:
     """Whether a survey is so large that the search must not follow all of it, and has nothing but single rows."""
     rows = sum(len(o.components) for o in now.other_residuals) if now.reading_residuals is None else 0
-    return rows * now.n_unknowns > _LARGE and not len(now.image_residuals.used) and not precision_of(now).hidden
+    return large(rows, now.n_unknowns) and not len(now.image_residuals.used) and not precision_of(now).hidden
 
 
 def watched(over: FloatArray, used: BoolArray, allowed: BoolArray, before: IntArray) -> IntArray:
