@@ -5,7 +5,7 @@ to its redundancy r, and their squares to half its variance.
 """
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from adjust.model.survey import FloatArray
 from adjust.testing.distributions import chi2, norm

@@ -50,15 +50,33 @@ def declare_runs(commands: Any, shaped: dict[str, Any]) -> None:
 
 def _open(arguments: argparse.Namespace) -> int:
     require_project(arguments.folder)
-    from survey.workbench.guard import loopback_address
-    from survey.workbench.opening import open_folder
+    import signal
+    import webbrowser
 
-    host = loopback_address(arguments.host, arguments.port)
-    read_only = arguments.read_only or not os.access(arguments.folder, os.W_OK)
+    from survey.workbench.guard import loopback_address, new_token
+    from survey.workbench.live import Listening
+    from survey.workbench.server import Server
+    from survey.workbench.session import Workbench
+
+    folder, port, place = arguments.folder, arguments.port, arguments.at
+    host = loopback_address(arguments.host, port)
+    read_only = arguments.read_only or not os.access(folder, os.W_OK)
     if read_only and not arguments.read_only:
-        say(arguments, f"{arguments.folder}: cannot be written; it is open for reading only")
-    open_folder(arguments.folder, host, arguments.port, read_only, not arguments.no_browser,
-                lambda line: say(arguments, line), arguments.at)  # fmt: skip
+        say(arguments, f"{folder}: cannot be written; it is open for reading only")
+    token = new_token()
+    server = Server(Workbench(folder, read_only=read_only), token, f"labsurvey_{port}")
+    endings = {signal.SIGINT, signal.SIGTERM}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, endings)  # in all threads from here on: this one waits for them
+    try:
+        with Listening(server, host, port) as listening:
+            address = f"{listening.address}#token={token}" + (f"&{place.lstrip('#')}" if place else "")
+            print(address, flush=True)
+            say(arguments, "Ctrl-C ends it")
+            if not arguments.no_browser:
+                webbrowser.open(address)
+            signal.sigwait(endings)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return DONE
 
 

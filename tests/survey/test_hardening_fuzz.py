@@ -37,7 +37,6 @@ NO_READERS = {
     "survey/project/declared/editing.py:with_sigma_scale": "the text of survey.toml, read before",
     "survey/project/declared/editing.py:with_datum": "the text of survey.toml, read before",
     "survey/project/declared/editing.py:with_treatment": "the text of survey.toml, read before",
-    "survey/workbench/opening.py:open_folder": "a browser",
     "capture/devices/cameras/opencv.py:discover": "the system's list of devices",
     "capture/devices/cameras/opencv.py:_serial": "the system's list of devices",
     "capture/devices/cameras/registry.py:open_camera": "a device",

@@ -26,7 +26,7 @@ from survey.report.language import (
 )
 
 SURVEY, ADJUST = (Path(str(package.__file__)).parent for package in (survey, adjust))
-PAGES = (*SURVEY.glob("report/*.py"), *SURVEY.glob("batch/*.py"))  # what is said in the reader's language
+PAGES = (*SURVEY.glob("report/**/*.py"), *SURVEY.glob("batch/*.py"))  # what is said in the reader's language
 TEMPLATES = SURVEY / "report" / "templates"
 OTHERS = [language for language in LANGUAGES if language != "en"]
 

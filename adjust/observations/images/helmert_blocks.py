@@ -8,8 +8,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 
@@ -63,6 +61,9 @@ def _cut(incidence: sparse.csr_array, hidden: FloatArray) -> BoolArray | None:
 
 def _far_apart(seen: sparse.csc_array) -> FloatArray:
     """A number for each pose (n,): near those of poses that see the same points, far from others."""
+    from scipy.sparse.csgraph import connected_components  # small surveys do without
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+
     parts, part = connected_components(sparse.block_array([[None, seen], [seen.T, None]]), directed=False)
     if parts > 1:
         return np.asarray(part[: seen.shape[0]], dtype=float)
