@@ -29,8 +29,9 @@ _SOUND = 0.1
 def agreeing(network: PoseNetwork, family_alpha: float = 0.001, factor: float = 1.0) -> BoolArray:
     """Pairs (E,) in use that are in a loop that closes, or in none that is short. factor: of all variances.
 
-    Each of the others is looked at again with those alone that agree already, and with one more at every station, which
-    take turns: a wrong pair may leave open the loops of all others at its end. So on until no more agree.
+    Each of the others is looked at again with those alone that agree already, with one more at every station, and with
+    all but one there, which take turns: a wrong pair may leave open the loops of all others at its end. So on until no
+    more agree.
     """
     loops = _short_loops(network, network.used, network.used)
     fine = network.used.copy()
@@ -43,7 +44,8 @@ def agreeing(network: PoseNetwork, family_alpha: float = 0.001, factor: float = 
     fine |= _in_closing(network, loops, limit)
     while True:
         before = int(np.count_nonzero(fine))
-        for guests in (fine, *_in_turn(network, network.used & ~fine)):
+        turns = _in_turn(network, network.used & ~fine)
+        for guests in (fine, *turns, *(network.used & ~mine for mine in turns)):
             fine |= _in_closing(network, _short_loops(network, network.used & ~fine, fine | guests), limit)
         if np.count_nonzero(fine) == before:
             return fine
