@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from gtsam import Pose3
@@ -10,7 +11,7 @@ from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.graph.solver import Solved, SolveOptions, settled, solve
 from adjust.lenses.models import MODELS, camera_constants, monotone_radius_px, principal_point_px
-from adjust.model.errors import listed
+from adjust.model.errors import NotConvergedError, listed
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, Survey
@@ -20,6 +21,9 @@ from adjust.start import Start, find_start
 from adjust.start.choice import Begun, adjusted_from_own_start
 from adjust.start.given import GivenStarts, given_starts, moved_onto
 from adjust.start.robust import limit, screen
+
+if TYPE_CHECKING:
+    from adjust.pose_network import PoseNetwork
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,12 @@ def adjust(
 ) -> Adjustment:
     """Adjust a survey: start values (found where not given), least squares, precision.
 
-    progress: called with (iteration, v'Pv). Raises SurveyError, IndeterminateError, NotConvergedError.
+    Stations that measured pairs tie together are started and stepped as a network, whatever else is observed between
+    them. progress: called with (iteration, v'Pv). Raises SurveyError, IndeterminateError, NotConvergedError.
     """
+    network = _network(survey)
+    if network is not None:
+        return _adjusted_network(network, survey, start, options, progress)
     if start is not None:
         return _adjusted(Begun(survey, start), survey, options, progress)
     return adjusted_from_own_start(
@@ -53,6 +61,37 @@ def adjust(
         lambda trial, starts: _trusted(trial, starts, options),
         lambda begun: _adjusted(begun, survey, options, progress),
     )
+
+
+def _network(survey: Survey) -> "PoseNetwork | None":
+    if not survey.pairs:
+        return None
+    from adjust.pose_network.from_survey import network_of_pairs  # here: a survey without pairs starts without it
+
+    return network_of_pairs(survey)
+
+
+def _adjusted_network(
+    network: "PoseNetwork", given: Survey, start: StartValues | None, options: AdjustOptions,
+    progress: Callable[[int, float], None] | None,
+) -> Adjustment:  # fmt: skip
+    """From the start where it has all stations, else from averaged rotations; from pairs that agree where that fails.
+
+    What nothing measures is held meanwhile: the positions of a network of rotations.
+    """
+    from adjust.pose_network.agreement import agreeing_start  # here: as above
+    from adjust.pose_network.solve import minimize
+
+    names: list[ParameterName] = [("world_from_station", s) for s in network.station_ids]
+    poses = [start.poses[n] for n in names if n in start.poses] if start is not None else []
+    begin = None
+    if len(poses) == len(names):
+        begin = np.array([p.rotation().matrix() for p in poses]), np.array([p.translation() for p in poses])
+    try:
+        found = minimize(network, begin, progress=progress)
+    except NotConvergedError:
+        found = minimize(network, agreeing_start(network), progress=progress)
+    return replace(assemble(found.graph, found.solved, options, given=given), survey=given)
 
 
 def _adjusted(

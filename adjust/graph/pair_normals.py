@@ -52,7 +52,8 @@ class PairLinear:
 class PairNormals:
     """The system of a graph with ``only_pairs``, and its elimination by Cholesky. last: keys to be eliminated last.
 
-    b, a: (E,) numbers of the ends of the pairs in use, -1 for what is held.
+    b, a: (E,) numbers of the ends of the pairs in use, -1 for what is held. The ends of the others share a clique as
+    well, as if these were in use: what is out is tested at the price of what is in.
     """
 
     def __init__(self, graph: AdjustmentGraph, last: Iterable[int]) -> None:
@@ -60,19 +61,22 @@ class PairNormals:
             raise ValueError("the survey has no pairs between fixed stations")
         self.graph, self.batch = graph, graph.pairs
         self.priors = [item.factor for item in graph.singles if item.used and item.factor.size()]
-        b, a = (keys[self.batch.active] for keys in (self.batch.b_key, self.batch.a_key))
+        known = [*self.batch.seen(), *(factor.keys()[0] for factor in self.priors)]
+        b, a = (keys[~self.batch.both_held] for keys in (self.batch.b_key, self.batch.a_key))
+        solved = np.isin(b, [*known, -1]) & np.isin(a, [*known, -1])
         symbolic = gtsam.SymbolicFactorGraph()
         for factor in self.priors:
             symbolic.push_factor(factor.keys()[0])
-        for ends in zip(b.tolist(), a.tolist(), strict=True):
+        for ends in zip(b[solved].tolist(), a[solved].tolist(), strict=True):
             symbolic.push_factor(*(k for k in ends if k >= 0))
         ordering = gtsam.Ordering.ColamdConstrainedLastSymbolicFactorGraph(symbolic, list(last))
         keys = np.array([ordering.at(i) for i in range(ordering.size())], dtype=np.int64)
-        b, a = (_numbers(keys, ends) for ends in (b, a))
+        b, a = (_numbers(keys, ends[solved]) for ends in (b, a))
         both = (b >= 0) & (a >= 0)
         pattern = clique_pattern(len(keys), b[both], a[both])
         self.keys = keys[pattern.order]
-        self.b, self.a = (_numbers(pattern.order, ends) for ends in (b, a))
+        active = self.batch.arrays.used[~self.batch.both_held][solved]
+        self.b, self.a = (_numbers(pattern.order, ends[active]) for ends in (b, a))
         self.number = {key: i for i, key in enumerate(self.keys.tolist())}
         self.factor = PoseFactor(pattern)
         self.kept = False

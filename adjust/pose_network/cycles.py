@@ -168,6 +168,55 @@ def forest_loops(a: IntArray, b: IntArray, forest: Forest, chords: IntArray) -> 
     return out
 
 
+def short_loops(
+    n: int, a: IntArray, b: IntArray, pairs: IntArray, through: IntArray, most: int
+) -> list[list[int]]:  # fmt: skip
+    """For each of these pairs a short loop that it closes with those: its pairs, it first, walked from its a.
+
+    Two searches meet that begin at its ends; where they have seen ``most`` stations without, there is none. Loops that
+    are there already are not given again.
+    """
+    starts, neighbour, way = adjacency(n, a[through], b[through])
+    all_ways = list(zip(neighbour.tolist(), through[way].tolist(), strict=True))
+    ways = [all_ways[i:j] for i, j in pairwise(starts.tolist())]
+    found: dict[frozenset[int], list[int]] = {}
+    for e, v, w in zip(pairs.tolist(), a[pairs].tolist(), b[pairs].tolist(), strict=True):
+        came: tuple[dict[int, tuple[int, int]], ...] = {v: (v, -1)}, {w: (w, -1)}
+        fronts, meet = [[v], [w]], -1
+        while meet < 0 and all(fronts) and len(came[0]) + len(came[1]) < most:
+            side = int(len(fronts[1]) < len(fronts[0]))
+            fronts[side], meet = _further(fronts[side], e, ways, came[side], came[1 - side])
+        if meet >= 0:
+            loop = [e, *_back(came[1], meet)[::-1], *_back(came[0], meet)]
+            found.setdefault(frozenset(loop), loop)
+    return list(found.values())
+
+
+def _further(
+    front: list[int], without: int, ways: list[list[tuple[int, int]]], came: dict[int, tuple[int, int]],
+    others: dict[int, tuple[int, int]],
+) -> tuple[list[int], int]:  # fmt: skip
+    """One step of a search: the next front, and the station where it meets the other search, -1 where it does not."""
+    new: list[int] = []
+    for x in front:
+        for y, e in ways[x]:
+            if e != without and y not in came:
+                came[y] = x, e
+                new.append(y)
+                if y in others:
+                    return new, y
+    return new, -1
+
+
+def _back(came: dict[int, tuple[int, int]], station: int) -> list[int]:
+    """The pairs from a station back to where its search began."""
+    out = []
+    while (step := came[station])[1] >= 0:
+        station = step[0]
+        out.append(step[1])
+    return out
+
+
 def flat(loops: Sequence[Sequence[int]]) -> tuple[IntArray, IntArray]:
     """Ranges (n + 1,) of the loops' pairs, and these one after the other."""
     ptr = np.cumsum([0] + [len(pairs) for pairs in loops])

@@ -1,11 +1,58 @@
 """From a survey of stations and pairs to a pose network."""
 
+from dataclasses import fields
+
 import numpy as np
 
-from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.observations.pairs import pair_arrays
-from adjust.pose_network.network import PoseNetwork, pose_network
+from adjust.pose_network.network import PoseNetwork, check_determined, pose_network
+
+_BESIDE = ("distances", "coordinates", "coordinate_differences", "levels", "alignments")
+"""What may be observed between stations beside their pairs: it brings no unknown of its own."""
+_FREELY = {"stations", "pairs", "closures", "instruments", "setups", "beams", "surfaces", *_BESIDE}
+
+
+def network_of_pairs(survey: Survey) -> PoseNetwork | None:
+    """The network of a survey whose unknowns are poses of fixed stations, all tied together by its pairs; else None.
+
+    This is the one place that says which surveys are started and stepped as networks: what is observed between the
+    stations besides only adds to it. Raises IndeterminateError where nothing but pairs is observed, and these leave a
+    station floating or give no datum.
+    """
+    if not survey.pairs or not _stations_and_pairs(survey):
+        return None
+    beside = any(getattr(survey, kind) for kind in _BESIDE)
+    if beside and survey.datum.kind == "inner":  # where a free network lies is not to be seen in its pairs alone
+        return None
+    reached = {r.frame_id for p in survey.pairs for r in (p.a, p.b)}
+    lost = [s.station_id for s in survey.stations
+            if s.station_id not in reached and s.world_from_station.treatment == "free"]  # fmt: skip
+    if lost:
+        if beside:
+            return None
+        raise IndeterminateError(
+            f"no measured pair ties {listed(lost, 8)} to the datum; measure a pair to the rest, hold the "
+            "station, or leave it out", tuple(lost),
+        )  # fmt: skip
+    if not beside:
+        return network_from_survey(survey)
+    try:
+        network = network_from_survey(survey)
+        check_determined(network)
+    except IndeterminateError:
+        return None
+    return None if network.rotation_only else network
+
+
+def _stations_and_pairs(survey: Survey) -> bool:
+    """Whether there is nothing but fixed stations, pairs between them and what else may be observed between them."""
+    there_is = {f.name for f in fields(survey) if isinstance(v := getattr(survey, f.name), tuple) and v}
+    if there_is - _FREELY or survey.vertical.tilt.free:
+        return False
+    fixed = {s.station_id for s in survey.stations if s.motion == "fixed"}
+    return all(r.kind == "station" and r.frame_id in fixed for p in survey.pairs for r in (p.a, p.b))
 
 
 def network_from_survey(survey: Survey, any_datum: bool = False) -> PoseNetwork:

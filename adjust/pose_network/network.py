@@ -13,7 +13,6 @@ from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Station, Survey, Treatment
 from adjust.observations.pairs import PairArrays
-from adjust.pose_network.cycles import adjacency, breadth_first, forest_loops, loop_labels
 from adjust.spatial.rigid import nearest_rotation
 
 _FEW = 8
@@ -75,6 +74,11 @@ class PoseNetwork:
     def dim(self) -> int:
         """Unknowns of a station: 6, or 3 in a network of rotations."""
         return 3 if self.rotation_only else 6
+
+    @property
+    def sizes(self) -> IntArray:
+        """Components (E,) that each pair measured."""
+        return np.where(self.is_pose, 6, 3)
 
     @property
     def whitening(self) -> FloatArray:
@@ -244,47 +248,6 @@ def check_determined(network: PoseNetwork, used: BoolArray | None = None) -> Non
                 f"no measured pair ties {what}{listed(ids, _FEW)} to the datum; measure a pair to the rest, "
                 "hold a station of that part, or leave it out", ids,
             )  # fmt: skip
-
-
-def loop_marks(network: PoseNetwork, used: BoolArray) -> tuple[BoolArray, IntArray]:
-    """Of every pair (E,): whether it closes any loop, and a mark equal for pairs that share all their loops.
-
-    Pairs without a loop are controlled by nothing; pairs with the same mark cannot be told apart. All stations with a
-    given pose count as one. Pairs out of use have none.
-    """
-    rows = np.flatnonzero(used)
-    a, b = _joined_ends(network, rows)
-    mark = np.zeros(network.n_pairs, dtype=np.int64)
-    mark[rows] = loop_labels(network.n_stations, a, b)
-    return mark != 0, mark
-
-
-def sole_loops(network: PoseNetwork, pairs: IntArray) -> list[list[int]]:
-    """Of pairs (k,) out of use: the pairs in use that would share all their loops with it, were it alone taken back.
-
-    These are the pairs of its way through the network that close no loop otherwise.
-    """
-    rows = np.flatnonzero(network.used)
-    bridge = ~loop_marks(network, network.used)[0]
-    if not bridge[rows].any():
-        return [[] for _ in pairs]
-    both = np.concatenate([rows, pairs])
-    a, b = _joined_ends(network, both)
-    walk = adjacency(network.n_stations, a[: len(rows)], b[: len(rows)])
-    forest = breadth_first(*walk, np.arange(network.n_stations))
-    k = np.arange(len(rows), len(both))
-    closing = (forest.part[a[k]] == forest.part[b[k]]) & (a[k] != b[k])
-    loops = iter(forest_loops(a, b, forest, k[closing]))
-    return [sorted(e for e in both[next(loops)[1:]].tolist() if bridge[e]) if closes else [] for closes in closing]
-
-
-def _joined_ends(network: PoseNetwork, rows: IntArray) -> tuple[IntArray, IntArray]:
-    """The ends a and b of pairs, all stations with a given pose as one."""
-    node = np.arange(network.n_stations)
-    given = np.concatenate([network.held, np.array(sorted(network.prior_cov), dtype=np.int64)])
-    if len(given):
-        node[given] = given[0]
-    return node[network.a_idx[rows]], node[network.b_idx[rows]]
 
 
 def survey_of(network: PoseNetwork) -> Survey:

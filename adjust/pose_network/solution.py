@@ -10,7 +10,6 @@ from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray
 from adjust.pose_network.network import PoseNetwork
 from adjust.pose_network.precision import NetworkPrecision
-from adjust.pose_network.robust import RejectedPair, clean
 from adjust.pose_network.solve import DEFAULTS, Minimum, NetworkOptions, Progress, minimize
 from adjust.precision.precision import global_test
 
@@ -19,7 +18,7 @@ from adjust.precision.precision import global_test
 class NetworkSolution:
     """``world_from_station`` of all stations: rotations (N, 3, 3), translations (N, 3) m, zero in rotation networks.
 
-    network: as solved; its ``used`` leaves out what was rejected. omega: v'Pv of the pairs in use and the priors.
+    network: as solved. omega: v'Pv of the pairs in use and the priors.
     redundancy: observations less unknowns. iterations, max_step: of the last least squares.
     """
 
@@ -30,7 +29,6 @@ class NetworkSolution:
     redundancy: int
     iterations: int
     max_step: float
-    rejected: tuple[RejectedPair, ...]
     minimum: Minimum
 
     @cached_property
@@ -62,26 +60,20 @@ def solve_network(
     network: PoseNetwork, start: tuple[FloatArray, FloatArray] | None = None,
     options: NetworkOptions = DEFAULTS, progress: Progress | None = None,
 ) -> NetworkSolution:  # fmt: skip
-    """Solve a network from nothing (or from a start), without its wrong pairs.
+    """Solve a network over its pairs in use, from nothing or from a start.
 
     Raises IndeterminateError naming the stations that float, NotConvergedError.
     """
-    if options.robust == "off":
-        return as_solution(network, minimize(network, start, options, progress=progress))
-    found = clean(network, options, start, progress)
-    solution = as_solution(found.network, found.minimum, found.rejected)
-    solution.__dict__["precision"] = found.precision  # already computed for the tests
-    return solution
+    return as_solution(network, minimize(network, start, options, progress=progress))
 
 
-def as_solution(network: PoseNetwork, minimum: Minimum, rejected: tuple[RejectedPair, ...] = ()) -> NetworkSolution:
+def as_solution(network: PoseNetwork, minimum: Minimum) -> NetworkSolution:
     """The minimum with its counts."""
     used, graph, solved = network.used, minimum.graph, minimum.solved
-    sizes = np.where(network.is_pose, 6, 3)[used]
-    n_observations = int(sizes.sum()) + sum(len(i.components) for i in graph.singles if i.kind == "prior")
+    n_observations = int(network.sizes[used].sum()) + sum(len(i.components) for i in graph.singles if i.kind == "prior")
     defect = 0 if solved.datum is None else solved.datum.defect
     redundancy = n_observations - graph.unknowns.n_unknowns + defect
     return NetworkSolution(
         network, minimum.rotations, minimum.translations, minimum.omega, redundancy, solved.iterations,
-        solved.max_step, rejected, minimum,
+        solved.max_step, minimum,
     )  # fmt: skip

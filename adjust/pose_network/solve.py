@@ -23,13 +23,10 @@ Progress = Callable[[int, float], None]
 class NetworkOptions:
     """How a network is solved.
 
-    robust: look for wrong pairs never ("off"), where the first solution shows some ("auto"), or from the start ("on").
-    alpha: probability that any pair of a network without wrong ones is rejected. max_step: convergence, what is left to
-    go in sigmas. patience: steps that may fail to lower the weighted square sum before damping begins.
+    max_step: convergence, what is left to go in sigmas. patience: steps that may fail to lower the weighted square sum
+    before damping begins.
     """
 
-    robust: str = "auto"
-    alpha: float = 0.01
     max_step: float = 1e-6
     max_iterations: int = 100
     patience: int = 8
@@ -90,7 +87,7 @@ def minimize(
     except NotConvergedError as error:
         raise NotConvergedError(
             f"{str(error).splitlines()[0].split(';')[0].replace('adjustment', 'network')}; look for wrong pairs, or "
-            "let the program look for them (robust)"
+            "let the program look for them (reject_pairs)"
         ) from error
     except IndeterminateError as error:  # what the pairs join was seen before
         raise IndeterminateError(

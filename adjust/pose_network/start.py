@@ -9,7 +9,7 @@ import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.pose_network.network import PoseNetwork
-from adjust.spatial.rigid import nearest_rotation, rotation_log
+from adjust.spatial.rigid import nearest_rotation
 
 
 def find_network_start(network: PoseNetwork, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
@@ -126,16 +126,3 @@ def _position_graph(
         else:
             graph.add(gtsam.JacobianFactor(i, s * one, j, -s * one, s * z, noise))
     return graph
-
-
-def rotation_residuals(network: PoseNetwork, R: FloatArray) -> FloatArray:
-    """Log(measured^-1 present) of the rotations ``b_from_a``, (E, 3) rad."""
-    present = np.swapaxes(R[network.b_idx], 1, 2) @ R[network.a_idx]
-    return rotation_log(np.swapaxes(network.rotations, 1, 2) @ present)
-
-
-def translation_misfits(network: PoseNetwork, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Lengths (E,) m of measured minus present shifts, zero where none was measured."""
-    world_from_b = R[network.b_idx]
-    present = np.einsum("nji,nj->ni", world_from_b, t[network.a_idx] - t[network.b_idx])
-    return np.asarray(np.nan_to_num(np.linalg.norm(network.translations - present, axis=1)))

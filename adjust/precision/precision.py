@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ObservationRows:
-    """An observation over its keys: A (k, n) and its residual e (k,), both whitened, A Q A' (k, k).
+    """An observation over its keys: A (k, n) and its residual e (k,), both whitened.
 
     W: square root information (k, k), of which root is the inverse.
     """
@@ -48,9 +48,21 @@ class ObservationRows:
     keys: list[int]
     A: FloatArray
     e: FloatArray
-    influence: FloatArray
     W: FloatArray
     root: FloatArray
+    tree: TreeCovariance
+    datum: STransformation | None
+
+    @cached_property
+    def influence(self) -> FloatArray:
+        """Whitened A Q A' (k, k), zero of what is held. Dear where the keys share no clique: what is not in use."""
+        if not self.keys:
+            return np.zeros((len(self.e),) * 2)
+        return np.asarray(self.A @ _in_datum(self.datum, self.keys, self.tree.joint(self.keys)) @ self.A.T)
+
+
+def _in_datum(datum: STransformation | None, keys: Sequence[int], Q: FloatArray) -> FloatArray:
+    return Q if datum is None else datum.apply(keys, Q)
 
 
 class Precision:
@@ -114,13 +126,10 @@ class Precision:
         for j, i in enumerate(bundle.reduced):
             self.hidden[bundle.point_key[i]] = points[j]
 
-    def _in_datum(self, keys: Sequence[int], Q: FloatArray) -> FloatArray:
-        return Q if self.transformation is None else self.transformation.apply(keys, Q)
-
     def cov(self, key: int) -> FloatArray:
         """Covariance (dim, dim) of one unknown."""
         Q = self.hidden[key].copy() if key in self.hidden else self.tree.marginal(key)
-        Q = self._in_datum([key], Q)
+        Q = _in_datum(self.transformation, [key], Q)
         held = list(self.graph.unknowns.held.get(key, ()))
         if held:
             Q[held], Q[:, held] = 0.0, 0.0
@@ -134,7 +143,7 @@ class Precision:
         keys = [self.graph.unknowns.by_name[name].key for name in names]
         below = [(b, hidden) for b in self._hidden if (hidden := [k for k in keys if b.hides(k)])]
         if not below:
-            return self._in_datum(keys, self.tree.joint(keys))
+            return _in_datum(self.transformation, keys, self.tree.joint(keys))
         seen = [k for k in keys if k not in self.hidden]
         outer = list(dict.fromkeys([k for b, _ in below for k in b.batch.interface] + seen))
         Q, at = self.tree.joint(outer), stacking(self.graph, outer)
@@ -147,7 +156,7 @@ class Precision:
             scatter[np.ix_(mine, mine)] = own
         if seen:
             L[place.index(seen), at.index(seen)] = 1.0
-        return self._in_datum(keys, L @ Q @ L.T + scatter)
+        return _in_datum(self.transformation, keys, L @ Q @ L.T + scatter)
 
     def rows(self, item: ObservationFactor) -> ObservationRows:
         """An observation that is neither image point nor reading, linearised at the solution: built once, and kept."""
@@ -155,11 +164,10 @@ class Precision:
         if found is None:
             linear = item.factor.linearize(self.solved.values)
             (A, b), keys = linear.jacobian(), list(linear.keys())
-            M = np.zeros((len(b), len(b)))  # of what is held: nothing moves it
-            if keys:
-                M = A @ self._in_datum(keys, self.tree.joint(keys)) @ A.T
             W = np.asarray(noise_of(item).R())
-            found = self._rows[item] = ObservationRows(keys, A, -b, M, W, np.asarray(np.linalg.inv(W)))
+            found = self._rows[item] = ObservationRows(
+                keys, A, -b, W, np.asarray(np.linalg.inv(W)), self.tree, self.transformation
+            )  # fmt: skip
         return found
 
     @cached_property

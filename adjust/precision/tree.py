@@ -170,7 +170,7 @@ class TreeCovariance:
 
     def times(self, columns: FloatArray) -> FloatArray:
         """The whole covariance matrix times columns (n, m), without forming it."""
-        x = np.array(columns, dtype=float)
+        x = np.array(columns, dtype=float, order="C")
         self._solve(np.arange(len(self._front), dtype=np.int64), x)
         return x
 

@@ -18,7 +18,8 @@ import scipy.linalg
 
 from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
-from adjust.relay.loops import LoopBasis, evaluate_loops, loop_basis
+from adjust.pose_network.loops import evaluate_loops
+from adjust.relay.loops import LoopBasis, loop_basis
 from adjust.relay.network import Network
 from adjust.spatial.rigid import skew
 from adjust.spatial.rigid_motions import Motions, exp, right_jacobian

@@ -198,17 +198,20 @@ def play(closures: Sequence[Closure], pair: Pair, residual: FloatArray) -> Float
 
 
 def in_condition_form(result: Adjustment) -> Adjustment:
-    """A survey of nothing but pairs, adjusted once more: one unknown per pair, all independent loops as conditions.
+    """Measured pairs adjusted once more: one unknown per pair, all independent loops as conditions.
 
     ``result``: by the poses of its stations, screened. What it says of stations stays; what it says of pairs is then
-    from the conditions, and a warning tells where the two forms differ. Where priors or several given stations close
-    loops as well, where rotations and poses are mixed, or where there is no loop, ``result`` is returned as it is.
+    from the conditions, and a warning tells where the two forms differ. Where something else is observed too, where
+    priors or several given stations close loops as well, where rotations and poses are mixed, or where there is no
+    loop, ``result`` is returned as it is.
     """
     survey = result.survey
+    if len(result.image_residuals.used) or any(o.kind != "pair" for o in result.other_residuals):
+        return result
     used = [p for p in survey.pairs if p.used]
     given = [s for s in survey.stations if s.world_from_station.treatment != "free"]
     kinds = {isinstance(p.b_from_a, Rot3) for p in used}
-    if len(given) > 1 or any(s.world_from_station.treatment == "prior" for s in given) or len(kinds) != 1:
+    if len(given) > 1 or len(kinds) != 1:
         return result
     found = adjust_loops(network_from_pairs(used))
     pairs, precision = found.pairs, result.precision

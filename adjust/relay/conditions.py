@@ -23,8 +23,9 @@ import numpy as np
 
 from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
+from adjust.pose_network.loops import Loops, evaluate_loops
 from adjust.relay.counts import parts
-from adjust.relay.loops import LoopBasis, evaluate_loops, loop_basis, loop_misclosures
+from adjust.relay.loops import LoopBasis, loop_basis, loop_misclosures
 from adjust.relay.network import Network, gtsam_motion, motions_from_values, prior_factor, station_values
 from adjust.relay.normal_equations import (
     NormalEquations,
@@ -232,9 +233,7 @@ def _closure_factor(basis: LoopBasis, loop: int, dim: int) -> gtsam.CustomFactor
     rows = slice(basis.ptr[loop], basis.ptr[loop + 1])
     keys = [int(e) for e in basis.pair_idx[rows]]
     n = len(keys)
-    alone = LoopBasis(
-        basis.topology, np.array([0, n]), np.arange(n), basis.sense[rows], basis.start_idx[loop : loop + 1], False, ""
-    )
+    alone = Loops(np.array([0, n]), np.arange(n), basis.sense[rows], basis.start_idx[loop : loop + 1])
 
     def call(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
         if dim == 3:

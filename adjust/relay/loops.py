@@ -1,8 +1,4 @@
-"""Independent loops of a network, and their misclosures one by one.
-
-A loop is walked from its first station; the product of its pairs, each taken along or against its direction, would be
-the identity without errors. Its logarithm is the misclosure, in the frame of the first station.
-"""
+"""Independent loops of a network, and their misclosures one by one (:mod:`adjust.pose_network.loops`)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,9 +7,9 @@ from typing import Literal
 import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
-from adjust.pose_network.cycles import adjacency, breadth_first, flat, forest_loops, shortest_loops
+from adjust.pose_network.cycles import adjacency, breadth_first, forest_loops, shortest_loops
+from adjust.pose_network.loops import Loops, misclosures, walked
 from adjust.relay.network import Network, Topology
-from adjust.spatial.rigid_motions import Motions, identities, right_jacobian_inverse
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
@@ -26,30 +22,17 @@ SEARCH_BUDGET = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class LoopBasis:
-    """E - n + c independent loops: loop k are the pairs ``pair_idx[ptr[k]:ptr[k + 1]]`` in the order of the walk.
+class LoopBasis(Loops):
+    """E - n + c independent loops.
 
-    sense: +1 where a pair is walked from a to b, -1 from b to a. start_idx: (L,) first station. minimal: whether the
-    total length is the least possible. chord_idx: (L,) for loops of a spanning tree the pair that only this loop has.
-    note: how the loops were found, for people.
+    minimal: whether the total length is the least possible. chord_idx: (L,) for loops of a spanning tree the pair that
+    only this loop has. note: how the loops were found, for people.
     """
 
     topology: Topology
-    ptr: IntArray
-    pair_idx: IntArray
-    sense: IntArray
-    start_idx: IntArray
     minimal: bool
     note: str
     chord_idx: IntArray | None = None
-
-    def __len__(self) -> int:
-        return len(self.start_idx)
-
-    @property
-    def lengths(self) -> IntArray:
-        """Pairs in each loop (L,)."""
-        return np.diff(self.ptr)
 
     def pairs(self, loop: int) -> tuple[str, ...]:
         """Ids of the pairs of a loop, in the order of the walk."""
@@ -97,47 +80,8 @@ def _basis(
     topology: Topology, loops: Sequence[Sequence[int]], first: Sequence[int] | IntArray, minimal: bool, note: str,
     chords: IntArray | None = None,
 ) -> LoopBasis:  # fmt: skip
-    (ptr, pairs), start = flat(loops), np.array(first, dtype=np.int64)
-    sense, at = np.zeros(len(pairs), dtype=np.int64), start.copy()
-    for rows, some in _steps(ptr):
-        a, b = topology.a_idx[pairs[rows]], topology.b_idx[pairs[rows]]
-        along = a == at[some]
-        sense[rows] = np.where(along, 1, -1)
-        at[some] = np.where(along, b, a)
-    return LoopBasis(topology, ptr, pairs, sense, start, minimal, note, chords)
-
-
-def _steps(ptr: IntArray) -> list[tuple[IntArray, IntArray]]:
-    """Step by step, the rows (of all loops that are this long) and the loops they belong to."""
-    lengths = np.diff(ptr)
-    out = []
-    loops = np.arange(len(lengths))
-    for step in range(int(lengths.max()) if len(lengths) else 0):
-        loops = loops[lengths[loops] > step]
-        out.append((ptr[loops] + step, loops))
-    return out
-
-
-def evaluate_loops(basis: LoopBasis, b_from_a: Motions) -> tuple[FloatArray, FloatArray]:
-    """Misclosures (L, dim) and their derivatives (K, dim, dim) by the pairs, in the order of ``basis.pair_idx``.
-
-    With M the product round the loop and Z that up to station a of the pair: M moves by ``+-Ad(Z^-1) d`` on the right,
-    and its logarithm by Jr^-1 of it; + where the pair is walked from a to b.
-    """
-    dim = b_from_a.dim
-    product = identities(len(basis), dim)
-    before = np.zeros((len(basis.pair_idx), dim, dim))
-    for rows, loops in _steps(basis.ptr):
-        step, along = b_from_a[basis.pair_idx[rows]], basis.sense[rows] > 0
-        now = product[loops]
-        after = step.where(along, step.inverse()) @ now
-        before[rows] = now.where(along, after).inverse().adjoint()
-        product.rotation[loops] = after.rotation
-        if product.translation is not None and after.translation is not None:
-            product.translation[loops] = after.translation
-    w = product.log()
-    outer = right_jacobian_inverse(w)[np.repeat(np.arange(len(basis)), basis.lengths)]
-    return w, basis.sense[:, None, None] * (outer @ before)
+    found = walked(topology.a_idx, topology.b_idx, loops, first)
+    return LoopBasis(found.ptr, found.pair_idx, found.sense, found.start_idx, topology, minimal, note, chords)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,8 +117,6 @@ class LoopMisclosures:
 def loop_misclosures(network: Network, basis: LoopBasis | None = None) -> LoopMisclosures:
     """How well each loop closes, from the measured pairs alone."""
     basis = basis or loop_basis(network.topology)
-    w, blocks = evaluate_loops(basis, network.b_from_a)
-    each = blocks @ network.cov[basis.pair_idx] @ np.swapaxes(blocks, -1, -2)
-    cov = np.add.reduceat(each, basis.ptr[:-1], axis=0) if len(basis) else np.zeros((0, network.dim, network.dim))
+    w, cov = misclosures(basis, network.b_from_a, network.cov)
     test = np.einsum("li,li->l", w, np.linalg.solve(cov, w[..., None])[..., 0])
     return LoopMisclosures(basis, w, cov, test, np.asarray(chi2.sf(test, network.dim)))

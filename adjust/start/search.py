@@ -105,7 +105,7 @@ def turns_of_views(survey: Survey, turned: Mapping[str, FloatArray]) -> dict[int
 
 
 def _network_start(survey: Survey) -> Start | None:
-    """The network's own solution, without the pairs that contradict the rest; None where there is more than pairs.
+    """Averaged rotations and linear positions of the pairs that agree; None where there is more than pairs.
 
     Surveys of rotations alone, whose positions stay open, are left to the general search, too. Raises
     IndeterminateError naming the stations that no pair ties to the others.
@@ -113,19 +113,18 @@ def _network_start(survey: Survey) -> Start | None:
     if not survey.is_pose_network or not any(isinstance(p.b_from_a, Pose3) and p.used for p in survey.pairs):
         return None
     # here: a survey without pairs starts without it
+    from adjust.pose_network.agreement import agreeing_start
     from adjust.pose_network.from_survey import network_from_survey
-    from adjust.pose_network.robust import clean
-    from adjust.pose_network.solve import NetworkOptions
+    from adjust.pose_network.network import check_determined
 
     network = network_from_survey(survey, any_datum=True)
-    found = clean(network, NetworkOptions())
-    R, t = found.minimum.rotations, found.minimum.translations
-    notes = [f"{network.n_stations} stations from averaged rotations, linear positions and least squares"]
-    notes += [f"{rejected} (left out of the start)" for rejected in found.rejected]
+    check_determined(network)
+    R, t = agreeing_start(network)
+    notes = (f"{network.n_stations} stations from averaged rotations and linear positions of the pairs that agree",)
     poses: dict[ParameterName, Pose3] = {
         ("world_from_station", s): Pose3(Rot3(R[i]), t[i]) for i, s in enumerate(network.station_ids)
     }
-    return Start({}, poses, {}, notes=tuple(notes))
+    return Start({}, poses, {}, notes=notes)
 
 
 class _Search:

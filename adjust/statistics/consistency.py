@@ -34,16 +34,16 @@ def consistency(
 ) -> Consistency:
     """Test every part, and look for changes; ``alpha`` is the error probability of all of it together.
 
-    condensed: the system of this adjustment; None for a network of pairs, of which the groups are tested. Where the
-    global test fails because residuals are too large, every part is tested against the rest: else wrong sigmas would
-    make everything suspect. Groups whose variance was estimated from these residuals are not tested for it.
+    condensed: the system of this adjustment; None for a large network of pairs, of which the groups are tested. Where
+    the global test fails because residuals are too large, every part is tested against the rest: else wrong sigmas
+    would make everything suspect. Groups whose variance was estimated from these residuals are not tested for it.
     """
     test = adjustment.global_test
     if test is None:
         return Consistency(alpha, alpha, 0, (), (), False, 0)
     relative = test.status == "failed"
     system = None if condensed is None else condensed.system
-    if condensed is None or adjustment.survey.is_pose_network:
+    if condensed is None:
         parts = parts_of_network(adjustment) if len(adjustment.groups) > 1 else ()
     else:
         parts = parts_of(adjustment, condensed.system, condensed.numbers)

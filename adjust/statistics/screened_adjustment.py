@@ -5,14 +5,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from adjust.adjustment import adjust
+from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues, values_of
-from adjust.model.errors import SurveyError
+from adjust.model.errors import NotConvergedError, SurveyError, listed
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
-from adjust.statistics.outliers.search import OutlierSearch, SearchOptions, search_outliers
-from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs, is_pure, uncontrolled_pairs
+from adjust.statistics.outliers.search import OutlierSearch, SearchOptions, disagreeing_pairs, search_outliers
+from adjust.statistics.outliers.watched import watchable
 from adjust.statistics.result import Component, VarianceComponents
 from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.variance_components import ComponentOptions, Scaled, estimate_variance_components
@@ -21,6 +21,8 @@ from adjust.testing.criteria import limits
 _LARGEST, _ROOM = 6000, 1e8
 """Unknowns up to which gross errors are always searched; above, numbers that the search may need for its columns."""
 _PASSES = 3
+_CONTROLLED = 1e-4
+"""Redundancy number below which nothing controls an observation."""
 _SCREENED = "left out as gross errors"
 _OTHERS = (
     "table", "pair", "distance", "coordinates", "coordinate_difference", "level", "alignment", "laser", "surface",
@@ -30,12 +32,13 @@ _OTHERS = (
 
 @dataclass(frozen=True)
 class CleanOptions:
-    """pairs: the adjustment itself, and whether what contradicts the rest is left out.
+    """reject_pairs: leave out what contradicts the rest: pairs, and observations of all kinds but image points.
 
-    variance_components: the variances of all groups are estimated.
+    adjust: the adjustment itself. variance_components: the variances of all groups are estimated.
     """
 
-    pairs: PairOptions = field(default_factory=PairOptions)
+    reject_pairs: bool = True
+    adjust: AdjustOptions = field(default_factory=AdjustOptions)
     variance_components: bool = False
 
 
@@ -45,38 +48,53 @@ def adjust_cleaned(
 ) -> Adjustment:  # fmt: skip
     """Adjust; what was left out and which variances were estimated is part of the result and its warnings.
 
-    Raises as :func:`adjust.adjustment.adjust`. Networks of nothing but pairs have a search of their own.
+    Raises as :func:`adjust.adjustment.adjust`.
     """
     found = _cleaned(survey, options, progress, start)
-    if options.pairs.reject_pairs and _blamed_on_rays(survey, found):
+    if options.reject_pairs and _blamed_on_rays(survey, found):
         # a wrong tape reading to a beacon that few images see is explained as well by leaving out its rays: the
         # explanation that needs fewer observations left out is the likelier one
         other = _others_first(survey, options, progress, start)
         if other is not None and _left_out(survey, other) < _left_out(survey, found):
             return other
-    return found
+    if found.survey.pair_form == "poses":
+        return found
+    from adjust.relay.closed import in_condition_form  # here: most surveys go without it
+
+    return in_condition_form(found)
 
 
 def _cleaned(
     survey: Survey, options: CleanOptions, progress: Callable[[int, float], None] | None, start: StartValues | None
 ) -> Adjustment:
     """Image points are screened before all others."""
-    first = adjust_with_pairs(survey, options.pairs, progress, start)
-    if is_pure(survey):
-        return first
-    now, search, scaled, factors = first, None, None, dict[str, float]()
+    search, wrong = None, None
+    if options.reject_pairs and start is None:
+        wrong = disagreeing_pairs(survey, only_large=True)
+    try:
+        first = None if wrong is not None else adjust(survey, start, options.adjust, progress)
+    except NotConvergedError:
+        wrong = disagreeing_pairs(survey) if options.reject_pairs else None
+        if wrong is None:
+            raise
+        first = None
+    if first is None:
+        search = search_outliers(survey, None, _how(options), progress, wrong=wrong)
+        first = search.adjustment
+    now, scaled, factors = first, None, dict[str, float]()
     rejected: set[tuple[str, ...]] | None = None
     for _ in range(_PASSES):
         if factors:  # what was left out before is tried again with the variances of now
             given = scaled_survey(first.survey, factors)
-            now = adjust(given, values_of(now), options.pairs.adjust, progress)
-        search = _searched(survey, now, options, progress)
+            now = adjust(given, values_of(now), options.adjust, progress)
+        if search is None or now is not first:
+            search = _searched(survey, now, options, progress)
         now = search.adjustment if search is not None else now
         found = {(d.kind, *d.ids) for d in search.rejected} if search is not None else set[tuple[str, ...]]()
         if not options.variance_components or found == rejected:
             break
         rejected = found
-        how = ComponentOptions(adjust=options.pairs.adjust)
+        how = ComponentOptions(adjust=options.adjust)
         scaled = estimate_variance_components(now.survey, options=how, progress=progress, first=now)
         now = scaled.adjustment
         factors = {c.group: factors.get(c.group, 1.0) * c.factor for c in scaled.components.components}
@@ -85,7 +103,7 @@ def _cleaned(
 
 def _unsearched(now: Adjustment, options: CleanOptions) -> tuple[str, ...]:
     """That nothing was searched although something fails, in one line."""
-    n = _failing(now) if options.pairs.reject_pairs else 0
+    n = _failing(now) if options.reject_pairs else 0
     if not n or _searchable(now, n):
         return ()
     return (
@@ -96,7 +114,8 @@ def _unsearched(now: Adjustment, options: CleanOptions) -> tuple[str, ...]:
 
 def _searchable(now: Adjustment, n: int) -> bool:
     """Whether ``n`` observations that fail can be left out one after the other."""
-    return now.n_unknowns <= _LARGEST or n * len(now.other_residuals) <= _ROOM
+    few = now.n_unknowns <= _LARGEST or n * len(now.other_residuals) <= _ROOM
+    return few or watchable(now)
 
 
 def _blamed_on_rays(survey: Survey, found: Adjustment) -> bool:
@@ -126,11 +145,10 @@ def _others_first(
     survey: Survey, options: CleanOptions, progress: Callable[[int, float], None] | None, start: StartValues | None
 ) -> Adjustment | None:
     """The other order: all other kinds before the image points; None where that leads nowhere."""
-    every = replace(options.pairs.adjust, reject_points=False, reject_blocks=False)
-    unscreened = replace(options.pairs, adjust=every)
+    unscreened = replace(options, adjust=replace(options.adjust, reject_points=False, reject_blocks=False))
     try:
-        first = adjust_with_pairs(survey, unscreened, progress, start)
-        search = _searched(survey, first, replace(options, pairs=unscreened), progress)
+        first = adjust(survey, start, unscreened.adjust, progress)
+        search = _searched(survey, first, unscreened, progress)
         now = first if search is None else search.adjustment
         if search is None or not search.rejected:
             return None
@@ -155,11 +173,14 @@ def _searched(
     given: Survey, now: Adjustment, options: CleanOptions, progress: Callable[[int, float], None] | None
 ) -> OutlierSearch | None:
     """The search for gross errors; None where nothing fails, or nothing can be searched."""
-    n = _failing(now) if options.pairs.reject_pairs else 0
+    n = _failing(now) if options.reject_pairs else 0
     if not n or not _searchable(now, n):
         return None
-    how = SearchOptions(kinds=_OTHERS, adjust=options.pairs.adjust)
-    return search_outliers(given, options=how, progress=progress, first=now)
+    return search_outliers(given, options=_how(options), progress=progress, first=now)
+
+
+def _how(options: CleanOptions) -> SearchOptions:
+    return SearchOptions(kinds=_OTHERS, adjust=options.adjust)
 
 
 def _failing(now: Adjustment) -> int:
@@ -228,3 +249,15 @@ def component_notes(components: VarianceComponents) -> tuple[str, ...]:
 def rescaled(survey: Survey, components: VarianceComponents) -> Survey:
     """A survey with the variances that another adjustment of the same instruments found."""
     return scaled_survey(survey, {c.group: c.factor for c in components.components})
+
+
+def uncontrolled_pairs(result: Adjustment) -> tuple[str, ...]:
+    """Warning of pairs in use that nothing checks."""
+    ids = [o.ids[0] for o in result.other_residuals
+           if o.kind == "pair" and o.used and float(o.redundancy.max()) < _CONTROLLED]  # fmt: skip
+    if not ids:
+        return ()
+    what = "pair {} closes no loop: nobody would notice an error in it" if len(ids) == 1 else (
+        "pairs {} close no loop: nobody would notice an error in them"
+    )  # fmt: skip
+    return (what.format(listed(ids, 12)) + "; measure a second way to what it leads to",)

@@ -10,7 +10,6 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import PoseParameter, Station, Survey
 from adjust.pose_network.from_survey import network_from_survey
-from adjust.statistics.pair_networks import is_pure
 from survey.folder.text import id_problem
 from survey.interop.networks.g2o import Information, read_g2o_file, write_g2o
 from survey.jobs.adjusting.warm_start import network_poses
@@ -60,7 +59,7 @@ def project_to_g2o(source: Path, target: Path, information: Information) -> tupl
     """Write the pairs of a project; number of stations and pairs, which poses were written, what was left out."""
     project = read(source)
     survey = project.survey
-    if not is_pure(survey):
+    if not survey.is_pose_network or survey.points or survey.targets or survey.tables:
         raise SurveyError(
             f"{source}: g2o holds nothing but poses of fixed stations and pairs between them; this project has more, "
             "or has no pairs"

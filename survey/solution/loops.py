@@ -16,9 +16,10 @@ from gtsam import Pose3, Rot3
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Survey
+from adjust.pose_network.loops import evaluate_loops
 from adjust.relay.closed import play
 from adjust.relay.counts import Counts, count
-from adjust.relay.loops import LoopMisclosures, evaluate_loops, loop_misclosures
+from adjust.relay.loops import LoopMisclosures, loop_misclosures
 from adjust.relay.network import Network, Topology, topology
 from adjust.spatial.rigid_motions import Motions
 from survey.folder.text import natural_key

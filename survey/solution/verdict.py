@@ -8,12 +8,12 @@ import numpy as np
 
 from adjust.model.result import CAUTIOUS_SIGMAS, Adjustment
 from adjust.statistics.result import Consistency
-from adjust.testing.distributions import chi2, norm
+from adjust.testing.criteria import limits
 
 
 @dataclass(frozen=True)
 class Suspects:
-    """Observations whose test exceeds its limit, all of them taken together at the level alpha (Bonferroni).
+    """Observations whose test exceeds its limit, all of them taken together at the level alpha (Sidak 1967).
 
     Where sigma0 is above its limit, wrong sigmas would make everything suspect: the limits then grow with sigma0.
 
@@ -35,7 +35,8 @@ def suspects(adjustment: Adjustment) -> Suspects:
     n = max(int(image.used.sum()) + int(others.n_components[others.used].sum()), 1)
     alpha = test.alpha if test is not None else 0.05
     spread = adjustment.sigma0 if test is not None and test.omega > test.upper else 1.0
-    image_limit, w_limit = spread**2 * float(chi2.isf(alpha / n, 2)), spread * float(norm.isf(alpha / (2 * n)))
+    of_image, of_component = limits(alpha, np.array([2, 1]), n)
+    image_limit, w_limit = spread**2 * float(of_image), spread * float(np.sqrt(of_component))
     n_not_used = int((~image.used).sum()) + int((~others.used).sum())
     n_other = int(np.count_nonzero(others.largest[others.used] > w_limit))
     n_image = int(((image.test > image_limit) & image.used).sum())

@@ -13,7 +13,6 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
-from adjust.statistics.pair_networks import is_pure
 from survey.project import Project
 from survey.project.exclusions import Exclusion, Name
 from survey.project.observed import Hits, Observed, union
@@ -117,11 +116,10 @@ class KnownValues:
     def begin(self, survey: Survey) -> StartValues | None:
         """Start values of a survey; None where the search has to begin anew, as it must for a free datum.
 
-        Inner constraints keep the mean place of where the search began, and networks of pairs have a start of their
-        own.
+        Inner constraints keep the mean place of where the search began.
         """
         known = all(self.models.get(c.camera_id) == c.lens.model for c in survey.cameras)
-        if not known or survey.datum.kind == "inner" or is_pure(survey) or survey.pair_form == "closed":
+        if not known or survey.datum.kind == "inner" or survey.pair_form == "closed":
             return None
         if any(len(self.start.lenses[c.camera_id]) != len(MODELS[c.lens.model].names) for c in survey.cameras):
             return None

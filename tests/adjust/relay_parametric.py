@@ -9,7 +9,7 @@ from adjust.relay.result import AdjustedPairs, adjusted_pairs
 from adjust.spatial.rigid_motions import Motions
 from tests.adjust.relay_networks import as_gtsam
 
-OPTIONS = NetworkOptions(robust="off", max_step=1e-9)
+OPTIONS = NetworkOptions(max_step=1e-9)
 
 
 @dataclass(frozen=True, eq=False)

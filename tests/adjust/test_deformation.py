@@ -13,12 +13,12 @@ from adjust.epochs.deformation import relative_pose, station_deformations
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Coordinates, FrameRef, Pair, PositionRef
 from adjust.model.survey import Datum, Point, PoseParameter, Station, Survey
-from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs
+from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from tests.sizes import size
 
 SIGMAS = np.r_[np.full(3, np.radians(10 / 3600)), np.full(3, 1e-4)]
 EDGES = [(i, j) for i in range(6) for j in range(i + 1, min(6, i + 3))]
-OPTIONS = PairOptions(reject_pairs=False)
+OPTIONS = CleanOptions(reject_pairs=False)
 
 
 def chain():
@@ -49,7 +49,7 @@ def measured(poses, rng, sigmas=SIGMAS, held=0, rotations=False):
 
 
 def adjusted(survey):
-    return adjust_with_pairs(survey, OPTIONS)
+    return adjust_cleaned(survey, OPTIONS)
 
 
 def with_a_point(survey):

@@ -4,12 +4,10 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, Pair
-from adjust.pose_network import NetworkOptions, solve_network
+from adjust.pose_network import solve_network
 from adjust.pose_network.session import NetworkSession, SessionOptions
 from tests.adjust.pose_networks import Simulated, simulate
 from tests.benchmarks.networks import additions, difference, first_stations
-
-PLAIN = NetworkOptions(robust="off")
 
 
 def grown(sim: Simulated, group: int = 1, **options) -> NetworkSession:
@@ -25,7 +23,7 @@ def grown(sim: Simulated, group: int = 1, **options) -> NetworkSession:
 def test_a_grown_network_equals_its_batch_solution(nx: int, ny: int, group: int) -> None:
     sim = simulate(nx, ny, seed=nx)
     session = grown(sim, group)
-    batch = solve_network(sim.network, options=PLAIN)
+    batch = solve_network(sim.network)
     metres, sigmas = difference(session.poses(), session.network(), batch)
     assert sigmas < 0.05
     finished = session.finish()
@@ -40,7 +38,7 @@ def test_a_grown_network_equals_its_batch_solution(nx: int, ny: int, group: int)
 def test_settled_stations_wake_when_they_are_needed() -> None:
     sim = simulate(100, 2, seed=9)
     session = grown(sim, section=30)
-    batch = solve_network(sim.network, options=PLAIN)
+    batch = solve_network(sim.network)
     assert difference(session.poses(), session.network(), batch)[1] < 0.5
     # a loop from the far end to a settled station moves everything, also what had settled
     R, t = sim.rotations, sim.translations
@@ -51,7 +49,7 @@ def test_settled_stations_wake_when_they_are_needed() -> None:
     assert {"s100", "s150"} <= done.moved.keys()
     present = session.poses()
     finished = session.finish()
-    again = solve_network(finished.network, options=PLAIN)
+    again = solve_network(finished.network)
     assert difference(present, session.network(), again)[1] < 0.2
     assert finished.omega == pytest.approx(again.omega, rel=1e-9)
     # the same where a pair between settled stations is taken out
@@ -82,7 +80,7 @@ def test_additions_say_what_is_new_and_what_moved() -> None:
     assert done.misfit["wrong"] > 1e4
     assert len(done.moved) > 30
     session.remove(["wrong"])
-    batch = solve_network(sim.network, options=PLAIN)
+    batch = solve_network(sim.network)
     finished = session.finish()
     assert not finished.network.used[finished.network.pair_ids.index("wrong")]
     assert finished.omega == pytest.approx(batch.omega, rel=1e-9)
@@ -96,7 +94,7 @@ def test_a_pair_may_start_at_a_held_station() -> None:
     cov = np.diag([1e-4, 1e-2, 1.0, 1e-3, 0.1, 1.0]) ** 2  # strong in some directions of a only
     measured = Pose3(Rot3(R[10].T @ R[0]), R[10].T @ (t[0] - t[10]) + 0.02)
     session.add([Pair("back", FrameRef("station", "s0"), FrameRef("station", "s10"), measured, cov)])
-    batch = solve_network(session.network(), options=PLAIN)
+    batch = solve_network(session.network())
     assert difference(session.poses(), session.network(), batch)[1] < 1e-3
 
 
@@ -107,7 +105,7 @@ def test_rotations_may_be_added_to_poses() -> None:
                  Rot3(sim.rotations[9].T @ sim.rotations[1]), np.eye(3) * 1e-10)  # fmt: skip
     session.add([extra])
     finished = session.finish()
-    assert finished.redundancy == solve_network(sim.network, options=PLAIN).redundancy + 3
+    assert finished.redundancy == solve_network(sim.network).redundancy + 3
     turn = finished.rotations[9].T @ finished.rotations[1]
     assert turn == pytest.approx(sim.rotations[9].T @ sim.rotations[1], abs=1e-4)
 

@@ -12,13 +12,13 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, LensParameter, PoseParameter, Station, Survey, Target
 from adjust.relay.closed import closed, play
 from adjust.relay.conditions import MAX_HARD_LOOPS, adjust_condition_factors, adjust_conditions, adjust_loops
-from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs
+from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from survey.simulate import resample, stereo
 from tests.adjust import helpers as h
 from tests.adjust.relay_networks import grid, simulate
 
 ARCSEC = np.radians(1.0 / 3600.0)
-UNSCREENED = PairOptions(reject_pairs=False)
+UNSCREENED = CleanOptions(reject_pairs=False)
 LENS = LensParameter("brown", ("fx", "fy", "u0", "v0"), None)
 BLOCK = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
 EYES = [("camera", "C1"), ("camera", "C2"), ("target", "M1"), ("target", "M2"), ("camera", "C3")]
@@ -69,8 +69,8 @@ def check_equal(found: Adjustment, expected: Adjustment) -> None:
 def test_eyes_that_are_no_stations_close_their_loops(rotations: bool) -> None:
     """Conditions on the pairs against poses of hand-made stations: residuals, tests and covariances."""
     survey = eyes(1, rotations)
-    found = adjust_with_pairs(closed(survey), UNSCREENED)
-    expected = adjust_with_pairs(as_stations(survey), UNSCREENED)
+    found = adjust_cleaned(closed(survey), UNSCREENED)
+    expected = adjust_cleaned(as_stations(survey), UNSCREENED)
     assert found.precision.by_conditions
     assert not expected.precision.by_conditions
     assert found.redundancy == (3 if rotations else 6) * (9 - 5 + 1)
@@ -114,7 +114,7 @@ def test_few_loops_by_closure_factors_many_by_normal_equations(n: int, monkeypat
 def test_conditions_that_contradict_the_poses_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     survey = closed(eyes(1))
     monkeypatch.setattr("adjust.relay.closed._AGREEMENT", 1e-15)
-    assert any("differ by" in w for w in adjust_with_pairs(survey, UNSCREENED).warnings)
+    assert any("differ by" in w for w in adjust_cleaned(survey, UNSCREENED).warnings)
 
 
 @pytest.mark.parametrize("sigmas", [(200.0 * ARCSEC, 2e-3), (1e-3 * ARCSEC, 1e-8)])
@@ -122,13 +122,13 @@ def test_a_mount_is_one_more_motion_with_its_own_sigmas(sigmas: tuple[float, flo
     """Against the same network with the mount as a pair of its own between two stations; a stiff one, and a loose."""
     survey = eyes(2)
     closure = Closure("plate", ("C1-C2", "C2-C3", "C1-C3"), *sigmas)
-    found = adjust_with_pairs(closed(survey, (closure,)), UNSCREENED)
+    found = adjust_cleaned(closed(survey, (closure,)), UNSCREENED)
     plain = as_stations(survey)
     here, there = FrameRef("station", "C1"), FrameRef("station", "plate")
     mount = Pair("mount", there, here, Pose3(), closure.cov(6))
     pairs = tuple(replace(p, a=there) if p.pair_id == "C1-C3" else p for p in plain.pairs)
     plain = replace(plain, pairs=(*pairs, mount), stations=(*plain.stations, Station("plate")))
-    expected = adjust_with_pairs(plain, UNSCREENED)
+    expected = adjust_cleaned(plain, UNSCREENED)
     assert found.omega == pytest.approx(expected.omega, rel=2e-4)
     assert found.redundancy == expected.redundancy
     theirs = {o.ids[0]: o for o in expected.other_residuals}
@@ -144,11 +144,11 @@ def test_a_mount_is_one_more_motion_with_its_own_sigmas(sigmas: tuple[float, flo
 
 def test_a_loose_mount_leaves_its_loops_open_and_the_others_closed() -> None:
     survey = eyes(3)
-    hard = adjust_with_pairs(closed(survey), UNSCREENED)
+    hard = adjust_cleaned(closed(survey), UNSCREENED)
     loose = Closure("plate", ("C1-C2", "C2-C3", "C1-C3"), 1.0, 10.0)
-    found = adjust_with_pairs(closed(survey, (loose,)), UNSCREENED)
+    found = adjust_cleaned(closed(survey, (loose,)), UNSCREENED)
     without = replace(survey, pairs=tuple(p for p in survey.pairs if p.pair_id != "C1-C3"))
-    expected = adjust_with_pairs(closed(without), UNSCREENED)
+    expected = adjust_cleaned(closed(without), UNSCREENED)
     assert found.omega == pytest.approx(expected.omega, rel=1e-4)
     assert hard.omega > found.omega
 
@@ -184,10 +184,10 @@ def test_eyes_close_their_loops_in_the_graph_of_the_cameras() -> None:
     """The same as with stations written by hand; and the pairs over them tell something of the rig."""
     by_hand, start = rig(False)
     given, _ = rig(True)
-    found = adjust_with_pairs(closed(given), UNSCREENED, start=start)
-    expected = adjust_with_pairs(by_hand, UNSCREENED, start=start)
+    found = adjust_cleaned(closed(given), UNSCREENED, start=start)
+    expected = adjust_cleaned(by_hand, UNSCREENED, start=start)
     check_equal(found, expected)
-    alone = adjust_with_pairs(replace(by_hand, pairs=(), stations=by_hand.stations[:-2]), UNSCREENED, start=start)
+    alone = adjust_cleaned(replace(by_hand, pairs=(), stations=by_hand.stations[:-2]), UNSCREENED, start=start)
     name = ("station_from_camera", "right")
     assert h.relative(found.estimates[name].cov, expected.estimates[name].cov) < 1e-6
     assert found.redundancy - alone.redundancy == 6 * (4 - 2)

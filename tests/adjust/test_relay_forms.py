@@ -10,8 +10,9 @@ from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import Datum, PoseParameter, Station, Survey
+from adjust.pose_network.loops import evaluate_loops
 from adjust.relay.conditions import MAX_HARD_LOOPS, ConditionOptions, adjust_condition_factors, adjust_conditions
-from adjust.relay.loops import evaluate_loops, loop_basis, loop_misclosures
+from adjust.relay.loops import loop_basis, loop_misclosures
 from adjust.relay.network import Network, network_from_pairs, topology
 from adjust.spatial.rigid_motions import Motions
 from tests.adjust.relay_networks import (

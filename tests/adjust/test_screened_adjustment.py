@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from adjust.adjustment import AdjustOptions
-from adjust.statistics.pair_networks import PairOptions
 from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from survey.simulate import beacons
 from tests.adjust import helpers as h
@@ -32,7 +31,7 @@ def test_a_wrong_tape_is_not_blamed_on_the_few_rays_to_its_beacon() -> None:
     wrong = replace(distance, value=distance.value + 60.0 * distance.sigma)
     survey = replace(survey, image_blocks=tuple(b for b in blocks if len(b.uv)), coordinates=coordinates,
                      distances=(wrong, *survey.distances[1:]))  # fmt: skip
-    options = CleanOptions(PairOptions(adjust=AdjustOptions(reject_points=True)))
+    options = CleanOptions(adjust=AdjustOptions(reject_points=True))
     start = h.shaken(h.start_at(truth), 1, 0.0005, 0.0005)
     found = adjust_cleaned(survey, options, start=start)
     assert [d.ids[0] for d in found.decisions if d.action == "rejected"] == [wrong.distance_id]

@@ -17,9 +17,9 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Station, Survey
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.influence import shifts
-from adjust.statistics.pair_networks import adjust_with_pairs
 from adjust.statistics.relative_precision import relative_precision
 from adjust.statistics.reliability import observation_name, reliability
+from adjust.statistics.screened_adjustment import adjust_cleaned
 from adjust.statistics.system import linear_system
 from adjust.testing.criteria import LevelOptions, criteria, noncentrality, sidak
 from survey.simulate import head_on_table, resample, stereo
@@ -252,7 +252,7 @@ def test_pose_networks_have_the_same_reliability_as_the_graph(turning: bool) -> 
     stations = tuple(Station(f"R{i}", world_from_station=PoseParameter(p, "free" if i else "held"))
                      for i, p in enumerate(poses))  # fmt: skip
     survey = Survey(stations=stations, pairs=tuple(pairs))
-    network = adjust_with_pairs(survey)
+    network = adjust_cleaned(survey)
     found = reliability(network)
     if turning:
         poses, axes = [Pose3(p.rotation(), np.zeros(3)) for p in poses], ("tx", "ty", "tz")

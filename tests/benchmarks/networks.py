@@ -15,12 +15,10 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import FloatArray
-from adjust.pose_network import NetworkOptions, NetworkSolution, PoseNetwork, pose_network, solve_network
+from adjust.pose_network import NetworkSolution, PoseNetwork, pose_network, solve_network
 from adjust.pose_network.session import NetworkSession
 from adjust.spatial.rigid_motions import Motions
 from tests.adjust.pose_networks import network_jacobians, simulate
-
-PLAIN = NetworkOptions(robust="off")
 
 
 def as_pair(network: PoseNetwork, e: int) -> Pair:
@@ -97,7 +95,7 @@ def grow(nx: int, ny: int) -> Grown:
     finished = session.finish()
     finish_s = time.perf_counter() - begin
     begin = time.perf_counter()
-    batch = solve_network(network, options=PLAIN)
+    batch = solve_network(network)
     batch_s = time.perf_counter() - begin
     after = difference((finished.rotations, finished.translations), finished.network, batch)
     return Grown(np.array(ms), difference(present, finished.network, batch), after, finish_s, batch_s)
@@ -131,7 +129,7 @@ def batch(nx: int, ny: int) -> Batch:
     """Solve a grid from nothing, with all variances and tests."""
     network = simulate(nx, ny).network
     begin = time.perf_counter()
-    solution = solve_network(network, options=PLAIN)
+    solution = solve_network(network)
     middle = time.perf_counter()
     total = float(solution.precision.pairs.redundancy.sum())
     end = time.perf_counter()

@@ -10,13 +10,12 @@ import numpy as np
 from gtsam import BetweenFactorPose3, Pose3, PriorFactorPose3, Rot3
 
 from adjust.model.survey import FloatArray, IntArray
-from adjust.pose_network import NetworkOptions, PoseNetwork, pose_network, solve_network
+from adjust.pose_network import PoseNetwork, pose_network, solve_network
 from adjust.pose_network.start import find_network_start
 from survey.interop.networks.g2o import read_g2o
 from tests.benchmarks.cases import Arrays
 from tests.benchmarks.outcome import Competitor, Outcome
 
-PLAIN = NetworkOptions(robust="off")
 HELD_SIGMA = 1e-4  # of the prior that stands for the held station in GTSAM's graph: rad and m
 
 
@@ -57,7 +56,7 @@ def ours(case: PoseGraph) -> Competitor:
 
     def run() -> Outcome:
         t0 = perf_counter()
-        solution = solve_network(network.with_used(network.used), start, PLAIN)
+        solution = solve_network(network.with_used(network.used), start)
         t1 = perf_counter()
         cov = solution.precision.station_cov
         t2 = perf_counter()

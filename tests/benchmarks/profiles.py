@@ -14,8 +14,8 @@ from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.graph.solver import _Loop, solve
 from adjust.observations.images.reduction import PoseReduction
 from adjust.observations.pairs import PairBatch
-from adjust.pose_network import NetworkOptions, solve_network
 from adjust.pose_network import solve as pose_solve
+from adjust.pose_network import solve_network
 from adjust.precision.precision import Precision
 from adjust.precision.tree import TreeCovariance
 from adjust.start import find_start
@@ -173,7 +173,7 @@ def pose_graphs(names: Sequence[str]) -> str:
 
         def run(clock: Clock, network: Any = network) -> None:
             fresh = network.with_used(network.used)
-            solution = clock.timed("the rest of the solution", solve_network)(fresh, None, NetworkOptions(robust="off"))
+            solution = clock.timed("the rest of the solution", solve_network)(fresh)
             clock.timed("covariances of stations", lambda s: s.precision.station_cov)(solution)
             clock.timed("the rest of the tests", lambda s: s.precision.pairs)(solution)
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from adjust.model.errors import SurveyError
-from adjust.pose_network import NetworkOptions, solve_network
+from adjust.pose_network import solve_network
 from survey.cli import main
 from survey.interop.networks.g2o import read_g2o, read_g2o_file, write_g2o
 from survey.jobs.adjusting.steps import adjust_project
@@ -37,13 +37,13 @@ def test_gtsam_reads_the_same(tmp_path: Path) -> None:
 @pytest.mark.parametrize("information", ["tangent", "quaternion"])
 def test_written_networks_come_back(tmp_path: Path, information) -> None:
     net = simulate(4, 3).network
-    solution = solve_network(net, options=NetworkOptions(robust="off"))
+    solution = solve_network(net)
     write_g2o(tmp_path / "n.g2o", net, solution.rotations, solution.translations, information)
     back = read_g2o(tmp_path / "n.g2o", information, use_vertices=True)
     assert back.cov == pytest.approx(net.cov, rel=1e-9, abs=1e-15)
     assert back.rotations == pytest.approx(net.rotations, abs=1e-12)
     assert back.station_translations == pytest.approx(solution.translations, abs=1e-12)
-    assert solve_network(back, options=NetworkOptions(robust="off")).omega == pytest.approx(solution.omega, rel=1e-9)
+    assert solve_network(back).omega == pytest.approx(solution.omega, rel=1e-9)
 
 
 def test_the_two_meanings_of_the_rotation_information_differ_by_four(tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ def test_blocks_alone_are_read_where_that_is_asked_for(tmp_path: Path, capsys: p
 
 def test_a_converted_network_gives_the_minimum_of_all_its_pairs(tmp_path: Path) -> None:
     sim = simulate(4, 3, seed=5, extra=8, wrong=2)
-    plain = solve_network(sim.network, options=NetworkOptions(robust="off"))
+    plain = solve_network(sim.network)
     write_g2o(tmp_path / "n.g2o", sim.network, plain.rotations, plain.translations)
     convert_job(tmp_path / "n.g2o", tmp_path / "n")
     kept = adjust_project(read(tmp_path / "n"), progress=False)

@@ -14,7 +14,7 @@ from adjust.graph.assembly import StartValues
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.observations import Coordinates, Distance, FrameRef, Pair, PositionRef
 from adjust.model.survey import Camera, Datum, LensParameter, Point, PointParameter, PoseParameter, Station, Survey
-from adjust.statistics.pair_networks import PairOptions, adjust_with_pairs, is_pure
+from adjust.pose_network.from_survey import network_of_pairs
 from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from survey import problem, solve
 from survey.cli import main
@@ -82,7 +82,7 @@ def test_a_held_component_of_a_station_keeps_its_value_in_a_network_of_pairs():
     survey, poses = _network(4, combinations(range(4), 2), noise=1.0)
     held = PoseParameter(poses[2], held=("tz",))
     stations = tuple(_station(s.station_id, held) if s.station_id == "S2" else s for s in survey.stations)
-    free, found = adjust_with_pairs(survey), adjust_with_pairs(replace(survey, stations=stations))
+    free, found = adjust_cleaned(survey), adjust_cleaned(replace(survey, stations=stations))
     station = found.estimates["world_from_station", "S2"]
     moved = Pose3.Logmap(poses[2].between(station.value))
     assert abs(moved[5]) < 1e-11
@@ -144,7 +144,7 @@ def test_two_held_stations_control_the_way_between_them():
     found = network_dict(pair_network(survey))
     assert found["uncontrolled_pairs"] == []
     assert (found["redundancy"], found["conditions_through_given_stations"]) == (6, 1)
-    assert adjust_with_pairs(survey).redundancy == 6
+    assert adjust_cleaned(survey).redundancy == 6
     # the loop is that from one held station over the pairs to the other
     off = Pose3(Rot3.Rz(3e-4), np.zeros(3))
     pairs = (survey.pairs[0], replace(survey.pairs[1], b_from_a=survey.pairs[1].b_from_a.compose(off)))
@@ -167,7 +167,7 @@ def test_rotations_among_poses_are_counted_by_themselves():
     survey = replace(survey, pairs=(turned, *survey.pairs[1:]))
     # three equations of the loop of rotations, none of positions: two pairs of them close no loop
     assert pair_network(survey).redundancy == 3
-    assert adjust_with_pairs(survey).redundancy == 3
+    assert adjust_cleaned(survey).redundancy == 3
 
 
 def test_a_station_without_pairs_is_a_part_of_its_own():
@@ -176,7 +176,7 @@ def test_a_station_without_pairs_is_a_part_of_its_own():
     assert found["parts"] == [["S0", "S1", "S2"], ["S3"]]
     assert found["isolated_stations"] == ["S3"]
     with pytest.raises(SurveyError, match="no measured pair ties S3 to the datum"):
-        adjust_with_pairs(survey)
+        adjust_cleaned(survey)
 
 
 def test_a_loop_closes_as_its_product_says():
@@ -203,11 +203,15 @@ def test_tests_of_loops_are_distributed_as_they_claim():
 
 def test_both_ways_of_adjusting_a_pure_network_agree():
     survey, _ = _network(6, combinations(range(6), 2), 1.0)
-    assert is_pure(survey)
-    one, two = adjust_with_pairs(survey), adjust(survey, options=AdjustOptions())
+    mixed = _mixed(survey)
+    assert network_of_pairs(survey) is not None
+    assert network_of_pairs(mixed) is None
+    one, two = adjust_cleaned(survey), adjust(mixed, options=AdjustOptions())
     assert one.omega == pytest.approx(two.omega, rel=1e-9)
-    assert (one.redundancy, one.n_unknowns, one.n_observations) == (two.redundancy, two.n_unknowns, two.n_observations)
-    for name, estimate in two.estimates.items():
+    assert one.redundancy == two.redundancy
+    assert (one.n_unknowns, one.n_observations) == (two.n_unknowns - 3, two.n_observations - 3)
+    for name, estimate in one.estimates.items():
+        estimate = two.estimates[name]
         np.testing.assert_allclose(one.estimates[name].value.matrix(), estimate.value.matrix(), atol=1e-10)
         np.testing.assert_allclose(one.estimates[name].cov, estimate.cov, rtol=1e-6, atol=1e-16)
     mine, theirs = (solution_dict(x, RunInfo("", ""))["pairs"] for x in (one, two))
@@ -220,7 +224,7 @@ def test_both_ways_of_adjusting_a_pure_network_agree():
 
 def test_sigmas_of_an_adjusted_pair_in_a_ring_follow_from_its_redundancy():
     survey, _ = _network(3, [(0, 1), (1, 2), (2, 0)], 1.0, rotations=True)
-    result = adjust_with_pairs(survey)
+    result = adjust_cleaned(survey)
     pairs = solution_dict(result, RunInfo("", "", sigmas="a_priori"))["pairs"]
     # three equal rotations share the misclosure: each keeps two thirds of its variance
     for entry in pairs.values():
@@ -237,14 +241,46 @@ def test_a_wrong_pair_in_a_survey_with_other_observations_is_left_out():
     origin = [PositionRef(None, FrameRef("station", f"S{i}")) for i in range(5)]
     length = float(np.linalg.norm(poses[1].translation() - poses[2].translation()))
     survey = replace(survey, pairs=pairs, distances=(Distance("d", origin[1], origin[2], length, 1e-3),))
-    assert not is_pure(survey)
     result = adjust_cleaned(survey)
     assert [p.pair_id for p in result.survey.pairs if not p.used] == [survey.pairs[3].pair_id]
     assert result.global_test.passed
     assert [w for w in result.warnings if w.startswith("left out: pair p0-4: off by ")]
-    kept = adjust_cleaned(survey, CleanOptions(PairOptions(reject_pairs=False)))
+    kept = adjust_cleaned(survey, CleanOptions(reject_pairs=False))
     assert all(p.used for p in kept.survey.pairs)
     assert not kept.global_test.passed
+
+
+def _with_loose_reading(survey):
+    """With a distance of no weight between two stations: no survey of pairs alone any more."""
+    ends = [PositionRef(None, FrameRef("station", f"S{i}")) for i in (1, 2)]
+    return replace(survey, distances=(Distance("d", *ends, 1.0, 1e6),))
+
+
+@pytest.mark.parametrize("beside", ["distance", "point"])
+def test_a_survey_of_pairs_is_one_with_anything_beside(beside):
+    """Estimates, covariances, tests, exclusions, decisions and variance components, whatever else is observed."""
+    survey, _ = _network(7, combinations(range(7), 2), 2.0)
+    wrong = dict.fromkeys((3, 11), Pose3(Rot3.Rz(0.02), np.array([0.05, 0.0, 0.0])))
+    pairs = [replace(p, b_from_a=p.b_from_a.compose(wrong[i])) if i in wrong else p for i, p in enumerate(survey.pairs)]
+    survey = replace(survey, pairs=tuple(pairs))
+    options = CleanOptions(variance_components=True)
+    other = _with_loose_reading(survey) if beside == "distance" else _mixed(survey)
+    one, two = (adjust_cleaned(each, options) for each in (survey, other))
+    assert [p.pair_id for p in one.survey.pairs if not p.used] == [survey.pairs[i].pair_id for i in wrong]
+    assert [p.used for p in one.survey.pairs] == [p.used for p in two.survey.pairs]
+    for name, estimate in one.estimates.items():
+        np.testing.assert_allclose(estimate.value.matrix(), two.estimates[name].value.matrix(), atol=1e-8)
+        np.testing.assert_allclose(estimate.cov, two.estimates[name].cov, rtol=1e-4, atol=1e-14)
+    theirs = {o.ids: o for o in two.other_residuals}
+    for o in one.other_residuals:
+        assert o.test == pytest.approx(theirs[o.ids].test, rel=1e-4)
+        np.testing.assert_allclose(o.redundancy, theirs[o.ids].redundancy, atol=1e-6)
+    assert {(d.action, d.ids) for d in one.decisions} == {(d.action, d.ids) for d in two.decisions}
+    mine, same = ({c.group: c for c in x.variance_components.components} for x in (one, two))
+    assert mine["pair"].factor == pytest.approx(same["pair"].factor, rel=1e-4)
+    assert mine["pair"].factor == pytest.approx(4.0, rel=0.4)
+    told = [{w for w in x.warnings if w.startswith("left out: pair ")} for x in (one, two)]
+    assert len(told[0]) == len(told[1]) == len(wrong)
 
 
 def test_sigmas_too_small_throughout_reject_no_pair():
@@ -366,7 +402,7 @@ def test_surveys_with_more_than_pairs_grow_from_their_last_solution(tmp_path, ca
     capsys.readouterr()
     assert main(["add", str(tmp_path / "lab"), str(tmp_path / "more"), "--quiet"]) == 0
     assert "from the previous solution" in capsys.readouterr().out
-    grown = adjust_with_pairs(replace(
+    grown = adjust_cleaned(replace(
         first, stations=everything.stations, pairs=(*first.pairs, *later), distances=first.distances + second.distances
     ))  # fmt: skip
     found = json.loads((tmp_path / "lab" / "results" / "solution.json").read_text())
@@ -401,4 +437,4 @@ def test_tables_with_other_columns_are_merged_under_one_header(tmp_path):
 def test_a_free_network_needs_no_held_station():
     survey, _ = _network(4, combinations(range(4), 2), 1.0)
     free = replace(survey, stations=tuple(_station(s.station_id) for s in survey.stations), datum=Datum("inner"))
-    assert adjust_with_pairs(free).omega == pytest.approx(adjust_with_pairs(survey).omega, rel=1e-8)
+    assert adjust_cleaned(free).omega == pytest.approx(adjust_cleaned(survey).omega, rel=1e-8)

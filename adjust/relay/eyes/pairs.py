@@ -10,10 +10,10 @@ import scipy.linalg
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair
 from adjust.model.survey import FloatArray
+from adjust.pose_network.loops import evaluate_loops
 from adjust.relay.conditions import ConditionAdjustment, adjust_conditions
 from adjust.relay.eyes.eyes import EyeAdjustment, EyeOptions, adjust_eye_motions, adjust_eyes, symmetric
 from adjust.relay.eyes.sequences import MotionSequence, PoseSequence
-from adjust.relay.loops import evaluate_loops
 from adjust.relay.network import network_from_pairs
 from adjust.relay.normal_equations import condition_matrix
 

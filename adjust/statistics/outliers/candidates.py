@@ -8,7 +8,7 @@ import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.model.observations import ImageBlock, ReadingCovariance
-from adjust.model.survey import BoolArray, Survey
+from adjust.model.survey import BoolArray, IntArray, Survey
 
 _FIELD = {
     "pair": "pairs", "distance": "distances", "coordinates": "coordinates", "level": "levels",
@@ -36,6 +36,11 @@ class Candidates:
         out[list(self.place)] = True
         out[: self.n_image] = with_images
         return out
+
+    def of(self, field: str, rows: IntArray) -> tuple[int, ...]:
+        """The observations that are these rows (k,) of a field of the survey."""
+        index = {place: o for o, place in self.place.items()}
+        return tuple(index[field, i] for i in rows.tolist())
 
 
 def candidates(graph: AdjustmentGraph, images: bool = True) -> Candidates:

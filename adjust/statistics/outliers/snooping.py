@@ -21,7 +21,8 @@ from adjust.statistics.system import LinearSystem
 from adjust.testing.gross_errors import Verdicts
 from adjust.testing.single_tests import CONTROLLED, eigen2
 
-_CAUCHY = 2.385**2
+CAUCHY = 2.385**2
+"""Of Cauchy weights: squares over this are weighted less than a half (Zhang 1997)."""
 
 
 class Verdict(NamedTuple):
@@ -42,7 +43,7 @@ class Snooping:
 
     def __init__(self, system: LinearSystem, candidates: BoolArray, first: int = 0, n_kept: int = 0) -> None:
         s, at = system, int(system.ptr[first])
-        self.system, self.candidates = system, candidates
+        self.system, self.candidates, self.group_names = system, candidates, system.group_names
         self.ptr, self.row_of = s.ptr[first:] - at, s.row_of[at:] - first
         self.used, self.group, self.sizes = s.used[first:], s.group[first:], np.diff(self.ptr)
         self.joint = [(j.rows - at, j.W / np.linalg.norm(j.W, axis=0)) for j in s.joint]
@@ -112,7 +113,7 @@ class Snooping:
 
     def tests(self) -> Verdicts:
         """Of all observations (M,), with what is kept as the last of the groups."""
-        M, n_groups = len(self.sizes), len(self.system.group_names) + 1
+        M, n_groups = len(self.sizes), len(self.group_names) + 1
         T, freedom, whole, own = np.zeros(M), np.zeros(M, dtype=np.int64), np.zeros(M, dtype=np.bool_), np.zeros(M)
         for members, R in zip(self.alike, self.R, strict=True):
             g = self.g[self.rows(members)]
@@ -244,7 +245,7 @@ class Snooping:
 
         squares = of(s.e)
         for _ in range(rounds):
-            new = 1.0 / (1.0 + squares / (_CAUCHY * q))
+            new = 1.0 / (1.0 + squares / (CAUCHY * q))
             for rows, _ in self.joint:  # one weight for what is whitened together
                 mine = self.row_of[rows]
                 new[mine] = new[mine].min()

@@ -15,7 +15,6 @@ from adjust.model.subsets import with_points
 from adjust.model.survey import Survey
 from adjust.statistics.outliers.supported import lost_notes, supported
 from adjust.statistics.outliers.undetermined_points import without_lost_points
-from adjust.statistics.pair_networks import PairOptions
 from adjust.statistics.screened_adjustment import CleanOptions, adjust_cleaned
 from survey.jobs.adjusting.probable_causes import explained, with_probable_causes
 from survey.jobs.adjusting.symmetric_boards import consistent_turns
@@ -63,7 +62,7 @@ class Step:
 def _options(project: Project) -> CleanOptions:
     said = project.options
     how = AdjustOptions(said.alpha, said.reject_blocks, said.reject_points)
-    return CleanOptions(PairOptions(said.reject_pairs, how), said.variance_components)
+    return CleanOptions(said.reject_pairs, how, said.variance_components)
 
 
 def _loops_closed(work: Work) -> Work:
@@ -79,7 +78,7 @@ def _boards_turned(work: Work) -> Work:
 def _spots_identified(work: Work) -> Work:
     project = work.project
     gate = project.spots_request.gate_px if project.spots_request is not None else 15.0
-    how = _options(project).pairs.adjust
+    how = _options(project).adjust
     try:
         part = supported(without_points(project.survey))[0]
         first = adjust(part, work.begin(part), how, work.progress)

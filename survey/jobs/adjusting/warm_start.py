@@ -1,8 +1,7 @@
 """Adjusting a project that has grown, from the values of its last solution.
 
 The result is that of adjusting everything at once: the minimum does not depend on where the search begins. Where it
-might (free networks, whose datum is that of the start; networks of pairs in which some were rejected), the search
-begins anew.
+might (free networks, whose datum is that of the start), the search begins anew.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,9 +16,8 @@ from adjust.lenses.models import MODELS
 from adjust.model.errors import NotConvergedError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Survey
-from adjust.pose_network.from_survey import network_from_survey
+from adjust.pose_network.from_survey import network_from_survey, network_of_pairs
 from adjust.start import find_start
-from adjust.statistics.pair_networks import is_pure
 from survey.jobs.adjusting.steps import adjust_project
 from survey.project import Project
 from survey.solution.earlier.previous import Previous
@@ -36,12 +34,12 @@ def warm_adjustment(
     itself is tested anew, because what it contradicted may be gone.
     """
     survey = project.survey
-    if survey.datum.kind == "inner" or project.options.pairs == "closed" or (is_pure(survey) and not previous.clean):
+    if survey.datum.kind == "inner" or project.options.pairs == "closed":
         return cold(project), COLD
     found: list[bool] = []
 
     def begin(part: Survey) -> StartValues | None:
-        start = (network_start if is_pure(part) else survey_start)(part, previous)
+        start = (survey_start if network_of_pairs(part) is None else network_start)(part, previous)
         found.append(start is not None)
         return start
 

@@ -35,7 +35,7 @@ _POSES = {
 class Previous:
     """A solution that was written: poses and points by parameter name; covs as written, by the same names.
 
-    factor: by which sigmas were multiplied. clean: whether the run left nothing out by itself. vectors: components as
+    factor: by which sigmas were multiplied. vectors: components as
     ``solution.json`` has them, of lenses (with ``model``), table angles and geometry and warps, by parameter name.
     """
 
@@ -44,7 +44,6 @@ class Previous:
     covs: Mapping[ParameterName, FloatArray]
     factor: float
     summary: Mapping[str, Any]
-    clean: bool
     vectors: Mapping[ParameterName, Mapping[str, Any]] = field(default_factory=dict)
 
     def vector(self, name: ParameterName, names: Sequence[str], units: Sequence[str]) -> FloatArray | None:
@@ -138,8 +137,7 @@ def _previous(found: Mapping[str, Any], covs: Mapping[str, FloatArray]) -> Previ
         raise ValueError("a covariance has not the size of its parameter")
     int(summary["redundancy"]), float(summary["sigma0"] or 0.0)
     factor = float(_numbers([summary["sigma_factor"]], 1)[0])
-    clean = found["left_out"]["in_this_run"] == 0
-    return Previous(dict(_poses(found)), points, by_name, factor, summary, clean, dict(_vectors(found)))
+    return Previous(dict(_poses(found)), points, by_name, factor, summary, dict(_vectors(found)))
 
 
 def _vectors(found: Mapping[str, Any]) -> Iterator[tuple[ParameterName, Mapping[str, Any]]]:
