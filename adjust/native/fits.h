@@ -125,4 +125,27 @@ template <int N> inline bool place_covariance(const Normals<N> &at, int n_free, 
     return true;
 }
 
+// The same where the residuals' variance differs from pixel to pixel, as where the model fails on the few that tell the
+// place: each pixel by its own residual, as if the fit had been made without it (HC3 of MacKinnon and White 1985).
+template <int N, class Row> inline bool place_covariance_by_pixel(const Normals<N> &at, int n_free, const Pixels &w, const Row &row, double *cov) {
+    double inverse[N][N] = {};
+    for (int i = 0; i < N; ++i) inverse[i][i] = 1.0;
+    if (!scaled_solve(at.H, n_free, 0.0, inverse)) return false;
+    cov[0] = cov[1] = cov[2] = cov[3] = 0.0;
+    for (int i = 0; i < w.n; ++i) {
+        double d[N], leverage = 0.0, pull[2] = {};
+        const double left = w.value[i] - row(w.x[i], w.y[i], d);
+        for (int a = 0; a < n_free; ++a)
+            for (int b = 0; b < n_free; ++b) {
+                const double part = inverse[a][b] * d[b];
+                leverage += d[a] * part;
+                if (a < 2) pull[a] += part;
+            }
+        const double without = left / larger(1.0 - leverage, 0.05);
+        for (int a = 0; a < 2; ++a)
+            for (int b = 0; b < 2; ++b) cov[2 * a + b] += without * without * pull[a] * pull[b];
+    }
+    return true;
+}
+
 }  // namespace

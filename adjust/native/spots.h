@@ -78,8 +78,12 @@ inline void fit_spots(In<float, 2> gray, In<int64_t, 2> labels, double saturatio
                 evaluate(p, at);
                 if (!levenberg_marquardt(p, n_free, 2e-5, evaluate, clamp, at)) continue;
                 const double variance = at.cost / (n - n_free);
-                double here[4];
+                double here[4], rim[4];
                 if ((lowest >= 0.0 && variance >= lowest) || !place_covariance(at, n_free, variance, here)) continue;
+                // of a full spot only the rim tells the place, while the background around it says how well the model fits
+                if (saturated.data[c] > 0 && place_covariance_by_pixel(at, n_free, w, SpotProfile(p, profile), rim) &&
+                    rim[0] + rim[3] > here[0] + here[3])
+                    std::memcpy(here, rim, sizeof here);
                 lowest = variance, best.data[c] = profile, rms.data[c] = root(variance);
                 std::memcpy(&out(c, 0), p, sizeof p), std::memcpy(&cov(c, 0, 0), here, sizeof here);
             }

@@ -11,10 +11,11 @@ from adjust.native.vision import GAUSSIAN, fit_spots
 from survey.detection.gray import AnyImage, Gray32, gray_values, saturation_level
 from survey.detection.results import Detection, SpotOptions, Spots
 
-# Neither profile is quite that of a small disc under a point spread, least of all on the rim that saturation leaves;
-# measured on noiseless renderings (tests/survey/test_detection_spots.py): at most 0.0008 px rms where nothing is full.
+# Neither profile is quite that of a small disc under a point spread: at most 0.0008 px rms on renderings without noise
+# (tests/survey/test_detection_spots.py). Of a full spot only the rim is left, where it shows in the residuals and so in
+# the covariance; the floor is for what all of them share.
 SPOT_FLOOR_PX = 0.0005
-SATURATED_FLOOR_PX = 0.006
+SATURATED_FLOOR_PX = 0.002
 _FWHM = 2.3548200450309493
 
 
@@ -22,7 +23,8 @@ def detect_spots(image: AnyImage, options: SpotOptions | None = None) -> Spots:
     """All spots of the wanted size, brightest first.
 
     The centre is that of a pixel-integrated elliptic Gaussian or of a disc with a soft rim, whichever fits better;
-    saturated pixels are left out. The covariance is that of the fit, with the residuals' variance.
+    saturated pixels are left out. The covariance is that of the fit, with the residuals' variance; where pixels are
+    saturated, that by each pixel's own residual if it is larger (MacKinnon and White 1985, HC3).
     """
     options = options or SpotOptions()
     gray = gray_values(image)

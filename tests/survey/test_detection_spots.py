@@ -49,10 +49,21 @@ def test_centres_and_their_covariance(diameter_m, gray, profile, limit):
         q.append(np.einsum("ni,nij,nj->n", e[-1], np.linalg.inv(spots.cov), e[-1]))
         wide.append(np.median(spots.diameter_px))
     assert np.sqrt((np.concatenate(e) ** 2).mean()) < limit
-    # 2 is honest; the floor for saturated spots is that of the largest ones
+    # 2 is honest
     assert (0.8 if gray < 255 else 0.4) < np.concatenate(q).mean() < 3.0
     if profile == "disc":
         assert np.mean(wide) == pytest.approx(1600 * diameter_m, abs=0.5)
+
+
+@pytest.mark.parametrize(("diameter_m", "gray"), [(0.006, 4000.0), (0.009, 1000.0), (0.009, 20000.0)])
+def test_full_spots_are_as_uncertain_as_their_rims(diameter_m, gray):
+    # before the rim's own residuals counted, the mean was 15, 11 and 23
+    image = render(CAMERA, beacons=Beacons(BEACONS, diameter_m, gray, "disc"), imaging=Imaging(0.5, 1.0, 20), seed=0)
+    spots = detect_spots(image, SpotOptions((1.5, 30.0)))
+    e = matched(spots)
+    q = np.einsum("ni,nij,nj->n", e, np.linalg.inv(spots.cov), e)
+    assert spots.saturated.min() > 80
+    assert 0.4 < q.mean() < 3.0
 
 
 @pytest.mark.parametrize("profile", [GAUSSIAN, DISC])
