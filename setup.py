@@ -23,10 +23,10 @@ class Build(build_ext):
         return name.replace(".", "/") + ".so"
 
     def build_extensions(self):
-        """Compile and link what is not up to date."""
+        """Compile and link what is not kept from an earlier build."""
         libraries = {e.name.rpartition("_")[2]: Path(self.get_ext_fullpath(e.name)) for e in self.extensions}
         try:
-            NativeBuild(Path(self.build_temp), os.environ.get("LABSURVEY_NATIVE") == "checked").run(libraries)
+            NativeBuild(os.environ.get("LABSURVEY_NATIVE") == "checked").run(libraries)
         except CompilerError as error:
             sys.exit(f"\nerror: {error}")
 

@@ -1,16 +1,19 @@
-"""Compiles and links the native library: which commands, what is up to date, and what to say when a compiler fails."""
+"""Compiles and links the native library: which commands, what is kept, and what to say when a compiler fails."""
 
 import os
 import platform
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import sysconfig
 import tempfile
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
 
 from backend import compiler
@@ -41,75 +44,85 @@ def instruction_sets() -> dict[str, list[str]]:
 
 
 class NativeBuild:
-    """The build of all libraries, with objects in the folder ``temp``, in ``checked`` form or that for use."""
+    """The build of all libraries, in ``checked`` form or that for use.
 
-    def __init__(self, temp: Path, checked: bool) -> None:
-        self.temp = temp / ("checked" if checked else "native")
-        self.temp.mkdir(parents=True, exist_ok=True)
+    What is compiled and linked is kept in the folder ``build/native`` of the sources, under the hash of its command,
+    its sources and the compiler's version: no build does again what another one has done, wherever its result goes.
+    """
+
+    def __init__(self, checked: bool) -> None:
+        self.kept = Path("build/native")
+        self.kept.mkdir(parents=True, exist_ok=True)
         arch = shlex.split(os.environ.get("ARCHFLAGS", "")) if MAC else []
         found = compiler()
         zig = [sys.executable, "-m", "ziglang"]
         # linking by "zig c++" would first build a C++ library, which is not needed here
-        self.compile, link = (found, found) if found else ([*zig, "c++"], [*zig, "cc"])
-        self.compile = [*self.compile, *ALWAYS, *(CHECKED if checked else FLAGS), *arch]
+        self.compilers = (found, found) if found else ([*zig, "c++"], [*zig, "cc"])
         needed = [] if MAC else ["-Wl,--as-needed", *([] if checked else ["-s"])]
-        self.link = [*link, "-shared", *arch, *needed, *(SANITIZERS if checked else [])]
+        self.compile = [*self.compilers[0], *ALWAYS, *(CHECKED if checked else FLAGS), *arch]
+        self.link = [*self.compilers[1], "-shared", *arch, *needed, *(SANITIZERS if checked else [])]
 
     def run(self, libraries: dict[str, Path]) -> None:
-        """Compile what is older than its sources, all at once, then link: the path of the library for each set."""
-        flags = instruction_sets()
-        objects = {
-            self.temp / f"{source.stem}_{name}.o": (source, [*self.compile, *flags[name], "-c", str(source)])
-            for name in libraries
-            for source in sorted(SOURCES.glob("*.cpp"))
-            if source.stem != "processor" or name == "base"
-        }
-        with tempfile.TemporaryDirectory(dir=self.temp) as cache_of_zig, ThreadPoolExecutor(os.cpu_count()) as pool:
-            where = Path(cache_of_zig).resolve()
-            more = {"ZIG_GLOBAL_CACHE_DIR": str(where), "ZIG_LOCAL_CACHE_DIR": str(where)}
-            if MAC and (target := sysconfig.get_config_var("MACOSX_DEPLOYMENT_TARGET")):
-                more["MACOSX_DEPLOYMENT_TARGET"] = str(target)
-            environment = more | os.environ  # what is said from outside holds
-
-            def compiled(item: tuple[Path, tuple[Path, list[str]]]) -> None:
-                path, (source, command) = item
-                _made(path, _included(source), command, environment)
-
-            def linked(item: tuple[str, Path]) -> None:
-                name, path = item
-                mine = [o for o in objects if o.stem.endswith(f"_{name}")]
+        """Compile what is not kept, all at once, then link: the path of the library for each set of instructions."""
+        with tempfile.TemporaryDirectory(dir=self.kept) as scratch, ThreadPoolExecutor(os.cpu_count()) as pool:
+            self.scratch = Path(scratch).resolve()
+            self.environment = self._environment()
+            self.about = [_told([*c, "--version"], self.environment) for c in self.compilers]
+            for (name, path), objects in [(x, pool.map(self._compiled, *_units(x[0]))) for x in libraries.items()]:
+                command = [*self.link, *map(str, objects)]
+                library = self._made(f"kernels_{name}", ".so", [], command, ["-lm"])
                 path.parent.mkdir(parents=True, exist_ok=True)
-                command = [*self.link, *map(str, mine)]
-                _made(path, mine, command, environment, self.temp.parent / f"{name}.command", ["-lm"])
+                fresh = path.with_name(f"{path.name}.{os.getpid()}")
+                shutil.copy(library, fresh)
+                fresh.replace(path)  # at once: the former one may be in use
+        for old in self.kept.glob("*.*o"):
+            if old.stat().st_mtime < time.time() - 30 * 86400:  # no build has used it for a month
+                old.unlink(missing_ok=True)
 
-            list(pool.map(compiled, objects.items()))
-            list(pool.map(linked, libraries.items()))
+    def _environment(self) -> dict[str, str]:
+        """What is said from outside holds."""
+        more = {"ZIG_GLOBAL_CACHE_DIR": str(self.scratch), "ZIG_LOCAL_CACHE_DIR": str(self.scratch)}
+        if MAC and (target := sysconfig.get_config_var("MACOSX_DEPLOYMENT_TARGET")):
+            more["MACOSX_DEPLOYMENT_TARGET"] = str(target)
+        return more | os.environ
+
+    def _compiled(self, source: Path, name: str) -> Path:
+        command = [*self.compile, *instruction_sets()[name], "-c", str(source)]
+        return self._made(f"{source.stem}_{name}", ".o", _included(source), command, [])
+
+    def _made(self, stem: str, ending: str, sources: list[Path], command: list[str], last: list[str]) -> Path:
+        """The file of this command, made unless it is kept."""
+        about = [command, last, self.about, self.environment.get("MACOSX_DEPLOYMENT_TARGET")]
+        content = b"\0".join([repr(about).encode(), *(p.read_bytes() for p in sources)])
+        path = self.kept / f"{stem}_{sha256(content).hexdigest()[:20]}{ending}"
+        if path.exists():
+            os.utime(path)
+            return path
+        fresh = self.scratch / path.name
+        whole = [*command, "-o", str(fresh), *last]
+        print(shlex.join(whole), flush=True)
+        if told := _told(whole, self.environment):
+            print(told, flush=True)
+        return fresh.replace(path)
 
 
-def _made(
-    path: Path, sources: list[Path], command: list[str], environment: dict[str, str], record: Path | None = None,
-    last: list[str] | None = None,
-) -> None:  # fmt: skip
-    """Make a file, unless it is newer than its sources and was made by the same command."""
-    whole = [*command, "-o", str(path), *(last or [])]
-    record = record or path.with_suffix(".command")
-    text = shlex.join(whole)
-    if path.exists() and record.exists() and record.read_text(encoding="utf-8") == text:
-        made = path.stat().st_mtime_ns
-        if all(s.stat().st_mtime_ns < made for s in sources):
-            return
-    record.unlink(missing_ok=True)
-    print(text, flush=True)
+def _units(name: str) -> tuple[list[Path], list[str]]:
+    """What is compiled for a set of instructions, and the set's name for each."""
+    sources = [s for s in sorted(SOURCES.glob("*.cpp")) if s.stem != "processor" or name == "base"]
+    return sources, [name] * len(sources)
+
+
+def _told(command: list[str], environment: dict[str, str]) -> str:
+    """What a command printed; ``CompilerError`` where it failed."""
+    text = shlex.join(command)
     try:
-        done = subprocess.run(whole, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
+        done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
     except OSError as error:
         raise CompilerError(_advice(text, str(error))) from None
     told = done.stdout.decode(errors="replace").strip()
     if done.returncode != 0:
         raise CompilerError(_advice(text, told or f"ended with code {done.returncode}"))
-    if told:
-        print(told, flush=True)
-    record.write_text(text, encoding="utf-8")
+    return told
 
 
 def _advice(command: str, told: str) -> str:

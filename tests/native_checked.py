@@ -34,8 +34,7 @@ def main() -> int:
     parser.add_argument("-m", dest="module", help="run this module instead of pytest")
     arguments, others = parser.parse_known_args()
     build = {"LABSURVEY_NATIVE": "checked", "CXX": os.environ.get("CXX", "g++")}
-    command = [sys.executable, "setup.py", "-q", "build_ext", "--build-lib", str(PLACE / "lib"), "--build-temp",
-               str(PLACE / "temp")]  # fmt: skip
+    command = [sys.executable, "setup.py", "-q", "build_ext", "--build-lib", str(PLACE / "lib")]
     subprocess.run(command, cwd=ROOT, env=os.environ | build, check=True)
     for name in ("adjust", "survey", "capture", "tests"):
         ignored = shutil.ignore_patterns("__pycache__", "*.so")

@@ -2,6 +2,7 @@
 
 import math
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -198,7 +199,6 @@ def test_standa_not_there(tmp_path):
 
 
 _IOC = """
-import sys
 from caproto.ioc_examples.fake_motor_record import FakeMotor
 from caproto.server import PVGroup, SubGroup, run
 
@@ -208,23 +208,31 @@ class Table(PVGroup):
     b = SubGroup(FakeMotor, velocity=200.0, precision=6, user_limits=(-40, 40), tick_rate_hz=50.0, prefix="m2")
 
 
-run(Table(prefix="labsurvey:").pvdb, interfaces=["127.0.0.1"], log_pv_names=False)
+async def listens(_):
+    print("listens", flush=True)
+
+
+run(Table(prefix="labsurvey:").pvdb, interfaces=["127.0.0.1"], log_pv_names=False, startup_hook=listens)
 """
 
+# the machine may be busy: no limit of time here is short, and what takes time is waited for, not slept over
 _EPICS = """
 import math, sys, time
 import numpy as np
-from capture.devices.turntables.epics import EpicsController
+from ophyd.signal import EpicsSignalBase
+from capture.devices.turntables import epics
 from capture.devices.turntables.moving import MovingTable
 from capture.devices.turntable import Axis, ControllerError, LimitError, Settle, StoppedError, TableDisconnectedError
 
+EpicsSignalBase.set_defaults(timeout=60.0, connection_timeout=60.0)
+epics._CONNECT_S = 60.0
 DEG = math.pi / 180
 axes = (Axis("axis1", -60 * DEG, 60 * DEG), Axis("axis2", -170 * DEG, 170 * DEG))
-settle = Settle(0.05 * DEG, 0.01 * DEG, window_s=0.05, stall_s=0.5, timeout_s=10.0, poll_s=0.005)
-controller = EpicsController(["labsurvey:m1", "labsurvey:m2"], [1, -1], [0.0, 0.0], "deg")
+settle = Settle(0.05 * DEG, 0.01 * DEG, window_s=0.05, stall_s=30.0, timeout_s=120.0, poll_s=0.005)
+controller = epics.EpicsController(["labsurvey:m1", "labsurvey:m2"], [1, -1], [0.0, 0.0], "deg")
 table = MovingTable("table", axes, controller, settle)
 table.open()
-table.set(np.radians([12.5, -30.0])).wait(10.0)
+table.set(np.radians([12.5, -30.0])).wait(120.0)
 assert np.allclose(np.degrees(table.position), [12.5, -30.0], atol=1e-6), table.position
 try:
     table.set(np.radians([61.0, 0.0]))
@@ -236,15 +244,18 @@ try:
     raise AssertionError("the record's limit")
 except ControllerError as error:
     assert "own limits -40 to 40" in str(error), error
-status = table.set(np.radians([60.0, 0.0]))
-time.sleep(0.1)
+controller._motors[0].velocity.put(0.5, wait=True)  # 95 s to where it is sent
+status = table.set(np.radians([60.0, -30.0]))
+while np.degrees(table.position[0]) < 12.6:  # the record loses a STOP that comes before it moves
+    time.sleep(0.01)
 table.stop()
 try:
-    status.wait(3.0)
+    status.wait(60.0)
     raise AssertionError("stop")
 except StoppedError:
     pass
-time.sleep(0.3)
+while controller.read(0).moving:
+    time.sleep(0.01)
 assert np.degrees(table.position[0]) < 55.0
 table.close()
 print("EPICS OK")
@@ -255,7 +266,9 @@ sys.stdout.flush()
 @pytest.mark.slow
 def test_epics_motor_records(tmp_path):
     """An IOC and a client in processes of their own, on a port of their own."""
-    port = str(20000 + os.getpid() % 20000)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
     environment = os.environ | {
         "EPICS_CA_SERVER_PORT": port,
         "EPICS_CAS_SERVER_PORT": port,
@@ -264,10 +277,13 @@ def test_epics_motor_records(tmp_path):
         "OPHYD_CONTROL_LAYER": "caproto",
         "OPENBLAS_NUM_THREADS": "1",
     }
-    with subprocess.Popen([sys.executable, "-c", _IOC], env=environment, stderr=subprocess.DEVNULL) as ioc:
+    with subprocess.Popen([sys.executable, "-c", _IOC], env=environment, stdout=subprocess.PIPE,
+                          stderr=subprocess.DEVNULL, text=True) as ioc:  # fmt: skip
         try:
+            assert ioc.stdout is not None
+            assert ioc.stdout.readline() == "listens\n"
             done = subprocess.run(
-                [sys.executable, "-c", _EPICS], env=environment, capture_output=True, text=True, timeout=60
+                [sys.executable, "-c", _EPICS], env=environment, capture_output=True, text=True, timeout=600
             )
         finally:
             ioc.kill()
