@@ -281,19 +281,6 @@ class WeakDirection:
 
 
 @dataclass(frozen=True, eq=False)
-class PrincipalComponent:
-    """The direction in which all coordinates together are weakest. share: of the trace of their covariance.
-
-    shifts: (n, 3) m, one sigma, of ``names``.
-    """
-
-    sigma: float
-    share: float
-    names: tuple[ParameterName, ...]
-    shifts: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class Ellipsoid:
     """A confidence region: semi_axes (k,) m, largest first, axes (3, k) unit vectors in the world, at ``level``.
 

@@ -279,11 +279,6 @@ def _finish(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray, 
     )  # fmt: skip
 
 
-def one_motion(rotation: FloatArray, translation: FloatArray) -> Motions:
-    """A single motion as the arrays have it."""
-    return Motions(np.asarray(rotation)[None], np.asarray(translation)[None])
-
-
 def stacked(parts: Sequence[Motions]) -> Motions:
     """Motions one after the other."""
     shifts = [p.translation for p in parts if p.translation is not None]
