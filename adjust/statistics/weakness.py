@@ -130,18 +130,6 @@ def _within(system: LinearSystem, number: IntArray, limit: float) -> list[tuple[
     return out
 
 
-def correlation_matrix(
-    adjustment: Adjustment, names: Sequence[ParameterName], system: LinearSystem | None = None
-) -> tuple[tuple[str, ...], FloatArray]:
-    """Labels and correlation matrix (n, n) of the free components of these unknowns."""
-    system = system or linear_system(adjustment)
-    index = system.columns.of(names)
-    Q = covariance_columns(system, index)[index]
-    d = np.sqrt(np.maximum(np.diag(Q), 1e-300))
-    labels = tuple(f"{' '.join(system.columns.names[i])} {system.columns.components[i]}" for i in index)
-    return labels, np.asarray(Q / np.outer(d, d))
-
-
 def weak_directions(
     adjustment: Adjustment, most: int = 5, least_inflation: float = 10.0, system: LinearSystem | None = None
 ) -> tuple[WeakDirection, ...]:

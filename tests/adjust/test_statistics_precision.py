@@ -19,7 +19,7 @@ from adjust.statistics.relative_precision import ellipsoid, relative_precision
 from adjust.statistics.scaling import scaled_survey
 from adjust.statistics.system import linear_system
 from adjust.statistics.variance_components import estimate_variance_components
-from adjust.statistics.weakness import correlation_matrix, correlations, weak_directions
+from adjust.statistics.weakness import correlations, weak_directions
 from tests.adjust import helpers as h
 from tests.adjust import statistics_networks as net
 
@@ -117,17 +117,12 @@ def test_correlations_and_weak_directions() -> None:
     survey = replace(survey, readings=(*gone, loose), distances=tapes)
     adjustment = adjust(survey, start)
     Q, N = inverse(adjustment)
-    system = linear_system(adjustment)
     found = correlations(adjustment, 0.95)
     d = np.sqrt(np.diag(Q))
     C = np.triu(Q / np.outer(d, d), 1)
     assert len(found) == np.count_nonzero(np.abs(C) >= 0.95)
     assert abs(found[0].coefficient) == pytest.approx(np.abs(C).max(), rel=1e-9)
     assert {found[0].a, found[0].b} == {("point", point)}
-    labels, matrix = correlation_matrix(adjustment, [("point", point)])
-    assert labels == tuple(f"point {point} {axis}" for axis in "xyz")
-    at = system.columns.at["point", point]
-    np.testing.assert_allclose(matrix, (Q / np.outer(d, d))[np.ix_(at, at)], atol=1e-9)
     worst = weak_directions(adjustment)[0]
     scale = np.sqrt(np.diag(N))
     assert worst.inflation == pytest.approx(np.sqrt(np.linalg.eigvalsh(Q * np.outer(scale, scale))[-1]), rel=1e-6)

@@ -20,7 +20,7 @@ from scipy.sparse.linalg import splu
 
 from adjust.model.errors import NotConvergedError
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.spatial.rigid_motions import Motions, exp, right_jacobian, right_jacobian_inverse
+from adjust.spatial.rigid_motions import Motions, right_jacobian, right_jacobian_inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,8 +283,3 @@ def stacked(parts: Sequence[Motions]) -> Motions:
     """Motions one after the other."""
     shifts = [p.translation for p in parts if p.translation is not None]
     return Motions(np.concatenate([p.rotation for p in parts]), np.concatenate(shifts))
-
-
-def disturbed(motions: Motions, tangents: FloatArray) -> Motions:
-    """``X Exp(d)``: observed from true with errors (n, 6)."""
-    return motions @ exp(tangents)
