@@ -121,3 +121,10 @@ def second_order(kind: ErrorKind, field: BeaconField, sigmas: FloatArray) -> Flo
         return np.full(np.shape(sigmas), np.inf)
     inverse_fourth = 1.0 / (field.nearest_m * field.farthest_m) ** 2
     return np.sqrt(first + 3.0 * field.alpha_px**2 * sigmas**4 * (1.0 + field.widest**2) * inverse_fourth)
+
+
+def tolerance(rms_px: float, slope: float) -> float:
+    """The standard deviation (m or rad) of each component that keeps the RMS error of u at ``rms_px``."""
+    if not (rms_px > 0.0 and slope > 0.0):
+        raise SurveyError(f"no tolerance from {rms_px} px and a slope of {slope} px per unit; both have to be positive")
+    return rms_px / slope

@@ -10,6 +10,7 @@ from adjust.design.error_analysis import (
     expected_slope,
     pixel_errors,
     second_order,
+    tolerance,
     u_jacobian,
 )
 from adjust.design.error_figures import SIZES, error_figure
@@ -113,8 +114,8 @@ def test_the_papers_figures_meet_its_conclusion():
     assert slopes["beacon position"] * MM == pytest.approx(5.3, abs=0.3)
     assert slopes["camera position"] * MM == pytest.approx(5.3, abs=0.3)
     assert slopes["camera attitude"] * DEG == pytest.approx(29.9, abs=0.1)
-    assert 5.0 / slopes["camera position"] == pytest.approx(1.0 * MM, rel=0.15)
-    assert 5.0 / slopes["camera attitude"] == pytest.approx(0.17 * DEG, rel=0.03)
+    assert tolerance(5.0, slopes["camera position"]) == pytest.approx(1.0 * MM, rel=0.15)
+    assert tolerance(5.0, slopes["camera attitude"]) == pytest.approx(0.17 * DEG, rel=0.03)
     assert expected_slope("beacon position", BeaconField(nearest_m=0.01)) * MM == pytest.approx(5.0, abs=0.1)
     rng = np.random.default_rng(12)
     anywhere = rng.uniform(0.0, 1.0, (10_000, 3))
@@ -122,8 +123,10 @@ def test_the_papers_figures_meet_its_conclusion():
     assert np.sqrt(np.mean(u**2)) > 1e4
 
 
-def test_impossible_fields_are_refused():
+def test_impossible_fields_and_budgets_are_refused():
     with pytest.raises(SurveyError, match="nearest_m < farthest_m"):
         BeaconField(nearest_m=2.0)
     with pytest.raises(SurveyError, match="outside the image"):
         BeaconField(u0_px=1300.0)
+    with pytest.raises(SurveyError, match="no tolerance"):
+        tolerance(0.0, 5.0)
