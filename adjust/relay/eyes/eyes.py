@@ -137,7 +137,7 @@ def _adjusted(setup: EyeSetup, options: EyeOptions) -> EyeAdjustment:
     target = np.concatenate([6 * i + np.arange(6) for i in range(k) if len(solution.rows(i))])
     cov = np.zeros((6 * k, 6 * k))
     cov[np.ix_(target, target)] = solution.cov[np.ix_(place, place)]
-    _refuse_weak(setup, solution, cov, options.largest_sigma_rad)
+    _refuse_weak(setup, cov, options.largest_sigma_rad)
     first = solution.cov.shape[0] - len(solution.scales)
     spread = np.sqrt(np.diag(solution.cov)[first:])
     factors = np.exp(solution.scales)
@@ -151,7 +151,7 @@ def _adjusted(setup: EyeSetup, options: EyeOptions) -> EyeAdjustment:
     )  # fmt: skip
 
 
-def _refuse_weak(setup: EyeSetup, solution: EyeSolution, cov: FloatArray, largest: float) -> None:
+def _refuse_weak(setup: EyeSetup, cov: FloatArray, largest: float) -> None:
     """The last word: a rotation that stays uncertain is no result."""
     for i, eye in enumerate(setup.eyes):
         s, V = np.linalg.eigh(cov[6 * i : 6 * i + 3, 6 * i : 6 * i + 3])
