@@ -93,8 +93,7 @@ def condensed_system(precision: Precision) -> CondensedSystem:
     numbers: list[IntArray] = []
     columns: KeyColumns = {}
 
-    def image_rows(precision: Precision, n: int, key_columns: KeyColumns) -> ImageRows:
-        graph = precision.graph
+    def image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> ImageRows:
         columns.update(key_columns)
         parts = [_known(graph, n, key_columns, kept, blocks, numbers)]
         for part, bundle in enumerate(graph.bundles, 1):
