@@ -168,7 +168,8 @@ def _check_apart(
         if (taken := mine[holder[mine] >= 0]).size:
             raise SurveyError(
                 f"candidates {candidates[int(holder[taken[0]])].name!r} and {candidates[i].name!r} both bring the "
-                f"new unknown {' '.join(columns.names[taken[0]])}; make one of them, or give them ids of their own"
+                f"new unknown {' '.join(columns.names[taken[0]])}; make one candidate of them, or give them ids of "
+                "their own"
             )
         holder[mine] = i
 
