@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from adjust.adjustment import AdjustOptions
     from adjust.adjustment import adjust as solve
+    from adjust.epochs.congruence import joint_congruence
     from adjust.epochs.joint import joint_survey
     from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
     from adjust.model.result import Adjustment, Estimate
@@ -31,6 +32,7 @@ _PLACES = {
     "Survey": ("adjust.model.survey", "Survey"),
     "SurveyError": ("adjust.model.errors", "SurveyError"),
     "in_datum": ("adjust.precision.other_datum", "in_datum"),
+    "joint_congruence": ("adjust.epochs.congruence", "joint_congruence"),
     "joint_survey": ("adjust.epochs.joint", "joint_survey"),
     "solve": ("adjust.adjustment", "adjust"),
 }
@@ -46,6 +48,7 @@ __all__ = [
     "Survey",
     "SurveyError",
     "in_datum",
+    "joint_congruence",
     "joint_survey",
     "solve",
 ]

@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 from scipy.linalg import qr
 
 from adjust.design.exact import exact
-from adjust.design.rows import DesignMatrix, Rows, design_matrix
+from adjust.design.rows import DesignMatrix, design_matrix
 from adjust.graph.assembly import GraphBuilder, StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.observations import (
@@ -26,6 +27,7 @@ from adjust.model.observations import (
 )
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Point, Survey
+from adjust.statistics.system import Columns
 
 _RANK = 1e-10
 
@@ -99,22 +101,29 @@ def inform(
     """
     whole = with_candidates(survey, candidates)
     design = design_matrix(exact(whole, start), start)
+    columns, by_name = design.columns, design.graph.unknowns.by_name
     base = set(_names_of(survey, start))
-    owners = _owners(survey, candidates, design)
-    own: list[list[Rows]] = [[] for _ in candidates]
-    for rows, owner in zip(design.rows, owners, strict=True):
+    owned: list[list[IntArray]] = [[] for _ in candidates]
+    for part, owner in zip(design.observations, _owners(survey, candidates, design), strict=True):
         if owner is not None:
-            own[owner].append(rows)
-    private = np.ones(design.n, dtype=np.bool_)
-    for name in base & set(design.at):
-        private[design.at[name]] = False
-    _check_apart(design, own, private, candidates)
-    touched = np.zeros(design.n, dtype=np.bool_)
-    for rows in (r for group in own for r in group):
-        touched[rows.columns] = True
-    names = tuple(n for n in design.names if n in base and (touched[design.at[n]].any() or n in set(wanted)))
-    columns = design.columns(names)
-    return Informed(names, tuple(_eliminated(design.n, group, columns, private) for group in own))
+            owned[owner].append(part.rows)
+    own = [design.A[np.concatenate(rows or [np.zeros(0, dtype=np.int64)])] for rows in owned]
+    private = np.ones(len(columns), dtype=np.bool_)
+    private[columns.of([n for n in columns.at if n in base])] = False
+    _check_apart(columns, own, private, candidates)
+    touched = np.zeros(len(columns), dtype=np.bool_)
+    for A in own:
+        touched[A.indices] = True
+    names = tuple(n for n in columns.at if n in base and (touched[columns.at[n]].any() or n in set(wanted)))
+    first = np.cumsum([0, *(by_name[n].dim for n in names)])
+    free = (k + columns.free[n] for k, n in zip(first[:-1], names, strict=True))
+    place = np.concatenate([np.zeros(0, dtype=np.int64), *free])
+    J = []
+    for A in own:
+        told = _eliminated(A, columns.of(names), private)
+        J.append(np.zeros((len(told), int(first[-1]))))
+        J[-1][:, place] = told
+    return Informed(names, tuple(J))
 
 
 def _names_of(survey: Survey, start: StartValues) -> tuple[ParameterName, ...]:
@@ -122,7 +131,7 @@ def _names_of(survey: Survey, start: StartValues) -> tuple[ParameterName, ...]:
 
 
 def _owners(survey: Survey, candidates: Sequence[Candidate], design: DesignMatrix) -> list[int | None]:
-    """For each of the design's rows the candidate that brings it, None for what is planned anyway."""
+    """For each of the design's observations the candidate that brings it, None for what is planned anyway."""
     images: list[int | None] = [None] * len(survey.image_blocks)
     in_order = {kind: name for kind, name in _LISTS.items() if kind != "table"}
     ordered: dict[str, list[int | None]] = {k: [None] * len(getattr(survey, name)) for k, name in in_order.items()}
@@ -134,51 +143,46 @@ def _owners(survey: Survey, candidates: Sequence[Candidate], design: DesignMatri
             ordered[kind] += [i] * len(getattr(c, name))
         readings |= {(r.table_id, r.epoch_id): i for r in c.table_readings}
         points |= {("point", p.point_id): i for p in c.points}
-    others = design.predictor.graph.others
+    others = design.graph.others
     # readings are not among the others and count from 0
     first = {kind: next((k for k, o in enumerate(others) if o.kind == kind), 0) for kind in ordered}
     out: list[int | None] = []
-    for rows in design.rows:
-        if rows.kind == "image":
-            out.append(images[rows.number])
-        elif rows.kind == "table":
-            out.append(readings.get(others[rows.number].ids))
-        elif rows.kind == "prior":
-            out.append(points.get(others[rows.number].ids))
+    for part in design.observations:
+        if part.kind == "image":
+            out.append(images[part.number])
+        elif part.kind == "table":
+            out.append(readings.get(others[part.number].ids))
+        elif part.kind == "prior":
+            out.append(points.get(others[part.number].ids))
         else:  # kinds that no candidate brings are of the design
-            out.append(ordered[rows.kind][rows.number - first[rows.kind]] if rows.kind in ordered else None)
+            out.append(ordered[part.kind][part.number - first[part.kind]] if part.kind in ordered else None)
     return out
 
 
 def _check_apart(
-    design: DesignMatrix, own: Sequence[Sequence[Rows]], private: BoolArray, candidates: Sequence[Candidate]
+    columns: Columns, own: Sequence[sparse.csr_matrix], private: BoolArray, candidates: Sequence[Candidate]
 ) -> None:
-    holder = np.full(design.n, -1)
-    for i, group in enumerate(own):
-        for rows in group:
-            mine = rows.columns[private[rows.columns]]
-            if (taken := mine[(holder[mine] >= 0) & (holder[mine] != i)]).size:
-                name = next(n for n, at in design.at.items() if at.start <= taken[0] < at.stop)
-                raise SurveyError(
-                    f"candidates {candidates[int(holder[taken[0]])].name!r} and {candidates[i].name!r} both bring the "
-                    f"new unknown {' '.join(name)}; make one candidate of them, or give them ids of their own"
-                )
-            holder[mine] = i
+    holder = np.full(len(columns), -1)
+    for i, A in enumerate(own):
+        mine = np.unique(A.indices[private[A.indices]])
+        if (taken := mine[holder[mine] >= 0]).size:
+            raise SurveyError(
+                f"candidates {candidates[int(holder[taken[0]])].name!r} and {candidates[i].name!r} both bring the "
+                f"new unknown {' '.join(columns.names[taken[0]])}; make one candidate of them, or give them ids of "
+                "their own"
+            )
+        holder[mine] = i
 
 
-def _eliminated(n: int, group: Sequence[Rows], columns: IntArray, private: BoolArray) -> FloatArray:
+def _eliminated(told: sparse.csr_matrix, columns: IntArray, private: BoolArray) -> FloatArray:
     """Rows over ``columns`` that are left when the candidate's own unknowns are eliminated, at most as many as these.
 
     The rows are turned so that the own unknowns appear in the first ones alone (orthogonal elimination, by rank where
     the candidate does not determine them).
     """
-    if not group:
+    A = told.toarray()
+    if not len(A):
         return np.zeros((0, len(columns)))
-    A = np.zeros((sum(len(r.A) for r in group), n))
-    at = 0
-    for r in group:
-        A[at : at + len(r.A), r.columns] = r.A
-        at += len(r.A)
     own = np.flatnonzero(private & (A != 0).any(axis=0))
     both = np.hstack([A[:, own], A[:, columns]])
     used = np.flatnonzero((both != 0).any(axis=0))

@@ -79,24 +79,6 @@ class BeaconField:
         return 2.0 * float(np.log(f / n)) / (f * f - n * n) if n > 0.0 else float("inf")
 
 
-@dataclass(frozen=True, eq=False)
-class ErrorCurve:
-    """RMS of the errors of u over the size of one kind of error.
-
-    sigmas: (k,) m or rad of each of the three components. monte_carlo_px: (k,) of the exact model. linear_px: (k,)
-    first order over the very beacons that were drawn. first_order_px, second_order_px: (k,) over all beacons there may
-    be. slope: px per m or rad, median over the points, which single near beacons do not sway.
-    """
-
-    kind: ErrorKind
-    sigmas: FloatArray
-    monte_carlo_px: FloatArray
-    linear_px: FloatArray
-    first_order_px: FloatArray
-    second_order_px: FloatArray
-    slope: float
-
-
 def pixel_errors(
     kind: ErrorKind, x_in_camera: FloatArray, errors: FloatArray, alpha_px: float = 1600.0
 ) -> FloatArray:
@@ -141,27 +123,8 @@ def second_order(kind: ErrorKind, field: BeaconField, sigmas: FloatArray) -> Flo
     return np.sqrt(first + 3.0 * field.alpha_px**2 * sigmas**4 * (1.0 + field.widest**2) * inverse_fourth)
 
 
-def error_curve(
-    kind: ErrorKind, sigmas: FloatArray, field: BeaconField = BeaconField(), n_trials: int = 10_000, seed: int = 0
-) -> ErrorCurve:
-    """Monte Carlo of one kind of error: ``n_trials`` beacons and normal errors for each of ``sigmas`` (k,) m or rad."""
-    rng = np.random.default_rng(seed)
-    rms, linear = np.empty(len(sigmas)), np.empty(len(sigmas))
-    for i, sigma in enumerate(sigmas):
-        beacons = field.sample(n_trials, rng)
-        errors = sigma * rng.standard_normal((n_trials, 3))
-        rms[i] = _rms(pixel_errors(kind, beacons, errors, field.alpha_px)[:, 0])
-        linear[i] = sigma * np.sqrt(np.mean(np.sum(u_jacobian(kind, beacons, field.alpha_px) ** 2, axis=1)))
-    return ErrorCurve(kind, sigmas, rms, linear, expected_slope(kind, field) * sigmas,
-                      second_order(kind, field, sigmas), float(np.median(rms / sigmas)))  # fmt: skip
-
-
 def tolerance(rms_px: float, slope: float) -> float:
     """The standard deviation (m or rad) of each component that keeps the RMS error of u at ``rms_px``."""
     if not (rms_px > 0.0 and slope > 0.0):
         raise SurveyError(f"no tolerance from {rms_px} px and a slope of {slope} px per unit; both have to be positive")
     return rms_px / slope
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.design.exact import exact
-from adjust.design.rows import design_matrix
 from adjust.design.selection import Component
-from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
-from adjust.model.survey import FloatArray, Survey
+from adjust.model.survey import FloatArray
+from adjust.statistics.system import linear_system
+from adjust.statistics.weakness import covariance_columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,26 +49,24 @@ class Tolerance:
     limiting: str
 
 
-def budget(survey: Survey, start: StartValues, expected: Adjustment, wanted: Sequence[Component]) -> Budget:
-    """The variance of the wanted components by group of observations. ``expected``: of the same survey and values."""
-    design = design_matrix(exact(survey, start), start)
-    names = tuple(dict.fromkeys(c.name for c in wanted))
-    by_name = expected.precision.graph.unknowns.by_name
+def budget(expected: Adjustment, wanted: Sequence[Component]) -> Budget:
+    """The variance of the wanted components by group of observations, of what :func:`expect` says of a survey.
+
+    Raises SurveyError in a free datum, and for a component that is held.
+    """
     if expected.datum_defect:
         raise SurveyError("a budget by groups needs a given datum; hold something instead of inner constraints")
-    N = design.normal()
-    columns = design.columns(names)
-    s = 1.0 / np.sqrt(np.diag(N))
-    unit = np.zeros((design.n, len(columns)))
-    unit[columns, np.arange(len(columns))] = 1.0
-    Q = s[:, None] * np.linalg.solve(N * np.outer(s, s), s[:, None] * unit)
-    at = {(n, c): k for k, (n, c) in enumerate((n, c) for n in names for c in by_name[n].components)}
-    pick = [at[c.name, c.component] for c in wanted]
-    groups = tuple(dict.fromkeys(r.group for r in design.rows))
-    variances = np.zeros((len(groups), len(wanted)))
-    for r in design.rows:
-        variances[groups.index(r.group)] += np.sum((r.A @ Q[r.columns][:, pick]) ** 2, axis=0)
-    return Budget(groups, tuple(wanted), variances)
+    system = linear_system(expected)
+    at = {(n, c): i for i, (n, c) in enumerate(zip(system.columns.names, system.columns.components, strict=True))}
+    held = [c for c in wanted if (c.name, c.component) not in at]
+    if held:
+        raise SurveyError(f"{held[0].text} is held and has no variance; require the precision of something else")
+    used = system.used[system.row_of]
+    Q = covariance_columns(system, np.array([at[c.name, c.component] for c in wanted], dtype=np.int64))
+    variances = np.zeros((len(system.group_names), len(wanted)))
+    np.add.at(variances, system.group[system.row_of[used]], np.asarray(system.A[used] @ Q) ** 2)
+    there = np.unique(system.group[system.used])
+    return Budget(tuple(system.group_names[g] for g in there), tuple(wanted), variances[there])
 
 
 def tolerances(found: Budget, required: Mapping[int, float]) -> tuple[Tolerance, ...]:

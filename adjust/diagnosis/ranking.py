@@ -8,6 +8,7 @@ import numpy as np
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.trial import Misfit, Trial
 from adjust.model.survey import FloatArray
+from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
 _ALPHA = 1e-4
@@ -36,7 +37,7 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
     """The trials that explain the misfit by test, the best first.
 
     Each drop of v'Pv is tested against chi-square with as many degrees of freedom as the change has parameters, at a
-    level shared by all hypotheses that were looked at (Bonferroni). Compared with each other by v'Pv plus p ln n
+    level shared by all hypotheses that were looked at (Sidak). Compared with each other by v'Pv plus p ln n
     (Schwarz 1978), all in units of the least variance factor that any of them leaves.
     """
     good = [t for t in trials if t.result is not None]
@@ -47,7 +48,7 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
     weight = _probabilities(base, good, scale)
     out = []
     for trial, probability in zip(good, weight, strict=True):
-        critical = float(chi2.isf(_ALPHA / number, max(1, trial.hypothesis.parameters)))
+        critical = float(chi2.isf(sidak(_ALPHA, number), max(1, trial.hypothesis.parameters)))
         statistic = (base.omega - _cost(trial)) / scale
         share = (base.omega - _cost(trial)) / max(base.excess, 1e-9)
         if statistic > critical and share > _EXPLAINED and trial.misfit.unused <= base.unused:

@@ -249,10 +249,10 @@ def _arrays(*arrays: FloatArray) -> tuple[FloatArray, ...]:
     return tuple(np.ascontiguousarray(a, dtype=np.float64) for a in arrays)
 
 
-def _pixels(uv: FloatArray, which: BoolArray, shown: int = 5) -> str:
+def _pixels(uv: FloatArray, which: BoolArray) -> str:
     """Some of the named pixels, for a message."""
     bad = uv[which]
-    return f"pixels {listed([f'({u:.1f}, {v:.1f})' for u, v in bad], shown)}"
+    return f"pixels {listed([f'({u:.1f}, {v:.1f})' for u, v in bad], 5)}"
 
 
 def _require_invertible(

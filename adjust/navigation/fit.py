@@ -12,7 +12,7 @@ import numpy as np
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import DONE, SpotArrays, gauss_newton
 from adjust.navigation.system import Sightings, System
-from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log
+from adjust.spatial.rigid import inverse, rotation_exp, rotation_log
 from adjust.spatial.rigid_motions import right_jacobian_inverse
 from adjust.testing.gross_errors import Search, State, Verdicts, one_group
 
@@ -67,19 +67,14 @@ class PoseFit:
     in_front: bool
 
 
-def retract(pose: FloatArray, step: FloatArray) -> FloatArray:
-    """``pose * Exp(step)``: rotation and translation are stepped apart, exact to first order at ``step = 0``."""
-    return np.asarray(pose @ rigid(rotation_exp(step[:3]), step[3:]))
-
-
 def local(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The step (6,) with ``retract(a, step) = b``."""
+    """The step (6,) with ``b = a * (Exp(step[:3]), step[3:])``: rotation and translation are stepped apart."""
     step = inverse(a) @ b
     return np.concatenate([rotation_log(step[:3, :3]), step[:3, 3]])
 
 
 def local_derivative(step: FloatArray) -> FloatArray:
-    """Derivative (6, 6) of ``local(a, retract(b, d))`` by d at zero, where ``step = local(a, b)``."""
+    """Derivative (6, 6) of ``local(a, b * d)`` by the step d at zero, where ``step = local(a, b)``."""
     out = np.zeros((6, 6))
     out[:3, :3], out[3:, 3:] = right_jacobian_inverse(step[:3]), rotation_exp(step[:3])
     return out

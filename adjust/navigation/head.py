@@ -13,13 +13,10 @@ from adjust.model.survey import TABLE_GEOMETRY, FloatArray, PoseParameter, Surve
 from adjust.navigation.model import Beacons, Head, HeadCamera, HeadTable
 
 
-def head_and_beacons(
-    adjustment: Adjustment, station_id: str, known: Beacons | None = None, factor: float = 1.0
-) -> tuple[Head, Beacons]:
+def head_and_beacons(adjustment: Adjustment, station_id: str, known: Beacons | None = None) -> tuple[Head, Beacons]:
     """Head ``station_id`` and the beacons of an adjustment (or those given), values and joint covariance.
 
-    factor: sigma0 where the covariance is to be scaled with it. Raises SurveyError where the station carries no camera,
-    or there is no beacon.
+    Raises SurveyError where the station carries no camera, or there is no beacon.
     """
     survey = adjustment.survey
     cameras = tuple(_camera(adjustment, c.camera_id) for c in survey.cameras if c.station_id == station_id)
@@ -35,7 +32,6 @@ def head_and_beacons(
         names += [("world_from_table", table_id), ("table_geometry", table_id), ("mount_from_station", station_id)]
     points = [("point", p.point_id) for p in survey.points] if known is None else []
     cov, sizes = _joint(adjustment, [*names, *points], _full_sizes(cameras, table, len(points)))
-    cov = factor**2 * cov
     p = sum(sizes[: len(names)])
     head = Head(cameras, cov[:p, :p], table)
     if known is not None:

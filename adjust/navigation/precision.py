@@ -125,15 +125,13 @@ def some_pose(system: System, seen: Sightings, used: IntArray, beacon: IntArray,
 
 
 def expected_precision(
-    head: Head, beacons: Beacons, poses: Sequence[Pose3], sigma_px: float, *, hidden: Sequence[str] = ()
+    head: Head, beacons: Beacons, poses: Sequence[Pose3], sigma_px: float
 ) -> tuple[Expected, ...]:
-    """Precision at poses ``world_from_station`` before anything is measured: all beacons in view but ``hidden``."""
+    """Precision at poses ``world_from_station`` before anything is measured, with all beacons in view."""
     system = make_system(head, beacons)
     out = []
     for pose in poses:
-        view = visible(system, pose.matrix())
-        view[:, [beacons.beacon_ids.index(b) for b in hidden]] = False
-        camera, beacon = (a.astype(np.int64) for a in np.nonzero(view))
+        camera, beacon = (a.astype(np.int64) for a in np.nonzero(visible(system, pose.matrix())))
         out.append(_expected(system, pose, camera, beacon, sigma_px))
     return tuple(out)
 

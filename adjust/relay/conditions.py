@@ -107,7 +107,7 @@ def adjust_condition_factors(network: Network, options: ConditionOptions = Condi
     return ConditionAdjustment(pairs, basis, found.closure)
 
 
-def adjust_loops(network: Network, options: ConditionOptions = ConditionOptions()) -> ConditionAdjustment:
+def adjust_loops(network: Network) -> ConditionAdjustment:
     """By GTSAM's graph of priors and hard closures where that is safe, else by the normal equations; any size.
 
     Safe: few enough loops, all of them closed, and redundancy numbers that sum to the equations, which constraints lost
@@ -116,17 +116,17 @@ def adjust_loops(network: Network, options: ConditionOptions = ConditionOptions(
     top = network.topology
     if top.n_pairs - top.n_stations + int(parts(top).max(initial=0)) + 1 <= MAX_HARD_LOOPS:
         try:
-            found = adjust_condition_factors(network, options)
+            found = adjust_condition_factors(network)
         except NotConvergedError:
-            return adjust_conditions(network, options)
+            return adjust_conditions(network)
         except RuntimeError as error:
             if "ndetermin" not in str(error):
                 raise
-            return adjust_conditions(network, options)
+            return adjust_conditions(network)
         total = found.pairs.redundancy_total
         if abs(float(found.pairs.redundancy.sum()) - total) < 1e-6 * max(1, total):
             return found
-    return adjust_conditions(network, options)
+    return adjust_conditions(network)
 
 
 def _loop_kind(network: Network, options: ConditionOptions) -> Literal["shortest", "tree"]:

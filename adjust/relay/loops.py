@@ -114,9 +114,9 @@ class LoopMisclosures:
         )
 
 
-def loop_misclosures(network: Network, basis: LoopBasis | None = None) -> LoopMisclosures:
+def loop_misclosures(network: Network) -> LoopMisclosures:
     """How well each loop closes, from the measured pairs alone."""
-    basis = basis or loop_basis(network.topology)
+    basis = loop_basis(network.topology)
     w, cov = misclosures(basis, network.b_from_a, network.cov)
     test = np.einsum("li,li->l", w, np.linalg.solve(cov, w[..., None])[..., 0])
     return LoopMisclosures(basis, w, cov, test, np.asarray(chi2.sf(test, network.dim)))

@@ -18,13 +18,11 @@ def pose_distance(a: FloatArray, b: FloatArray, lever: float) -> FloatArray:
     return np.asarray(np.hypot(np.sqrt(squares[..., 3].sum(axis=-1)), lever * turn))
 
 
-def mean_pose(
-    poses: FloatArray, lever: float, members: IntArray | None = None, iterations: int = 20
-) -> tuple[FloatArray, FloatArray]:
+def mean_pose(poses: FloatArray, lever: float, members: IntArray | None = None) -> tuple[FloatArray, FloatArray]:
     """One mean (4, 4) as :func:`mean_poses` has it, and the distance (n,) m of each motion from it."""
     order = np.arange(len(poses)) if members is None else np.argsort(members, kind="stable")
     sorted_members = None if members is None else members[order]
-    mean = mean_poses(poses[order], lever, np.array([0, len(poses)]), sorted_members, iterations)[0]
+    mean = mean_poses(poses[order], lever, np.array([0, len(poses)]), sorted_members)[0]
     return mean, pose_distance(poses, mean, lever)
 
 

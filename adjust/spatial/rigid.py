@@ -31,13 +31,8 @@ def rotation_log(r: FloatArray) -> FloatArray:
     return out
 
 
-def nearest_rotation(m: FloatArray, weights: FloatArray | None = None) -> FloatArray:
-    """Rotations (..., 3, 3) nearest to matrices in the Frobenius norm (orthogonal Procrustes, Schoenemann 1966).
-
-    weights: leading-axis weights; the matrices are then summed over the first axis beforehand.
-    """
-    if weights is not None:
-        m = np.tensordot(weights, m, axes=1)
+def nearest_rotation(m: FloatArray) -> FloatArray:
+    """Rotations (..., 3, 3) nearest to matrices in the Frobenius norm (orthogonal Procrustes, Schoenemann 1966)."""
     u, _, vt = np.linalg.svd(m)
     sign = np.sign(np.linalg.det(u @ vt))
     u = u.copy()
@@ -61,6 +56,15 @@ def inverse(m: FloatArray) -> FloatArray:
 def transform(m: FloatArray, x: FloatArray) -> FloatArray:
     """Points (..., 3) moved by rigid motions (..., 4, 4)."""
     return np.asarray((m[..., :3, :3] @ x[..., None])[..., 0] + m[..., :3, 3])
+
+
+def adjoint(m: FloatArray) -> FloatArray:
+    """(..., 6, 6): a small motion (rotation, translation) on the right of m (..., 4, 4) as one on its left."""
+    R, t = m[..., :3, :3], m[..., :3, 3]
+    out = np.zeros((*m.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., 3:, :3] = skew(t) @ R
+    return out
 
 
 def rotation_to(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.spatial.rigid import rotation_exp, rotation_log, skew
+from adjust.spatial.rigid import adjoint, rigid, rotation_exp, rotation_log, skew
 
 _SMALL = 0.3  # rad; below it the series are exact to the last digit, above it the closed forms lose none
 
@@ -70,10 +70,7 @@ class Motions:
         """Ad (n, dim, dim): ``X Exp(d) X^-1 = Exp(Ad d)``."""
         if self.translation is None:
             return self.rotation
-        out = np.zeros((len(self), 6, 6))
-        out[:, :3, :3] = out[:, 3:, 3:] = self.rotation
-        out[:, 3:, :3] = skew(self.translation) @ self.rotation
-        return out
+        return adjoint(rigid(self.rotation, self.translation))
 
 
 def identities(n: int, dim: int) -> Motions:

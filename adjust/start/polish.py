@@ -8,7 +8,7 @@ from scipy.sparse import csc_array
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.spatial.averaging import pose_distance
-from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log, skew
+from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp, rotation_log, skew
 from adjust.start.network import ChainObservation, Chains, FrameNetwork
 from adjust.start.views import View
 
@@ -106,20 +106,12 @@ def _residuals(misfits: _Misfits, poses: FloatArray, lever: float) -> tuple[Floa
     for j in range(longest):
         turned = chains.inverted[:, j, None, None]
         after = before @ np.where(turned, backwards[chains.slots[:, j]], poses[chains.slots[:, j]])
-        jacobians[:, j] = np.where(turned, -_adjoint(before), _adjoint(after))
+        jacobians[:, j] = np.where(turned, -adjoint(before), adjoint(after))
         before = after
     nearest = np.argmin(pose_distance(misfits.measured, before[:, None], lever), axis=1)
     miss = before @ inverse(misfits.measured[np.arange(n), nearest])
     residuals = np.concatenate([rotation_log(miss[:, :3, :3]), miss[:, :3, 3]], axis=1)
     return (misfits.roots @ residuals[:, :, None])[..., 0], misfits.roots[:, None] @ jacobians
-
-
-def _adjoint(pose: FloatArray) -> FloatArray:
-    """Maps (n, 6, 6) of motions (turn, shift) from right of poses (n, 4, 4) to left of them."""
-    out = np.zeros((len(pose), 6, 6))
-    out[:, :3, :3] = out[:, 3:, 3:] = pose[:, :3, :3]
-    out[:, 3:, :3] = skew(pose[:, :3, 3]) @ pose[:, :3, :3]
-    return out
 
 
 def _step(

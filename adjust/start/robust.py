@@ -14,9 +14,8 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.solver import Solved, SolveOptions, solve
 from adjust.model.survey import BoolArray, FloatArray
 from adjust.precision.precision import Precision, image_residuals
-from adjust.testing.criteria import cautious, limits, typical_factor
+from adjust.testing.criteria import cauchy_weights, cautious, limits, typical_factor
 
-_CAUCHY = 2.385**2
 _FAMILY = 0.001
 _ROUNDS = 6
 
@@ -74,7 +73,7 @@ def _reweighted(graph: AdjustmentGraph, solved: Solved, used: BoolArray, options
     e = graph.whitened_squares(values)
     for _ in range(15):
         factor = scale(e[used])
-        graph.set_weights(used / (1.0 + e / (_CAUCHY * factor)))
+        graph.set_weights(used * cauchy_weights(e / factor))
         roughly = SolveOptions(max_step=1e-2, max_iterations=options.max_iterations)
         values = solve(graph, roughly, start=values).values
         before, e = e, graph.whitened_squares(values)

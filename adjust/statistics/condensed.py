@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
+from adjust.frames.chains import adjoint_of_inverse
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import N_SHAPE
@@ -21,7 +22,6 @@ from adjust.native.parallel import side_by_side
 from adjust.observations.images.batch import warp_shape
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
-from adjust.spatial.rigid import skew
 from adjust.statistics.system import (
     Entries,
     ImageRows,
@@ -93,8 +93,7 @@ def condensed_system(precision: Precision) -> CondensedSystem:
     numbers: list[IntArray] = []
     columns: KeyColumns = {}
 
-    def image_rows(precision: Precision, n: int, key_columns: KeyColumns) -> ImageRows:
-        graph = precision.graph
+    def image_rows(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> ImageRows:
         columns.update(key_columns)
         parts = [_known(graph, n, key_columns, kept, blocks, numbers)]
         for part, bundle in enumerate(graph.bundles, 1):
@@ -165,7 +164,7 @@ def _condensed(graph: AdjustmentGraph, mine: IntArray, shapes: Mapping[str | Non
         those = nl == count
         lens[those, :, :count] = rows[those][:, :, :count]
         pose[those] = rows[those][:, :, count : count + 6]
-    by_camera = pose @ _of_cameras(images.chains.R[mine], images.chains.t[mine])
+    by_camera = pose @ adjoint_of_inverse(images.chains.R[mine], images.chains.t[mine])
     by_key = rows[:, :, :width] @ images.local_from_keys(mine)
     return _Rows(by_key, lens, by_camera, pose, rows[:, :, width:-1].copy(), rows[:, :, -1].copy())
 
@@ -181,15 +180,6 @@ def _condensed_rows(
         if len(given):
             factors[i] = given[blocks[b].point_idx]
     return graph.images.condensed_rows(mine, factors)
-
-
-def _of_cameras(R: FloatArray, t: FloatArray) -> FloatArray:
-    """Motions (B, 6, 6) in the target of a motion d of the camera: Exp(d) T = T Exp(Ad(inv T) d), T = (R, t)."""
-    out = np.zeros((len(R), 6, 6))
-    turned = R.transpose(0, 2, 1)
-    out[:, :3, :3] = out[:, 3:, 3:] = turned
-    out[:, 3:, :3] = -turned @ skew(t)
-    return out
 
 
 def _shape_factors(x: FloatArray) -> FloatArray:
@@ -214,7 +204,7 @@ def _unknown(
     of_row = np.repeat(np.arange(len(lengths)), lengths)
     pose = local[:, MAX_LENS : MAX_LENS + 6]
     c = bundle.chains
-    by_camera = _of_cameras(c.R, c.t)
+    by_camera = adjoint_of_inverse(c.R, c.t)
     kept["lens"].append(local[:, :MAX_LENS])
     kept["target"].append(np.zeros_like(pose))
     kept["camera"].append(np.einsum("ni,nij->nj", pose, by_camera[of_row]))

@@ -41,14 +41,6 @@ def ellipsoid(
     return Ellipsoid(np.sqrt(quantile * values), axes, level, sigma0 is not None and redundancy > 0)
 
 
-def point_ellipsoid(
-    adjustment: Adjustment, name: Place, level: float = 0.95, scaled: bool = False
-) -> Ellipsoid:
-    """Of a point's coordinates or a pose's origin, in world axes."""
-    place = _Places(adjustment).place(name)
-    return ellipsoid(place.cov(adjustment), level, *_scale(adjustment, scaled))
-
-
 def relative_precision(
     adjustment: Adjustment, pairs: Sequence[tuple[Place, Place]], level: float = 0.95, scaled: bool = False
 ) -> tuple[RelativePrecision, ...]:
@@ -153,30 +145,3 @@ def _relative(adjustment: Adjustment, a: _Place, b: _Place, level: float, scaled
         a.name, b.name, d, own, length, float(np.sqrt(max(0.0, float(u @ own @ u)))), ellipsoid(own, level, *scale),
         flat if flat.dimension == 2 else None, cov[:3, :3] if turned else None,
     )  # fmt: skip
-
-
-def relative_sigmas(adjustment: Adjustment, names: Sequence[ParameterName]) -> tuple[FloatArray, FloatArray]:
-    """Of all pairs of points (n, n): sigma of their distance, and the largest sigma of their relative position; m."""
-    places = _Places(adjustment)
-    found = [places.place(n) for n in names]
-    n = len(found)
-    x = np.array([p.x for p in found])
-    free = list(dict.fromkeys(k for p in found for k in p.by))
-    Q = np.zeros((3 * n, 3 * n))
-    if free:
-        joint = np.asarray(adjustment.precision.joint(free))
-        dims = {k: p.by[k].shape[1] for p in found for k in p.by}
-        at = dict(zip(free, np.cumsum([0] + [dims[k] for k in free])[:-1].tolist(), strict=True))
-        J = np.zeros((3 * n, len(joint)))
-        for i, p in enumerate(found):
-            for k, D in p.by.items():
-                J[3 * i : 3 * i + 3, at[k] : at[k] + dims[k]] = D[3:]
-        Q = J @ joint @ J.T
-    blocks = Q.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
-    own = blocks[np.arange(n), np.arange(n)]
-    cov = own[:, None] + own[None, :] - blocks - blocks.transpose(0, 1, 3, 2)
-    d = x[None, :] - x[:, None]
-    length = np.linalg.norm(d, axis=2)
-    u = np.divide(d, length[..., None], out=np.zeros_like(d), where=length[..., None] > 0.0)
-    along = np.sqrt(np.maximum(0.0, np.einsum("abi,abij,abj->ab", u, cov, u)))
-    return along, np.sqrt(np.maximum(0.0, np.linalg.eigvalsh(cov)[..., -1]))

@@ -11,7 +11,8 @@ from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.point_tests import AdjustedPoints, bias_ellipses
 from adjust.testing.criteria import Criteria
-from adjust.testing.single_tests import p_normal, p_posterior, p_prior, p_tau
+from adjust.testing.distributions import norm
+from adjust.testing.single_tests import p_posterior, p_prior, p_tau
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +27,8 @@ class ObservationTests:
     this observation, in any direction, that shows in its own residuals (the redundancy number where it has one
     component); of what is not used how certain its prediction is, 1 / (1 + variance of the prediction / its own).
     statistic: (M,) v' inv(Q_vv) v over the controlled directions. p: (M,) a priori (chi-square). p_posterior: (M,)
-    with sigma0 estimated (F; the tau-test where there is one component). fails, fails_posterior: (M,) below the level
-    of the criteria. Probabilities are computed when they are asked for.
+    with sigma0 estimated (F; the tau-test where there is one component). fails: (M,) where p is below the level of the
+    criteria. Probabilities are computed when they are asked for.
     detectable: (M,) length of the least detectable bias in sigmas of the observation, over the controlled directions;
     inf where there is none. external: (M,) lambda-bar, how far that bias moves the unknowns: no unknown, and no
     function of them, moves by more than this many of its sigmas; 0 where not used.
@@ -72,15 +73,7 @@ class ObservationTests:
     @property
     def fails(self) -> BoolArray:
         """Where p is below the level of the criteria (M,)."""
-        return self._below_level(self.p)
-
-    @property
-    def fails_posterior(self) -> BoolArray:
-        """The same of p_posterior (M,)."""
-        return self._below_level(self.p_posterior)
-
-    def _below_level(self, p: FloatArray) -> BoolArray:
-        return np.asarray(np.nan_to_num(p, nan=1.0) < self.criteria.alpha[np.maximum(self.freedom, 1) - 1])
+        return np.asarray(np.nan_to_num(self.p, nan=1.0) < self.criteria.alpha[np.maximum(self.freedom, 1) - 1])
 
     @property
     def tau(self) -> FloatArray:
@@ -90,7 +83,7 @@ class ObservationTests:
     @cached_property
     def p_w(self) -> FloatArray:
         """Two-sided, of w (K,)."""
-        return p_normal(self.w)
+        return np.asarray(2.0 * norm.sf(np.abs(self.w)))
 
     @cached_property
     def p_tau(self) -> FloatArray:
@@ -278,19 +271,6 @@ class WeakDirection:
         """For people."""
         named = [f"{' '.join(p.name)} {p.component} {p.amount:+.2g} {p.unit}" for p in self.parts]
         return f"{self.inflation:.3g} times weaker together than alone: {listed(named, most)}"
-
-
-@dataclass(frozen=True, eq=False)
-class PrincipalComponent:
-    """The direction in which all coordinates together are weakest. share: of the trace of their covariance.
-
-    shifts: (n, 3) m, one sigma, of ``names``.
-    """
-
-    sigma: float
-    share: float
-    names: tuple[ParameterName, ...]
-    shifts: FloatArray
 
 
 @dataclass(frozen=True, eq=False)

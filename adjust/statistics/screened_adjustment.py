@@ -246,11 +246,6 @@ def component_notes(components: VarianceComponents) -> tuple[str, ...]:
     return tuple(out)
 
 
-def rescaled(survey: Survey, components: VarianceComponents) -> Survey:
-    """A survey with the variances that another adjustment of the same instruments found."""
-    return scaled_survey(survey, {c.group: c.factor for c in components.components})
-
-
 def uncontrolled_pairs(result: Adjustment) -> tuple[str, ...]:
     """Warning of pairs in use that nothing checks."""
     ids = [o.ids[0] for o in result.other_residuals

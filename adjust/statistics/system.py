@@ -10,6 +10,7 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
+import gtsam
 import numpy as np
 import numpy.typing as npt
 import scipy
@@ -23,6 +24,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
 from adjust.observations.images.bundles import BundleBatch
+from adjust.observations.listed import ObservationFactor
 from adjust.observations.terrestrial.layout import Chunk
 from adjust.precision.precision import Precision
 from adjust.precision.s_transformation import without_datum_rows
@@ -286,37 +288,73 @@ KeyColumns = dict[int, IntArray]
 
 def linear_system(adjustment: Adjustment) -> LinearSystem:
     """The system of an adjustment. Raises SurveyError for one without covariances."""
-    return assembled(precision_of(adjustment), _points_apart)
+    return assembled(precision_of(adjustment), points_apart)
 
 
-def assembled(precision: Precision, image_rows: Callable[[Precision, int, KeyColumns], ImageRows]) -> LinearSystem:
-    """The system of these image rows over n columns, and of all other observations."""
-    graph = precision.graph
-    graph.prepare(precision.solved.values, jacobians=True)
+MakeImageRows = Callable[[AdjustmentGraph, int, KeyColumns], ImageRows]
+ItemRows = tuple[Sequence[int], FloatArray, FloatArray]
+"""Keys of an observation, its whitened rows over them, and its whitened residuals."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyRows:
+    """All observations at some values: ``A``, ``e``, ``ptr``, ``used`` as in ``LinearSystem``; groups (M,).
+
+    n_image: the first of them, which are image points; n_before: rows before those of the readings.
+    """
+
+    columns: Columns
+    key_columns: KeyColumns
+    A: sparse.csr_matrix
+    e: FloatArray
+    ptr: IntArray
+    used: BoolArray
+    groups: list[str]
+    n_image: int
+    n_before: int
+
+
+def survey_rows(
+    graph: AdjustmentGraph, values: gtsam.Values, image_rows: MakeImageRows,
+    of_item: Callable[[ObservationFactor], ItemRows],
+) -> SurveyRows:  # fmt: skip
+    """Rows of a graph that was prepared at these values."""
     columns = _columns(graph)
     key_columns = {graph.unknowns.by_name[name].key: _all_columns(graph, columns, name) for name in columns.at}
     n = len(columns)
-    images = image_rows(precision, n, key_columns)
-    others = _other_rows(precision, n, key_columns)
-    readings = _reading_rows(precision, n, key_columns)
-    n_image, n_before = len(images.lengths), images.A.shape[0] + others[0].shape[0]
-    A = sparse.vstack([images.A, others[0], readings[0]]).tocsr()
+    images = image_rows(graph, n, key_columns)
+    others = _other_rows([of_item(item) for item in graph.others], n, key_columns)
+    readings = _reading_rows(graph, values, n, key_columns)
     lengths = np.concatenate([images.lengths, others[2], np.ones(len(readings[1]))])
-    ptr = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-    used = np.concatenate([images.used, _used_others(graph)])
-    groups = images.groups + groups_of_others(graph)
-    names = tuple(dict.fromkeys(groups))
-    number = {g: i for i, g in enumerate(names)}
-    group = np.array([number[g] for g in groups], dtype=np.int64)
-    datum, motions = _datum(precision, n, key_columns)
-    e = np.concatenate([images.e, others[1], readings[1]])
-    joint = tuple(JointReadings(n_before + rows, W) for rows, W in joint_readings(graph))
-    return LinearSystem(precision, columns, A, e, ptr, used, group, names, datum, motions, n_image, joint)
+    return SurveyRows(
+        columns, key_columns, sparse.vstack([images.A, others[0], readings[0]]).tocsr(),
+        np.concatenate([images.e, others[1], readings[1]]), np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        np.concatenate([images.used, _used_others(graph)]), images.groups + groups_of_others(graph),
+        len(images.lengths), images.A.shape[0] + others[0].shape[0],
+    )  # fmt: skip
 
 
-def _points_apart(precision: Precision, n: int, key_columns: KeyColumns) -> ImageRows:
-    """Every image point an observation of its own."""
+def assembled(precision: Precision, image_rows: MakeImageRows) -> LinearSystem:
+    """The system of these image rows over n columns, and of all other observations."""
     graph = precision.graph
+    graph.prepare(precision.solved.values, jacobians=True)
+
+    def of_item(item: ObservationFactor) -> ItemRows:
+        kept = precision.rows(item)
+        return kept.keys, kept.A, kept.e
+
+    rows = survey_rows(graph, precision.solved.values, image_rows, of_item)
+    names = tuple(dict.fromkeys(rows.groups))
+    number = {g: i for i, g in enumerate(names)}
+    group = np.array([number[g] for g in rows.groups], dtype=np.int64)
+    datum, motions = _datum(precision, len(rows.columns), rows.key_columns)
+    joint = tuple(JointReadings(rows.n_before + at, W) for at, W in joint_readings(graph))
+    return LinearSystem(precision, rows.columns, rows.A, rows.e, rows.ptr, rows.used, group, names, datum, motions,
+                        rows.n_image, joint)  # fmt: skip
+
+
+def points_apart(graph: AdjustmentGraph, n: int, key_columns: KeyColumns) -> ImageRows:
+    """Every image point an observation of its own."""
     A, e = _image_rows(graph, n, key_columns)
     groups = [b.group for b in graph.survey.image_blocks for _ in range(len(b.uv))]
     return ImageRows(A, e, np.full(len(groups), 2), graph.used(), groups)
@@ -472,7 +510,7 @@ def bundle_rows(bundle: BundleBatch, n: int, key_columns: KeyColumns) -> Rows:
     columns = np.concatenate([key_columns[key] for key in bundle.order])
     kept = columns >= 0
     select = sparse.csr_matrix((np.ones(int(kept.sum())), (np.flatnonzero(kept), columns[kept])), (len(columns), n))
-    A_keys = local.matrix((2 * k, bundle.n_local)) @ bundle.G @ select + points.matrix((2 * k, n))
+    A_keys = local.matrix((2 * k, bundle.n_local)) @ bundle.local_from_keys() @ select + points.matrix((2 * k, n))
     order = bundle_order(bundle)
     return A_keys.tocsr()[order], bundle.A[:, :, MAX_LENS + 6].ravel()[order]
 
@@ -485,25 +523,23 @@ def bundle_order(bundle: BundleBatch) -> IntArray:
 
 
 def _other_rows(
-    precision: Precision, n: int, key_columns: KeyColumns
+    items: Sequence[ItemRows], n: int, key_columns: KeyColumns
 ) -> tuple[sparse.csr_matrix, FloatArray, IntArray]:
     entries, residuals, lengths, at = Entries(), [np.zeros(0)], [], 0
-    for item in precision.graph.others:
-        rows = precision.rows(item)
-        n_rows = len(rows.e)
-        columns = np.concatenate([np.zeros(0, dtype=np.int64), *(key_columns[k] for k in rows.keys)])
-        entries.add(np.arange(at, at + n_rows), columns, rows.A)
-        residuals.append(rows.e)
-        lengths.append(n_rows)
-        at += n_rows
+    for keys, A, e in items:
+        columns = np.concatenate([np.zeros(0, dtype=np.int64), *(key_columns[k] for k in keys)])
+        entries.add(np.arange(at, at + len(e)), columns, A)
+        residuals.append(e)
+        lengths.append(len(e))
+        at += len(e)
     return entries.matrix((at, n)), np.concatenate(residuals), np.array(lengths, dtype=np.int64)
 
 
-def _reading_rows(precision: Precision, n: int, key_columns: KeyColumns) -> Rows:
-    batch = precision.graph.terrestrial
+def _reading_rows(graph: AdjustmentGraph, values: gtsam.Values, n: int, key_columns: KeyColumns) -> Rows:
+    batch = graph.terrestrial
     if batch is None:
         return sparse.csr_matrix((0, n)), np.zeros(0)
-    e, entries = batch.unweighted(precision.solved.values).copy(), Entries()
+    e, entries = batch.unweighted(values).copy(), Entries()
     alike: dict[tuple[int, ...], list[Chunk]] = {}
     for chunk in batch.layout.chunks:
         if chunk.keys:  # those between held positions have none

@@ -8,7 +8,7 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
 from adjust.precision.s_transformation import without_datum_rows
-from adjust.statistics.result import Correlation, PrincipalComponent, WeakDirection, WeakPart
+from adjust.statistics.result import Correlation, WeakDirection, WeakPart
 from adjust.statistics.system import DENSE, FEW, LinearSystem, linear_system
 
 _MOST = 200
@@ -130,18 +130,6 @@ def _within(system: LinearSystem, number: IntArray, limit: float) -> list[tuple[
     return out
 
 
-def correlation_matrix(
-    adjustment: Adjustment, names: Sequence[ParameterName], system: LinearSystem | None = None
-) -> tuple[tuple[str, ...], FloatArray]:
-    """Labels and correlation matrix (n, n) of the free components of these unknowns."""
-    system = system or linear_system(adjustment)
-    index = system.columns.of(names)
-    Q = covariance_columns(system, index)[index]
-    d = np.sqrt(np.maximum(np.diag(Q), 1e-300))
-    labels = tuple(f"{' '.join(system.columns.names[i])} {system.columns.components[i]}" for i in index)
-    return labels, np.asarray(Q / np.outer(d, d))
-
-
 def weak_directions(
     adjustment: Adjustment, most: int = 5, least_inflation: float = 10.0, system: LinearSystem | None = None
 ) -> tuple[WeakDirection, ...]:
@@ -195,24 +183,3 @@ def _largest(system: LinearSystem, index: IntArray, scale: FloatArray, most: int
         values, vectors = found.eigenvalues, found.eigenvectors
     order = np.argsort(-values, kind="stable")
     return np.asarray(values)[order], np.asarray(vectors)[:, order]
-
-
-def principal_component(adjustment: Adjustment, system: LinearSystem | None = None) -> PrincipalComponent | None:
-    """The weakest deformation of all points together: first eigenvector of their covariance (Niemeier 2008, 11.3).
-
-    None without unknown points.
-    """
-    system = system or linear_system(adjustment)
-    names = tuple(n for n in system.columns.at if n[0] == "point")
-    if not names:
-        return None
-    index = system.columns.of(names)
-    values, vectors = _largest(system, index, np.ones(len(index)), 1)
-    largest = float(max(values[0], 0.0))
-    shifts, vector, at = np.zeros((len(names), 3)), vectors[:, 0] * np.sqrt(largest), 0
-    for i, name in enumerate(names):
-        free = system.columns.free[name]
-        shifts[i, free] = vector[at : at + len(free)]
-        at += len(free)
-    total = float(_variances(system, index).sum())
-    return PrincipalComponent(float(np.sqrt(largest)), largest / total, names, shifts)

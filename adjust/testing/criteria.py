@@ -23,6 +23,7 @@ CAUTIOUS = 0.5
 MANY = 20
 """Tests from which the typical one of a group, by itself, says whether its sigmas are too small."""
 _OF_A_FACTOR = 0.001
+_CAUCHY = 2.385**2
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,11 @@ def typical_factor(statistics: FloatArray, freedom: IntArray) -> float:
     if not known.any():
         return float("nan")
     return float(np.median(statistics[known] / chi2.ppf(0.5, freedom[known])))
+
+
+def cauchy_weights(squares: FloatArray) -> FloatArray:
+    """Of a robust solution, by squares over their expectation (Huber 1981, 7.8; the constant is Zhang's, 1997)."""
+    return np.asarray(1.0 / (1.0 + squares / _CAUCHY))
 
 
 def sidak(family_alpha: float, n_tests: int) -> float:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.testing.distributions import chi2, fisher, norm, student
+from adjust.testing.distributions import chi2, fisher, student
 
 CONTROLLED = 1e-6
 """Share of an error that must show in the residuals to be told from rounding."""
@@ -131,11 +131,6 @@ def p_posterior(
     with np.errstate(divide="ignore", invalid="ignore"):
         F = np.where(possible, statistic / q / np.where(possible, rest / np.maximum(left, 1.0), 1.0), np.nan)
     return np.asarray(fisher.sf(F, q, np.maximum(left, 1.0)))
-
-
-def p_normal(w: FloatArray) -> FloatArray:
-    """Two-sided."""
-    return np.asarray(2.0 * norm.sf(np.abs(w)))
 
 
 def p_tau(tau: FloatArray, used: BoolArray, redundancy: int) -> FloatArray:

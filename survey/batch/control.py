@@ -78,11 +78,6 @@ class Chart:
     slope_sigma: float
     p_slope: float
 
-    @property
-    def alarms(self) -> int:
-        """Epochs outside of either pair of limits, and runs."""
-        return int(np.count_nonzero(self.outside | self.outside_scatter)) + len(self.runs)
-
 
 def chart(series: Series) -> Chart:
     """The control chart of a series of two epochs or more. Raises ValueError for fewer or a sigma that is not > 0."""

@@ -70,9 +70,9 @@ def run_as_program(main: Callable[[], int]) -> NoReturn:
     sys.exit(code)
 
 
-def postpone(names: Sequence[str] = ("numpy.f2py", "numpy.testing")) -> None:
+def postpone() -> None:
     """Modules that load when their contents are first looked at: SciPy imports all of NumPy and needs little of it."""
-    for name in names:
+    for name in ("numpy.f2py", "numpy.testing"):
         spec = None if name in sys.modules else importlib.util.find_spec(name)
         if spec is not None and spec.loader is not None:
             spec.loader = importlib.util.LazyLoader(spec.loader)

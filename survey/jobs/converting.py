@@ -65,7 +65,6 @@ _ENDINGS = {
     ".snx": "sinex",
     **camera_formats.ENDINGS,
 }
-FORMATS = tuple(dict.fromkeys((*READERS, *WRITERS, "project")))
 
 
 @dataclass(frozen=True)

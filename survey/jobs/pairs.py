@@ -20,6 +20,7 @@ from adjust.relay.eyes.drift import sequences
 from adjust.relay.eyes.eyes import adjust_eye_motions
 from adjust.relay.eyes.pairs import EyePairs, close_loops, triangle_misclosure
 from adjust.relay.network import gtsam_motion
+from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 from survey.folder.whole import whole_folder
 from survey.jobs.relay import (
@@ -162,7 +163,7 @@ def triangles(eyes: EyePairs) -> tuple[TriangleMisclosure, ...]:
         test = float(w @ np.linalg.solve(cov, w))
         p = float(chi2.sf(test, 6))
         size = float(np.linalg.norm(w[:3])), float(np.linalg.norm(w[3:]))
-        out.append(TriangleMisclosure(names, *size, test, p, p >= _ALPHA / len(three)))
+        out.append(TriangleMisclosure(names, *size, test, p, p >= sidak(_ALPHA, len(three))))
     return tuple(out)
 
 

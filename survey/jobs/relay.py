@@ -135,10 +135,10 @@ def read_trajectories(paths: Mapping[str, Path]) -> tuple[Trajectory, ...]:
     return tuple(out)
 
 
-def write_relay_pairs(folder: Path, pairs: Sequence[Pair], overwrite: bool = False) -> Path:
+def write_relay_pairs(folder: Path, pairs: Sequence[Pair]) -> Path:
     """Write ``pairs.csv`` into a folder, with full covariances. Raises SurveyError where there is one already."""
-    if (folder / "pairs.csv").exists() and not overwrite:
-        raise SurveyError(f"{folder / 'pairs.csv'} exists; write into another folder or say that it may be replaced")
+    if (folder / "pairs.csv").exists():
+        raise SurveyError(f"{folder / 'pairs.csv'} exists; write into another folder or move it away")
     return write_table(folder, "pairs", pair_columns(pairs))
 
 

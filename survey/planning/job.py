@@ -90,7 +90,7 @@ def _planned(folder: Path, request: PlanRequest, progress: bool) -> PlanningOutc
     shares: Budget | None = None
     allowed: tuple[Tolerance, ...] = ()
     if required and not expected.datum_defect:
-        shares = budget(planned.survey, planned.start, expected, tuple(required))
+        shares = budget(expected, tuple(required))
         allowed = tolerances(shares, dict(enumerate(required.values())))
     chosen = time.perf_counter()
     trials = _trials(planned, expected, request, progress) if request.trials else None

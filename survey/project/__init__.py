@@ -11,7 +11,7 @@ from survey.project.project import (
     SpotsRequest,
 )
 from survey.project.reading import read, read_definition
-from survey.project.writing import write_image_points, write_project, write_spots
+from survey.project.writing import write_project
 
 __all__ = [
     "AdjustmentOptions",
@@ -24,7 +24,5 @@ __all__ = [
     "atomic_write",
     "read",
     "read_definition",
-    "write_image_points",
     "write_project",
-    "write_spots",
 ]

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from adjust.model.errors import SurveyError
-from adjust.model.observations import ImageBlock
 from adjust.model.survey import Survey
 from survey.folder.text import atomic_write
 from survey.folder.units import from_si
@@ -36,17 +35,6 @@ from survey.project.tables.observation_columns import (
 from survey.project.tables.reading import Columns
 from survey.project.tables.terrestrial_columns import new_tables
 from survey.project.targets import PointList, TargetKind
-
-
-def write_image_points(folder: Path, blocks: Sequence[ImageBlock], survey: Survey, *, parquet: bool = False) -> Path:
-    """Write the table of image points of a project; its path. ``survey`` names the points of the blocks."""
-    columns = image_point_columns(blocks, survey)
-    return write_table(Path(folder) / OBSERVATIONS_FOLDER, "image_points", columns, parquet)
-
-
-def write_spots(folder: Path, spots: Sequence[SpotBlock], *, parquet: bool = False) -> Path:
-    """Write the table of unidentified spots of a project; its path."""
-    return write_table(Path(folder) / OBSERVATIONS_FOLDER, "spots", spot_columns(spots), parquet)
 
 
 def write_project(

@@ -21,7 +21,7 @@ from survey.cli import main
 from survey.interop.names import with_safe_ids
 from survey.interop.networks.foreign import ForeignNetwork
 from survey.interop.networks.gama import read_gama
-from survey.interop.networks.krumm import read_adjusted, read_krumm
+from survey.interop.networks.krumm import read_krumm
 from survey.interop.networks.lgc import read_lgc
 from tests.acceptance.dense_network import DenseResult, dense_adjust, gradient_at, sparse_sigmas
 from tests.acceptance.gama_results import GamaResult, gama_result
@@ -281,11 +281,11 @@ def krumm_rows(
     start = {p.point_id: p.x_in_world.value for p in survey.points}
     axes = [i for i in range(3) if any("xyz"[i] not in p.x_in_world.held for p in survey.points
                                        if p.x_in_world.treatment != "held")]  # fmt: skip
-    digits = _digits(folder / f"{name}.adj")
     out = []
-    for point, triples in read_adjusted(folder / f"{name}.adj").items():
-        for k, (axis, (x, correction, sigma)) in enumerate(zip(axes, triples, strict=True)):
-            half = [0.5 * 10.0**-d for d in digits[point][3 * k : 3 * k + 3]]
+    for point, printed in _printed(folder / f"{name}.adj").items():
+        for k, axis in enumerate(axes):
+            (x, correction, sigma), digits = zip(*printed[3 * k : 3 * k + 3], strict=True)
+            half = [0.5 * 10.0**-d for d in digits]
             ours = points[point][axis]
             out.append(
                 KrummRow(
@@ -297,10 +297,10 @@ def krumm_rows(
     return out
 
 
-def _digits(path: Path) -> dict[str, list[int]]:
-    """Printed decimals of every number, by point."""
+def _printed(path: Path) -> dict[str, list[tuple[float, int]]]:
+    """Every number with its printed decimals, by point: coordinate, correction and deviation of each axis."""
     lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
-    return {w[0]: [len(_WORD.fullmatch(x)[1]) for x in w[1:]] for w in lines if w}
+    return {w[0]: [(float(x.replace("−", "-")), len(_WORD.fullmatch(x)[1])) for x in w[1:]] for w in lines if w}
 
 
 def compare_krumm(folder: Path, name: str) -> Compared:

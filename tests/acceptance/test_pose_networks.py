@@ -14,7 +14,7 @@ from adjust.pose_network import solve_network
 from adjust.pose_network.network import survey_of
 from adjust.pose_network.solve import minimize
 from adjust.statistics.screened_adjustment import adjust_cleaned
-from survey.interop.networks.g2o import read_g2o
+from survey.interop.networks.g2o import read_g2o_file
 from tests.adjust.chordal import chordal_cost, minimize_chordal
 from tests.adjust.pose_networks import exp6, simulate
 from tests.benchmarks.networks import batch, gradient, grow
@@ -28,7 +28,7 @@ CERTIFIED = {"sphere2500": 1.687e3, "torus3D": 2.423e4, "parking-garage": 1.263}
 
 @pytest.mark.parametrize("name", CERTIFIED)
 def test_published_optimum_is_met_from_nothing(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    network = read_g2o(data_folder("calibration", "pose_graphs") / f"{name}.g2o")
+    network = read_g2o_file(data_folder("calibration", "pose_graphs") / f"{name}.g2o").network
     assert np.isnan(network.station_translations[1:]).all()  # neither odometry nor the file's vertices are used
     chordal = minimize_chordal(network)
     assert float(f"{chordal.cost:.3e}") == CERTIFIED[name]

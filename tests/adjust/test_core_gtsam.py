@@ -11,17 +11,26 @@ import gtsam
 import numpy as np
 import pytest
 
-from adjust.graph.assembly import AdjustmentGraph, StartValues
+from adjust.adjustment import adjust
+from adjust.graph.assembly import AdjustmentGraph, StartValues, values_of
 from adjust.graph.solver import SolveOptions, solve
-from adjust.model.observations import FrameRef, Pair
+from adjust.model.observations import Closure, FrameRef, Pair
 from adjust.model.survey import Survey, VectorPrior
+from adjust.observations.images import helmert_blocks
+from adjust.pose_network.network import survey_of
 from adjust.precision.precision import Precision
+from adjust.relay.closed import closed
 from survey.simulate import resample, stereo
 from tests.adjust import helpers as h
+from tests.adjust.pose_networks import simulate
 from tests.adjust.terrestrial_networks import measured, polar_network, start_near
 from tests.adjust.test_core_jacobians import others
 from tests.adjust.test_geometry import geometric
+from tests.adjust.test_relay_closed import eyes
 from tests.adjust.test_terrestrial_joint import laboratory, start_of
+from tests.benchmarks import dissection
+from tests.benchmarks.building import Plan, build
+from tests.benchmarks.bundle import start as bundle_start
 
 pytestmark = pytest.mark.slow
 
@@ -55,6 +64,26 @@ def readings() -> Problem:
     """Every kind of reading."""
     survey, truth = polar_network(4)
     return measured(survey, truth, 4), start_near(survey, truth, 2, 1e-3)
+
+
+def pair_graph() -> Problem:
+    """Nothing but pairs and a prior: eliminated in the compiled core."""
+    survey = survey_of(simulate(4, 3, seed=2, extra=5).network)
+    return survey, h.shaken(values_of(adjust(survey)), 1, 0.002, 0.002)
+
+
+def closed_loop() -> Problem:
+    """Eyes that are no stations, and a mount with play that closes one of their loops."""
+    survey = closed(eyes(1), (Closure("mount", ("C1-C2", "C2-M1", "C1-M1"), 1e-3, 1e-3),))
+    return survey, h.shaken(values_of(adjust(survey)), 1, 0.002, 0.002)
+
+
+def cut_bundle() -> AdjustmentGraph:
+    """Two rooms seen through a door, each hidden in a Helmert block of its own."""
+    plan = build(Plan(2, 1, stations=20, points=200, door=6))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(helmert_blocks, "SMALLEST", 8)
+        return h.build(dissection.survey_of(plan), bundle_start(plan.bundle))
 
 
 def loose(survey: Survey, factor: float) -> Survey:
@@ -108,6 +137,7 @@ def problem(make: Callable[[], Problem]) -> Callable[[], AdjustmentGraph]:
 GRAPHS = {
     "bundle": problem(bundle), "reduced epochs": problem(reduced_epochs), "lab": problem(lab),
     "readings": problem(readings), "pairs and others": of_pairs_and_others, "geometry": of_geometry,
+    "pairs alone": problem(pair_graph), "closed loop": problem(closed_loop), "Helmert blocks": cut_bundle,
 }  # fmt: skip
 
 
@@ -133,7 +163,7 @@ def test_gtsams_own_algorithms_reach_the_same_optimum_and_covariances(kind: str)
 
 
 def test_all_kinds_of_observations_are_among_these() -> None:
-    seen = {"image": False, "bundle": False, "hidden points": False, "reduced poses": False}
+    seen = dict.fromkeys(("image", "bundle", "hidden points", "reduced poses", "Helmert blocks", "only pairs"), False)
     kinds: set[str] = set()
     for make in GRAPHS.values():
         graph = make()
@@ -142,6 +172,8 @@ def test_all_kinds_of_observations_are_among_these() -> None:
         seen["bundle"] |= bool(graph.bundles)
         seen["hidden points"] |= any(bundle.reduced for bundle in graph.bundles)
         seen["reduced poses"] |= graph.reduction is not None
+        seen["Helmert blocks"] |= len(graph.bundles) > 1
+        seen["only pairs"] |= graph.only_pairs
     assert all(seen.values()), seen
     assert kinds == {
         "table", "pair", "distance", "coordinates", "prior", "level", "alignment", "laser", "surface",
@@ -150,7 +182,7 @@ def test_all_kinds_of_observations_are_among_these() -> None:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ["bundle", "reduced epochs", "lab"])
+@pytest.mark.parametrize("kind", ["bundle", "reduced epochs", "lab", "Helmert blocks"])
 def test_the_solvers_view_is_of_the_same_chi_square_anywhere(kind: str) -> None:
     """Neither graph needs anything prepared, nor minds what the other was asked in between."""
     graph = GRAPHS[kind]()
@@ -161,7 +193,7 @@ def test_the_solvers_view_is_of_the_same_chi_square_anywhere(kind: str) -> None:
         assert 2.0 * graph.graph.error(values) == pytest.approx(expected, rel=1e-10)
 
 
-@pytest.mark.parametrize("kind", ["bundle", "reduced epochs", "lab"])
+@pytest.mark.parametrize("kind", ["bundle", "reduced epochs", "lab", "Helmert blocks"])
 def test_the_solvers_view_has_the_step_of_the_graph(kind: str) -> None:
     """Also at values that nothing was prepared for."""
     graph = GRAPHS[kind]()

@@ -8,8 +8,8 @@ import pytest
 from gtsam import Pose3, Rot3
 from scipy.stats import chi2
 
-from adjust.design.error_analysis import ERROR_KINDS, BeaconField, error_curve, tolerance
-from adjust.design.error_figures import error_figure, error_figures
+from adjust.design.error_analysis import ERROR_KINDS, BeaconField
+from adjust.design.error_figures import error_figure
 from adjust.design.placement import PlacementOptions, place_beacons
 from adjust.design.pose_budget import pose_budget, pose_tolerances, simulate_poses
 from adjust.model.errors import SurveyError
@@ -191,14 +191,3 @@ def test_without_a_nearest_depth_few_trials_carry_the_sum():
     assert np.median(error_figure("camera attitude", BeaconField()).effective) > 9000
     far = error_figure("beacon position", BeaconField(nearest_m=0.5))
     assert np.median(far.effective) > 5000
-
-
-def test_figures_are_those_of_the_error_curves():
-    """The same model as ``error_curve``, whose projection is tested against OpenCV's."""
-    field = BeaconField(nearest_m=0.1)
-    for figure in error_figures([field], n_trials=20_000, seed=4)[0]:
-        curve = error_curve(figure.kind, figure.sigmas, field, 20_000, seed=11)
-        both = np.hypot(figure.rms_se, figure.rms_se)
-        assert np.abs((figure.rms - curve.monte_carlo_px) / both).max() < 4.5
-        np.testing.assert_allclose(figure.analytic, curve.second_order_px)
-        assert tolerance(5.0, figure.slope) == pytest.approx(5.0 / figure.slope)

@@ -7,20 +7,18 @@ import pytest
 from adjust.design.error_analysis import (
     ERROR_KINDS,
     BeaconField,
-    error_curve,
     expected_slope,
     pixel_errors,
     second_order,
     tolerance,
     u_jacobian,
 )
+from adjust.design.error_figures import SIZES, error_figure
 from adjust.model.errors import SurveyError
 from adjust.spatial.rotation_forms import matrix_from_euler
 
 MM, DEG = 1e-3, np.pi / 180.0
 FAR = BeaconField(nearest_m=0.1)
-SIZES = {"beacon position": np.linspace(0.2, 2, 10) * MM, "camera position": np.linspace(0.2, 2, 10) * MM,
-         "camera attitude": np.linspace(0.05, 0.5, 10) * DEG}  # fmt: skip
 CAMERA = np.array([[1600.0, 0, 640], [0, 1600, 512], [0, 0, 1]])
 
 
@@ -65,12 +63,12 @@ def test_beacons_are_uniform_over_what_the_camera_sees():
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ERROR_KINDS)
 def test_the_simulation_is_the_first_order_within_a_percent(kind):
-    curve = error_curve(kind, SIZES[kind], FAR, n_trials=100_000, seed=7)
-    ratio = curve.monte_carlo_px / curve.first_order_px
+    curve = error_figure(kind, FAR, SIZES[kind], n_trials=100_000, seed=7)
+    ratio = curve.rms / (curve.slope * curve.sigmas)
     np.testing.assert_allclose(ratio, 1.0, atol=0.02)  # a single point: the heavy tail still shows
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.004)
-    assert np.mean(curve.monte_carlo_px / curve.linear_px) == pytest.approx(1.0, abs=0.004)
-    assert curve.slope == pytest.approx(expected_slope(kind, FAR), rel=0.005)
+    assert np.mean(curve.rms / curve.same_draws) == pytest.approx(1.0, abs=0.004)
+    assert np.median(curve.rms / curve.sigmas) == pytest.approx(expected_slope(kind, FAR), rel=0.005)
 
 
 def test_integrals_by_quadrature():
@@ -87,9 +85,9 @@ def test_integrals_by_quadrature():
 @pytest.mark.slow
 def test_large_errors_need_the_second_order():
     sizes = np.array([10, 15, 20]) * MM
-    curve = error_curve("beacon position", sizes, FAR, n_trials=1_000_000, seed=11)
-    assert np.all(curve.monte_carlo_px[1:] > 1.005 * curve.first_order_px[1:])
-    np.testing.assert_allclose(curve.monte_carlo_px, curve.second_order_px, rtol=0.01)
+    curve = error_figure("beacon position", FAR, sizes, n_trials=1_000_000, seed=11)
+    assert np.all(curve.rms[1:] > 1.005 * curve.slope * sizes[1:])
+    np.testing.assert_allclose(curve.rms, curve.analytic, rtol=0.01)
     # what the first order leaves, beacon by beacon, each with errors of either sign: only even orders remain
     rng = np.random.default_rng(12)
     beacons, errors = FAR.sample(1_000_000, rng), 5 * MM * rng.standard_normal((1_000_000, 3))
@@ -111,9 +109,10 @@ def test_the_papers_figures_meet_its_conclusion():
     """
     field, slopes = BeaconField(), {}
     for kind in ERROR_KINDS:
-        slopes[kind] = np.median([error_curve(kind, SIZES[kind], field, seed=s).slope for s in range(40)])
+        figures = (error_figure(kind, field, seed=s) for s in range(40))
+        slopes[kind] = np.median([np.median(f.rms / f.sigmas) for f in figures])
     assert slopes["beacon position"] * MM == pytest.approx(5.3, abs=0.3)
-    assert slopes["camera position"] == slopes["beacon position"]
+    assert slopes["camera position"] * MM == pytest.approx(5.3, abs=0.3)
     assert slopes["camera attitude"] * DEG == pytest.approx(29.9, abs=0.1)
     assert tolerance(5.0, slopes["camera position"]) == pytest.approx(1.0 * MM, rel=0.15)
     assert tolerance(5.0, slopes["camera attitude"]) == pytest.approx(0.17 * DEG, rel=0.03)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from adjust.model.errors import SurveyError
 from adjust.native.navigation import real_roots, three_point_poses
 from adjust.navigation import Motion, NavigateOptions, NavigationEpoch, PosePrior, Spots, expected_precision, navigate
-from adjust.navigation.fit import local, local_derivative, retract
+from adjust.navigation.fit import local, local_derivative
 from adjust.navigation.motion import MotionState, predicted, table_prior
 from adjust.navigation.system import evaluate, make_system, square_root
 from adjust.spatial.rigid import rigid, rotation_exp
@@ -28,6 +28,11 @@ from tests.adjust.navigation import (
 )
 
 ALONE = NavigateOptions(motion=None)
+
+
+def retract(pose, step):
+    """The inverse of ``local``."""
+    return pose @ rigid(rotation_exp(step[:3]), step[3:])
 
 
 def test_roots_of_a_polynomial_of_degree_eight():

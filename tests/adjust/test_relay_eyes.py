@@ -14,7 +14,7 @@ from adjust.adjustment import adjust
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.survey import FloatArray
-from adjust.relay.eyes.eyes import EyeOptions, adjust_eye_motions, adjust_eyes, pair_from_marker
+from adjust.relay.eyes.eyes import EyeOptions, adjust_eye_motions, adjust_eyes
 from adjust.relay.eyes.images import camera_sequence, eye_sequences, target_sequence
 from adjust.relay.eyes.pairs import close_loops, pairs_of, triangle_misclosure
 from adjust.relay.eyes.sequences import KnownWorlds, MotionSequence, PoseSequence
@@ -314,25 +314,6 @@ def test_a_known_relation_helps_and_the_same_target_is_exact() -> None:
     same = adjust_eyes([replace(s, world_ids=("w",) * 6) for s in sequences])
     assert np.all(np.diag(same.cov)[6:] < np.diag(alone.cov)[6:])
     assert np.allclose(related.cov, same.cov, rtol=1e-4, atol=1e-14)
-
-
-def test_marker_block_covariance_is_the_scatter() -> None:
-    rng = np.random.default_rng(18)
-    seen, carried, camera = (Pose3(m) for m in random_rigid(rng, 3, 1.0, 0.7))
-    covs = [np.diag(rng.uniform(1, 3, 6) * s) for s in (1e-6, 1e-7, 2e-7)]
-    a, b = FrameRef("station", "s1"), FrameRef("station", "s2")
-    true = camera.compose(seen).compose(carried.inverse())
-    tests = []
-    for _ in range(200):
-        e = [rng.multivariate_normal(np.zeros(6), c) for c in covs]
-        pair = pair_from_marker(
-            "m", seen.compose(Pose3.Expmap(e[0])), covs[0],
-            (a, carried.compose(Pose3.Expmap(e[1])), covs[1]), (b, camera.compose(Pose3.Expmap(e[2])), covs[2]),
-        )  # fmt: skip
-        assert isinstance(pair.b_from_a, Pose3)
-        d = Pose3.Logmap(true.between(pair.b_from_a))
-        tests.append(d @ np.linalg.solve(pair.cov, d))
-    assert chi2.ppf(0.0005, 1200) < np.sum(tests) < chi2.ppf(0.9995, 1200)
 
 
 # -- from images -------------------------------------------------------------------------------------------------------

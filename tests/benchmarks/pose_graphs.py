@@ -12,7 +12,7 @@ from gtsam import BetweenFactorPose3, Pose3, PriorFactorPose3, Rot3
 from adjust.model.survey import FloatArray, IntArray
 from adjust.pose_network import PoseNetwork, pose_network, solve_network
 from adjust.pose_network.start import find_network_start
-from survey.interop.networks.g2o import read_g2o
+from survey.interop.networks.g2o import read_g2o_file
 from tests.benchmarks.cases import Arrays
 from tests.benchmarks.outcome import Competitor, Outcome
 
@@ -36,7 +36,7 @@ class PoseGraph(Arrays):
 
 def read(path: Path) -> PoseGraph:
     """A g2o file, with the start that ours finds."""
-    network = read_g2o(path)
+    network = read_g2o_file(path).network
     start = np.tile(np.eye(4), (network.n_stations, 1, 1))
     start[:, :3, :3], start[:, :3, 3] = find_network_start(network)
     return PoseGraph(

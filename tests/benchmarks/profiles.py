@@ -19,7 +19,7 @@ from adjust.pose_network import solve_network
 from adjust.precision.precision import Precision
 from adjust.precision.tree import TreeCovariance
 from adjust.start import find_start
-from survey.interop.networks.g2o import read_g2o
+from survey.interop.networks.g2o import read_g2o_file
 from tests.benchmarks import tables, terrestrial
 from tests.benchmarks.data import calibration, rough_start, survey
 from tests.data import data_folder
@@ -169,7 +169,7 @@ def pose_graphs(names: Sequence[str]) -> str:
     """For published graphs."""
     columns = {}
     for name in names:
-        network = read_g2o(data_folder("calibration", "pose_graphs") / f"{name}.g2o")
+        network = read_g2o_file(data_folder("calibration", "pose_graphs") / f"{name}.g2o").network
 
         def run(clock: Clock, network: Any = network) -> None:
             fresh = network.with_used(network.used)

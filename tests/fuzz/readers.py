@@ -251,9 +251,9 @@ EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 4 0 0 4 0 4
 
 
 def _g2o(path: Path) -> object:
-    from survey.interop.networks.g2o import read_g2o
+    from survey.interop.networks.g2o import read_g2o_file
 
-    return read_g2o(path), read_g2o(path, "quaternion", True)
+    return read_g2o_file(path).network, read_g2o_file(path, "quaternion", True).network
 
 
 def _foreign(name: str) -> Callable[[Path], object]:
@@ -290,12 +290,6 @@ def _aicon(file: str) -> Callable[[Path], Read]:
 
 def _dbat(file: str) -> Callable[[Path], Read]:
     return _one_of("dbat", {**DBAT_FILES, "net.xml": DBAT}, "net.xml", file)
-
-
-def _adjusted_krumm(path: Path) -> object:
-    from survey.interop.networks.krumm import read_adjusted
-
-    return read_adjusted(path)
 
 
 def _recover(folder: Path) -> Read:
@@ -344,7 +338,6 @@ READERS: dict[str, Reader] = {
     "g2o": Reader(lambda: [_G2O], in_file("net.g2o", _g2o)),
     "gama": Reader(lambda: [GKF.encode()], in_file("net.gkf", _foreign("gama"))),
     "krumm": Reader(lambda: [KRUMM.encode()], in_file("net.dat", _foreign("krumm"))),
-    "krumm-adjusted": Reader(lambda: [b"A 1.0 2.0 3.0\nB 1 2 3 4 5 6 7\n"], in_file("net.adj", _adjusted_krumm)),
     "lgc": Reader(lambda: [LGC.encode()], in_file("net.lgc", _foreign("lgc"))),
     "csv": Reader(lambda: [CSV.encode()], in_file("net.csv", _foreign("csv"))),
     "dbat": Reader(lambda: [DBAT.encode()], _dbat("net.xml")),

@@ -7,7 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from survey.cli import main
+from survey.commands.converting import FORMATS
+from survey.jobs.converting import READERS, WRITERS
 from survey.project import read
+
+
+def test_formats_of_the_command_are_those_that_are_read_or_written():
+    assert set(FORMATS) == {*READERS, *WRITERS, "project"}
 
 
 def _lines(n=5, seed=1, noise=1e-3):

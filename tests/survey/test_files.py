@@ -269,17 +269,6 @@ def test_existing_project_is_not_overwritten_by_chance(good: Path) -> None:
     assert list((good / "observations").iterdir()) == []
 
 
-def test_image_points_alone(good: Path) -> None:
-    project = files.read(good)
-    path = files.write_image_points(good, project.survey.image_blocks[:1], project.survey, parquet=True)
-    assert path.name == "image_points.parquet"
-    assert len(files.read(good).survey.image_blocks) == 1
-    files.write_spots(good, project.spots)
-    assert differences(files.read(good).spots, project.spots) == []
-    files.write_image_points(good, (), project.survey)
-    assert files.read(good).survey.image_blocks == ()
-
-
 def test_tables_without_rows_observe_nothing(good: Path) -> None:
     for path in (good / "observations").iterdir():
         path.write_text(path.read_text().partition("\n")[0])

@@ -7,7 +7,7 @@ import pytest
 from adjust.model.errors import SurveyError
 from adjust.pose_network import solve_network
 from survey.cli import main
-from survey.interop.networks.g2o import read_g2o, read_g2o_file, write_g2o
+from survey.interop.networks.g2o import read_g2o_file, write_g2o
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.converting import convert_job
 from survey.project import read
@@ -20,7 +20,7 @@ VERTEX = "VERTEX_SE3:QUAT {} 0 0 0 0 0 0 1"
 
 def test_gtsam_reads_the_same(tmp_path: Path) -> None:
     path = data_folder("calibration", "pose_graphs") / "smallGrid3D.g2o"
-    net = read_g2o(path, use_vertices=True)
+    net = read_g2o_file(path, use_vertices=True).network
     graph, values = gtsam.readG2o(str(path), True)
     assert graph.size() == net.n_pairs
     assert values.size() == net.n_stations
@@ -39,7 +39,7 @@ def test_written_networks_come_back(tmp_path: Path, information) -> None:
     net = simulate(4, 3).network
     solution = solve_network(net)
     write_g2o(tmp_path / "n.g2o", net, solution.rotations, solution.translations, information)
-    back = read_g2o(tmp_path / "n.g2o", information, use_vertices=True)
+    back = read_g2o_file(tmp_path / "n.g2o", information, use_vertices=True).network
     assert back.cov == pytest.approx(net.cov, rel=1e-9, abs=1e-15)
     assert back.rotations == pytest.approx(net.rotations, abs=1e-12)
     assert back.station_translations == pytest.approx(solution.translations, abs=1e-12)
@@ -49,7 +49,7 @@ def test_written_networks_come_back(tmp_path: Path, information) -> None:
 def test_the_two_meanings_of_the_rotation_information_differ_by_four(tmp_path: Path) -> None:
     path = tmp_path / "n.g2o"
     path.write_text("\n".join([VERTEX.format(0), VERTEX.format(1), EDGE]))
-    tangent, quaternion = read_g2o(path), read_g2o(path, "quaternion")
+    tangent, quaternion = read_g2o_file(path).network, read_g2o_file(path, "quaternion").network
     assert np.diag(tangent.cov[0]) == pytest.approx([0.25] * 3 + [1.0] * 3)
     assert np.diag(quaternion.cov[0]) == pytest.approx([1.0] * 6)
 
@@ -71,7 +71,7 @@ def test_damage_is_named(tmp_path: Path, line: str, message: str) -> None:
     path = tmp_path / "n.g2o"
     path.write_text("\n".join([VERTEX.format(0), VERTEX.format(1), line]) + "\n")
     with pytest.raises(SurveyError, match=message):
-        read_g2o(path)
+        read_g2o_file(path)
 
 
 INDEFINITE = "EDGE_SE3:QUAT {} {} 1 2 3 0 0 0 1 " + " ".join(
@@ -87,7 +87,7 @@ def _partly_indefinite(path: Path) -> Path:
 
 def test_indefinite_information_is_counted_and_named_with_its_lines(tmp_path: Path) -> None:
     with pytest.raises(SurveyError, match="line 6: the information matrix of edge 1 2") as caught:
-        read_g2o(_partly_indefinite(tmp_path / "n.g2o"))
+        read_g2o_file(_partly_indefinite(tmp_path / "n.g2o"))
     assert "of 3 these 2 are not: 1 2 (line 6), 2 3 (line 7); " in str(caught.value)
     assert "--block-diagonal" in str(caught.value)
 
@@ -103,7 +103,7 @@ def test_blocks_alone_are_read_where_that_is_asked_for(tmp_path: Path, capsys: p
     # blocks that are indefinite themselves cannot be helped
     path.write_text(path.read_text().replace("9 0 0 9 0 9", "9 0 0 9 0 -9"))
     with pytest.raises(SurveyError, match=r"line 6: .* not positive definite.*; correct the file"):
-        read_g2o(path, block_diagonal=True)
+        read_g2o_file(path, block_diagonal=True)
 
 
 def test_a_converted_network_gives_the_minimum_of_all_its_pairs(tmp_path: Path) -> None:

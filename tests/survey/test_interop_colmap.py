@@ -6,16 +6,20 @@ import subprocess
 import numpy as np
 import pycolmap
 import pytest
-from gtsam import Pose3
+from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from survey.cli import main
-from survey.interop.cameras.colmap import pose3, reconstruction, rigid3d
+from survey.interop.cameras.colmap import reconstruction, rigid3d
 from survey.interop.cameras.colmap_model import read_model
 from survey.jobs.converting import adjusted_values
 from survey.project import read
 from tests.survey.camera_lab import SIGMA_PX, world_pixels
+
+
+def pose3(rigid):
+    return Pose3(Rot3(rigid.rotation.matrix()), rigid.translation)
 
 
 @pytest.fixture(scope="module")

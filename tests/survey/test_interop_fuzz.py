@@ -8,7 +8,6 @@ from hypothesis import HealthCheck, configuration, given, settings
 from hypothesis import strategies as st
 
 from adjust.model.errors import SurveyError
-from survey.interop.networks.krumm import read_adjusted
 from survey.jobs.converting import READERS
 from tests.sizes import size
 from tests.survey.interop_samples import AICON, CSV, DBAT, DBAT_FILES, GKF, KRUMM, LGC
@@ -102,9 +101,3 @@ def test_damaged_tables_of_dbat(tmp_path, file, data):
 @given(data=st.one_of(st.binary(max_size=200), st.text(max_size=200)))
 def test_anything_at_all(tmp_path, name, data):
     _try(READERS[name], tmp_path / "net.file", data)
-
-
-@_QUICK
-@given(data=st.one_of(st.binary(max_size=200), _damaged("A 1.0 2.0 3.0\nB 1 2 3 4 5 6 7\n")))
-def test_adjusted_coordinates(tmp_path, data):
-    _try(read_adjusted, tmp_path / "net.adj", data)

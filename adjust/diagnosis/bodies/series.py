@@ -7,11 +7,12 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.prediction import adjusted_pose, chains_of
-from adjust.diagnosis.table.views import adjoint, view_covariance
+from adjust.diagnosis.table.views import view_covariance
 from adjust.frames.unknowns import Chain
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
-from adjust.spatial.rigid import inverse, rotation_log
+from adjust.spatial.rigid import adjoint, inverse, rotation_log
+from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
 _CAP = 60.0  # of one comparison of two images, chi-square with six degrees of freedom
@@ -137,7 +138,7 @@ def step_of(series: Series) -> Step | None:
         return None
     best = int(np.argmin(costs))
     gain = whole - costs[best]
-    if gain < float(chi2.isf(1e-4 / len(costs), 6)):
+    if gain < float(chi2.isf(sidak(1e-4, len(costs)), 6)):
         return None
     k = best + _LEAST
     early, late = int(np.argmin(before[:k, k - 1])), k + int(np.argmin(before[k:, -1] - before[k:, k - 1]))

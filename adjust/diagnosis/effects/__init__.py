@@ -17,6 +17,7 @@ from adjust.diagnosis.effects.shapes import shapes
 from adjust.diagnosis.effects.steps import steps
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
+from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
 _ALPHA = 1e-4
@@ -41,7 +42,7 @@ def _scored(case: Case) -> Iterator[Hypothesis]:
         return
     redundancy = max(linear.result.redundancy, 1)
     scale = max(1.0, (linear.result.omega - max(e.first.drop for e in clear)) / redundancy)
-    limit = _ALPHA / max(len(effects), 1)
+    limit = sidak(_ALPHA, len(effects))
     clear = [e for e in clear if e.first.drop > scale * float(chi2.isf(limit, e.first.seen))]
     best: dict[tuple[str, ...], Effect] = {}
     for e in sorted(clear, key=lambda e: -e.value(scale, linear.result.n_observations)):

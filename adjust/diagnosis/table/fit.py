@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.diagnosis.table.views import TableViews, adjoint, given_geometry
+from adjust.diagnosis.table.views import TableViews, given_geometry
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.averaging import mean_pose
-from adjust.spatial.rigid import inverse, rigid, rotation_exp, rotation_log
+from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp, rotation_log
 from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb, solve_ax_zb
 
 _MEDIAN_6 = 5.348  # of chi-square with six degrees of freedom

@@ -11,7 +11,7 @@ from adjust.diagnosis.case import own_lens, single_views
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Station, Survey, Table, Target
-from adjust.spatial.rigid import inverse, rigid, rotation_exp, skew
+from adjust.spatial.rigid import adjoint, inverse, rigid, rotation_exp, skew
 from adjust.start.views import View, untrustworthy
 
 
@@ -92,15 +92,6 @@ def given_geometry(table: Table) -> FloatArray:
     """Non-orthogonality (rad) and axis offset (m) as they are given, (2,)."""
     given = dict(zip(table.geometry.names, table.geometry.values, strict=True))
     return np.array([given.get("non_orthogonality", 0.0), given.get("axis_offset", 0.0)])
-
-
-def adjoint(m: FloatArray) -> FloatArray:
-    """(..., 6, 6): a small motion (rotation, translation) on the right of m as one on its left."""
-    R, t = m[..., :3, :3], m[..., :3, 3]
-    out = np.zeros((*m.shape[:-2], 6, 6))
-    out[..., :3, :3] = out[..., 3:, 3:] = R
-    out[..., 3:, :3] = skew(t) @ R
-    return out
 
 
 def table_views(survey: Survey) -> tuple[TableViews, ...]:

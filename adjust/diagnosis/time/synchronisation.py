@@ -14,6 +14,7 @@ from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.sequences import Link, fitted, links
 from adjust.model.survey import PoseParameter, Station, Survey
+from adjust.testing.criteria import sidak
 from adjust.testing.distributions import norm
 
 _ALPHA = 1e-4
@@ -36,7 +37,7 @@ def unsynchronised(case: Case) -> Iterator[Hypothesis]:
     """One hypothesis: all cameras that see a moving target expose at their own times."""
     rigs = [link for link in links(case) if link.kind == "rig"]
     offsets = [o for o in (time_offset(link) for link in rigs) if o is not None]
-    bound = norm.isf(_ALPHA / max(1, len(rigs)))
+    bound = norm.isf(sidak(_ALPHA, len(rigs)))
     clear = [o for o in offsets if abs(o.intervals) > bound * o.sigma]
     seen = np.nanmedian(case.error_px) if np.isfinite(case.error_px).any() else np.inf
     if not clear or not seen < _ALONE_PX:

@@ -218,7 +218,7 @@ class BundleBatch:
         self.own_links = np.array([link for _, link in owners], dtype=np.int64)
         self.own_at = (self.first_pose + 6 * np.array(blocks_of, dtype=np.int64)).astype(np.int64)
 
-    def _local_from_keys(self) -> sparse.csr_matrix:
+    def local_from_keys(self) -> sparse.csr_matrix:
         """Derivative (n_local, n_keys) of the local unknowns by the keys: lens and points direct, poses by chains."""
         r, c = [self._G_rows], [self._G_columns]
         v = [self.chains.C[self._G_links].ravel(), self._G_ones]
@@ -257,7 +257,7 @@ class BundleBatch:
             raise self._undetermined_point(bad)
         add_direct(self.n_reduced, len(self.point), self.arrays, self.A, S, g)
         run_split(pose_rows, self.runs, self.arrays, self.A, self.of_reduced, S)
-        self.G = self._local_from_keys()
+        self.G = self.local_from_keys()
         gradient = np.asarray(self.G.T @ g)
         rest = self.chi_square - float(np.einsum("ja,jab,jb->", self.h, self.Vi, self.h))
         self.blind = self._blind_motions(values) if damping == 0.0 else np.zeros((self.n_keys - self.n_hidden, 0))

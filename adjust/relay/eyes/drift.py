@@ -54,11 +54,11 @@ def sequences(common: CommonMotions, model: DriftModel) -> tuple[MotionSequence,
 
 
 _FIT = EyeOptions(reject=False, free_scales=True)
+_MOST_ROUNDS = 60
+_ALPHA = 0.05
 
 
-def fit_drift(
-    common: CommonMotions, options: EyeOptions = _FIT, max_iterations: int = 60
-) -> tuple[DriftModel, EyeAdjustment]:
+def fit_drift(common: CommonMotions) -> tuple[DriftModel, EyeAdjustment]:
     """Variance components of rotation and position of every tracker, estimated until they reproduce themselves.
 
     Foerstner (1979): each component is v'Pv over the redundancy of its group. Needs three eyes, since two cannot tell
@@ -69,15 +69,15 @@ def fit_drift(
         raise SurveyError(f"{k} trackers cannot tell whose errors are whose; give three or more, or sigmas")
     length = float(common.times_s[0, 1] - common.times_s[0, 0])
     model = DriftModel(length, np.full(k, 3e-3), np.full(k, 1e-2), 0.0, 0.0, np.zeros((k, 2)))
-    for _ in range(max_iterations):
-        adjusted = adjust_eye_motions(sequences(common, model), options)
+    for _ in range(_MOST_ROUNDS):
+        adjusted = adjust_eye_motions(sequences(common, model), _FIT)
         factor, redundancy = _components(adjusted.solution, k)
         model = DriftModel(
             length, model.rotation * np.sqrt(factor[:, 0]), model.position * np.sqrt(factor[:, 1]),
             *_autocorrelation(adjusted.solution, k), redundancy,
         )  # fmt: skip
         if np.abs(factor - 1.0).max() < 0.02:
-            return model, adjust_eye_motions(sequences(common, model), options)
+            return model, adjust_eye_motions(sequences(common, model), _FIT)
     raise NotConvergedError(
         f"the variance components of {k} trackers did not settle; one of them may have no errors that the others see"
     )
@@ -127,13 +127,13 @@ def _autocorrelation(solution: EyeSolution, k: int) -> tuple[float, float]:
 
 
 def choose_interval(
-    trajectories: Sequence[Trajectory], offsets_s: Sequence[float], intervals_s: Sequence[float], alpha: float = 0.05
+    trajectories: Sequence[Trajectory], offsets_s: Sequence[float], intervals_s: Sequence[float]
 ) -> tuple[DriftModel, EyeAdjustment, CommonMotions]:
     """The shortest interval whose misclosures are not positively correlated with their neighbours (one-sided test).
 
     Raises SurveyError where they are at all intervals.
     """
-    limit = float(norm.isf(alpha))
+    limit = float(norm.isf(_ALPHA))
     seen = []
     for interval in intervals_s:
         common = common_motions(trajectories, offsets_s, interval)

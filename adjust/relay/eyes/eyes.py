@@ -137,7 +137,7 @@ def _adjusted(setup: EyeSetup, options: EyeOptions) -> EyeAdjustment:
     target = np.concatenate([6 * i + np.arange(6) for i in range(k) if len(solution.rows(i))])
     cov = np.zeros((6 * k, 6 * k))
     cov[np.ix_(target, target)] = solution.cov[np.ix_(place, place)]
-    _refuse_weak(setup, solution, cov, options.largest_sigma_rad)
+    _refuse_weak(setup, cov, options.largest_sigma_rad)
     first = solution.cov.shape[0] - len(solution.scales)
     spread = np.sqrt(np.diag(solution.cov)[first:])
     factors = np.exp(solution.scales)
@@ -151,7 +151,7 @@ def _adjusted(setup: EyeSetup, options: EyeOptions) -> EyeAdjustment:
     )  # fmt: skip
 
 
-def _refuse_weak(setup: EyeSetup, solution: EyeSolution, cov: FloatArray, largest: float) -> None:
+def _refuse_weak(setup: EyeSetup, cov: FloatArray, largest: float) -> None:
     """The last word: a rotation that stays uncertain is no result."""
     for i, eye in enumerate(setup.eyes):
         s, V = np.linalg.eigh(cov[6 * i : 6 * i + 3, 6 * i : 6 * i + 3])
@@ -175,23 +175,3 @@ def as_pose(motions: Motions) -> Pose3:
 def symmetric(cov: FloatArray) -> FloatArray:
     """Without the rounding that makes it lopsided."""
     return np.asarray(0.5 * (cov + cov.T))
-
-
-def pair_from_marker(
-    pair_id: str, camera_from_target: Pose3, cov: FloatArray,
-    carrier: tuple[FrameRef, Pose3, FloatArray], watcher: tuple[FrameRef, Pose3, FloatArray],
-) -> Pair:  # fmt: skip
-    """A camera of one station sees the marker block of another: ``watcher_from_carrier`` with its covariance.
-
-    camera_from_target: as measured, cov (6, 6) in frame target. carrier: frame of the station that carries the block,
-    ``station_from_target`` and its covariance. watcher: frame of the station that looks, ``station_from_camera`` and
-    its covariance. Errors of the three are independent.
-    """
-    a, a_from_target, target_cov = carrier
-    b, b_from_camera, camera_cov = watcher
-    target_from_a = a_from_target.inverse()
-    b_from_a = b_from_camera.compose(camera_from_target).compose(target_from_a)
-    by_camera = camera_from_target.compose(target_from_a).inverse().AdjointMap()
-    by_target = a_from_target.AdjointMap()
-    out = by_camera @ camera_cov @ by_camera.T + by_target @ (cov + target_cov) @ by_target.T
-    return Pair(pair_id, a, b, b_from_a, symmetric(out))

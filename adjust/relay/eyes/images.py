@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from gtsam import Pose3
 
-from adjust.adjustment import AdjustOptions, adjust
+from adjust.adjustment import adjust
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import Adjustment
@@ -19,10 +19,9 @@ from adjust.relay.eyes.setup import from_matrix
 from adjust.relay.eyes.solver import stacked
 
 ROOM = "room"  # the world of targets that the survey holds
-_ADJUST = AdjustOptions()
 
 
-def camera_sequence(survey: Survey, camera_id: str, options: AdjustOptions = _ADJUST) -> PoseSequence:
+def camera_sequence(survey: Survey, camera_id: str) -> PoseSequence:
     """Poses of one camera before the targets it saw, adjusted by itself, with the joint covariance of all epochs.
 
     Targets seen together in an epoch make one world, named after the first of them; targets that the survey holds stand
@@ -37,7 +36,7 @@ def camera_sequence(survey: Survey, camera_id: str, options: AdjustOptions = _AD
     targets = _unmoved(survey, blocks)
     world_of = _worlds(blocks, targets)
     epochs = tuple(dict.fromkeys(b.epoch_id for b in blocks))
-    alone = adjust(_alone(camera, blocks, targets, world_of), options=options)
+    alone = adjust(_alone(camera, blocks, targets, world_of))
     first = {b.epoch_id: world_of[b.target_id] for b in blocks if b.target_id}
     return _sequence(alone, FrameRef("camera", camera_id), "world_from_station", epochs, first)
 
@@ -57,7 +56,7 @@ def _sequence(
     return PoseSequence(eye, ids, tuple(world_of[e] for e in ids), found, cov)
 
 
-def target_sequence(survey: Survey, target_id: str, options: AdjustOptions = _ADJUST) -> PoseSequence:
+def target_sequence(survey: Survey, target_id: str) -> PoseSequence:
     """Poses of a marker block that a station carries, before a camera that stands still, with their joint covariance.
 
     Of several such cameras the one that saw the block at most epochs counts; it is the world, by its id, and its lens
@@ -79,7 +78,7 @@ def target_sequence(survey: Survey, target_id: str, options: AdjustOptions = _AD
         Survey(
             cameras=(own,), stations=(Station(camera.camera_id, "fixed", still),), targets=(moving,),
             image_blocks=blocks,
-        ), options=options,
+        )
     )  # fmt: skip
     epochs = tuple(dict.fromkeys(b.epoch_id for b in blocks))
     world = dict.fromkeys(epochs, f"camera {camera.camera_id}")
@@ -154,9 +153,7 @@ def _alone(
     )
 
 
-def eye_sequences(
-    survey: Survey | Adjustment, station_id: str | None = None, options: AdjustOptions = _ADJUST
-) -> tuple[PoseSequence, ...]:
+def eye_sequences(survey: Survey | Adjustment, station_id: str | None = None) -> tuple[PoseSequence, ...]:
     """One sequence for each eye of a station (None: of the one station with two or more), cameras before blocks.
 
     Eyes are the station's cameras, and the marker blocks it carries that a camera of another station, which stands
@@ -177,8 +174,6 @@ def eye_sequences(
     if station_id not in eyes:
         raise SurveyError(f"station {station_id!r} has no camera; those with cameras are {', '.join(eyes)}")
     return tuple(
-        camera_sequence(found, eye.frame_id, options)
-        if eye.kind == "camera"
-        else target_sequence(found, eye.frame_id, options)
+        camera_sequence(found, eye.frame_id) if eye.kind == "camera" else target_sequence(found, eye.frame_id)
         for eye in eyes[station_id]
     )

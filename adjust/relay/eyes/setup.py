@@ -43,7 +43,7 @@ def motion_setup(sequences: Sequence[MotionSequence], free_scales: bool) -> EyeS
     )
     _refuse_unlinked(len(eyes), conditions.eye_k, conditions.eye_l, [e.frame_id for e in eyes], "eyes")
     start = identities(len(eyes), 6)
-    for a, b in _walk(len(eyes), eye_k, eye_l):
+    for a, b in _walk(eye_k, eye_l):
         mine: BoolArray = ((eye_k == a) & (eye_l == b)) | ((eye_k == b) & (eye_l == a))
         of_a, of_b = np.where(eye_k == a, k, other)[mine], np.where(eye_k == a, other, k)[mine]
         X = _hand_eye(matrices(observed[of_a]), matrices(observed[of_b]), eyes[a], eyes[b])
@@ -105,7 +105,7 @@ def _pose_start(
     links = [(int(a), int(b)) for a, b in zip(c.world_k, c.world_l, strict=True)] + [(a, b) for a, b, _ in known]
     for first in _first_of_parts(len(free), links, n_eyes, [a for a, _, _ in known]):
         free[first] = False
-    for a, b in _walk(n_eyes, c.eye_k, c.eye_l):
+    for a, b in _walk(c.eye_k, c.eye_l):
         mine: BoolArray = ((c.eye_k == a) & (c.eye_l == b)) | ((c.eye_k == b) & (c.eye_l == a))
         turned = (c.eye_k == b)[mine]
         of_a, of_b = np.where(turned, c.l_idx[mine], c.k_idx[mine]), np.where(turned, c.k_idx[mine], c.l_idx[mine])
@@ -237,7 +237,7 @@ def _observed(parts: Sequence[Motions], covs: Sequence[FloatArray]) -> tuple[Mot
     return stacked(parts), np.asarray(scipy.linalg.block_diag(*full))
 
 
-def _walk(n: int, a: IntArray, b: IntArray) -> list[tuple[int, int]]:
+def _walk(a: IntArray, b: IntArray) -> list[tuple[int, int]]:
     """Tree from eye 0 through all eyes that share epochs, as (from, to)."""
     out, done = [], {0}
     links = sorted(
@@ -255,7 +255,7 @@ def _walk(n: int, a: IntArray, b: IntArray) -> list[tuple[int, int]]:
 
 
 def _refuse_unlinked(n: int, a: IntArray, b: IntArray, ids: list[str], what: str) -> None:
-    reached = {0} | {y for _, y in _walk(n, a, b)}
+    reached = {0} | {y for _, y in _walk(a, b)}
     lost = [ids[i] for i in range(n) if i not in reached]
     if lost:
         raise SurveyError(

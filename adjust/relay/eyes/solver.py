@@ -20,7 +20,9 @@ from scipy.sparse.linalg import splu
 
 from adjust.model.errors import NotConvergedError
 from adjust.model.survey import BoolArray, FloatArray, IntArray
-from adjust.spatial.rigid_motions import Motions, exp, right_jacobian, right_jacobian_inverse
+from adjust.spatial.rigid_motions import Motions, right_jacobian, right_jacobian_inverse
+
+_MOST_STEPS, _STILL = 50, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,12 +220,12 @@ def _diagonal_blocks(M: FloatArray | sp.csc_array, index: IntArray) -> FloatArra
     return np.asarray(M[rows.ravel(), cols.ravel()]).reshape(-1, 6, 6)
 
 
-def solve_eyes(problem: EyeProblem, max_iterations: int = 50, max_step: float = 1e-9) -> EyeSolution:
+def solve_eyes(problem: EyeProblem) -> EyeSolution:
     """Least squares. Raises NotConvergedError; the caller has seen to it that everything is determined."""
     U, scales = problem.start, np.zeros(problem.n_scales)
     v = np.zeros((len(problem.observed), 6))
     n_free = 6 * int(problem.free.sum())
-    for iteration in range(1, max_iterations + 1):
+    for iteration in range(1, _MOST_STEPS + 1):
         at = linearise(problem, U, scales, v)
         weights = _Weights(problem, at)
         w = at.f.ravel() - weights.B @ v.ravel()
@@ -237,10 +239,10 @@ def solve_eyes(problem: EyeProblem, max_iterations: int = 50, max_step: float = 
         delta[problem.free] = step[:n_free].reshape(-1, 6)
         U, scales = U.retract(delta), scales + step[n_free:]
         moved = float(np.sqrt(step @ N @ step))
-        if moved < max_step or (iteration > 8 and moved < 1e-6):
+        if moved < _STILL or (iteration > 8 and moved < 1e-6):
             return _finish(problem, U, scales, v, iteration)
     raise NotConvergedError(
-        f"the eyes did not settle in {max_iterations} steps (last step {moved:.2g} sigma); look for wrong "
+        f"the eyes did not settle in {_MOST_STEPS} steps (last step {moved:.2g} sigma); look for wrong "
         "poses or epochs"
     )
 
@@ -279,17 +281,7 @@ def _finish(problem: EyeProblem, U: Motions, scales: FloatArray, v: FloatArray, 
     )  # fmt: skip
 
 
-def one_motion(rotation: FloatArray, translation: FloatArray) -> Motions:
-    """A single motion as the arrays have it."""
-    return Motions(np.asarray(rotation)[None], np.asarray(translation)[None])
-
-
 def stacked(parts: Sequence[Motions]) -> Motions:
     """Motions one after the other."""
     shifts = [p.translation for p in parts if p.translation is not None]
     return Motions(np.concatenate([p.rotation for p in parts]), np.concatenate(shifts))
-
-
-def disturbed(motions: Motions, tangents: FloatArray) -> Motions:
-    """``X Exp(d)``: observed from true with errors (n, 6)."""
-    return motions @ exp(tangents)

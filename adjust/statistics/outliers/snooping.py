@@ -18,11 +18,9 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.observations.terrestrial.statistics import influences as influences_of_readings
 from adjust.precision.precision import Precision
 from adjust.statistics.system import LinearSystem
+from adjust.testing.criteria import cauchy_weights
 from adjust.testing.gross_errors import Verdicts
 from adjust.testing.single_tests import CONTROLLED, eigen2
-
-CAUCHY = 2.385**2
-"""Of Cauchy weights: squares over this are weighted less than a half (Zhang 1997)."""
 
 
 class Verdict(NamedTuple):
@@ -233,9 +231,9 @@ class Snooping:
         return found
 
     def robust_squares(self, freedom: IntArray, factors: FloatArray, rounds: int = 20) -> FloatArray:
-        """Weighted squares (M,), over the factors (G,) of the groups, where Cauchy weights settle (Huber 1981, 7.8).
+        """Weighted squares (M,), over the factors (G,) of the groups, where Cauchy weights settle.
 
-        The constant is that of Zhang (1997). What is kept keeps its weight.
+        What is kept keeps its weight.
         """
         s, q, at = self.system, np.maximum(freedom, 1), self.system.A.shape[0] - len(self.row_of)
         used, weights = s.used[s.row_of].astype(float), np.ones(len(self.used))
@@ -245,7 +243,7 @@ class Snooping:
 
         squares = of(s.e)
         for _ in range(rounds):
-            new = 1.0 / (1.0 + squares / (CAUCHY * q))
+            new = cauchy_weights(squares / q)
             for rows, _ in self.joint:  # one weight for what is whitened together
                 mine = self.row_of[rows]
                 new[mine] = new[mine].min()

@@ -12,8 +12,9 @@ import numpy as np
 from adjust.model.result import Adjustment
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.precision.precision import ObservationRows, Precision
-from adjust.statistics.outliers.snooping import CAUCHY, Snooping
+from adjust.statistics.outliers.snooping import Snooping
 from adjust.statistics.system import Entries, groups_of_others, precision_of
+from adjust.testing.criteria import cauchy_weights
 
 FOLLOWED = 120
 """Observations that fail, or that are out, of which so many are watched at once."""
@@ -92,7 +93,7 @@ class WatchedSnooping(Snooping):
             less = 1.0 - np.where(self.used, weights, 0.0)[self.row_of]
             e = np.linalg.solve(own - self._M * np.where(self.used[self.row_of], less, 0.0), self.g)
             squares = np.bincount(self.row_of, weights=e**2, minlength=len(q)) / factors[self.group]
-            new = 1.0 / (1.0 + squares / (CAUCHY * q))
+            new = cauchy_weights(squares / q)
             if np.abs(new - weights).max(initial=0.0) < 1e-2:
                 break
             weights = new

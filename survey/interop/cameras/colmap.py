@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from gtsam import Pose3, Rot3
+from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
 from adjust.model.errors import SurveyError
@@ -235,11 +235,6 @@ def rigid3d(pose: Pose3) -> Any:
 
     xyzw = Rotation.from_matrix(pose.rotation().matrix()).as_quat()
     return pycolmap.Rigid3d(pycolmap.Rotation3d(xyzw), np.asarray(pose.translation()))
-
-
-def pose3(rigid: Any) -> Pose3:
-    """Pycolmap's pose as ours."""
-    return Pose3(Rot3(np.asarray(rigid.rotation.matrix())), np.asarray(rigid.translation))
 
 
 def _add_rigs(export: _Export, cameras: list[Camera]) -> None:

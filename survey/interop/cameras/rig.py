@@ -1,6 +1,5 @@
 """Cameras that are fixed to each other, with their lenses: what most calibration files of other programs hold."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -136,8 +135,3 @@ def _camera(c: RigCamera, rig_id: str, first: bool, safe: dict[str, str]) -> Cam
     elif c.pose_cov is not None and c.rig_from_camera is not None and (np.diagonal(c.pose_cov) > 0.0).all():
         pose = PoseParameter(c.rig_from_camera, "prior", c.pose_cov)
     return Camera(safe.get(c.camera_id, c.camera_id), rig_id, c.image_size, lens, pose)
-
-
-def relative_to(cameras: Sequence[RigCamera], base: Pose3) -> list[Pose3]:
-    """``base_from_camera`` of every camera, where ``base`` is rig_from_base."""
-    return [base.inverse() * (c.rig_from_camera or Pose3()) for c in cameras]

@@ -43,13 +43,6 @@ class G2oFile:
     notes: tuple[str, ...] = ()
 
 
-def read_g2o(
-    path: Path, information: Information = "tangent", use_vertices: bool = False, block_diagonal: bool = False
-) -> PoseNetwork:
-    """The network of :func:`read_g2o_file`."""
-    return read_g2o_file(path, information, use_vertices, block_diagonal).network
-
-
 def read_g2o_file(
     path: Path, information: Information = "tangent", use_vertices: bool = False, block_diagonal: bool = False
 ) -> G2oFile:

@@ -303,20 +303,3 @@ def _angle(text: str, dms: bool, line: Line) -> float:
     if found is None:
         raise line.where.error(f"found {text[:30]!r} where an angle like 38°48'50.7\" is expected; correct it")
     return sexagesimal(found[1], (found[2], found[3], found[4]), "angle", line.where)
-
-
-def read_adjusted(path: Path) -> dict[str, list[tuple[float, float, float]]]:
-    """A file of adjusted coordinates: by point, per axis the coordinate (m), its correction and its deviation.
-
-    Units of the last two vary from file to file (cm or mm). One axis for heights, else two or three; a last column
-    is the point's own deviation and is not read.
-    """
-    out = {}
-    for line in lines_of(path, "#"):
-        name, *words = line.words
-        numbers = line.numbers([word.replace("−", "-") for word in words], f"point {name!r}")
-        if len(numbers) not in (3, 7, 10):
-            raise line.where.error(f"point {name!r}: found {len(numbers)} numbers, expected 3, 7 or 10")
-        triples = [numbers[i : i + 3] for i in range(0, len(numbers) - 1, 3)]
-        out[name] = [(a, b, c) for a, b, c in triples]
-    return out

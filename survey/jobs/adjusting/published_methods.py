@@ -20,7 +20,6 @@ from survey.solution.dictionary import plain
 from survey.solution.pairs import pairs_dict
 from survey.solution.quantities import ARCSEC_PER_RAD, Scale
 
-METHODS = ("joint", "published")
 MOST_PAIRS = 400  # its equations are dense: 3 corrections a pair, 9 equations a loop
 
 

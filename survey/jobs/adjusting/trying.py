@@ -25,13 +25,13 @@ _LENGTHS = ("square_mm", "marker_mm", "gap_mm")
 _NUMBER = re.compile(r"(=\s*)([-+0-9.eE_]+)")
 
 
-def try_job(folder: Path, number: int, progress: bool = False) -> str:
+def try_job(folder: Path, number: int) -> str:
     """Adjust, and carry out candidate ``number`` (from 1) of the diagnosis. What was done, for people.
 
     Files that are changed are kept as they were below ``kept/``; what is left out becomes rows of ``exclusions.csv``.
     Raises SurveyError where there is no such candidate, or where only a person can do it.
     """
-    chosen = chosen_of(folder, _candidates(folder, progress), number)
+    chosen = chosen_of(folder, _candidates(folder), number)
     done = [_carried_out(folder, edit, chosen) for edit in chosen.edits]
     return "\n".join([f"changed: {chosen.cause}", *(f"  {line}" for line in done)])
 
@@ -48,9 +48,9 @@ def chosen_of(folder: Path, candidates: Sequence[Hypothesis], number: int) -> Hy
     return chosen
 
 
-def _candidates(folder: Path, progress: bool) -> list[Hypothesis]:
+def _candidates(folder: Path) -> list[Hypothesis]:
     try:
-        diagnosis = adjust_project(read(folder), progress).diagnosis
+        diagnosis = adjust_project(read(folder), False).diagnosis
     except DiagnosedError as error:
         diagnosis = error.diagnosis
     return [] if diagnosis is None else [c.hypothesis for c in diagnosis.candidates]
