@@ -81,11 +81,15 @@ def stacking(graph: AdjustmentGraph, keys: Sequence[int]) -> Stacking:
 
 def whitened_rows(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> sparse.csr_matrix:
     """The whitened Jacobian (m, n), columns as stacked; ``stack`` has all keys of ``linear``."""
+    i, j, value = _entries(linear, stack)
+    return sparse.csr_matrix((value, (i, j)), (int(i.max(initial=-1)) + 1, stack.n + 1))[:, : stack.n]
+
+
+def _entries(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> tuple[IntArray, IntArray, FloatArray]:
+    """Rows, columns as stacked, and values of the whitened Jacobian; the right side is the column after the last."""
     i, j, value = np.asarray(linear.sparseJacobian_())  # counted from 1; keys in ascending order, then the right side
     place = np.append(stack.index(sorted(stack.at)), stack.n)
-    rows = int(i.max()) if len(i) else 0
-    full = sparse.csr_matrix((value, (i.astype(np.int64) - 1, place[j.astype(np.int64) - 1])), (rows, stack.n + 1))
-    return full[:, : stack.n]
+    return i.astype(np.int64) - 1, place[j.astype(np.int64) - 1], value
 
 
 def times(linear: gtsam.GaussianFactorGraph, stack: Stacking, V: FloatArray) -> FloatArray:
@@ -95,8 +99,8 @@ def times(linear: gtsam.GaussianFactorGraph, stack: Stacking, V: FloatArray) -> 
 
 def normal_diagonal(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> FloatArray:
     """Diagonal (n,) of the normal matrix."""
-    A = whitened_rows(linear, stack)
-    return np.asarray(A.multiply(A).sum(axis=0)).ravel()
+    _, j, value = _entries(linear, stack)
+    return np.bincount(j, value**2, stack.n + 1)[: stack.n]
 
 
 @dataclass(frozen=True, eq=False)

@@ -357,10 +357,12 @@ def damped(graph: AdjustmentGraph, linear: gtsam.GaussianFactorGraph, damping: f
     """The graph with Marquardt's damping: every unknown held with ``damping`` times its own diagonal."""
     stack = stacking(graph, visible_keys(graph, linear))
     root = np.sqrt(damping * np.maximum(normal_diagonal(linear, stack), 1e-12))
-    out = linear.clone()
+    one = {n: gtsam.noiseModel.Unit.Create(n) for n in {place.stop - place.start for place in stack.at.values()}}
+    out = gtsam.GaussianFactorGraph()
+    out.push_back(linear)
     for key, place in stack.at.items():
         n = place.stop - place.start
-        out.add(key, np.diag(root[place]), np.zeros(n), gtsam.noiseModel.Unit.Create(n))
+        out.add(key, np.diag(root[place]), np.zeros(n), one[n])
     return out
 
 

@@ -149,50 +149,56 @@ inline int64_t joint_blocks(const Tree &t, Ints first, Ints second, Out<double, 
     return -1;
 }
 
-// Q x in place (D, m) over cliques (parents first) that hold every ancestor of each of them. first: row of x at which a
-// key begins. With R'u = x, R y = u: leaves to roots, then back. rows: scratch as wide as the widest clique.
-inline void solve_cliques(Ints cliques, Ints key_ptr, Ints keys, Ints dims, Ints first, Ints front, Ints width, Ints at, Vector data,
-                          Out<double, 2> x, Out<int64_t, 1> rows) {
-    const int64_t m = x.n[1], count = cliques.n[0];
+constexpr int64_t STRIP = 32;  // rows of a clique's block that are turned or cut to a triangle at once
+
+// Numbers of scratch that solve_cliques takes for m columns.
+inline int64_t solution_room(Ints width, int64_t m) {
+    int64_t most = 0;
+    for (int64_t c = 0; c < width.n[0]; ++c) most = larger(most, width[c] * (STRIP + 2 * padded_most(m)));
+    return most;
+}
+
+// Q x in place (D, m). With R'u = x, R y = u: over the cliques up (parents first) from leaves to roots, which hold every
+// ancestor of where x is not zero; then back over down, which hold every ancestor of where Q x is wanted. first: row of x
+// at which a key begins. rows: scratch as wide as the widest clique.
+inline void solve_cliques(Ints up, Ints down, Ints key_ptr, Ints keys, Ints dims, Ints first, Ints front, Ints width, Ints at, Vector data,
+                          Out<double, 2> x, Out<int64_t, 1> rows, Out<double, 1> work) {
+    const int64_t m = x.n[1], pm = padded(m), line = sizeof(double) * m;
     const auto place = [&](int64_t c) {
         int64_t o = 0;
         for (int64_t i = key_ptr[c]; i < key_ptr[c + 1]; ++i)
             for (int64_t j = 0; j < dims[keys[i]]; ++j) rows.data[o++] = first[keys[i]] + j;
     };
-    const auto row = [&](int64_t j) { return x.data + rows[j] * m; };
-    for (int64_t index = count - 1; index >= 0; --index) {
-        const int64_t c = cliques[index], nf = front[c], n = width[c];
-        const double *A = data.data + at[c];
+    // C (n, m) = A B with B the first rows of x in the clique, and A (n, inner) of what entry(i, j) says
+    const auto times = [&](int64_t n, int64_t inner, auto entry) {
+        double *B = work.data, *C = B + inner * pm, *A = C + n * pm;
+        std::memset(B, 0, sizeof(double) * inner * pm);
+        for (int64_t i = 0; i < inner; ++i) std::memcpy(B + i * pm, x.data + rows[i] * m, line);
+        for (int64_t i = 0; i < n; i += STRIP) {
+            const int64_t some = smaller(STRIP, n - i);
+            for (int64_t k = 0; k < some; ++k)
+                for (int64_t j = 0; j < inner; ++j) A[k * inner + j] = entry(i + k, j);
+            product(A, inner, B, pm, C + i * pm, pm, some, m, inner);
+        }
+        return C;
+    };
+    for (int64_t index = up.n[0] - 1; index >= 0; --index) {
+        const int64_t c = up[index], nf = front[c], n = width[c];
+        const double *R = data.data + at[c];
         place(c);
-        for (int64_t j = nf; j < n; ++j)
-            for (int64_t i = 0; i < nf; ++i) {
-                const double a = A[i * n + j];
-                if (a == 0.0) continue;
-                double *to = row(j);
-                const double *from = row(i);
-                for (int64_t k = 0; k < m; ++k) to[k] += a * from[k];
-            }
-        for (int64_t j = nf - 1; j >= 0; --j) {
-            double *to = row(j);
-            for (int64_t k = 0; k < m; ++k) to[k] *= A[j * n + j];
-            for (int64_t i = 0; i < j; ++i) {
-                const double *from = row(i);
-                for (int64_t k = 0; k < m; ++k) to[k] += A[i * n + j] * from[k];
-            }
+        const double *C = times(n, nf, [&](int64_t i, int64_t j) { return j <= i ? R[j * n + i] : 0.0; });
+        for (int64_t i = 0; i < n; ++i) {
+            double *to = x.data + rows[i] * m;
+            if (i < nf) std::memcpy(to, C + i * pm, line);
+            else add_multiple(1.0, C + i * pm, to, m);
         }
     }
-    for (int64_t index = 0; index < count; ++index) {
-        const int64_t c = cliques[index], nf = front[c], n = width[c];
-        const double *A = data.data + at[c];
+    for (int64_t index = 0; index < down.n[0]; ++index) {
+        const int64_t c = down[index], nf = front[c], n = width[c];
+        const double *R = data.data + at[c];
         place(c);
-        for (int64_t i = 0; i < nf; ++i) {
-            double *to = row(i);
-            for (int64_t k = 0; k < m; ++k) to[k] *= A[i * n + i];
-            for (int64_t j = i + 1; j < n; ++j) {
-                const double *from = row(j);
-                for (int64_t k = 0; k < m; ++k) to[k] += A[i * n + j] * from[k];
-            }
-        }
+        const double *C = times(nf, n, [&](int64_t i, int64_t j) { return i <= j ? R[i * n + j] : 0.0; });
+        for (int64_t i = 0; i < nf; ++i) std::memcpy(x.data + rows[i] * m, C + i * pm, line);
     }
 }
 

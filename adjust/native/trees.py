@@ -23,8 +23,10 @@ _invert_cliques = Function("invert_cliques", "front[C] width[C] at[C] data[*] ro
 _covariance_room = Function("covariance_room", "front[C] width[C]")
 _covariance_rows = Function("covariance_rows", f"{TREE} n_front[C] data[*] work[*]")
 _joint_blocks = Function("joint_blocks", f"{TREE} first[p] second[p] out[p,e,e]")
+_solution_room = Function("solution_room", "width[C] m")
 _solve_cliques = Function(
-    "solve_cliques", "cliques[*] key_ptr[C+1] keys[*] dims[K] first[*] front[C] width[C] at[C] data[*] x[*,*] rows[*]"
+    "solve_cliques",
+    "up[*] down[*] key_ptr[C+1] keys[*] dims[K] first[*] front[C] width[C] at[C] data[*] x[*,*] rows[*] work[*]",
 )
 
 
@@ -105,10 +107,14 @@ def joint_blocks(tree: TreeArrays, first: IntArray, second: IntArray, out: Float
     return _joint_blocks(*tree, first, second, out)
 
 
-def solve_cliques(tree: TreeArrays, cliques: IntArray, first: IntArray, data: FloatArray, x: FloatArray) -> None:
-    """Q x in place (D, m) over ``cliques`` (parents first), which hold every ancestor of each of them.
+def solve_cliques(
+    tree: TreeArrays, up: IntArray, down: IntArray, first: IntArray, data: FloatArray, x: FloatArray
+) -> None:
+    """Q x in place (D, m), x not zero only in the cliques ``up`` and Q x wanted only in ``down``.
 
-    first: row of x at which a key begins. With R'u = x, R y = u: leaves to roots, then back.
+    Both parents first, with every ancestor of each of theirs. first: row of x at which a key begins.
     """
     rows = np.empty(int(tree.width.max(initial=0)), dtype=np.int64)
-    _solve_cliques(cliques, tree.key_ptr, tree.keys, tree.dims, first, tree.front, tree.width, tree.at, data, x, rows)
+    work = np.empty(_solution_room(tree.width, x.shape[1]))
+    _solve_cliques(up, down, tree.key_ptr, tree.keys, tree.dims, first, tree.front, tree.width, tree.at, data, x, rows,
+                   work)  # fmt: skip

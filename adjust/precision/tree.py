@@ -10,11 +10,15 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
+from scipy import sparse
 
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.elimination import PoseTree
 from adjust.native.trees import TreeArrays, covariance_rows, fill_block, invert_cliques, joint_blocks, solve_cliques
 from adjust.observations.images.reduction import Leaves
+
+_COLUMNS = 96
+"""Columns that go through the tree at once."""
 
 
 class TreeCovariance:
@@ -138,7 +142,7 @@ class TreeCovariance:
         x = np.zeros((int(self._first[-1]), len(rows)))
         x[rows, np.arange(len(rows))] = 1.0
         cliques = self._ancestors(set(self._home[numbers].tolist()))
-        self._solve(cliques, x)
+        self._solve(cliques, cliques, x)
         out = x[rows]
         return np.asarray(0.5 * (out + out.T))
 
@@ -151,8 +155,8 @@ class TreeCovariance:
                 c = int(self._parents[c])
         return np.array(sorted(found), dtype=np.int64)
 
-    def _solve(self, cliques: IntArray, x: FloatArray) -> None:
-        solve_cliques(self.arrays, cliques, self._first, self._data, x)
+    def _solve(self, up: IntArray, down: IntArray, x: FloatArray) -> None:
+        solve_cliques(self.arrays, up, down, self._first, self._data, x)
 
     def rows(self, keys: Sequence[int]) -> IntArray:
         """Rows of these keys in a stacked vector of all unknowns, as :meth:`times` takes it."""
@@ -171,8 +175,23 @@ class TreeCovariance:
     def times(self, columns: FloatArray) -> FloatArray:
         """The whole covariance matrix times columns (n, m), without forming it."""
         x = np.array(columns, dtype=float, order="C")
-        self._solve(np.arange(len(self._front), dtype=np.int64), x)
+        every = np.arange(len(self._front), dtype=np.int64)
+        self._solve(every, every, x)
         return x
+
+    def among(self, A: sparse.csr_array) -> FloatArray:
+        """A Q A' (m, m) of the rows of A (m, n), without forming Q: columns of Q A', on their ways to the root only."""
+        home = np.repeat(self._home, self._dims)
+        of_row = np.maximum.reduceat(np.append(home[A.indices], 0), A.indptr[:-1]) if A.shape[0] else np.zeros(0)
+        order = np.argsort(of_row, kind="stable")  # neighbours in the tree side by side
+        A, out = A[order], np.zeros((A.shape[0],) * 2)
+        for i in range(0, A.shape[0], _COLUMNS):
+            mine, rest = A[i : i + _COLUMNS], A[i:]
+            x = np.ascontiguousarray(mine.toarray().T)
+            self._solve(*(self._ancestors(set(home[rows.indices].tolist())) for rows in (mine, rest)), x)
+            out[i:, i : i + _COLUMNS] = rest @ x
+        back = np.argsort(order)
+        return np.asarray((np.tril(out) + np.tril(out, -1).T)[np.ix_(back, back)])
 
     def full(self) -> FloatArray:
         """The whole covariance matrix (n, n) of all unknowns, rows as :meth:`places` says, parents before children.

@@ -22,8 +22,6 @@ _NEAREST, _NEAR = 30, 0.5
 """Of the others those with the largest tests, from this share of their limit."""
 _LARGE = 3e7
 """Rows times unknowns from which only a part is followed."""
-_COLUMNS = 96
-"""Columns that go through the tree at once."""
 
 
 def large(n_rows: int, n_unknowns: int) -> bool:
@@ -108,7 +106,4 @@ def _influences(precision: Precision, rows: Sequence[ObservationRows]) -> FloatA
         k = len(each.e)
         entries.add(np.arange(m, m + k), np.concatenate([np.zeros(0, dtype=np.int64), *at]), each.A)
         m += k
-    A = entries.matrix((m, precision.tree.n))
-    parts = [A @ precision.tree.times(A[i : i + _COLUMNS].T.toarray()) for i in range(0, m, _COLUMNS)]
-    M = np.hstack([np.zeros((m, 0)), *parts])
-    return np.asarray(0.5 * (M + M.T))
+    return precision.tree.among(entries.matrix((m, precision.tree.n)))
