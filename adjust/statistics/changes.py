@@ -20,6 +20,7 @@ from scipy import sparse
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.parallel import side_by_side
 from adjust.precision.precision import noise_of
 from adjust.statistics.condensed import CondensedSystem
 from adjust.statistics.result import Change, ChangeShift
@@ -105,7 +106,7 @@ class ChangeSearch:
         if sum(u.B.shape[1] * len(u.epochs) for u in units) > most:
             self.runs = int(np.clip(most / sum(u.B.shape[1] for u in units), 2, _MOST_RUNS))
             units = list(self._units(self.runs))
-        self.candidates = [self._candidates(_by_runs(u)) for u in units]
+        self.candidates = side_by_side(lambda u: self._candidates(_by_runs(u)), units)
         self.n_tests = sum(len(c.g) for c in self.candidates)
 
     def left_out(self) -> tuple[str, ...]:

@@ -7,7 +7,6 @@ influences, the search for outliers) needs them apart. Rows are linearised at th
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -37,6 +36,8 @@ _SMALL_SET = 100
 """Unknowns of one epoch, or one point, up to which they are eliminated by themselves."""
 _AT_ONCE = 64
 """Right-hand sides that are solved in one go."""
+_PIECE = 4096
+"""Unknowns of small sets that are solved in one go: what stays in a core's own memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +121,10 @@ class LinearSystem:
     def normal_of(self, weights: FloatArray) -> "Normal":
         """The normal matrix with weights (m,) of the rows."""
         kept = weights > 0.0
-        A = self.A[kept]
-        return Normal((A.T @ A.multiply(weights[kept][:, None]) + self.datum.T @ self.datum).tocsc(), self.motions)
+        A = self.A if kept.all() else self.A[kept]
+        weighted = A.copy()
+        weighted.data *= np.repeat(weights[kept], np.diff(A.indptr))
+        return Normal((A.T @ weighted + self.datum.T @ self.datum).tocsc(), self.motions)
 
     @cached_property
     def sigmas(self) -> FloatArray:
@@ -191,27 +194,25 @@ def _arrow(scaled: sparse.csc_matrix) -> Solver | None:
     if sizes.max() > _SMALL_SET:
         return None
     sets = [np.argsort(label, kind="stable")[np.repeat(sizes, sizes) == k].reshape(-1, k) for k in np.unique(sizes)]
-    inverses = [np.linalg.inv(_blocks(own, x)) for x in sets]
     inside = np.concatenate([x.ravel() for x in sets])  # the sets one after the other, those of a size together
-    order, m = np.concatenate([rest[inside], core]), len(rest)
-    edges = np.cumsum([0, *(x.size for x in sets)]).tolist()
-
-    def inner(b: FloatArray) -> FloatArray:
-        out = np.empty_like(b)
-        for inverse, (i, j) in zip(inverses, pairwise(edges), strict=True):
-            shape = (*inverse.shape[:2], -1)
-            np.matmul(inverse, b[i:j].reshape(shape), out=out[i:j].reshape(shape))
-        return out
-
-    across = across[inside].toarray()
-    T = inner(across)
-    factor = scipy.linalg.cho_factor(head - across.T @ T)
+    across, pieces, at = across[inside].toarray(), list[_Piece](), 0
+    for x in sets:
+        for inverse in np.array_split(np.linalg.inv(_blocks(own, x)), -(-x.size // _PIECE)):
+            mine = slice(at, at + inverse.shape[0] * inverse.shape[1])
+            pieces.append(_Piece(_slice(rest[inside[mine]]), inverse, across[mine]))
+            at = mine.stop
+    for piece in pieces:
+        head -= piece.across.T @ piece.own(piece.across)
+    factor = scipy.linalg.cho_factor(head)
 
     def solve_some(b: FloatArray) -> FloatArray:
-        y = b[order]
-        x = np.empty_like(b)
-        x[core] = x_core = scipy.linalg.cho_solve(factor, y[m:] - T.T @ y[:m])
-        x[order[:m]] = inner(y[:m]) - T @ x_core
+        x, y = np.empty_like(b), b[core]
+        for p in pieces:
+            x[p.rows] = own = p.own(b[p.rows])
+            y -= p.across.T @ own
+        x[core] = y = scipy.linalg.cho_solve(factor, y)
+        for p in pieces:
+            x[p.rows] -= p.own(p.across @ y)
         return x
 
     def solve(b: FloatArray) -> FloatArray:
@@ -221,6 +222,25 @@ def _arrow(scaled: sparse.csc_matrix) -> Solver | None:
         return (solved[0] if len(solved) == 1 else np.concatenate(solved, axis=1)).reshape(b.shape)
 
     return solve, 2.0 * len(rest) * len(core) + len(core) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Some small sets of k unknowns each: where they are, the inverses (p, k, k), their rows over the core (p k, c)."""
+
+    rows: IntArray | slice
+    inverse: FloatArray
+    across: FloatArray
+
+    def own(self, b: FloatArray) -> FloatArray:
+        """Inverses times (p k, r) or (p k,)."""
+        return np.matmul(self.inverse, b.reshape(*self.inverse.shape[:2], -1)).reshape(b.shape)
+
+
+def _slice(rows: IntArray) -> IntArray | slice:
+    """Rows, as a slice where they follow each other: then nothing is copied."""
+    first = int(rows[0])
+    return slice(first, first + len(rows)) if np.array_equal(rows, np.arange(first, first + len(rows))) else rows
 
 
 def _blocks(N: sparse.csr_matrix, sets: IntArray) -> FloatArray:
@@ -244,15 +264,16 @@ class Normal:
     def __init__(self, N: sparse.csc_matrix, motions: FloatArray) -> None:
         self.N, self.motions = N, motions
         self.scale = 1.0 / np.sqrt(np.maximum(N.diagonal(), 1e-300))
-        S = sparse.diags(self.scale)
-        scaled = (S @ N @ S).tocsc()
-        self.n = scaled.shape[0]
+        scaled, self.n = N.copy(), N.shape[0]
+        scaled.data *= self.scale[N.indices] * np.repeat(self.scale, np.diff(N.indptr))
         self._of_scaled, self.cost = _solver(scaled)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """The solution (n, k) or (n,) of N x = right, with the datum's rows fulfilled where ``right`` is seen."""
         scale = self.scale if right.ndim == 1 else self.scale[:, None]
-        return np.asarray(scale * self._of_scaled(scale * right))
+        out = self._of_scaled(scale * right)
+        out *= scale
+        return out
 
     @cached_property
     def inverse(self) -> FloatArray:
