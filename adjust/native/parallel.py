@@ -1,24 +1,31 @@
 """Compiled kernels on all cores: they hold no lock and write disjoint places, so threads need no copies."""
 
 import os
+import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
 from adjust.model.survey import IntArray
 
 _WORTHWHILE = 5_000
+_here = threading.local()
 _Part = TypeVar("_Part")
 _Result = TypeVar("_Result")
 
 
 @cache
 def _pool(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers, thread_name_prefix="adjust")
+    return ThreadPoolExecutor(workers, thread_name_prefix="adjust", initializer=setattr, initargs=(_here, "busy", True))
+
+
+@cache
+def _stages(workers: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers, thread_name_prefix="stage", initializer=setattr, initargs=(_here, "step", True))
 
 
 def workers() -> int:
@@ -48,11 +55,38 @@ def split_blocks(ptr: IntArray, parts: int = 0) -> list[IntArray]:
 def side_by_side(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -> list[_Result]:
     """The results of a function of every part, in their order; where the parts are the same, so are the results.
 
-    The function must not come back here.
+    What a function itself gives here is done in its own thread.
     """
-    if len(parts) <= 1 or workers() == 1:
+    if len(parts) <= 1 or workers() == 1 or hasattr(_here, "busy"):
         return [function(part) for part in parts]
     return list(_pool(workers()).map(function, parts))
+
+
+class Beside:
+    """Steps that need nothing of each other, begun as they are given; each may share out its own work.
+
+    Only one thread runs Python at a time: it pays for those that wait for kernels, for libraries or for the disk. With
+    one thread, and inside a step, they are done where they are given. Leaving a ``with`` of it waits for all.
+    """
+
+    def __init__(self) -> None:
+        self._alone = workers() == 1 or hasattr(_here, "step") or hasattr(_here, "busy")
+        self._begun = list[Future[Any]]()
+
+    def of(self, step: Callable[[], _Result]) -> Callable[[], _Result]:
+        """What gives the result of a step, or raises what it raised."""
+        if self._alone:
+            result = step()
+            return lambda: result
+        begun = _stages(workers()).submit(step)
+        self._begun.append(begun)
+        return begun.result
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        wait(self._begun)
 
 
 def run_split(kernel: Callable[..., object], runs: list[IntArray], *arguments: object) -> None:

@@ -20,8 +20,10 @@ from scipy import sparse
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.parallel import side_by_side
 from adjust.precision.precision import noise_of
 from adjust.statistics.condensed import CondensedSystem
+from adjust.statistics.normal import Normal
 from adjust.statistics.result import Change, ChangeShift
 from adjust.statistics.system import LinearSystem
 from adjust.testing.distributions import chi2, fisher, norm
@@ -58,25 +60,26 @@ class Unit:
 class _Candidates:
     """A unit's possible changes (J, ...), scaled so that B'B has a unit diagonal: M (J, q, q), g (J, q), scale (J, q).
 
-    Y: (n, j q) Q A'B of the j runs by themselves, one after the other; a change has the sum of those from its run on.
+    X: (n, j q) A'B of the j runs by themselves, one after the other; a change has the sum of those from its run on.
     """
 
     unit: Unit
     M: FloatArray
     g: FloatArray
     scale: FloatArray
-    Y: FloatArray
+    X: sparse.csr_matrix
 
 
 @dataclass(frozen=True, eq=False)
 class _Chosen:
-    """What was found, less what was found before it: B (m, q) over all rows, X = A'B (n, q).
+    """What was found, less what was found before it: B (m, q) over all rows, X = A'B and Y = QX (n, q).
 
     inverse: (q, q) of its M; amounts: (q,) that times its g.
     """
 
     B: FloatArray
     X: FloatArray
+    Y: FloatArray
     inverse: FloatArray
     amounts: FloatArray
 
@@ -99,13 +102,13 @@ class ChangeSearch:
         step = s.normal.solve(np.asarray(s.A[rows].T @ s.e[rows]))
         self.A, self.e = s.A, s.e - s.A @ step
         self.epoch, self.epochs = _coded([b.epoch_id for b in adjustment.survey.image_blocks])
-        n = len(s.columns)
         units, self.runs = list(self._units(_MOST_RUNS)), _MOST_RUNS
-        most = min(_WORK / s.normal.cost, _ROOM / max(n, 1))
+        sums = s.normal.structured
+        most = min(_WORK / s.normal.cost, _ROOM / max(len(s.columns), 1)) if sums is None else _ROOM / len(sums.U)
         if sum(u.B.shape[1] * len(u.epochs) for u in units) > most:
             self.runs = int(np.clip(most / sum(u.B.shape[1] for u in units), 2, _MOST_RUNS))
             units = list(self._units(self.runs))
-        self.candidates = [self._candidates(_by_runs(u)) for u in units]
+        self.candidates = side_by_side(lambda u: self._candidates(_by_runs(u)), units)
         self.n_tests = sum(len(c.g) for c in self.candidates)
 
     def left_out(self) -> tuple[str, ...]:
@@ -219,34 +222,48 @@ class ChangeSearch:
         A, e = self.A[u.rows], self.e[u.rows]
         columns = (u.run[:, None] * q + np.arange(q)).ravel()
         wide = sparse.csr_matrix((u.B.ravel(), columns, np.arange(len(u.rows) + 1) * q), (len(u.rows), J * q))
-        X = (A.T @ wide).toarray()
-        Y = self.system.normal.solve(X)
+        X = (A.T @ wide).tocsr()
         P = _from_runs_on(_by_run(u, u.B))
         g = _from_runs_on(_by_run(u, e[:, None]))[:, :, 0]
-        taken, X_on, Y_on = np.empty((J, q, q)), np.zeros((len(X), q)), np.zeros((len(X), q))
-        for j in reversed(range(J)):
-            X_on += X[:, j * q : (j + 1) * q]
-            Y_on += Y[:, j * q : (j + 1) * q]
-            taken[j] = X_on.T @ Y_on
+        taken = _taken(self.system.normal, X, J)[1 if J > 1 else 0 :]
         size = np.sqrt(np.einsum("jqq->jq", P))
         scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
-        M = (P - taken[1 if J > 1 else 0 :]) * scale[:, :, None] * scale[:, None, :]
-        return _Candidates(u, 0.5 * (M + M.transpose(0, 2, 1)), g * scale, scale, Y)
+        M = (P - taken) * scale[:, :, None] * scale[:, None, :]
+        return _Candidates(u, 0.5 * (M + M.transpose(0, 2, 1)), g * scale, scale, X)
 
     def _chosen(self, c: _Candidates, j: int, before: Sequence[_Chosen]) -> _Chosen:
         """Its directions that show, less what they have in common with those before."""
         u, B = c.unit, np.zeros((len(self.e), c.unit.B.shape[1]))
         mine = u.run >= (j + 1 if len(u.epochs) > 1 else 0)
         B[u.rows[mine]] = u.B[mine] * c.scale[j]
-        of_runs = c.Y.reshape(len(c.Y), -1, u.B.shape[1])[:, (j + 1 if len(u.epochs) > 1 else 0) :]
-        X, Y = np.asarray(self.A.T @ B), of_runs.sum(axis=1) * c.scale[j]
+        X = np.asarray(self.A.T @ B)
+        Y = self.system.normal.solve(X)
         shares = [x.inverse @ (x.B.T @ B - x.X.T @ Y) for x in before]
         for x, share in zip(before, shares, strict=True):
-            B, X = B - x.B @ share, X - x.X @ share
+            B, X, Y = B - x.B @ share, X - x.X @ share, Y - x.Y @ share
         values, vectors = np.linalg.eigh(next(x.M[j] for x in self.candidates if x.unit is u))
         V = vectors[:, values > _SEEN]
         inverse = np.linalg.pinv(V.T @ c.M[j] @ V, rcond=1e-12, hermitian=True)
-        return _Chosen(B @ V, X @ V, inverse, inverse @ (V.T @ c.g[j]))
+        return _Chosen(B @ V, X @ V, Y @ V, inverse, inverse @ (V.T @ c.g[j]))
+
+
+def _taken(normal: Normal, X: sparse.csr_matrix, J: int) -> FloatArray:
+    """X'QX of the runs from j on together (J, q, q); X (n, J q) of the runs by themselves."""
+    q, sums = X.shape[1] // J, normal.structured
+    if sums is None:
+        Y, out = normal.solve(X.toarray()), np.empty((J, q, q))
+        X_on, Y_on = np.zeros((2, len(Y), q))
+        for j in reversed(range(J)):
+            X_on += X[:, j * q : (j + 1) * q].toarray()
+            Y_on += Y[:, j * q : (j + 1) * q]
+            out[j] = X_on.T @ Y_on
+        return out
+    own = (X.T @ (sums.own @ X)).tocoo()
+    (a, i), (b, k) = np.divmod(own.row, q), np.divmod(own.col, q)
+    of_run = np.bincount((np.minimum(a, b) * q + i) * q + k, own.data, J * q * q).reshape(J, q, q)
+    shared = np.asarray(X.T @ sums.U.T).reshape(J, q, -1)
+    own_on, shared_on = (np.cumsum(x[::-1], axis=0)[::-1] for x in (of_run, shared))
+    return np.asarray(own_on + shared_on @ shared_on.transpose(0, 2, 1))
 
 
 def _by_runs(u: Unit) -> Unit:
@@ -285,7 +302,7 @@ def _from_runs_on(of_runs: FloatArray) -> FloatArray:
 def _given(c: _Candidates, known: _Chosen) -> _Candidates:
     """Candidates with M and g where one more change is part of the model."""
     u = c.unit
-    across = _by_run(u, known.B[u.rows]) - (c.Y.T @ known.X).reshape(len(u.epochs), u.B.shape[1], -1)
+    across = _by_run(u, known.B[u.rows]) - np.asarray(c.X.T @ known.Y).reshape(len(u.epochs), u.B.shape[1], -1)
     K = _from_runs_on(across) * c.scale[:, :, None]
     M = c.M - K @ known.inverse @ K.transpose(0, 2, 1)
     return replace(c, M=0.5 * (M + M.transpose(0, 2, 1)), g=c.g - K @ known.amounts)

@@ -8,6 +8,7 @@ global test stands out in its own part.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, pairwise
 
 import numpy as np
 
@@ -94,17 +95,21 @@ def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> 
     """All parts that are neither the whole nor without redundancy. blocks: the image block of each observation."""
     found = contributions(adjustment, system, blocks)
     members: dict[tuple[str, str], list[int]] = {}
-    for i, labels in enumerate(_labels(adjustment, system, blocks)):
-        if found.n[i]:
+    for i, (n, labels) in enumerate(zip(found.n.tolist(), _labels(adjustment, system, blocks), strict=True)):
+        if n:
             for label in labels:
                 members.setdefault(label, []).append(i)
-    total, out = int(np.count_nonzero(found.n)), []
-    for (kind, name), listed in members.items():
-        index = np.array(listed, dtype=np.int64)
-        n, r, omega = (float(x[index].sum()) for x in (found.n, found.redundancy, found.omega))
-        if r > _LEAST and len(index) < total:
-            out.append(Part(kind, name, index, n, r, omega))
-    return tuple(out)
+    if not members:
+        return ()
+    every = np.fromiter(chain.from_iterable(members.values()), dtype=np.int64)
+    edges = np.cumsum([0, *map(len, members.values())])
+    sums = (np.add.reduceat(x[every], edges[:-1]).tolist() for x in (found.n, found.redundancy, found.omega))
+    total = int(np.count_nonzero(found.n))
+    return tuple(
+        Part(*label, every[i:j], n, r, omega)
+        for label, (i, j), n, r, omega in zip(members, pairwise(edges.tolist()), *sums, strict=True)
+        if r > _LEAST and j - i < total
+    )
 
 
 def contributions(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> Contributions:
@@ -152,37 +157,46 @@ def tested_parts(
 
     relative: against all others (F), where the survey as a whole does not fit its sigmas.
     """
-    out = []
-    for part in parts:
-        p = _p_relative(adjustment, part) if relative else _p(part, level, system)
-        factor = part.omega / part.redundancy
-        out.append(PartTest(part.kind, part.name, round(part.n), part.redundancy, part.omega, factor, p, p < level))
+    if not parts:
+        return ()
+    n, r, omega = (np.array([getattr(part, x) for part in parts]) for x in ("n", "redundancy", "omega"))
+    if relative:
+        found = _p_relative(adjustment, r, omega)
+    else:
+        found = upper_tail_bound(omega, r)
+        for i in _undecided(system, parts, (n, r, omega, found), level) if system is not None else ():
+            rows = _rows(system, parts[i])
+            found[i] = min(found[i], upper_tail(omega[i], eigenvalues(system, rows, round(n[i]))))
+    out = [
+        PartTest(part.kind, part.name, round(part.n), part.redundancy, part.omega, part.omega / part.redundancy, p,
+                 p < level) for part, p in zip(parts, found.tolist(), strict=True)
+    ]  # fmt: skip
     return tuple(sorted(out, key=lambda x: (x.p, -x.factor, x.kind, x.name)))
 
 
-def _p_relative(adjustment: Adjustment, part: Part) -> float:
-    """Of the factor of a part over that of the rest."""
-    left, rest = adjustment.redundancy - part.redundancy, adjustment.omega - part.omega
-    if left < 1.0 or rest <= 0.0:
-        return 1.0
-    return float(fisher.sf(part.omega / part.redundancy / (rest / left), part.redundancy, left))
+def _p_relative(adjustment: Adjustment, r: FloatArray, omega: FloatArray) -> FloatArray:
+    """Of the factor of parts (k,) over that of the rest."""
+    left, rest = adjustment.redundancy - r, adjustment.omega - omega
+    some = (left >= 1.0) & (rest > 0.0)
+    factor = np.where(some, rest, 1.0) / np.where(some, left, 1.0)
+    return np.where(some, fisher.sf(omega / r / factor, r, np.where(some, left, 1.0)), 1.0)
 
 
-def _p(part: Part, level: float, system: LinearSystem | None) -> float:
-    """The probability, or a bound of it where both the bound and what could be better say the same."""
-    bound = upper_tail_bound(part.omega, part.redundancy)
-    if bound < level or system is None or not len(part.members):
-        return bound
-    n_rows = int((system.ptr[part.members + 1] - system.ptr[part.members]).sum())
-    k = min(n_rows, part.n)
-    lost = part.n - part.redundancy  # degrees of freedom that the unknowns take; evenly, the variance is least
-    squares = part.n - k + k * (1.0 - lost / k) ** 2
-    scale = max(squares, 1e-12) / part.redundancy
-    best = float(chi2.sf(part.omega / scale, part.redundancy / scale))
-    if best > level or n_rows > _EXACT:
-        return bound
-    rows = np.concatenate([np.arange(system.ptr[o], system.ptr[o + 1]) for o in part.members.tolist()])
-    return min(bound, upper_tail(part.omega, eigenvalues(system, rows, round(part.n))))
+def _undecided(
+    system: LinearSystem, parts: Sequence[Part], known: tuple[FloatArray, ...], level: float
+) -> list[int]:
+    """Of which parts the bound of the probability and what could be better do not say the same."""
+    lengths, (n, r, omega, bound) = np.diff(system.ptr), known
+    n_rows = np.array([lengths[part.members].sum() for part in parts])
+    k = np.maximum(np.minimum(n_rows, n), 1.0)
+    lost = n - r  # degrees of freedom that the unknowns take; evenly, the variance is least
+    scale = np.maximum(n - k + k * (1.0 - lost / k) ** 2, 1e-12) / r
+    best = chi2.sf(omega / scale, r / scale)
+    return np.flatnonzero((bound >= level) & (n_rows > 0) & (best <= level) & (n_rows <= _EXACT)).tolist()
+
+
+def _rows(system: LinearSystem, part: Part) -> IntArray:
+    return np.concatenate([np.arange(system.ptr[o], system.ptr[o + 1]) for o in part.members.tolist()])
 
 
 def eigenvalues(system: LinearSystem, rows: IntArray, n: int) -> FloatArray:

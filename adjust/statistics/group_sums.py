@@ -20,7 +20,8 @@ import scipy
 from scipy import sparse
 
 from adjust.model.survey import FloatArray, IntArray
-from adjust.statistics.system import LinearSystem, Normal
+from adjust.statistics.normal import Normal
+from adjust.statistics.system import LinearSystem
 
 _SMALL = 500
 """Unknowns up to which the normal matrices of the groups are full ones."""

@@ -7,13 +7,11 @@ influences, the search for outliers) needs them apart. Rows are linearised at th
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import gtsam
 import numpy as np
 import numpy.typing as npt
-import scipy
 from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
@@ -22,23 +20,11 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
-from adjust.native.parallel import side_by_side
 from adjust.observations.images.bundles import BundleBatch
 from adjust.observations.listed import ObservationFactor
 from adjust.observations.terrestrial.layout import Chunk
 from adjust.precision.precision import Precision
-from adjust.precision.s_transformation import without_datum_rows
-
-DENSE = 3000
-"""Unknowns up to which the normal matrix is factored as a full one."""
-FEW = 200
-"""Unknowns up to which it is inverted at once."""
-_PLAIN = 600
-"""Unknowns up to which nothing is gained by their structure."""
-_SMALL_SET = 100
-"""Unknowns of one epoch, or one point, up to which they are eliminated by themselves."""
-_AT_ONCE = 64
-"""Right-hand sides that are solved in one go."""
+from adjust.statistics.normal import Normal
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +101,17 @@ class LinearSystem:
         return np.repeat(np.arange(len(self.used)), np.diff(self.ptr))
 
     @cached_property
-    def normal(self) -> "Normal":
+    def normal(self) -> Normal:
         """The normal matrix of the used observations and the datum."""
         return self.normal_of(self.used[self.row_of].astype(float))
 
-    def normal_of(self, weights: FloatArray) -> "Normal":
+    def normal_of(self, weights: FloatArray) -> Normal:
         """The normal matrix with weights (m,) of the rows."""
         kept = weights > 0.0
-        A = self.A[kept]
-        return Normal((A.T @ A.multiply(weights[kept][:, None]) + self.datum.T @ self.datum).tocsc(), self.motions)
+        A = self.A if kept.all() else self.A[kept]
+        weighted = A.copy()
+        weighted.data *= np.repeat(weights[kept], np.diff(A.indptr))
+        return Normal((A.T @ weighted + self.datum.T @ self.datum).tocsc(), self.motions)
 
     @cached_property
     def sigmas(self) -> FloatArray:
@@ -151,121 +139,6 @@ class LinearSystem:
                 free = self.columns.free[names[i]]
                 out[i] = Q[free[:, None], free]
         return out
-
-
-Solver = tuple[Callable[[FloatArray], FloatArray], float]
-"""The solution of a normal matrix with a unit diagonal, and the multiplications that one right-hand side takes."""
-
-
-def _solver(scaled: sparse.csc_matrix) -> Solver:
-    n = scaled.shape[0]
-    if n <= FEW:  # its inverse: SciPy's linear algebra takes longer to load
-        inverse = np.linalg.inv(scaled.toarray())
-        return lambda b: inverse @ b, float(n**2)
-    arrow = _arrow(scaled) if n > _PLAIN else None
-    if arrow is not None:
-        return arrow
-    if n <= DENSE:
-        factor = scipy.linalg.cho_factor(scaled.toarray())
-        return lambda b: np.asarray(scipy.linalg.cho_solve(factor, b)), float(n**2)
-    from scipy.sparse.linalg import splu  # here: as above
-
-    lu = splu(scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    return lu.solve, 2.0 * lu.L.nnz
-
-
-def _arrow(scaled: sparse.csc_matrix) -> Solver | None:
-    """The solution by a few unknowns that most others touch and many small sets that touch nothing but these.
-
-    That is a survey of many epochs, or of many points seen from a few places; None for others.
-    """
-    from scipy.sparse.csgraph import connected_components
-
-    degree = np.diff(scaled.indptr)
-    core = np.flatnonzero(degree > 2 * np.median(degree))
-    rest = np.flatnonzero(degree <= 2 * np.median(degree))
-    if not 0 < len(core) <= DENSE:
-        return None
-    N = scaled.tocsr()
-    own, across, head = N[rest][:, rest], N[rest][:, core], N[core][:, core].toarray()
-    _, label = connected_components(own, directed=False)
-    sizes = np.bincount(label)
-    if sizes.max() > _SMALL_SET:
-        return None
-    sets = [np.argsort(label, kind="stable")[np.repeat(sizes, sizes) == k].reshape(-1, k) for k in np.unique(sizes)]
-    inverses = [np.linalg.inv(_blocks(own, x)) for x in sets]
-    inside = np.concatenate([x.ravel() for x in sets])  # the sets one after the other, those of a size together
-    order, m = np.concatenate([rest[inside], core]), len(rest)
-    edges = np.cumsum([0, *(x.size for x in sets)]).tolist()
-
-    def inner(b: FloatArray) -> FloatArray:
-        out = np.empty_like(b)
-        for inverse, (i, j) in zip(inverses, pairwise(edges), strict=True):
-            shape = (*inverse.shape[:2], -1)
-            np.matmul(inverse, b[i:j].reshape(shape), out=out[i:j].reshape(shape))
-        return out
-
-    across = across[inside].toarray()
-    T = inner(across)
-    factor = scipy.linalg.cho_factor(head - across.T @ T)
-
-    def solve_some(b: FloatArray) -> FloatArray:
-        y = b[order]
-        x = np.empty_like(b)
-        x[core] = x_core = scipy.linalg.cho_solve(factor, y[m:] - T.T @ y[:m])
-        x[order[:m]] = inner(y[:m]) - T @ x_core
-        return x
-
-    def solve(b: FloatArray) -> FloatArray:
-        columns = b.reshape(len(b), -1)
-        parts = [columns[:, i : i + _AT_ONCE] for i in range(0, columns.shape[1], _AT_ONCE)]
-        solved = side_by_side(solve_some, parts)
-        return (solved[0] if len(solved) == 1 else np.concatenate(solved, axis=1)).reshape(b.shape)
-
-    return solve, 2.0 * len(rest) * len(core) + len(core) ** 2
-
-
-def _blocks(N: sparse.csr_matrix, sets: IntArray) -> FloatArray:
-    """The blocks (p, k, k) of a matrix that has no others; sets (p, k)."""
-    p, k = sets.shape
-    place, number = np.full(N.shape[0], -1), np.full(N.shape[0], -1)
-    place[sets], number[sets] = np.arange(k), np.arange(p)[:, None]
-    entries = N.tocoo()
-    kept = number[entries.row] >= 0
-    out = np.zeros((p, k, k))
-    out[number[entries.row[kept]], place[entries.row[kept]], place[entries.col[kept]]] = entries.data[kept]
-    return out
-
-
-class Normal:
-    """A normal matrix (n, n), factored: solutions, and its inverse in the datum of the survey.
-
-    cost: multiplications of a solution.
-    """
-
-    def __init__(self, N: sparse.csc_matrix, motions: FloatArray) -> None:
-        self.N, self.motions = N, motions
-        self.scale = 1.0 / np.sqrt(np.maximum(N.diagonal(), 1e-300))
-        S = sparse.diags(self.scale)
-        scaled = (S @ N @ S).tocsc()
-        self.n = scaled.shape[0]
-        self._of_scaled, self.cost = _solver(scaled)
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """The solution (n, k) or (n,) of N x = right, with the datum's rows fulfilled where ``right`` is seen."""
-        scale = self.scale if right.ndim == 1 else self.scale[:, None]
-        return np.asarray(scale * self._of_scaled(scale * right))
-
-    @cached_property
-    def inverse(self) -> FloatArray:
-        """Inverse (n, n) of the matrix with its datum rows."""
-        return self.solve(np.eye(self.n))
-
-    def covariance(self, datum: sparse.csr_matrix) -> FloatArray:
-        """Covariance (n, n) of the unknowns: the inverse less what the datum's own rows add (S-transformation)."""
-        if self.motions.shape[1] == 0:
-            return self.inverse
-        return without_datum_rows(self.inverse, self.motions, datum @ self.motions)
 
 
 @dataclass(frozen=True, eq=False)

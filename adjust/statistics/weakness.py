@@ -1,15 +1,18 @@
 """What is badly determined, by name: correlations, unknowns that replace each other, the weakest deformation."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
 from adjust.precision.s_transformation import without_datum_rows
+from adjust.statistics.normal import DENSE, FEW, Inverse
 from adjust.statistics.result import Correlation, WeakDirection, WeakPart
-from adjust.statistics.system import DENSE, FEW, LinearSystem, linear_system
+from adjust.statistics.system import LinearSystem, linear_system
 
 _MOST = 200
 _SHARE = 0.1
@@ -43,7 +46,7 @@ def compared_columns(system: LinearSystem) -> IntArray:
     What is there at one epoch alone comes after, and points last; as many as ``_WORK`` allows.
     """
     n, columns = len(system.columns), system.columns
-    if n <= DENSE or _in_tree(system):
+    if n <= DENSE or _in_tree(system) or _structure(system) is not None:
         return np.arange(n)
     epochs = {b.epoch_id for b in system.precision.graph.survey.image_blocks}
     rank = {name: 2 if len(name) == 3 and name[2] in epochs else 1 if name[0] == "point" else 0 for name in columns.at}
@@ -79,8 +82,8 @@ def correlations(
 ) -> tuple[Correlation, ...]:  # fmt: skip
     """Pairs of components whose correlation is at least ``limit`` in size, largest first, 200 at most.
 
-    Without names of all unknowns. Where these are too many, of the :func:`compared_columns` with all, and of the
-    components of every unknown with each other.
+    Without names of all unknowns. Where these are too many and share too much, of the :func:`compared_columns` with
+    all, and of the components of every unknown with each other.
     """
     system = system or linear_system(adjustment)
     c = system.columns
@@ -89,6 +92,9 @@ def correlations(
     number = np.full(len(c), -1)
     number[index] = np.arange(len(index))
     sigma = np.sqrt(np.maximum(_variances(system, np.arange(len(c))), 1e-300))
+    structure = _structure(system, limit) if names is None and len(c) > DENSE and not _in_tree(system) else None
+    if structure is not None:
+        return _named(system, _of_structure(structure, sigma, limit))
     columns = _some_columns(system)
 
     def above(first: int) -> list[tuple[int, int, float]]:
@@ -105,8 +111,56 @@ def correlations(
     found = [x for part in side_by_side(above, range(0, len(index), _AT_A_TIME)) for x in part]
     if names is None and len(index) < len(c):
         found += _within(system, number, limit)
-    order = sorted(found, key=lambda x: (-abs(x[2]), x[0], x[1]))[:_MOST]
+    return _named(system, found)
+
+
+_Found = list[tuple[int, int, float]]
+
+
+def _named(system: LinearSystem, found: _Found) -> tuple[Correlation, ...]:
+    c, order = system.columns, sorted(found, key=lambda x: (-abs(x[2]), x[0], x[1]))[:_MOST]
     return tuple(Correlation(c.names[i], c.components[i], c.names[j], c.components[j], x) for i, j, x in order)
+
+
+@dataclass(frozen=True, eq=False)
+class _Structure:
+    """A covariance matrix as a sum, its U over the sigmas, and the components (k,) that share enough with others."""
+
+    Q: Inverse
+    V: FloatArray
+    sharing: IntArray
+
+
+def _structure(system: LinearSystem, limit: float = 0.95) -> _Structure | None:
+    """Of a system of small sets that meet in few unknowns; None for others, and where too many share too much.
+
+    Components of different sets have a covariance U' U alone: a correlation is at most the product of two lengths.
+    """
+    Q = system.normal.structured if not system.motions.shape[1] else None
+    if Q is None:
+        return None
+    V = Q.U / np.sqrt(np.maximum(system.sigmas**2, 1e-300))
+    lengths = np.sqrt(np.einsum("cn,cn->n", V, V))
+    sharing = np.flatnonzero(lengths * lengths.max(initial=0.0) >= limit)
+    return _Structure(Q, V, sharing) if len(sharing) <= _WHOLE else None
+
+
+def _of_structure(found: _Structure, sigma: FloatArray, limit: float) -> _Found:
+    """All pairs of components: within a set from its block, of different sets those that share enough."""
+    Q, V, sharing = found.Q, found.V, found.sharing
+    own = sparse.triu(Q.own, 1).tocoo()
+    C = own.data / (sigma[own.row] * sigma[own.col]) + np.einsum("ck,ck->k", V[:, own.row], V[:, own.col])
+    high = np.abs(C) >= limit
+    out: _Found = list(zip(own.row[high].tolist(), own.col[high].tolist(), C[high].tolist(), strict=True))
+
+    def above(first: int) -> _Found:
+        i = sharing[first : first + _AT_A_TIME]
+        C = V[:, i].T @ V[:, sharing]
+        other = (i[:, None] < sharing) & ((Q.member[i][:, None] != Q.member[sharing]) | (Q.member[sharing] < 0))
+        a, b = np.nonzero((np.abs(C) >= limit) & other)
+        return list(zip(i[a].tolist(), sharing[b].tolist(), C[a, b].tolist(), strict=True))
+
+    return out + [x for part in side_by_side(above, range(0, len(sharing), _AT_A_TIME)) for x in part]
 
 
 def _variances(system: LinearSystem, index: IntArray) -> FloatArray:

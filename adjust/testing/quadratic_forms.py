@@ -81,9 +81,9 @@ def _saddlepoint(x: float, weights: FloatArray) -> float:
     return low
 
 
-def upper_tail_bound(x: float, redundancy: float) -> float:
-    """At least P(sum > x), far above its mean, whatever the weights: chi-square with r degrees of freedom.
+def upper_tail_bound(x: FloatArray | float, redundancy: FloatArray | float) -> FloatArray:
+    """At least P(sum > x) (k,), far above its mean, whatever the weights: chi-square with r degrees of freedom (k,).
 
     Of all weights up to 1 with the sum r those that are 1 or 0 spread most (Szekely and Bakirov 2003).
     """
-    return float(chi2.sf(x, redundancy))
+    return np.asarray(chi2.sf(x, redundancy))

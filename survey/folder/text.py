@@ -7,6 +7,7 @@ import os
 import re
 import stat
 import tempfile
+import threading
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -17,6 +18,7 @@ LARGEST_FILE = 4 * 2**30  # bytes; longer observations go into several projects
 LARGEST_NUMBER = 1e15  # its square and what is made of it stay finite
 _FORBIDDEN_IN_IDS = set('/\\:@,;"|<>*?')
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what spreadsheets take for the beginning of a formula
+_ASKING = threading.Lock()
 _LONGEST_ID = 120  # bytes: an id with a prefix and an ending is still the name of a file
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{i}" for port in ("COM", "LPT") for i in range(1, 10))}
 
@@ -85,8 +87,9 @@ def sync_folder(folder: Path) -> None:
 
 
 def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
+    with _ASKING:  # of the whole process, and only told by what changes it
+        mask = os.umask(0)
+        os.umask(mask)
     return mask
 
 

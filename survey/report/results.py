@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from adjust.model.result import Adjustment
+from adjust.native.parallel import Beside
 from survey.folder.replacing import changing, replace_parts
 from survey.project import atomic_write
 from survey.project.project import RESULTS
@@ -78,19 +80,29 @@ def make_results(
     """
     results = place / RESULTS
     parquet = options.parquet or (place.parent / RESULTS / PARQUET).is_file()  # there: not to be old
-    page = report_html(adjustment, run, solution, statistics, options.language)
-    pdf = report_pdf(page) if options.pdf else b""
     results.mkdir(parents=True, exist_ok=True)
-    makers: Mapping[str, Callable[[], bytes]] = {
+    tables: dict[str, Callable[[], bytes]] = {
         "covariance.npz": lambda: covariance_npz(adjustment, run.sigmas),
         "residuals.csv": lambda: image_residuals_csv(adjustment),
         **({PARQUET: lambda: image_residuals_parquet(adjustment)} if parquet else {}),
         "residuals_other.csv": lambda: other_residuals_csv(adjustment),
-        "report.html": page.encode,
-        **({"report.pdf": lambda: pdf} if options.pdf else {}),
-        "solution.json": lambda: solution_json(solution).encode(),
     }
-    paths = {name: results / name for name in makers}
-    for name, make in makers.items():
-        atomic_write(paths[name], make())
-    return paths
+    with Beside() as writing:
+
+        def begun(makers: Mapping[str, Callable[[], bytes]]) -> list[Callable[[], None]]:
+            return [writing.of(partial(_write, results / name, make)) for name, make in makers.items()]
+
+        done = begun(tables)
+        page = report_html(adjustment, run, solution, statistics, options.language)
+        pages: dict[str, Callable[[], bytes]] = {
+            "report.html": page.encode,
+            **({"report.pdf": lambda: report_pdf(page)} if options.pdf else {}),
+            "solution.json": lambda: solution_json(solution).encode(),
+        }
+        for written in (*done, *begun(pages)):
+            written()
+    return {name: results / name for name in (*tables, *pages)}
+
+
+def _write(path: Path, make: Callable[[], bytes]) -> None:
+    atomic_write(path, make())

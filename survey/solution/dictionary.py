@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
 from survey.solution.left_out import left_out_dict
-from survey.solution.quantities import Scale, SigmaKind, point_entry, pose_entry, scale_of, vector_entry
+from survey.solution.quantities import Scale, SigmaKind, point_entry, pose_entries, pose_entry, scale_of, vector_entry
 from survey.solution.statistics import Statistics
 from survey.solution.statistics_dict import statistics_dict
 from survey.solution.verdict import findings, fit_of, suspects, verdict
@@ -282,7 +283,8 @@ def _pose(
     scale: Scale,
 ) -> dict[str, Any]:  # fmt: skip
     """The pose under ``key`` and, where it moves, under ``epochs``; empty where it is no unknown."""
-    epochs = {e.name[2]: {key: pose_entry(e, scale)} for e in moving.get(name, ())}
+    mine = moving.get(name, ())
+    epochs = {e.name[2]: {key: entry} for e, entry in zip(mine, pose_entries(mine, scale), strict=True)}
     single = adjustment.estimates.get(name)
     entry: dict[str, Any] = {} if single is None else {key: pose_entry(single, scale)}
     return entry | ({"epochs": epochs} if epochs else {})
@@ -366,16 +368,22 @@ def solution_json(solution: Mapping[str, Any]) -> str:
 def _lines(value: Any, depth: int) -> str:
     kind = type(value)
     if kind is dict and value:
-        inner = ",\n".join([f"{' ' * (depth + 1)}{_one(k)}: {_lines(v, depth + 1)}" for k, v in value.items()])
+        inner = ",\n".join([_key(k, depth + 1) + _lines(v, depth + 1) for k, v in value.items()])
         return f"{{\n{inner}\n{' ' * depth}}}"
     if kind is not list:
         return _one(value)
     kinds = set(map(type, value))
+    if kinds == _FLOATS and all(map(math.isfinite, value)):
+        return f"[{', '.join(map(float.__repr__, value))}]"
     if dict in kinds or str in kinds:
         inner = ",\n".join([" " * (depth + 1) + _lines(v, depth + 1) for v in value])
         return f"[\n{inner}\n{' ' * depth}]"
-    plainly = kinds == _FLOATS and all(map(math.isfinite, value))
-    return f"[{', '.join(map(float.__repr__ if plainly else _one, value))}]"
+    return f"[{', '.join(map(_one, value))}]"
+
+
+@lru_cache(maxsize=4096)
+def _key(name: str, depth: int) -> str:
+    return f"{' ' * depth}{_one(name)}: "
 
 
 def _one(value: Any) -> str:

@@ -3,7 +3,9 @@
 Everything that a report or a result file says about the precision of an unknown passes through :class:`Scale`.
 """
 
+import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,31 +114,37 @@ def pose_dict(pose: Pose3) -> dict[str, Any]:
     """Translation, unit quaternion with w >= 0, and Euler angles with R = Rz(z) Ry(y) Rx(x)."""
     rotation = pose.rotation()
     q: Any = rotation.toQuaternion()  # a class that the stubs leave out
-    wxyz = np.array([q.w(), q.x(), q.y(), q.z()])
+    wxyz = [q.w(), q.x(), q.y(), q.z()]
     return {
-        "translation_mm": (1e3 * np.asarray(pose.translation())).tolist(),
-        "rotation_quaternion_wxyz": (wxyz if wxyz[0] >= 0.0 else -wxyz).tolist(),
-        "rotation_euler_xyz_deg": np.degrees(rotation.xyz()).tolist(),
+        "translation_mm": [1e3 * x for x in pose.translation().tolist()],
+        "rotation_quaternion_wxyz": wxyz if wxyz[0] >= 0.0 else [-x for x in wxyz],
+        "rotation_euler_xyz_deg": [math.degrees(x) for x in rotation.xyz().tolist()],
     }
 
 
 def pose_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
-    """A pose ``a_from_b``: sigmas of its origin along the axes of a, sigmas of its rotation about the axes of b.
+    """A pose ``a_from_b``: sigmas of its origin along the axes of a, sigmas of its rotation about the axes of b."""
+    return pose_entries([estimate], scale)[0]
+
+
+def pose_entries(estimates: Sequence[Estimate], scale: Scale) -> list[dict[str, Any]]:
+    """The same of poses, in their order.
 
     The tangent of the covariance is in b; the translation part is turned into a: ``R cov R'``.
     """
-    pose = estimate.value
-    if not isinstance(pose, Pose3):
-        raise TypeError(f"{'/'.join(estimate.name)} is not a pose")
-    R = pose.rotation().matrix()
-    translation_cov = R @ estimate.cov[3:, 3:] @ R.T
-    translation_sigmas = scale.factor * np.sqrt(np.clip(np.diag(translation_cov), 0.0, None))
-    rotation_sigmas = sigmas_of(estimate, scale)[:3]
-    return pose_dict(pose) | {
-        "sigma_translation_mm": (1e3 * translation_sigmas).tolist(),
-        "sigma_rotation_arcsec": (ARCSEC_PER_RAD * rotation_sigmas).tolist(),
-        "status": status_of(estimate),
-    }
+    poses = [e.value for e in estimates if isinstance(e.value, Pose3)]
+    if len(poses) < len(estimates):
+        raise TypeError(f"{'/'.join(next(e.name for e in estimates if not isinstance(e.value, Pose3)))} is not a pose")
+    if not poses:
+        return []
+    R, cov = np.array([p.rotation().matrix() for p in poses]), np.array([e.cov for e in estimates])
+    variances = np.diagonal(cov, axis1=1, axis2=2)[:, :3], np.einsum("nij,njk,nik->ni", R, cov[:, 3:, 3:], R)
+    rotation, translation = (scale.factor * np.sqrt(np.clip(v, 0.0, None)) for v in variances)
+    sigmas = (1e3 * translation).tolist(), (ARCSEC_PER_RAD * rotation).tolist()
+    return [
+        pose_dict(p) | {"sigma_translation_mm": st, "sigma_rotation_arcsec": sr, "status": status_of(e)}
+        for p, e, st, sr in zip(poses, estimates, *sigmas, strict=True)
+    ]
 
 
 def point_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from math import isfinite
 from typing import Any
 
@@ -34,6 +35,7 @@ OTHER_COLUMNS = (
 )
 _DECIMALS = (4, 4, 6, 6, 6, 6, 5, 5, 4, 4, 4, 0)
 _CHUNK = 50_000
+_NEEDS_QUOTES = frozenset(',"\r\n')
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +58,13 @@ def image_rows(adjustment: Adjustment) -> ImageRows:
     survey = adjustment.survey
     point_ids, start = _point_names(survey)
     blocks, ptr = survey.image_blocks, adjustment.image_residuals.block_ptr
-    uv, sigmas = np.empty((ptr[-1], 2)), np.empty((ptr[-1], 2))
-    point = np.empty(ptr[-1], dtype=np.int64)
-    for block, first, last in zip(blocks, ptr[:-1], ptr[1:], strict=True):
-        uv[first:last] = block.uv
-        sigmas[first:last] = np.sqrt(np.diagonal(block.cov, axis1=1, axis2=2))
-        point[first:last] = start[block.target_id] + np.asarray(block.point_idx)
-    return ImageRows(np.repeat(np.arange(len(blocks)), np.diff(ptr)), uv, sigmas, point, point_ids)
+    lengths, none = np.diff(ptr), np.zeros((0, 2))
+    uv = np.concatenate([none, *(b.uv for b in blocks)])
+    cov = np.concatenate([np.zeros((0, 2, 2)), *(b.cov for b in blocks)])
+    first = np.array([start[b.target_id] for b in blocks], dtype=np.int64)
+    point = np.concatenate([np.zeros(0, dtype=np.int64), *(b.point_idx for b in blocks)]) + np.repeat(first, lengths)
+    sigmas = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    return ImageRows(np.repeat(np.arange(len(blocks)), lengths), uv, sigmas, point, point_ids)
 
 
 def _point_names(survey: Survey) -> tuple[tuple[str, ...], dict[str | None, int]]:
@@ -78,8 +80,9 @@ def image_residuals_csv(adjustment: Adjustment) -> bytes:
     """``residuals.csv``; sigmas are those of the observations, a priori; no number is written where there is none."""
     rows, found = image_rows(adjustment), adjustment.image_residuals
     blocks = adjustment.survey.image_blocks
-    names = ((cell_text(b.epoch_id), cell_text(b.camera_id), cell_text(b.target_id or "")) for b in blocks)
-    heads = Words.of([",".join(map(_quoted, x)) + "," for x in names])
+    names = [(b.epoch_id, b.camera_id, b.target_id or "") for b in blocks]
+    cell = {name: _quoted(cell_text(name)) for name in set(chain.from_iterable(names))}
+    heads = Words.of([f"{cell[epoch]},{cell[camera]},{cell[target]}," for epoch, camera, target in names])
     points = Words.of([_quoted(cell_text(p)) for p in rows.point_ids])
     numbers = _numbers(rows, found)
 
@@ -125,7 +128,7 @@ def _by_one(adjustment: Adjustment, rows: ImageRows, part: slice, values: FloatA
 
 
 def _quoted(word: str) -> str:
-    return '"' + word.replace('"', '""') + '"' if any(c in word for c in ',"\r\n') else word
+    return word if _NEEDS_QUOTES.isdisjoint(word) else '"' + word.replace('"', '""') + '"'
 
 
 def other_residuals_csv(adjustment: Adjustment) -> bytes:

@@ -1,5 +1,6 @@
 """What the statistics of an adjustment say, gathered for reports and result files."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,6 +8,7 @@ from gtsam import Pose3
 
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray, IntArray
+from adjust.native.parallel import Beside
 from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.consistency import consistency
@@ -69,6 +71,8 @@ MOST_BUDGETS = 60
 _FEW_PLACES = 300
 """Places whose neighbours are found without a tree."""
 MOST_NEIGHBOURS = 150
+
+
 def statistics_of(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], scale: Scale) -> Statistics:
     """All of them, at every size. Raises SurveyError for a tolerance that is about nothing."""
     judged = verdicts(adjustment, tolerances, scale)
@@ -81,14 +85,17 @@ def statistics_of(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], sca
     condensed = condensed_system(precision_of(adjustment))
     system, components = condensed.system, adjustment.variance_components
     names = _budgeted(adjustment)
-    budget = uncertainty_budget(adjustment, names[:MOST_BUDGETS], PROBABILITY, components, system) if names else ()
-    tested = consistency(adjustment, condensed, alpha)
-    return Statistics(
-        reliability(adjustment, system=condensed), components, correlations(adjustment, system=system),
-        weak_directions(adjustment, system=system), near,
-        tuple(_scaled_budget(x, scale.factor) for x in budget), drawn, adjustment.decisions, judged, tested,
-        (*tested.left_out, *_left_out(adjustment, system, len(names))),
-    )  # fmt: skip
+    _ = system.normal, system.sigmas  # all of these ask for them
+    with Beside() as made:
+        tested = made.of(lambda: consistency(adjustment, condensed, alpha))
+        reliable = made.of(lambda: reliability(adjustment, system=condensed))
+        weak = made.of(lambda: weak_directions(adjustment, system=system))
+        correlated = made.of(lambda: correlations(adjustment, system=system))
+        budget = made.of(lambda: _budget(adjustment, names[:MOST_BUDGETS], system, scale.factor))
+        return Statistics(
+            reliable(), components, correlated(), weak(), near, budget(), drawn, adjustment.decisions, judged, tested(),
+            (*tested().left_out, *_left_out(adjustment, system, len(names))),
+        )  # fmt: skip
 
 
 _LARGE_NETWORK = (
@@ -126,9 +133,16 @@ def _budgeted(adjustment: Adjustment) -> tuple[ParameterName, ...]:
     return tuple(sorted(names, key=lambda n: rank[n[0]]))
 
 
-def _scaled_budget(entry: BudgetEntry, factor: float) -> BudgetEntry:
-    lines = tuple(replace(line, u=factor * line.u) for line in entry.lines)
-    return replace(entry, u=factor * entry.u, expanded=factor * entry.expanded, lines=lines)
+def _budget(
+    adjustment: Adjustment, names: Sequence[ParameterName], system: LinearSystem, factor: float
+) -> tuple[BudgetEntry, ...]:
+    """Of these unknowns, its sigmas scaled as the others are."""
+    found = uncertainty_budget(adjustment, names, PROBABILITY, adjustment.variance_components, system) if names else ()
+    return tuple(
+        replace(x, u=factor * x.u, expanded=factor * x.expanded,
+                lines=tuple(replace(line, u=factor * line.u) for line in x.lines))
+        for x in found
+    )  # fmt: skip
 
 
 def _nearest(x: FloatArray, k: int) -> IntArray:

@@ -10,8 +10,8 @@ from adjust.adjustment import adjust
 from adjust.model.result import Adjustment
 from adjust.native import parallel
 from adjust.observations.images import batch as batch_module
-from adjust.statistics import system as system_module
-from adjust.statistics import weakness
+from adjust.statistics import changes, weakness
+from adjust.statistics import normal as normal_module
 from adjust.statistics.budget import uncertainty_budget
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.reliability import reliability
@@ -43,16 +43,20 @@ def test_few_unknowns_that_many_touch_and_many_small_sets() -> None:
         at += k
     order = rng.permutation(n)
     N = N[np.ix_(order, order)]
-    found = system_module._arrow(sparse.csc_matrix(N))
+    found = normal_module._arrow(sparse.csc_matrix(N))
     assert found is not None
-    solve, cost = found
-    assert cost < n**2
+    assert found.cost < n**2
     for b in (rng.normal(size=n), rng.normal(size=(n, 3))):
-        x = solve(b)
+        x = found.solve(b)
         assert x.shape == b.shape
         np.testing.assert_allclose(x, np.linalg.solve(N, b), rtol=1e-8, atol=1e-10)
+    scale = rng.uniform(0.5, 2.0, n)
+    Q = found.inverse(scale)
+    assert np.count_nonzero(Q.member < 0) == len(Q.U)
+    inverse = np.linalg.inv(N) * np.outer(scale, scale)
+    np.testing.assert_allclose(Q.own.toarray() + Q.U.T @ Q.U, inverse, rtol=1e-8, atol=1e-9 * np.abs(inverse).max())
     full = rng.normal(size=(n, n))
-    assert system_module._arrow(sparse.csc_matrix(full @ full.T)) is None
+    assert normal_module._arrow(sparse.csc_matrix(full @ full.T)) is None
 
 
 def test_lanczos_finds_the_directions_of_the_whole_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,6 +101,31 @@ def test_correlations_of_a_large_survey_leave_out_only_what_they_say(monkeypatch
     assert len(got) > 10
     for k, value in got.items():
         assert value == pytest.approx(expected[k], abs=1e-6)
+
+
+def test_small_sets_that_meet_in_few_unknowns_are_compared_with_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every pair, of single epochs too; and changes from every epoch on, as by solutions for each."""
+    adjustment = lab()
+    condensed = condensed_system(precision_of(adjustment))
+    searched = changes.ChangeSearch(adjustment, condensed)
+    assert condensed.system.normal.structured is None
+    monkeypatch.setattr(weakness, "_MOST", 10_000)
+    every = correlations(adjustment, 0.3, system=condensed.system)
+    monkeypatch.setattr(normal_module, "_PLAIN", 10)
+    monkeypatch.setattr(weakness, "DENSE", 10)
+    monkeypatch.setattr(weakness, "_WHOLE", 100)
+    condensed = condensed_system(precision_of(adjustment))
+    system = condensed.system
+    assert system.normal.structured is not None
+    found = correlations(adjustment, 0.3, system=system)
+    assert len(weakness.compared_columns(system)) == len(system.columns)
+    assert len(found) == len(every) > 10
+    for x, y in zip(sorted(found, key=str), sorted(every, key=str), strict=True):
+        assert (x.a, x.a_component, x.b, x.b_component) == (y.a, y.a_component, y.b, y.b_component)
+        assert x.coefficient == pytest.approx(y.coefficient, abs=1e-6)
+    for a, b in zip(searched.candidates, changes.ChangeSearch(adjustment, condensed).candidates, strict=True):
+        np.testing.assert_allclose(a.M, b.M, rtol=0.0, atol=1e-7)
+    assert max(len(a.M) for a in searched.candidates) > 5
 
 
 def test_correlations_from_the_tree_are_those_of_the_normal_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,7 +175,7 @@ def test_threads_and_portions_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
         return [*tests, *ellipses, *rows, shifts, np.array([x.coefficient for x in listed])]
 
     monkeypatch.setattr(parallel, "_WORTHWHILE", 300)
-    monkeypatch.setattr(system_module, "_AT_ONCE", 7)
+    monkeypatch.setattr(normal_module, "_AT_ONCE", 7)
     monkeypatch.setattr(batch_module, "_AT_ONCE", 200)
     found = []
     for threads in ("1", "3"):
