@@ -44,13 +44,14 @@ class Diagnosis:
         return tuple(_text(i, c) for i, c in enumerate(self.candidates[:_SHOWN], start=1))
 
     def told(self) -> list[dict[str, Any]]:
-        """The candidates for machines: name, cause, change, ids, epochs, and how sure it is."""
+        """The candidates for machines: name, cause, change, ids, epochs, how sure it is, and where to edit."""
         return [
             {
                 "name": c.hypothesis.name, "cause": c.hypothesis.cause, "change": c.hypothesis.change,
                 "kind": c.hypothesis.place.kind, "ids": list(c.hypothesis.place.ids),
                 "epochs": list(c.hypothesis.place.epochs), "explained": c.explained, "statistic": c.statistic,
                 "critical": c.critical, "probability": c.probability, "sigma0": c.sigma0,
+                "where": c.where, "can_be_tried": bool(c.hypothesis.edits),
             }
             for c in self.candidates[:_SHOWN]
         ]  # fmt: skip
@@ -117,7 +118,8 @@ def _formed(family: Family, case: Case) -> list[Hypothesis]:
 def _text(number: int, candidate: Candidate) -> str:
     h = candidate.hypothesis
     sure = "" if candidate.probability > 0.99 else f", probability {100.0 * candidate.probability:.0f} %"
+    where = f"; {candidate.where}" if candidate.where else ""
     return (
         f"{'' if number == 1 else 'or else: '}{h.cause}; {h.change} (explains {100.0 * candidate.explained:.0f} % of "
-        f"the misfit, sigma0 becomes {candidate.sigma0:.3g}{sure}; --try {number})"
+        f"the misfit, sigma0 becomes {candidate.sigma0:.3g}{sure}{where}{f'; --try {number}' if h.edits else ''})"
     )

@@ -31,10 +31,13 @@ class ScaleKey:
 
 @dataclass(frozen=True)
 class SetKey:
-    """The value at ``path`` of ``survey.toml`` becomes another: a number, a word, yes or no, a list of words."""
+    """The value at ``path`` of ``survey.toml`` becomes another: a number, a word, yes or no, a list of them.
+
+    Of a list of numbers in place of one that is shorter (coordinates in a plane), the first ones.
+    """
 
     path: tuple[str, ...]
-    value: float | int | str | bool | tuple[str, ...]
+    value: float | int | str | bool | tuple[str | float, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +65,31 @@ class Rename:
 
 
 @dataclass(frozen=True)
+class ExchangeColumns:
+    """In the rows of a table where each column of ``where`` has one of its values: two columns trade their values."""
+
+    table: str
+    columns: tuple[str, str]
+    where: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ChangeReadings:
+    """The values of terrestrial readings, by id: new = factor * old + offset (rad or m), written in their own unit."""
+
+    ids: tuple[str, ...]
+    factor: float
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
 class LeaveOut:
     """Rows of ``exclusions.csv``, each as a person would name it: "image:Y/hY06", "epoch:t09", "pairs:p3"."""
 
     names: tuple[str, ...]
 
 
-Edit = ScaleKey | SetKey | ChangeColumns | Rename | LeaveOut
+Edit = ScaleKey | SetKey | ChangeColumns | ExchangeColumns | ChangeReadings | Rename | LeaveOut
 
 
 @dataclass(frozen=True, eq=False)

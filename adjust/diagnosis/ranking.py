@@ -22,7 +22,7 @@ class Candidate:
 
     statistic: drop of the bounded v'Pv over the variance factor that is left; critical: what it exceeds.
     probability: among all that were tried and the survey as it stands, by their likelihood and number of parameters.
-    sigma0: of the adjustment with the change.
+    sigma0: of the adjustment with the change. where: file and line of the project, for who knows it.
     """
 
     hypothesis: Hypothesis
@@ -31,6 +31,7 @@ class Candidate:
     critical: float
     probability: float
     sigma0: float
+    where: str = ""
 
 
 def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candidate, ...]:

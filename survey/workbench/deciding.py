@@ -6,12 +6,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from adjust.diagnosis.hypothesis import LeaveOut
 from adjust.diagnosis.ranking import Candidate
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, decode, read_bytes
-from survey.jobs.adjusting.trying import chosen_of, edited, kept_name, reason_of
+from survey.jobs.adjusting.edits import changed_files, kept_name, left_out
+from survey.jobs.adjusting.trying import chosen_of, in_use, reason_of
 from survey.jobs.detecting import author_name
 from survey.jobs.excluding import FILE, included_rows, new_rows
 from survey.project.declared.editing import with_datum, with_sigma_scale, with_treatment
@@ -135,14 +135,8 @@ class Deciding(Resident):
         """
         with self._lock:
             chosen = chosen_of(self.folder, [c.hypothesis for c in self.remedies], number)
-            names: list[str] = []
-            texts: dict[str, str] = {}
-            for edit in chosen.edits:
-                if isinstance(edit, LeaveOut):
-                    names += edit.names
-                else:
-                    name, _, text = edited(self.folder, edit, chosen, texts)
-                    texts[name] = text
+            texts = {file.name: file.after for file in changed_files(self.folder, chosen)}
+            names = in_use(self.situation.project, left_out(chosen))
             return self.decide(exclude=names, texts=texts, reason=reason_of(chosen), base=base,
                                label=f"remedy: {chosen.cause}", cold=True)  # fmt: skip
 

@@ -1,6 +1,7 @@
 """Images of one moment that have different names: the first thing that goes wrong with one's own images."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -30,7 +31,7 @@ def test_the_error_names_the_cameras_and_what_to_do(rig):
     wrong = renamed(rig)
     with pytest.raises(SurveyError) as raised:
         adjust(wrong)
-    said = str(explained(wrong, raised.value))
+    said = str(explained(wrong, raised.value, Path()))
     assert "share no epoch" in said
     assert "give images of one moment the same name" in said
     assert said.index("share no epoch") < said.index("undetermined")

@@ -12,7 +12,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place, Rename
 from adjust.diagnosis.sequences import Link, Shift, fitted, links, shifts
 from adjust.model.errors import listed
 from adjust.model.observations import FrameRef, ImageBlock, Pair, TableReading
@@ -127,7 +127,8 @@ def _cameras(survey: Survey, link: Link) -> Iterator[Hypothesis]:
         yield Hypothesis(
             "cameras exchanged", f"cameras {a} and {b} have each other's images at {_listed(epochs, link.epochs)}",
             f"exchange these images between images/{a} and images/{b}", Place("camera", (a, b), "", epochs),
-            exchanged_cameras(survey, a, b, epochs), (), ratio, 2, n,
+            exchanged_cameras(survey, a, b, epochs),
+            (Rename("image_points", "camera_id", {a: b, b: a}, {"epoch_id": epochs}),), ratio, 2, n,
         )  # fmt: skip
 
 
@@ -184,8 +185,12 @@ def _far(difference: FloatArray, cov: FloatArray) -> bool:
 
 def _without_one(survey: Survey, field: str, row: int) -> Hypothesis:
     o = getattr(survey, field)[row]
-    what = f"pair {o.pair_id}" if field == "pairs" else f"the reading of table {o.table_id} at epoch {o.epoch_id}"
+    what, place = (f"pair {o.pair_id}", Place("pair", (o.pair_id,))) if field == "pairs" else (
+        f"the reading of table {o.table_id} at epoch {o.epoch_id}",
+        Place("table", (o.table_id,), "axis1_deg", (o.epoch_id,)),
+    )
+    edits = (LeaveOut((f"pairs:{o.pair_id}",)),) if field == "pairs" else ()
     kept: dict[str, Any] = {field: tuple(x for i, x in enumerate(getattr(survey, field)) if i != row)}
     return Hypothesis("the same twice", f"{what} is there twice with different values, and this one (row {row + 1} of "
-                      "those in use) does not fit", "leave it out", Place(field, (str(row),)),
-                      replace(survey, **kept), (), 10.0, 1, 2)  # fmt: skip
+                      "those in use) does not fit", "leave it out", place,
+                      replace(survey, **kept), edits, 10.0, 1, 2)  # fmt: skip

@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.hypothesis import Edit, Hypothesis, Place, SetKey
 from adjust.diagnosis.screen import Screen, improvement, screen
 from adjust.model.survey import FloatArray, Point, Survey
 
@@ -65,7 +65,7 @@ def _exchanges(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
         yield Hypothesis(
             "given points exchanged", f"the given coordinates of points {a} and {b} are each other's",
             f"exchange the coordinates of {a} and {b} in survey.toml", Place("point", (a, b), "x_in_world"),
-            with_given(survey, {a: x[b], b: x[a]}),
+            with_given(survey, {a: x[b], b: x[a]}), _edits({a: x[b], b: x[a]}),
         )  # fmt: skip
 
 
@@ -83,7 +83,7 @@ def _slip(survey: Survey, name: str, axis: int, read: float, new: FloatArray) ->
     return Hypothesis(
         "slipped decimal", f"point {name}: the decimal point of its given {what} has slipped: {read:.10g} m for "
         f"{new[axis]:.10g} m", f"write {new[axis]:.10g} m for {what} of point {name} in survey.toml",
-        Place("point", (name,), what), with_given(survey, {name: new}),
+        Place("point", (name,), what), with_given(survey, {name: new}), _edits({name: new}),
     )  # fmt: skip
 
 
@@ -96,6 +96,12 @@ def _axes(survey: Survey, given: list[str]) -> Iterator[Hypothesis]:
         ("are millimetres, read as metres", "multiply all of them by 0.001", 0.001 * np.eye(3)),
         ("are metres, read as millimetres", "multiply all of them by 1000", 1000.0 * np.eye(3)),
     ):  # fmt: skip
+        new = {n: M @ v for n, v in x.items()}
         yield Hypothesis("axes or unit of given coordinates", f"the given coordinates {said}",
                          f"{remedy} in survey.toml", Place("point", tuple(given), "x_in_world"),
-                         with_given(survey, {n: M @ v for n, v in x.items()}))  # fmt: skip
+                         with_given(survey, new), _edits(new))  # fmt: skip
+
+
+def _edits(new: dict[str, FloatArray]) -> tuple[Edit, ...]:
+    """Other coordinates (m) of points, as keys of ``survey.toml``."""
+    return tuple(SetKey(("points", n, "x_mm"), tuple(float(f"{1e3 * c:.15g}") for c in x)) for n, x in new.items())

@@ -120,12 +120,14 @@ def _exchanges(
     for gain, (a, b), other, blocks in sorted(found, key=lambda f: -f[0])[:_MOST]:
         where = [survey.image_blocks[i] for i in sorted(blocks)]
         epochs = tuple(dict.fromkeys(x.epoch_id for x in where))
-        cameras = tuple(dict.fromkeys(x.camera_id for x in where))
+        at = {c: tuple(dict.fromkeys(x.epoch_id for x in where if x.camera_id == c)) for c in
+              dict.fromkeys(x.camera_id for x in where)}  # fmt: skip
         yield Hypothesis(
             name, f"{things} {a} and {b} are called by each other's names in {len(blocks)} images, the first at epoch "
             f"{epochs[0]}: wrong names, or they changed places", f"exchange them in {column} of image_points.csv",
             Place(column.removesuffix("_id"), (a, b), column, epochs), _renamed(survey, blocks),
-            (Rename("image_points", column, other, {"camera_id": cameras, "epoch_id": epochs}),), gain, 1, looked_at,
+            tuple(Rename("image_points", column, other, {"camera_id": (c,), "epoch_id": e}) for c, e in at.items()),
+            gain, 1, looked_at,
         )  # fmt: skip
 
 

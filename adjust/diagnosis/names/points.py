@@ -81,8 +81,10 @@ def _evidence(before: Screen, changed: Survey, rows: IntArray) -> float:
 def _hypothesis(changed: Survey, setup_id: str | None, a: str, b: str, evidence: float) -> Hypothesis:
     where = "everywhere" if setup_id is None else f"in set-up {setup_id}"
     at = {} if setup_id is None else {"setup_id": (setup_id,)}
+    mine = (r for r in changed.readings if r.second is not None and setup_id in (None, r.setup_id))
+    second = ("second_id",) if any(r.second is not None and r.second.point_id in (a, b) for r in mine) else ()
     return Hypothesis(
         "points exchanged", f"points {a} and {b} are called by each other's names {where}",
         "exchange them in to_id of terrestrial.csv", Place("point", (a, b), "to_id"), changed,
-        (Rename("terrestrial", "to_id", {a: b, b: a}, at),), evidence,
+        tuple(Rename("terrestrial", c, {a: b, b: a}, at) for c in ("to_id", *second)), evidence,
     )  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.diagnosis.case import CAP, Case
-from adjust.diagnosis.hypothesis import ChangeColumns, Hypothesis, Place
+from adjust.diagnosis.hypothesis import ChangeColumns, Edit, ExchangeColumns, Hypothesis, Place
 from adjust.diagnosis.screen import Screen, screen
 from adjust.diagnosis.sequences import Link, fitted, links, typical, with_pairs
 from adjust.diagnosis.units.conventions import Scope
@@ -32,13 +32,16 @@ _LARGE = 500
 
 @dataclass(frozen=True)
 class Convention:
-    """name: of the kind of mistake. said: what is wrong. remedy: in pairs.csv. mend: the motion as it was meant."""
+    """name: of the kind of mistake. said: what is wrong. remedy: in pairs.csv. mend: the motion as it was meant.
+
+    columns: the numbers of pairs.csv that change, and by which matrix, where that mends it.
+    """
 
     name: str
     said: str
     remedy: str
     mend: Callable[[Motion], Motion | None]
-    scale: float | None = None
+    columns: tuple[tuple[str, ...], FloatArray] | None = None
 
 
 def _inverted(m: Motion) -> Motion:
@@ -101,20 +104,21 @@ def _scaled(factor: float) -> Callable[[Motion], Motion | None]:
     return lambda m: Pose3(m.rotation(), factor * m.translation()) if isinstance(m, Pose3) else None
 
 
+_SHIFT, _QUATERNION = ("tx_mm", "ty_mm", "tz_mm"), ("qw", "qx", "qy", "qz")
 CONVENTIONS: tuple[Convention, ...] = (
     Convention("pairs inverted", "are a_from_b, read as b_from_a", "exchange a_id and b_id", _inverted),
     Convention("unit of shifts", "have shifts in metres, read as millimetres", "multiply tx, ty, tz by 1000",
-               _scaled(1000.0), 1000.0),
+               _scaled(1000.0), (_SHIFT, 1000.0 * np.eye(3))),
     Convention("unit of shifts", "have shifts in millimetres, read as metres", "multiply tx, ty, tz by 0.001",
-               _scaled(0.001), 0.001),
+               _scaled(0.001), (_SHIFT, 0.001 * np.eye(3))),
     Convention("unit of shifts", "have shifts in inches, read as millimetres", "multiply tx, ty, tz by 25.4",
-               _scaled(25.4), 25.4),
+               _scaled(25.4), (_SHIFT, 25.4 * np.eye(3))),
     Convention("order of quaternions", "have quaternions in the order x y z w, read as w x y z",
-               "put the last of the four numbers first", _last_first),
+               "put the last of the four numbers first", _last_first, (_QUATERNION, np.roll(np.eye(4), 1, axis=0))),
     Convention("order of quaternions", "have quaternions in the order w x y z, read as x y z w",
-               "put the first of the four numbers last", _first_last),
+               "put the first of the four numbers last", _first_last, (_QUATERNION, np.roll(np.eye(4), -1, axis=0))),
     Convention("rotations inverted", "have the rotation of a_from_b beside the shift of b_from_a",
-               "negate qx, qy and qz", _turned_back),
+               "negate qx, qy and qz", _turned_back, (_QUATERNION[1:], -np.eye(3))),
     Convention("shift in other axes", "have the origin of b in a, read as that of a in b",
                "replace the shifts t by -R t", _origin_of_a),
     Convention("order of Euler angles", "have Euler angles about x, y, z, read as about z, y, x",
@@ -122,7 +126,7 @@ CONVENTIONS: tuple[Convention, ...] = (
     Convention("order of Euler angles", "have Euler angles of order 2-1-3, read as z, y, x",
                "name the columns by that order", _other_euler),
     Convention("left-handed frames", "are of frames whose z axis points the other way (left-handed)",
-               "negate qx, qy and tz", _left_handed),
+               "negate qx, qy and tz", _left_handed, (("qx", "qy", "tz_mm"), -np.eye(3))),
 )  # fmt: skip
 
 
@@ -265,9 +269,11 @@ def _of_pairs(found: Screen, survey: Survey) -> FloatArray:
     return np.array([at.get(p.pair_id, 0.0) for p in survey.pairs])
 
 
-def _edits(survey: Survey, rows: IntArray, convention: Convention) -> tuple[ChangeColumns, ...]:
-    if convention.scale is None:
+def _edits(survey: Survey, rows: IntArray, convention: Convention) -> tuple[Edit, ...]:
+    where = {"pair_id": tuple(survey.pairs[i].pair_id for i in rows)}
+    if convention.mend is _inverted:
+        return (ExchangeColumns("pairs", ("a_id", "b_id"), where),)
+    if convention.columns is None:
         return ()
-    ids = tuple(survey.pairs[i].pair_id for i in rows)
-    return (ChangeColumns("pairs", ("tx_mm", "ty_mm", "tz_mm"), convention.scale * np.eye(3), np.zeros(3),
-                          {"pair_id": ids}),)  # fmt: skip
+    columns, matrix = convention.columns
+    return (ChangeColumns("pairs", columns, matrix, np.zeros(len(columns)), where),)

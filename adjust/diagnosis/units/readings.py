@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
-from adjust.diagnosis.hypothesis import Hypothesis, Place
+from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, Place
 from adjust.diagnosis.screen import Screen, improvement, screen
 from adjust.diagnosis.units.conventions import ANGLES, LENGTHS, MISREADINGS, SLIPS, TURNS, Misreading, Scope
 from adjust.graph.assembly import values_of
@@ -158,9 +158,11 @@ def _concerns_all(survey: Survey, scope: Scope) -> bool:
 
 
 def _hypothesis(survey: Survey, scope: Scope, misreading: Misreading, evidence: float, looked_at: int) -> Hypothesis:
+    ids = tuple(survey.readings[i].reading_id for i in scope.rows)
     return Hypothesis(
         misreading.name, _cause(scope, misreading), _remedy(misreading), scope.place,
-        mended(survey, scope.rows, misreading), (), evidence, 1, max(looked_at, 1),
+        mended(survey, scope.rows, misreading), (ChangeReadings(ids, misreading.factor, misreading.offset),), evidence,
+        1, max(looked_at, 1),
     )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from adjust.model.errors import DiagnosedError, IndeterminateError, NotConvergedError, SurveyError
@@ -17,10 +18,10 @@ _LARGE = 1.15
 """sigma0 from which a mistake is looked for by trial; below, sigmas that are a little small explain as much."""
 
 
-def explained(survey: Survey, error: SurveyError) -> SurveyError:
-    """What an adjustment of ``survey`` raised, with the probable causes in front where there are any."""
+def explained(survey: Survey, error: SurveyError, folder: Path) -> SurveyError:
+    """What an adjustment of the ``survey`` of a folder raised, with the probable causes in front, if any."""
     apart, contradictions = separate_epochs(survey), _probable_causes(survey)
-    diagnosis = _diagnosis(survey, None, error, contradictions)
+    diagnosis = _located(_diagnosis(survey, None, error, contradictions), folder)
     tried = diagnosis.lines if diagnosis is not None else ()
     if not apart and not contradictions and not tried:
         return error
@@ -30,8 +31,8 @@ def explained(survey: Survey, error: SurveyError) -> SurveyError:
     return SurveyError(message) if diagnosis is None else DiagnosedError(message, diagnosis)
 
 
-def with_probable_causes(survey: Survey, result: Adjustment) -> Adjustment:
-    """The adjustment of ``survey`` with the probable causes of what contradicts as its first warnings."""
+def with_probable_causes(survey: Survey, result: Adjustment, folder: Path) -> Adjustment:
+    """The adjustment of the ``survey`` of a folder; its first warnings are the probable causes of what contradicts."""
     warnings: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     if survey.tables:
@@ -42,7 +43,7 @@ def with_probable_causes(survey: Survey, result: Adjustment) -> Adjustment:
         # what does not fit may have spoilt the lenses too: then those that the images alone give
         causes = _probable_causes(survey, result) or _probable_causes(survey)
         if not warnings:
-            diagnosis = _diagnosis(survey, result, None, causes)
+            diagnosis = _located(_diagnosis(survey, result, None, causes), folder)
             warnings = diagnosis.lines if diagnosis is not None else ()
         warnings += tuple(c for c in causes if c not in warnings)
     lines = tuple(f"probable cause: {c}" for c in warnings)
@@ -64,6 +65,14 @@ def _diagnosis(
 
     found = diagnose(Case(survey, result, error))
     return found if found.candidates else None
+
+
+def _located(found: "Diagnosis | None", folder: Path) -> "Diagnosis | None":
+    if found is None:
+        return None
+    from survey.jobs.adjusting.places import located  # here: as above
+
+    return located(found, folder)
 
 
 def _consequence(error: SurveyError) -> str:

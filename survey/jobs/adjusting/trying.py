@@ -1,39 +1,30 @@
-"""A candidate of a diagnosis carried out on the project folder, so that it can be taken back."""
+"""A candidate of a diagnosis carried out on the project folder: all of it or nothing, so that it can be taken back."""
 
-import csv
-import io
-import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 
-import numpy as np
-
-from adjust.diagnosis.hypothesis import ChangeColumns, Edit, Hypothesis, LeaveOut, Rename, ScaleKey, SetKey
+from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import DiagnosedError, SurveyError
 from survey.folder.replacing import changing, replace_parts
-from survey.folder.text import atomic_write, decode, read_bytes
+from survey.folder.text import atomic_write
+from survey.jobs.adjusting.edits import changed_files, left_out
 from survey.jobs.adjusting.steps import adjust_project
-from survey.jobs.excluding import exclude_job
+from survey.jobs.excluding import FILE, new_rows
 from survey.project import read
-from survey.project.declared.toml_text import key_lines
-
-DEFINITION, KEPT = "survey.toml", "kept"
-FileEdit = ScaleKey | SetKey | ChangeColumns | Rename
-_LENGTHS = ("square_mm", "marker_mm", "gap_mm")
-_NUMBER = re.compile(r"(=\s*)([-+0-9.eE_]+)")
+from survey.project.exclusions import appended
+from survey.project.observed import Observed
+from survey.project.project import Project
+from survey.project.reading import read_all
 
 
 def try_job(folder: Path, number: int) -> str:
     """Adjust, and carry out candidate ``number`` (from 1) of the diagnosis. What was done, for people.
 
     Files that are changed are kept as they were below ``kept/``; what is left out becomes rows of ``exclusions.csv``.
-    Raises SurveyError where there is no such candidate, or where only a person can do it.
+    Raises SurveyError, with nothing written, where there is no such candidate, where only a person can do it, and where
+    the project could not be read afterwards.
     """
-    chosen = chosen_of(folder, _candidates(folder), number)
-    done = [_carried_out(folder, edit, chosen) for edit in chosen.edits]
-    return "\n".join([f"changed: {chosen.cause}", *(f"  {line}" for line in done)])
+    return carried_out(folder, chosen_of(folder, _candidates(folder), number))
 
 
 def chosen_of(folder: Path, candidates: Sequence[Hypothesis], number: int) -> Hypothesis:
@@ -56,114 +47,40 @@ def _candidates(folder: Path) -> list[Hypothesis]:
     return [] if diagnosis is None else [c.hypothesis for c in diagnosis.candidates]
 
 
-def _carried_out(folder: Path, edit: Edit, chosen: Hypothesis) -> str:
-    if isinstance(edit, LeaveOut):
-        exclude_job(folder, edit.names, reason_of(chosen))
-        rows = f"{len(edit.names)} row{'s' if len(edit.names) > 1 else ''}"
-        return f"observations/exclusions.csv: {rows} added; labsurvey include takes them back"
-    name, before, text = edited(folder, edit, chosen)
-    kept = kept_name(folder, name)
+def carried_out(folder: Path, chosen: Hypothesis) -> str:
+    """All edits of a hypothesis made in the project, or none. What was done, for people. Raises SurveyError."""
     with changing(folder, inputs=True) as place:
-        for path, content in ((kept, before), (name, text)):
-            (place / path).parent.mkdir(parents=True, exist_ok=True)
-            atomic_write(place / path, content)
+        changed = changed_files(folder, chosen)
+        after = _readable(folder, {file.name: file.after for file in changed})
+        names = in_use(read(folder), left_out(chosen))
+        texts = {name: text for file in changed for name, text in ((file.kept, file.before), (file.name, file.after))}
+        if names:
+            texts[FILE] = appended(folder / FILE, new_rows(after, names, reason_of(chosen)))
+        for name, text in texts.items():
+            (place / name).parent.mkdir(parents=True, exist_ok=True)
+            atomic_write(place / name, text)
         replace_parts(folder)
-    return f"{name}: changed; as it was: {kept}"
+    lines = [f"{file.name}: changed; as it was: {file.kept}" for file in changed]
+    if names:
+        rows = f"{len(names)} row{'s' if len(names) > 1 else ''}"
+        lines.append(f"{FILE}: {rows} added; labsurvey include takes them back")
+    return "\n".join([f"changed: {chosen.cause}", *(f"  {line}" for line in lines)])
+
+
+def _readable(folder: Path, texts: Mapping[str, str]) -> Project:
+    """The project as it would be; raises SurveyError where it could not be read any more."""
+    try:
+        return read_all(folder, texts)
+    except SurveyError as error:
+        raise SurveyError(f"{folder}: nothing was changed: with this change {error}") from error
+
+
+def in_use(now: Project, names: Sequence[str]) -> tuple[str, ...]:
+    """Those names of which something is not left out already, by people or in a table."""
+    observed = Observed(now.survey, now.spots)
+    return tuple(name for name in names if observed.is_used(observed.find(name)))
 
 
 def reason_of(chosen: Hypothesis) -> str:
     """Why something is left out that a candidate leaves out, for ``exclusions.csv``."""
     return f"tried: {chosen.cause}"
-
-
-def edited(
-    folder: Path, edit: FileEdit, chosen: Hypothesis, texts: Mapping[str, str] = MappingProxyType({})
-) -> tuple[str, str, str]:
-    """The file that an edit changes, by its path in the folder, and its text before and after; nothing is written.
-
-    texts: of files that are to be read instead. Raises SurveyError.
-    """
-    name = DEFINITION if isinstance(edit, ScaleKey | SetKey) else f"observations/{edit.table}.csv"
-    path = folder / name
-    if not path.exists():
-        raise SurveyError(f"{path}: this project has no such table; {chosen.change}")
-    before = texts[name] if name in texts else decode(path, read_bytes(path)[0])
-    return name, before, _definition(path, before, edit) if isinstance(edit, ScaleKey | SetKey) else _table(
-        path, before, edit, chosen)  # fmt: skip
-
-
-def kept_name(folder: Path, name: str) -> str:
-    """A name below ``kept/`` that nothing has yet."""
-    path = Path(name)
-    number = 1
-    while (folder / KEPT / f"{path.stem}-{number}{path.suffix}").exists():
-        number += 1
-    return f"{KEPT}/{path.stem}-{number}{path.suffix}"
-
-
-def _definition(path: Path, text: str, edit: ScaleKey | SetKey) -> str:
-    """``survey.toml`` with the change, its comments and order kept."""
-    where, lines = key_lines(text), text.splitlines(keepends=True)
-    if isinstance(edit, ScaleKey):
-        keys = [(*edit.path, key) for key in _LENGTHS if (*edit.path, key) in where] or [edit.path]
-        for key in keys:
-            if key not in where:
-                raise SurveyError(f"{path}: no length of {'.'.join(edit.path)} stands there; its points are in a file: "
-                                  f"multiply them by {edit.factor:.9g}")  # fmt: skip
-            lines[where[key] - 1] = _scaled(lines[where[key] - 1], str(key[-1]), edit.factor)
-    elif edit.path in where:
-        raise SurveyError(f"{path}:{where[edit.path]}: {edit.path[-1]} is given; set it to {_toml(edit.value)}")
-    elif edit.path[:2] not in where:
-        raise SurveyError(f"{path}: [{'.'.join(edit.path[:2])}] is not there; set {'.'.join(edit.path)} yourself")
-    else:
-        new = f"{'.'.join(edit.path[2:])} = {_toml(edit.value)}\n"
-        lines.insert(where[edit.path[:2]], new)
-    changed = "".join(lines)
-    tomllib.loads(changed)
-    return changed
-
-
-def _scaled(line: str, key: str, factor: float) -> str:
-    at = re.search(rf"\b{re.escape(key)}\b", line)
-    begin = at.start() if at else 0
-    return line[:begin] + _NUMBER.sub(lambda m: f"{m[1]}{float(m[2]) * factor:.9g}", line[begin:], count=1)
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, tuple):
-        return f"[{', '.join(_toml(v) for v in value)}]"
-    return f'"{value}"' if isinstance(value, str) else repr(value)
-
-
-def _table(path: Path, text: str, edit: ChangeColumns | Rename, chosen: Hypothesis) -> str:
-    """A table with its rows changed; lines that are not concerned stay as they are."""
-    lines = text.splitlines(keepends=True)
-    begin = next((i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
-    header = next(csv.reader([lines[begin]]), []) if begin < len(lines) else []
-    names = [name.strip() for name in header]
-    wanted = edit.columns if isinstance(edit, ChangeColumns) else (edit.column,)
-    if missing := [name for name in wanted if name not in names]:
-        raise SurveyError(f"{path}:{begin + 1}: the column {missing[0]!r} is missing; {chosen.change}")
-    for i in range(begin + 1, len(lines)):
-        if not lines[i].strip() or lines[i].startswith("#"):
-            continue
-        cells = next(csv.reader([lines[i]]))
-        row = dict(zip(names, cells, strict=False))
-        if all(row.get(column) in values for column, values in edit.where.items()):
-            lines[i] = _row([(_changed(row, edit)).get(name, row.get(name, "")) for name in names])
-    return "".join(lines)
-
-
-def _changed(row: Mapping[str, str], edit: ChangeColumns | Rename) -> dict[str, str]:
-    if isinstance(edit, Rename):
-        return {edit.column: edit.names.get(row[edit.column], row[edit.column])}
-    values = edit.matrix @ np.array([float(row[name]) for name in edit.columns]) + edit.offset
-    return {name: f"{value:.12g}" for name, value in zip(edit.columns, values, strict=True)}
-
-
-def _row(cells: list[str]) -> str:
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerow(cells)
-    return out.getvalue()

@@ -3,7 +3,8 @@
 What a text says after that is for the readers to judge; here only the place of a key is known.
 """
 
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,66 @@ from survey.folder.units import from_si
 from survey.project.declared.owners import GEOMETRY_UNITS, geometry_key
 from survey.project.declared.poses import quaternion_wxyz
 
+LENGTHS = ("square_mm", "marker_mm", "gap_mm", "markers")
+"""The keys of a target that say how large it is."""
 _OF_POSE = ("rotation_euler_xyz_deg", "held", "sigma_rotation_arcsec", "sigma_translation_mm", "covariance")
+
+
+def with_value(text: str, path: Sequence[str], value: object) -> str:
+    """With another value of the key at a path, which is made where it is not there. Raises SurveyError."""
+    def change(at: Any) -> None:
+        before = at.get(path[-1])
+        n = len(before) if isinstance(before, list) and any(isinstance(x, float | int) for x in before) else None
+        at[path[-1]] = list(value)[:n] if isinstance(value, tuple) else value
+
+    return _with_change(text, path[:-1], change)
+
+
+def with_product(text: str, path: Sequence[str], factor: float) -> str:
+    """With the number, or every length of the target, at a path multiplied; a scale that is not there was 1.
+
+    Raises SurveyError where no number stands there: points of a target in a file of their own.
+    """
+    owner = tomllib.loads(text)
+    for key in path:
+        owner = owner.get(key, {}) if isinstance(owner, dict) else owner
+    keys = [key for key in LENGTHS if isinstance(owner, dict) and key in owner]
+    if path[:2] == ("sigmas", "scale") or not isinstance(owner, dict):
+        number = 1.0 if isinstance(owner, dict) else owner
+        return with_value(text, path, _times(number, factor))
+    if not keys:
+        raise SurveyError(f"no length of {'.'.join(path)} stands there; its points are in a file: multiply them by "
+                          f"{factor:.9g}")  # fmt: skip
+
+    def change(at: Any) -> None:
+        for key in keys:
+            at[key] = _times(owner[key], factor)
+
+    return _with_change(text, path, change)
+
+
+def _times(value: Any, factor: float) -> Any:
+    """A number, or every number of a list or table, multiplied."""
+    if isinstance(value, Mapping):
+        return {key: _times(one, factor) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_times(one, factor) for one in value]
+    return float(f"{factor * value:.9g}")
+
+
+def _with_change(text: str, path: Sequence[str], change: Callable[[Any], None]) -> str:
+    """With the table at a path changed, and nothing else; raises SurveyError where the text does not allow that."""
+    wanted = tomllib.loads(text)
+    at = wanted
+    for key in path:
+        at = at.setdefault(key, {})
+    change(at)
+    document: Any = tomlkit.parse(text)
+    change(_table(document, *path))
+    new = tomlkit.dumps(document)
+    if tomllib.loads(new) != wanted:
+        raise SurveyError(f"{'.'.join(path)} cannot be changed by a program here; edit it yourself")
+    return new
 
 
 def with_sigma_scale(text: str, group: str, factor: float) -> str:
