@@ -29,7 +29,7 @@ def _statements(node: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
         elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
             for other in child.orelse:
                 yield from _statements(ast.Module([other], []))
-        else:
+        elif not isinstance(child, ast.expr):
             yield from _statements(child)
 
 

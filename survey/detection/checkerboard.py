@@ -54,12 +54,14 @@ def other_board(gray: Gray32, gray8: Gray8, target: Checkerboard) -> tuple[int, 
     """
     c, r = target.columns, target.rows
     steps = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1), (1, -1), (-1, 1))
-    for columns, rows in ((c + i, r + j) for i, j in steps):
-        found = _find(gray8, columns, rows) if min(columns, rows) >= 3 else None
-        if found is not None:
-            detection, whole = _measured(gray, gray8, found.reshape(rows, columns, 2))
-            if len(detection):
-                return _size(whole)
+    sizes = [(c + i, r + j) for i, j in steps if min(c + i, r + j) >= 3]
+    for finder in (_glimpsed, _find):  # what is not there takes long: first a quick look for all sizes
+        for columns, rows in sizes:
+            found = finder(gray8, columns, rows)
+            if found is not None:
+                detection, whole = _measured(gray, gray8, found.reshape(rows, columns, 2))
+                if len(detection):
+                    return _size(whole)
     return None
 
 
@@ -107,17 +109,29 @@ def _find(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
     an image without a board its other thresholds follow the noise for half a second, unless a look at the squares
     beforehand stops it, which now and then overlooks a board: without that look it has a smoothed image.
     """
+    if (found := _glimpsed(gray8, columns, rows)) is not None:
+        return found
     pattern = (columns, rows)
-    small, factor = halved(gray8, _SQUARE_PX * max(pattern))
-    ok, corners = cv2.findChessboardCorners(small, pattern, flags=0)
-    if not ok or _off_grid(np.reshape(corners, (rows, columns, 2))).max() > _REGULAR:
-        small, factor = reduced(gray8, _COARSE_PX)
-        ok, corners = _found_in(small, pattern)
+    small, factor = reduced(gray8, _COARSE_PX)
+    ok, corners = _found_in(small, pattern)
     if ok:
-        return np.asarray((np.reshape(corners, (-1, 2)).astype(float) + 0.5) * factor - 0.5)
+        return _enlarged(corners, factor)
     if small is not gray8:
         ok, corners = cv2.findChessboardCorners(gray8, pattern, flags=_CLASSIC | cv2.CALIB_CB_FAST_CHECK)
     return np.reshape(corners, (-1, 2)).astype(float) if ok else None
+
+
+def _glimpsed(gray8: Gray8, columns: int, rows: int) -> FloatArray | None:
+    """Corners (n, 2) px that the classic finder sees in a small image at once, and that lie as on a board."""
+    small, factor = halved(gray8, _SQUARE_PX * max(columns, rows))
+    ok, corners = cv2.findChessboardCorners(small, (columns, rows), flags=0)
+    if not ok or _off_grid(np.reshape(corners, (rows, columns, 2))).max() > _REGULAR:
+        return None
+    return _enlarged(corners, factor)
+
+
+def _enlarged(corners: Any, factor: FloatArray) -> FloatArray:
+    return np.asarray((np.reshape(corners, (-1, 2)).astype(float) + 0.5) * factor - 0.5)
 
 
 def _found_in(coarse: Gray8, pattern: tuple[int, int]) -> tuple[bool, Any]:

@@ -88,12 +88,16 @@ def filling(folder: Path) -> Iterator[Path]:
             yield place
         return
     with changing(folder, inputs=True) as place:
+        _refuse(folder, ["survey.toml"])  # before the work
         yield place
-        names = [name for entry in place.iterdir() for name in _files(place, entry.name)]
-        there = next((name for name in sorted(names) if os.path.lexists(folder / name)), None)
-        if there is not None:
-            raise SurveyError(f"{folder / there}: there is a project already; choose another folder")
+        _refuse(folder, [name for entry in place.iterdir() for name in _files(place, entry.name)])
         replace_parts(folder)
+
+
+def _refuse(folder: Path, names: Sequence[str]) -> None:
+    there = next((name for name in sorted(names) if os.path.lexists(folder / name)), None)
+    if there is not None:
+        raise SurveyError(f"{folder / there}: there is a project already; choose another folder")
 
 
 def write_set(folder: Path, texts: Mapping[str, str]) -> dict[str, Path]:

@@ -74,22 +74,22 @@ def start_project(images: Path, folder: Path) -> StartOutcome:
     sizes: dict[str, tuple[int, int]] = {}
     seen: Counter[tuple[int, int]] = Counter()
     looked_at = with_markers = 0
-    for camera, paths in cameras.items():
-        chosen = {paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, _LOOKED_AT).astype(int))}
-        for path in paths:
-            image = read_image(path)
-            size = (image.shape[1], image.shape[0])
-            if sizes.setdefault(camera, size) != size:
-                raise SurveyError(f"{path}: {size[0]} x {size[1]} px, but {paths[0].name} has {sizes[camera][0]} x "
-                                  f"{sizes[camera][1]}; images of one camera have one size: put others into a folder "
-                                  "of their own")  # fmt: skip
-            if path in chosen:
-                board, markers = _shown(image)
-                looked_at += 1
-                with_markers += markers
-                seen.update([board] if board is not None else [])
-    board, n = seen.most_common(1)[0] if seen else (None, 0)
     with filling(Path(folder)) as place:
+        for camera, paths in cameras.items():
+            chosen = {paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, _LOOKED_AT).astype(int))}
+            for path in paths:
+                image = read_image(path)
+                size = (image.shape[1], image.shape[0])
+                if sizes.setdefault(camera, size) != size:
+                    first = " x ".join(map(str, sizes[camera]))
+                    raise SurveyError(f"{path}: {size[0]} x {size[1]} px, but {paths[0].name} has {first}; images of "
+                                      "one camera have one size: put others into a folder of their own")  # fmt: skip
+                if path in chosen:
+                    board, markers = _shown(image)
+                    looked_at += 1
+                    with_markers += markers
+                    seen.update([board] if board is not None else [])
+        board, n = seen.most_common(1)[0] if seen else (None, 0)
         for camera, paths in cameras.items():
             (place / IMAGES_FOLDER / camera).mkdir(parents=True)
             for path in paths:

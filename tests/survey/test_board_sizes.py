@@ -125,19 +125,19 @@ def project(folder, columns, rows, n=2):
 )
 def test_a_wrong_size_is_said_once_with_the_keys_to_change(tmp_path, columns, rows, says):
     with pytest.raises(SurveyError) as error:
-        detect_job(project(tmp_path / "lab", columns, rows, 3 if rows == 7 else 1), jobs=1, progress=False)
+        detect_job(project(tmp_path / "lab", columns, rows, 3 if columns == 8 else 1), jobs=1, progress=False)
     assert str(error.value).count("\n") == 0
     assert f"[targets.board] says columns = {columns}, rows = {rows}" in str(error.value)
     assert f"set columns = {says[0]}, rows = {says[1]}" in str(error.value)
 
 
 def test_a_second_board_of_another_size_is_no_wrong_size(tmp_path):
-    lab = project(tmp_path / "lab", 9, 6)
+    lab = project(tmp_path / "lab", 9, 6, 1)
     with open(lab / "survey.toml", "a") as file:
         file.write('[targets.part]\nkind = "checkerboard"\ncolumns = 7\nrows = 6\nsquare_mm = 20\nmotion = "epoch"\n')
     outcome = detect_job(lab, jobs=1, progress=False)
     assert outcome.wrong_sizes == {}
-    assert outcome.summary()["image_points"] == 2 * 54
+    assert outcome.summary()["image_points"] == 54
 
 
 def test_a_wrong_size_is_said_at_every_adjustment(tmp_path):
@@ -148,9 +148,8 @@ def test_a_wrong_size_is_said_at_every_adjustment(tmp_path):
     (lab / "survey.toml").write_text(toml)
     with open(lab / "survey.toml", "a") as file:
         file.write('[targets.small]\nkind = "checkerboard"\ncolumns = 7\nrows = 5\nsquare_mm = 20\nmotion = "epoch"\n')
-    for k in range(3):
-        view = placed(Checkerboard(7, 4, 0.02), (0.1, 0.2 * k, 0.1))
-        cv2.imwrite(str(lab / "images" / "c" / f"s{k}.png"), image_of(view, seed=k, camera=SMALL))
+    view = placed(Checkerboard(7, 4, 0.02), (0.1, 0.2, 0.1))
+    cv2.imwrite(str(lab / "images" / "c" / "s1.png"), image_of(view, camera=SMALL))
     text = "survey.toml: [targets.small] says columns = 7, rows = 5, but the images show a board of 7 x 4 inner corners"
     for _ in range(2):
         said = [w for w in adjust_job(lab, progress=False).adjustment.warnings if w.startswith("detection")]

@@ -44,12 +44,12 @@ def test_cameras_sizes_and_board_are_read_out_of_the_images(images, tmp_path, ca
 
 def test_one_folder_is_one_camera_and_a_name_may_be_anything(images, tmp_path):
     place = tmp_path / 'my "camera" 1'
-    shutil.copytree(images / "left", place)
+    shutil.copytree(images / "left", place, ignore=shutil.ignore_patterns("e03*", "e04*"))
     with pytest.raises(SurveyError, match="its name is that of the camera"):
         start_project(place, tmp_path / "no")
     assert not (tmp_path / "no").exists()
     outcome = start_project(place.rename(tmp_path / "camera-1"), tmp_path / "yes")
-    assert list(outcome.cameras.values()) == [(4, (1280, 1024))]
+    assert list(outcome.cameras.values()) == [(2, (1280, 1024))]
     assert outcome.summary()["board"] == [9, 6]
 
 

@@ -16,6 +16,8 @@ from survey.workbench.session import Workbench
 from tests.survey.test_report_browser import need_browser
 from tests.survey.test_workbench_browser import Page, need_playwright
 
+pytestmark = [pytest.mark.slow, pytest.mark.browser]
+
 POINT = "image_point:X/tX05/board/c40"  # moved by 4 px
 READING = "table_angles:turntable/tZ05"  # typed wrong by half a degree
 

@@ -3,7 +3,9 @@
 Every view says ``inner_from_outer = inner_from_mount * mount_from_table(angles) * table_from_outer``.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +19,8 @@ from adjust.start.closed_forms.hand_eye import relative_motions, solve_ax_xb, so
 _MEDIAN_6 = 5.348  # of chi-square with six degrees of freedom
 _BOUND = 30.0  # weights fall beyond this many times the median
 _LEVER_M = 1.0
+Known = dict[tuple[Any, ...], Any]
+"""Poses that fits began with, by the function and the numbers that they follow from."""
 _GEOMETRY_SIGMAS = np.array([np.radians(1.0), 0.02])  # weak: only so that no direction is wholly open
 
 
@@ -49,15 +53,17 @@ def residuals(
 
 
 def fit_table(
-    views: TableViews, place: IntArray, start: TableFit | None = None, iterations: int = 12
+    views: TableViews, place: IntArray, start: TableFit | None = None, iterations: int = 12, known: Known | None = None
 ) -> TableFit | None:
     """Robust least squares; ``place`` (n,): which place of an outer thing each view shows. None where nothing starts.
 
-    Gauss-Newton with Geman-McClure weights whose scale follows the median.
+    Gauss-Newton with Geman-McClure weights whose scale follows the median. known: poses that fits of the same views
+    began with, to which those of this one are added: most trials differ in few of them.
     """
     geometry = given_geometry(views.table) if start is None else start.geometry
     motions = views.motions(geometry=geometry)
-    begun = _start(views, motions, place) if start is None else _renewed(views, motions, place, start)
+    begun = (_start(views, motions, place, {} if known is None else known) if start is None
+             else _renewed(views, motions, place, start))  # fmt: skip
     if begun is None:
         return None
     X, Z = begun
@@ -118,12 +124,12 @@ def _renewed(
     """The inner poses of another fit, with every place as the mean of what its views say."""
     X = start.mount_from_inner
     offers = motions[views.epoch] @ X[views.inner] @ views.poses
-    Z = [mean_pose(offers[place == p], _LEVER_M)[0] for p in range(int(place.max()) + 1)]
+    Z = [_mean(offers[place == p]) for p in range(int(place.max()) + 1)]
     return X, np.array(Z)
 
 
 def _start(
-    views: TableViews, motions: FloatArray, place: IntArray
+    views: TableViews, motions: FloatArray, place: IntArray, known: Known
 ) -> tuple[FloatArray, FloatArray] | None:
     """Closed form for the group of views with most turns, then one constant pose after the other."""
     n_places = int(place.max()) + 1
@@ -133,7 +139,7 @@ def _start(
     rows = {g: np.flatnonzero((views.inner == g[0]) & (place == g[1])) for g in groups}
     M = motions[views.epoch]
     for g in sorted(groups, key=lambda g: -len(rows[g])):
-        found = _closed_form(M[rows[g]], views.poses[rows[g]])
+        found = _once(known, _closed_form, M[rows[g]], views.poses[rows[g]])
         if found is not None:
             X[g[0]], Z[g[1]] = found
             break
@@ -146,12 +152,23 @@ def _start(
         i, p = max(open_ones, key=lambda g: len(rows[g]))
         use = rows[i, p]
         if i in X:
-            Z[p] = mean_pose(M[use] @ X[i] @ views.poses[use], _LEVER_M)[0]
+            Z[p] = _once(known, _mean, M[use] @ X[i] @ views.poses[use])
         else:
-            X[i] = mean_pose(inverse(M[use]) @ Z[p] @ inverse(views.poses[use]), _LEVER_M)[0]
+            X[i] = _once(known, _mean, inverse(M[use]) @ Z[p] @ inverse(views.poses[use]))
     if len(X) < len(views.inner_ids) or len(Z) < n_places:
         return None
     return np.array([X[i] for i in range(len(X))]), np.array([Z[p] for p in range(n_places)])
+
+
+def _once(known: Known, function: Callable[..., Any], *given: FloatArray) -> Any:
+    key = (function, *(g.tobytes() for g in given))
+    if key not in known:
+        known[key] = function(*given)
+    return known[key]
+
+
+def _mean(offers: FloatArray) -> FloatArray:
+    return mean_pose(offers, _LEVER_M)[0]
 
 
 def _closed_form(motions: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray] | None:
@@ -167,4 +184,4 @@ def _closed_form(motions: FloatArray, poses: FloatArray) -> tuple[FloatArray, Fl
         Z, _ = solve_ax_xb(a, b, True)
     except (SurveyError, np.linalg.LinAlgError):
         return None
-    return mean_pose(inverse(motions) @ Z @ inverse(poses), _LEVER_M)[0], Z
+    return _mean(inverse(motions) @ Z @ inverse(poses)), Z

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.diagnosis.table.fit import TableFit, fit_table, residuals
+from adjust.diagnosis.table.fit import Known, TableFit, fit_table, residuals
 from adjust.diagnosis.table.views import TableViews
 from adjust.model.survey import FloatArray, IntArray, Target
 from adjust.spatial.rigid import inverse, rotation_exp, rotation_log, transform
@@ -48,13 +48,14 @@ def outlying(fit: TableFit) -> IntArray:
 
 def find_places(views: TableViews) -> Places | None:
     """Whether an outer thing stood in two places; None where nothing can be fitted."""
-    one = fit_table(views, views.outer)
+    known: Known = {}
+    one = fit_table(views, views.outer, known=known)
     if one is None:
         return None
     if not len(outlying(one)) and one.scale < _VAGUE:
         return Places(views.outer, one)
     trials = [p for o in range(len(views.outer_ids)) for p in _splits(views, o)]
-    fits = [(p, f) for p in trials if (f := fit_table(views, p, None, 6)) is not None]
+    fits = [(p, f) for p in trials if (f := fit_table(views, p, None, 6, known)) is not None]
     if not fits:
         return Places(views.outer, one)
     scale = min([one.scale, *(f.scale for _, f in fits)])
