@@ -31,6 +31,20 @@ class PositionRef:
     frame: FrameRef | None = None
 
 
+def frame_text(ref: FrameRef) -> str:
+    """``kind:id@epoch``, as in the tables of the project folder; ``world``."""
+    if ref.kind == "world":
+        return "world"
+    return f"{ref.kind}:{ref.frame_id}" + (f"@{ref.epoch_id}" if ref.epoch_id else "")
+
+
+def position_text(ref: PositionRef) -> str:
+    """A position as people write it."""
+    if ref.frame is None:
+        return str(ref.point_id)
+    return frame_text(ref.frame) + (f"/{ref.point_id}" if ref.point_id else "")
+
+
 @dataclass(frozen=True, eq=False)
 class ImageBlock:
     """The image points that one camera saw of one target (or of the world's points) at one epoch.

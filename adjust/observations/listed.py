@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import gtsam
 
-from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.survey import FloatArray
 
 
@@ -20,15 +19,3 @@ class ObservationFactor:
     units: tuple[str, ...]
     observed: FloatArray
     used: bool = True
-
-
-def frame_text(ref: FrameRef) -> str:
-    """``kind:id@epoch``, as in the tables of the project folder."""
-    return f"{ref.kind}:{ref.frame_id}" + (f"@{ref.epoch_id}" if ref.epoch_id else "")
-
-
-def position_text(ref: PositionRef) -> str:
-    """A position as people write it."""
-    if ref.frame is None:
-        return str(ref.point_id)
-    return frame_text(ref.frame) + (f"/{ref.point_id}" if ref.point_id else "")

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from adjust.model.observations import FrameRef, ImageBlock
+from adjust.model.observations import FrameRef, ImageBlock, frame_text, position_text
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from survey.project.observed import Hits, Observed, name_of_residual
-from survey.project.tables.references import frame_text, position_text
 from survey.solution.dictionary import plain
 from survey.solution.quantities import sigma_unit_for_people, unit_for_people
 from survey.workbench.places import refs_of

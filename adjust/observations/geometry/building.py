@@ -10,7 +10,16 @@ from gtsam import Pose3
 from adjust.frames.state import State
 from adjust.frames.unknowns import Chain, FrameTree, Unknowns, VectorMap, vector_map
 from adjust.model.errors import SurveyError
-from adjust.model.observations import Alignment, FrameRef, LaserSpot, Level, OnSurface, PositionRef
+from adjust.model.observations import (
+    Alignment,
+    FrameRef,
+    LaserSpot,
+    Level,
+    OnSurface,
+    PositionRef,
+    frame_text,
+    position_text,
+)
 from adjust.model.result import ParameterName
 from adjust.model.survey import SURFACES, Beam, BoolArray, FloatArray, Surface, Survey, VectorParameter
 from adjust.observations.factors import ChainPose, Position, custom
@@ -23,7 +32,7 @@ from adjust.observations.geometry.residuals import (
     spot_residual,
     surface_residual,
 )
-from adjust.observations.listed import ObservationFactor, frame_text, position_text
+from adjust.observations.listed import ObservationFactor
 from adjust.spatial.vertical import VerticalMap, collect_vertical, up_at
 
 BEAM_UNITS = ("m", "m", "1", "1")

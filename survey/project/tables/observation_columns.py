@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair, TableReading
+from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair, TableReading, frame_text, position_text
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.units import from_si
 from survey.project.declared.poses import quaternion_wxyz
@@ -14,7 +14,6 @@ from survey.project.tables.coordinates import XYZ_RHO, XYZ_SIGMAS
 from survey.project.tables.covariance import sigmas_and_correlations
 from survey.project.tables.pairs import COVARIANCE_COLUMNS, QUATERNION, SIGMA_COLUMNS, TRANSLATION
 from survey.project.tables.reading import Columns, TextColumn
-from survey.project.tables.references import frame_text, position_text
 from survey.project.tables.terrestrial_columns import triple_rows
 
 _FLAGS = ("false", "true")

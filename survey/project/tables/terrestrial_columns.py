@@ -12,6 +12,8 @@ from adjust.model.observations import (
     OnSurface,
     Reading,
     ReadingCovariance,
+    frame_text,
+    position_text,
 )
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.units import from_si
@@ -19,7 +21,6 @@ from survey.project.tables.coordinates import DIFFERENCE, DIFFERENCE_RHO, DIFFER
 from survey.project.tables.covariance import sigmas_and_correlations
 from survey.project.tables.geometric import axis_text
 from survey.project.tables.reading import Columns
-from survey.project.tables.references import frame_text, position_text
 from survey.project.tables.terrestrial import ANGLES, HEIGHTS
 
 _Column = Sequence[str] | FloatArray
