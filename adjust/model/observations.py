@@ -62,6 +62,21 @@ class ImageBlock:
     used: BoolArray | None = None
     group: str = "image"
 
+    @property
+    def place(self) -> tuple[str, str, str | None, str]:
+        """What tells it from the other blocks of a survey."""
+        return self.camera_id, self.epoch_id, self.target_id, self.group
+
+    @property
+    def mask(self) -> BoolArray:
+        """Which points (n,) are used."""
+        return np.ones(len(self.uv), dtype=np.bool_) if self.used is None else np.asarray(self.used, dtype=np.bool_)
+
+    @property
+    def n_used(self) -> int:
+        """How many are."""
+        return len(self.uv) if self.used is None else int(np.count_nonzero(self.used))
+
     def part(self, rows: IntArray | BoolArray) -> "ImageBlock":
         """These image points of it alone."""
         used = None if self.used is None else self.used[rows]

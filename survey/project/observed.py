@@ -368,7 +368,7 @@ def without(
     every = union(hits)
     masks, others, members, gone = every.images, every.others, every.members, every.spots
     blocks = tuple(
-        replace(b, used=~masks[i] if b.used is None else b.used & ~masks[i]) if i in masks else b
+        replace(b, used=b.mask & ~masks[i]) if i in masks else b
         for i, b in enumerate(survey.image_blocks)
     )
     changed: dict[str, Any] = {

@@ -92,7 +92,7 @@ def point_rows(survey: Survey, now: Survey, adjustment: Adjustment | None) -> Po
 
 
 def _used(blocks: Sequence[ImageBlock]) -> BoolArray:
-    parts = [np.ones(len(b.uv), dtype=np.bool_) if b.used is None else b.used for b in blocks]
+    parts = [b.mask for b in blocks]
     return np.concatenate([*parts, np.zeros(0, dtype=np.bool_)])
 
 

@@ -90,5 +90,5 @@ def _contradicted(survey: Survey, result: Adjustment) -> bool:
 
 
 def _images_refused(survey: Survey, result: Adjustment) -> bool:
-    taking_part = sum(1 for b in result.survey.image_blocks if b.used is None or b.used.any())
-    return taking_part < sum(1 for b in survey.image_blocks if b.used is None or b.used.any())
+    taking_part = sum(1 for b in result.survey.image_blocks if b.n_used)
+    return taking_part < sum(1 for b in survey.image_blocks if b.n_used)

@@ -128,7 +128,7 @@ def _with_known_points(survey: Survey) -> Survey:
     seen: dict[int, set[tuple[str, str]]] = {}
     for b in survey.image_blocks:
         if b.target_id is None:
-            for i in (b.point_idx if b.used is None else b.point_idx[b.used]).tolist():
+            for i in (b.point_idx[b.mask]).tolist():
                 seen.setdefault(i, set()).add((b.camera_id, b.epoch_id))
     given = {r.point_id for c in survey.coordinates if c.used for r in c.positions if r.frame is None}
     given |= points_read(survey)

@@ -26,7 +26,7 @@ def image_point_columns(blocks: Sequence[ImageBlock], survey: Survey) -> Columns
     index: dict[str, int] = {}
     codes = {owner: np.array([index.setdefault(n, len(index)) for n in ids], int) for owner, ids in names.items()}
     sizes = [len(block.uv) for block in blocks]
-    used = [np.ones(len(block.uv), bool) if block.used is None else np.asarray(block.used) for block in blocks]
+    used = [block.mask for block in blocks]
     flags = np.concatenate([np.zeros(0, bool), *used])
     points = [codes[block.target_id][np.asarray(block.point_idx, int)] for block in blocks]
     return {
