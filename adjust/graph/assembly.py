@@ -17,6 +17,7 @@ from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorPrior
 from adjust.observations.factors import (
     ChainPose,
+    ObservationFactor,
     Position,
     coordinates_factor,
     distance_factor,
@@ -32,7 +33,6 @@ from adjust.observations.images.bundle_points import add_point_factors
 from adjust.observations.images.bundles import BundleBatch, may_be_hidden
 from adjust.observations.images.helmert_blocks import helmert_blocks
 from adjust.observations.images.reduction import PoseReduction, reduction
-from adjust.observations.listed import ObservationFactor
 from adjust.observations.terrestrial.batch import TerrestrialBatch
 from adjust.observations.terrestrial.building import build_batch, reading_refs
 from adjust.observations.terrestrial.parameters import collect_terrestrial, full_start

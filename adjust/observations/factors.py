@@ -21,6 +21,20 @@ Jacobians = list[tuple[int, FloatArray]]
 Residual = Callable[[gtsam.Values], tuple[FloatArray, Jacobians]]
 
 
+@dataclass(frozen=True, eq=False)
+class ObservationFactor:
+    """A factor that is not an image batch, with what a report needs to know of it. ``observed``: (k,)."""
+
+    factor: gtsam.NonlinearFactor
+    kind: str
+    group: str
+    ids: tuple[str, ...]
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    observed: FloatArray
+    used: bool = True
+
+
 def gaussian(cov: FloatArray) -> gtsam.noiseModel.Gaussian:
     """Noise of a full covariance; never turned into a constraint, however small (GTSAM's "smart" models are)."""
     return gtsam.noiseModel.Gaussian.Covariance(np.atleast_2d(cov), False)

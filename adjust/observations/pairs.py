@@ -22,8 +22,7 @@ from adjust.model.result import ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.pairs import pair_jacobians, pair_rows
 from adjust.native.trees import KeyCovariances
-from adjust.observations.factors import Jacobians, custom
-from adjust.observations.listed import ObservationFactor
+from adjust.observations.factors import Jacobians, ObservationFactor, custom
 from adjust.spatial.rigid_motions import Motions, exp
 from adjust.testing.distributions import chi2
 

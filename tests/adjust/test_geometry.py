@@ -40,8 +40,8 @@ from adjust.model.survey import (
     Vertical,
     tilt_axes,
 )
-from adjust.observations.geometry.motions import direction_motions, surface_motions
 from adjust.observations.geometry.residuals import line_distance, plane_distance, sphere_distance
+from adjust.observations.motions import direction_motions, surface_motions
 from adjust.spatial.motions import point_motions
 from adjust.spatial.vertical import tilted
 from tests.adjust import helpers as h

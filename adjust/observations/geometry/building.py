@@ -22,7 +22,7 @@ from adjust.model.observations import (
 )
 from adjust.model.result import ParameterName
 from adjust.model.survey import SURFACES, Beam, BoolArray, FloatArray, Surface, Survey, VectorParameter
-from adjust.observations.factors import ChainPose, Position, custom, positions_residual
+from adjust.observations.factors import ChainPose, ObservationFactor, Position, custom, positions_residual
 from adjust.observations.geometry.fitting import fitted_beam, fitted_surface
 from adjust.observations.geometry.residuals import (
     alignment_residual,
@@ -31,7 +31,6 @@ from adjust.observations.geometry.residuals import (
     spot_residual,
     surface_residual,
 )
-from adjust.observations.listed import ObservationFactor
 from adjust.spatial.vertical import VerticalMap, collect_vertical, up_at
 
 BEAM_UNITS = ("m", "m", "1", "1")
