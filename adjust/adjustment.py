@@ -12,7 +12,6 @@ from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.graph.solver import Solved, SolveOptions, settled, solve
 from adjust.lenses.models import MODELS, camera_constants, monotone_radius_px, principal_point_px
 from adjust.model.errors import NotConvergedError, listed
-from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, Survey
 from adjust.observations.terrestrial.statistics import JoinedResiduals, reading_residuals
@@ -124,7 +123,7 @@ def rejections(survey: Survey, given: Survey) -> tuple[str, ...]:
         if block.used is None or block.used.all() or not block.used.any():
             continue
         ids = targets[block.target_id] if block.target_id else points
-        old = before.get(_place(block), frozenset())
+        old = before.get(block.place, frozenset())
         names = [ids[int(i)] for i in block.point_idx[~block.used] if int(i) not in old]
         if not names:
             continue
@@ -135,14 +134,10 @@ def rejections(survey: Survey, given: Survey) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _place(block: ImageBlock) -> tuple[str, str, str | None, str]:
-    return block.camera_id, block.epoch_id, block.target_id, block.group
-
-
 def _unused_before(given: Survey) -> dict[tuple[str, str, str | None, str], frozenset[int]]:
     """Positions of the points of each block that its owner does not use."""
     return {
-        _place(b): frozenset(b.point_idx[~b.used].tolist())
+        b.place: frozenset(b.point_idx[~b.used].tolist())
         for b in given.image_blocks
         if b.used is not None and not b.used.all()
     }
@@ -291,7 +286,7 @@ def _image_warnings(graph: AdjustmentGraph, result: Adjustment, given: Survey | 
     for i in np.flatnonzero((used == 0) | (bad > 0)).tolist():
         block = blocks[i]
         what = f"camera {block.camera_id} at epoch {block.epoch_id}, target {block.target_id or 'points'}"
-        if used[i] == 0 and len(before.get(_place(block), ())) == len(block.uv):
+        if used[i] == 0 and len(before.get(block.place, ())) == len(block.uv):
             continue  # as its owner wants it
         if used[i] == 0 and len(block.uv):
             out.append(f"{what}: not used")

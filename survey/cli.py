@@ -10,21 +10,19 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from survey.commands.adjusting import declare_adjust
-from survey.commands.aligning import declare_align
 from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, Version, run_as_program, run_command
 from survey.commands.comparing import declare_compare
 from survey.commands.completion import declare_completion
 from survey.commands.converting import declare_convert
-from survey.commands.detecting import declare_detect
 from survey.commands.examples import declare_example, declare_schema
 from survey.commands.excluding import declare_exclude, declare_include
-from survey.commands.navigating import declare_navigate
+from survey.commands.navigating import declare_align, declare_navigate
 from survey.commands.networks import declare_add, declare_pairs, declare_remove, declare_trackers
 from survey.commands.opening import declare_open, declare_runs
 from survey.commands.parser import Parser, name_commands
 from survey.commands.planning import declare_check, declare_plan
 from survey.commands.reporting import declare_report
-from survey.commands.starting import declare_init
+from survey.commands.starting import declare_detect, declare_init
 
 __all__ = ["DONE", "FAILED", "INTERRUPTED", "TEST_FAILED", "USAGE", "build_parser", "main"]
 

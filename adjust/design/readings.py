@@ -11,7 +11,7 @@ from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, Survey, VectorParameter, VectorPrior
-from adjust.observations.listed import ObservationFactor
+from adjust.observations.factors import ObservationFactor
 from adjust.precision.precision import noise_of
 
 Rng = np.random.Generator

@@ -12,7 +12,7 @@ from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.model.survey import FloatArray, IntArray, Survey
-from adjust.observations.listed import ObservationFactor
+from adjust.observations.factors import ObservationFactor
 from adjust.statistics.system import Columns, ItemRows, points_apart, survey_rows
 
 

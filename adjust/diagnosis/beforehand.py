@@ -85,7 +85,7 @@ def _usage(survey: Survey) -> Counter[str]:
 
     for block in survey.image_blocks:
         if block.target_id is None:
-            rows = block.point_idx if block.used is None else block.point_idx[block.used]
+            rows = block.point_idx[block.mask]
             for i in rows.tolist():
                 out[survey.points[i].point_id] += 2
     for r in (r for r in survey.readings if r.used):

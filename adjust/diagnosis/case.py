@@ -11,11 +11,10 @@ from gtsam import Pose3
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import values_of
 from adjust.model.errors import SurveyError
-from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.start.lenses import Sighting, start_lens
-from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block, target_points, used_rows
+from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block, target_points
 
 if TYPE_CHECKING:
     from adjust.diagnosis.score import Linear
@@ -109,7 +108,7 @@ class Case:
 
 def _is_whole(survey: Survey, result: Adjustment) -> bool:
     """Whether every image point and observation in use takes part."""
-    given = sum(int(used_rows(b).sum()) for b in survey.image_blocks)
+    given = sum(int(b.mask.sum()) for b in survey.image_blocks)
     return given == int(result.image_residuals.used.sum()) and survey.n_others_used == result.survey.n_others_used
 
 
@@ -126,18 +125,14 @@ def block_misfits(survey: Survey, result: Adjustment | None) -> FloatArray:
     if result is None:
         return out
     ptr, residuals = result.image_residuals.block_ptr, result.image_residuals.residuals
-    place = {_place(b): i for i, b in enumerate(survey.image_blocks)}
+    place = {b.place: i for i, b in enumerate(survey.image_blocks)}
     for k, block in enumerate(result.survey.image_blocks):
         r = residuals[ptr[k] : ptr[k + 1]]
         squares = np.einsum("ni,nij,nj->n", r, np.linalg.inv(block.cov), r)
-        i = place.get(_place(block))
+        i = place.get(block.place)
         if i is not None:
             out[i] = np.minimum(np.where(np.isfinite(squares), squares, np.inf), 2.0 * CAP).sum()
     return out
-
-
-def _place(block: ImageBlock) -> tuple[str, str, str | None, str]:
-    return block.camera_id, block.epoch_id, block.target_id, block.group
 
 
 def own_lens(survey: Survey, camera: Camera) -> FloatArray:
@@ -147,7 +142,7 @@ def own_lens(survey: Survey, camera: Camera) -> FloatArray:
         (i, b) for i, b in enumerate(survey.image_blocks)
         if b.camera_id == camera.camera_id and b.target_id is not None
     ]  # fmt: skip
-    seen = [Sighting(i, points[str(b.target_id)][b.point_idx[used_rows(b)]], b.uv[used_rows(b)]) for i, b in mine]
+    seen = [Sighting(i, points[str(b.target_id)][b.point_idx[b.mask]], b.uv[b.mask]) for i, b in mine]
     return start_lens(camera, [s for s in seen if len(s.x)]).values
 
 
@@ -168,8 +163,8 @@ def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
     known = replace(survey, cameras=tuple(c for c in survey.cameras if c.camera_id in lenses))
     focal = {c.camera_id: focal_px(c, lenses[c.camera_id]) for c in known.cameras}
     blocks = {i: b for i, b in enumerate(survey.image_blocks) if b.target_id is not None}
-    rays, _ = rays_by_block(known, lenses, {i: b.uv[used_rows(b)] for i, b in blocks.items()})
-    seen = {i: points[str(blocks[i].target_id)][blocks[i].point_idx[used_rows(blocks[i])]] for i in rays}
+    rays, _ = rays_by_block(known, lenses, {i: b.uv[b.mask] for i, b in blocks.items()})
+    seen = {i: points[str(blocks[i].target_id)][blocks[i].point_idx[blocks[i].mask]] for i in rays}
     sights = joined([(i, x, rays[i], focal[blocks[i].camera_id]) for i, x in seen.items() if len(x) >= 3])
     return make_views(sights)[0]
 

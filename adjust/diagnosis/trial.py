@@ -75,7 +75,7 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
     Observations that the start, a screen or a search left out count as they are predicted, bounded: else an
     explanation that leaves more of them out would look the better one.
     """
-    points = 2 * sum(len(b.uv) if b.used is None else int(b.used.sum()) for b in survey.image_blocks)
+    points = 2 * sum(b.n_used for b in survey.image_blocks)
     n_others = n_other_components(survey)
     if result is None:
         return Misfit(CAP * (points + n_others), points + n_others, points + n_others, 0)

@@ -12,11 +12,12 @@ from gtsam import Pose3, Rot3
 from adjust.frames.state import State, collect_vectors
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
 from adjust.model.errors import SurveyError
-from adjust.model.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef
+from adjust.model.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef, frame_text, position_text
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey, VectorPrior
 from adjust.observations.factors import (
     ChainPose,
+    ObservationFactor,
     Position,
     coordinates_factor,
     distance_factor,
@@ -32,7 +33,6 @@ from adjust.observations.images.bundle_points import add_point_factors
 from adjust.observations.images.bundles import BundleBatch, may_be_hidden
 from adjust.observations.images.helmert_blocks import helmert_blocks
 from adjust.observations.images.reduction import PoseReduction, reduction
-from adjust.observations.listed import ObservationFactor, frame_text, position_text
 from adjust.observations.terrestrial.batch import TerrestrialBatch
 from adjust.observations.terrestrial.building import build_batch, reading_refs
 from adjust.observations.terrestrial.parameters import collect_terrestrial, full_start

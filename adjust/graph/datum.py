@@ -20,9 +20,7 @@ from adjust.graph.assembly import AdjustmentGraph, Evaluation, inner_datum_keys
 from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray
-from adjust.observations.geometry.motions import MOVED, vector_motions
-from adjust.observations.terrestrial.motions import MOVED as READINGS_MOVED
-from adjust.observations.terrestrial.motions import reading_motions
+from adjust.observations.motions import MOVED, READINGS_MOVED, reading_motions, vector_motions
 from adjust.spatial.motions import motions_of, points_motions, poses_at, poses_motions
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.rank import readable
 from adjust.model.errors import SurveyError
-from adjust.observations.listed import position_text
+from adjust.model.observations import position_text
 
 _GROUPS, _OWNERS, _MOVED = 4, 3, 4
 _BY_FAR = 9.0

@@ -245,7 +245,7 @@ def principal_point_px(model: LensModel, values: FloatArray, constants: FloatArr
 
 
 def _arrays(*arrays: FloatArray) -> tuple[FloatArray, ...]:
-    """Contiguous float64 arrays, so that the kernels are compiled once."""
+    """Contiguous float64 arrays, as the kernels take them."""
     return tuple(np.ascontiguousarray(a, dtype=np.float64) for a in arrays)
 
 

@@ -31,6 +31,20 @@ class PositionRef:
     frame: FrameRef | None = None
 
 
+def frame_text(ref: FrameRef) -> str:
+    """``kind:id@epoch``, as in the tables of the project folder; ``world``."""
+    if ref.kind == "world":
+        return "world"
+    return f"{ref.kind}:{ref.frame_id}" + (f"@{ref.epoch_id}" if ref.epoch_id else "")
+
+
+def position_text(ref: PositionRef) -> str:
+    """A position as people write it."""
+    if ref.frame is None:
+        return str(ref.point_id)
+    return frame_text(ref.frame) + (f"/{ref.point_id}" if ref.point_id else "")
+
+
 @dataclass(frozen=True, eq=False)
 class ImageBlock:
     """The image points that one camera saw of one target (or of the world's points) at one epoch.
@@ -47,6 +61,21 @@ class ImageBlock:
     cov: FloatArray
     used: BoolArray | None = None
     group: str = "image"
+
+    @property
+    def place(self) -> tuple[str, str, str | None, str]:
+        """What tells it from the other blocks of a survey."""
+        return self.camera_id, self.epoch_id, self.target_id, self.group
+
+    @property
+    def mask(self) -> BoolArray:
+        """Which points (n,) are used."""
+        return np.ones(len(self.uv), dtype=np.bool_) if self.used is None else np.asarray(self.used, dtype=np.bool_)
+
+    @property
+    def n_used(self) -> int:
+        """How many are."""
+        return len(self.uv) if self.used is None else int(np.count_nonzero(self.used))
 
     def part(self, rows: IntArray | BoolArray) -> "ImageBlock":
         """These image points of it alone."""

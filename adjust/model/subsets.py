@@ -57,7 +57,7 @@ def with_points(survey: Survey, kept: Sequence[int]) -> Survey:
 
 def in_use(survey: Survey) -> Survey:
     """The survey less the image points and table readings that are not used: for what predicts nothing of them."""
-    blocks = tuple(b.in_use() for b in survey.image_blocks if b.used is None or b.used.any())
+    blocks = tuple(b.in_use() for b in survey.image_blocks if b.n_used)
     return replace(survey, image_blocks=blocks, table_readings=tuple(r for r in survey.table_readings if r.used))
 
 

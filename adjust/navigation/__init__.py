@@ -1,6 +1,6 @@
 """Navigation: the pose of a calibrated head from beacons, epoch by epoch, with covariance."""
 
-from adjust.navigation.head import head_and_beacons
+from adjust.navigation.head import head_and_beacons, head_of
 from adjust.navigation.model import (
     Beacons,
     EpochPose,
@@ -36,5 +36,6 @@ __all__ = [
     "Trajectory",
     "expected_precision",
     "head_and_beacons",
+    "head_of",
     "navigate",
 ]

@@ -13,6 +13,13 @@ from adjust.model.survey import TABLE_GEOMETRY, FloatArray, PoseParameter, Surve
 from adjust.navigation.model import Beacons, Head, HeadCamera, HeadTable
 
 
+def head_of(survey: Survey) -> str | None:
+    """The only station with cameras, or the only one of them on a table."""
+    carrying = list(dict.fromkeys(c.station_id for c in survey.cameras))
+    turned = [s.station_id for s in survey.stations if s.station_id in carrying and s.motion == "table"]
+    return next((choice[0] for choice in (turned, carrying) if len(choice) == 1), None)
+
+
 def head_and_beacons(adjustment: Adjustment, station_id: str, known: Beacons | None = None) -> tuple[Head, Beacons]:
     """Head ``station_id`` and the beacons of an adjustment (or those given), values and joint covariance.
 

@@ -17,6 +17,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.navigation import FoundArrays, SkyArrays, search
 from adjust.navigation.fit import PoseFit, Prior, fit_pose, fit_without_outliers, local, log_evidence
 from adjust.navigation.model import NavigateOptions
+from adjust.navigation.precision import spot_noise
 from adjust.navigation.system import Sightings, System, evaluate, station_rays, visible
 from adjust.spatial.rigid import rigid
 from adjust.testing.distributions import chi2
@@ -292,7 +293,7 @@ def _posterior(system: System, seen: Sightings, match: IntArray, prior: Prior) -
     fit = fit_pose(system, seen, used, match[used], prior.pose, prior)
     if fit is None:
         return None
-    own = fit.G @ _spot_noise(seen, fit) @ fit.G.T + fit.G_prior @ prior.cov @ fit.G_prior.T
+    own = fit.G @ spot_noise(seen, fit.used) @ fit.G.T + fit.G_prior @ prior.cov @ fit.G_prior.T
     return Prior(fit.pose, own, fit.B, np.arange(6))
 
 
@@ -344,7 +345,7 @@ def _grown(
 ) -> PoseFit:
     """Name the spots that the pose explains and the coarse consensus left out."""
     for _ in range(len(seen.uv) - len(fit.used) - len(rejected)):
-        prior = Prior(fit.pose, fit.G @ _spot_noise(seen, fit) @ fit.G.T, fit.B, np.arange(6))
+        prior = Prior(fit.pose, fit.G @ spot_noise(seen, fit.used) @ fit.G.T, fit.B, np.arange(6))
         distance, support = gate_distances(system, seen, prior, options)
         distance[~(allowed_namings(system, seen) & (support > 0.0))] = np.inf
         distance[fit.used] = np.inf
@@ -360,13 +361,6 @@ def _grown(
             return fit
         fit = more
     return fit
-
-
-def _spot_noise(seen: Sightings, fit: PoseFit) -> FloatArray:
-    out = np.zeros((2 * len(fit.used),) * 2)
-    for i, cov in enumerate(seen.cov[fit.used]):
-        out[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = cov
-    return out
 
 
 def score_of(system: System, seen: Sightings, fit: PoseFit, prior: Prior | None, options: NavigateOptions) -> float:

@@ -13,12 +13,26 @@ from gtsam import Pose3, Rot3
 from adjust.frames.state import State
 from adjust.frames.unknowns import Chain, Unknown, Unknowns, VectorMap
 from adjust.model.observations import Coordinates, Distance, Pair
-from adjust.model.survey import FloatArray, PoseParameter, VectorPrior
+from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, VectorPrior
 from adjust.observations.images.batch import Chains
 from adjust.spatial.rigid import skew
 
 Jacobians = list[tuple[int, FloatArray]]
 Residual = Callable[[gtsam.Values], tuple[FloatArray, Jacobians]]
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationFactor:
+    """A factor that is not an image batch, with what a report needs to know of it. ``observed``: (k,)."""
+
+    factor: gtsam.NonlinearFactor
+    kind: str
+    group: str
+    ids: tuple[str, ...]
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    observed: FloatArray
+    used: bool = True
 
 
 def gaussian(cov: FloatArray) -> gtsam.noiseModel.Gaussian:
@@ -135,20 +149,31 @@ def coordinates_factor(observation: Coordinates, positions: Sequence[Position]) 
     known = np.isfinite(np.diag(observation.cov))
     if len(positions) == 1 and positions[0].point_key is not None and known.all():
         return gtsam.PriorFactorPoint3(positions[0].point_key, observation.values[0], gaussian(observation.cov))
+    keys = list(dict.fromkeys(k for p in positions for k in p.keys))
+    residual = positions_residual([((p, 1.0),) for p in positions], observation.values, known)
+    return custom(keys, observation.cov[np.ix_(known, known)], residual)
+
+
+def positions_residual(
+    sums: Sequence[Sequence[tuple[Position, float]]], values: FloatArray, known: BoolArray
+) -> Residual:
+    """Sums of positions with signs minus what was observed of them (n, 3); ``known`` (3n,): which components were."""
+    wanted = values.ravel()
 
     def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
-        out, blocks = np.zeros(3 * len(positions)), []
-        for i, position in enumerate(positions):
-            x, jacobians = position(values)
-            out[3 * i : 3 * i + 3] = x - observation.values[i]
-            for key, J in jacobians:
-                block = np.zeros((len(out), J.shape[1]))
-                block[3 * i : 3 * i + 3] = J
-                blocks.append((key, block[known]))
-        return out[known], blocks
+        out, blocks = np.zeros(3 * len(sums)), []
+        for i, signed in enumerate(sums):
+            rows = slice(3 * i, 3 * i + 3)
+            for position, sign in signed:
+                x, jacobians = position(values)
+                out[rows] += sign * x
+                for key, J in jacobians:
+                    block = np.zeros((len(out), J.shape[1]))
+                    block[rows] = sign * J
+                    blocks.append((key, block[known]))
+        return (out - wanted)[known], blocks
 
-    keys = list(dict.fromkeys(k for p in positions for k in p.keys))
-    return custom(keys, observation.cov[np.ix_(known, known)], residual)
+    return residual
 
 
 def pair_factor(observation: Pair, unknowns: Unknowns, state: State, chain: Chain) -> gtsam.NonlinearFactor:
@@ -208,13 +233,18 @@ def pose_prior_factor(parameter: PoseParameter, key: int) -> gtsam.NonlinearFact
     known = np.isfinite(np.diag(cov))
     if known.all():
         return gtsam.PriorFactorPose3(key, mean, gaussian(cov))
+    return custom([key], cov[np.ix_(known, known)], _components_residual(key, mean, np.flatnonzero(known)))
+
+
+def _components_residual(key: int, given: Pose3, rows: IntArray) -> Residual:
+    """Some components of the tangent at a given pose."""
 
     def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
         D = np.zeros((6, 6), order="F")
-        r = Pose3.Logmap(mean.between(values.atPose3(key)), D)
-        return np.asarray(r)[known], [(key, D[known])]
+        r = Pose3.Logmap(given.between(values.atPose3(key)), D)
+        return np.asarray(r)[rows], [(key, D[rows])]
 
-    return custom([key], cov[np.ix_(known, known)], residual)
+    return residual
 
 
 HOLD = 1e-9
@@ -230,13 +260,7 @@ def hold_factor(unknown: Unknown, held: Sequence[int], value: Pose3 | FloatArray
     if isinstance(value, Pose3):
         if rows == [3, 4, 5]:
             return gtsam.PoseTranslationPrior3D(key, value, gaussian(cov))
-
-        def pose_residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
-            D = np.zeros((6, 6), order="F")
-            r = Pose3.Logmap(value.between(values.atPose3(key)), D)
-            return np.asarray(r)[rows], [(key, D[rows])]
-
-        return custom([key], cov, pose_residual)
+        return custom([key], cov, _components_residual(key, value, np.array(rows)))
     wanted, select = np.asarray(value, dtype=float)[rows], np.eye(unknown.dim)[rows]
 
     def point_residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:

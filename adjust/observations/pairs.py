@@ -17,13 +17,12 @@ from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, FrameTree, Unknowns
-from adjust.model.observations import Pair
+from adjust.model.observations import Pair, frame_text
 from adjust.model.result import ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.pairs import pair_jacobians, pair_rows
 from adjust.native.trees import KeyCovariances
-from adjust.observations.factors import Jacobians, custom
-from adjust.observations.listed import ObservationFactor, frame_text
+from adjust.observations.factors import Jacobians, ObservationFactor, custom
 from adjust.spatial.rigid_motions import Motions, exp
 from adjust.testing.distributions import chi2
 

@@ -16,7 +16,8 @@ from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, values_of
 from adjust.graph.datum import InnerDatum, datum_rows, in_world, inner_datum, survey_motions
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
-from adjust.model.survey import Datum, FloatArray, Point, PoseParameter, Survey, Target
+from adjust.model.rewriting import Rewriting
+from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Survey
 from adjust.precision.precision import Precision, rotations_only
 from adjust.precision.s_transformation import STransformation, s_transformation
 
@@ -104,30 +105,25 @@ def in_datum(result: Adjustment, datum: Datum, reference: Mapping[str, FloatArra
     )  # fmt: skip
 
 
+class _Released(Rewriting):
+    """Held points and held poses of things in the world are free."""
+
+    def __init__(self, survey: Survey) -> None:
+        self.carried = {t.target_id for t in survey.targets if t.station_id is not None}
+
+    def pose(self, name: ParameterName, given: PoseParameter) -> PoseParameter:
+        inside = name[0] in ("station_from_camera", "mount_from_station") or (
+            name[0] == "carrier_from_target" and name[1] in self.carried
+        )
+        return replace(given, treatment="free") if given.treatment == "held" and not inside else given
+
+    def point(self, name: ParameterName, given: PointParameter) -> PointParameter:
+        return replace(given, treatment="free") if given.treatment == "held" else given
+
+
 def released(survey: Survey) -> Survey:
     """The survey with held points and held poses of things in the world free."""
-    points = tuple(
-        Point(p.point_id, replace(p.x_in_world, treatment="free")) if p.x_in_world.treatment == "held" else p
-        for p in survey.points
-    )
-    stations = tuple(
-        replace(s, world_from_station=_free(s.world_from_station), epochs={e: _free(q) for e, q in s.epochs.items()})
-        for s in survey.stations
-    )
-    targets = tuple(_released_target(t) for t in survey.targets)
-    tables = tuple(replace(t, world_from_table=_free(t.world_from_table)) for t in survey.tables)
-    return replace(survey, points=points, stations=stations, targets=targets, tables=tables)
-
-
-def _free(parameter: PoseParameter) -> PoseParameter:
-    return replace(parameter, treatment="free") if parameter.treatment == "held" else parameter
-
-
-def _released_target(target: Target) -> Target:
-    if target.station_id is not None:
-        return target
-    epochs = {e: _free(q) for e, q in target.epochs.items()}
-    return replace(target, carrier_from_target=_free(target.carrier_from_target), epochs=epochs)
+    return _Released(survey)(survey)
 
 
 def _fitted(

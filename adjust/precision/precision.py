@@ -27,9 +27,9 @@ from adjust.model.result import (
 )
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.point_tests import AdjustedPoints, residual_tests
+from adjust.observations.factors import ObservationFactor
 from adjust.observations.images.batch import whitened_squares
 from adjust.observations.images.bundle_hidden import BundleHidden
-from adjust.observations.listed import ObservationFactor
 from adjust.precision.s_transformation import STransformation, s_transformation
 from adjust.precision.tree import TreeCovariance
 from adjust.testing.distributions import chi2

@@ -13,10 +13,9 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
-from adjust.model.observations import Pair
+from adjust.model.observations import Pair, frame_text
 from adjust.model.survey import FloatArray, IntArray
 from adjust.observations.factors import gaussian
-from adjust.observations.listed import frame_text
 from adjust.spatial.rigid_motions import Motions
 
 

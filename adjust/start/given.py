@@ -1,18 +1,17 @@
 """Start values that came with a survey: which there are, the survey without them, and a start moved onto them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.model.result import ParameterName
-from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Station, Survey, Target
+from adjust.model.rewriting import Rewriting
+from adjust.model.survey import FloatArray, PointParameter, PoseParameter, Survey
 from adjust.spatial.rigid import align
 from adjust.start.search import Start
 
-_P = TypeVar("_P", PoseParameter, PointParameter)
 _IN_WORLD = ("world_from_station", "world_from_table")
 
 
@@ -34,7 +33,9 @@ def given_starts(survey: Survey) -> GivenStarts:
         for p in survey.points
         if _is_start(p.x_in_world) and np.isfinite(np.asarray(p.x_in_world.value, dtype=float)).all()
     }
-    poses = {name: parameter.value for name, parameter in _pose_parameters(survey).items() if _is_start(parameter)}
+    listed = _Listed()
+    listed(survey)
+    poses = {name: parameter.value for name, parameter in listed.found.items() if _is_start(parameter)}
     return GivenStarts(points, {name: pose for name, pose in poses.items() if pose is not None})
 
 
@@ -42,52 +43,33 @@ def _is_start(parameter: PoseParameter | PointParameter) -> bool:
     return parameter.treatment == "free" and parameter.value is not None and not parameter.held
 
 
-def _pose_parameters(survey: Survey) -> dict[ParameterName, PoseParameter]:
-    """All poses by name; what holds for every epoch that is not listed goes without the epoch."""
-    out: dict[ParameterName, PoseParameter] = {}
-    _rewritten(survey, out.setdefault)
-    return out
+class _Listed(Rewriting):
+    """Collects all poses by name."""
+
+    def __init__(self) -> None:
+        self.found: dict[ParameterName, PoseParameter] = {}
+
+    def pose(self, name: ParameterName, given: PoseParameter) -> PoseParameter:
+        self.found[name] = given
+        return given
+
+
+class _Bare(Rewriting):
+    """No start values of free points, of free poses, or of both."""
+
+    def __init__(self, points: bool, poses: bool) -> None:
+        self.points, self.poses = points, poses
+
+    def pose(self, name: ParameterName, given: PoseParameter) -> PoseParameter:
+        return replace(given, value=None) if self.poses and _is_start(given) else given
+
+    def point(self, name: ParameterName, given: PointParameter) -> PointParameter:
+        return replace(given, value=None) if self.points and _is_start(given) else given
 
 
 def without_starts(survey: Survey, points: bool, poses: bool) -> Survey:
     """The survey without the start values of its free points, of its free poses, or of both."""
-    if points:
-        kept = tuple(replace(p, x_in_world=_bare(p.x_in_world)) for p in survey.points)
-        survey = replace(survey, points=kept)
-    return _rewritten(survey, lambda name, parameter: _bare(parameter)) if poses else survey
-
-
-def _bare(parameter: _P) -> _P:
-    return replace(parameter, value=None) if _is_start(parameter) else parameter
-
-
-def _rewritten(survey: Survey, new: Callable[[ParameterName, PoseParameter], PoseParameter]) -> Survey:
-    """The survey with ``new(name, parameter)`` for every pose."""
-
-    def moved(owner: Station | Target, kind: str, owner_id: str) -> dict[str, Any]:
-        pose = getattr(owner, kind)
-        epochs = {e: new((kind, owner_id, e), parameter) for e, parameter in owner.epochs.items()}
-        return {kind: new((kind, owner_id), pose), "epochs": epochs}
-
-    return replace(
-        survey,
-        cameras=tuple(
-            replace(c, station_from_camera=new(("station_from_camera", c.camera_id), c.station_from_camera))
-            for c in survey.cameras
-        ),
-        stations=tuple(
-            replace(
-                s, **moved(s, "world_from_station", s.station_id),
-                mount_from_station=new(("mount_from_station", s.station_id), s.mount_from_station),
-            )
-            for s in survey.stations
-        ),
-        tables=tuple(
-            replace(t, world_from_table=new(("world_from_table", t.table_id), t.world_from_table))
-            for t in survey.tables
-        ),
-        targets=tuple(replace(t, **moved(t, "carrier_from_target", t.target_id)) for t in survey.targets),
-    )  # fmt: skip
+    return _Bare(points, poses)(survey)
 
 
 def moved_onto(start: Start, given: GivenStarts, survey: Survey) -> Start:

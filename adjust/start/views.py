@@ -96,11 +96,6 @@ def joined(items: Sequence[tuple[int, FloatArray, FloatArray, float]]) -> Sights
                   np.array(focal, dtype=np.float64))  # fmt: skip
 
 
-def used_rows(block: ImageBlock) -> BoolArray:
-    """Rows of the block that take part, (n,) bool."""
-    return np.ones(len(block.uv), dtype=bool) if block.used is None else np.asarray(block.used, dtype=bool)
-
-
 def target_points(target: Target) -> FloatArray:
     """Points (n, 3) m of a target, with the sag of its given warp."""
     x = np.array(target.x_in_target, dtype=float)

@@ -8,7 +8,6 @@ import numpy as np
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import StartValues, values_of
 from adjust.model.errors import NotConvergedError, SurveyError, listed
-from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
 from adjust.statistics.outliers.search import OutlierSearch, SearchOptions, disagreeing_pairs, search_outliers
@@ -127,18 +126,14 @@ def _blamed_on_rays(survey: Survey, found: Adjustment) -> bool:
     names = [p.point_id for p in found.survey.points]
     paired = {r.frame_id for p in survey.pairs if p.used for r in (p.a, p.b) if r.kind == "station"}
     carrying = {c.camera_id for c in survey.cameras if c.station_id in paired}
-    kept = {(b.camera_id, b.epoch_id) for b in found.survey.image_blocks if b.used is None or b.used.any()}
-    lost = {b.camera_id for b in survey.image_blocks if (b.camera_id, b.epoch_id) not in kept and _n_used(b)}
+    kept = {(b.camera_id, b.epoch_id) for b in found.survey.image_blocks if b.n_used}
+    lost = {b.camera_id for b in survey.image_blocks if (b.camera_id, b.epoch_id) not in kept and b.n_used}
     return bool(lost & carrying) or any(
         b.camera_id in carrying or names[int(i)] in touched
         for b in found.survey.image_blocks
         if b.target_id is None and b.used is not None
         for i in b.point_idx[~b.used]
     )
-
-
-def _n_used(block: ImageBlock) -> int:
-    return len(block.uv) if block.used is None else int(block.used.sum())
 
 
 def _others_first(
@@ -161,7 +156,7 @@ def _others_first(
 
 def _left_out(given: Survey, found: Adjustment) -> int:
     """Number of observed components in use that take no part any more; a whole image counts like each of its points."""
-    before = sum(2 * _n_used(b) for b in given.image_blocks)
+    before = sum(2 * b.n_used for b in given.image_blocks)
     after = 2 * int(found.image_residuals.used.sum())
     out = sum(len(o.components) for o in found.other_residuals if not o.used)
     unused = (given.distances, given.coordinates, given.pairs, given.coordinate_differences, given.readings,

@@ -20,8 +20,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.native.lenses import MAX_LENS
+from adjust.observations.factors import ObservationFactor
 from adjust.observations.images.bundles import BundleBatch
-from adjust.observations.listed import ObservationFactor
 from adjust.observations.terrestrial.layout import Chunk
 from adjust.precision.precision import Precision
 from adjust.statistics.normal import Normal

@@ -23,7 +23,7 @@ from capture.simulated.angles import AnglesFile
 from capture.simulated.aravis import AravisCamera
 
 _READY = "ready"
-_START_S = 60.0  # the renderer may have to be compiled
+_START_S = 60.0  # on a busy machine
 _LOOK_S = 0.02
 GRADIENT = "gradient"
 

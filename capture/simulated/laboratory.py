@@ -16,8 +16,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from survey.simulate.draft import Draft
 from survey.simulate.parts import BOARD, add_beacons, add_head, add_table, shoot_board_from_table, turn_to_walls
-from survey.simulate.rendering import Beacons, BrownCamera, GrayImage, Imaging, PlacedTarget, render
-from survey.simulate.scene import BROWN, Scene, Truth, transform
+from survey.simulate.rendering import Beacons, GrayImage, Imaging, PlacedTarget, may_be_seen, render, scene_camera
+from survey.simulate.scene import Scene, Truth, transform
 
 CAMERA_IDS = ("X", "Y", "Z")
 TABLE_ID = "turntable"
@@ -89,7 +89,7 @@ class SimulatedLab:
         return np.asarray(np.clip(np.rint(image), 0.0, 255.0), np.uint8)
 
     def warm_up(self) -> None:
-        """Render a board and beacons once: the first time the renderer is compiled, which may take many seconds."""
+        """Render a board and beacons once: the first time the rays of all pixels are found and libraries loaded."""
         for pose in self.poses[:1]:
             self._light_at(pose.camera_ids[0], (pose.axis1_rad, pose.axis2_rad))
 
@@ -109,11 +109,11 @@ class SimulatedLab:
         if camera_id not in CAMERA_IDS:
             raise SurveyError(f"camera {camera_id!r}: the simulated laboratory has {', '.join(CAMERA_IDS)}")
         scene = self._scene(angles_rad)
-        camera = _camera(scene, camera_id)
+        camera = scene_camera(scene, camera_id)
         camera_from_world = np.linalg.inv(scene.world_from_camera(camera_id, _NOW)).astype(np.float64)
         board = scene.world_from_target("board", _NOW)
         pose = Pose3(camera_from_world @ board)
-        placed = [PlacedTarget(BOARD, pose)] if _in_view(camera, pose) else []
+        placed = [PlacedTarget(BOARD, pose)] if may_be_seen(camera, pose, BOARD.points()[1]) else []
         room = render(camera, placed, imaging=_ROOM)
         x = transform(camera_from_world, scene.world_points())
         if not len(x):
@@ -125,23 +125,6 @@ class SimulatedLab:
     def _scene(self, angles_rad: FloatArray) -> Scene:
         base = self.draft.scene()
         return Scene(base.survey, {**self.truth, ("table_angles", TABLE_ID, _NOW): angles_rad})
-
-
-def _camera(scene: Scene, camera_id: str) -> BrownCamera:
-    lens = dict(zip(BROWN, scene.vector("lens", camera_id), strict=True))
-    distortion = tuple(float(lens[name]) for name in ("k1", "k2", "p1", "p2", "k3"))
-    return BrownCamera(IMAGE_SIZE, lens["fx"], lens["fy"], lens["u0"], lens["v0"], distortion)
-
-
-def _in_view(camera: BrownCamera, camera_from_board: Pose3) -> bool:
-    """Whether a sphere around the board reaches into a cone around the image; drawing a board beside it takes long."""
-    x = BOARD.points()[1]
-    middle = camera_from_board.transformFrom(x.mean(axis=0))
-    radius = 1.3 * float(np.linalg.norm(x - x.mean(axis=0), axis=1).max())
-    distance = max(float(np.linalg.norm(middle)), 1.01 * radius)
-    half_field = np.arctan(0.5 * np.hypot(*camera.image_size) / min(camera.fx, camera.fy)) + np.radians(4.0)
-    off_axis = np.arctan2(np.hypot(middle[0], middle[1]), middle[2])
-    return bool(off_axis < half_field + np.arcsin(radius / distance))
 
 
 _DEFAULT = LabSize()

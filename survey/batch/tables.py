@@ -15,6 +15,7 @@ from survey.batch.record import DONE, FAILED, TEST_FAILED, Record
 from survey.batch.run import counts, exit_code
 from survey.batch.trends import LEVEL, Trends
 from survey.folder.text import cell_text
+from survey.solution.dictionary import plain
 
 STATES = {DONE: "done", FAILED: "error", TEST_FAILED: "does not fit"}
 _MOST_TOLD = 8
@@ -106,15 +107,7 @@ def overview_json(records: Sequence[Record], trends: Trends) -> str:
                    "points_outside_expected_by_chance": trends.expected, "notes": list(trends.notes),
                    "charts": charts},
     }  # fmt: skip
-    return json.dumps(_finite(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    return json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _chart(trends: Trends, c: Chart, records: Sequence[Record], names: Sequence[str]) -> dict[str, Any]:

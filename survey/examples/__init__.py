@@ -28,11 +28,16 @@ def write_example(name: str, folder: Path, *, seed: int = 1, jobs: int | None = 
     """
     if name not in EXAMPLES:
         raise SurveyError(f"example {name!r}: unknown; choose one of {', '.join(EXAMPLES)}")
+    from survey.examples.alignment import alignment_files
+    from survey.examples.beacons import beacon_files
     from survey.examples.folders import MAKERS
     from survey.examples.pictures import write_images
-    from survey.examples.plain import WITHOUT_IMAGES
+    from survey.examples.relay import relay_files
+    from survey.examples.simulated import head_files, station_files
 
-    draft, files = MAKERS[name](seed) if name in MAKERS else (None, WITHOUT_IMAGES[name](seed))
+    without_images = {"total-station": beacon_files, "alignment": alignment_files, "relay": relay_files,
+                      "relay-station": station_files, "head": head_files}  # fmt: skip
+    draft, files = MAKERS[name](seed) if name in MAKERS else (None, without_images[name](seed))
     from survey.folder.whole import whole_folder  # here: the command line asks this module for its names alone
 
     with whole_folder(Path(folder)) as place:

@@ -14,8 +14,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray
 from survey.project.targets import PointList
 from survey.simulate.draft import Draft, Shot
-from survey.simulate.rendering import Beacons, BrownCamera, GrayImage, Imaging, PlacedTarget, render
-from survey.simulate.scene import BROWN, Scene, transform
+from survey.simulate.rendering import Beacons, GrayImage, Imaging, PlacedTarget, may_be_seen, render, scene_camera
+from survey.simulate.scene import Scene, transform
 
 # a gray sensor with some gain in a room of ordinary light
 DAY = Imaging(blur_px=0.9, noise_gray=4.0, background_gray=105.0, gradient=(0.18, -0.12))
@@ -59,19 +59,12 @@ def picture(draft: Draft, scene: Scene, shot: Shot, seed: int, clutter: bool = F
     clutter: also what stands in the room without being meant, such as wall plates behind a board held by hand, which
     hides parts of them. The examples' plates are hung for the epochs that are meant to show them.
     """
-    camera = _camera(scene, shot.camera_id)
+    camera = scene_camera(scene, shot.camera_id)
     camera_from_world = np.linalg.inv(scene.world_from_camera(shot.camera_id, shot.epoch_id)).astype(np.float64)
     if shot.beacons:
         beacons = Beacons(transform(camera_from_world, scene.world_points()), BEACON_DIAMETER_M, 230.0)
         return render(camera, beacons=beacons, imaging=NIGHT, seed=seed)
     return render(camera, _placed(draft, scene, shot, camera_from_world, clutter), imaging=DAY, seed=seed)
-
-
-def _camera(scene: Scene, camera_id: str) -> BrownCamera:
-    lens = dict(zip(BROWN, scene.vector("lens", camera_id), strict=True))
-    distortion = tuple(float(lens[name]) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"))
-    size = next(c.image_size for c in scene.survey.cameras if c.camera_id == camera_id)
-    return BrownCamera(size, lens["fx"], lens["fy"], lens["u0"], lens["v0"], distortion)
 
 
 def _placed(
@@ -85,20 +78,6 @@ def _placed(
         if isinstance(kind, PointList):
             continue
         pose = Pose3(camera_from_world @ scene.world_from_target(target.target_id, shot.epoch_id))
-        if _may_be_seen(_camera(scene, shot.camera_id), pose, target.x_in_target):
+        if may_be_seen(scene_camera(scene, shot.camera_id), pose, target.x_in_target):
             placed.append(PlacedTarget(kind, pose))
     return placed
-
-
-def _may_be_seen(camera: BrownCamera, camera_from_target: Pose3, x_in_target: FloatArray) -> bool:
-    """Whether a sphere around the target reaches into the cone around the image; rendering the others costs time."""
-    middle = x_in_target.mean(axis=0)
-    radius = 1.3 * float(
-        np.linalg.norm(x_in_target - middle, axis=1).max()
-    )  # with squares and margin around the points
-    x, y, z = camera_from_target.transformFrom(middle)
-    distance = float(np.linalg.norm((x, y, z)))
-    if distance <= radius:
-        return True
-    half_field = np.arctan(0.5 * np.hypot(*camera.image_size) / min(camera.fx, camera.fy)) + np.radians(6.0)
-    return bool(np.arctan2(np.hypot(x, y), z) < half_field + np.arcsin(radius / distance))

@@ -16,7 +16,7 @@ from survey.folder.locking import hold, remove_unheld
 
 LARGEST_FILE = 4 * 2**30  # bytes; longer observations go into several projects
 LARGEST_NUMBER = 1e15  # its square and what is made of it stay finite
-_FORBIDDEN_IN_IDS = set('/\\:@,;"|<>*?')
+FORBIDDEN_IN_IDS = set('/\\:@,;"|<>*?')
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what spreadsheets take for the beginning of a formula
 _ASKING = threading.Lock()
 _LONGEST_ID = 120  # bytes: an id with a prefix and an ending is still the name of a file
@@ -137,7 +137,7 @@ def id_problem(name: str) -> str | None:
     """Why ``name`` cannot be an id, or None. Ids become names of files and parts of references, so both stay safe."""
     if not name:
         return "an id is empty; give it a name"
-    if name in (".", "..") or name.startswith(".") or set(name) & _FORBIDDEN_IN_IDS or not name.isprintable():
+    if name in (".", "..") or name.startswith(".") or set(name) & FORBIDDEN_IN_IDS or not name.isprintable():
         allowed = "use letters, digits, '_', '-' and '.' (not in front), none of / \\ : @ , ; and not '..'"
         return f"{name!r} cannot be an id; {allowed}"
     if name != name.strip():

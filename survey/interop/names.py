@@ -6,8 +6,7 @@ from typing import Any
 from adjust.model.errors import listed
 from adjust.model.observations import PositionRef
 from adjust.model.survey import Survey
-from survey.folder.text import _FORBIDDEN_IN_IDS as FORBIDDEN
-from survey.folder.text import formula_problem, id_problem
+from survey.folder.text import FORBIDDEN_IN_IDS, formula_problem, id_problem
 
 
 def safe_ids(names: list[str], taken: set[str] | None = None) -> dict[str, str]:
@@ -17,7 +16,8 @@ def safe_ids(names: list[str], taken: set[str] | None = None) -> dict[str, str]:
     for name in names:
         if id_problem(name) is None and name not in (taken or set()):
             continue
-        plain = "".join("_" if c in FORBIDDEN or not c.isprintable() else c for c in name).strip().lstrip(".") or "_"
+        plain = "".join("_" if c in FORBIDDEN_IN_IDS or not c.isprintable() else c for c in name)
+        plain = plain.strip().lstrip(".") or "_"
         plain = f"_{plain[1:]}" if formula_problem(plain) else plain
         new, count = plain, 2
         while new in used:

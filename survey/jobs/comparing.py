@@ -15,6 +15,7 @@ from adjust.model.result import Adjustment
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.congruence_text import congruence_dict, congruence_text
 from survey.project import Project, read
+from survey.solution.dictionary import plain
 from survey.solution.quantities import ARCSEC_PER_RAD, SigmaKind
 
 ALPHA = 0.05
@@ -46,7 +47,7 @@ class CompareOutcome:
         """As plain values; None where something was not measured or cannot be tested."""
         return {
             "folders": [str(f) for f in self.folders],
-            "sigma0": [_number(a.sigma0) for a in self.adjustments],
+            "sigma0": plain([a.sigma0 for a in self.adjustments]),
             "redundancy": [a.redundancy for a in self.adjustments],
             "sigmas": self.sigmas or "a_priori",
             "alpha": ALPHA,
@@ -117,16 +118,8 @@ def _adjusted(project: Project, progress: bool) -> Adjustment:
         raise error if str(folder) in str(error) else SurveyError(f"{folder}: {error}") from error
 
 
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _numbers(values: Any) -> list[float | None]:
-    return [_number(v) for v in np.asarray(values, dtype=float)]
-
-
 def _test(test: DeformationTest) -> dict[str, Any]:
-    return {"chi_square": _number(test.statistic), "freedom": test.freedom, "p": _number(test.p)}
+    return {"chi_square": plain(test.statistic), "freedom": test.freedom, "p": plain(test.p)}
 
 
 def _entry(d: Deformation) -> dict[str, Any]:
@@ -134,12 +127,12 @@ def _entry(d: Deformation) -> dict[str, Any]:
     return {
         "a": d.a,
         "b": d.b,
-        "rotation_arcsec": _numbers(ARCSEC_PER_RAD * d.rotation),
-        "sigma_rotation_arcsec": _numbers(ARCSEC_PER_RAD * sigmas[:3]),
-        "rotation_euler_xyz_arcsec": _numbers(ARCSEC_PER_RAD * d.euler_zyx),
-        "sigma_rotation_euler_xyz_arcsec": _numbers(ARCSEC_PER_RAD * np.sqrt(np.diag(d.euler_cov))),
-        "displacement_mm": _numbers(1e3 * d.displacement),
-        "sigma_displacement_mm": _numbers(1e3 * sigmas[3:]),
+        "rotation_arcsec": plain(ARCSEC_PER_RAD * d.rotation),
+        "sigma_rotation_arcsec": plain(ARCSEC_PER_RAD * sigmas[:3]),
+        "rotation_euler_xyz_arcsec": plain(ARCSEC_PER_RAD * d.euler_zyx),
+        "sigma_rotation_euler_xyz_arcsec": plain(ARCSEC_PER_RAD * np.sqrt(np.diag(d.euler_cov))),
+        "displacement_mm": plain(1e3 * d.displacement),
+        "sigma_displacement_mm": plain(1e3 * sigmas[3:]),
         "test_rotation": _test(d.rotation_test),
         "test_displacement": _test(d.displacement_test),
         "test": _test(d.test),

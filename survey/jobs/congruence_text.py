@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from adjust.epochs.congruence_result import Congruence, CongruenceTest, Motion
+from survey.solution.dictionary import plain
 from survey.solution.quantities import ARCSEC_PER_RAD
 
 _MOST = 60
@@ -15,15 +16,15 @@ def congruence_dict(found: Congruence) -> dict[str, Any]:
     """As plain values; None where something was not measured or cannot be tested."""
     return {
         "alpha": found.alpha,
-        "sigma0": _number(found.sigma0),
-        "redundancy": _number(found.redundancy),
-        "p_equal_variances": _number(found.ratio_p),
+        "sigma0": plain(found.sigma0),
+        "redundancy": plain(found.redundancy),
+        "p_equal_variances": plain(found.ratio_p),
         "motions_left_open": list(found.datum),
         "all": _test(found.before),
         "stable": _test(found.after),
         "stable_names": [_name(n) for n in found.stable],
         "moved_names": [_name(n) for n in found.moved],
-        "search": [{"name": _name(s.name), "share": _number(s.share), "test": _test(s.test)} for s in found.steps],
+        "search": [{"name": _name(s.name), "share": plain(s.share), "test": _test(s.test)} for s in found.steps],
         "motions": [_motion(m) for m in found.motions],
         "warnings": list(found.warnings),
     }
@@ -78,23 +79,19 @@ def _name(name: tuple[str, ...]) -> str:
     return "/".join(name)
 
 
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
 def _test(test: CongruenceTest) -> dict[str, Any]:
-    return {"f": _number(test.statistic), "freedom": test.freedom, "freedom_sigma0": _number(test.freedom_sigma0),
-            "p": _number(test.p), "passed": test.passed}  # fmt: skip
+    return {"f": plain(test.statistic), "freedom": test.freedom, "freedom_sigma0": plain(test.freedom_sigma0),
+            "p": plain(test.p), "passed": test.passed}  # fmt: skip
 
 
 def _motion(m: Motion) -> dict[str, Any]:
     out: dict[str, Any] = {
         "name": _name(m.name),
-        "displacement_mm": [_number(1e3 * float(x)) for x in m.displacement],
-        "sigma_displacement_mm": [_number(1e3 * math.sqrt(max(0.0, float(v)))) for v in np.diag(m.cov)],
+        "displacement_mm": plain(1e3 * m.displacement),
+        "sigma_displacement_mm": plain(1e3 * np.sqrt(np.maximum(np.diag(m.cov), 0.0))),
         "semi_axes_mm": [1e3 * float(x) for x in m.ellipsoid.semi_axes],
         "test": _test(m.test),
-        "smallest_mm": _number(1e3 * m.smallest),
+        "smallest_mm": plain(1e3 * m.smallest),
         "stable": m.stable,
         "significant": m.significant,
     }

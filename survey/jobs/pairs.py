@@ -14,7 +14,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
-from adjust.model.observations import FrameRef, Pair
+from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
 from adjust.relay.eyes.drift import sequences
 from adjust.relay.eyes.eyes import adjust_eye_motions
@@ -75,7 +75,7 @@ class PairsOutcome:
         found, test = self.found, self.found.joint.global_test()
         return {
             "source": self.source,
-            "eyes": [_text(eye) for eye in found.joint.eyes],
+            "eyes": [frame_text(eye) for eye in found.joint.eyes],
             "sigma0": found.joint.sigma0 if found.joint.redundancy else None,
             "redundancy": found.joint.redundancy,
             "global_test": None if test is None else test.status,
@@ -90,7 +90,8 @@ class PairsOutcome:
         closed, joint = self.found.closed, self.found.joint_pairs()
         out = {}
         for i, pair in enumerate(self.found.eyes.pairs):
-            entry: dict[str, Any] = {"a": _text(pair.a), "b": _text(pair.b), "alone": _entry(pair.b_from_a, pair.cov)}
+            entry: dict[str, Any] = {"a": frame_text(pair.a), "b": frame_text(pair.b)}
+            entry["alone"] = _entry(pair.b_from_a, pair.cov)
             if closed is not None:
                 adjusted = gtsam_motion(closed.adjusted.pairs.b_from_a, i)
                 entry["loops_closed"] = _entry(adjusted, closed.actual_cov[i])
@@ -197,7 +198,3 @@ def _loop_entry(t: TriangleMisclosure) -> dict[str, Any]:
         "eyes": list(t.eyes), "misclosure_arcsec": ARCSEC_PER_RAD * t.rotation, "misclosure_mm": 1e3 * t.translation,
         "test": t.test, "p_value": t.p_value, "closes": t.closes,
     }  # fmt: skip
-
-
-def _text(frame: FrameRef) -> str:
-    return f"{frame.kind}:{frame.frame_id}"

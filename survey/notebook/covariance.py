@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from adjust.model.survey import FloatArray
-from survey.notebook.frames_library import pandas
+from survey.notebook.frames import pandas
 from survey.notebook.html import Cell, heading, html_table
 from survey.notebook.names import Component
 

@@ -13,10 +13,10 @@ from adjust.design.error_figures import ErrorFigure, error_figures
 from adjust.model.errors import SurveyError
 from survey.folder.replacing import write_set
 from survey.planning.page import html_page
-from survey.planning.summary import number
 from survey.report import drawing as d
 from survey.report.charts import Series, chart
 from survey.report.markup import figures, fixed, general, section, table
+from survey.solution.dictionary import plain
 
 PAPER = BeaconField()
 BOUNDED = BeaconField(nearest_m=0.1)
@@ -85,12 +85,12 @@ def _entry(f: ErrorFigure, rms_px: float) -> dict[str, Any]:
         "kind": f.kind, "nearest_mm": 1e3 * f.field.nearest_m,
         f"sigma_{unit}": (factor * f.sigmas).tolist(),
         "monte_carlo_px": f.rms.tolist(), "standard_error_px": f.rms_se.tolist(),
-        "controlled_px": [number(v) for v in f.controlled],
-        "controlled_standard_error_px": [number(v) for v in f.controlled_se],
-        "same_draws_px": f.same_draws.tolist(), "analytic_px": [number(v) for v in f.analytic],
-        f"slope_px_per_{unit}": number(f.slope / factor),
-        f"slope_monte_carlo_px_per_{unit}": number(f.slope_monte_carlo / factor),
-        f"slope_standard_error_px_per_{unit}": number(f.slope_se / factor),
+        "controlled_px": plain(f.controlled),
+        "controlled_standard_error_px": plain(f.controlled_se),
+        "same_draws_px": f.same_draws.tolist(), "analytic_px": plain(f.analytic),
+        f"slope_px_per_{unit}": plain(f.slope / factor),
+        f"slope_monte_carlo_px_per_{unit}": plain(f.slope_monte_carlo / factor),
+        f"slope_standard_error_px_per_{unit}": plain(f.slope_se / factor),
         f"slope_median_px_per_{unit}": median / factor,
         "largest_deviation": float(np.abs(f.deviation).max()),
         "effective_trials": f.effective.tolist(),

@@ -12,7 +12,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
-from adjust.navigation import Beacons, Expected, Head, expected_precision, head_and_beacons
+from adjust.navigation import Beacons, Expected, Head, expected_precision, head_and_beacons, head_of
 from survey.planning.plan_file import NavigationPlan, Plan
 from survey.solution.frames import AdjustedFrames
 
@@ -74,11 +74,9 @@ def plan_navigation(plan: Plan, expected: Adjustment, n_place: int) -> Navigatio
 
 
 def _station(plan: Plan, expected: Adjustment) -> str:
-    carrying = list(dict.fromkeys(c.station_id for c in expected.survey.cameras))
-    turned = [s.station_id for s in expected.survey.stations if s.station_id in carrying and s.motion == "table"]
-    for choice in (turned, carrying):
-        if len(choice) == 1:
-            return choice[0]
+    found = head_of(expected.survey)
+    if found is not None:
+        return found
     raise SurveyError(f"{plan.path}: several stations carry cameras; name one as station under [navigation]")
 
 

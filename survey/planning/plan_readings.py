@@ -19,20 +19,14 @@ from adjust.model.observations import (
     PositionRef,
     Reading,
     ReadingKind,
+    position_text,
 )
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.units import to_si
 from survey.project.declared.instruments import setup_problem
 from survey.project.declared.node import Node
 from survey.project.project import Accuracy, Project
-from survey.project.tables.references import (
-    NameProblemError,
-    Names,
-    check_epochs,
-    position_text,
-    read_frame,
-    read_position,
-)
+from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame, read_position
 
 READING_KINDS = ("direction", "angle", "zenith", "azimuth", "slope_distance", "horizontal_distance",
                  "height_difference")  # fmt: skip

@@ -21,6 +21,7 @@ from adjust.model.survey import FloatArray
 from survey.planning.building import Planned
 from survey.planning.navigation import NavigationOutcome
 from survey.planning.plan_file import Plan
+from survey.solution.dictionary import plain
 from survey.solution.quantities import ARCSEC_PER_RAD, key_of, sigma_unit_for_people
 
 _MOST = 8
@@ -60,11 +61,6 @@ class PlanningOutcome:
 def people(unit: str) -> tuple[str, float]:
     """Unit and factor in which a sigma is read."""
     return sigma_unit_for_people(unit)
-
-
-def number(value: float) -> float | None:
-    """A finite number, or None for JSON."""
-    return float(value) if np.isfinite(value) else None
 
 
 def sigma_of(component: Component, sigma: float) -> str:
@@ -158,7 +154,7 @@ def _tolerances(o: PlanningOutcome) -> dict[str, Any]:
     met = o.budget.sigmas <= np.array(list(o.required.values())) * (1 + 1e-9)
     return {
         "met": bool(met.all()),
-        "groups": {t.group: {"factor_alone": number(t.alone), "factor_together": number(t.together),
+        "groups": {t.group: {"factor_alone": plain(t.alone), "factor_together": plain(t.together),
                              "limited_by": t.limiting} for t in o.tolerances},
         "components": {
             c.text: {"required": people(c.unit)[1] * r, "planned": people(c.unit)[1] * float(s),
@@ -187,22 +183,22 @@ def _navigation(n: NavigationOutcome) -> dict[str, Any]:
         "undetermined": sum(bool(e.undetermined) for e in n.precision),
         "meet_requirement": int(np.sum(meets(n))),
         "beacons": len(n.beacons.beacon_ids),
-        "sigma_rotation_deg": [number(v) for v in turn],
-        "sigma_translation_mm": [number(v) for v in shift],
+        "sigma_rotation_deg": plain(turn),
+        "sigma_translation_mm": plain(shift),
         "beacons_seen": [len(e.beacon_ids) for e in n.precision],
         "tolerances": {},
     }
     for t in n.tolerances:
         unit, alone, beside, shared = tolerance_values(t)
         key = t.source.replace(" ", "_")
-        out["tolerances"][key] = {f"alone_{unit}": number(alone), f"beside_{unit}": number(beside),
-                                  f"shared_{unit}": number(shared)}  # fmt: skip
+        out["tolerances"][key] = {f"alone_{unit}": plain(alone), f"beside_{unit}": plain(beside),
+                                  f"shared_{unit}": plain(shared)}  # fmt: skip
     if n.tolerances:
-        out["simulated_over_predicted"] = [number(v) for v in n.simulated]
+        out["simulated_over_predicted"] = plain(n.simulated)
     if n.placement is not None:
         p = n.placement
         out["placement"] = {
-            "x_mm": (1e3 * n.places).tolist(), "measure": [number(v) for v in p.measure], "exchanged": p.exchanged,
+            "x_mm": (1e3 * n.places).tolist(), "measure": plain(p.measure), "exchanged": p.exchanged,
             "final": p.final, "criterion": n.plan.criterion,
         }  # fmt: skip
     return out

@@ -7,12 +7,18 @@ from typing import Any
 import numpy as np
 
 from adjust.model.errors import SurveyError
-from adjust.model.observations import CoordinateDifferences, Coordinates, FrameRef, PositionRef, ReadingCovariance
+from adjust.model.observations import (
+    CoordinateDifferences,
+    Coordinates,
+    FrameRef,
+    PositionRef,
+    ReadingCovariance,
+    position_text,
+)
 from adjust.model.survey import BoolArray, IntArray, Survey
 from survey.folder.text import suggestion
 from survey.project.exclusions import WHAT, Name, name_problem
 from survey.project.project import SpotBlock
-from survey.project.tables.references import position_text
 
 _READINGS: Mapping[str, tuple[str, Callable[[Any], str]]] = {  # table: field of the survey, id of an observation
     "table_angles": ("table_readings", lambda r: f"{r.table_id}/{r.epoch_id}"),
@@ -362,7 +368,7 @@ def without(
     every = union(hits)
     masks, others, members, gone = every.images, every.others, every.members, every.spots
     blocks = tuple(
-        replace(b, used=~masks[i] if b.used is None else b.used & ~masks[i]) if i in masks else b
+        replace(b, used=b.mask & ~masks[i]) if i in masks else b
         for i, b in enumerate(survey.image_blocks)
     )
     changed: dict[str, Any] = {

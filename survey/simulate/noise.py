@@ -1,16 +1,17 @@
 """Fresh noise on every observation and prior of a survey, drawn around the truth with its own covariance."""
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.design.noise import moved, with_drawn_priors
+from adjust.design.readings import draw
 from adjust.model.observations import Pair
-from adjust.model.survey import Camera, FloatArray, Point, PoseParameter, Station, Survey, Table, Target, VectorPrior
+from adjust.model.survey import FloatArray, Survey
 from survey.simulate.readings import fresh_readings
-from survey.simulate.scene import BROWN, Scene, Truth
+from survey.simulate.scene import Scene, Truth
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +48,11 @@ def resample(survey: Survey, truth: Truth, seed: int) -> Survey:
         survey,
         image_blocks=tuple(replace(b, uv=uv) for b, uv in zip(survey.image_blocks, parts, strict=True)),
         table_readings=tuple(
-            replace(r, angles=angles + _draw(r.cov, rng))
+            replace(r, angles=angles + draw(r.cov, rng))
             for r, angles in zip(survey.table_readings, ideal.table, strict=True)
         ),
         pairs=tuple(
-            replace(p, b_from_a=_disturbed(value, _draw(p.cov, rng)))
+            replace(p, b_from_a=moved(value, draw(p.cov, rng)))
             for p, value in zip(survey.pairs, ideal.pairs, strict=True)
         ),
         distances=tuple(
@@ -59,16 +60,11 @@ def resample(survey: Survey, truth: Truth, seed: int) -> Survey:
             for d, value in zip(survey.distances, ideal.distances, strict=True)
         ),
         coordinates=tuple(
-            replace(c, values=values + _draw(c.cov, rng).reshape(-1, 3))
+            replace(c, values=values + draw(c.cov, rng).reshape(-1, 3))
             for c, values in zip(survey.coordinates, ideal.coordinates, strict=True)
         ),
-        cameras=tuple(_camera(c, truth, rng) for c in survey.cameras),
-        stations=tuple(_station(s, truth, rng) for s in survey.stations),
-        tables=tuple(_table(t, truth, rng) for t in survey.tables),
-        targets=tuple(_target(t, truth, rng) for t in survey.targets),
-        points=tuple(_point(p, truth, rng) for p in survey.points),
     )
-    return replace(again, **fresh_readings(ideal.scene, rng))
+    return replace(with_drawn_priors(again, rng, truth), **fresh_readings(ideal.scene, rng))
 
 
 def _ideal(scene: Scene) -> _Ideal:
@@ -98,91 +94,3 @@ def _ideal(scene: Scene) -> _Ideal:
 def _true_pair(scene: Scene, pair: Pair) -> Pose3 | Rot3:
     b_from_a = np.linalg.inv(scene.world_from_frame(pair.b)) @ scene.world_from_frame(pair.a)
     return Rot3(b_from_a[:3, :3]) if isinstance(pair.b_from_a, Rot3) else Pose3(b_from_a)
-
-
-def _draw(cov: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """(n,) noise with covariance (n, n); zero where the diagonal is infinite or the component exact."""
-    noise = np.zeros(len(cov))
-    known = np.isfinite(np.diag(cov)) & (np.diag(cov) > 0.0)
-    if known.any():
-        noise[known] = np.linalg.cholesky(cov[np.ix_(known, known)]) @ rng.standard_normal(int(known.sum()))
-    return noise
-
-
-def _disturbed(value: Pose3 | Rot3, tangent: FloatArray) -> Pose3 | Rot3:
-    if isinstance(value, Rot3):
-        return value.compose(Rot3.Expmap(tangent))
-    return value.compose(Pose3.Expmap(tangent))
-
-
-def _pose(parameter: PoseParameter, truth: Truth, name: tuple[str, ...], rng: np.random.Generator) -> PoseParameter:
-    true = truth.get(name)
-    if parameter.treatment != "prior" or parameter.prior_cov is None or not isinstance(true, Pose3):
-        return parameter
-    mean = true.compose(Pose3.Expmap(_draw(parameter.prior_cov, rng)))
-    return replace(parameter, value=mean)
-
-
-def _poses(
-    parameters: Mapping[str, PoseParameter], draw: Callable[[PoseParameter, str], PoseParameter]
-) -> dict[str, PoseParameter]:
-    return {epoch_id: draw(parameter, epoch_id) for epoch_id, parameter in parameters.items()}
-
-
-def _vector_prior(
-    prior: VectorPrior | None, names: tuple[str, ...], true: Pose3 | FloatArray | None, rng: np.random.Generator
-) -> VectorPrior | None:
-    if prior is None or true is None or isinstance(true, Pose3):
-        return prior
-    by_name = dict(zip(names, true, strict=True))
-    return replace(prior, mean=np.array([by_name[name] for name in prior.names]) + _draw(prior.cov, rng))
-
-
-def _camera(camera: Camera, truth: Truth, rng: np.random.Generator) -> Camera:
-    name = camera.camera_id
-    prior = _vector_prior(camera.lens.prior, BROWN, truth.get(("lens", name)), rng)
-    return replace(
-        camera,
-        lens=replace(camera.lens, prior=prior),
-        station_from_camera=_pose(camera.station_from_camera, truth, ("station_from_camera", name), rng),
-    )
-
-
-def _station(station: Station, truth: Truth, rng: np.random.Generator) -> Station:
-    name = station.station_id
-    return replace(
-        station,
-        world_from_station=_pose(station.world_from_station, truth, ("world_from_station", name), rng),
-        mount_from_station=_pose(station.mount_from_station, truth, ("mount_from_station", name), rng),
-        epochs=_poses(station.epochs, lambda p, e: _pose(p, truth, ("world_from_station", name, e), rng)),
-    )
-
-
-def _table(table: Table, truth: Truth, rng: np.random.Generator) -> Table:
-    name, geometry = table.table_id, table.geometry
-    prior = _vector_prior(geometry.prior, geometry.names, truth.get(("table_geometry", name)), rng)
-    return replace(
-        table,
-        geometry=replace(geometry, prior=prior),
-        world_from_table=_pose(table.world_from_table, truth, ("world_from_table", name), rng),
-    )
-
-
-def _target(target: Target, truth: Truth, rng: np.random.Generator) -> Target:
-    name, warp = target.target_id, target.warp
-    if warp is not None:
-        warp = replace(warp, prior=_vector_prior(warp.prior, warp.names, truth.get(("warp", name)), rng))
-    return replace(
-        target,
-        warp=warp,
-        carrier_from_target=_pose(target.carrier_from_target, truth, ("carrier_from_target", name), rng),
-        epochs=_poses(target.epochs, lambda p, e: _pose(p, truth, ("carrier_from_target", name, e), rng)),
-    )
-
-
-def _point(point: Point, truth: Truth, rng: np.random.Generator) -> Point:
-    parameter = point.x_in_world
-    true = truth.get(("point", point.point_id))
-    if parameter.treatment != "prior" or parameter.prior_cov is None or true is None or isinstance(true, Pose3):
-        return point
-    return replace(point, x_in_world=replace(parameter, value=true + _draw(parameter.prior_cov, rng)))

@@ -12,6 +12,7 @@ import numpy as np
 from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
+from adjust.design.readings import draw
 from adjust.model.observations import Alignment, FrameRef, LaserSpot, Level, OnSurface, PositionRef, Reading
 from adjust.model.survey import FloatArray, Survey, VectorParameter, tilt_axes
 from survey.simulate.scene import Scene
@@ -163,11 +164,3 @@ def _prior(vector: VectorParameter, scene: Scene, name: tuple[str, ...], rng: np
         return vector
     mean = np.array([true[vector.names.index(n)] for n in vector.prior.names]) + draw(vector.prior.cov, rng)
     return replace(vector, prior=replace(vector.prior, mean=mean))
-
-
-def draw(cov: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """(n,) noise with covariance (n, n); zero where the diagonal is infinite."""
-    noise, known = np.zeros(len(cov)), np.isfinite(np.diag(cov))
-    if known.any():
-        noise[known] = np.linalg.cholesky(cov[np.ix_(known, known)]) @ rng.standard_normal(int(known.sum()))
-    return noise

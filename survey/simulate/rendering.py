@@ -25,6 +25,7 @@ from adjust.model.survey import FloatArray
 from adjust.native.vision import Facets, draw_facets, pixel_corner_rays, spread_and_sum
 from survey.project.dictionaries import charuco_board, marker_cells
 from survey.project.targets import Charuco, Checkerboard, DetectableTarget, MarkerBlock, MarkerGrid
+from survey.simulate.scene import BROWN, Scene
 
 GrayImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 _Gray32 = npt.NDArray[np.float32]
@@ -125,6 +126,26 @@ class _Patch:
 
     def y_edges(self) -> FloatArray:
         return self.y0 + self.y_step * np.arange(self.cells.shape[0] + 1)
+
+
+def scene_camera(scene: Scene, camera_id: str) -> BrownCamera:
+    """A camera as it truly is."""
+    lens = dict(zip(BROWN, scene.vector("lens", camera_id), strict=True))
+    distortion = tuple(float(lens[name]) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"))
+    size = next(c.image_size for c in scene.survey.cameras if c.camera_id == camera_id)
+    return BrownCamera(size, lens["fx"], lens["fy"], lens["u0"], lens["v0"], distortion)
+
+
+def may_be_seen(camera: BrownCamera, camera_from_target: Pose3, x_in_target: FloatArray) -> bool:
+    """Whether a sphere around the target reaches into the cone around the image; rendering the others costs time."""
+    middle = x_in_target.mean(axis=0)
+    radius = 1.3 * float(np.linalg.norm(x_in_target - middle, axis=1).max())  # with what is around the points
+    x, y, z = camera_from_target.transformFrom(middle)
+    distance = float(np.linalg.norm((x, y, z)))
+    if distance <= radius:
+        return True
+    half_field = np.arctan(0.5 * np.hypot(*camera.image_size) / min(camera.fx, camera.fy)) + np.radians(6.0)
+    return bool(np.arctan2(np.hypot(x, y), z) < half_field + np.arcsin(radius / distance))
 
 
 def render(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3, Rot3
 
-from adjust.model.observations import FrameRef, Pair
+from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.pose_network.loops import evaluate_loops
@@ -52,10 +52,7 @@ class PairNetwork:
 
 def frame_name(frame: FrameRef) -> str:
     """As in tables; a station goes without its kind."""
-    if frame.kind == "world":
-        return _WORLD
-    text = frame.frame_id if frame.kind == "station" else f"{frame.kind}:{frame.frame_id}"
-    return f"{text}@{frame.epoch_id}" if frame.epoch_id else text
+    return frame_text(frame).removeprefix("station:")
 
 
 def pair_network(survey: Survey) -> PairNetwork:

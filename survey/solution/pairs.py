@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model.observations import FrameRef
+from adjust.model.observations import frame_text
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray
 from adjust.precision.precision import Precision
@@ -30,7 +30,7 @@ def pairs_dict(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
     found = {o.ids[0]: o for o in adjustment.other_residuals if o.kind == "pair"}
     tests = _tests([found[p.pair_id] for p in adjustment.survey.pairs if p.pair_id in found])
     refs = dict.fromkeys(r for p in adjustment.survey.pairs for r in (p.a, p.b))
-    place, text = {r: frames.world_from(r) for r in refs}, {r: _frame_text(r) for r in refs}
+    place, text = {r: frames.world_from(r) for r in refs}, {r: frame_text(r) for r in refs}
     for pair in adjustment.survey.pairs:
         a, b = place[pair.a], place[pair.b]
         is_pose = isinstance(pair.b_from_a, Pose3)
@@ -45,11 +45,6 @@ def pairs_dict(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
                 entry.get(form, {}).pop("translation_mm", None)
         out[pair.pair_id] = entry | tests.get(pair.pair_id, {})
     return out
-
-
-def _frame_text(frame: FrameRef) -> str:
-    text = frame.kind + (f":{frame.frame_id}" if frame.frame_id else "")
-    return f"{text}@{frame.epoch_id}" if frame.epoch_id else text
 
 
 def pair_sigmas(adjusted: Pose3, cov: FloatArray | None, factor: float = 1.0) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from gtsam import Pose3
 from adjust.navigation import EpochPose, NavigationEpoch, Trajectory
 from survey.project import atomic_write
 from survey.project.tables.files import write_table
+from survey.solution.dictionary import plain
 from survey.solution.quantities import ARCSEC_PER_RAD, pose_dict
 
 _POSE_COLUMNS = (
@@ -67,15 +68,11 @@ def write_trajectory(
     return paths
 
 
-def _finite(matrix: Any) -> Any:
-    return [[float(v) if np.isfinite(v) else None for v in row] for row in matrix]
-
-
 def _entry(epoch: EpochPose) -> dict[str, Any]:
     """One epoch: pose, covariance (rad, m; tangent in the head; None where open), its sources, and other solutions."""
     entry: dict[str, Any] = {"status": epoch.status, "bridge": epoch.bridge, "labels": [list(x) for x in epoch.labels]}
     if isinstance(epoch.world_from_station, Pose3):
-        entry |= {"world_from_station": pose_dict(epoch.world_from_station), "covariance": _finite(epoch.cov)}
+        entry |= {"world_from_station": pose_dict(epoch.world_from_station), "covariance": plain(epoch.cov)}
     if epoch.shares is not None:
         shares = epoch.shares
         parts = {"spots": shares.spots, "beacons": shares.beacons, "calibration": shares.calibration,

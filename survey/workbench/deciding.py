@@ -21,7 +21,7 @@ from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
 from survey.project.reading import leaving_out, read_all
 from survey.solution.earlier.changes import Changes
 from survey.workbench.resident import Resident, Watch
-from survey.workbench.situation import CancelledError, ChangedError, Situation, Step, n_used, signature_of
+from survey.workbench.situation import CancelledError, ChangedError, Situation, Step, signature_of
 
 _NONE: Mapping[str, str] = MappingProxyType({})
 
@@ -63,8 +63,8 @@ class Deciding(Resident):
         hits = union(observed.hits(name, observed.place_of(name)) for name in found)
         gone = leaving_out(now.everything, [*now.exclusions.values(), *(Exclusion(n) for n in found)]) \
             if excluded else now.project  # fmt: skip
-        images = {(b.camera_id, b.epoch_id) for b in now.project.survey.image_blocks if n_used(b)}
-        kept = {(b.camera_id, b.epoch_id) for b in gone.survey.image_blocks if n_used(b)}
+        images = {(b.camera_id, b.epoch_id) for b in now.project.survey.image_blocks if b.n_used}
+        kept = {(b.camera_id, b.epoch_id) for b in gone.survey.image_blocks if b.n_used}
         epochs = {e for _, e in images} - {e for _, e in kept}
         return {
             "names": [str(n) for n in found], "text": hits.text(), "n_image_points": hits.n_image_points,

@@ -33,7 +33,6 @@ from survey.workbench.situation import (
     in_complex,
     signature_of,
     spot_places,
-    used_only,
 )
 
 Watch = Callable[[int, float], None]
@@ -173,7 +172,7 @@ class Resident:
         if mode == "cold" or self.version == 0 or not spot_places(project.spots) <= situation.known_spots:
             return None, "cold"
         survey = situation.now
-        named = tuple(used_only(b) for b in survey.image_blocks[len(project.survey.image_blocks) :])
+        named = tuple(b.in_use() for b in survey.image_blocks[len(project.survey.image_blocks) :])
         blocks = (*project.survey.image_blocks, *(b for b in named if len(b.uv)))
         survey = replace(project.survey, image_blocks=blocks)
         survey = seen_points(survey) if project.spots else survey

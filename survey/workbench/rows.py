@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from adjust.model.observations import FrameRef, ImageBlock
+from adjust.model.observations import FrameRef, ImageBlock, frame_text, position_text
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from survey.project.observed import Hits, Observed, name_of_residual
-from survey.project.tables.references import frame_text, position_text
 from survey.solution.dictionary import plain
 from survey.solution.quantities import sigma_unit_for_people, unit_for_people
 from survey.workbench.places import refs_of
@@ -93,7 +92,7 @@ def point_rows(survey: Survey, now: Survey, adjustment: Adjustment | None) -> Po
 
 
 def _used(blocks: Sequence[ImageBlock]) -> BoolArray:
-    parts = [np.ones(len(b.uv), dtype=np.bool_) if b.used is None else b.used for b in blocks]
+    parts = [b.mask for b in blocks]
     return np.concatenate([*parts, np.zeros(0, dtype=np.bool_)])
 
 

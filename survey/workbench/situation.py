@@ -150,17 +150,6 @@ def in_complex(uv: FloatArray) -> list[complex]:
     return [complex(u, v) for u, v in uv.tolist()]
 
 
-def n_used(block: ImageBlock) -> int:
-    """How many of its points are in use."""
-    return len(block.uv) if block.used is None else int(block.used.sum())
-
-
-def used_only(block: ImageBlock) -> ImageBlock:
-    """The block without its points that are not in use."""
-    rows = np.arange(len(block.uv)) if block.used is None else np.flatnonzero(block.used)
-    return replace(block, point_idx=block.point_idx[rows], uv=block.uv[rows], cov=block.cov[rows], used=None)
-
-
 def identified_in(everything: Project, adjustment: Adjustment) -> tuple[ImageBlock, ...]:
     """The spots that the adjustment found a name for, as blocks over all points of the project."""
     spots = spot_places(everything.spots)

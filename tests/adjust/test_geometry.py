@@ -40,8 +40,8 @@ from adjust.model.survey import (
     Vertical,
     tilt_axes,
 )
-from adjust.observations.geometry.motions import direction_motions, surface_motions
 from adjust.observations.geometry.residuals import line_distance, plane_distance, sphere_distance
+from adjust.observations.motions import direction_motions, surface_motions
 from adjust.spatial.motions import point_motions
 from adjust.spatial.vertical import tilted
 from tests.adjust import helpers as h
@@ -457,7 +457,7 @@ def test_free_vertical_turns_with_the_survey() -> None:
          r"level 'up': the axis of station:stage starts 90 deg .* name the axis along which it was laid"),
         ({"alignments": (Alignment("a", FrameRef("station", "stage"), np.array([1.0, 0, 0]), FrameRef("world"),
                                    np.array([-1.0, 0, 0]), np.zeros(2), np.eye(2)),)},
-         r"alignment 'a': the axes of station:stage and world: start 180 deg apart; correct an axis"),
+         r"alignment 'a': the axes of station:stage and world start 180 deg apart; correct an axis"),
         ({"laser_spots": (LaserSpot("s", "gone", "e", "board", np.zeros(2), np.eye(2)),)},
          r"beam 'gone' is observed but not part of the survey"),
         ({"on_surfaces": (OnSurface("gone", PositionRef(frame=FrameRef("station", "stage")), 1e-3),)},

@@ -7,8 +7,7 @@ import pytest
 
 from adjust.adjustment import adjust
 from adjust.model.errors import SurveyError
-from survey.jobs.adjusting.probable_causes import explained
-from survey.project.epoch_names import separate_epochs
+from survey.jobs.adjusting.probable_causes import explained, separate_epochs
 from survey.simulate import stereo
 
 

@@ -10,20 +10,27 @@ from gtsam import Pose3
 from adjust.frames.state import State
 from adjust.frames.unknowns import Chain, FrameTree, Unknowns, VectorMap, vector_map
 from adjust.model.errors import SurveyError
-from adjust.model.observations import Alignment, FrameRef, LaserSpot, Level, OnSurface, PositionRef
+from adjust.model.observations import (
+    Alignment,
+    FrameRef,
+    LaserSpot,
+    Level,
+    OnSurface,
+    PositionRef,
+    frame_text,
+    position_text,
+)
 from adjust.model.result import ParameterName
 from adjust.model.survey import SURFACES, Beam, BoolArray, FloatArray, Surface, Survey, VectorParameter
-from adjust.observations.factors import ChainPose, Position, custom
+from adjust.observations.factors import ChainPose, ObservationFactor, Position, custom, positions_residual
 from adjust.observations.geometry.fitting import fitted_beam, fitted_surface
 from adjust.observations.geometry.residuals import (
     alignment_residual,
     beam_axes,
-    differences_residual,
     level_residual,
     spot_residual,
     surface_residual,
 )
-from adjust.observations.listed import ObservationFactor, frame_text, position_text
 from adjust.spatial.vertical import VerticalMap, collect_vertical, up_at
 
 BEAM_UNITS = ("m", "m", "1", "1")
@@ -160,7 +167,8 @@ class GeometryFactors:
             a, b = [at[ref] for ref in d.at], [at[ref] for ref in d.to]
             keys = list(dict.fromkeys(k for p in (*a, *b) for k in p.keys))
             _refuse_held(keys, f"the coordinate difference {ends[0][0]} to {ends[0][1]}")
-            factor = custom(keys, d.cov[np.ix_(known, known)], differences_residual(d, a, b, known))
+            signed = [((y, 1.0), (x, -1.0)) for x, y in zip(a, b, strict=True)]
+            factor = custom(keys, d.cov[np.ix_(known, known)], positions_residual(signed, d.values, known))
             names = tuple(f"{a} {b} {axis}" if len(ends) > 1 else axis for a, b in ends for axis in "xyz")
             ids = tuple(dict.fromkeys(x for pair in ends for x in pair))
             names, observed = tuple(np.array(names)[known]), d.values.ravel()[known]

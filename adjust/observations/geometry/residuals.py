@@ -3,40 +3,17 @@
 A direction u = R a of a body turns with its pose by ``du = -R [a]x dw`` (perturbation on the right).
 """
 
-from collections.abc import Sequence
 
 import gtsam
 import numpy as np
 from gtsam import Pose3
 
 from adjust.frames.unknowns import VectorMap
-from adjust.model.observations import Alignment, CoordinateDifferences, LaserSpot, Level, OnSurface
+from adjust.model.observations import Alignment, LaserSpot, Level, OnSurface
 from adjust.model.survey import BoolArray, FloatArray, Surface, tilt_axes
 from adjust.observations.factors import ChainPose, Jacobians, Position, Residual
 from adjust.spatial.rigid import skew
 from adjust.spatial.vertical import VerticalMap, tilted_frame, up_at
-
-
-def differences_residual(
-    observation: CoordinateDifferences, at: Sequence[Position], to: Sequence[Position], known: BoolArray
-) -> Residual:
-    """Coordinates of ``to`` minus those of ``at``; ``known`` (k,): which of the 3n components were observed."""
-    wanted = observation.values.ravel()
-
-    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
-        out, blocks = np.zeros(3 * len(at)), []
-        for i, (a, b) in enumerate(zip(at, to, strict=True)):
-            rows = slice(3 * i, 3 * i + 3)
-            for position, sign in ((b, 1.0), (a, -1.0)):
-                x, jacobians = position(values)
-                out[rows] += sign * x
-                for key, J in jacobians:
-                    block = np.zeros((len(out), J.shape[1]))
-                    block[rows] = sign * J
-                    blocks.append((key, block[known]))
-        return (out - wanted)[known], blocks
-
-    return residual
 
 
 def alignment_residual(observation: Alignment, b_from_a: ChainPose, known: BoolArray) -> Residual:

@@ -10,11 +10,10 @@ from typing import overload
 import gtsam
 import numpy as np
 
-from adjust.model.observations import Reading
+from adjust.model.observations import Reading, position_text
 from adjust.model.result import ObservationResidual, ReadingResiduals
 from adjust.model.survey import FloatArray, Survey
 from adjust.native.trees import KeyCovariances, row_influences
-from adjust.observations.listed import position_text
 from adjust.observations.terrestrial.batch import TerrestrialBatch
 
 _ANGLES = ("direction", "angle", "zenith", "azimuth")

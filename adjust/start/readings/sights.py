@@ -9,9 +9,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from adjust.model.observations import PositionRef, Reading
+from adjust.model.observations import PositionRef, Reading, position_text
 from adjust.model.survey import FloatArray, Survey
-from adjust.observations.listed import position_text
 from adjust.observations.terrestrial.batch import circular_median
 from adjust.spatial.vertical import plumb
 

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from adjust.model.errors import SurveyError
-from adjust.model.observations import PositionRef
+from adjust.model.observations import PositionRef, position_text
 from adjust.model.survey import FloatArray, Survey
-from adjust.observations.listed import position_text
 from adjust.start.readings.plane import PlaneStart
 from adjust.start.readings.sights import (
     Node,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph
-from adjust.model.observations import ImageBlock, ReadingCovariance
+from adjust.model.observations import ReadingCovariance
 from adjust.model.survey import BoolArray, IntArray, Survey
 
 _FIELD = {
@@ -94,7 +94,7 @@ def _blocks(survey: Survey, found: Candidates, out: BoolArray) -> tuple[Any, ...
         if not mine.any():
             blocks.append(block)
             continue
-        used = np.ones(len(mine), dtype=np.bool_) if block.used is None else block.used
+        used = block.mask
         blocks.append(replace(block, used=used & ~mine))
     return tuple(blocks)
 
@@ -111,14 +111,10 @@ def _parts(c: ReadingCovariance, lost: set[str]) -> list[ReadingCovariance]:
 
 def as_given(survey: Survey, given: Survey) -> Survey:
     """The survey with those image points in use that are so in the one it was made of: to be screened anew."""
-    used = {_place(b): b for b in given.image_blocks}
+    used = {b.place: b for b in given.image_blocks}
     blocks = []
     for b in survey.image_blocks:
-        before = used.get(_place(b))
+        before = used.get(b.place)
         same = before is not None and np.array_equal(before.point_idx, b.point_idx)
         blocks.append(replace(b, used=before.used) if before is not None and same else b)
     return replace(survey, image_blocks=tuple(blocks))
-
-
-def _place(block: ImageBlock) -> tuple[str, str, str | None, str]:
-    return block.camera_id, block.epoch_id, block.target_id, block.group

@@ -134,7 +134,7 @@ class _Needs:
         others = self.others()
         few = self._seen_by_too_few(others)
         for block, needs in zip(self.survey.image_blocks, self.of_blocks, strict=True):
-            taking = np.ones(len(block.uv), dtype=np.bool_) if block.used is None else block.used
+            taking = block.mask
             taking = taking & (not needs & few)
             if taking.any():
                 used |= needs
@@ -157,7 +157,7 @@ class _Needs:
         points: dict[ParameterName, int] = {}
         reduced: set[ParameterName] = set()
         for block, needs in zip(self.survey.image_blocks, self.of_blocks, strict=True):
-            n = len(block.uv) if block.used is None else int(block.used.sum())
+            n = block.n_used
             for name in (name for name in needs if _is_of_epoch(name)):
                 points[name] = points.get(name, 0) + n
                 if n < len(block.uv):

@@ -93,7 +93,7 @@ class CameraValues:
     def blocks(self) -> Iterator[ImageBlock]:
         """Image points in use."""
         for block in self.survey.image_blocks:
-            used = np.ones(len(block.uv), dtype=bool) if block.used is None else np.asarray(block.used)
+            used = block.mask
             if used.any():
                 yield ImageBlock(block.camera_id, block.epoch_id, block.target_id, block.point_idx[used],
                                  block.uv[used], block.cov[used])  # fmt: skip

@@ -3,11 +3,9 @@
 import json
 from typing import Any
 
-import numpy as np
-
 from adjust.model.observations import PositionRef
-from adjust.model.survey import FloatArray
 from survey.interop.networks.values import NetworkValues, between_points, point_of
+from survey.solution.dictionary import plain
 
 FORMAT = "labsurvey-network-1"
 
@@ -24,7 +22,7 @@ def network_json(network: NetworkValues) -> str:
         "points": {p.point_id: _point(network, p) for p in survey.points},
         "readings": [_reading(r) for r in survey.readings if between_points(r)],
         "reading_covariances": [
-            {"ids": list(c.reading_ids), "covariance": _rows(c.cov)} for c in survey.reading_covariances
+            {"ids": list(c.reading_ids), "covariance": plain(c.cov)} for c in survey.reading_covariances
         ],
         "distances": [
             {"id": d.distance_id, "from": point_of(d.a), "to": point_of(d.b), "value_m": d.value, "sigma_m": d.sigma,
@@ -32,25 +30,17 @@ def network_json(network: NetworkValues) -> str:
             for d in survey.distances if point_of(d.a) is not None and point_of(d.b) is not None
         ],
         "coordinate_differences": [
-            {"from": _ids(o.at), "to": _ids(o.to), "values_m": _rows(o.values), "covariance_m2": _rows(o.cov),
+            {"from": _ids(o.at), "to": _ids(o.to), "values_m": plain(o.values), "covariance_m2": plain(o.cov),
              "used": o.used}
             for o in survey.coordinate_differences
         ],
         "coordinates": [
-            {"points": _ids(o.positions), "values_m": _rows(o.values), "covariance_m2": _rows(o.cov), "used": o.used}
+            {"points": _ids(o.positions), "values_m": plain(o.values), "covariance_m2": plain(o.cov), "used": o.used}
             for o in survey.coordinates
         ],
         "adjusted": _adjusted(network),
     }  # fmt: skip
     return json.dumps(document, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _rows(matrix: FloatArray) -> list[list[float | None]]:
-    return [[_number(v) for v in row] for row in matrix.tolist()]
 
 
 def _ids(positions: tuple[PositionRef, ...]) -> list[str | None]:
@@ -62,9 +52,9 @@ def _point(network: NetworkValues, point: Any) -> dict[str, Any]:
     parameter = point.x_in_world
     out = {"treatment": parameter.treatment, "held": list(parameter.held)}
     if x is not None:
-        out["x_m"] = [_number(v) for v in x]
+        out["x_m"] = plain(x)
     if parameter.prior_cov is not None:
-        out["prior_covariance_m2"] = _rows(parameter.prior_cov)
+        out["prior_covariance_m2"] = plain(parameter.prior_cov)
     return out
 
 
@@ -85,6 +75,6 @@ def _adjusted(network: NetworkValues) -> dict[str, Any] | None:
     return {
         "sigma_factor": network.factor,
         "points": {
-            name: {"x_m": network.x[name].tolist(), "covariance_m2": _rows(cov)} for name, cov in network.covs.items()
+            name: {"x_m": network.x[name].tolist(), "covariance_m2": plain(cov)} for name, cov in network.covs.items()
         },
     }

@@ -1,5 +1,6 @@
 """Why an adjustment failed, or what contradicts in it, where the images can tell. Nothing is repaired."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +9,6 @@ from typing import TYPE_CHECKING
 from adjust.model.errors import DiagnosedError, IndeterminateError, NotConvergedError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
-from survey.project.epoch_names import separate_epochs
 
 if TYPE_CHECKING:
     from adjust.diagnosis.diagnosis import Diagnosis
@@ -99,5 +99,27 @@ def _contradicted(survey: Survey, result: Adjustment) -> bool:
 
 
 def _images_refused(survey: Survey, result: Adjustment) -> bool:
-    taking_part = sum(1 for b in result.survey.image_blocks if b.used is None or b.used.any())
-    return taking_part < sum(1 for b in survey.image_blocks if b.used is None or b.used.any())
+    taking_part = sum(1 for b in result.survey.image_blocks if b.n_used)
+    return taking_part < sum(1 for b in survey.image_blocks if b.n_used)
+
+
+def separate_epochs(survey: Survey) -> tuple[str, ...]:
+    """For people: pairs of cameras of one station that share no epoch although only moving targets join them."""
+    moving = {t.target_id for t in survey.targets if t.motion == "epoch"}
+    seen: dict[str, set[tuple[str, str]]] = {}
+    joined = set()
+    for block in survey.image_blocks:
+        if block.target_id in moving:
+            seen.setdefault(block.camera_id, set()).add((str(block.target_id), block.epoch_id))
+        else:
+            joined.add(block.camera_id)  # a fixed target or beacons join it to others at any epoch
+    station = {c.camera_id: c.station_id for c in survey.cameras}
+    found = []
+    for a, b in itertools.combinations((c for c in seen if c not in joined), 2):
+        if station[a] == station[b] and not seen[a] & seen[b]:
+            names = ", ".join(repr(sorted(epoch for _, epoch in seen[c])[0]) for c in (a, b))
+            found.append(
+                f"cameras {a} and {b} share no epoch (the first are {names}): give images of one moment the same "
+                "name, images/<camera_id>/<epoch_id>.png, and detect again"
+            )
+    return tuple(found)

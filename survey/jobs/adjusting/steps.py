@@ -174,7 +174,7 @@ def _result(work: Work) -> Adjustment:
 def told(project: Project, given: Survey, adjustment: Adjustment) -> Adjustment:
     """An adjustment that says what was noticed when its project was read, and how much of ``given`` it left out."""
     warnings = adjustment.warnings + project.notes + project.image_notes + image_warnings(project.detected)
-    images = sum(len(b.uv) if b.used is None else int(b.used.sum()) for b in given.image_blocks)
+    images = sum(b.n_used for b in given.image_blocks)
     images -= int(adjustment.image_residuals.used.sum())
     others = given.n_others_used - adjustment.survey.n_others_used
     return replace(adjustment, warnings=warnings, n_screened=images + others)

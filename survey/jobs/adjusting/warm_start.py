@@ -15,7 +15,8 @@ from adjust.graph.assembly import StartValues
 from adjust.lenses.models import MODELS
 from adjust.model.errors import NotConvergedError
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import Camera, FloatArray, LensParameter, PoseParameter, Survey
+from adjust.model.rewriting import Rewriting, Vector
+from adjust.model.survey import FloatArray, LensParameter, PointParameter, PoseParameter, Survey
 from adjust.pose_network.from_survey import network_from_survey, network_of_pairs
 from adjust.start import find_start
 from survey.jobs.adjusting.steps import adjust_project
@@ -84,7 +85,7 @@ def network_poses(survey: Survey, known: Mapping[ParameterName, Pose3]) -> dict[
 
 def survey_start(survey: Survey, previous: Previous) -> StartValues | None:
     """Start values with what is known from before; None where images contradict it."""
-    found = find_start(_with_known(survey, previous))
+    found = find_start(_Known(previous)(survey))
     if found.excluded_blocks:
         return None
     start = start_values(found)
@@ -116,59 +117,34 @@ def _take(
         out[name] = value if held is None else np.where(free, value, held)
 
 
-def _with_known(survey: Survey, previous: Previous) -> Survey:
-    """The survey with previous values of free lenses, poses and points as their start."""
+class _Known(Rewriting):
+    """Previous values of free lenses, poses and points as their start."""
 
-    def pose(parameter: PoseParameter, *name: str) -> PoseParameter:
-        value = previous.poses.get(name)
-        known = value is not None and parameter.treatment == "free" and not parameter.held
-        return replace(parameter, value=value) if known else parameter
+    def __init__(self, previous: Previous) -> None:
+        self.previous = previous
 
-    def epochs(given: Mapping[str, PoseParameter], usual: PoseParameter, *name: str) -> dict[str, PoseParameter]:
-        known = {n[2]: pose(given.get(n[2], usual), *n) for n in previous.poses if n[:2] == name and len(n) == 3}
-        return {**given, **known}
+    def pose(self, name: ParameterName, given: PoseParameter) -> PoseParameter:
+        value = self.previous.poses.get(name)
+        known = value is not None and given.treatment == "free" and not given.held
+        return replace(given, value=value) if known else given
 
-    stations = tuple(
-        replace(
-            s,
-            world_from_station=pose(s.world_from_station, "world_from_station", s.station_id),
-            epochs=epochs(s.epochs, s.world_from_station, "world_from_station", s.station_id),
-            mount_from_station=pose(s.mount_from_station, "mount_from_station", s.station_id),
-        )
-        for s in survey.stations
-    )
-    targets = tuple(
-        replace(
-            t,
-            carrier_from_target=pose(t.carrier_from_target, "carrier_from_target", t.target_id),
-            epochs=epochs(t.epochs, t.carrier_from_target, "carrier_from_target", t.target_id),
-        )
-        for t in survey.targets
-    )
-    tables = tuple(
-        replace(t, world_from_table=pose(t.world_from_table, "world_from_table", t.table_id)) for t in survey.tables
-    )
-    cameras = tuple(
-        replace(
-            c, lens=_known_lens(c, previous),
-            station_from_camera=pose(c.station_from_camera, "station_from_camera", c.camera_id),
-        )
-        for c in survey.cameras
-    )  # fmt: skip
-    points = tuple(
-        replace(p, x_in_world=replace(p.x_in_world, value=previous.points[p.point_id]))
-        if p.x_in_world.treatment == "free" and not p.x_in_world.held and p.point_id in previous.points else p
-        for p in survey.points
-    )  # fmt: skip
-    return replace(survey, stations=stations, targets=targets, tables=tables, cameras=cameras, points=points)
+    def epochs(
+        self, name: ParameterName, given: Mapping[str, PoseParameter], usual: PoseParameter
+    ) -> Mapping[str, PoseParameter]:
+        found = (n for n in self.previous.poses if n[:2] == name and len(n) == 3)
+        return {**given, **{n[2]: self.pose(n, given.get(n[2], usual)) for n in found}}
 
+    def vector(self, name: ParameterName, given: Vector) -> Vector:
+        """The lens with its values of before; what is held, tied or has a prior needs nothing of it."""
+        if not isinstance(given, LensParameter) or not given.free:
+            return given
+        model = MODELS[given.model]
+        found = self.previous.vector(name, model.names, model.units)
+        if found is None or self.previous.vectors[name].get("model") != given.model:
+            return given
+        held = np.zeros(len(model.names)) if given.values is None else given.values
+        return replace(given, values=np.where([n in given.free for n in model.names], found, held))
 
-def _known_lens(camera: Camera, previous: Previous) -> LensParameter:
-    """The lens with its values of before; what is held, tied or has a prior needs nothing of it."""
-    lens, name = camera.lens, ("lens", camera.camera_id)
-    model = MODELS[lens.model]
-    found = previous.vector(name, model.names, model.units)
-    if found is None or previous.vectors[name].get("model") != lens.model or not lens.free:
-        return lens
-    held = np.zeros(len(model.names)) if lens.values is None else lens.values
-    return replace(lens, values=np.where([n in lens.free for n in model.names], found, held))
+    def point(self, name: ParameterName, given: PointParameter) -> PointParameter:
+        known = given.treatment == "free" and not given.held and name[1] in self.previous.points
+        return replace(given, value=self.previous.points[name[1]]) if known else given

@@ -10,7 +10,7 @@ import numpy as np
 from adjust.model.errors import SurveyError
 from adjust.model.subsets import in_use, points_read, with_points
 from adjust.model.survey import Survey
-from adjust.navigation import NavigationEpoch, Spots
+from adjust.navigation import NavigationEpoch, Spots, head_of
 from adjust.statistics.outliers.supported import supported
 from survey.folder.text import decode, natural_key, read_bytes
 from survey.project import Project
@@ -36,12 +36,10 @@ class NavigateRequest:
 
 def chosen_station(project: Project) -> str:
     """The station to navigate: the only one with cameras, or the only one on a table. Raises SurveyError."""
-    survey = project.survey
-    carrying = list(dict.fromkeys(c.station_id for c in survey.cameras))
-    turned = [s.station_id for s in survey.stations if s.station_id in carrying and s.motion == "table"]
-    for choice in (turned, carrying):
-        if len(choice) == 1:
-            return choice[0]
+    found = head_of(project.survey)
+    if found is not None:
+        return found
+    carrying = list(dict.fromkeys(c.station_id for c in project.survey.cameras))
     raise SurveyError(
         f"{project.folder}/survey.toml: {len(carrying)} stations carry cameras ({', '.join(carrying)}); say which one "
         "is to be navigated with --station"
@@ -130,7 +128,7 @@ def _with_known_points(survey: Survey) -> Survey:
     seen: dict[int, set[tuple[str, str]]] = {}
     for b in survey.image_blocks:
         if b.target_id is None:
-            for i in (b.point_idx if b.used is None else b.point_idx[b.used]).tolist():
+            for i in (b.point_idx[b.mask]).tolist():
                 seen.setdefault(i, set()).add((b.camera_id, b.epoch_id))
     given = {r.point_id for c in survey.coordinates if c.used for r in c.positions if r.frame is None}
     given |= points_read(survey)

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import numpy as np
 from gtsam import Rot3
 
-from adjust.model.observations import Closure
+from adjust.model.observations import Closure, frame_text
 from adjust.model.survey import Survey
 from survey.folder.units import from_si, to_si
 from survey.project.declared.declarations import keys_of
@@ -23,7 +23,7 @@ from survey.project.project import (
     Foot,
     Tolerance,
 )
-from survey.project.tables.references import NameProblemError, Names, check_epochs, frame_text, read_frame
+from survey.project.tables.references import NameProblemError, Names, check_epochs, read_frame
 
 _UNITS = ("mm", "arcsec", "deg", "px", "1")
 _SAID = {POSITION: ("mm",), ROTATION: ("arcsec", "deg")}

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from gtsam import Pose3
 
-from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair, TableReading
+from adjust.model.observations import Coordinates, Distance, ImageBlock, Pair, TableReading, frame_text, position_text
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.units import from_si
 from survey.project.declared.poses import quaternion_wxyz
@@ -14,8 +14,7 @@ from survey.project.tables.coordinates import XYZ_RHO, XYZ_SIGMAS
 from survey.project.tables.covariance import sigmas_and_correlations
 from survey.project.tables.pairs import COVARIANCE_COLUMNS, QUATERNION, SIGMA_COLUMNS, TRANSLATION
 from survey.project.tables.reading import Columns, TextColumn
-from survey.project.tables.references import frame_text, position_text
-from survey.project.tables.terrestrial_columns import triple_rows
+from survey.project.tables.terrestrial_columns import between_columns, group_columns, triple_columns
 
 _FLAGS = ("false", "true")
 
@@ -27,7 +26,7 @@ def image_point_columns(blocks: Sequence[ImageBlock], survey: Survey) -> Columns
     index: dict[str, int] = {}
     codes = {owner: np.array([index.setdefault(n, len(index)) for n in ids], int) for owner, ids in names.items()}
     sizes = [len(block.uv) for block in blocks]
-    used = [np.ones(len(block.uv), bool) if block.used is None else np.asarray(block.used) for block in blocks]
+    used = [block.mask for block in blocks]
     flags = np.concatenate([np.zeros(0, bool), *used])
     points = [codes[block.target_id][np.asarray(block.point_idx, int)] for block in blocks]
     return {
@@ -73,7 +72,7 @@ def angle_columns(readings: Sequence[TableReading]) -> Columns:
         "epoch_id": [reading.epoch_id for reading in readings],
         "table_id": [reading.table_id for reading in readings],
         **dict(zip(names, rows.T, strict=True)),
-        **_group_columns([reading.group for reading in readings], [True] * len(readings), "table"),
+        **group_columns(readings, "table", used=False),
     }
 
 
@@ -104,7 +103,7 @@ def pair_columns(pairs: Sequence[Pair]) -> Columns:
         "a_id": [frame_text(pair.a) for pair in pairs],
         "b_id": [frame_text(pair.b) for pair in pairs],
         **columns,
-        **_group_columns([pair.group for pair in pairs], [pair.used for pair in pairs], "pair"),
+        **group_columns(pairs, "pair"),
     }
 
 
@@ -116,50 +115,27 @@ def distance_columns(distances: Sequence[Distance]) -> Columns:
         "to_id": [position_text(distance.b) for distance in distances],
         "value_m": np.array([distance.value for distance in distances]),
         "sigma_mm": from_si([distance.sigma for distance in distances], "mm"),
-        **_group_columns([d.group for d in distances], [d.used for d in distances], "distance"),
+        **group_columns(distances, "distance"),
     }
 
 
 def coordinate_columns(coordinates: Sequence[Coordinates]) -> tuple[Columns, Columns]:
     """One row per position, and one row per covariance between positions of the same observation."""
-    rows, set_ids, groups, used = [], [], [], []
-    between: list[tuple[str, str, str, str, str]] = []
-    covariances: list[float] = []
-    alone: set[str] = set()
+    sets, alone = [], set[str]()
     for number, observation in enumerate(coordinates, 1):
         names = [position_text(position) for position in observation.positions]
         set_id = observation.set_id or (f"set{number}" if len(names) > 1 or names[0] in alone else "")
         alone.update(names if not set_id else ())
-        for i, values in enumerate(observation.values):
-            rows.append(triple_rows(values, observation.cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]))
-            set_ids.append(set_id)
-            groups.append(observation.group)
-            used.append(observation.used)
-        for i, j in zip(*np.nonzero(np.triu(observation.cov)), strict=True):
-            if i // 3 != j // 3:
-                between.append((set_id, names[i // 3], "xyz"[i % 3], names[j // 3], "xyz"[j % 3]))
-                covariances.append(float(from_si(observation.cov[i, j], "mm2")))
-    columns = ("x_mm", "y_mm", "z_mm", *XYZ_SIGMAS, *XYZ_RHO)
-    table: dict[str, Sequence[str] | FloatArray] = {
-        "point_id": [position_text(position) for observation in coordinates for position in observation.positions],
-        **dict(zip(columns, np.array(rows).reshape(-1, 9).T, strict=True)),
+        sets.append((set_id, names, observation.cov))
+    set_ids = [set_id for set_id, names, _ in sets for _ in names]
+    return {
+        "point_id": [name for _, names, _ in sets for name in names],
+        **triple_columns(("x_mm", "y_mm", "z_mm", *XYZ_SIGMAS, *XYZ_RHO), coordinates),
         **({"set_id": set_ids} if any(set_ids) else {}),
-        **_group_columns(groups, used, "coordinates"),
-    }
-    ids = ("set_id", "a_id", "a_axis", "b_id", "b_axis")
-    extra: dict[str, Sequence[str] | FloatArray] = {name: [row[i] for row in between] for i, name in enumerate(ids)}
-    return table, {**extra, "covariance_mm2": np.array(covariances)}
+        **group_columns([c for c in coordinates for _ in c.positions], "coordinates"),
+    }, between_columns(sets)
 
 
 def _repeat(values: Sequence[str], sizes: Sequence[int]) -> TextColumn:
     index = {name: i for i, name in enumerate(dict.fromkeys(values))}
     return TextColumn(tuple(index), np.repeat(np.array([index[name] for name in values], int), sizes))
-
-
-def _group_columns(groups: Sequence[str], used: Sequence[bool], usual: str) -> dict[str, list[str]]:
-    columns = {}
-    if any(group != usual for group in groups):
-        columns["group"] = list(groups)
-    if not all(used):
-        columns["used"] = [_FLAGS[flag] for flag in used]
-    return columns

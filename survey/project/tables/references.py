@@ -8,7 +8,7 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from adjust.model.observations import FrameKind, FrameRef, PositionRef
+from adjust.model.observations import FrameKind, FrameRef, PositionRef, frame_text
 from adjust.model.survey import Survey
 from survey.folder.text import id_problem, suggestion
 from survey.project.tables.reading import Table
@@ -103,11 +103,11 @@ def _read_position(text: str, names: Names) -> PositionRef:
         if text not in names.points:
             raise NameProblemError(f"unknown point {text!r}; {_where_points_come_from(text, names)}")
         return PositionRef(text)
-    frame_text, slash, point_id = text.partition("/")
+    name, slash, point_id = text.partition("/")
     if "@" in point_id:  # target:board/r0c0@e01 is as clear as target:board@e01/r0c0
         point_id, _, epoch = point_id.partition("@")
-        frame_text = f"{frame_text}@{epoch}"
-    frame = read_frame(frame_text, names)
+        name = f"{name}@{epoch}"
+    frame = read_frame(name, names)
     if not slash:
         return PositionRef(None, frame)
     if frame.kind != "target":
@@ -140,20 +140,6 @@ def check_epochs(a: FrameRef | None, b: FrameRef | None, names: Names) -> None:
         if ref and body and ref.epoch_id is None:
             name = frame_text(ref)
             raise NameProblemError(f"{name!r} moves and the epoch is not given; write '{name}@epoch_id'")
-
-
-def frame_text(frame: FrameRef) -> str:
-    """The name that ``read_frame`` reads."""
-    if frame.kind == "world":
-        return "world"
-    return f"{frame.kind}:{frame.frame_id}" + (f"@{frame.epoch_id}" if frame.epoch_id is not None else "")
-
-
-def position_text(position: PositionRef) -> str:
-    """The name that ``read_position`` reads."""
-    if position.frame is None:
-        return position.point_id or ""
-    return frame_text(position.frame) + (f"/{position.point_id}" if position.point_id is not None else "")
 
 
 def read_ends(

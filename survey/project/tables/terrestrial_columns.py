@@ -1,17 +1,21 @@
 """Terrestrial and geometric observations as the columns of their tables, the inverse of the modules that read them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from adjust.model.observations import (
     Alignment,
     CoordinateDifferences,
+    Coordinates,
     LaserSpot,
     Level,
     OnSurface,
     Reading,
     ReadingCovariance,
+    frame_text,
+    position_text,
 )
 from adjust.model.survey import FloatArray, Survey
 from survey.folder.units import from_si
@@ -19,7 +23,6 @@ from survey.project.tables.coordinates import DIFFERENCE, DIFFERENCE_RHO, DIFFER
 from survey.project.tables.covariance import sigmas_and_correlations
 from survey.project.tables.geometric import axis_text
 from survey.project.tables.reading import Columns
-from survey.project.tables.references import frame_text, position_text
 from survey.project.tables.terrestrial import ANGLES, HEIGHTS
 
 _Column = Sequence[str] | FloatArray
@@ -40,14 +43,16 @@ def new_tables(survey: Survey) -> dict[str, Columns]:
     }
 
 
-def group_columns(groups: Sequence[str], used: Sequence[bool], usual: Sequence[str] | str) -> dict[str, list[str]]:
-    """``group`` and ``used`` where they are not as usual."""
-    expected = [usual] * len(groups) if isinstance(usual, str) else list(usual)
+def group_columns(items: Sequence[Any], usual: str = "", used: bool = True) -> dict[str, list[str]]:
+    """``group`` and ``used`` of one item a row where they are not as usual: readings have groups by their kind.
+
+    used: whether the table tells it.
+    """
     columns = {}
-    if list(groups) != expected:
-        columns["group"] = list(groups)
-    if not all(used):
-        columns["used"] = ["true" if flag else "false" for flag in used]
+    if any(x.group != (usual or x.kind) for x in items):
+        columns["group"] = [x.group for x in items]
+    if used and not all(x.used for x in items):
+        columns["used"] = ["true" if x.used else "false" for x in items]
     return columns
 
 
@@ -83,7 +88,7 @@ def reading_columns(readings: Sequence[Reading]) -> Columns:
         "to_id": [position_text(r.to) for r in readings],
         "reading_id": [r.reading_id for r in readings],
         **_filled(columns),
-        **group_columns([r.group for r in readings], [r.used for r in readings], [r.kind for r in readings]),
+        **group_columns(readings),
     }
 
 
@@ -101,8 +106,16 @@ def correlation_columns(covariances: Sequence[ReadingCovariance]) -> Columns:
     }
 
 
-def triple_rows(values: FloatArray, cov: FloatArray) -> FloatArray:
-    """Values, sigmas and correlations (9,) of three coordinates in mm, nan where not observed."""
+def triple_columns(
+    names: Sequence[str], items: Sequence[Coordinates] | Sequence[CoordinateDifferences]
+) -> dict[str, FloatArray]:
+    """Values, sigmas and correlations (9 columns) of three coordinates a row in mm, nan where not observed."""
+    rows = [_triple(x, item.cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3])
+            for item in items for i, x in enumerate(item.values)]  # fmt: skip
+    return dict(zip(names, np.array(rows).reshape(-1, 9).T, strict=True))
+
+
+def _triple(values: FloatArray, cov: FloatArray) -> FloatArray:
     known = np.isfinite(np.diag(cov))
     sigma, rho = sigmas_and_correlations(np.where(np.isfinite(cov), cov, 1.0)[None])
     pairs = np.triu_indices(3, 1)
@@ -111,38 +124,40 @@ def triple_rows(values: FloatArray, cov: FloatArray) -> FloatArray:
     return np.concatenate([*row, np.where(both & (rho[0] != 0.0), rho[0], np.nan)])
 
 
+def between_columns(sets: Iterable[tuple[str, Sequence[str], FloatArray]]) -> dict[str, _Column]:
+    """One row per covariance between different rows of a set; sets: id, names of its rows (n,), cov (3n, 3n) m^2."""
+    rows, values = [], []
+    for set_id, names, cov in sets:
+        for i, j in zip(*np.nonzero(np.triu(cov)), strict=True):
+            if i // 3 != j // 3:
+                rows.append((set_id, names[i // 3], "xyz"[i % 3], names[j // 3], "xyz"[j % 3]))
+                values.append(float(from_si(cov[i, j], "mm2")))
+    ids = ("set_id", "a_id", "a_axis", "b_id", "b_axis")
+    out: dict[str, _Column] = {name: [row[i] for row in rows] for i, name in enumerate(ids)}
+    return {**out, "covariance_mm2": np.array(values)}
+
+
 def difference_columns(items: Sequence[CoordinateDifferences]) -> tuple[Columns, Columns]:
     """One row per difference, and one row per covariance between those of the same observation."""
-    rows: list[FloatArray] = []
-    names, ends, set_ids, groups, used = [], [], [], [], []
-    between: list[tuple[str, str, str, str]] = []
-    covariances: list[float] = []
-    for number, item in enumerate(items, 1):
-        first = len(rows)
-        for i, pair in enumerate(zip(item.at, item.to, strict=True)):
+    names: list[str] = []
+    sets = []
+    for item in items:
+        first = len(names)
+        for _ in item.at:
             own = item.set_id if len(item.at) == 1 and item.set_id not in names else ""
-            names.append(own or f"d{len(rows) + 1}")
-            ends.append(tuple(position_text(ref) for ref in pair))
-            rows.append(triple_rows(item.values[i], item.cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]))
-            set_ids.append((item.set_id or f"set{number}") if len(item.at) > 1 else "")
-            groups.append(item.group)
-            used.append(item.used)
-        for i, j in zip(*np.nonzero(np.triu(item.cov, 1)), strict=True):
-            if i // 3 != j // 3:
-                between.append((names[first + i // 3], "xyz"[i % 3], names[first + j // 3], "xyz"[j % 3]))
-                covariances.append(float(from_si(item.cov[i, j], "mm2")))
-    columns = (*DIFFERENCE, *DIFFERENCE_SIGMAS, *DIFFERENCE_RHO)
-    numbers = dict(zip(columns, np.array(rows).reshape(-1, 9).T, strict=True))
-    table: dict[str, _Column] = {
+            names.append(own or f"d{len(names) + 1}")
+        sets.append(("", names[first:], item.cov))
+    set_ids = [(x.set_id or f"set{n}") if len(x.at) > 1 else "" for n, x in enumerate(items, 1) for _ in x.at]
+    numbers = triple_columns((*DIFFERENCE, *DIFFERENCE_SIGMAS, *DIFFERENCE_RHO), items)
+    between = between_columns(sets)
+    del between["set_id"]
+    return {
         "difference_id": names,
-        "from_id": [end[0] for end in ends],
-        "to_id": [end[1] for end in ends],
+        "from_id": [position_text(ref) for item in items for ref in item.at],
+        "to_id": [position_text(ref) for item in items for ref in item.to],
         **_filled({"set_id": set_ids, **numbers}),
-        **group_columns(groups, used, "coordinate_difference"),
-    }
-    ids = ("a_id", "a_axis", "b_id", "b_axis")
-    extra: dict[str, _Column] = {name: [row[i] for row in between] for i, name in enumerate(ids)}
-    return table, {**extra, "covariance_mm2": np.array(covariances)}
+        **group_columns([item for item in items for _ in item.at], "coordinate_difference"),
+    }, between
 
 
 def level_columns(levels: Sequence[Level]) -> Columns:
@@ -153,7 +168,7 @@ def level_columns(levels: Sequence[Level]) -> Columns:
         "axis": [axis_text(level.axis_in_frame) for level in levels],
         "value_arcsec": from_si([level.value for level in levels], "arcsec"),
         "sigma_arcsec": from_si([level.sigma for level in levels], "arcsec"),
-        **group_columns([level.group for level in levels], [level.used for level in levels], "level"),
+        **group_columns(levels, "level"),
     }
 
 
@@ -177,7 +192,7 @@ def alignment_columns(alignments: Sequence[Alignment]) -> Columns:
     return {
         **{name: [get(a) for a in alignments] for name, get in text.items()},
         **_filled(dict(zip(columns, numbers.T, strict=True))),
-        **group_columns([a.group for a in alignments], [a.used for a in alignments], "alignment"),
+        **group_columns(alignments, "alignment"),
     }
 
 
@@ -193,7 +208,7 @@ def spot_columns(spots: Sequence[LaserSpot]) -> Columns:
         "sigma_x_mm": sigma[:, 0],
         "sigma_y_mm": sigma[:, 1],
         **_filled({"rho_xy": np.where(rho[:, 0] != 0.0, rho[:, 0], np.nan)}),
-        **group_columns([s.group for s in spots], [s.used for s in spots], "laser"),
+        **group_columns(spots, "laser"),
     }
 
 
@@ -205,5 +220,5 @@ def surface_columns(items: Sequence[OnSurface]) -> Columns:
         "point_id": [position_text(item.position) for item in items],
         "sigma_mm": from_si([item.sigma for item in items], "mm"),
         **_filled({"offset_mm": np.where(offset != 0.0, from_si(offset, "mm"), np.nan)}),
-        **group_columns([item.group for item in items], [item.used for item in items], "surface"),
+        **group_columns(items, "surface"),
     }

@@ -1,0 +1,75 @@
+"""A survey with other parameters: the one walk over its lenses, poses, tables, warps and points by their names."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TypeVar
+
+from adjust.model.result import ParameterName
+from adjust.model.survey import (
+    Camera,
+    LensParameter,
+    PointParameter,
+    PoseParameter,
+    Station,
+    Survey,
+    Table,
+    Target,
+    VectorParameter,
+)
+
+Vector = TypeVar("Vector", LensParameter, VectorParameter)
+
+
+class Rewriting:
+    """What becomes of every parameter; a method that is not written anew leaves all of its kind as they are."""
+
+    def vector(self, name: ParameterName, given: Vector) -> Vector:
+        """A lens, a table's geometry or a warp."""
+        return given
+
+    def pose(self, name: ParameterName, given: PoseParameter) -> PoseParameter:
+        """A pose; that which holds for all epochs that are not listed goes without an epoch."""
+        return given
+
+    def epochs(
+        self, name: ParameterName, given: Mapping[str, PoseParameter], usual: PoseParameter
+    ) -> Mapping[str, PoseParameter]:
+        """The poses that are listed by epoch; ``usual``: that of all others."""
+        return {epoch: self.pose((*name, epoch), pose) for epoch, pose in given.items()}
+
+    def point(self, name: ParameterName, given: PointParameter) -> PointParameter:
+        """A point in the world."""
+        return given
+
+    def __call__(self, survey: Survey) -> Survey:
+        """The survey rewritten: owner after owner, of each its vector first."""
+        return replace(
+            survey,
+            cameras=tuple(map(self._camera, survey.cameras)),
+            stations=tuple(map(self._station, survey.stations)),
+            tables=tuple(map(self._table, survey.tables)),
+            targets=tuple(map(self._target, survey.targets)),
+            points=tuple(replace(p, x_in_world=self.point(("point", p.point_id), p.x_in_world)) for p in survey.points),
+        )
+
+    def _camera(self, c: Camera) -> Camera:
+        lens = self.vector(("lens", c.camera_id), c.lens)
+        pose = self.pose(("station_from_camera", c.camera_id), c.station_from_camera)
+        return replace(c, lens=lens, station_from_camera=pose)
+
+    def _station(self, s: Station) -> Station:
+        name = ("world_from_station", s.station_id)
+        pose, mount = self.pose(name, s.world_from_station), ("mount_from_station", s.station_id)
+        return replace(s, world_from_station=pose, mount_from_station=self.pose(mount, s.mount_from_station),
+                       epochs=self.epochs(name, s.epochs, s.world_from_station))  # fmt: skip
+
+    def _table(self, t: Table) -> Table:
+        geometry = self.vector(("table_geometry", t.table_id), t.geometry)
+        return replace(t, geometry=geometry, world_from_table=self.pose(("world_from_table", t.table_id),
+                                                                        t.world_from_table))  # fmt: skip
+
+    def _target(self, t: Target) -> Target:
+        warp = None if t.warp is None else self.vector(("warp", t.target_id), t.warp)
+        name = ("carrier_from_target", t.target_id)
+        return replace(t, warp=warp, carrier_from_target=self.pose(name, t.carrier_from_target),
+                       epochs=self.epochs(name, t.epochs, t.carrier_from_target))  # fmt: skip

@@ -1,0 +1,56 @@
+"""The one walk over a survey's parameters: every name once, and nothing but what is asked for changes."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from gtsam import Pose3
+
+from adjust.graph.assembly import GraphBuilder
+from adjust.model.result import ParameterName
+from adjust.model.rewriting import Rewriting, Vector
+from adjust.model.survey import PointParameter, PoseParameter
+from survey.simulate import full_lab
+from tests.adjust import helpers as h
+
+
+class Names(Rewriting):
+    """Puts free poses at the origin, and notes all names."""
+
+    def __init__(self) -> None:
+        self.seen: list[ParameterName] = []
+
+    def vector(self, name: ParameterName, given: Vector) -> Vector:
+        self.seen.append(name)
+        return given
+
+    def pose(self, name: ParameterName, given: PoseParameter) -> PoseParameter:
+        self.seen.append(name)
+        return replace(given, value=Pose3(np.eye(4))) if given.treatment == "free" else given
+
+    def point(self, name: ParameterName, given: PointParameter) -> PointParameter:
+        self.seen.append(name)
+        return given
+
+    def epochs(
+        self, name: ParameterName, given: Mapping[str, PoseParameter], usual: PoseParameter
+    ) -> Mapping[str, PoseParameter]:
+        return super().epochs(name, {**given, "later": usual}, usual)
+
+
+def test_every_parameter_is_met_once_under_the_name_of_its_unknown() -> None:
+    survey, truth = full_lab(1)
+    start, names = h.start_at(truth), Names()
+    changed = names(survey)
+    assert len(set(names.seen)) == len(names.seen)
+    unknowns = GraphBuilder(survey, start.lenses).build(start).unknowns.by_name
+    of_owners = {n[:2] for n in unknowns if n[0] not in ("table_angles", "orientation", "instrument", "vertical")}
+    assert of_owners <= {n[:2] for n in names.seen}
+    assert all("later" in s.epochs for s in changed.stations)
+    free = [t.carrier_from_target for t in survey.targets if t.carrier_from_target.treatment == "free"]
+    moved = [t.carrier_from_target.value for t in changed.targets if t.carrier_from_target.treatment == "free"]
+    assert len(free) == len(moved) > 0
+    assert all(np.array_equal(m.matrix(), np.eye(4)) for m in moved if m is not None)
+    assert changed.image_blocks is survey.image_blocks
+    assert all(a.lens is b.lens for a, b in zip(changed.cameras, survey.cameras, strict=True))
+    assert all(a.x_in_world is b.x_in_world for a, b in zip(changed.points, survey.points, strict=True))
