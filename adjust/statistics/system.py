@@ -173,7 +173,7 @@ def assembled(precision: Precision, image_rows: Callable[[Precision, int, KeyCol
     others = _other_rows(precision, n, key_columns)
     readings = _reading_rows(precision, n, key_columns)
     n_image, n_before = len(images.lengths), images.A.shape[0] + others[0].shape[0]
-    A = sparse.vstack([images.A, others[0], readings[0]]).tocsr()
+    A = stacked([images.A, others[0], readings[0]])
     lengths = np.concatenate([images.lengths, others[2], np.ones(len(readings[1]))])
     ptr = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
     used = np.concatenate([images.used, _used_others(graph)])
@@ -185,6 +185,12 @@ def assembled(precision: Precision, image_rows: Callable[[Precision, int, KeyCol
     e = np.concatenate([images.e, others[1], readings[1]])
     joint = tuple(JointReadings(n_before + rows, W) for rows, W in joint_readings(graph))
     return LinearSystem(precision, columns, A, e, ptr, used, group, names, datum, motions, n_image, joint)
+
+
+def stacked(parts: Sequence[sparse.csr_matrix]) -> sparse.csr_matrix:
+    """One below the other; not copied where all others are empty."""
+    some = [A for A in parts if A.shape[0]] or parts[:1]
+    return some[0] if len(some) == 1 else sparse.vstack(some).tocsr()
 
 
 def _points_apart(precision: Precision, n: int, key_columns: KeyColumns) -> ImageRows:
@@ -272,8 +278,11 @@ class Entries:
         """Values (b, r, c) at rows (b, r) and columns (b, c)."""
         down = np.broadcast_to(rows[:, :, None].astype(np.int32), values.shape)
         across = np.broadcast_to(columns[:, None, :].astype(np.int32), values.shape)
-        kept = across >= 0
-        self.parts.append((down[kept], across[kept], values[kept]))
+        if (columns >= 0).all():
+            self.parts.append((down.ravel(), across.ravel(), values.ravel()))
+        else:
+            kept = across >= 0
+            self.parts.append((down[kept], across[kept], values[kept]))
 
     def add_many(self, points: IntArray, columns: IntArray, values: FloatArray) -> None:
         """Two rows each of many points: columns (k, c), values (k, 2, c)."""
