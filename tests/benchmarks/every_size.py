@@ -85,7 +85,7 @@ def unknown_points(place: Path, n: int) -> Commands:
     given, start = bundle.survey(built.bundle), bundle.start(built.bundle)
     camera = replace(given.cameras[0], lens=replace(given.cameras[0].lens, values=start.lenses["camera"]))
     points = tuple(replace(p, x_in_world=PointParameter(start.points[p.point_id])) for p in given.points)
-    inside = [np.all((b.uv >= 0) & (b.uv < SIZE), axis=1) for b in given.image_blocks]
+    inside = [np.all((b.uv >= 0) & (b.uv <= np.array(SIZE) - 1), axis=1) for b in given.image_blocks]
     blocks = tuple(replace(b, point_idx=b.point_idx[k], uv=b.uv[k], cov=b.cov[k])
                    for b, k in zip(given.image_blocks, inside, strict=True))  # fmt: skip
     return _written(place, replace(given, cameras=(camera,), points=points, image_blocks=blocks))
