@@ -99,7 +99,7 @@ class ChangeSearch:
         self.system: LinearSystem = condensed.system
         s = self.system
         rows = s.used[s.row_of]
-        step = s.normal.solve(np.asarray(s.A[rows].T @ s.e[rows]))
+        step = s.normal.solve(np.asarray(s.A.T @ np.where(rows, s.e, 0.0)))
         self.A, self.e = s.A, s.e - s.A @ step
         self.epoch, self.epochs = _coded([b.epoch_id for b in adjustment.survey.image_blocks])
         units, self.runs = list(self._units(_MOST_RUNS)), _MOST_RUNS
@@ -219,12 +219,14 @@ class ChangeSearch:
     def _candidates(self, u: Unit) -> _Candidates:
         """Of the runs from j on, j = 1, 2, ..., or of the only one."""
         J, q = len(u.epochs), u.B.shape[1]
-        A, e = self.A[u.rows], self.e[u.rows]
-        columns = (u.run[:, None] * q + np.arange(q)).ravel()
-        wide = sparse.csr_matrix((u.B.ravel(), columns, np.arange(len(u.rows) + 1) * q), (len(u.rows), J * q))
-        X = (A.T @ wide).tocsr()
+        columns = u.run[:, None] * q + np.arange(q)
+        order, length = np.argsort(u.rows, kind="stable"), np.zeros(len(self.e), dtype=np.int64)
+        length[u.rows] = q
+        ptr = np.concatenate([[0], np.cumsum(length)])
+        wide = sparse.csr_matrix((u.B[order].ravel(), columns[order].ravel(), ptr), (len(length), J * q))
+        X = (self.A.T @ wide).tocsr()
         P = _from_runs_on(_by_run(u, u.B))
-        g = _from_runs_on(_by_run(u, e[:, None]))[:, :, 0]
+        g = _from_runs_on(_by_run(u, self.e[u.rows, None]))[:, :, 0]
         taken = _taken(self.system.normal, X, J)[1 if J > 1 else 0 :]
         size = np.sqrt(np.einsum("jqq->jq", P))
         scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)

@@ -6,7 +6,7 @@ what a block could have besides: a motion of its camera, of its target, other le
 epochs, another shape of its target. What the residuals say of these is asked in :mod:`adjust.statistics.changes`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,6 +31,7 @@ from adjust.statistics.system import (
     bundle_order,
     bundle_rows,
     columns_of_blocks,
+    stacked,
 )
 
 _FLAT = 1e-9
@@ -100,7 +101,7 @@ def condensed_system(precision: Precision) -> CondensedSystem:
             number = np.array([i for i, p in graph.image_order if p == part], dtype=np.int64)
             parts.append(_unknown(bundle, number, n, key_columns, kept, blocks))
             numbers.append(number)
-        A = sparse.vstack([p.A for p in parts]).tocsr()
+        A = stacked([p.A for p in parts])
         e, lengths, used = (np.concatenate([getattr(p, x) for p in parts]) for x in ("e", "lengths", "used"))
         return ImageRows(A, e, lengths, used, [g for p in parts for g in p.groups])
 
@@ -121,9 +122,7 @@ def _known(
     """Blocks of known targets, those of the same size together."""
     images, entries = graph.images, Entries()
     number = np.array([i for i, part in graph.image_order if not part], dtype=np.int64)
-    shapes: dict[str | None, FloatArray] = {}
-    shapes.update({t.target_id: _shape_factors(t.x_in_target) for t in graph.survey.targets})
-    columns, sets = columns_of_blocks(graph, key_columns), images.alike()
+    shapes, columns, sets = _shapes(graph), columns_of_blocks(graph, key_columns), images.alike()
     at, lengths, e = 0, [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
     for mine, part in zip(sets, side_by_side(lambda mine: _condensed(graph, mine, shapes), sets), strict=True):
         g, k = part.e.shape
@@ -153,10 +152,24 @@ class _Rows:
     e: FloatArray
 
 
-def _condensed(graph: AdjustmentGraph, mine: IntArray, shapes: Mapping[str | None, FloatArray]) -> _Rows:
+def _shapes(graph: AdjustmentGraph) -> Callable[[IntArray], FloatArray]:
+    """Of image points (..) of known targets what their derivatives are to be multiplied by: (.., 4)."""
+    first, every, blocks = dict[str | None, int](), [np.zeros((1, N_SHAPE))], graph.images.blocks
+    for target in graph.survey.targets:
+        first[target.target_id] = sum(map(len, every))
+        every.append(_shape_factors(target.x_in_target))
+    some = [b.target_id in first for b in blocks]
+    place = [first[b.target_id] + b.point_idx if x else np.zeros(len(b.uv), dtype=np.int64)
+             for b, x in zip(blocks, some, strict=True)]  # fmt: skip
+    table, at = np.concatenate(every), np.concatenate([np.zeros(0, dtype=np.int64), *place])
+    return lambda points: table[at[points]]
+
+
+def _condensed(graph: AdjustmentGraph, mine: IntArray, shapes: Callable[[IntArray], FloatArray]) -> _Rows:
     """Of blocks that are alike."""
     images, width = graph.images, int(graph.images.n_rows[mine[0]]) - 1
-    rows = _condensed_rows(graph, mine, shapes)
+    points = images.ptr[mine][:, None] + np.arange(len(images.blocks[mine[0]].uv))
+    rows = images.condensed_rows(mine, shapes(points))
     nl = images.state.lenses.n_free[images.camera[mine]]
     lens = np.zeros((*rows.shape[:2], MAX_LENS))
     pose = np.empty((*rows.shape[:2], 6))
@@ -167,19 +180,6 @@ def _condensed(graph: AdjustmentGraph, mine: IntArray, shapes: Mapping[str | Non
     by_camera = pose @ adjoint_of_inverse(images.chains.R[mine], images.chains.t[mine])
     by_key = rows[:, :, :width] @ images.local_from_keys(mine)
     return _Rows(by_key, lens, by_camera, pose, rows[:, :, width:-1].copy(), rows[:, :, -1].copy())
-
-
-def _condensed_rows(
-    graph: AdjustmentGraph, mine: IntArray, shapes: Mapping[str | None, FloatArray]
-) -> FloatArray:
-    """Rows (g, k, lens + pose + warp + shape + 1) of g blocks with equally many points and columns."""
-    blocks, none = graph.images.blocks, np.zeros((0, N_SHAPE))
-    factors = np.zeros((len(mine), len(blocks[mine[0]].uv), N_SHAPE))
-    for i, b in enumerate(mine.tolist()):
-        given = shapes.get(blocks[b].target_id, none)
-        if len(given):
-            factors[i] = given[blocks[b].point_idx]
-    return graph.images.condensed_rows(mine, factors)
 
 
 def _shape_factors(x: FloatArray) -> FloatArray:

@@ -174,6 +174,8 @@ class Normal:
 
     def solve(self, right: FloatArray) -> FloatArray:
         """The solution (n, k) or (n,) of N x = right, with the datum's rows fulfilled where ``right`` is seen."""
+        if right.ndim == 1 and (sums := self.structured) is not None:
+            return np.asarray(sums.own @ right + (sums.U @ right) @ sums.U)
         scale = self.scale if right.ndim == 1 else self.scale[:, None]
         out = self._of_scaled(scale * right)
         out *= scale
@@ -187,8 +189,9 @@ class Normal:
     @cached_property
     def structured(self) -> Inverse | None:
         """The same as a sum, where many small sets of unknowns share few others: linear in n. None for others."""
-        some = self._arrow is not None and len(self._arrow.core) * self.n <= _ROOM
-        return self._arrow.inverse(self.scale) if self._arrow is not None and some else None
+        if self._arrow is None or len(self._arrow.core) * self.n > _ROOM:
+            return None
+        return self._arrow.inverse(self.scale)
 
     def covariance(self, datum: sparse.csr_matrix) -> FloatArray:
         """Covariance (n, n) of the unknowns: the inverse less what the datum's own rows add (S-transformation)."""

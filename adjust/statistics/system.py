@@ -200,11 +200,17 @@ def survey_rows(
     readings = _reading_rows(graph, values, n, key_columns)
     lengths = np.concatenate([images.lengths, others[2], np.ones(len(readings[1]))])
     return SurveyRows(
-        columns, key_columns, sparse.vstack([images.A, others[0], readings[0]]).tocsr(),
+        columns, key_columns, stacked([images.A, others[0], readings[0]]),
         np.concatenate([images.e, others[1], readings[1]]), np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
         np.concatenate([images.used, _used_others(graph)]), images.groups + groups_of_others(graph),
         len(images.lengths), images.A.shape[0] + others[0].shape[0],
     )  # fmt: skip
+
+
+def stacked(parts: Sequence[sparse.csr_matrix]) -> sparse.csr_matrix:
+    """One below the other; not copied where all others are empty."""
+    some = [A for A in parts if A.shape[0]] or parts[:1]
+    return some[0] if len(some) == 1 else sparse.vstack(some).tocsr()
 
 
 def assembled(precision: Precision, image_rows: MakeImageRows) -> LinearSystem:
@@ -310,8 +316,11 @@ class Entries:
         """Values (b, r, c) at rows (b, r) and columns (b, c)."""
         down = np.broadcast_to(rows[:, :, None].astype(np.int32), values.shape)
         across = np.broadcast_to(columns[:, None, :].astype(np.int32), values.shape)
-        kept = across >= 0
-        self.parts.append((down[kept], across[kept], values[kept]))
+        if (columns >= 0).all():
+            self.parts.append((down.ravel(), across.ravel(), values.ravel()))
+        else:
+            kept = across >= 0
+            self.parts.append((down[kept], across[kept], values[kept]))
 
     def add_many(self, points: IntArray, columns: IntArray, values: FloatArray) -> None:
         """Two rows each of many points: columns (k, c), values (k, 2, c)."""

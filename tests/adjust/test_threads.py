@@ -1,5 +1,6 @@
 """Whole adjustments are the same to the last bit for any number of threads."""
 
+import threading
 from collections.abc import Callable
 
 import numpy as np
@@ -9,6 +10,7 @@ from gtsam import Pose3
 from adjust.adjustment import adjust
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
+from adjust.native.parallel import Beside, side_by_side
 from tests.benchmarks import bundle
 from tests.benchmarks.building import Plan, build
 from tests.benchmarks.data import calibration
@@ -45,3 +47,34 @@ def test_the_same_bits_for_any_number_of_threads(
         found.append(numbers(make()))
     for other in found[1:]:
         assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(found[0], other, strict=True))
+
+
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_steps_beside_each_other(threads: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each gives its result or raises; all are done when it is left; a step shares out work, parts of it do not."""
+    monkeypatch.setenv("LABSURVEY_THREADS", threads)
+    others, done, gate = set[str](), list[int](), threading.Event()
+
+    def part(i: int) -> int:
+        others.add(threading.current_thread().name)
+        return sum(side_by_side(lambda j: i * j, range(4)))
+
+    def failing() -> int:
+        raise ValueError("step")
+
+    def late() -> None:
+        gate.wait(5.0)
+        done.append(1)
+
+    def everything() -> None:
+        with Beside() as steps:
+            first = steps.of(lambda: side_by_side(part, range(20)))
+            assert first() == first() == [6 * i for i in range(20)]
+            threading.Timer(0.05, gate.set).start()
+            steps.of(late)
+            steps.of(failing)()
+
+    with pytest.raises(ValueError, match="step"):
+        everything()
+    assert done == [1]
+    assert all(name.startswith("adjust") for name in others) == (threads == "3")

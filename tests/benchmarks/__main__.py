@@ -10,7 +10,7 @@ from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from tests.benchmarks import sections_cameras, sections_networks, sections_other
+from tests.benchmarks import every_size, sections_cameras, sections_networks, sections_other
 from tests.benchmarks.session import Session
 
 CASES: dict[str, Callable[[Session], None]] = {
@@ -19,7 +19,7 @@ CASES: dict[str, Callable[[Session], None]] = {
     "graphs": sections_networks.published_graphs, "additions": sections_networks.additions,
     "large": sections_networks.large_networks, "readings": sections_networks.readings,
     "trials": sections_networks.simulations, "targets": sections_other.targets, "start": sections_other.start_up,
-    "stages": sections_other.stages, "script": sections_other.script, "sizes": sections_other.sizes,
+    "stages": sections_other.stages, "script": sections_other.script, "sizes": every_size.sizes,
 }  # fmt: skip
 PACKAGES = ("gtsam", "numpy", "scipy", "opencv-contrib-python-headless", "pycolmap")
 

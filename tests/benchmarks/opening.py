@@ -1,7 +1,8 @@
 """How long ``labsurvey open`` takes, from the command to what a click shows, and what the browser holds.
 
-``python -m tests.benchmarks.opening FOLDER`` of a project, or ``--points 1000000`` of a stereo head with so many. Times
-are of the wall and of a machine that does nothing else; a few rounds, the least of each is printed.
+``python -m tests.benchmarks.opening FOLDER`` of a project, or ``--points 1000000`` of a stereo head with so many; with
+``--report`` how long its ``report.html`` takes. Times are of the wall and of a machine that does nothing else; a few
+rounds, the least of each is printed.
 """
 
 import argparse
@@ -38,8 +39,8 @@ def wait(page: Any, expression: str) -> None:
         time.sleep(0.01)
 
 
-def browser_mb(root: int) -> float:
-    """What the processes of a browser hold by themselves and their share of what they hold together, MB."""
+def browser_processes(root: int) -> list[Path]:
+    """Those of a browser, below a process, in /proc."""
     parents = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -49,16 +50,47 @@ def browser_mb(root: int) -> float:
     mine = {root}
     while more := {pid for pid, above in parents.items() if above in mine} - mine:
         mine |= more
-    total = 0
-    for pid in mine:
-        try:
-            line = Path(f"/proc/{pid}/cmdline").read_bytes()
-            if b"chrom" in line.split(b"\0")[0]:
-                rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
-                total += int(rollup.split("\nPss:")[1].split()[0])
-        except (OSError, IndexError):
-            continue
-    return total / 1024.0
+    return [Path(f"/proc/{pid}") for pid in mine if b"chrom" in _told(Path(f"/proc/{pid}/cmdline")).split(b"\0")[0]]
+
+
+def _told(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError:  # it is gone
+        return b""
+
+
+def browser_mb(root: int) -> float:
+    """What the processes of a browser hold by themselves and their share of what they hold together, MB."""
+    texts = [_told(process / "smaps_rollup").decode() for process in browser_processes(root)]
+    return sum(int(text.split("\nPss:")[1].split()[0]) for text in texts if "\nPss:" in text) / 1024.0
+
+
+def browser_cpu_s(root: int) -> float:
+    """Processor seconds that these processes have used."""
+    fields = [_told(process / "stat").decode().rpartition(")")[2].split() for process in browser_processes(root)]
+    return sum(int(f[11]) + int(f[12]) for f in fields if f) / os.sysconf("SC_CLK_TCK")
+
+
+def report(folder: Path) -> dict[str, float]:
+    """One round of ``results/report.html``: until it is loaded and drawn; then a table sorted."""
+    path, out = folder / "results" / "report.html", dict[str, float]()
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
+        page = browser.new_context(viewport={"width": 1280, "height": 800}, locale="en-GB").new_page()
+        used, begin = browser_cpu_s(os.getpid()), time.perf_counter()
+        page.goto(path.resolve().as_uri())
+        page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        out["report loaded and drawn, s"] = time.perf_counter() - begin
+        out["processor of the browser, s"] = browser_cpu_s(os.getpid()) - used
+        begin = time.perf_counter()
+        page.locator("#all-observations th button, #all-observations th").nth(3).click()
+        page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        out["table sorted, s"] = time.perf_counter() - begin
+        out["elements"] = page.evaluate("document.querySelectorAll('*').length")
+        out |= {"page, MB": path.stat().st_size / 1e6, "browser, MB": browser_mb(os.getpid())}
+        browser.close()
+    return out
 
 
 def measured(folder: Path) -> dict[str, float]:
@@ -127,10 +159,13 @@ def main() -> None:
     parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("--points", type=int, default=0)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--report", action="store_true", help="the report of an adjusted project instead")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         folder = project_of(given.points, Path(place)) if given.points else given.folder
-        rounds = [measured(folder) for _ in range(given.rounds)]
+        if given.report and given.points:
+            subprocess.run([sys.executable, "-m", "survey", "adjust", str(folder), "--quiet"], check=True)
+        rounds = [(report if given.report else measured)(folder) for _ in range(given.rounds)]
     for name in rounds[0]:
         print(f"{name:<32}{min(one[name] for one in rounds):10.2f}")
 

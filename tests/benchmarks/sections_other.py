@@ -12,15 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from survey.project import write_project
-from tests.benchmarks import finding, profiles, tables, terrestrial
-from tests.benchmarks.data import calibration, survey
+from tests.benchmarks import finding, profiles, tables
 from tests.benchmarks.session import Session
 from tests.data import data_folder
 
-_STEPS = ("read", "adjust", "statistics", "report")
-LONGEST_S = 300.0
-"""Processor seconds that one command may need among those by size."""
 OUR_COMMAND, SCRIPT = "labsurvey adjust rig", "OpenCV's classic script"
 
 
@@ -84,71 +79,6 @@ def start_up(session: Session) -> None:
     what = "139 readings, the whole command: times as long as its adjustment alone"
     session.compare(what, whole / kernel, "the same run", "the rest: libraries, files, report")
     session.say(tables.table(("", "s (median)", "range", "CPU s"), rows))
-
-
-def sizes(session: Session) -> None:
-    """Whole commands by size: processor time of every step, on how many threads, and the largest memory."""
-    session.say("", "## Whole commands by size", "")
-    session.say(
-        "`labsurvey adjust` with every statistic and the report, one run each; seconds of the steps as the command "
-        "counts them. Images: two cameras, 100 points a view. Networks: three readings a line, held datum. A size that "
-        f"would need more than {LONGEST_S:g} s of processor time, were it linear, is not run; none is waited for "
-        "longer than twice that.",
-        "",
-    )  # fmt: skip
-    views, points = ((50, 500), (300, 1000)) if session.quick else ((50, 500, 5000), (300, 1000, 3000))
-    kinds = ((views, lambda n: survey(calibration(2, n)), lambda n: f"{200 * n} image points"),
-             (points, lambda n: terrestrial.network(n, False), lambda n: f"network of {n} points"))  # fmt: skip
-    rows, grown = list[list[str]](), list[str]()
-    for counts, make, called in kinds:
-        times = dict[int, float]()  # processor seconds with one thread
-        for n in counts:
-            before = next(reversed(times.items()), None)
-            if before is not None and before[1] * n / before[0] > LONGEST_S:
-                rows.append([called(n), "", "not run", *[""] * (2 + len(_STEPS))])
-                continue
-            with tempfile.TemporaryDirectory() as folder:
-                write_project(Path(folder), make(n))
-                for threads in ("2", "1"):
-                    print(f"running: {called(n)}, {threads} threads", file=sys.stderr, flush=True)
-                    row, used = _adjusted(Path(folder), threads)
-                    rows.append([called(n), threads, *row])
-                if used:
-                    times[n] = used
-        if len(times) > 1:
-            (n, less), (m, more) = list(times.items())[-2:]
-            grown.append(f"{called(m)} {np.log(more / less) / np.log(m / n):.2f}")
-    session.say(tables.table(("", "threads", "s", "CPU s", "MB", *_STEPS), rows))
-    session.say("", f"Exponents of growth of processor time, from the size before, one thread: {'; '.join(grown)}.")
-
-
-_LAUNCH = """import resource, subprocess, sys
-try:
-    code = subprocess.call(sys.argv[2:], timeout=float(sys.argv[1]))
-except subprocess.TimeoutExpired:
-    code = None
-used = resource.getrusage(resource.RUSAGE_CHILDREN)
-print(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, code)"""
-"""A small program that runs a command: what starts a large one from a large one would count its own memory too."""
-
-
-def _adjusted(lab: Path, threads: str) -> tuple[list[str], float]:
-    """The cells of a whole ``labsurvey adjust``, and its processor seconds, 0 where it was stopped."""
-    command = [sys.executable, "-m", "survey", "adjust", str(lab), "--quiet"]
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    begin = time.perf_counter()
-    run = subprocess.run([sys.executable, "-c", _LAUNCH, str(2.0 * LONGEST_S), *command], check=True, text=True,
-                         stdout=subprocess.PIPE, env={**environment, "LABSURVEY_THREADS": threads})  # fmt: skip
-    wall = time.perf_counter() - begin
-    *said, used = (line for line in run.stdout.splitlines() if line.strip())
-    cpu, mb, code = used.split()
-    if code == "None":
-        return [f"stopped after {wall:.0f}", *[""] * (2 + len(_STEPS))], 0.0
-    if code not in ("0", "3"):
-        raise RuntimeError(f"{' '.join(command)}: exit code {code}")
-    steps = dict(re.findall(r"(\w+) ([\d.]+) s", said[-1]))
-    cells = [f"{wall:.2f}", f"{float(cpu):.2f}", f"{float(mb):.0f}", *(steps.get(x, "") for x in _STEPS)]
-    return cells, float(cpu)
 
 
 def script(session: Session) -> None:

@@ -12,15 +12,18 @@ from gtsam import Pose3, Rot3
 from pyarrow import parquet
 from scipy.spatial.transform import Rotation
 
+from adjust.adjustment import adjust
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, Estimate, GlobalTest
 from adjust.native.text import Words, number_rows
 from survey.report.results import ReportOptions, write_results
+from survey.simulate import head_on_table
 from survey.solution.covariances import covariance_npz, read_covariances
 from survey.solution.dictionary import RunInfo, correlated, solution_dict, solution_json
 from survey.solution.frames import AdjustedFrames, table_from_mount
 from survey.solution.quantities import ellipsoid, key_of, pose_entry, scale_of, vector_entry
 from survey.solution.residual_tables import image_residuals_csv, image_residuals_parquet, other_residuals_csv
+from survey.solution.statistics import statistics_of
 from survey.solution.verdict import suspects, verdict
 from tests.survey.adjustments import POSE_COMPONENTS, POSE_UNITS, Lab, correlate, lab_adjustment
 
@@ -456,3 +459,19 @@ def test_json_is_one_line_for_an_entry_and_for_a_list_of_numbers():
     for nothing in (float("nan"), [float("inf"), 1.0]):
         with pytest.raises(ValueError, match="JSON compliant"):
             solution_json({"x": nothing})
+
+
+def test_files_are_the_same_for_any_number_of_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Statistics and files that are made beside each other."""
+    adjusted = adjust(head_on_table(2, n_cameras=2, n_table_epochs=6, n_free_epochs=4)[0])
+    files = {}
+    for threads in "13":
+        monkeypatch.setenv("LABSURVEY_THREADS", threads)
+        found = statistics_of(adjusted, (), scale_of(adjusted, "a_posteriori"))
+        paths = write_results(tmp_path / threads, adjusted, RUN, found, ReportOptions(parquet=True))
+        files[threads] = {name: path.read_bytes() for name, path in paths.items()}
+    assert len(files["1"]) == 6
+    assert files["1"] == files["3"]
+    (tmp_path / "usual").touch()
+    usual = (tmp_path / "usual").stat().st_mode
+    assert {(tmp_path / "3" / "results" / name).stat().st_mode for name in files["3"]} == {usual}

@@ -25,8 +25,8 @@ from survey.folder.arrays import read_arrays
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import atomic_write, decode, read_bytes
 from survey.project.exclusions import Exclusion, Name
-from survey.project.project import DEFINITION_FILE
-from survey.solution.dictionary import RunInfo, plain, solution_json
+from survey.project.project import DEFINITION_FILE, RESULTS
+from survey.solution.dictionary import RunInfo, plain
 from survey.solution.earlier.changes import Snapshot, snapshot
 
 RUNS, MOST = "runs", 50
@@ -70,7 +70,7 @@ def _exclusion(e: Exclusion) -> dict[str, Any]:
 def record_run(
     folder: Path, place: Path, adjustment: Adjustment, run: RunInfo, solution: Mapping[str, Any], author: str
 ) -> tuple[str, ...]:
-    """Keep a run: its files made in ``place`` while ``folder`` is being changed; old files that are to go then."""
+    """Keep a run: its files made in ``place`` with its results, while ``folder`` is changed; old files that go then."""
     runs, there = _readable(folder), [int(path.parent.name) for path in _places(folder)]
     of = [dict(run.input_hashes), plain(run.options), dict(run.versions), sorted(solution)]
     fingerprint = hashlib.sha256(json.dumps(of, sort_keys=True, allow_nan=False).encode()).hexdigest()
@@ -82,7 +82,7 @@ def record_run(
     into = place / RUNS / f"{number:04d}"
     into.mkdir(parents=True)
     atomic_write(into / _RUN, json.dumps(said.as_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-    atomic_write(into / _SOLUTION, solution_json(dict(solution)))
+    atomic_write(into / _SOLUTION, (place / RESULTS / _SOLUTION).read_bytes())
     atomic_write(into / _ESTIMATES, _estimates_npz(adjustment.estimates.values()))
     atomic_write(into / DEFINITION_FILE, read_bytes(folder / DEFINITION_FILE)[0])
     light = [r.number for r in runs if not r.pinned]

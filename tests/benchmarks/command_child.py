@@ -1,0 +1,109 @@
+"""A command in this process: its processor time by step, its memory, and what two threads can save, as a line of JSON.
+
+With ``LABSURVEY_THREADS`` above 1 what is shared out is done in turn and timed by the thread's own clock. Two threads
+would take as long as the longer of two lists, filled one after the other; the rest of the sum is what they save.
+"""
+
+import json
+import re
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from adjust.native import parallel
+
+WORKERS = 2
+
+
+def saved(seconds: Iterable[float]) -> float:
+    """What two lists, filled one after the other, save of the sum."""
+    lists = [0.0] * WORKERS
+    for s in seconds:
+        lists[lists.index(min(lists))] += s
+    return sum(lists) - max(lists)
+
+
+class InTurn:
+    """A pool that does everything at once, in this thread, and adds up what two would save."""
+
+    def __init__(self) -> None:
+        self.parts = self.steps = 0.0
+        self.begun: list[float] = []
+
+    def map(self, function: Callable[[Any], Any], parts: Iterable[Any]) -> list[Any]:
+        """As of an executor: parts that are shared out."""
+        out, seconds = [], []
+        parallel._here.busy = True
+        try:
+            for part in parts:
+                begin = time.thread_time()
+                out.append(function(part))
+                seconds.append(time.thread_time() - begin)
+        finally:
+            del parallel._here.busy
+        self.parts += saved(seconds)
+        return out
+
+    def submit(self, step: Callable[[], Any]) -> "Future[Any]":
+        """As of an executor: a step beside others; its own parts do not count twice."""
+        begin, before = time.thread_time(), self.parts
+        done: Future[Any] = Future()
+        try:
+            done.set_result(step())
+        except Exception as error:  # the one who waits is told
+            done.set_exception(error)
+        self.begun.append(time.thread_time() - begin - (self.parts - before))
+        return done
+
+    def finished(self) -> None:
+        """No more steps beside these."""
+        self.steps += saved(self.begun)
+        self.begun = []
+
+
+def main() -> None:
+    """Runs the command of the arguments."""
+    pool = InTurn()
+    parallel._pool = parallel._stages = lambda workers: pool  # type: ignore[assignment,misc]  # stands for both
+    parallel.Beside.__exit__ = lambda self, *_: pool.finished()  # type: ignore[assignment,method-assign]
+    from survey.jobs.adjusting import job
+
+    job.time = SimpleNamespace(perf_counter=time.process_time)  # type: ignore[assignment]
+    from survey.cli import program
+
+    sys.argv = ["labsurvey", *sys.argv[1:]]
+    said, code = StringIO(), 0
+    with redirect_stdout(said):
+        try:
+            program()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+    if code not in (0, 3):
+        raise SystemExit(code)
+    stages = re.findall(r"(\w[\w ]*) ([\d.]+) s(?:,|$)", next(iter(reversed(_steps(said.getvalue()))), ""))
+    every = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    print(json.dumps({
+        "cpu_s": sum(u.ru_utime + u.ru_stime for u in every), "mb": _largest_kb() / 1024,
+        "stages": {name.strip(): float(s) for name, s in stages}, "parts": pool.parts, "steps": pool.steps,
+    }))  # fmt: skip
+
+
+def _largest_kb() -> int:
+    """Of this process, and not of the one that it came from, as ``getrusage`` would tell; or of its own children."""
+    found = re.search(r"VmHWM:\s*(\d+)", Path("/proc/self/status").read_text())
+    return max(int(found[1]) if found else 0, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+
+
+def _steps(said: str) -> list[str]:
+    return [line for line in said.splitlines() if re.match(r"\s*(detect|read) [\d.]+ s", line)]
+
+
+if __name__ == "__main__":
+    main()
