@@ -84,11 +84,11 @@ class PairArrays:
 
 def pair_arrays(pairs: Sequence[Pair]) -> PairArrays:
     """Pairs as arrays."""
-    cov = np.zeros((len(pairs), 6, 6))
-    for e, pair in enumerate(pairs):
-        k = len(pair.cov)
-        cov[e, :k, :k] = pair.cov
-        cov[e, range(k, 6), range(k, 6)] = np.inf
+    cov, size = np.zeros((len(pairs), 6, 6)), np.array([len(p.cov) for p in pairs], dtype=np.int64)
+    cov[size == 3, 3:, 3:] = np.diag([np.inf] * 3)
+    for k in (3, 6):
+        alike = np.flatnonzero(size == k)
+        cov[alike, :k, :k] = np.array([pairs[e].cov for e in alike.tolist()]).reshape(-1, k, k)
     measured = [p.b_from_a for p in pairs]
     R = [m.rotation().matrix() if isinstance(m, Pose3) else m.matrix() for m in measured]
     t = [m.translation() if isinstance(m, Pose3) else np.full(3, np.nan) for m in measured]
