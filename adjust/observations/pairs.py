@@ -297,6 +297,14 @@ class PairBatch:
         redundancy = np.where(used[:, None], np.diagonal(Qvv, axis1=1, axis2=2), 0.0)
         return PairStatistics(residual, white, redundancy, test, freedom, p, own, arrays.cov + sign * scatter)
 
+    def squares(self, found: Sequence[ObservationResidual]) -> dict[int, float]:
+        """Weighted squares of the residuals of these pairs, by their row in ``Survey.pairs``; ``found`` are of all."""
+        v, rows = np.zeros((len(self), 6)), self.rows.tolist()
+        for e, row in enumerate(rows):
+            v[e, : len(found[row].residual)] = found[row].residual
+        white = np.einsum("nij,nj->ni", self.arrays.whitening, v)
+        return dict(zip(rows, np.einsum("ni,ni->n", white, white).tolist(), strict=True))
+
     def residuals(self, stats: PairStatistics, items: Iterable[ObservationFactor]) -> list[ObservationResidual]:
         """As reports take them."""
         v, cov = stats.residual, self.arrays.cov
