@@ -98,7 +98,7 @@ def times(linear: gtsam.GaussianFactorGraph, stack: Stacking, V: FloatArray) -> 
 def normal_diagonal(linear: gtsam.GaussianFactorGraph, stack: Stacking) -> FloatArray:
     """Diagonal (n,) of the normal matrix."""
     _, j, value = _entries(linear, stack)
-    return np.bincount(j, value**2, stack.n + 1)[: stack.n]
+    return np.asarray(np.bincount(j, value**2, stack.n + 1)[: stack.n], dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)

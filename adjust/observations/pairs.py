@@ -83,11 +83,11 @@ class PairArrays:
 
 def pair_arrays(pairs: Sequence[Pair]) -> PairArrays:
     """Pairs as arrays."""
-    cov = np.zeros((len(pairs), 6, 6))
-    for e, pair in enumerate(pairs):
-        k = len(pair.cov)
-        cov[e, :k, :k] = pair.cov
-        cov[e, range(k, 6), range(k, 6)] = np.inf
+    cov, size = np.zeros((len(pairs), 6, 6)), np.array([len(p.cov) for p in pairs], dtype=np.int64)
+    cov[size == 3, 3:, 3:] = np.diag([np.inf] * 3)
+    for k in (3, 6):
+        alike = np.flatnonzero(size == k)
+        cov[alike, :k, :k] = np.array([pairs[e].cov for e in alike.tolist()]).reshape(-1, k, k)
     measured = [p.b_from_a for p in pairs]
     R = [m.rotation().matrix() if isinstance(m, Pose3) else m.matrix() for m in measured]
     t = [m.translation() if isinstance(m, Pose3) else np.full(3, np.nan) for m in measured]
@@ -295,6 +295,14 @@ class PairBatch:
             p = np.where(freedom > 0, chi2.sf(test, np.maximum(freedom, 1)), np.nan)
         redundancy = np.where(used[:, None], np.diagonal(Qvv, axis1=1, axis2=2), 0.0)
         return PairStatistics(residual, white, redundancy, test, freedom, p, own, arrays.cov + sign * scatter)
+
+    def squares(self, found: Sequence[ObservationResidual]) -> dict[int, float]:
+        """Weighted squares of the residuals of these pairs, by their row in ``Survey.pairs``; ``found`` are of all."""
+        v, rows = np.zeros((len(self), 6)), self.rows.tolist()
+        for e, row in enumerate(rows):
+            v[e, : len(found[row].residual)] = found[row].residual
+        white = np.einsum("nij,nj->ni", self.arrays.whitening, v)
+        return dict(zip(rows, np.einsum("ni,ni->n", white, white).tolist(), strict=True))
 
     def residuals(self, stats: PairStatistics, items: Iterable[ObservationFactor]) -> list[ObservationResidual]:
         """As reports take them."""

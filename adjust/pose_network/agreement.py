@@ -14,7 +14,7 @@ from adjust.model.survey import BoolArray, FloatArray, IntArray
 from adjust.pose_network.cycles import short_loops
 from adjust.pose_network.loops import Loops, misclosures, walked
 from adjust.pose_network.network import PoseNetwork
-from adjust.pose_network.solve import minimize
+from adjust.pose_network.solve import NetworkOptions, minimize
 from adjust.pose_network.start import find_network_start
 from adjust.spatial.rigid_motions import Motions
 from adjust.testing.criteria import MANY, limits, typical_factor
@@ -24,6 +24,8 @@ _SEEN = 100
 """Stations among which another way is looked for between the ends of a pair."""
 _SOUND = 0.1
 """Share of the loops that go through no wrong pair, at least: their tests tell whether the sigmas are too small."""
+_PROPOSING = NetworkOptions(max_step=1e-2)
+"""Sigmas: what is proposed is tested again at a minimum to the last digit."""
 
 
 def agreeing(network: PoseNetwork, family_alpha: float = 0.001, factor: float = 1.0) -> BoolArray:
@@ -115,7 +117,7 @@ def disagreeing(
     if (fine == network.used).all():
         return None
     used = _connected(network, fine)
-    found = minimize(network.with_used(used))
+    found = minimize(network.with_used(used), options=_PROPOSING)
     squares = _squares(network, found.rotations, found.translations)
     typical = typical_factor(squares[used], network.sizes[used]) if used.sum() >= MANY else 1.0
     limit = max(factor, typical) * limits(family_alpha, network.sizes, int(network.used.sum()))

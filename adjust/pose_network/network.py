@@ -158,8 +158,10 @@ def pose_network(
     Q = _full_cov(np.asarray(cov, dtype=float), t, n_pairs)
     R, T = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
     held, start, prior = dict(held or {}), dict(start or {}), dict(prior or {})
-    for i, pose in {**start, **{k: p for k, (p, _) in prior.items()}, **held}.items():
-        R[i], T[i] = nearest_rotation(np.asarray(pose, dtype=float)[:3, :3]), np.asarray(pose)[:3, 3]
+    known = {**start, **{k: p for k, (p, _) in prior.items()}, **held}
+    if known:
+        poses = np.array(list(known.values()), dtype=float)
+        R[list(known)], T[list(known)] = nearest_rotation(poses[:, :3, :3]), poses[:, :3, 3]
     if inner is None:
         inner = range(n) if not held and not prior else ()
     network = PoseNetwork(

@@ -315,10 +315,14 @@ def group_summaries(
     names = list(dict.fromkeys(block.group for block in graph.survey.image_blocks))
     for group, *sums_of_group in zip(names, *_image_sums(graph, images, names), strict=True):
         add(group, *sums_of_group)
-    for item, factor in zip(others, graph.others, strict=True):
+    of_pairs = {} if graph.pairs is None else graph.pairs.squares(others[graph.first_pair :])
+    for i, (item, factor) in enumerate(zip(others, graph.others, strict=True)):
         if item.used:
-            e = noise_of(factor).whiten(item.residual)
-            add(item.group, len(item.residual), float(item.redundancy.sum()), float(e @ e))
+            square = of_pairs.get(i - graph.first_pair)
+            if square is None:
+                e = noise_of(factor).whiten(item.residual)
+                square = float(e @ e)
+            add(item.group, len(item.residual), sum(item.redundancy.tolist()), square)
     if readings is not None:
         of_group: dict[str, list[int]] = {}
         for i, reading in enumerate(graph.survey.readings):

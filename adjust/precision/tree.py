@@ -188,7 +188,8 @@ class TreeCovariance:
         for i in range(0, A.shape[0], _COLUMNS):
             mine, rest = A[i : i + _COLUMNS], A[i:]
             x = np.ascontiguousarray(mine.toarray().T)
-            self._solve(*(self._ancestors(set(home[rows.indices].tolist())) for rows in (mine, rest)), x)
+            up, down = (self._ancestors(set(home[rows.indices].tolist())) for rows in (mine, rest))
+            self._solve(up, down, x)
             out[i:, i : i + _COLUMNS] = rest @ x
         back = np.argsort(order)
         return np.asarray((np.tril(out) + np.tril(out, -1).T)[np.ix_(back, back)])

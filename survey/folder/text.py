@@ -2,6 +2,7 @@
 
 import difflib
 import errno
+import functools
 import hashlib
 import os
 import re
@@ -133,6 +134,7 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     return tuple(numbers)
 
 
+@functools.lru_cache(1 << 16)
 def id_problem(name: str) -> str | None:
     """Why ``name`` cannot be an id, or None. Ids become names of files and parts of references, so both stay safe."""
     if not name:

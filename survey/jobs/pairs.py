@@ -34,8 +34,7 @@ from survey.jobs.relay import (
 )
 from survey.project import write_project
 from survey.project.project import DEFINITION_FILE
-from survey.solution.pairs import pair_sigmas
-from survey.solution.quantities import ARCSEC_PER_RAD, pose_dict
+from survey.solution.quantities import ARCSEC_PER_RAD, pair_sigmas, pose_dict
 
 TRAJECTORIES = "trajectories"
 _ENDINGS = (".csv", ".txt", ".tum")
@@ -190,7 +189,8 @@ def write_pair_project(folder: Path, pairs: Sequence[Pair], title: str) -> Path:
 
 def _entry(b_from_a: Any, cov: FloatArray) -> dict[str, Any]:
     pose = b_from_a if isinstance(b_from_a, Pose3) else Pose3(b_from_a, np.zeros(3))
-    return pose_dict(pose) | pair_sigmas(pose, cov) | {"cov": cov.tolist()}
+    (sigmas,) = pair_sigmas(pose.rotation().matrix()[None], cov[None])
+    return pose_dict(pose) | sigmas | {"cov": cov.tolist()}
 
 
 def _loop_entry(t: TriangleMisclosure) -> dict[str, Any]:

@@ -60,6 +60,10 @@ class Scene:
         """Of all spots, (n, 3)."""
         return np.array([s.x for s in self.spots]).reshape(-1, 3)
 
+    def spot_covs(self) -> FloatArray:
+        """Of all spots, (n, 3, 3)."""
+        return np.array([s.cov for s in self.spots]).reshape(-1, 3, 3)
+
     def positions(self) -> FloatArray:
         """Everything with a place, (n, 3)."""
         parts = [self.spot_places()]
@@ -153,11 +157,11 @@ def _corners(target: Target) -> FloatArray:
 
 def enlargement(scene: Scene, ellipsoid: float, extent: float) -> float:
     """How much ellipsoids are enlarged, a round number: a typical one to 3.5 %, the largest to 20 % of the extent."""
-    semi_axes = [ellipsoid * float(np.sqrt(max(np.linalg.eigvalsh(s.cov)[-1], 0.0))) for s in scene.spots]
-    positive = [a for a in semi_axes if a > 0.0]
-    if not positive:
+    largest = np.linalg.eigvalsh(scene.spot_covs())[:, -1]
+    if not (largest > 0.0).any():
         return 1.0
-    return d.round_below(extent * min(0.035 / float(np.median(positive)), 0.2 / max(positive)))
+    semi_axes = ellipsoid * np.sqrt(largest[largest > 0.0])
+    return d.round_below(extent * min(0.035 / float(np.median(semi_axes)), 0.2 / float(semi_axes.max())))
 
 
 def space(scene: Scene, ellipsoid: float) -> Markup:
@@ -172,7 +176,7 @@ def space(scene: Scene, ellipsoid: float) -> Markup:
         "reach": reach,
         "enlarged": enlargement(scene, ellipsoid, 2.0 * reach),
         "lines": _ground(low, high) + _lines(scene, reach),
-        "spots": [_spot(s.x, s.cov, ellipsoid, s.kind) for s in scene.spots],
+        "spots": _spots(scene, ellipsoid),
         "labels": _names(scene),
     }
     return part("space", of="report.html") + json_script("space-data", data)
@@ -183,12 +187,15 @@ def rounded(x: FloatArray) -> Any:
     return np.round(x, 5).tolist()
 
 
-def _spot(x: FloatArray, cov: FloatArray, ellipsoid: float, kind: str) -> dict[str, Any]:
-    variances, vectors = np.linalg.eigh(cov)
-    axes = (vectors * (ellipsoid * np.sqrt(np.clip(variances, 0.0, None)))).T
+def _spots(scene: Scene, ellipsoid: float) -> list[dict[str, Any]]:
+    variances, vectors = np.linalg.eigh(scene.spot_covs())
+    axes = np.swapaxes(vectors * (ellipsoid * np.sqrt(np.clip(variances, 0.0, None)))[:, None], 1, 2)
     # seven significant digits: enlarged ellipsoids stay round, and equal input gives equal bytes
-    shown = [[float(f"{a:.7g}") for a in axis] for axis in axes]
-    return {"x": rounded(x), "axes": shown, "colour": d.RED if kind == "point" else d.GREEN}
+    shown = ([[float(f"{a:.7g}") for a in axis] for axis in of_one] for of_one in axes.tolist())
+    return [
+        {"x": x, "axes": own, "colour": d.RED if s.kind == "point" else d.GREEN}
+        for s, x, own in zip(scene.spots, rounded(scene.spot_places()), shown, strict=True)
+    ]
 
 
 def _line(x: FloatArray, colour: str, width: float, alpha: float = 1.0) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -18,7 +18,7 @@ from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
 from survey.solution.left_out import left_out_dict
-from survey.solution.quantities import Scale, SigmaKind, point_entry, pose_entries, pose_entry, scale_of, vector_entry
+from survey.solution.quantities import Scale, SigmaKind, point_entry, pose_entries, scale_of, vector_entry
 from survey.solution.statistics import Statistics
 from survey.solution.statistics_dict import statistics_dict
 from survey.solution.verdict import findings, fit_of, suspects, verdict
@@ -26,8 +26,10 @@ from survey.solution.verdict import findings, fit_of, suspects, verdict
 CORRELATION_LIMIT = 0.95
 # parameters for which "zero" is no sensible hypothesis
 _NEVER_ZERO = {"fx", "fy", "u0", "v0", "c", "xp", "yp"}
+_AS_IT_IS = frozenset((str, int, bool, type(None)))
 _FLOATS = {float}
 _JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
+PoseOf = Callable[[tuple[str, ...], str], dict[str, Any]]
 CONVENTIONS = {
     "poses": "a_from_b takes coordinates in b to coordinates in a; camera x right, y down, z forward",
     "translation_mm": "origin of b in a; sigma_translation_mm along the axes of a",
@@ -66,16 +68,17 @@ class RunInfo:
 def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None = None) -> dict[str, Any]:
     """The whole solution as plain values, floats in full, None where there is no number; ``found``: its statistics."""
     scale = scale_of(adjustment, run.sigmas)
+    poses = _poses(adjustment, scale)
     solution: dict[str, Any] = plain(
         {
             "format": 1,
             "summary": _summary(adjustment, run, scale, found),
             "conventions": CONVENTIONS,
-            "cameras": _cameras(adjustment, scale),
-            "stations": _stations(adjustment, scale),
+            "cameras": _cameras(adjustment, poses, scale),
+            "stations": _stations(adjustment, poses),
             "points": _points(adjustment, scale),
-            "tables": _tables(adjustment, scale),
-            "targets": _targets(adjustment, scale),
+            "tables": _tables(adjustment, poses, scale),
+            "targets": _targets(adjustment, poses, scale),
             "pairs": _pairs(adjustment, scale),
             **instrument_entries(adjustment, scale),
             **_network(adjustment),
@@ -116,14 +119,14 @@ def _free_datum(adjustment: Adjustment) -> dict[str, Any]:
 def plain(value: Any) -> Any:
     """Only what JSON knows: mappings and sequences kept, numbers as Python's, None for what is not finite."""
     kind = type(value)
-    if kind is str or kind is int or kind is bool or value is None:
+    if kind in _AS_IT_IS:
         return value
     if kind is float:
         return value if math.isfinite(value) else None
     if kind is list and set(map(type, value)) == _FLOATS and all(map(math.isfinite, value)):
         return value
     if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): v if type(v) in _AS_IT_IS else plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
         return [plain(v) for v in value]
     if isinstance(value, bool | np.bool_):
@@ -225,15 +228,15 @@ def _lens(estimate: Estimate, model: str, scale: Scale) -> dict[str, Any]:
     return entry
 
 
-def _cameras(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
-    moving, sums = _of_epochs(adjustment), _sums_of_blocks(adjustment.image_residuals)
+def _cameras(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any]:
+    sums = _sums_of_blocks(adjustment.image_residuals)
     out: dict[str, Any] = {}
     for camera in adjustment.survey.cameras:
         entry: dict[str, Any] = {"station": camera.station_id, "image_size_px": list(camera.image_size)}
         lens = adjustment.estimates.get(("lens", camera.camera_id))
         if lens is not None:
             entry["lens"] = _lens(lens, camera.lens.model, scale)
-        entry |= _pose(adjustment, moving, ("station_from_camera", camera.camera_id), "station_from_camera", scale)
+        entry |= pose(("station_from_camera", camera.camera_id), "station_from_camera")
         out[camera.camera_id] = entry | _images(adjustment, camera.camera_id, sums)
     return out
 
@@ -269,35 +272,28 @@ def _rms(n: float, squares: float) -> float:
     return math.sqrt(squares / (2 * n)) if n else math.nan
 
 
-def _of_epochs(adjustment: Adjustment) -> dict[tuple[str, ...], list[Estimate]]:
-    """What there is once at every epoch, by the first two parts of its name."""
-    out: dict[tuple[str, ...], list[Estimate]] = {}
-    for n, estimate in adjustment.estimates.items():
-        if len(n) == 3:
-            out.setdefault(n[:2], []).append(estimate)
-    return out
+def _poses(adjustment: Adjustment, scale: Scale) -> PoseOf:
+    """What is said of a pose: under ``key`` and, where it moves, under ``epochs``; nothing where it is no unknown."""
+    moving: dict[tuple[str, ...], dict[str, dict[str, Any]]] = {}
+    entries = pose_entries(adjustment.estimates.values(), scale)
+    for name, entry in entries.items():
+        if len(name) == 3:
+            moving.setdefault(name[:2], {})[name[2]] = entry
+
+    def pose(name: tuple[str, ...], key: str) -> dict[str, Any]:
+        epochs = {epoch: {key: entry} for epoch, entry in moving.get(name, {}).items()}
+        return ({key: entries[name]} if name in entries else {}) | ({"epochs": epochs} if epochs else {})
+
+    return pose
 
 
-def _pose(
-    adjustment: Adjustment, moving: Mapping[tuple[str, ...], list[Estimate]], name: tuple[str, ...], key: str,
-    scale: Scale,
-) -> dict[str, Any]:  # fmt: skip
-    """The pose under ``key`` and, where it moves, under ``epochs``; empty where it is no unknown."""
-    mine = moving.get(name, ())
-    epochs = {e.name[2]: {key: entry} for e, entry in zip(mine, pose_entries(mine, scale), strict=True)}
-    single = adjustment.estimates.get(name)
-    entry: dict[str, Any] = {} if single is None else {key: pose_entry(single, scale)}
-    return entry | ({"epochs": epochs} if epochs else {})
-
-
-def _stations(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
-    moving = _of_epochs(adjustment)
+def _stations(adjustment: Adjustment, pose: PoseOf) -> dict[str, Any]:
     out = {}
     for station in adjustment.survey.stations:
         name = station.station_id
         entry = {"motion": station.motion} | ({"table": station.table_id} if station.table_id else {})
-        entry |= _pose(adjustment, moving, ("mount_from_station", name), "mount_from_station", scale)
-        out[name] = entry | _pose(adjustment, moving, ("world_from_station", name), "world_from_station", scale)
+        entry |= pose(("mount_from_station", name), "mount_from_station")
+        out[name] = entry | pose(("world_from_station", name), "world_from_station")
     return out
 
 
@@ -305,13 +301,12 @@ def _points(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
     return {n[1]: point_entry(e, scale) for n, e in adjustment.estimates.items() if n[0] == "point"}
 
 
-def _tables(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
-    moving = _of_epochs(adjustment)
+def _tables(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any]:
     out = {}
     for table in adjustment.survey.tables:
         name = table.table_id
         entry: dict[str, Any] = {"axes": list(table.axes)}
-        entry |= _pose(adjustment, moving, ("world_from_table", name), "world_from_table", scale)
+        entry |= pose(("world_from_table", name), "world_from_table")
         geometry = adjustment.estimates.get(("table_geometry", name))
         if geometry is not None:
             entry["geometry"] = vector_entry(geometry, scale)
@@ -320,15 +315,14 @@ def _tables(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
     return out
 
 
-def _targets(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
-    moving = _of_epochs(adjustment)
+def _targets(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any]:
     out = {}
     for target in adjustment.survey.targets:
         name = target.target_id
         key = "station_from_target" if target.station_id else "world_from_target"
         entry: dict[str, Any] = {"n_points": len(target.point_ids), "motion": target.motion}
         entry |= {"station": target.station_id} if target.station_id else {}
-        entry |= _pose(adjustment, moving, ("carrier_from_target", name), key, scale)
+        entry |= pose(("carrier_from_target", name), key)
         warp = adjustment.estimates.get(("warp", name))
         out[name] = entry | ({"warp": vector_entry(warp, scale)} if warp is not None else {})
     return out
@@ -367,23 +361,25 @@ def solution_json(solution: Mapping[str, Any]) -> str:
 
 def _lines(value: Any, depth: int) -> str:
     kind = type(value)
+    if kind is float:
+        return _one(value)
     if kind is dict and value:
-        inner = ",\n".join([_key(k, depth + 1) + _lines(v, depth + 1) for k, v in value.items()])
+        before = " " * (depth + 1)
+        inner = ",\n".join([f"{before}{_key(k)}: {_lines(v, depth + 1)}" for k, v in value.items()])
         return f"{{\n{inner}\n{' ' * depth}}}"
     if kind is not list:
         return _one(value)
+    try:
+        text = ", ".join(map(float.__repr__, value))
+    except TypeError:
+        text = "n"
+    if "n" not in text:  # not even of nan or inf
+        return f"[{text}]"
     kinds = set(map(type, value))
-    if kinds == _FLOATS and all(map(math.isfinite, value)):
-        return f"[{', '.join(map(float.__repr__, value))}]"
     if dict in kinds or str in kinds:
         inner = ",\n".join([" " * (depth + 1) + _lines(v, depth + 1) for v in value])
         return f"[\n{inner}\n{' ' * depth}]"
     return f"[{', '.join(map(_one, value))}]"
-
-
-@lru_cache(maxsize=4096)
-def _key(name: str, depth: int) -> str:
-    return f"{' ' * depth}{_one(name)}: "
 
 
 def _one(value: Any) -> str:
@@ -393,3 +389,6 @@ def _one(value: Any) -> str:
     if kind is int:
         return int.__repr__(value)
     return json.encoder.encode_basestring(value) if kind is str else _JSON.encode(value)
+
+
+_key = lru_cache(json.encoder.encode_basestring)

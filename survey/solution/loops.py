@@ -28,6 +28,7 @@ from survey.solution.quantities import ARCSEC_PER_RAD
 ALPHA = 0.001
 """Error probability of the test of all loops together."""
 _MOST_LOOPS = 1000
+_Ends = list[tuple[str, str, str]]
 _GIVEN = "given:"  # no station's id holds a colon
 _WORLD = "world"
 
@@ -60,18 +61,18 @@ def pair_network(survey: Survey) -> PairNetwork:
     used = [p for p in survey.pairs if p.used]
     bare = _bare_stations(survey)
     poses = [p for p in used if isinstance(p.b_from_a, Pose3)]
-    dim = 6 if len(poses) == len(used) and used else 3
-    whole = topology(_ends(used), bare)
+    dim, ends = 6 if len(poses) == len(used) and used else 3, _ends(used)
+    whole = topology(ends, bare)
     counts = count(whole, dim)
-    tied = _tied(survey, used, bare, 6 if poses else 3)
-    closed = count(tied, dim)
+    closed = count(_tied(ends, _links(survey, used, ends, 6 if poses else 3), bare), dim)
     real = set(whole.station_ids) - {_WORLD}
     conditions, redundancy, shifts = closed.independent_conditions, closed.redundancy, None
     if dim == 3 and poses:
-        shifts = count(topology(_ends(poses), bare), 3)
-        redundancy += count(_tied(survey, poses, bare, 6), 3).redundancy
+        of_poses = _ends(poses)
+        shifts = count(topology(of_poses, bare), 3)
+        redundancy += count(_tied(of_poses, _links(survey, poses, of_poses, 6), bare), 3).redundancy
     return PairNetwork(
-        counts, shifts, _given(survey, used, 6 if poses else 3),
+        counts, shifts, _given(survey, ends, 6 if poses else 3),
         _ordered(_real(closed.uncontrolled_pairs)), _groups(_real(g) for g in closed.inseparable_pairs),
         tuple(found for part in closed.parts if (found := _ordered(s for s in part if s in real))),
         conditions, redundancy,
@@ -92,7 +93,8 @@ def _real(ids: Sequence[str]) -> tuple[str, ...]:
     return tuple(i for i in ids if not i.startswith(_GIVEN))
 
 
-def _ends(pairs: Sequence[Pair]) -> list[tuple[str, str, str]]:
+def _ends(pairs: Sequence[Pair]) -> _Ends:
+    """Ids of the pairs, and names of their frames a and b."""
     return [(p.pair_id, frame_name(p.a), frame_name(p.b)) for p in pairs]
 
 
@@ -109,17 +111,16 @@ def _is_given(parameter: PoseParameter, dim: int) -> bool:
     return parameter.treatment == "prior" and cov is not None and bool(np.isfinite(np.diag(cov)[:dim]).all())
 
 
-def _given(survey: Survey, pairs: Sequence[Pair], dim: int) -> tuple[str, ...]:
-    ends = {frame_name(r) for p in pairs for r in (p.a, p.b)}
-    fixed = (s for s in survey.stations if s.motion == "fixed" and s.station_id in ends)
+def _given(survey: Survey, ends: _Ends, dim: int) -> tuple[str, ...]:
+    names = {name for _, *both in ends for name in both}
+    fixed = (s for s in survey.stations if s.motion == "fixed" and s.station_id in names)
     given = tuple(s.station_id for s in fixed if _is_given(s.world_from_station, dim))
-    return ((_WORLD,) if _WORLD in ends else ()) + given
+    return ((_WORLD,) if _WORLD in names else ()) + given
 
 
-def _tied(survey: Survey, pairs: Sequence[Pair], bare: tuple[str, ...], dim: int) -> Topology:
+def _tied(ends: _Ends, links: "Sequence[_Link]", bare: tuple[str, ...] = ()) -> Topology:
     """The pairs, and what is known without them where that closes loops."""
-    links = [(link.link_id, link.frame, link.carrier) for link in _links(survey, pairs, dim)]
-    return topology(_ends(pairs) + links, bare)
+    return topology(ends + [(link.link_id, link.frame, link.carrier) for link in links], bare)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,12 +137,14 @@ class _Link:
         return _GIVEN + self.frame
 
 
-def _links(survey: Survey, pairs: Sequence[Pair], dim: int) -> list[_Link]:
+def _links(survey: Survey, pairs: Sequence[Pair], ends: _Ends, dim: int) -> list[_Link]:
     """What is known without pairs, where it closes loops."""
-    given, stations = _given(survey, pairs, dim), {s.station_id: s for s in survey.stations}
+    given, stations = _given(survey, ends, dim), {s.station_id: s for s in survey.stations}
     fixed = [s for s in given if s != _WORLD] if len(given) > 1 else []
     out = [_Link(s, _WORLD, ("world_from_station", s), stations[s].world_from_station) for s in fixed]
-    frames, rig = {frame_name(r): r for p in pairs for r in (p.a, p.b)}, dict[str, list[_Link]]()
+    frames, rig = dict[str, FrameRef](), dict[str, list[_Link]]()
+    for pair, (_, a, b) in zip(pairs, ends, strict=True):
+        frames[a], frames[b] = pair.a, pair.b
     on = {("camera", c.camera_id): (c.station_id, c.station_from_camera) for c in survey.cameras}
     on |= {("target", t.target_id): (t.station_id, t.carrier_from_target)
            for t in survey.targets if t.station_id is not None and t.motion != "epoch"}  # fmt: skip
@@ -165,13 +168,14 @@ def pair_loops(survey: Survey) -> LoopMisclosures | None:
         return None
     dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3
     motions = [p.b_from_a for p in pairs]
-    covs = [np.asarray(p.cov)[:dim, :dim] for p in pairs]
-    for link in _links(survey, pairs, dim):
+    covs, ends = [np.asarray(p.cov)[:dim, :dim] for p in pairs], _ends(pairs)
+    links = _links(survey, pairs, ends, dim)
+    for link in links:
         given = link.given
         motions.append(given.value or Pose3())
         held = given.treatment == "held" or given.prior_cov is None
         covs.append(np.zeros((dim, dim)) if held else np.asarray(given.prior_cov)[:dim, :dim])
-    network = Network(_tied(survey, pairs, (), dim), _motions(motions, dim), np.array(covs))
+    network = Network(_tied(ends, links), motion_arrays(motions, dim), np.array(covs))
     return loop_misclosures(network)
 
 
@@ -184,7 +188,7 @@ def loops_after(adjustment: Adjustment, loops: LoopMisclosures) -> FloatArray:
     top, dim = basis.topology, loops.vector.shape[1]
     by_id = {p.pair_id: p for p in survey.pairs}
     found = {o.ids[0]: np.asarray(o.residual) for o in adjustment.other_residuals if o.kind == "pair"}
-    links = {link.link_id: link for link in _links(survey, survey.pairs, dim)}
+    links = {link.link_id: link for link in _links(survey, survey.pairs, _ends(survey.pairs), dim)}
     motions: list[Pose3 | Rot3] = []
     moved, lost = np.zeros((top.n_pairs, dim)), np.zeros(top.n_pairs, dtype=np.bool_)
     for e, pair_id in enumerate(top.pair_ids):
@@ -199,16 +203,17 @@ def loops_after(adjustment: Adjustment, loops: LoopMisclosures) -> FloatArray:
         lost[e] = v is None
         if v is not None:
             moved[e] = (v - play(survey.closures, pair, v))[:dim]
-    w = evaluate_loops(basis, _motions(motions, dim).retract(moved))[0]
+    w = evaluate_loops(basis, motion_arrays(motions, dim).retract(moved))[0]
     w[np.logical_or.reduceat(lost[basis.pair_idx], basis.ptr[:-1])] = np.nan
     return w
 
 
-def _motions(motions: Sequence[Pose3 | Rot3], dim: int) -> Motions:
-    rotation = np.array([(m.rotation() if isinstance(m, Pose3) else m).matrix() for m in motions])
+def motion_arrays(of: Sequence[Pose3 | Rot3], dim: int) -> Motions:
+    """Rotations or poses (then all of them) as arrays; of poses the rotations alone where ``dim`` is 3."""
+    rotation = np.array([(m.rotation() if isinstance(m, Pose3) else m).matrix() for m in of])
     if dim == 3:
         return Motions(rotation)
-    return Motions(rotation, np.array([m.translation() for m in motions if isinstance(m, Pose3)]))
+    return Motions(rotation, np.array([m.translation() for m in of if isinstance(m, Pose3)]))
 
 
 def network_dict(network: PairNetwork) -> dict[str, Any]:
@@ -277,7 +282,7 @@ def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
         pairs = [by_id[i] for i in closure.pair_ids]
         dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3
         covs = np.array([np.asarray(p.cov)[:dim, :dim] for p in pairs])
-        loop = loop_misclosures(Network(topology(_ends(pairs)), _motions([p.b_from_a for p in pairs], dim), covs))
+        loop = loop_misclosures(Network(topology(_ends(pairs)), motion_arrays([p.b_from_a for p in pairs], dim), covs))
         w, cov = loop.vector[0], loop.cov[0]
         entry: dict[str, Any] = {"pairs": list(closure.pair_ids), "used": pairs[-1].used}
         entry |= {"sigma_arcsec": ARCSEC_PER_RAD * closure.rotation_sigma, "sigma_mm": 1e3 * closure.translation_sigma}

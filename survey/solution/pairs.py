@@ -9,10 +9,13 @@ from gtsam import Pose3
 from adjust.model.observations import frame_text
 from adjust.model.result import Adjustment, ObservationResidual
 from adjust.model.survey import FloatArray
+from adjust.observations.pairs import pair_arrays
 from adjust.precision.precision import Precision
+from adjust.spatial.rigid_motions import Motions
 from adjust.testing.distributions import chi2
 from survey.solution.frames import AdjustedFrames
-from survey.solution.quantities import ARCSEC_PER_RAD, Scale, pose_dict
+from survey.solution.loops import motion_arrays
+from survey.solution.quantities import ARCSEC_PER_RAD, Scale, pair_sigmas, pose_dicts
 
 UNCONTROLLED = 1e-4
 """Redundancy number below which nothing controls an observation."""
@@ -24,42 +27,45 @@ def pairs_dict(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
     Sigmas of the adjusted translation are along the axes of b, those of its rotation and the residuals about and along
     the axes of a. ``misfit``: lengths of the residuals.
     """
-    frames, out = AdjustedFrames(adjustment), dict[str, Any]()
-    precision = adjustment.precision
-    covs = precision.pair_covariances() if isinstance(precision, Precision) else {}
+    frames, pairs, factor = AdjustedFrames(adjustment), adjustment.survey.pairs, scale.factor
     found = {o.ids[0]: o for o in adjustment.other_residuals if o.kind == "pair"}
-    tests = _tests([found[p.pair_id] for p in adjustment.survey.pairs if p.pair_id in found])
-    refs = dict.fromkeys(r for p in adjustment.survey.pairs for r in (p.a, p.b))
-    place, text = {r: frames.world_from(r) for r in refs}, {r: frame_text(r) for r in refs}
-    for pair in adjustment.survey.pairs:
-        a, b = place[pair.a], place[pair.b]
-        is_pose = isinstance(pair.b_from_a, Pose3)
-        measured = pair.b_from_a if isinstance(pair.b_from_a, Pose3) else Pose3(pair.b_from_a, np.zeros(3))
-        entry: dict[str, Any] = {"a": text[pair.a], "b": text[pair.b], "used": pair.used}
-        entry["measured"] = pose_dict(measured)
-        if a is not None and b is not None:
-            adjusted = b.between(a)
-            entry["adjusted"] = pose_dict(adjusted) | pair_sigmas(adjusted, covs.get(pair.pair_id), scale.factor)
-        if not is_pose:
+    tests = _tests([found[p.pair_id] for p in pairs if p.pair_id in found])
+    ends = [(frame_text(p.a), frame_text(p.b)) for p in pairs]
+    ref = {name: r for p, names in zip(pairs, ends, strict=True) for name, r in zip(names, (p.a, p.b), strict=True)}
+    number = {name: i for i, name in enumerate(ref)}
+    a, b = np.array([(number[i], number[j]) for i, j in ends]).T
+    place = [frames.world_from(r) for r in ref.values()]
+    world = motion_arrays([Pose3() if p is None else p for p in place], 6)
+    now = world[b].inverse() @ world[a]
+    sigmas, adjusted = _sigmas(adjustment, now.rotation, factor), _dicts(now)
+    measured, is_pose = pair_arrays(pairs), [isinstance(p.b_from_a, Pose3) for p in pairs]
+    out: dict[str, Any] = {}
+    known = np.array([p is not None for p in place])
+    rows = zip(pairs, ends, (known[a] & known[b]).tolist(), is_pose, _dicts(measured.motions), adjusted, strict=True)
+    for pair, names, there, whole, before, after in rows:
+        entry: dict[str, Any] = {"a": names[0], "b": names[1], "used": pair.used, "measured": before}
+        if there:
+            entry["adjusted"] = after | sigmas.get(pair.pair_id, {})
+        if not whole:
             for form in ("measured", "adjusted"):
                 entry.get(form, {}).pop("translation_mm", None)
         out[pair.pair_id] = entry | tests.get(pair.pair_id, {})
     return out
 
 
-def pair_sigmas(adjusted: Pose3, cov: FloatArray | None, factor: float = 1.0) -> dict[str, Any]:
-    """Sigmas of ``b_from_a`` times factor: rotation about the axes of a, translation along the axes of b.
+def _dicts(of: Motions) -> list[dict[str, Any]]:
+    return pose_dicts(of.rotation, np.zeros((len(of), 3)) if of.translation is None else of.translation)
 
-    cov: (6, 6) or (3, 3) in the tangent in frame a; without it there are none.
-    """
-    if cov is None:
-        return {}
-    sigma = factor * np.sqrt(np.clip(np.diag(cov), 0.0, None))
-    out = {"sigma_rotation_arcsec": (ARCSEC_PER_RAD * sigma[:3]).tolist()}
-    if len(cov) == 6:
-        R = adjusted.rotation().matrix()
-        along = np.sqrt(np.clip(np.diag(R @ cov[3:, 3:] @ R.T), 0.0, None))
-        out["sigma_translation_mm"] = (1e3 * factor * along).tolist()
+
+def _sigmas(adjustment: Adjustment, rotations: FloatArray, factor: float) -> dict[str, dict[str, Any]]:
+    """Of the adjusted pairs by id, where there are covariances. rotations: (E, 3, 3) of all."""
+    precision, out = adjustment.precision, dict[str, dict[str, Any]]()
+    covs = precision.pair_covariances() if isinstance(precision, Precision) else {}
+    names = [p.pair_id for p in adjustment.survey.pairs]
+    for dim in (3, 6):
+        rows = [e for e, name in enumerate(names) if name in covs and len(covs[name]) == dim]
+        of = np.array([covs[names[e]] for e in rows]).reshape(-1, dim, dim)
+        out |= zip([names[e] for e in rows], pair_sigmas(rotations[rows], of, factor), strict=True)
     return out
 
 

@@ -3,9 +3,8 @@
 Everything that a report or a result file says about the precision of an unknown passes through :class:`Scale`.
 """
 
-import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model.errors import SurveyError
-from adjust.model.result import Adjustment, Estimate
+from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
 from adjust.testing.distributions import chi2, fisher
 from survey.project.project import SIGMA_KINDS
@@ -110,41 +109,71 @@ def vector_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
     return entry | {"status": dict(zip(estimate.components, estimate.status, strict=True))}
 
 
+def pose_dicts(rotations: FloatArray, translations: FloatArray) -> list[dict[str, Any]]:
+    """Of each of n poses (n, 3, 3), (n, 3) m what :func:`pose_dict` says."""
+    signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    squares = 1.0 + np.diagonal(rotations, axis1=1, axis2=2) @ signs.T  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
+    q = np.zeros((len(rotations), 4, 4))  # four times its products; the row of the largest is the best conditioned
+    q[:, range(4), range(4)] = squares
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        q[:, 0, i + 1] = q[:, i + 1, 0] = rotations[:, k, j] - rotations[:, j, k]
+        q[:, j + 1, k + 1] = q[:, k + 1, j + 1] = rotations[:, k, j] + rotations[:, j, k]
+    wxyz = q[np.arange(len(q)), np.argmax(squares, axis=1)]
+    wxyz *= np.where(wxyz[:, :1] < 0.0, -1.0, 1.0) / np.linalg.norm(wxyz, axis=1)[:, None]
+    R = np.moveaxis(rotations, 0, 2)
+    x = np.arctan2(R[2, 1], R[2, 2])
+    y = np.arctan2(-R[2, 0], np.hypot(R[2, 1], R[2, 2]))
+    # of the first two turns alone, which a quarter turn about y does not hide
+    z = np.arctan2(np.sin(x) * R[0, 2] - np.cos(x) * R[0, 1], np.cos(x) * R[1, 1] - np.sin(x) * R[1, 2])
+    rows = (1e3 * translations).tolist(), wxyz.tolist(), np.degrees(np.column_stack([x, y, z])).tolist()
+    names = "translation_mm", "rotation_quaternion_wxyz", "rotation_euler_xyz_deg"
+    return [dict(zip(names, row, strict=True)) for row in zip(*rows, strict=True)]
+
+
 def pose_dict(pose: Pose3) -> dict[str, Any]:
     """Translation, unit quaternion with w >= 0, and Euler angles with R = Rz(z) Ry(y) Rx(x)."""
-    rotation = pose.rotation()
-    q: Any = rotation.toQuaternion()  # a class that the stubs leave out
-    wxyz = [q.w(), q.x(), q.y(), q.z()]
-    return {
-        "translation_mm": [1e3 * x for x in pose.translation().tolist()],
-        "rotation_quaternion_wxyz": wxyz if wxyz[0] >= 0.0 else [-x for x in wxyz],
-        "rotation_euler_xyz_deg": [math.degrees(x) for x in rotation.xyz().tolist()],
-    }
+    return pose_dicts(pose.rotation().matrix()[None], pose.translation()[None])[0]
 
 
-def pose_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
-    """A pose ``a_from_b``: sigmas of its origin along the axes of a, sigmas of its rotation about the axes of b."""
-    return pose_entries([estimate], scale)[0]
-
-
-def pose_entries(estimates: Sequence[Estimate], scale: Scale) -> list[dict[str, Any]]:
-    """The same of poses, in their order.
+def pose_entries(estimates: Iterable[Estimate], scale: Scale) -> dict[ParameterName, dict[str, Any]]:
+    """Of poses ``a_from_b`` by name: sigmas of their origins along the axes of a, of their rotations about those of b.
 
     The tangent of the covariance is in b; the translation part is turned into a: ``R cov R'``.
     """
-    poses = [e.value for e in estimates if isinstance(e.value, Pose3)]
-    if len(poses) < len(estimates):
-        raise TypeError(f"{'/'.join(next(e.name for e in estimates if not isinstance(e.value, Pose3)))} is not a pose")
-    if not poses:
-        return []
-    R, cov = np.array([p.rotation().matrix() for p in poses]), np.array([e.cov for e in estimates])
-    variances = np.diagonal(cov, axis1=1, axis2=2)[:, :3], np.einsum("nij,njk,nik->ni", R, cov[:, 3:, 3:], R)
-    rotation, translation = (scale.factor * np.sqrt(np.clip(v, 0.0, None)) for v in variances)
-    sigmas = (1e3 * translation).tolist(), (ARCSEC_PER_RAD * rotation).tolist()
-    return [
-        pose_dict(p) | {"sigma_translation_mm": st, "sigma_rotation_arcsec": sr, "status": status_of(e)}
-        for p, e, st, sr in zip(poses, estimates, *sigmas, strict=True)
-    ]
+    found = [(e, e.value) for e in estimates if isinstance(e.value, Pose3)]
+    R = np.array([pose.rotation().matrix() for _, pose in found]).reshape(-1, 3, 3)
+    t = np.array([pose.translation() for _, pose in found]).reshape(-1, 3)
+    cov = np.array([e.cov for e, _ in found]).reshape(-1, 6, 6)
+    shift = 1e3 * scale.factor * np.sqrt(_variances(R @ cov[:, 3:, 3:] @ np.swapaxes(R, 1, 2)))
+    turn = ARCSEC_PER_RAD * scale.factor * np.sqrt(_variances(cov[:, :3, :3]))
+    rows = zip(found, pose_dicts(R, t), shift.tolist(), turn.tolist(), strict=True)
+    return {
+        e.name: entry | {"sigma_translation_mm": mm, "sigma_rotation_arcsec": arcsec, "status": status_of(e)}
+        for (e, _), entry, mm, arcsec in rows
+    }
+
+
+def _variances(cov: FloatArray) -> FloatArray:
+    """Diagonals (n, k) of covariances (n, k, k)."""
+    return np.clip(np.diagonal(cov, axis1=1, axis2=2), 0.0, None)
+
+
+def pose_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:
+    """The same of one; raises KeyError where it is no pose."""
+    return pose_entries([estimate], scale)[estimate.name]
+
+
+def pair_sigmas(rotations: FloatArray, covs: FloatArray, factor: float = 1.0) -> list[dict[str, Any]]:
+    """Sigmas of n ``b_from_a`` times factor: rotation about the axes of a, translation along the axes of b.
+
+    rotations: (n, 3, 3) of ``b_from_a``. covs: (n, 6, 6) or (n, 3, 3) in the tangent in frame a.
+    """
+    turn = ARCSEC_PER_RAD * factor * np.sqrt(_variances(covs[:, :3, :3]))
+    out: list[dict[str, Any]] = [{"sigma_rotation_arcsec": row} for row in turn.tolist()]
+    if covs.shape[1] == 6:
+        shift = 1e3 * factor * np.sqrt(_variances(rotations @ covs[:, 3:, 3:] @ np.swapaxes(rotations, 1, 2)))
+        out = [entry | {"sigma_translation_mm": row} for entry, row in zip(out, shift.tolist(), strict=True)]
+    return out
 
 
 def point_entry(estimate: Estimate, scale: Scale) -> dict[str, Any]:

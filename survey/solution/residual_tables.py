@@ -8,14 +8,14 @@ import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import chain
+from itertools import chain, groupby
 from math import isfinite
 from typing import Any
 
 import numpy as np
 
 from adjust.model.observations import Reading
-from adjust.model.result import Adjustment, ImageResiduals, ReadingResiduals
+from adjust.model.result import Adjustment, ImageResiduals, ObservationResidual, ReadingResiduals
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.parallel import side_by_side
 from adjust.native.text import Words, number_rows
@@ -137,22 +137,31 @@ def other_residuals_csv(adjustment: Adjustment) -> bytes:
     writer, readings = csv.writer(out, lineterminator="\n"), adjustment.reading_residuals
     writer.writerow(OTHER_COLUMNS.split(","))
     n = len(adjustment.other_residuals) - (0 if readings is None else len(readings.observed))
-    for o in adjustment.other_residuals[:n]:
-        of, used = (o.kind, cell_text(o.group), cell_text(" ".join(o.ids))), int(o.used)
-        values = (np.asarray(x, dtype=float).tolist()
-                  for x in (o.observed, o.adjusted, o.residual, o.sigma, o.redundancy, o.standardized))  # fmt: skip
-        test = _number(o.test)
-        for component, unit, observed, adjusted, residual, sigma, *numbers in zip(
-            o.components, o.units, *values, strict=True
-        ):
-            value_unit, factor, small_unit, small = _units(component, unit)
-            writer.writerow((
-                *of, component, value_unit, _number(observed * factor), _number(adjusted * factor), small_unit,
-                _number(residual * small), _number(sigma * small), *map(_number, numbers), test, used,
-            ))  # fmt: skip
+    for alike, some in groupby(adjustment.other_residuals[:n], lambda o: (o.kind, o.components, o.units)):
+        writer.writerows(_other_rows(alike[0], list(map(_units, *alike[1:])), list(some)))
     if readings is not None:
         writer.writerows(_reading_rows(adjustment.survey.readings, readings))
     return out.getvalue().encode()
+
+
+def _other_rows(
+    kind: str, units: Sequence[tuple[str, float, str, float]], some: Sequence[ObservationResidual]
+) -> Iterator[tuple[str | int, ...]]:
+    """Of observations with the same components, column by column."""
+    names, factor, small_names, small = (list(x) for x in zip(*units, strict=True))
+    k, components = len(units), list(some[0].components)
+    values: list[list[float]] = [
+        (np.array([getattr(o, name) for o in some], dtype=float).reshape(-1, k) * scale).ravel().tolist()
+        for name, scale in (("observed", factor), ("adjusted", factor), ("residual", small), ("sigma", small),
+                            ("redundancy", 1.0), ("standardized", 1.0))
+    ]  # fmt: skip
+    observed, adjusted, *rest = (map(_number, column) for column in values)
+    of = ((cell_text(o.group), cell_text(" ".join(o.ids)), _number(o.test), int(o.used)) for o in some)
+    groups, ids, tests, used = zip(*(row for row in of for _ in range(k)), strict=True)
+    each = (components, names, small_names)
+    component, value_unit, small_unit = (x * len(some) for x in each)
+    return zip([kind] * len(ids), groups, ids, component, value_unit, observed, adjusted, small_unit, *rest, tests,
+               used, strict=True)  # fmt: skip
 
 
 def _reading_rows(readings: Sequence[Reading], found: ReadingResiduals) -> Iterator[tuple[str | int, ...]]:

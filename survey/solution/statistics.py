@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from gtsam import Pose3
@@ -170,13 +171,13 @@ def neighbours(adjustment: Adjustment, scale: Scale) -> tuple[RelativePrecision,
         return ()
     near = _nearest(np.array(places), min(3, len(names)))
     pairs = dict.fromkeys((min(i, int(k)), max(i, int(k))) for i, row in enumerate(near) for k in row if int(k) != i)
-    free = [(names[i], names[k]) for i, k in pairs if _is_free(adjustment, names[i]) or _is_free(adjustment, names[k])]
+    free = ((names[i], names[k]) for i, k in pairs if _is_free(adjustment, names[i]) or _is_free(adjustment, names[k]))
     posterior = scale.sigmas == "a_posteriori"
     f = scale.factor
     return tuple(
         replace(r, cov=f**2 * r.cov, sigma_distance=f * r.sigma_distance,
                 rotation_cov=None if r.rotation_cov is None else f**2 * r.rotation_cov)
-        for r in relative_precision(adjustment, free[:MOST_NEIGHBOURS], PROBABILITY, posterior)
+        for r in relative_precision(adjustment, list(islice(free, MOST_NEIGHBOURS)), PROBABILITY, posterior)
         if r.ellipsoid.dimension  # rotations alone say nothing of positions
     )  # fmt: skip
 

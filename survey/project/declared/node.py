@@ -19,6 +19,7 @@ from survey.project.declared.toml_text import KeyLines, KeyPath
 _REQUIRED: Any = object()
 _LARGEST_TOML = 16 * 2**20  # bytes
 _DEEPEST_KEY = 32  # parts between dots; time and memory grow with their square
+_NUMBERS = {int, float}
 _LONGEST_INTEGER = 1000  # bits: all that a double can hold, and less than what cannot be printed
 _KEY_PART = re.compile(r"[ \t]*([A-Za-z0-9_-]+|\"[^\"\n]*\"|'[^'\n]*')[ \t]*")
 
@@ -163,6 +164,8 @@ class Node:
         """Numbers of the given shape; ``infinite`` allows ``inf``, also written "inf", ``blank`` allows ``nan``."""
         array = np.empty(shape)
         self._fill(array, self.value(key, default), (key,))
+        if np.abs(array).max(initial=0.0) <= LARGEST_NUMBER:
+            return array
         if (not blank and np.isnan(array).any()) or (not infinite and np.isinf(array).any()):
             raise self.error("found a number that is not finite; give finite numbers", key)
         if (np.abs(array[np.isfinite(array)]) > LARGEST_NUMBER).any():
@@ -230,6 +233,9 @@ class Node:
         if not isinstance(value, list) or len(value) != len(array):
             found = f"a list of {len(value)}" if isinstance(value, list) else _kind(value)
             raise self.error(f"expected a list of {len(array)}, found {found}", *keys)
+        if array.ndim == 1 and set(map(type, value)) <= _NUMBERS:
+            array[:] = value
+            return
         for i, item in enumerate(value):
             self._fill(array[i : i + 1].reshape(array.shape[1:]), item, (*keys, i))
 

@@ -5,6 +5,7 @@ are those of R = Rz(z) Ry(y) Rx(x). The sigmas of a prior hold in the tangent at
 translation, in the frame on the right of the pose's name.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -27,13 +28,11 @@ _SIGMAS = POSE_KEYS[4:-1]
 
 def rotation_from_quaternion(wxyz: FloatArray) -> Rot3 | None:
     """The rotation of a quaternion, or None where its length is not 1 within 1e-3."""
-    if not np.abs(wxyz).max() < 2.0:  # nor is there an end to what stands in files
+    parts: list[float] = wxyz.tolist()
+    length = math.hypot(*parts)
+    if not abs(length - 1.0) <= 1e-3:
         return None
-    length = float(np.linalg.norm(wxyz))
-    if abs(length - 1.0) > 1e-3:
-        return None
-    w, x, y, z = wxyz / length
-    return Rot3.Quaternion(w, x, y, z)
+    return Rot3.Quaternion(*(part / length for part in parts))
 
 
 def quaternion_wxyz(rotation: Rot3) -> list[float]:

@@ -62,6 +62,11 @@ class Names:
         """Those that were read before, by their text: a network names each of its points many times."""
         return {}
 
+    @functools.cached_property
+    def frames(self) -> dict[str, FrameRef]:
+        """The same of frames: a network of pairs names each of its stations many times."""
+        return {}
+
     def ids(self, kind: str) -> list[str]:
         """All ids of a kind of frame."""
         return [frame_id for frame_kind, frame_id in self.bodies if frame_kind == kind]
@@ -69,6 +74,13 @@ class Names:
 
 def read_frame(text: str, names: Names) -> FrameRef:
     """A frame; a name without kind is a station."""
+    found = names.frames.get(text)
+    if found is None:
+        found = names.frames[text] = _read_frame(text, names)
+    return found
+
+
+def _read_frame(text: str, names: Names) -> FrameRef:
     body, _, epoch = text.partition("@")
     if "@" in text:
         _check_id(epoch, "epoch")
