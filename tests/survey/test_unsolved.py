@@ -1,4 +1,4 @@
-"""What is left of an adjustment that failed: its state, gradient and culprits beside the message, and what names them."""
+"""What is left of an adjustment that failed: its state, gradient and culprits beside the message, and who they are."""
 
 import json
 import shutil
@@ -147,3 +147,30 @@ def test_a_slipped_decimal_is_named_with_its_line_and_mended(
     assert ("survey.toml:" if size == 0.1 else "observations/terrestrial.csv:") in first
     assert "--try 1" in first
     assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("column", "row", "factor", "says"),
+    [("value_m", "slope_distance2-1", 0.1, "reading slope_distance2-1: its decimal point has slipped"),
+     ("value_deg", "direction1-3", 0.9, "reading direction1-3: its values are gon, read as degrees")],
+)  # fmt: skip
+def test_a_single_reading_that_is_left_out_is_named_as_it_was_meant(
+    column: str, row: str, factor: float, says: str, tmp_path: Path
+) -> None:
+    """The search for gross errors leaves it out; what it was meant to be is told, and done by --try."""
+    lab = tmp_path / "lab"
+    write_project(lab, survey_of("hall", 3)[0])
+    table = lab / "observations" / "terrestrial.csv"
+    rows = [line.split(",") for line in table.read_text(encoding="utf-8").splitlines()]
+    at = rows[0].index(column)
+    (line,) = (i for i, r in enumerate(rows) if row in r)
+    before = float(rows[line][at])
+    rows[line][at] = repr(before / factor)
+    table.write_text("\n".join(map(",".join, rows)) + "\n", encoding="utf-8")
+    main(["adjust", str(lab), "--quiet"])
+    said = json.loads((lab / "results" / "solution.json").read_text(encoding="utf-8"))
+    assert said["warnings"][0].startswith(f"probable cause: {says}")
+    assert said["diagnosis"][0]["where"] == f"observations/terrestrial.csv:{line + 1}"
+    assert main(["adjust", str(lab), "--quiet", "--try", "1"]) == 0
+    after = [r.split(",") for r in table.read_text(encoding="utf-8").splitlines()]
+    assert float(after[line][at]) == pytest.approx(before, rel=1e-10)

@@ -107,7 +107,7 @@ def _ways(kind: str) -> Iterator[tuple[float, float, str, str]]:
 
 
 def _with(every: tuple[_T, ...], row: int, value: float) -> tuple[_T, ...]:
-    return (*every[:row], replace(every[row], value=value), *every[row + 1 :])
+    return tuple(replace(o, value=value) if i == row else o for i, o in enumerate(every))
 
 
 def _misread(
