@@ -75,11 +75,12 @@ class ExchangeColumns:
 
 @dataclass(frozen=True)
 class ChangeReadings:
-    """The values of terrestrial readings, by id: new = factor * old + offset (rad or m), written in their own unit."""
+    """The values of readings or distances, by id: new = factor * old + offset (rad or m), each in its own unit."""
 
     ids: tuple[str, ...]
     factor: float
     offset: float = 0.0
+    table: str = "terrestrial"
 
 
 @dataclass(frozen=True)

@@ -88,14 +88,31 @@ def congruence(
 
     Raises SurveyError where nothing is common, or the reference is too small.
     """
+    both = common(first, second, options)
+    after = aligned(both.before, both.after, both.directions, _numbers(both.names, options.reference))
+    return compare(both.names, both.before, after, both.directions, both.pooled, options)
+
+
+@dataclass(frozen=True, eq=False)
+class Common:
+    """What two epochs have in common, not aligned; directions and pooled as :func:`compare` takes them."""
+
+    names: tuple[ParameterName, ...]
+    before: EpochState
+    after: EpochState
+    directions: FloatArray
+    pooled: tuple[float, float, float]
+
+
+def common(first: Adjustment, second: Adjustment, options: CongruenceOptions = DEFAULT_CONGRUENCE) -> Common:
+    """The points and fixed stations that both epochs have; raises SurveyError where there are none."""
     before, after = epoch_state(first), epoch_state(second)
     names = tuple(n for n in before.names if n in after.index)
     if not names:
         raise SurveyError("the epochs have no point and no fixed station in common; use the same ids in both")
     before, after = before.part(names), after.part(names)
     directions = _open_motions(before, after)
-    after = aligned(before, after, directions, _numbers(names, options.reference))
-    return compare(names, before, after, directions, _pooled(first, second, options.scaled), options)
+    return Common(names, before, after, directions, _pooled(first, second, options.scaled))
 
 
 def compare(

@@ -4,12 +4,16 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from gtsam import Pose3
 
 from adjust.frames.unknowns import Unknown
 from adjust.graph.assembly import AdjustmentGraph
+from adjust.graph.datum import normal_diagonal, stacking, visible_keys
 from adjust.graph.rank import readable
 from adjust.model.errors import SurveyError
 from adjust.model.observations import position_text
+from adjust.model.result import ParameterName
+from adjust.model.survey import FloatArray
 
 _GROUPS, _OWNERS, _MOVED = 4, 3, 4
 _BY_FAR = 9.0
@@ -28,6 +32,106 @@ class Misfit:
     square: float
 
 
+@dataclass(frozen=True)
+class GroupFit:
+    """A group of n observations: root mean square over sigmas at the start and where it stopped; its worst owners."""
+
+    group: str
+    n: int
+    at_start: float
+    where_stopped: float
+    worst: tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True)
+class Pull:
+    """What the gradient of v'Pv asks of the unknowns of a kind: how many of its own sigmas each would go by itself.
+
+    largest: the unknown that is pulled most, and by how much; rms: over all n components.
+    """
+
+    kind: str
+    n: int
+    rms: float
+    largest: tuple[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownState:
+    """An unknown at the start and where it stopped: a Pose3, or (n,) free components in ``units``."""
+
+    name: ParameterName
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    start: Pose3 | FloatArray
+    value: Pose3 | FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Stopped:
+    """Where an adjustment stopped that found no minimum. last_step: of any unknown, in its sigmas."""
+
+    iterations: int
+    omega: float
+    last_step: float
+    groups: tuple[GroupFit, ...]
+    gradient: tuple[Pull, ...]
+    unknowns: tuple[UnknownState, ...]
+
+
+def stopped_at(
+    graph: AdjustmentGraph, start: gtsam.Values, values: gtsam.Values, iterations: int, omega: float, last_step: float
+) -> Stopped:
+    """The state, the gradient by kinds of unknowns and the fit of every group, the worst first."""
+    before, after = (_by_group(misfits(graph, at)) for at in (start, values))
+    groups = [
+        GroupFit(name, len(mine), _rms(before.get(name, [])), _rms(mine),
+                 tuple((o, float(np.sqrt(s))) for o, s in _owners(mine)[:_OWNERS]))
+        for name, mine in after.items()
+    ]  # fmt: skip
+    every = graph.unknowns.by_name.values()
+    unknowns = tuple(UnknownState(u.name, u.components, u.units, _value(u, start), _value(u, values)) for u in every)
+    return Stopped(iterations, omega, last_step, tuple(sorted(groups, key=lambda g: -g.where_stopped)),
+                   _gradient(graph, values), unknowns)  # fmt: skip
+
+
+def _value(u: Unknown, values: gtsam.Values) -> Pose3 | FloatArray:
+    if u.kind == "pose":
+        return values.atPose3(u.key)
+    return np.asarray(values.atPoint3(u.key) if u.kind == "point" else values.atVector(u.key), dtype=float)
+
+
+def _gradient(graph: AdjustmentGraph, values: gtsam.Values) -> tuple[Pull, ...]:
+    """Over the root of the diagonal of the normal matrix; empty where the system cannot be set up there."""
+    try:
+        linear = graph.linearized(graph.prepare(values, True, 0.0, False))
+        stack = stacking(graph, visible_keys(graph, linear))
+        down, scale = linear.gradientAtZero(), np.sqrt(np.maximum(normal_diagonal(linear, stack), 1e-300))
+    except (SurveyError, RuntimeError):  # the latter from GTSAM, of what is not finite
+        return ()
+    pulls: dict[str, list[tuple[Unknown, FloatArray]]] = {}
+    for key, place in stack.at.items():
+        u = graph.unknowns.by_key[key]
+        pulls.setdefault(u.name[0], []).append((u, np.abs(down.at(key)) / scale[place]))
+    found = []
+    for kind, mine in pulls.items():
+        every = np.concatenate([pull for _, pull in mine])
+        u, most = max(mine, key=lambda item: float(np.max(item[1])))
+        found.append(Pull(kind, len(every), float(np.sqrt(np.mean(every**2))), (readable(u), float(np.max(most)))))
+    return tuple(sorted(found, key=lambda p: -p.largest[1]))
+
+
+def _rms(found: list[Misfit]) -> float:
+    return float(np.sqrt(np.mean([m.square for m in found]))) if found else 0.0
+
+
+def _by_group(found: list[Misfit]) -> dict[str, list[Misfit]]:
+    groups: dict[str, list[Misfit]] = {}
+    for m in found:
+        groups.setdefault(m.group, []).append(m)
+    return groups
+
+
 def describe_divergence(graph: AdjustmentGraph, start: gtsam.Values, values: gtsam.Values) -> list[str]:
     """Lines for people: chi-square, what moved farthest from the start, the worst observations there and here.
 
@@ -36,7 +140,7 @@ def describe_divergence(graph: AdjustmentGraph, start: gtsam.Values, values: gts
     before, after = misfits(graph, start), misfits(graph, values)
     n = max(1, len(after))
     first = _stands_out(before)
-    rms = [float(np.sqrt(np.mean([m.square for m in side]))) if side else 0.0 for side in (before, after)]
+    rms = [_rms(side) for side in (before, after)]
     lines = [] if first is None else [first]
     lines += [
         f"the observations miss by {rms[0]:.3g} of their sigmas (root mean square of {n}) at the start values, "
@@ -64,9 +168,7 @@ def _stands_out(found: list[Misfit]) -> str | None:
 
 def worst_by_group(found: list[Misfit]) -> list[str]:
     """A line for each group that does not fit, the worst first: its misfit, its worst owners and observation."""
-    groups: dict[str, list[Misfit]] = {}
-    for m in found:
-        groups.setdefault(m.group, []).append(m)
+    groups = _by_group(found)
     mean = {group: float(np.mean([m.square for m in mine])) for group, mine in groups.items()}
     lines = []
     for group in sorted((g for g in groups if mean[g] > _MISFIT), key=lambda g: -mean[g])[:_GROUPS]:

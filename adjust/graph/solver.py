@@ -12,7 +12,7 @@ import numpy as np
 
 from adjust.graph.assembly import AdjustmentGraph, Evaluation
 from adjust.graph.datum import InnerDatum, inner_datum, normal_diagonal, stacking, visible_keys
-from adjust.graph.divergence import describe_divergence
+from adjust.graph.divergence import describe_divergence, stopped_at
 from adjust.graph.elimination import Elimination
 from adjust.graph.pair_normals import PairLinear, PairNormals
 from adjust.graph.rank import describe_null_space, unobserved_unknowns
@@ -328,7 +328,9 @@ class _Loop:
             f"the adjustment did not converge in {iteration} steps: the last step moved an unknown by "
             f"{self.moved:.2g} sigma{what}; look for gross errors in the observations or a wrong start value"
         )
-        return NotConvergedError("\n  - ".join([head, *describe_divergence(self.graph, self.start, self.at.values)]))
+        said = [head, *describe_divergence(self.graph, self.start, self.at.values)]
+        stopped = stopped_at(self.graph, self.start, self.at.values, iteration, self.omega, float(self.moved))
+        return NotConvergedError("\n  - ".join(said), stopped)
 
     def _finish(self, iteration: int) -> Solved:
         if self.behind:

@@ -19,7 +19,14 @@ class IndeterminateError(SurveyError):
 
 
 class NotConvergedError(SurveyError):
-    """The adjustment did not reach a minimum; the message says what kept moving."""
+    """The adjustment did not reach a minimum; the message says what kept moving.
+
+    stopped: where that was (``adjust.graph.divergence.Stopped``), None where it is not known.
+    """
+
+    def __init__(self, message: str, stopped: object = None) -> None:
+        super().__init__(message)
+        self.stopped = stopped
 
 
 class DiagnosedError(SurveyError):

@@ -207,7 +207,8 @@ def _gates(system: System, seen: Sightings, prior: Prior, ahead: BoolArray) -> t
     camera, beacon = map(np.ascontiguousarray, np.nonzero(near_by))
     n = len(beacon)
     predicted, H, M, _ = evaluate(system, prior.pose, camera, beacon, np.zeros((n, 2)))
-    common = (H @ prior.B + M).reshape(n, 2, -1)
+    common = H @ prior.B + M
+    common = common.reshape(n, 2, common.shape[-1])  # n may be 0: nothing is ahead
     by_pose = (H @ prior.cov).reshape(n, 2, 6)
     base = by_pose @ H.reshape(n, 2, 6).transpose(0, 2, 1) + common @ common.transpose(0, 2, 1)
     spot, near = np.nonzero(seen.camera[:, None] == camera)

@@ -87,7 +87,7 @@ def minimize(
     except NotConvergedError as error:
         raise NotConvergedError(
             f"{str(error).splitlines()[0].split(';')[0].replace('adjustment', 'network')}; look for wrong pairs, or "
-            "let the program look for them (reject_pairs)"
+            "let the program look for them (reject_pairs)", error.stopped
         ) from error
     except IndeterminateError as error:  # what the pairs join was seen before
         raise IndeterminateError(

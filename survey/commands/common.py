@@ -41,6 +41,7 @@ def run_command(program: str, build_parser: Callable[[], argparse.ArgumentParser
     """Parse and run a command line of ``program``; its exit code. What its owner can mend is one line on stderr."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # a name that the terminal cannot show is no reason to stop
         sys.stdout.reconfigure(errors="backslashreplace")
+    arguments = argparse.Namespace()
     try:
         try:
             arguments = build_parser().parse_args(argv)
@@ -56,6 +57,7 @@ def run_command(program: str, build_parser: Callable[[], argparse.ArgumentParser
         if isinstance(error, OSError) and error.filename is None and error.errno not in _OF_THE_DISK:
             raise  # not about a file of the user
         print(f"{program}: error: {message(error)}", file=sys.stderr)
+        say(arguments, *map(shown, getattr(error, "__notes__", ())))
         return INTERRUPTED if getattr(error, "interrupted", False) else FAILED
     except KeyboardInterrupt:
         print(f"\n{program}: interrupted", file=sys.stderr)

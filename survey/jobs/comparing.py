@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from adjust.diagnosis.between import Between, causes_between
 from adjust.epochs.congruence import CongruenceOptions, congruence
 from adjust.epochs.congruence_result import Congruence
 from adjust.epochs.deformation import Deformation, DeformationTest, station_deformations
@@ -28,6 +29,7 @@ class CompareOutcome:
 
     congruence: None where nothing common can be tested; ``why`` then says what is in the way. sigmas: what both
     projects ask for; None: the pairs of stations are tested a priori, the congruence of all with the pooled sigma0.
+    causes: what explains that they are not congruent, other than motions.
     """
 
     folders: tuple[Path, Path]
@@ -36,12 +38,14 @@ class CompareOutcome:
     congruence: Congruence | None = None
     why: str = ""
     sigmas: SigmaKind | None = None
+    causes: tuple[Between, ...] = ()
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What the adjustments warn of; wrong sigmas there make wrong tests here."""
+        """Causes other than motions; what the adjustments warn of: wrong sigmas there make wrong tests here."""
         pairs = zip(self.folders, self.adjustments, strict=True)
-        return tuple(f"{folder}: {warning}" for folder, adjustment in pairs for warning in adjustment.warnings)
+        causes = (f"probable cause: {c.cause}; {c.change} (then p {c.p:.2g})" for c in self.causes)
+        return (*causes, *(f"{folder}: {warning}" for folder, adjustment in pairs for warning in adjustment.warnings))
 
     def summary(self) -> dict[str, Any]:
         """As plain values; None where something was not measured or cannot be tested."""
@@ -53,6 +57,11 @@ class CompareOutcome:
             "alpha": ALPHA,
             "deformations": [_entry(d) for d in self.deformations],
             "congruence": None if self.congruence is None else congruence_dict(self.congruence),
+            "diagnosis": [
+                {"name": c.name, "cause": c.cause, "change": c.change, "ids": list(c.ids), "statistic": c.statistic,
+                 "statistic_as_it_is": c.before, "p": c.p}
+                for c in self.causes
+            ],
             "warnings": list(self.problems),
         }
 
@@ -87,12 +96,13 @@ def compare_job(folder_a: Path, folder_b: Path, *, progress: bool = True) -> Com
         found, why = congruence(first, second, options), ""
     except SurveyError as error:
         found, why = None, f"no congruence test: {error}"
+    causes = () if found is None else causes_between(first, second, found, options)
     stations = [{s.station_id for s in a.survey.stations if s.motion == "fixed"} for a in (first, second)]
     if found is not None and len(stations[0] & stations[1]) < 2:
-        return CompareOutcome(folders, (first, second), (), found, sigmas=sigmas)
+        return CompareOutcome(folders, (first, second), (), found, sigmas=sigmas, causes=causes)
     scaled = (sigmas == "a_posteriori",) * 2
     moved = station_deformations(first, second, alpha=ALPHA, scale=(scaled[0], scaled[1]))
-    return CompareOutcome(folders, (first, second), moved, found, why, sigmas)
+    return CompareOutcome(folders, (first, second), moved, found, why, sigmas, causes)
 
 
 def _sigmas(projects: tuple[Project, Project]) -> SigmaKind | None:

@@ -15,7 +15,7 @@ from survey.report.context import Context
 from survey.report.drawing import DARK
 from survey.report.language import localised, speaking, t
 from survey.report.markup import document, element, joined, json_script, part
-from survey.report.sections import loops, observations, overview, published, statistics, unknowns
+from survey.report.sections import diagnosis, loops, observations, overview, published, statistics, unknowns
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.quantities import scale_of
 from survey.solution.residual_tables import image_rows
@@ -24,6 +24,7 @@ from survey.solution.statistics import Statistics
 _SECTIONS = (
     ("Identification", "identification", overview.identification),
     ("Summary", "summary", overview.summary),
+    ("Diagnosis", "diagnosis", diagnosis.diagnosis),
     ("Tolerances", "tolerances", overview.tolerances),
     ("Variance components", "components", statistics.components),
     ("Groups", "groups", overview.groups),

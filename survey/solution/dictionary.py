@@ -85,7 +85,7 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
             **_free_datum(adjustment),
             "groups": {g.group: _group(g) for g in adjustment.groups},
             **left_out_dict(adjustment, run.left_out, run.n_left_out, run.n_unused_in_files),
-            "warnings": [*findings(found.consistency if found else None), *adjustment.warnings],
+            "warnings": _warnings(adjustment, found),
             **({"diagnosis": adjustment.diagnosis.told()} if adjustment.diagnosis is not None else {}),
             **(statistics_dict(adjustment, found, scale) if found is not None else {}),
             "inputs": {
@@ -105,6 +105,13 @@ def solution_dict(adjustment: Adjustment, run: RunInfo, found: Statistics | None
         }
     )
     return solution
+
+
+def _warnings(adjustment: Adjustment, found: Statistics | None) -> list[str]:
+    """Causes that were tried first, then what tests of parts found, then the rest."""
+    tried = len(adjustment.diagnosis.lines) if adjustment.diagnosis is not None else 0
+    return [*adjustment.warnings[:tried], *findings(found.consistency if found else None),
+            *adjustment.warnings[tried:]]  # fmt: skip
 
 
 def _free_datum(adjustment: Adjustment) -> dict[str, Any]:

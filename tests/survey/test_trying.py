@@ -25,7 +25,7 @@ from adjust.diagnosis.names.epochs import exchanged_cameras
 from adjust.diagnosis.names.given import wrong_given
 from adjust.diagnosis.names.points import exchanged_points
 from adjust.diagnosis.time.forgotten_motion import forgotten_motion
-from adjust.diagnosis.units.pairs import CONVENTIONS, _edits, mended, misread_pairs
+from adjust.diagnosis.units.pairs import CONVENTIONS, edits_of, mended, misread_pairs
 from adjust.diagnosis.units.readings import misread_readings
 from adjust.model.errors import SurveyError
 from adjust.model.survey import Survey
@@ -114,7 +114,7 @@ def test_conventions_of_pairs_as_columns(convention, tmp_path: Path) -> None:
     write_project(lab, survey)
     given = read(lab).survey
     rows = np.array([0, 3, 7])
-    edits = _edits(given, rows, convention)
+    edits = edits_of(given, rows, convention)
     assert edits
     carried_out(lab, hypothesis(edits))
     assert_same(read(lab).survey, mended(given, rows, convention))

@@ -152,7 +152,7 @@ def misread_pairs(case: Case) -> Iterator[Hypothesis]:
         if evidence > _CLEARLY:
             cause = f"{scope.text} {convention.said}{_lengths(changed, hands)}"
             yield Hypothesis(convention.name, cause, f"in pairs.csv {convention.remedy}", scope.place, changed,
-                             _edits(survey, scope.rows, convention), evidence, 1, looked_at)  # fmt: skip
+                             edits_of(survey, scope.rows, convention), evidence, 1, looked_at)  # fmt: skip
 
 
 def _lengths(survey: Survey, hands: list[Link]) -> str:
@@ -269,7 +269,8 @@ def _of_pairs(found: Screen, survey: Survey) -> FloatArray:
     return np.array([at.get(p.pair_id, 0.0) for p in survey.pairs])
 
 
-def _edits(survey: Survey, rows: IntArray, convention: Convention) -> tuple[Edit, ...]:
+def edits_of(survey: Survey, rows: IntArray, convention: Convention) -> tuple[Edit, ...]:
+    """The change of these pairs in ``pairs.csv``; none where that is no matter of its columns."""
     where = {"pair_id": tuple(survey.pairs[i].pair_id for i in rows)}
     if convention.mend is _inverted:
         return (ExchangeColumns("pairs", ("a_id", "b_id"), where),)

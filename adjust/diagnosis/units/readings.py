@@ -22,6 +22,8 @@ from adjust.observations.terrestrial.equations import DIRECTION, wrapped
 _CLEARLY = 3.0
 """By how much the misfit of the readings concerned has to fall."""
 _MOST, _SINGLE = 6, 8
+_FAR = 1000.0
+"""Square over sigma of a single reading from which it is no matter how much larger it is."""
 _LARGE_START = 2500
 """Readings up to which start values are found anew for every hypothesis that concerns all of a kind."""
 
@@ -56,7 +58,9 @@ def _slips(survey: Survey, before: Screen | None) -> list[tuple[float, Scope, Mi
         for factor in SLIPS:
             slip = Misreading("slipped decimal", f"has slipped: {r.value:.9g} for {factor * r.value:.9g} (SI)", factor,
                               0.0, (r.kind,))  # fmt: skip
-            evidence = _evidence(survey, before, scope, slip)
+            was, now = (float(x[0]) / before.scale for x in (before.readings[[i]], _mended_squares(
+                before, scope.rows, slip)))  # fmt: skip
+            evidence = min(was, _FAR) / (now + 5.0)  # of it alone: among all others one bounded misfit is soon lost
             if evidence > _CLEARLY:
                 out.append((evidence, scope, slip))
     return out

@@ -26,6 +26,7 @@ from survey.folder.text import decode, read_bytes
 from survey.folder.units import from_si, to_si
 from survey.project.declared.editing import with_product, with_value
 from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
+from survey.project.reading import LAYOUTS
 
 KEPT = "kept"
 TableEdit = ChangeColumns | ExchangeColumns | ChangeReadings | Rename
@@ -78,7 +79,7 @@ def file_of(edit: ScaleKey | SetKey | TableEdit) -> str:
     """The file that an edit changes, by its path in the project."""
     if isinstance(edit, ScaleKey | SetKey):
         return DEFINITION_FILE
-    return f"{OBSERVATIONS_FOLDER}/{'terrestrial' if isinstance(edit, ChangeReadings) else edit.table}.csv"
+    return f"{OBSERVATIONS_FOLDER}/{edit.table}.csv"
 
 
 def kept_name(folder: Path, name: str) -> str:
@@ -122,7 +123,7 @@ def _table(path: Path, text: str, edit: TableEdit, chosen: Hypothesis) -> Iterat
     for at, line in enumerate(lines[1:], 2):
         row = dict(zip(names, next(csv.reader([line]), []), strict=False))
         number += bool(row)
-        if isinstance(edit, ChangeReadings) and row:
+        if row and _NUMBERED in where:
             row[_NUMBERED] = row.get(_NUMBERED) or f"r{number}"
         if not row or any(row[column] not in values for column, values in where.items()):
             yield line
@@ -137,7 +138,7 @@ def _table(path: Path, text: str, edit: TableEdit, chosen: Hypothesis) -> Iterat
 def _columns(edit: TableEdit) -> tuple[tuple[str, ...], Mapping[str, frozenset[str]]]:
     """The columns that an edit changes, and which values choose its rows."""
     if isinstance(edit, ChangeReadings):
-        return (), {_NUMBERED: frozenset(edit.ids)}
+        return (), {LAYOUTS[edit.table].ids[0] if edit.table != "terrestrial" else _NUMBERED: frozenset(edit.ids)}
     where = {column: frozenset(values) for column, values in edit.where.items()}
     return (edit.column,) if isinstance(edit, Rename) else edit.columns, where
 

@@ -13,13 +13,16 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.folder.replacing import changing, replace_parts
+from survey.folder.text import atomic_write
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.detecting import author_name, detect_in, detect_job, remember_images
 from survey.project import Project, read
 from survey.project.project import RESULTS
 from survey.report.results import ENGLISH_PAGE, ReportOptions, RunInfo, make_results, solution_dict, summary_text
+from survey.report.unsolved import JSON, PAGE, unsolved_files
 from survey.solution.earlier.runs import record_run, remove_empty
 from survey.solution.quantities import USUAL, scale_of
 from survey.solution.statistics import Statistics, statistics_of
@@ -108,12 +111,35 @@ def adjust_job(
                 project = read(folder)
         elif project.images and out is None:
             project = replace(project, detected=remember_images(folder, place))
-        adjustment = adjust_project(project, progress, timed=clock.step)
+        try:
+            adjustment = adjust_project(project, progress, timed=clock.step)
+        except SurveyError as error:
+            keep_failure(error, run_info(project, clock.seconds, said), target, place, report.language)
+            raise
         outcome = made(project, adjustment, place, clock, report, said, published=method == "published")
         gone = () if out is not None else kept_run(folder, place, project, outcome)
         replace_parts(target, gone=gone)
+        for name in (JSON, PAGE):  # of a failure before
+            (target / RESULTS / name).unlink(missing_ok=True)
     remove_empty(target, gone)
     return outcome.at(target)
+
+
+def keep_failure(error: SurveyError, run: RunInfo, target: Path, place: Path, language: str) -> None:
+    """Write what is known of an adjustment that failed to the results, and note that; an earlier solution stays.
+
+    For who is changing ``target``, with ``place`` for what is new. Where it cannot be written the error is as it was.
+    """
+    files = unsolved_files(error, run, language)
+    try:
+        (place / RESULTS).mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            atomic_write(place / RESULTS / name, content)
+        replace_parts(target)
+    except (OSError, SurveyError):
+        return
+    for name in files:
+        error.add_note(f"written: {target / RESULTS / name}")
 
 
 def kept_run(folder: Path, place: Path, project: Project, outcome: AdjustOutcome) -> tuple[str, ...]:

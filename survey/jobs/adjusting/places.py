@@ -75,7 +75,8 @@ class _Files:
         if isinstance(edit, LeaveOut):
             return next(filter(None, (self.rows(table, wanted) for table, wanted in _left_out(edit.names))), "")
         if isinstance(edit, ChangeReadings):
-            return self.rows("terrestrial", {"reading_id": edit.ids}) or self._numbered(edit.ids)
+            column = "reading_id" if edit.table == "terrestrial" else LAYOUTS[edit.table].ids[0]
+            return self.rows(edit.table, {column: edit.ids}) or self._numbered(edit.ids)
         more: Wanted = {edit.column: tuple(edit.names)} if isinstance(edit, Rename) else {}
         return self.rows(edit.table, {**edit.where, **more})
 

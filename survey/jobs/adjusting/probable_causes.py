@@ -46,6 +46,9 @@ def with_probable_causes(survey: Survey, result: Adjustment, folder: Path) -> Ad
             diagnosis = _located(_diagnosis(survey, result, None, causes), folder)
             warnings = diagnosis.lines if diagnosis is not None else ()
         warnings += tuple(c for c in causes if c not in warnings)
+    if diagnosis is None and not warnings:
+        diagnosis = _located(_misread(survey, result), folder)
+        warnings = diagnosis.lines if diagnosis is not None else ()
     lines = tuple(f"probable cause: {c}" for c in warnings)
     return replace(result, warnings=lines + result.warnings, diagnosis=diagnosis)
 
@@ -58,13 +61,27 @@ def _diagnosis(
 
     refused = error is not None and not isinstance(error, IndeterminateError | NotConvergedError)
     fits = result is not None and result.sigma0 < _LARGE and not _images_refused(survey, result)
-    if refused or fits or not survey.image_blocks or not only_symptoms(causes):
+    if refused or fits or not only_symptoms(causes):
         return None
     from adjust.diagnosis.case import Case
     from adjust.diagnosis.diagnosis import diagnose
 
     found = diagnose(Case(survey, result, error))
     return found if found.candidates else None
+
+
+def _misread(survey: Survey, result: Adjustment) -> "Diagnosis | None":
+    """What was left out by the search for gross errors, and fits as it was meant; None where nothing does."""
+    left_out = survey.n_others_used - result.survey.n_others_used
+    if left_out <= 0 and all(o.used for o in result.other_residuals):
+        return None
+    from adjust.diagnosis.diagnosis import Diagnosis  # here: as above
+    from adjust.diagnosis.trial import misfit_of
+    from adjust.diagnosis.units.singles import misread_singles
+
+    found = misread_singles(survey, result)
+    names = tuple(dict.fromkeys(c.hypothesis.name for c in found))
+    return Diagnosis(found, names, misfit_of(result, survey)) if found else None
 
 
 def _located(found: "Diagnosis | None", folder: Path) -> "Diagnosis | None":

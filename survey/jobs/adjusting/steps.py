@@ -162,7 +162,9 @@ def adjust_project(
                 with timed(step.name):
                     work = step.run(work)
     result = _result(work)
-    return told(project, work.survey, replace(result, warnings=result.warnings + work.notes + lost_notes(work.lost)))
+    tried = 0 if result.diagnosis is None else len(result.diagnosis.lines)
+    said = result.warnings[:tried] + work.notes + result.warnings[tried:] + lost_notes(work.lost)
+    return told(project, work.survey, replace(result, warnings=said))
 
 
 def _result(work: Work) -> Adjustment:

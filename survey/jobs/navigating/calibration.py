@@ -24,7 +24,7 @@ class Calibration:
     """Head and beacons of an adjustment without the navigated epochs.
 
     sigma0: None without redundancy. reused: read from a file, not adjusted anew. helped_by: epochs that were not asked
-    for and calibrate all the same.
+    for and calibrate all the same. causes: of what contradicts in it, for people; such a one is not kept.
     """
 
     head: Head
@@ -32,6 +32,7 @@ class Calibration:
     sigma0: float | None
     reused: bool = False
     helped_by: tuple[str, ...] = ()
+    causes: tuple[str, ...] = ()
 
 
 def digest(*values: Any) -> str:

@@ -12,11 +12,13 @@ import numpy as np
 from tqdm import tqdm
 
 from adjust.adjustment import AdjustOptions, adjust
+from adjust.diagnosis.trajectory import OfTrajectory, causes_of_trajectory
 from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.navigation import EpochPose, Motion, NavigateOptions, Trajectory, head_and_beacons, navigate
 from survey.folder.replacing import changing, replace_parts
 from survey.folder.text import natural_key
 from survey.jobs.adjusting.job import run_info
+from survey.jobs.adjusting.probable_causes import explained, with_probable_causes
 from survey.jobs.navigating.calibration import Calibration, digest, keep, kept
 from survey.jobs.navigating.task import (
     NavigateRequest,
@@ -51,6 +53,7 @@ class NavigateOutcome:
     seconds: dict[str, float] = field(default_factory=dict)
     paths: dict[str, Path] = field(default_factory=dict)
     sigmas: SigmaKind = "a_priori"
+    causes: tuple[OfTrajectory, ...] = ()
 
     def summary(self) -> dict[str, Any]:
         """Counts and median sigmas as plain values."""
@@ -64,6 +67,11 @@ class NavigateOutcome:
             "median_sigma_translation_mm": trans,
             "calibration_sigma0": self.calibration.sigma0,
             "sigmas": self.sigmas,
+            "diagnosis": [
+                {"name": c.name, "cause": c.cause, "change": c.change, "kind": c.kind, "ids": list(c.ids),
+                 "explained": c.explained, "statistic": c.statistic, "critical": c.critical}
+                for c in self.causes
+            ],
             "notes": list(self.notes),
             "written": {name: str(path) for name, path in self.paths.items()},
         }
@@ -72,6 +80,8 @@ class NavigateOutcome:
         """The counts, the precision, and every epoch without a certain pose, for people."""
         s = self.summary()
         lines = [f"{self.folder}: {s['epochs']} poses of {self.station}"]
+        lines += [f"  ! probable cause: {c.cause}; {c.change} (explains {100.0 * c.explained:.0f} % of the misfit)"
+                  for c in self.causes]  # fmt: skip
         lines.append("  " + ", ".join(f"{s[status]} {status}" for status in STATUSES if s[status]))
         if s["median_sigma_rotation_arcsec"] is not None:
             turn = "  ".join(f"{v:.0f}" for v in s["median_sigma_rotation_arcsec"])
@@ -145,8 +155,10 @@ def _navigated(folder: Path, request: NavigateRequest, there: Path, place: Path,
         sigmas, trajectory = "a_posteriori", _scaled(trajectory, calibration.sigma0)
     seconds = {"calibrate": calibrated - begin, "navigate": time.perf_counter() - calibrated}
     notes = _notes(project, calibration)
-    outcome = NavigateOutcome(folder, station, calibration, trajectory, notes, seconds, sigmas=sigmas)
-    summary = {k: v for k, v in outcome.summary().items() if k not in ("written", "folder", "notes")}
+    sizes = {c.camera_id: c.image_size for c in project.survey.cameras}
+    causes = causes_of_trajectory(calibration.head, calibration.beacons, observed, trajectory, options, sizes)
+    outcome = NavigateOutcome(folder, station, calibration, trajectory, notes, seconds, sigmas=sigmas, causes=causes)
+    summary = {k: v for k, v in outcome.summary().items() if k not in ("written", "folder", "notes", "diagnosis")}
     return replace(outcome, paths=write_trajectory(trajectory, observed, summary, place))
 
 
@@ -164,7 +176,7 @@ def _scaled(trajectory: Trajectory, sigma0: float) -> Trajectory:
 
 
 def _notes(project: Project, calibration: Calibration) -> tuple[str, ...]:
-    notes = [*project.notes, *project.image_notes]
+    notes = [*(f"calibration: {c}" for c in calibration.causes), *project.notes, *project.image_notes]
     missing = sorted({p.point_id for p in project.survey.points} - set(calibration.beacons.beacon_ids), key=natural_key)
     if missing:
         notes.append(f"beacons without coordinates, left out: {', '.join(missing)}")
@@ -207,8 +219,16 @@ def _calibrated(project: Project, station: str, without: Sequence[str], there: P
     found = kept(there, key)
     if found is not None:
         return found
-    adjustment = adjust(survey, options=options)
+    try:
+        adjustment = with_probable_causes(survey, adjust(survey, options=options), project.folder)
+    except SurveyError as error:
+        said = explained(survey, error, project.folder)
+        if said is error:
+            raise
+        raise said from error
     head, beacons = head_and_beacons(adjustment, station)
-    calibration = Calibration(head, beacons, adjustment.sigma0 if adjustment.redundancy > 0 else None)
-    keep(new, key, calibration)
+    said_of = tuple(w for w in adjustment.warnings if w.startswith("probable cause"))
+    calibration = Calibration(head, beacons, adjustment.sigma0 if adjustment.redundancy > 0 else None, causes=said_of)
+    if not said_of:  # what is wrong is told every time
+        keep(new, key, calibration)
     return calibration
