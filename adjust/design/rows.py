@@ -12,11 +12,12 @@ import numpy as np
 from adjust.design.prediction import Predictor
 from adjust.graph.assembly import StartValues
 from adjust.lenses.models import MODELS, camera_constants, lens_derivatives
+from adjust.model.boards import deformation, warming_of
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.observations.factors import ChainPose
-from adjust.observations.images.batch import square_root_information, warp_shape
+from adjust.observations.images.batch import square_root_information
 from adjust.spatial.rigid import skew
 
 
@@ -101,7 +102,7 @@ def _image(p: Predictor, number: int, block: ImageBlock, by_key: dict[int, slice
     ref = FrameRef("target", block.target_id, block.epoch_id) if block.target_id else FrameRef("world")
     chain = p.frames.relative(ref, FrameRef("camera", block.camera_id, block.epoch_id))
     pose, jacobians = ChainPose(p.graph.unknowns, p.graph.state, chain)(p.values)
-    R, x = pose.rotation().matrix(), p.points_in_frame(block.target_id)[idx]
+    R, x = pose.rotation().matrix(), p.points_in_frame(block.target_id, block.epoch_id)[idx]
     q = x @ R.T + pose.translation()
     model, lens = MODELS[camera.lens.model], p.lens(camera)
     _, by_lens, by_q = lens_derivatives(model, lens, camera_constants(camera), q, block.uv[used])
@@ -136,8 +137,9 @@ def _own_points(
         vector = unknowns.vectors.get(("warp", block.target_id))
         if vector is None or vector.key is None:
             return []
-        sag = warp_shape(p.targets[block.target_id].x_in_target)[idx] @ vector.matrix
-        return [(vector.key, by_x[:, :, 2:] * sag[:, None, :], np.arange(len(idx)))]
+        target = p.targets[block.target_id]
+        moves = deformation(target.x_in_target, vector.names, warming_of(p.survey, target, block.epoch_id))[idx]
+        return [(vector.key, by_x @ moves @ vector.matrix, np.arange(len(idx)))]
     out = []
     for row, i in enumerate(idx.tolist()):
         unknown = unknowns.by_name.get(("point", p.survey.points[i].point_id))

@@ -14,11 +14,11 @@ import numpy as np
 from scipy import sparse
 
 from adjust.graph.assembly import AdjustmentGraph
+from adjust.model.boards import BENT, deformation
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import N_SHAPE
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
-from adjust.observations.images.batch import warp_shape
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
 from adjust.spatial.rigid import skew
@@ -197,7 +197,7 @@ def _shape_factors(x: FloatArray) -> FloatArray:
     out = np.zeros((len(x), N_SHAPE))
     out[:, :3] = x
     if np.ptp(x[:, 2]) < _FLAT:
-        out[:, 2:] = warp_shape(x)
+        out[:, 2:] = deformation(x, BENT)[:, 2]
     return out
 
 
