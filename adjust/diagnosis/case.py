@@ -89,7 +89,7 @@ class Case:
         SurveyError where that fails.
         """
         linear = self.linear
-        start = None if linear is None else values_of(linear.result)
+        start = None if linear is None else values_of(linear.result, survey)
         if start is None or any(c.camera_id not in start.lenses for c in survey.cameras):
             return self.run(survey)
         return adjust(survey, start, AdjustOptions(reject_blocks=False))

@@ -11,7 +11,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, Survey, Table
 from adjust.model.tables import Harmonic, harmonic
 
-_COVERED = 0.75
+_COVERED = 2.0 / 3.0
 """Share of its longest period that the angles of an axis must cover for its harmonics."""
 
 

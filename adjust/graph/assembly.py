@@ -54,8 +54,8 @@ class StartValues:
     vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
 
 
-def values_of(adjustment: Adjustment) -> StartValues:
-    """Adjusted values as start values."""
+def values_of(adjustment: Adjustment, survey: Survey | None = None) -> StartValues:
+    """Adjusted values as start values; for another survey, whose tables and boards have other components in part."""
     estimates = adjustment.estimates
     poses = {n: e.value for n, e in estimates.items() if isinstance(e.value, Pose3)}
     arrays = {n: np.asarray(e.value) for n, e in estimates.items() if not isinstance(e.value, Pose3)}
@@ -63,8 +63,24 @@ def values_of(adjustment: Adjustment) -> StartValues:
         {n[1]: v for n, v in arrays.items() if n[0] == "lens"},
         poses,
         {n[1]: v for n, v in arrays.items() if n[0] == "point"},
-        {n: v for n, v in arrays.items() if n[0] not in ("lens", "point")},
+        {n: v for n, v in arrays.items() if n[0] not in ("lens", "point")} | _by_component(adjustment, survey),
     )
+
+
+def _by_component(adjustment: Adjustment, survey: Survey | None) -> dict[ParameterName, FloatArray]:
+    """Of tables and boards, in the order of their components in the survey: adjusted where they were, else as given."""
+    if survey is None:
+        return {}
+    owners = {("table_geometry", t.table_id): t.geometry for t in survey.tables}
+    owners |= {("warp", t.target_id): t.warp for t in survey.targets if t.warp is not None}
+    out: dict[ParameterName, FloatArray] = {}
+    for name, owner in owners.items():
+        if name in adjustment.estimates:
+            estimate = adjustment.estimates[name]
+            known = dict(zip(estimate.components, np.asarray(estimate.value).tolist(), strict=True))
+            given = zip(owner.names, owner.values.tolist(), strict=True)
+            out[name] = np.array([known[n] if n in known and n in owner.free else v for n, v in given])
+    return out
 
 
 @dataclass(frozen=True, eq=False)

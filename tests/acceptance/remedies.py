@@ -16,9 +16,10 @@ import numpy as np
 from adjust.adjustment import adjust
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, Survey, VectorParameter
+from adjust.model.tables import harmonic_names
 from adjust.testing.distributions import chi2
 from adjust.testing.significance import significances
-from survey.simulate import Truth, resample, stereo
+from survey.simulate import Truth, head_on_table, resample, stereo
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +62,34 @@ def board(name: str, term: str, values: dict[str, float], free: tuple[str, ...] 
     return Remedy(name, survey, truth | {key: true}, truth | {key: np.zeros(len(names))}, key, term)
 
 
+def table(name: str, term: str, harmonics: dict[str, int], values: dict[str, float]) -> Remedy:
+    """Two cameras on a table that turns all round; harmonics up to some order, of which few are not zero."""
+    survey, truth = head_on_table(22, n_cameras=2, n_table_epochs=14, n_free_epochs=4)
+    turntable = survey.tables[0]
+    given = turntable.geometry
+    waves = tuple(n for key, k in harmonics.items() for n in harmonic_names(key[:-2], int(key[-1]) - 1, k))
+    key = ("table_geometry", turntable.table_id)
+    geometry = replace(given, names=(*given.names, *waves), values=np.append(given.values, np.zeros(len(waves))),
+                       free=(*given.free, *waves))  # fmt: skip
+    survey = replace(survey, tables=(replace(turntable, geometry=geometry),))
+    base = np.asarray(truth[key])
+    true, none = (np.append(base, [v.get(n, 0.0) for n in waves]) for v in (values, {}))
+    return Remedy(name, survey, truth | {key: true}, truth | {key: none}, key, term)
+
+
 REMEDIES: dict[str, Callable[[], Remedy]] = {
     "board bent": lambda: board("board bent", "bend", {"warp_x": 3e-4, "warp_y": -2e-4, "warp_xy": 5e-5}),
     "board stretched": lambda: board("board stretched", "stretch", {"scale_y": 6e-4, "shear": -4e-4}),
     "board expands": lambda: board("board expands", "expansion", {"expansion": 80e-6}),
+    "encoder eccentric": lambda: table(
+        "encoder eccentric", "angle_2_order_1", {"angle_2": 2}, {"angle_2_cos_1": 2e-4, "angle_2_sin_1": -1e-4}
+    ),
+    "axis runs out": lambda: table(
+        "axis runs out", "radial_2_order_-1", {"radial_2": 2}, {"radial_2_re_m1": 2e-4, "radial_2_im_m1": 1e-4}
+    ),
+    "axis wobbles": lambda: table(
+        "axis wobbles", "tilt_2_order_+2", {"tilt_2": 2, "axial_2": 1}, {"tilt_2_re_p2": 3e-4, "axial_2_cos_1": 1e-4}
+    ),
 }
 
 
