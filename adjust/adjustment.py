@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gtsam import Pose3
 
+from adjust.frames.tables import check_harmonics
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
 from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
 from adjust.graph.solver import Solved, SolveOptions, settled, solve
@@ -50,6 +51,7 @@ def adjust(
     Stations that measured pairs tie together are started and stepped as a network, whatever else is observed between
     them. progress: called with (iteration, v'Pv). Raises SurveyError, IndeterminateError, NotConvergedError.
     """
+    check_harmonics(survey)
     network = _network(survey)
     if network is not None:
         return _adjusted_network(network, survey, start, options, progress)

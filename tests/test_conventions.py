@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from gtsam import Pose3, Rot3
 
-from adjust.frames.chains import table_motion
 from adjust.frames.state import State
+from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import FrameTree, Unknowns
 from adjust.lenses.models import MODELS, lens_constants, project
+from adjust.model.boards import deformation
 from adjust.model.observations import FrameRef, ImageBlock, Pair, TableReading
 from adjust.model.result import Estimate
 from adjust.model.survey import (
@@ -23,7 +24,7 @@ from adjust.model.survey import (
     Target,
     VectorParameter,
 )
-from adjust.observations.images.batch import square_root_information, warp_shape
+from adjust.observations.images.batch import square_root_information
 from survey.solution.quantities import Scale, pose_dict, pose_entry, sigmas_of
 from tests.adjust import helpers as h
 
@@ -40,10 +41,7 @@ def brown_pixel(x_in_camera: FloatArray) -> FloatArray:
 
 def motion(axes: tuple[str, ...], a: FloatArray, tilt: float = 0.0, offset: float = 0.0) -> FloatArray:
     """(4, 4) table_from_mount of the core."""
-    numbers = ["xyz".index(name) for name in axes] + [-1]
-    (R,), (t,), _ = table_motion(
-        numbers[0], numbers[1], a[:1], np.append(a, 0.0)[1:2], np.array([tilt]), np.array([offset])
-    )
+    (R,), (t,), _ = table_motions(axes, {"non_orthogonality": tilt, "axis_offset": offset}, a[None])
     return Pose3(Rot3(R), t).matrix()
 
 
@@ -158,13 +156,20 @@ def test_encoder_zeros_are_added_to_the_readings() -> None:
 
 def test_a_one_axis_table_turns_about_its_axis_alone() -> None:
     expected = Pose3(Rot3.Rz(0.7), np.zeros(3)).matrix()
-    np.testing.assert_allclose(motion(("z",), np.array([0.7, 99.0]), 0.5, 0.5), expected, atol=1e-15)
+    np.testing.assert_allclose(motion(("z",), np.array([0.7]), 0.5, 0.5), expected, atol=1e-15)
 
 
-def test_warp_is_one_in_the_middle_and_zero_at_the_edges() -> None:
-    """z = warp_x 4u(1-u) + warp_y 4v(1-v) with u along x, v along y, 0 to 1 over the target's points."""
+def test_a_board_bends_most_in_the_middle_and_twists_at_its_corners() -> None:
+    """z = warp_x 4u(1-u) + warp_y 4v(1-v) + warp_xy (2u-1)(2v-1), u along x, v along y, 0 to 1 over the points."""
     x = np.array([[-1.0, 2.0, 0.0], [1.0, 2.0, 0.0], [-1.0, 6.0, 0.0], [1.0, 6.0, 0.0], [0.0, 3.0, 0.0]])
-    np.testing.assert_allclose(warp_shape(x), [[0, 0], [0, 0], [0, 0], [0, 0], [1.0, 0.75]], atol=1e-15)
+    z = deformation(x, ("warp_x", "warp_y", "warp_xy"))[:, 2]
+    np.testing.assert_allclose(z, [[0, 0, 1], [0, 0, -1], [0, 0, -1], [0, 0, 1], [1.0, 0.75, 0]], atol=1e-15)
+
+
+def test_a_board_is_longer_along_an_axis_leans_along_x_and_grows_with_the_temperature() -> None:
+    """x + (scale_x x + shear y, scale_y y, 0) + expansion (T - reference) x."""
+    moves = deformation(np.array([[2.0, 3.0, 0.5]]), ("scale_y", "scale_x", "expansion", "shear"), warming=4.0)[0]
+    np.testing.assert_allclose(moves.T, [[0, 3, 0], [2, 0, 0], [8, 12, 2], [3, 0, 0]], atol=1e-15)
 
 
 def test_euler_angles_of_the_result_files_are_rz_ry_rx() -> None:

@@ -8,12 +8,12 @@ from gtsam import Pose3
 
 from adjust.graph.assembly import GraphBuilder, StartValues
 from adjust.lenses.models import MODELS, camera_constants, lens_residuals, project
+from adjust.model.boards import deformed, warming_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, ImageBlock, PositionRef, TableReading
 from adjust.model.survey import BoolArray, Camera, FloatArray, Point, Survey, Target
 from adjust.native.lenses import FISHEYE
 from adjust.observations.factors import ChainPose
-from adjust.observations.images.batch import warp_shape
 
 _STEPS = np.linspace(1.0 / 16.0, 1.0, 16)
 _NEAREST_M = 1e-3
@@ -54,16 +54,14 @@ class Predictor:
         """Full lens vector (n,)."""
         return self.graph.unknowns.vectors["lens", camera.camera_id].full(self.values)
 
-    def points_in_frame(self, target_id: str | None) -> FloatArray:
+    def points_in_frame(self, target_id: str | None, epoch_id: str | None = None) -> FloatArray:
         """All points of a target in its frame, its warp included, or all world points; (n, 3) m."""
         if target_id is None:
             return np.array([self._point(p) for p in self.survey.points]).reshape(-1, 3)
         target = self.targets[target_id]
-        x = np.array(target.x_in_target, dtype=float)
         vector = self.graph.unknowns.vectors.get(("warp", target_id))
-        if vector is not None:
-            x[:, 2] += warp_shape(target.x_in_target) @ vector.full(self.values)
-        return x
+        values = None if vector is None else vector.full(self.values)
+        return deformed(target, values, warming_of(self.survey, target, epoch_id))
 
     def _point(self, point: Point) -> FloatArray:
         unknown = self.graph.unknowns.by_name.get(("point", point.point_id))
@@ -75,7 +73,7 @@ class Predictor:
         camera = self.cameras[block.camera_id]
         ref = FrameRef("target", block.target_id, block.epoch_id) if block.target_id else FrameRef("world")
         pose = self.b_from_a(ref, FrameRef("camera", block.camera_id, block.epoch_id))
-        x = self.points_in_frame(block.target_id)[block.point_idx]
+        x = self.points_in_frame(block.target_id, block.epoch_id)[block.point_idx]
         q = x @ pose.rotation().matrix().T + pose.translation()
         return projected(camera, self.lens(camera), q), q
 
@@ -100,7 +98,7 @@ class Predictor:
         )
         if not _is_flat(target):
             return np.ones(len(block.point_idx), dtype=np.bool_)
-        sight = self.points_in_frame(target.target_id)[block.point_idx] - camera_in_target.translation()
+        sight = self.points_in_frame(target.target_id, block.epoch_id)[block.point_idx] - camera_in_target.translation()
         cosine = sight[:, 2] / np.linalg.norm(sight, axis=1)
         if target.target_id in seeing.two_sided:
             cosine = np.abs(cosine)
@@ -120,7 +118,7 @@ class Predictor:
         if ref.point_id is None:
             return np.asarray(pose.translation())
         target = self.targets[ref.frame.frame_id]
-        x = self.points_in_frame(target.target_id)[target.point_ids.index(ref.point_id)]
+        x = self.points_in_frame(target.target_id, ref.frame.epoch_id)[target.point_ids.index(ref.point_id)]
         return np.asarray(pose.transformFrom(x))
 
 

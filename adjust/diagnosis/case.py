@@ -10,11 +10,12 @@ from gtsam import Pose3
 
 from adjust.adjustment import AdjustOptions, adjust
 from adjust.graph.assembly import values_of
+from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Camera, FloatArray, Survey
 from adjust.start.lenses import Sighting, start_lens
-from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block, target_points
+from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block
 
 if TYPE_CHECKING:
     from adjust.diagnosis.score import Linear
@@ -87,7 +88,7 @@ class Case:
         SurveyError where that fails.
         """
         linear = self.linear
-        start = None if linear is None else values_of(linear.result)
+        start = None if linear is None else values_of(linear.result, survey)
         if start is None or any(c.camera_id not in start.lenses for c in survey.cameras):
             return self.run(survey)
         return adjust(survey, start, AdjustOptions(reject_blocks=False))
@@ -137,7 +138,7 @@ def block_misfits(survey: Survey, result: Adjustment | None) -> FloatArray:
 
 def own_lens(survey: Survey, camera: Camera) -> FloatArray:
     """Start values (n,) of a lens from the camera's images of targets alone; SurveyError where they give none."""
-    points = {t.target_id: target_points(t) for t in survey.targets}
+    points = {t.target_id: deformed(t) for t in survey.targets}
     mine = [
         (i, b) for i, b in enumerate(survey.image_blocks)
         if b.camera_id == camera.camera_id and b.target_id is not None
@@ -159,7 +160,7 @@ def own_lenses(survey: Survey) -> dict[str, FloatArray]:
 
 def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
     """Every block of a target with three used points or more that has a pose."""
-    points = {t.target_id: target_points(t) for t in survey.targets}
+    points = {t.target_id: deformed(t) for t in survey.targets}
     known = replace(survey, cameras=tuple(c for c in survey.cameras if c.camera_id in lenses))
     focal = {c.camera_id: focal_px(c, lenses[c.camera_id]) for c in known.cameras}
     blocks = {i: b for i, b in enumerate(survey.image_blocks) if b.target_id is not None}

@@ -7,15 +7,15 @@ from functools import cached_property
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.chains import table_motion
+from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import Chain, FrameTree, Unknowns
 from adjust.lenses.models import LensModel, camera_constants, lens_model, project
+from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.rigid import inverse, rigid
-from adjust.start.views import target_points
 
 Altered = Mapping[ParameterName, Pose3 | FloatArray]
 
@@ -39,10 +39,7 @@ def adjusted_pose(survey: Survey, result: Adjustment, name: ParameterName) -> Fl
         table = next(t for t in survey.tables if t.table_id == name[1])
         g = dict(zip(geometry.components, np.asarray(geometry.value), strict=True))
         said = np.asarray(angles.value) if angles is not None else read.angles if read is not None else np.zeros(0)
-        a = [float(v) + g.get(f"zero_{k + 1}", 0.0) for k, v in enumerate(said)]
-        axes = ["xyz".index(x) for x in table.axes]
-        one = [np.array([v]) for v in (a[0], a[-1], g.get("non_orthogonality", 0.0), g.get("axis_offset", 0.0))]
-        R, t, _ = table_motion(axes[0], axes[1] if len(axes) > 1 else -1, *one)
+        R, t, _ = table_motions(table.axes, g, said[None].astype(float))
         return rigid(R[0], t[0])
     estimate = result.estimates.get(name)
     return estimate.value.matrix() if estimate is not None and isinstance(estimate.value, Pose3) else None
@@ -66,7 +63,7 @@ class Prediction:
 
     @cached_property
     def _targets(self) -> dict[str, FloatArray]:
-        return {t.target_id: target_points(t) for t in self.survey.targets}
+        return {t.target_id: deformed(t) for t in self.survey.targets}
 
     def uv(self, i: int, altered: Altered | None = None) -> FloatArray | None:
         """(n, 2) px of block i; None where a value is not known, or a point lies behind the camera.

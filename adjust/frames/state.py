@@ -6,12 +6,13 @@ from contextlib import contextmanager
 import gtsam
 import numpy as np
 
-from adjust.frames.chains import table_motion
+from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import TableSlot, Unknowns, VectorMap, vector_map
 from adjust.lenses.models import MODELS, camera_constants
+from adjust.model.boards import BOARD, checked_warp, extent
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, IntArray, Survey, VectorParameter
-from adjust.native.images import LensArrays
+from adjust.native.images import LensArrays, WarpArrays
 from adjust.native.lenses import MAX_LENS
 
 
@@ -22,8 +23,8 @@ class State:
     GTSAM is served with it only inside :meth:`serving`, by which a caller says that it asks at the values of that
     evaluation; asked at any other time, a factor evaluates itself.
 
-    slot_R (S, 3, 3), slot_t (S, 3): poses of all slots. D (table slots, 6, 6): derivative of a table's motion by its
-    free angles and free geometry, ``angles`` columns first. lenses: see LensArrays. warp (targets, 2) m.
+    slot_R (S, 3, 3), slot_t (S, 3): poses of all slots. D (table slots, 6, k): derivative of a table's motion by its
+    free angles and free geometry, ``angles`` columns first. lenses, warps: see LensArrays and WarpArrays.
     points (P, 3) m: the free ones in the order of their keys, ``point_rows`` says where.
     """
 
@@ -41,8 +42,9 @@ class State:
         self.table_index: IntArray = np.full(n, -1, dtype=np.int64)
         for i, table_slot in enumerate(unknowns.table_slots):
             self.table_index[table_slot] = i
-        self.D = np.zeros((max(1, len(unknowns.table_slots)), 6, 6))
-        self.warp = np.zeros((max(1, len(survey.targets)), 2))
+        most = max((len(s.axes) + len(s.geometry.free) for s in unknowns.table_slots.values()), default=6)
+        self.D = np.zeros((max(1, len(unknowns.table_slots)), 6, most))
+        self.warps = self._warp_arrays(survey)
         self._free_slots = [
             (slot, key)
             for slot, key in enumerate(unknowns.slot_key)
@@ -74,6 +76,15 @@ class State:
             k = arrays.n_map[i] = len(sources)
             arrays.source[i, :k], arrays.column[i, :k] = sources, columns
             arrays.factor[i, :k] = self.lens_maps[i].matrix[sources, columns]
+        return arrays
+
+    def _warp_arrays(self, survey: Survey) -> WarpArrays:
+        n, order = max(1, len(survey.targets)), tuple(BOARD)
+        arrays = WarpArrays(np.zeros((n, len(order))), np.ones((n, 4)), np.zeros((n, len(order)), dtype=np.int64))
+        for i, (target, found) in enumerate(zip(survey.targets, self.warp_maps, strict=True)):
+            if found is not None:
+                arrays.extent[i] = extent(target.x_in_target)
+                arrays.of_free[i, : len(found.free)] = [order.index(name) for name in found.free]
         return arrays
 
     def _set(self, slot: int, pose: gtsam.Pose3) -> None:
@@ -132,7 +143,7 @@ class State:
             self.lenses.values[i, : full.size] = full
         for i, warp_map in enumerate(self.warp_maps):
             if warp_map is not None:
-                self.warp[i] = warp_map.full(values)
+                self.warps.values[i, [list(BOARD).index(name) for name in warp_map.names]] = warp_map.full(values)
 
     def by_keys(self, slot: int, by_slot: FloatArray) -> list[tuple[int, FloatArray]]:
         """From a derivative (n, 6) by a slot's pose to those by the unknowns behind it (none where it is held)."""
@@ -156,17 +167,10 @@ class State:
         """Poses of one table's slots, and their derivatives into D."""
         axes, geometry = slots[0].axes, slots[0].geometry
         k, at = len(axes), [s.slot for s in slots]
-        angles = np.zeros((len(slots), 2))
-        angles[:, :k] = [values.atVector(s.angles_key) for s in slots]
-        given = dict.fromkeys(("zero_1", "zero_2", "non_orthogonality", "axis_offset"), 0.0)
-        given |= dict(zip(geometry.names, geometry.full(values).tolist(), strict=True))
-        zero_1, zero_2, tilt, offset = given.values()
-        one = np.ones(len(slots))
-        self.slot_R[at], self.slot_t[at], derivative = table_motion(
-            axes[0], axes[1] if k == 2 else -1, angles[:, 0] + zero_1, angles[:, 1] + zero_2, tilt * one, offset * one
-        )
-        columns = [list(given).index(name) for name in geometry.names]
-        by_geometry = derivative[:, :, columns] @ geometry.matrix
+        angles = np.array([values.atVector(s.angles_key) for s in slots])
+        given = dict(zip(geometry.names, geometry.full(values).tolist(), strict=True))
+        self.slot_R[at], self.slot_t[at], derivative = table_motions(axes, given, angles)
+        by_geometry = derivative[:, :, k:] @ geometry.matrix
         rows = self.table_index[at]
         self.D[rows, :, :k] = derivative[:, :, :k]
         self.D[rows, :, k : k + by_geometry.shape[2]] = by_geometry
@@ -175,7 +179,7 @@ class State:
 def collect_vectors(survey: Survey, unknowns: Unknowns, lenses: dict[str, FloatArray]) -> None:
     """Register the lenses and board warps. ``lenses`` gives the full start vector of every camera.
 
-    Raises SurveyError where a target's warp or a lens names components its model does not have.
+    Raises SurveyError where a target's warp or a lens has components that there are not.
     """
     for camera in survey.cameras:
         model = MODELS[camera.lens.model]
@@ -191,6 +195,6 @@ def collect_vectors(survey: Survey, unknowns: Unknowns, lenses: dict[str, FloatA
         name = ("lens", camera.camera_id)
         unknowns.vectors[name] = vector_map(parameter, model.units, unknowns, name)
     for target in survey.targets:
-        if target.warp is not None:
+        if (warp := checked_warp(target)) is not None:
             name = ("warp", target.target_id)
-            unknowns.vectors[name] = vector_map(target.warp, ("m", "m"), unknowns, name)
+            unknowns.vectors[name] = vector_map(warp, tuple(BOARD[x] for x in warp.names), unknowns, name)

@@ -16,6 +16,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import ParameterName
 from adjust.model.survey import Camera, FloatArray, PoseParameter, Station, Survey, Table, Target, VectorParameter
+from adjust.model.tables import unit_of
 
 T = TypeVar("T")
 POSE_COMPONENTS = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -75,7 +76,7 @@ class TableSlot:
     slot: int
     table_id: str
     epoch_id: str
-    axes: tuple[int, ...]
+    axes: tuple[str, ...]
     angles_key: int
     geometry: VectorMap
 
@@ -298,7 +299,7 @@ class FrameTree:
             return u.slot_of[name]
         geometry_name: ParameterName = ("table_geometry", table.table_id)
         if geometry_name not in u.vectors:
-            units = tuple("m" if x == "axis_offset" else "rad" for x in table.geometry.names)
+            units = tuple(unit_of(x) for x in table.geometry.names)
             u.vectors[geometry_name] = vector_map(table.geometry, units, u, geometry_name)
         components = tuple(f"axis{i + 1}" for i in range(len(table.axes)))
         angles = u.add(("table_angles", table.table_id, epoch_id), "vector", components, ("rad",) * len(components))
@@ -306,6 +307,6 @@ class FrameTree:
         u.slot_key.append(angles.key)
         u.slot_pose.append(Pose3())
         u.slot_identity.append(False)
-        axes = tuple("xyz".index(a) for a in table.axes)
-        u.table_slots[slot] = TableSlot(slot, table.table_id, epoch_id, axes, angles.key, u.vectors[geometry_name])
+        geometry = u.vectors[geometry_name]
+        u.table_slots[slot] = TableSlot(slot, table.table_id, epoch_id, table.axes, angles.key, geometry)
         return slot

@@ -11,6 +11,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State, collect_vectors
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, Chain, FrameTree, Unknowns
+from adjust.model.boards import deformation, warming_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Coordinates, FrameRef, ImageBlock, Pair, PositionRef, frame_text, position_text
 from adjust.model.result import Adjustment, ParameterName
@@ -28,7 +29,7 @@ from adjust.observations.factors import (
     vector_prior_factor,
 )
 from adjust.observations.geometry.building import GeometryFactors, position_refs
-from adjust.observations.images.batch import ImageBatch, warp_shape
+from adjust.observations.images.batch import ImageBatch
 from adjust.observations.images.bundle_points import add_point_factors
 from adjust.observations.images.bundles import BundleBatch, may_be_hidden
 from adjust.observations.images.helmert_blocks import helmert_blocks
@@ -53,8 +54,8 @@ class StartValues:
     vectors: Mapping[ParameterName, FloatArray] = field(default_factory=dict)
 
 
-def values_of(adjustment: Adjustment) -> StartValues:
-    """Adjusted values as start values."""
+def values_of(adjustment: Adjustment, survey: Survey | None = None) -> StartValues:
+    """Adjusted values as start values; for another survey, whose tables and boards have other components in part."""
     estimates = adjustment.estimates
     poses = {n: e.value for n, e in estimates.items() if isinstance(e.value, Pose3)}
     arrays = {n: np.asarray(e.value) for n, e in estimates.items() if not isinstance(e.value, Pose3)}
@@ -62,8 +63,24 @@ def values_of(adjustment: Adjustment) -> StartValues:
         {n[1]: v for n, v in arrays.items() if n[0] == "lens"},
         poses,
         {n[1]: v for n, v in arrays.items() if n[0] == "point"},
-        {n: v for n, v in arrays.items() if n[0] not in ("lens", "point")},
+        {n: v for n, v in arrays.items() if n[0] not in ("lens", "point")} | _by_component(adjustment, survey),
     )
+
+
+def _by_component(adjustment: Adjustment, survey: Survey | None) -> dict[ParameterName, FloatArray]:
+    """Of tables and boards, in the order of their components in the survey: adjusted where they were, else as given."""
+    if survey is None:
+        return {}
+    owners = {("table_geometry", t.table_id): t.geometry for t in survey.tables}
+    owners |= {("warp", t.target_id): t.warp for t in survey.targets if t.warp is not None}
+    out: dict[ParameterName, FloatArray] = {}
+    for name, owner in owners.items():
+        if name in adjustment.estimates:
+            estimate = adjustment.estimates[name]
+            known = dict(zip(estimate.components, np.asarray(estimate.value).tolist(), strict=True))
+            given = zip(owner.names, owner.values.tolist(), strict=True)
+            out[name] = np.array([known[n] if n in known and n in owner.free else v for n, v in given])
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,11 +356,8 @@ class GraphBuilder:
         for factor in self._holds():
             others.add(factor)
         known = [(i, b) for i, free, b in split if not free]
-        n_warp = {t: self._n_warp(t) for t in dict.fromkeys(b.target_id for _, b in known)}
-        x_in_world = self._world_points() if None in n_warp else np.zeros((0, 3))
-        images = ImageBatch(
-            self.survey, state, [b for _, b in known], [chains[i] for i, _ in known], x_in_world, n_warp
-        )
+        x_in_world = self._world_points() if any(b.target_id is None for _, b in known) else np.zeros((0, 3))
+        images = ImageBatch(self.survey, state, [b for _, b in known], [chains[i] for i, _ in known], x_in_world)
         # unused observations too: they are predicted with the joint covariance of their unknowns
         outside = {k for item in self.others for k in list(item.factor.keys())} | set(self.unknowns.held)
         outside |= set() if pairs is None else pairs.keys()
@@ -419,14 +433,6 @@ class GraphBuilder:
         held, unheld = self.unknowns.held_points, np.full(3, np.nan)
         return np.array([held.get(p, unheld) for p in self.point_ids]).reshape(-1, 3)
 
-    def _n_warp(self, target_id: str | None) -> int:
-        vector = self.unknowns.vectors.get(("warp", target_id or ""))
-        if vector is None or vector.key is None:
-            return 0
-        if vector.free != vector.names:
-            raise SurveyError(f"target {target_id!r}: free both components of the warp or none")
-        return 2
-
     def _position_chain(self, ref: PositionRef) -> Chain | None:
         if ref.frame is None:
             if ref.point_id not in self.known_ids:
@@ -472,9 +478,12 @@ class GraphBuilder:
         if ref.point_id not in target.point_ids:
             raise SurveyError(f"target {target.target_id!r} has no point {ref.point_id!r}")
         i = target.point_ids.index(ref.point_id)
-        sag = warp_shape(target.x_in_target)[i]
         warp = self.unknowns.vectors.get(("warp", target.target_id))
-        return Position(pose, target.x_in_target[i], None, warp, (float(sag[0]), float(sag[1])))
+        if warp is None:
+            return Position(pose, target.x_in_target[i])
+        warming = warming_of(self.survey, target, ref.frame.epoch_id)
+        return Position(pose, target.x_in_target[i], None, warp,
+                        deformation(target.x_in_target, warp.names, warming)[i])  # fmt: skip
 
     def _other_factors(
         self, state: State, at: Mapping[PositionRef, Position], pair_chains: Mapping[int, Chain]

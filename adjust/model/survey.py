@@ -174,8 +174,8 @@ class Target:
     motion: ``fixed`` or ``epoch`` (moved between epochs, as a board held by hand).
     carrier_from_target: ``world_from_target``, or ``station_from_target`` where ``station_id`` is given; with motion
     ``epoch`` what holds for every epoch that is not listed in ``epochs``.
-    warp: sag of a board, names ("warp_x", "warp_y") m: z = warp_x 4u(1-u) + warp_y 4v(1-v), with u, v from 0 to 1 over
-    the board.
+    warp: how the points deviate from that, components of ``adjust.model.boards.BOARD``. reference_temperature: degC, at
+    which x_in_target holds.
     """
 
     target_id: str
@@ -186,6 +186,7 @@ class Target:
     carrier_from_target: PoseParameter = PoseParameter()
     epochs: Mapping[str, PoseParameter] = field(default_factory=dict)
     warp: VectorParameter | None = None
+    reference_temperature: float = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,6 +352,8 @@ class Survey:
     """Pairs by the poses of their frames, or every loop of them closed; set by :mod:`adjust.relay.closed`."""
     closures: tuple[Closure, ...] = ()
     """Mounts (``adjust.model.observations.Closure``) whose play the covariances of their pairs already contain."""
+    temperatures: Mapping[str, float] = field(default_factory=dict)
+    """degC by epoch, where it matters: of targets that expand."""
 
     @property
     def others(self) -> Mapping[str, tuple[Observation, ...]]:

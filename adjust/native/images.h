@@ -1,7 +1,7 @@
 // Image points of known targets: residuals, condensed normal equations and redundancy, block after block.
 //
 // A block is what one camera saw of one target at one epoch. Its local unknowns are the free lens parameters of the
-// camera, the six of camera_from_target (tangent on the right) and, where the target has them, two of its warp.
+// camera, the six of camera_from_target (tangent on the right) and, where the target has them, those of its warp.
 #pragma once
 #include "lenses.h"
 #include "trees.h"
@@ -9,8 +9,10 @@
 namespace {
 
 constexpr int CHUNK = 64;      // points evaluated together: their rows stay in the first two caches
-constexpr int MAX_LOCAL = 23;  // local unknowns and residual of a block: 14 + 6 + 2 + 1
+constexpr int N_WARP = 7;      // components of a warp: bent along x, along y, twisted; scale x, scale y, shear; expansion
+constexpr int MAX_LOCAL = 28;  // local unknowns and residual of a block: 14 + 6 + 7 + 1
 constexpr int N_SHAPE = 4;     // parameters of a target's shape
+constexpr int MAX_KEY = 64;    // components of a key that a pose follows from: a table's geometry
 enum Kind : int64_t { LENS, POSE, TABLE, WARP };
 
 struct Lenses {
@@ -22,22 +24,26 @@ struct Lenses {
     In<double, 2> factor;
 };
 struct Blocks {
-    explicit Blocks(Reader &r) : ptr(r), camera(r), warp_id(r), n_warp(r) {}
+    explicit Blocks(Reader &r) : ptr(r), camera(r), warp_id(r), n_warp(r), warming(r) {}
     Ints ptr, camera, warp_id, n_warp;
+    In<double, 1> warming;  // K above the temperature at which the target's points are known
 };
 struct Points {
-    explicit Points(Reader &r) : X(r), shape(r), uv(r) {}
-    In<double, 2> X, shape, uv;
+    explicit Points(Reader &r) : X(r), uv(r) {}
+    In<double, 2> X, uv;
 };
 struct Segments {
-    explicit Segments(Reader &r) : ptr(r), kind(r), link(r), table(r), start(r), n(r), place(r) {}
+    explicit Segments(Reader &r) : ptr(r), kind(r), link(r), table(r), start(r), n(r), place(r), factor(r) {}
     Ints ptr, kind, link, table, start, n, place;
+    In<double, 1> factor;  // of a lens or a warp: what the local unknown moves by one of its key
 };
-// Where the blocks stand: camera_from_target of each, and the warps.
+// Where the blocks stand: camera_from_target of each, and the warps: values, the extent of the target (least x and y, and
+// their span), and which components the free ones are.
 struct Poses {
-    explicit Poses(Reader &r) : R(r), t(r), warp(r) {}
+    explicit Poses(Reader &r) : R(r), t(r), warp(r), extent(r), of_warp(r) {}
     In<double, 3> R;
-    In<double, 2> t, warp;
+    In<double, 2> t, warp, extent;
+    In<int64_t, 2> of_warp;
 };
 struct Batch {
     explicit Batch(Reader &r) : blocks(r), points(r), W(r), lenses(r), poses(r) {}
@@ -52,35 +58,66 @@ struct Batch {
 
 struct Room {
     alignas(64) double A[MAX_LOCAL][2 * CHUNK];  // whitened rows as columns: all of u, then all of v
-    alignas(64) double in[10][CHUNK];
+    alignas(64) double in[8][CHUNK];
 };
 
-// What W points at p of the arrays in (of a row length) have: x in the target bent by its warp, in the camera, and more.
+// The warp of a block's target: see adjust.model.boards.
+struct Warp {
+    const double *w = nullptr, *extent = nullptr;
+    const int64_t *of_free = nullptr;
+    double warming = 0.0;
+
+    Warp(const Batch &B, int64_t b) {
+        const int64_t id = B.blocks.warp_id[b];
+        if (id < 0) return;
+        w = &B.poses.warp(id, 0), extent = &B.poses.extent(id, 0), of_free = &B.poses.of_warp(id, 0), warming = B.blocks.warming[b];
+    }
+    // Bends of one unit along x and y, and the twist.
+    [[gnu::always_inline]] void bends(V x, V y, V *out) const {
+        const V u = (x - extent[0]) / extent[2], v = (y - extent[1]) / extent[3];
+        out[0] = 4.0 * u * (1.0 - u), out[1] = 4.0 * v * (1.0 - v), out[2] = (2.0 * u - 1.0) * (2.0 * v - 1.0);
+    }
+    [[gnu::always_inline]] void apply(V *x) const {
+        V bent[3];
+        bends(x[0], x[1], bent);
+        const double grown = w[6] * warming;
+        const V by_x = (w[3] + grown) * x[0] + w[5] * x[1], by_y = (w[4] + grown) * x[1];
+        x[2] += w[0] * bent[0] + w[1] * bent[1] + w[2] * bent[2] + grown * x[2];
+        x[0] += by_x, x[1] += by_y;
+    }
+    // Derivatives by all components, from h (by the point in the target) and the point as it is known.
+    [[gnu::always_inline]] void columns(const V *h, const V *x, V *out) const {
+        bends(x[0], x[1], out);
+        for (int i = 0; i < 3; ++i) out[i] = h[2] * out[i];
+        out[3] = h[0] * x[0], out[4] = h[1] * x[1], out[5] = h[0] * x[1];
+        out[6] = warming * (out[3] + out[4] + h[2] * x[2]);
+    }
+};
+// What W points at p of the arrays in (of a row length) have: x in the target bent by its warp, in the camera, weights.
 struct Sight {
-    V x[3], q[3], shape[2], w00, w01, w11;
+    V x[3], q[3], w00, w01, w11;
 };
 struct Chunk {
-    const double *in[10];  // x y z u v w00 w01 w11 shape shape
+    const double *in[8];  // x y z u v w00 w01 w11
     int m, full;
 
     // Points lo .. lo + m - 1, padded to whole vectors by more of the last one, with weight zero.
     Chunk(const Batch &B, int64_t lo, int size, Room &room) : m(size), full((size + W - 1) / W * W) {
         const int64_t n = B.points.X.n[1];
-        const double *X = B.points.X.data + lo, *uv = B.points.uv.data + lo, *w = B.W.data + lo, *s = B.points.shape.data + lo;
-        const double *from[10] = {X, X + n, X + 2 * n, uv, uv + n, w, w + n, w + 2 * n, s, s + n};
-        for (int i = 0; i < 10; ++i) {
+        const double *X = B.points.X.data + lo, *uv = B.points.uv.data + lo, *w = B.W.data + lo;
+        const double *from[8] = {X, X + n, X + 2 * n, uv, uv + n, w, w + n, w + 2 * n};
+        for (int i = 0; i < 8; ++i) {
             in[i] = from[i];
             if (m == full) continue;
             std::memcpy(room.in[i], from[i], sizeof(double) * m);
-            for (int p = m; p < full; ++p) room.in[i][p] = i >= 5 && i < 8 ? 0.0 : room.in[i][m - 1];
+            for (int p = m; p < full; ++p) room.in[i][p] = i >= 5 ? 0.0 : room.in[i][m - 1];
             in[i] = room.in[i];
         }
     }
-    [[gnu::always_inline]] Sight at(int p, const double *R, const double *t, const double *warp) const {
+    [[gnu::always_inline]] Sight at(int p, const double *R, const double *t, const Warp &warp) const {
         Sight s;
         for (int i = 0; i < 3; ++i) s.x[i] = load(in[i] + p);
-        for (int i = 0; i < 2; ++i) s.shape[i] = load(in[8 + i] + p);
-        if (warp) s.x[2] += warp[0] * s.shape[0] + warp[1] * s.shape[1];
+        if (warp.w) warp.apply(s.x);
 #pragma GCC unroll 3
         for (int i = 0; i < 3; ++i) s.q[i] = R[3 * i] * s.x[0] + R[3 * i + 1] * s.x[1] + R[3 * i + 2] * s.x[2] + t[i];
         s.w00 = load(in[5] + p), s.w01 = load(in[6] + p), s.w11 = load(in[7] + p);
@@ -91,10 +128,6 @@ inline double least_of(V v) {
     double d = v[0];
     for (int i = 1; i < W; ++i) d = smaller(d, v[i]);
     return d;
-}
-inline const double *warp_of(const Batch &B, int64_t b) {
-    const int64_t w = B.blocks.warp_id[b];
-    return w < 0 ? nullptr : B.poses.warp.data + 2 * w;
 }
 // f(lo, size) of the parts of block b, about equally large and whole vectors but for the last.
 template <class F> inline void each_chunk(const Batch &B, int64_t b, F &&f) {
@@ -110,7 +143,8 @@ template <class Lens> inline void local_columns(const Batch &B, int64_t b, const
     const int nl = int(B.lenses.n_free[c]), nw = int(B.blocks.n_warp[b]), n_map = int(B.lenses.n_map[c]);
     const double *l = &B.lenses.values(c, 0), *k = &B.lenses.constants(c, 0), *factor = &B.lenses.factor(c, 0);
     const int64_t *source = &B.lenses.source(c, 0), *column = &B.lenses.column(c, 0);
-    const double *R = &B.poses.R(b, 0, 0), *t = &B.poses.t(b, 0), *warp = warp_of(B, b);
+    const double *R = &B.poses.R(b, 0, 0), *t = &B.poses.t(b, 0);
+    const Warp warp(B, b);
     bool seen[MAX_LENS] = {}, again[MAX_LENS];  // does a parameter share the column of one before it
     for (int i = 0; i < n_map; ++i) again[i] = std::exchange(seen[column[i]], true);
     const int full = chunk.full;
@@ -142,7 +176,12 @@ template <class Lens> inline void local_columns(const Batch &B, int64_t b, const
             const V o[6] = {s.x[1] * h[2] - s.x[2] * h[1], s.x[2] * h[0] - s.x[0] * h[2], s.x[0] * h[1] - s.x[1] * h[0], h[0], h[1], h[2]};
 #pragma GCC unroll 6
             for (int i = 0; i < 6; ++i) store(out + 2 * CHUNK * i, o[i]);
-            for (int i = 0; i < nw; ++i) store(out + 2 * CHUNK * (6 + i), h[2] * s.shape[i]);
+            if (nw) {
+                const V known[3] = {load(chunk.in[0] + p), load(chunk.in[1] + p), load(chunk.in[2] + p)};
+                V by_warp[N_WARP];
+                warp.columns(h, known, by_warp);
+                for (int i = 0; i < nw; ++i) store(out + 2 * CHUNK * (6 + i), by_warp[warp.of_free[i]]);
+            }
             store(out + 2 * CHUNK * (6 + nw), row == 0 ? s.w00 * r[0] + s.w01 * r[1] : s.w11 * r[1]);
         }
     }
@@ -184,10 +223,11 @@ inline void errors(Ints which, const Batch &B, Out<double, 1> chi, Out<double, 1
         V total = V{}, least = all<V>(__builtin_inf());
         with_lens(B.lenses.kind[c], [&]<class Lens>(Lens) {
             const auto p = parameters<Lens>(&B.lenses.values(c, 0));
+            const Warp warp(B, b);
             each_chunk(B, b, [&](int64_t lo, int size) {
                 const Chunk chunk(B, lo, size, room);
                 for (int j = 0; j < chunk.full; j += W) {
-                    const Sight s = chunk.at(j, &B.poses.R(b, 0, 0), &B.poses.t(b, 0), warp_of(B, b));
+                    const Sight s = chunk.at(j, &B.poses.R(b, 0, 0), &B.poses.t(b, 0), warp);
                     const auto [ru, rv] = lens_residual<Lens>(p, &B.lenses.constants(c, 0), s.q, load(chunk.in[3] + j), load(chunk.in[4] + j));
                     const V x = s.w00 * ru + s.w01 * rv, y = s.w11 * rv, e = x * x + y * y;
                     total += (s.w00 != 0.0) ? e : V{};
@@ -308,7 +348,7 @@ inline void half_cholesky(double (*H)[MAX_LOCAL], int n) {
 }
 
 // Derivative E (6, n of segment s) of a block's pose by its unknown: a pose, or a part of a table.
-inline void pose_by_key(int64_t s, const Segments &S, In<double, 3> C, In<double, 3> D, double (*E)[MAX_LENS]) {
+inline void pose_by_key(int64_t s, const Segments &S, In<double, 3> C, In<double, 3> D, double (*E)[MAX_KEY]) {
     const double *c = &C(S.link[s], 0, 0);
     const int n = int(S.n[s]);
     if (S.kind[s] == POSE) {
@@ -328,7 +368,7 @@ inline void pose_by_key(int64_t s, const Segments &S, In<double, 3> C, In<double
 // f(segment, local unknown at which it begins) for lens and warp, else g(segment).
 template <class F, class G> inline void each_segment(const Segments &S, int64_t b, int64_t nl, F &&plain, G &&chained) {
     for (int64_t s = S.ptr[b]; s < S.ptr[b + 1]; ++s) {
-        if (S.kind[s] == LENS) plain(s, int64_t(0));
+        if (S.kind[s] == LENS) plain(s, int64_t(S.start[s]));
         else if (S.kind[s] == WARP) plain(s, nl + 6 + S.start[s]);
         else chained(s);
     }
@@ -338,7 +378,7 @@ template <class F, class G> inline void each_segment(const Segments &S, int64_t 
 // the other, each (n, its width); place counts columns, width (B,) all of a block.
 inline void serve(Ints which, const Blocks &blocks, const Lenses &lenses, const Segments &S, In<double, 3> C, In<double, 3> D, Ints width, Ints at,
                   In<double, 3> H, Out<double, 1> flat, Out<double, 2> r_out) {
-    double T[MAX_LOCAL][MAX_LOCAL], E[6][MAX_LENS];
+    double T[MAX_LOCAL][MAX_LOCAL], E[6][MAX_KEY];
     for (int64_t index = 0; index < which.n[0]; ++index) {
         const int64_t b = which[index], nl = lenses.n_free[blocks.camera[b]];
         const int n = int(nl + 6 + blocks.n_warp[b] + 1);
@@ -353,7 +393,7 @@ inline void serve(Ints which, const Blocks &blocks, const Lenses &lenses, const 
                 double *o = key(s);
                 const int64_t k = S.n[s];
                 for (int j = 0; j < n; ++j)
-                    for (int64_t c = 0; c < k; ++c) o[j * k + c] += T[j][first + c];
+                    for (int64_t c = 0; c < k; ++c) o[j * k + c] += S.factor[s] * T[j][first + c];
             },
             [&](int64_t s) {
                 double *o = key(s);
@@ -368,11 +408,11 @@ inline void serve(Ints which, const Blocks &blocks, const Lenses &lenses, const 
 
 // Derivative G (n_local, sum of key dims) of a block's local unknowns by its keys.
 inline void block_by_keys(int64_t b, int64_t nl, const Segments &S, In<double, 3> C, In<double, 3> D, Out<double, 2> G) {
-    double E[6][MAX_LENS];
+    double E[6][MAX_KEY];
     std::memset(G.data, 0, sizeof(double) * G.n[0] * G.n[1]);
     each_segment(S, b, nl,
         [&](int64_t s, int64_t first) {
-            for (int64_t j = 0; j < S.n[s]; ++j) G(first + j, S.place[s] + j) += 1.0;
+            for (int64_t j = 0; j < S.n[s]; ++j) G(first + j, S.place[s] + j) += S.factor[s];
         },
         [&](int64_t s) {
             pose_by_key(s, S, C, D, E);
@@ -423,7 +463,7 @@ inline void congruent(const double *G, const double *Q, int64_t n, int64_t w, do
 
 // Residuals (N, 2) px of the listed blocks and the whitened covariance A Q A' (N, 3: 00, 01, 11) of their adjusted
 // points, from the covariances of a tree. lost[b] becomes 1 where two of its keys share no clique. W of the batch: that
-// of all points, used or not. work: scratch, w (w + 46) numbers for the widest block's w columns.
+// of all points, used or not. work: scratch, w (w + 56) numbers for the widest block's w columns.
 inline void all_statistics(Ints which, const Batch &B, const Segments &S, In<double, 3> C, In<double, 3> D, Ints width, const Keys &keys,
                            const Tree &tree, Out<double, 2> residual, Out<double, 2> influence, Out<int64_t, 1> lost, Out<double, 1> work) {
     Room room;

@@ -1,7 +1,7 @@
 """Image points of known targets in the core: residuals, condensed normal equations and redundancy, block after block.
 
 A block is what one camera saw of one target at one epoch. Its local unknowns are the free lens parameters of the
-camera, the six of ``camera_from_target`` (tangent on the right) and, where the target has them, two of its warp. All
+camera, the six of ``camera_from_target`` (tangent on the right) and, where the target has them, those of its warp. All
 functions take the blocks that they shall do, so that threads share them. The formulas are in ``images.h``.
 """
 
@@ -14,15 +14,18 @@ from adjust.native.library import Function
 from adjust.native.trees import TREE, TreeArrays
 
 SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP = 0, 1, 2, 3
-MAX_LOCAL = 23
+MAX_KEY = 64
+"""Components of a key that a pose follows from, at most."""
+MAX_LOCAL = 28
 """Local unknowns and residual of a block, at most."""
 N_SHAPE = 4
 """Parameters of a target's shape."""
 
-BLOCKS = "ptr[B+1] camera[B] warp_id[B] n_warp[B]"
+BLOCKS = "ptr[B+1] camera[B] warp_id[B] n_warp[B] warming[B]"
 LENSES = "kind[c] values[c,14] constants[c,4] n_free[c] n_map[c] source[c,14] column[c,14] factor[c,14]"
-SEGMENTS = "segment_ptr[B+1] segment_kind[S] link[S] table[S] start[S] n[S] place[S]"
-_BATCH = f"{BLOCKS} X[3,N] shape[2,N] uv[2,N] W[3,N] {LENSES} R[B,3,3] t[B,3] warp[*,2]"
+WARPS = "warp[T,7] extent[T,4] of_warp[T,7]"
+SEGMENTS = "segment_ptr[B+1] segment_kind[S] link[S] table[S] start[S] n[S] place[S] factor[S]"
+_BATCH = f"{BLOCKS} X[3,N] uv[2,N] W[3,N] {LENSES} R[B,3,3] t[B,3] {WARPS}"
 CHAINED = "C[*,6,6] D[*,6,*]"
 _evaluate_chains = Function(
     "evaluate_chains", "slot_R[S,3,3] slot_t[S,3] ptr[B+1] slot[L] inverse[L] R[B,3,3] t[B,3] C[L,6,6]"
@@ -59,26 +62,41 @@ class LensArrays(NamedTuple):
 
 
 class BlockArrays(NamedTuple):
-    """Blocks: rows ptr[b]..ptr[b + 1] of the points, camera, which warp applies (-1: none), free warp components."""
+    """Blocks: rows ptr[b]..ptr[b + 1] of the points, camera, which warp applies (-1: none), free warp components.
+
+    warming (B,): K above the temperature at which the points of the target are known.
+    """
 
     ptr: IntArray
     camera: IntArray
     warp_id: IntArray
     n_warp: IntArray
+    warming: FloatArray
 
 
 class PointArrays(NamedTuple):
-    """Image points by columns: X (3, N) m in the target, warp functions shape (2, N), observed uv (2, N) px."""
+    """Image points by columns: X (3, N) m in the target, observed uv (2, N) px."""
 
     X: FloatArray
-    shape: FloatArray
     uv: FloatArray
+
+
+class WarpArrays(NamedTuple):
+    """Warps of all targets: values (T, 7) in the order of ``adjust.model.boards.BOARD``, and which the free ones are.
+
+    extent (T, 4): least x and y of the points and their spans, m. of_free (T, 7): components, as many as are free.
+    """
+
+    values: FloatArray
+    extent: FloatArray
+    of_free: IntArray
 
 
 class SegmentArrays(NamedTuple):
     """How a block's condensed columns reach its keys: kind, link of the chain, table slot, start, width.
 
-    place: first column among those of all the block's keys. ptr: segments of every block.
+    place: first column among those of all the block's keys. ptr: segments of every block. factor: what a local unknown
+    of a lens or a warp moves by one of its key.
     """
 
     ptr: IntArray
@@ -88,12 +106,13 @@ class SegmentArrays(NamedTuple):
     start: IntArray
     n: IntArray
     place: IntArray
+    factor: FloatArray
 
 
 class BlocksAt(NamedTuple):
     """Blocks where they are evaluated: their points with square root information W (3, N): w00 w01 w11, the lenses.
 
-    R (B, 3, 3), t (B, 3) m: ``camera_from_target``. warp (targets, 2) m.
+    R (B, 3, 3), t (B, 3) m: ``camera_from_target``.
     """
 
     blocks: BlockArrays
@@ -102,12 +121,12 @@ class BlocksAt(NamedTuple):
     lenses: LensArrays
     R: FloatArray
     t: FloatArray
-    warp: FloatArray
+    warps: WarpArrays
 
     @property
     def arrays(self) -> tuple[FloatArray | IntArray, ...]:
         """All of them, as the core takes them."""
-        return *self.blocks, *self.points, self.W, *self.lenses, self.R, self.t, self.warp
+        return *self.blocks, *self.points, self.W, *self.lenses, self.R, self.t, *self.warps
 
 
 class ByKeys(NamedTuple):

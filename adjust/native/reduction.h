@@ -21,7 +21,7 @@ struct Scratch {
 
 // For the columns of a block's keys: where they stand among those of its pose, and the pose's derivative G (6, w).
 inline void by_own_columns(int64_t b, int64_t w, const Segments &S, Ints place, In<double, 3> C, In<double, 3> D, const Scratch &x) {
-    double E[6][MAX_LENS];
+    double E[6][MAX_KEY];
     std::memset(x.G, 0, sizeof(double) * 6 * w);
     for (int64_t s = S.ptr[b]; s < S.ptr[b + 1]; ++s) {
         const int64_t o = S.place[s];
@@ -49,11 +49,11 @@ inline void add_block(int64_t b, int n, int64_t nl, int64_t w, const Segments &S
     const auto chained = [](int64_t) {};
     each_segment(S, b, nl, [&](int64_t s, int64_t at) {
         for (int64_t j = 0; j < S.n[s]; ++j)
-            for (int i = 0; i < n; ++i) x.K[i * v + S.place[s] + j] += H(i, at + j);
+            for (int i = 0; i < n; ++i) x.K[i * v + S.place[s] + j] += S.factor[s] * H(i, at + j);
     }, chained);
     each_segment(S, b, nl, [&](int64_t s, int64_t at) {
         for (int64_t i = 0; i < S.n[s]; ++i)
-            for (int64_t j = 0; j < v; ++j) x.N[(S.place[s] + i) * v + j] += x.K[(at + i) * v + j];
+            for (int64_t j = 0; j < v; ++j) x.N[(S.place[s] + i) * v + j] += S.factor[s] * x.K[(at + i) * v + j];
     }, chained);
     for (int64_t i = 0; i < w; ++i)
         for (int a = 0; a < 6; ++a)

@@ -9,7 +9,7 @@ from adjust.frames.unknowns import VectorMap
 from adjust.lenses.models import camera_constants
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import TABLE_GEOMETRY, FloatArray, PoseParameter, Survey
+from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.navigation.model import Beacons, Head, HeadCamera, HeadTable
 
 
@@ -51,7 +51,7 @@ def head_and_beacons(adjustment: Adjustment, station_id: str, known: Beacons | N
 
 def _full_sizes(cameras: Sequence[HeadCamera], table: HeadTable | None, n_points: int) -> list[int]:
     sizes = [size for c in cameras for size in (len(c.lens), 6)]
-    return sizes + ([6, 4, 6] if table is not None else []) + [3] * n_points
+    return sizes + ([6, len(table.geometry), 6] if table is not None else []) + [3] * n_points
 
 
 def _camera(adjustment: Adjustment, camera_id: str) -> HeadCamera:
@@ -77,7 +77,7 @@ def _table(adjustment: Adjustment, station_id: str) -> HeadTable | None:
     found = adjustment.estimates.get(("table_geometry", table.table_id))
     if found is not None and not isinstance(found.value, Pose3):
         values |= dict(zip(found.components, found.value.tolist(), strict=True))
-    return HeadTable(table.axes, base, np.array([values.get(n, 0.0) for n in TABLE_GEOMETRY]), mount)
+    return HeadTable(table.axes, base, values, mount)
 
 
 def _pose(adjustment: Adjustment, name: ParameterName, parameter: PoseParameter) -> Pose3 | None:
@@ -115,14 +115,6 @@ def _joint(
 
 
 def _full(vectors: Mapping[ParameterName, VectorMap], name: ParameterName, dim: int) -> FloatArray:
-    """From free components to all of a parameter (n, dim), in navigation's order."""
+    """From free components to all of a parameter (n, dim)."""
     vector = vectors.get(name)
-    if vector is None:
-        return np.eye(dim)
-    matrix: FloatArray = vector.matrix
-    if name[0] != "table_geometry":
-        return matrix
-    out = np.zeros((4, dim))
-    for row, component in zip(matrix, vector.names, strict=True):
-        out[TABLE_GEOMETRY.index(component)] = row
-    return out
+    return np.eye(dim) if vector is None else vector.matrix

@@ -4,6 +4,7 @@ The head is a station that carries calibrated cameras; ``world_from_station`` is
 radians, images pixels. Covariances of poses are in GTSAM's tangent: rotation, then translation, in the station frame.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -30,11 +31,11 @@ class HeadCamera:
 
 @dataclass(frozen=True, eq=False)
 class HeadTable:
-    """A calibrated turntable that carries the head; ``geometry`` (4,) in the order of ``TABLE_GEOMETRY``."""
+    """A calibrated turntable that carries the head; with its geometry by name (:class:`adjust.model.survey.Table`)."""
 
     axes: tuple[str, ...]
     world_from_table: Pose3
-    geometry: FloatArray
+    geometry: Mapping[str, float]
     mount_from_station: Pose3
 
 
@@ -43,7 +44,7 @@ class Head:
     """The calibrated head.
 
     cov: joint covariance (p, p) of the calibration: camera after camera its lens (n,) and ``station_from_camera`` (6),
-    then, where there is a table, ``world_from_table`` (6), its geometry (4) and ``mount_from_station`` (6).
+    then, where there is a table, ``world_from_table`` (6), its geometry in its order and ``mount_from_station`` (6).
     """
 
     cameras: tuple[HeadCamera, ...]

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.chains import table_motion
+from adjust.frames.tables import table_motions
 from adjust.model.survey import FloatArray
 from adjust.navigation.fit import PoseFit, Prior, local, local_derivative
 from adjust.navigation.model import Motion, NavigationEpoch, PosePrior
 from adjust.navigation.system import System
-
-_AXES = {"x": 0, "y": 1, "z": 2}
 
 
 def given_prior(prior: PosePrior, system: System) -> Prior:
@@ -36,21 +34,17 @@ def table_prior(system: System, epoch: NavigationEpoch) -> Prior | None:
     table = system.head.table
     if table is None or epoch.table_angles is None:
         return None
-    angles = np.zeros(2)
-    angles[: len(table.axes)] = epoch.table_angles
-    axes = [_AXES[a] for a in table.axes] + [-1]
-    tilt, offset, zero_1, zero_2 = table.geometry
-    angle1, angle2 = (angles + (zero_1, zero_2))[:, None]
-    (R,), (t,), (D,) = table_motion(axes[0], axes[1], angle1, angle2, np.array([tilt]), np.array([offset]))
+    (R,), (t,), (D,) = table_motions(table.axes, table.geometry, np.array([epoch.table_angles], dtype=float))
     mount = table.mount_from_station
     motion = Pose3(np.vstack([np.column_stack([R, t]), [0.0, 0.0, 0.0, 1.0]]))
     pose = table.world_from_table * motion * mount
     by_base, by_motion = (motion * mount).inverse().AdjointMap(), mount.inverse().AdjointMap()
     at, k = system.table_at, len(table.axes)
-    B = by_base @ system.F[at : at + 6] + by_motion @ D[:, [2, 3, 0, 1]] @ system.F[at + 6 : at + 10]
+    end = at + 6 + len(table.geometry)
+    B = by_base @ system.F[at : at + 6] + by_motion @ D[:, k:] @ system.F[at + 6 : end]
     by_angles = by_motion @ D[:, :k]
     reading = np.zeros((k, k)) if epoch.table_cov is None else epoch.table_cov
-    return Prior(pose.matrix(), by_angles @ reading @ by_angles.T, B + system.F[at + 10 : at + 16], np.arange(6))
+    return Prior(pose.matrix(), by_angles @ reading @ by_angles.T, B + system.F[end : end + 6], np.arange(6))
 
 
 @dataclass(frozen=True, eq=False)

@@ -84,14 +84,14 @@ class ChainPose:
 class Position:
     """A position in the world: a world point (key or held value), or a point fixed in the frame of a chain.
 
-    warp: of the target that the point is on, and the two unit sags at the point.
+    warp: of the target that the point is on; moves (3, k): how its components move the point.
     """
 
     chain: ChainPose | None
     x_in_frame: FloatArray
     point_key: int | None = None
     warp: VectorMap | None = None
-    sag: tuple[float, float] = (0.0, 0.0)
+    moves: FloatArray | None = None
 
     @property
     def keys(self) -> list[int]:
@@ -110,12 +110,12 @@ class Position:
         pose, jacobians = self.chain(values)
         R = pose.rotation().matrix()
         x = self.x_in_frame
-        if self.warp is not None:
-            x = x + np.array([0.0, 0.0, np.asarray(self.sag) @ self.warp.full(values)])
+        if self.warp is not None and self.moves is not None:
+            x = x + self.moves @ self.warp.full(values)
         by_pose = np.hstack([-R @ skew(x), R])
         out = [(key, by_pose @ J) for key, J in jacobians]
-        if self.warp is not None and self.warp.key is not None:
-            out.append((self.warp.key, np.outer(R[:, 2], np.asarray(self.sag) @ self.warp.matrix)))
+        if self.warp is not None and self.warp.key is not None and self.moves is not None:
+            out.append((self.warp.key, R @ self.moves @ self.warp.matrix))
         return R @ x + pose.translation(), out
 
 

@@ -52,5 +52,6 @@ def motions_of(unknown: Unknown, values: gtsam.Values, in_world: bool) -> FloatA
         i = unknown.components.index("axis_offset")
         out[i, 6] = values.atVector(unknown.key)[i]
     elif unknown.name[0] == "warp":
-        out[:, 6] = values.atVector(unknown.key)
+        scales = [c.startswith("scale") for c in unknown.components]
+        out[:, 6] = values.atVector(unknown.key) + scales
     return out

@@ -12,11 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from gtsam import Pose3
 
+from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import Chain, FrameTree, Link
 from adjust.model.errors import SurveyError
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Survey, Table
 from adjust.spatial.averaging import mean_poses, pose_distance
-from adjust.spatial.rigid import inverse, rigid, rotation_exp
+from adjust.spatial.rigid import inverse, rigid
 
 IDENTITY = np.eye(4)
 _CONTRADICTION = np.deg2rad(10.0)
@@ -269,21 +270,11 @@ def partial_pose(parameter: PoseParameter | None) -> FloatArray | None:
 
 def table_from_mount(table: Table, angles: FloatArray) -> FloatArray:
     """Motion (4, 4) of a table at angles (k,) rad with its given geometry (:class:`adjust.model.survey.Table`)."""
-    geometry = dict(zip(table.geometry.names, table.geometry.values, strict=True))
-    axes = ["xyz".index(a) for a in table.axes]
-    if len(angles) != len(axes):
-        raise SurveyError(f"table {table.table_id!r} has {len(axes)} axes, a reading has {len(angles)} angles")
-
-    def turn(axis: int, angle: float) -> FloatArray:
-        return rigid(rotation_exp(np.eye(3)[axis] * angle), np.zeros(3))
-
-    motion = turn(axes[0], float(angles[0]) + geometry.get("zero_1", 0.0))
-    if len(axes) == 1:
-        return motion
-    third = 3 - axes[0] - axes[1]
-    shift = rigid(np.eye(3), np.eye(3)[third] * geometry.get("axis_offset", 0.0))
-    skewness = turn(third, geometry.get("non_orthogonality", 0.0))
-    return np.asarray(motion @ shift @ skewness @ turn(axes[1], float(angles[1]) + geometry.get("zero_2", 0.0)))
+    if len(angles) != len(table.axes):
+        raise SurveyError(f"table {table.table_id!r} has {len(table.axes)} axes, a reading has {len(angles)} angles")
+    geometry = dict(zip(table.geometry.names, table.geometry.values.tolist(), strict=True))
+    (R,), (t,), _ = table_motions(table.axes, geometry, np.asarray(angles, dtype=float)[None])
+    return rigid(R, t)
 
 
 def as_pose3(matrix: FloatArray) -> Pose3:

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from adjust.frames.unknowns import Chain
+from adjust.model.boards import deformed
 from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.start.network import FrameNetwork
-from adjust.start.views import target_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ class Positions:
     def __init__(self, survey: Survey, network: FrameNetwork, points: PointField) -> None:
         self.network, self.points = network, points
         self._row = {p.point_id: i for i, p in enumerate(survey.points)}
-        self._targets = {t.target_id: (t.point_ids, target_points(t)) for t in survey.targets}
+        self._targets = {t.target_id: (t.point_ids, deformed(t)) for t in survey.targets}
         self._chains: dict[FrameRef, Chain] = {}
 
     def chain(self, frame: FrameRef) -> Chain:

@@ -12,6 +12,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
@@ -36,7 +37,6 @@ from adjust.start.views import (
     joined,
     make_views,
     rays_by_block,
-    target_points,
     untrustworthy,
 )
 
@@ -181,7 +181,7 @@ class _Search:
 
     def _seen(self) -> tuple[dict[int, Sighting], dict[int, IntArray]]:
         """What the blocks show of targets, one array for all that show the same; points and rows of the others."""
-        whole = {t.target_id: target_points(t) for t in self.survey.targets}
+        whole = {t.target_id: deformed(t) for t in self.survey.targets}
         parts: dict[tuple[str, bytes], FloatArray] = {}
         seen, world = {}, {}
         for i, block in enumerate(self.survey.image_blocks):

@@ -10,7 +10,7 @@ import numpy as np
 from adjust.lenses.models import camera_constants, focal_length_px, lens_model, unit_rays
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
-from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray, Survey, Target
+from adjust.model.survey import BoolArray, Camera, FloatArray, IntArray, Survey
 from adjust.native.views import refine_poses, view_errors, view_offsets
 from adjust.start.closed_forms.absolute_pose import view_poses
 
@@ -96,15 +96,6 @@ def joined(items: Sequence[tuple[int, FloatArray, FloatArray, float]]) -> Sights
                   np.array(focal, dtype=np.float64))  # fmt: skip
 
 
-def target_points(target: Target) -> FloatArray:
-    """Points (n, 3) m of a target, with the sag of its given warp."""
-    x = np.array(target.x_in_target, dtype=float)
-    if target.warp is not None and np.any(target.warp.values):
-        low, span = x.min(axis=0), np.maximum(np.ptp(x, axis=0), 1e-12)
-        u, v = ((x - low) / span).T[:2]
-        sag = dict(zip(target.warp.names, target.warp.values, strict=True))
-        x[:, 2] += sag.get("warp_x", 0.0) * 4 * u * (1 - u) + sag.get("warp_y", 0.0) * 4 * v * (1 - v)
-    return x
 
 
 def block_text(block: ImageBlock) -> str:

@@ -15,11 +15,11 @@ from scipy import sparse
 
 from adjust.frames.chains import adjoint_of_inverse
 from adjust.graph.assembly import AdjustmentGraph
+from adjust.model.boards import BENT, deformation
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import N_SHAPE
 from adjust.native.lenses import MAX_LENS
 from adjust.native.parallel import side_by_side
-from adjust.observations.images.batch import warp_shape
 from adjust.observations.images.bundles import BundleBatch
 from adjust.precision.precision import Precision
 from adjust.statistics.system import (
@@ -187,7 +187,7 @@ def _shape_factors(x: FloatArray) -> FloatArray:
     out = np.zeros((len(x), N_SHAPE))
     out[:, :3] = x
     if np.ptp(x[:, 2]) < _FLAT:
-        out[:, 2:] = warp_shape(x)
+        out[:, 2:] = deformation(x, BENT)[:, 2]
     return out
 
 

@@ -11,7 +11,7 @@ RAD_PER_DEG = math.pi / 180.0
 RAD_PER_ARCSEC = math.pi / 648000.0
 RAD_PER_GON = math.pi / 200.0
 _PER_UNIT = {"gon": RAD_PER_GON, "mgon": RAD_PER_GON / 1e3, "cc": RAD_PER_GON / 1e4}
-_UNITS = ("mm", "m", "deg", "arcsec", "gon", "mgon", "cc", "px", "rad", "mm2", "ppm", "mm_per_m", "1")
+_UNITS = ("mm", "m", "deg", "arcsec", "gon", "mgon", "cc", "px", "rad", "mm2", "ppm", "mm_per_m", "ppm_per_K", "1")
 
 
 def to_si(value: npt.ArrayLike, unit: str) -> FloatArray:
@@ -28,7 +28,7 @@ def to_si(value: npt.ArrayLike, unit: str) -> FloatArray:
             return np.asarray(x * RAD_PER_ARCSEC)
         case "gon" | "mgon" | "cc":
             return np.asarray(x * _PER_UNIT[unit])
-        case "ppm":
+        case "ppm" | "ppm_per_K":
             return np.asarray(x / 1e6)
         case "mm_per_m":
             return np.asarray(x / 1e3)
@@ -40,7 +40,10 @@ def to_si(value: npt.ArrayLike, unit: str) -> FloatArray:
 def from_si(x: npt.ArrayLike, unit: str) -> FloatArray:
     """The inverse of ``to_si``, to the last bit where a double can do that; the same shape."""
     x = np.asarray(x, dtype=float)
-    factors = {"mm": 1e3, "mm2": 1e6, "deg": 1 / RAD_PER_DEG, "arcsec": 1 / RAD_PER_ARCSEC, "ppm": 1e6, "mm_per_m": 1e3}
+    factors = {
+        "mm": 1e3, "mm2": 1e6, "deg": 1 / RAD_PER_DEG, "arcsec": 1 / RAD_PER_ARCSEC, "ppm": 1e6, "mm_per_m": 1e3,
+        "ppm_per_K": 1e6,
+    }  # fmt: skip
     factor = ({name: 1 / rad for name, rad in _PER_UNIT.items()} | factors).get(unit, 1.0)
     first = np.asarray(x * factor)
     if factor == 1.0 or not first.size:

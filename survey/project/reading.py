@@ -247,11 +247,13 @@ def _read_definition(folder: Path, text: str | None = None) -> tuple[Definition,
     datum = _read_datum(root.table("datum"), station_ids)
     instruments, accuracies = read_instruments(root)
     table_ids = tuple(table.table_id for table in tables)
+    node = root.table("temperatures_degC")
     survey = Survey(
         cameras, stations, tables, targets, points, datum=datum, vertical=read_vertical(root.table("vertical")),
         bearings=read_bearings(root.table("bearings")), instruments=instruments,
         setups=read_setups(root, tuple(i.instrument_id for i in instruments), accuracies),
         beams=read_beams(root, station_ids, table_ids), surfaces=read_surfaces(root),
+        temperatures={epoch_id: node.number(epoch_id) for epoch_id in node.values},
     )  # fmt: skip
     tie_points = root.flag("tie_points", False)
     if not tie_points:

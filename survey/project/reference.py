@@ -75,6 +75,8 @@ def _kind(key: Key) -> str:
             return f"number{unit}" + (" > 0" if key.positive else "")
         case "whole":
             return "whole number" + (f" ≥ {key.least}" if key.least is not None else "")
+        case "flag" if key.choices:
+            return f"true, false or a list of {', '.join(f'`{word}`' for word in key.choices)}"
         case "table":
             return _LINKS.get(key.table, "table")
     return _KINDS[key.kind]

@@ -59,7 +59,8 @@ def _typed(key: Key, table: Declared) -> dict[str, Any]:
             fixed = table.of is not None and table.of[0] == key.name
             return {"const": table.of[1]} if fixed and table.of is not None else {"enum": list(key.choices)}
         case "flag":
-            return {"type": "boolean"}
+            flag = {"type": "boolean"}
+            return {"anyOf": [flag, _names({"enum": list(key.choices)})]} if key.choices else flag
         case "whole":
             return {"type": "integer"} | ({} if key.least is None else {"minimum": key.least})
         case "number":
@@ -75,9 +76,13 @@ def _typed(key: Key, table: Declared) -> dict[str, Any]:
             item: dict[str, Any] = {"enum": list(key.choices)} if key.choices else {"type": "string"}
             if (table.name, key.name) == ("lens", "free"):
                 item = {"enum": list(_lens_parameters())}
-            return {"type": "array", "items": item, "uniqueItems": True}
+            return _names(item)
         case "table":
             return _below(key, table)
+
+
+def _names(item: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "array", "items": item, "uniqueItems": True}
 
 
 def _list(item: dict[str, Any], least: int, most: int) -> dict[str, Any]:

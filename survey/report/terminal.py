@@ -14,7 +14,7 @@ from survey.solution.dictionary import RunInfo, solution_dict
 
 _WIDTH = 100
 _WORDS = {"passed": "PASSED", "check": "NEEDS A LOOK", "failed": "FAILED"}
-_MOST_WARNINGS, _MOST_GROUPS, _MOST_CAMERAS, _MOST_OTHER, _MOST_POINTS = 6, 6, 6, 4, 3
+_MOST_WARNINGS, _MOST_GROUPS, _MOST_CAMERAS, _MOST_OTHER, _MOST_POINTS, _MOST_TERMS = 6, 6, 6, 4, 3, 12
 _MOST_LOOPS, _MOST_EXCLUSIONS, _MOST_PAIRS = 3, 5, 5
 
 
@@ -25,7 +25,7 @@ def summary_text(adjustment: Adjustment, run: RunInfo, solution: dict[str, Any] 
     """
     solution = solution_dict(adjustment, run) if solution is None else solution
     lines: list[str] = []
-    for part in (_head, _warnings, _figures, _exclusions, _groups, _cameras, _network, _loops, _published):
+    for part in (_head, _warnings, _figures, _exclusions, _groups, _cameras, _terms, _network, _loops, _published):
         lines += part(solution)
     lines += _observations(adjustment, solution["summary"]["suspects"]["standardized_limit"])
     lines += _points(solution)
@@ -141,6 +141,20 @@ def _lens(lens: dict[str, Any] | None) -> str:
     if strong is not None:
         parts.append(f"{strong['a']}-{strong['b']} correlated {100 * strong['correlation']:.1f} %")
     return ", ".join(parts)
+
+
+def _terms(solution: dict[str, Any]) -> Iterator[str]:
+    """Terms of boards and tables that are estimated, and whether they differ from zero."""
+    owners = [(f"target {k}", e["warp"]) for k, e in solution["targets"].items() if "warp" in e]
+    owners += [(f"table {k}", e["geometry"]) for k, e in solution["tables"].items() if "geometry" in e]
+    rows = [(k, term, test) for k, e in owners for term, test in e.get("significance", {}).items()]
+    if rows:
+        yield ""
+    for name, term, test in rows[:_MOST_TERMS]:
+        said = "significant" if test["significant"] else "not significant"
+        yield f"  {_cut(name, 26):<26}  {_cut(term.replace('_', ' '), 24):<24}  {said}, p {test['p_value']:.2g}"
+    if len(rows) > _MOST_TERMS:
+        yield f"  and {len(rows) - _MOST_TERMS} more terms"
 
 
 def _network(solution: dict[str, Any]) -> Iterator[str]:

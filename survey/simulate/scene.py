@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.boards import BOARD
 from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.result import ParameterName
 from adjust.model.survey import BoolArray, Camera, FloatArray, Station, Survey, Table, Target
@@ -44,13 +45,41 @@ def transform(matrix: FloatArray, x: FloatArray) -> FloatArray:
     return moved
 
 
-def _warped(target: Target, warp: FloatArray) -> FloatArray:
-    """Points of a sagging board, (n, 3) m, as ``adjust.model.survey.Target`` defines the sag."""
+def _warped(target: Target, warp: FloatArray, temperature: float) -> FloatArray:
+    """Points of a board as it is, (n, 3) m, in the words of ``adjust.model.boards``."""
     x = target.x_in_target.copy()
+    names = target.warp.names if target.warp is not None else ("warp_x", "warp_y")
+    w = dict.fromkeys(BOARD, 0.0) | dict(zip(names, warp.tolist(), strict=True))
     span = np.ptp(x[:, :2], axis=0)
-    u = (x[:, :2] - x[:, :2].min(axis=0)) / np.where(span > 0.0, span, 1.0)
-    x[:, 2] += (4.0 * u * (1.0 - u)) @ warp
+    u, v = ((x[:, :2] - x[:, :2].min(axis=0)) / np.where(span > 0.0, span, 1.0)).T
+    grown = w["expansion"] * (temperature - target.reference_temperature) * x
+    x[:, 2] += w["warp_x"] * 4.0 * u * (1.0 - u) + w["warp_y"] * 4.0 * v * (1.0 - v)
+    x[:, 2] += w["warp_xy"] * (2.0 * u - 1.0) * (2.0 * v - 1.0)
+    x[:, 0] += w["scale_x"] * x[:, 0] + w["shear"] * x[:, 1]
+    x[:, 1] += w["scale_y"] * x[:, 1]
+    x += grown
     return x
+
+
+def _moving(axis: str, number: int, geometry: Mapping[str, float], angle: float) -> FloatArray:
+    """(4, 4): what the harmonics of an axis add to its turn by an angle, in the words of ``adjust.model.tables``."""
+    error, along, whirl = 0.0, 0.0, {"radial": 0.0j, "tilt": 0.0j}
+    for name, value in geometry.items():
+        kind, *rest = name.split("_")
+        if kind not in ("angle", "axial", "radial", "tilt") or rest[0] != str(number):
+            continue
+        order = int(rest[2].replace("m", "-").replace("p", ""))
+        if kind in whirl:
+            whirl[kind] += value * (1j if rest[1] == "im" else 1.0) * np.exp(1j * order * angle)
+        elif kind == "angle":
+            error += value * (np.cos if rest[1] == "cos" else np.sin)(order * angle)
+        else:
+            along += value * (np.cos if rest[1] == "cos" else np.sin)(order * angle)
+    x, y = "yzx"["xyz".index(axis)], "zxy"["xyz".index(axis)]
+    shift = shift_along(x, whirl["radial"].real) @ shift_along(y, whirl["radial"].imag) @ shift_along(axis, along)
+    tilt = rotation_about(x, whirl["tilt"].real) @ rotation_about(y, whirl["tilt"].imag)
+    moved: FloatArray = shift @ tilt @ rotation_about(axis, error)
+    return moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,16 +117,18 @@ class Scene:
     def table_from_mount(self, table_id: str, angles: FloatArray) -> FloatArray:
         """(4, 4): outer axis, common perpendicular, inner axis, as ``adjust.model.survey.Table`` writes the chain."""
         table = self._tables[table_id]
+        g = dict(zip(table.geometry.names, self.vector("table_geometry", table_id).tolist(), strict=True))
         if len(table.axes) == 1:
-            return rotation_about(table.axes[0], angles[0] + self.vector("table_geometry", table_id)[0])
+            return _moving(table.axes[0], 1, g, angles[0]) @ rotation_about(table.axes[0], angles[0] + g["zero_1"])
         outer, inner = table.axes
         third = next(axis for axis in "xyz" if axis not in (outer, inner))
-        skewness, offset, zero_1, zero_2 = self.vector("table_geometry", table_id)
         return (
-            rotation_about(outer, angles[0] + zero_1)
-            @ shift_along(third, offset)
-            @ rotation_about(third, skewness)
-            @ rotation_about(inner, angles[1] + zero_2)
+            _moving(outer, 1, g, angles[0])
+            @ rotation_about(outer, angles[0] + g["zero_1"])
+            @ shift_along(third, g["axis_offset"])
+            @ rotation_about(third, g["non_orthogonality"])
+            @ _moving(inner, 2, g, angles[1])
+            @ rotation_about(inner, angles[1] + g["zero_2"])
         )
 
     def world_from_station(self, station_id: str, epoch_id: str | None = None) -> FloatArray:
@@ -133,8 +164,8 @@ class Scene:
     def target_points(self, target_id: str, epoch_id: str | None = None) -> FloatArray:
         """The target's points in the world, (n, 3) m."""
         target = self._targets[target_id]
-        warp = ("warp", target_id)
-        x = _warped(target, self.vector(*warp)) if warp in self.truth else target.x_in_target
+        warp, warmth = ("warp", target_id), self.survey.temperatures.get(str(epoch_id), target.reference_temperature)
+        x = _warped(target, self.vector(*warp), warmth) if warp in self.truth else target.x_in_target
         return transform(self.world_from_target(target_id, epoch_id), x)
 
     def world_points(self) -> FloatArray:

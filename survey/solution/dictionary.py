@@ -14,6 +14,7 @@ from adjust.model.result import Adjustment, Estimate, GroupSummary, ImageResidua
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.precision import in_conditions
 from adjust.testing.distributions import norm
+from adjust.testing.significance import significances
 from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
@@ -316,10 +317,21 @@ def _tables(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any
         entry |= pose(("world_from_table", name), "world_from_table")
         geometry = adjustment.estimates.get(("table_geometry", name))
         if geometry is not None:
-            entry["geometry"] = vector_entry(geometry, scale)
+            entry["geometry"] = _terms(adjustment, geometry, scale)
         angles = {n[2]: e for n, e in adjustment.estimates.items() if n[:2] == ("table_angles", name)}
         out[name] = entry | {"epochs": {epoch: vector_entry(e, scale) for epoch, e in angles.items()}}
     return out
+
+
+def _terms(adjustment: Adjustment, estimate: Estimate, scale: Scale) -> dict[str, Any]:
+    """The components, and the tests of those that may be zero."""
+    found = significances(adjustment, estimate, scale.sigmas == "a_posteriori")
+    tests = {
+        s.term: {"components": list(s.components), "statistic": s.statistic, "freedom": list(s.freedom), "p_value": s.p,
+                 "significant": s.significant}
+        for s in found
+    }  # fmt: skip
+    return vector_entry(estimate, scale) | ({"significance": tests} if tests else {})
 
 
 def _targets(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any]:
@@ -331,7 +343,7 @@ def _targets(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, An
         entry |= {"station": target.station_id} if target.station_id else {}
         entry |= pose(("carrier_from_target", name), key)
         warp = adjustment.estimates.get(("warp", name))
-        out[name] = entry | ({"warp": vector_entry(warp, scale)} if warp is not None else {})
+        out[name] = entry | ({"warp": _terms(adjustment, warp, scale)} if warp is not None else {})
     return out
 
 

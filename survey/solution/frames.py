@@ -1,36 +1,18 @@
 """Where everything is after an adjustment: any frame of the survey in the world, from the adjusted values."""
 
-from functools import reduce
-
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.frames.tables import table_motions
 from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Station, Table, Target
 
 
-def _turn(axis: int, angle: float) -> Pose3:
-    rotation = (Rot3.Rx, Rot3.Ry, Rot3.Rz)[axis](angle)
-    return Pose3(rotation, np.zeros(3))
-
-
 def table_from_mount(axes: tuple[str, ...], geometry: dict[str, float], angles: FloatArray) -> Pose3:
     """The motion of a table, the formula of ``adjust.model.survey.Table``; ``geometry``: by name, missing is zero."""
-    first = "xyz".index(axes[0])
-    motion = _turn(first, float(angles[0]) + geometry.get("zero_1", 0.0))
-    if len(axes) == 1:
-        return motion
-    second = "xyz".index(axes[1])
-    third = 3 - first - second
-    offset = np.zeros(3)
-    offset[third] = geometry.get("axis_offset", 0.0)
-    parts = (
-        Pose3(Rot3(), offset),
-        _turn(third, geometry.get("non_orthogonality", 0.0)),
-        _turn(second, float(angles[1]) + geometry.get("zero_2", 0.0)),
-    )
-    return reduce(lambda a, b: a * b, parts, motion)
+    (R,), (t,), _ = table_motions(axes, geometry, np.asarray(angles, dtype=float)[None])
+    return Pose3(Rot3(R), t)
 
 
 class AdjustedFrames:

@@ -14,6 +14,7 @@ from gtsam import Pose3
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import FloatArray
+from adjust.model.tables import harmonic
 from adjust.testing.distributions import chi2, fisher
 from survey.project.project import SIGMA_KINDS
 from survey.project.project import SigmaKind as SigmaKind
@@ -57,15 +58,20 @@ SMALL_ANGLES = {
     "non_orthogonality", "tilt_1", "tilt_2", "vertical_index", "inclination", "across_1", "across_2",
 }  # fmt: skip
 
+PARTS_PER_MILLION = {"distance_scale", "scale_x", "scale_y", "shear"}
+
 
 def unit_for_people(component: str, unit: str) -> tuple[str, float]:
     """Unit and factor in which a person reads a value: mm, deg (arcsec for what is always small), ppm, px."""
     if unit == "m":
         return "mm", 1e3
     if unit == "rad":
-        return ("arcsec", ARCSEC_PER_RAD) if component in SMALL_ANGLES else ("deg", 180.0 / np.pi)
-    if component == "distance_scale":
+        small = component in SMALL_ANGLES or harmonic(component) is not None
+        return ("arcsec", ARCSEC_PER_RAD) if small else ("deg", 180.0 / np.pi)
+    if component in PARTS_PER_MILLION:
         return "ppm", 1e6
+    if unit == "1/K":
+        return "ppm_per_K", 1e6
     return ("" if unit in ("1", "") else unit), 1.0
 
 

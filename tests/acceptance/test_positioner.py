@@ -1,5 +1,7 @@
 """A real two-axis positioner under a metrology sensor (205 poses): axes, fit and the significance of both defects."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -7,6 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from adjust.adjustment import adjust
 from adjust.model.errors import SurveyError
+from adjust.model.survey import TABLE_GEOMETRY
+from adjust.model.tables import harmonic_names
+from adjust.testing.significance import significances
 from tests.acceptance.positioner import (
     POSITIONER,
     PoseWeights,
@@ -161,3 +166,41 @@ def test_what_cannot_be_tested_or_read_is_refused(perfect_machine):
         blockwise_covariance(joints, poses, PoseWeights(), n_blocks=30)
     with pytest.raises(SurveyError, match=r"\(52, 2\) joint angles and \(3, 4, 4\) poses"):
         positioner_survey(joints, poses[:3])
+
+
+def with_harmonics(survey, highest):
+    """With the harmonics of the inner axis unknown, up to an order of each kind."""
+    (table,) = survey.tables
+    given, waves = table.geometry, [n for kind, k in highest.items() for n in harmonic_names(kind, 1, k)]
+    geometry = replace(given, names=(*given.names, *waves), values=np.append(given.values, np.zeros(len(waves))),
+                       free=(*given.free, *waves))  # fmt: skip
+    return replace(survey, tables=(replace(table, geometry=geometry),))
+
+
+@pytest.mark.parametrize(
+    ("highest", "omega", "mean_mm", "significant"),
+    [
+        ({"angle": 1}, 199.56, 0.3764, {"angle_2_order_1"}),
+        ({"angle": 2}, 199.52, 0.3766, {"angle_2_order_1"}),
+        ({"angle": 2, "axial": 2, "radial": 1, "tilt": 1}, 158.325, 0.2619,
+         {"angle_2_order_1", "angle_2_order_2",
+          "radial_2_order_-1", "tilt_2_order_-1", "axial_2_order_1", "axial_2_order_2"}),
+    ],
+)  # fmt: skip
+def test_harmonics_of_its_inner_axis(recorded, highest, omega, mean_mm, significant):
+    """As another program fitted them (SciPy, plain lines, with weak priors)."""
+    result = adjust(with_harmonics(positioner_survey(*recorded), highest))
+    assert result.omega == pytest.approx(omega, abs=1e-2)
+    assert 1e3 * pose_fit(result).position_mean_m == pytest.approx(mean_mm, abs=6e-5)
+    tests = significances(result, result.estimates["table_geometry", POSITIONER], estimated_sigma0=True)
+    assert {test.term for test in tests if test.significant} == significant
+
+
+def test_harmonics_of_an_axis_that_turned_too_little_are_refused(recorded):
+    """The outer axis turned by 60 degrees."""
+    survey = positioner_survey(*recorded)
+    (table,) = survey.tables
+    waves = harmonic_names("angle", 0, 1)
+    geometry = replace(table.geometry, names=(*TABLE_GEOMETRY, *waves), values=np.zeros(6), free=waves)
+    with pytest.raises(SurveyError, match=r"axis 1 was read at 49 angles over 60 deg.*240 deg"):
+        adjust(replace(survey, tables=(replace(table, geometry=geometry),)))

@@ -91,6 +91,7 @@ def steps_of(unknown: Any, values: gtsam.Values) -> FloatArray:
     size = {"px": 1.0, "mm": 1e-2, "rad": 3e-4, "m": 3e-4, "1": 0.01}
     high_orders = {"k1": 0.05, "k2": 0.3, "k3": 2.0}
     high_orders |= {"k4": 0.03, "k5": 0.1, "k6": 0.2} if "k6" in unknown.components else {"k4": 10.0}
+    high_orders |= dict.fromkeys(("scale_x", "scale_y", "shear"), 1e-3)
     x = np.abs(values.atVector(unknown.key))
     steps = [size.get(u, 0.03 * v + 1e-7) for u, v in zip(unknown.units, x, strict=True)]
     return np.array([high_orders.get(c, s) for c, s in zip(unknown.components, steps, strict=True)])
@@ -440,13 +441,15 @@ def everything(
     """
     rng = np.random.default_rng(seed)
     names = MODELS[model].names
-    geometry = VectorParameter(
-        ("non_orthogonality", "axis_offset", "zero_1", "zero_2") if len(axes) == 2 else ("zero_1",),
-        np.array([0.02, 0.03, 0.1, -0.15]) if len(axes) == 2 else np.array([0.1]),
-        ("non_orthogonality", "axis_offset", "zero_1", "zero_2") if len(axes) == 2 else ("zero_1",),
-    )
+    of_axes = ("non_orthogonality", "axis_offset", "zero_1", "zero_2") if len(axes) == 2 else ("zero_1",)
+    values = np.array([0.02, 0.03, 0.1, -0.15]) if len(axes) == 2 else np.array([0.1])
+    waves = ("angle_1_cos_1", "angle_1_sin_3", "axial_1_sin_2", "radial_1_re_m1", "radial_1_im_p2", "tilt_1_im_m1")
+    waves += ("angle_2_sin_1", "axial_2_cos_1", "radial_2_im_m2", "tilt_2_re_p3") if len(axes) == 2 else ()
+    geometry = VectorParameter((*of_axes, *waves), np.append(values, 0.002 * np.sin(np.arange(len(waves)))),
+                               (*of_axes, *waves))  # fmt: skip
     ids = tuple(f"c{i}" for i in range(len(GRID)))
-    warp = VectorParameter(("warp_x", "warp_y"), np.array([0.004, -0.003]), ("warp_x", "warp_y"))
+    deviations = ("warp_x", "warp_y", "warp_xy", "scale_x", "scale_y", "shear", "expansion")
+    warp = VectorParameter(deviations, np.array([0.004, -0.003, 0.002, 0.01, -0.02, 0.015, 0.002]), deviations)
     lens = LensParameter(model, names, lens_values(model), ties=tuple(ties), pixel_size_mm=0.01)
     cameras = (
         Camera("X", "head", (640, 480), lens),
@@ -461,6 +464,7 @@ def everything(
             Target("wand", ids, GRID[:, [0, 1, 2]] * 0.7, motion="epoch"),
             Target("block", ids, GRID * 0.5, station_id="head"),
         ),
+        temperatures={"t1": 23.0, "t2": 18.0, "h1": 27.5},
         table_readings=tuple(
             TableReading("table", e, rng.normal(0.0, 0.1, len(axes)), random_cov(rng, [1e-4] * len(axes)))
             for e in ("t1", "t2")

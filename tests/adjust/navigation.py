@@ -7,6 +7,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.lenses.models import lens_constants
+from adjust.model.survey import TABLE_GEOMETRY
 from adjust.navigation import Beacons, Head, HeadCamera, HeadTable, NavigationEpoch, Spots
 
 SIZE = (1280, 1024)
@@ -86,7 +87,7 @@ def wide_head(focal_px=600.0):
 def with_table(head, sigma_deg=0.0, sigma_mm=0.0):
     """The head on a two-axis table whose axes meet in the world's origin."""
     extra = [np.diag([np.radians(sigma_deg) ** 2] * 3 + [(sigma_mm * MM) ** 2] * 3), np.zeros((10, 10))]
-    table = HeadTable(("x", "z"), Pose3(), np.zeros(4), Pose3())
+    table = HeadTable(("x", "z"), Pose3(), dict.fromkeys(TABLE_GEOMETRY, 0.0), Pose3())
     return replace(head, cov=block_diagonal([head.cov, *extra]), table=table)
 
 

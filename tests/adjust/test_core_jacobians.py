@@ -40,7 +40,7 @@ def plain_rows(graph: AdjustmentGraph, start: StartValues, values: gtsam.Values,
 
 def check_images(survey: Survey, start: StartValues, expected_links: set[str]) -> None:
     graph = h.build(survey, start)
-    values = h.disturbed(graph.start, graph, 5)
+    values = h.disturbed(graph.start, graph, 6)
     graph.prepare(values, jacobians=True)
     links = set()
     for b, factor in enumerate(image_factors(graph)):

@@ -8,6 +8,7 @@ from gtsam import Pose3
 from scipy.spatial.transform import Rotation
 
 from adjust.model.errors import SurveyError
+from adjust.model.survey import TABLE_GEOMETRY
 from adjust.native.navigation import real_roots, three_point_poses
 from adjust.navigation import Motion, NavigateOptions, NavigationEpoch, PosePrior, Spots, expected_precision, navigate
 from adjust.navigation.fit import local, local_derivative
@@ -115,9 +116,13 @@ def test_derivative_of_the_step_between_poses():
         np.testing.assert_allclose(J[:, j], numeric, atol=1e-7)
 
 
+def _geometry(values):
+    return dict(zip(TABLE_GEOMETRY, values, strict=True))
+
+
 def test_table_prior_is_the_chain_and_its_errors():
     head = with_table(mfns_head(), 0.05, 0.3)
-    head = replace(head, table=replace(head.table, geometry=np.array([0.01, 0.002, 0.1, -0.2])))
+    head = replace(head, table=replace(head.table, geometry=_geometry([0.01, 0.002, 0.1, -0.2])))
     system = make_system(head, printed_beacons())
     epoch = NavigationEpoch("e", (), table_angles=np.array([0.3, 0.7]), table_cov=np.eye(2) * 1e-8)
     prior = table_prior(system, epoch)
@@ -139,7 +144,8 @@ def test_table_geometry_errors_reach_the_pose(which):
     epoch = NavigationEpoch("e", (), table_angles=np.array([0.3, 0.7]))
     priors = []
     for step in (0.0, 1e-3):
-        geometry = np.array([0.01, 0.002, 0.1, -0.2]) + step * np.eye(4)[which]
+        values = np.array([0.01, 0.002, 0.1, -0.2]) + step * np.eye(4)[which]
+        geometry = _geometry(values.tolist())
         table = replace(head.table, geometry=geometry, mount_from_station=mount)
         priors.append(table_prior(make_system(replace(head, cov=cov, table=table), printed_beacons()), epoch))
     moved = local(priors[0].pose, priors[1].pose)

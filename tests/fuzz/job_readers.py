@@ -66,12 +66,13 @@ def _calibrations() -> list[bytes]:
     import numpy as np
     from gtsam import Pose3
 
+    from adjust.model.survey import TABLE_GEOMETRY
     from adjust.navigation import Beacons, Head, HeadCamera, HeadTable
     from survey.jobs.navigating.calibration import Calibration, keep
 
     cameras = tuple(HeadCamera(c, (640, 480), "brown", np.arange(9.0), np.ones(2), Pose3()) for c in "XY")
     beacons = Beacons(("B1", "B2"), np.ones((2, 3)), np.eye(6), None)
-    table = HeadTable(("x", "z"), Pose3(), np.zeros(4), Pose3())
+    table = HeadTable(("x", "z"), Pose3(), dict.fromkeys(TABLE_GEOMETRY, 0.0), Pose3())
     out = []
     with tempfile.TemporaryDirectory() as name:
         for head in (Head(cameras, np.eye(30), None), Head(cameras, np.eye(30), table)):

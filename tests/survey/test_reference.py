@@ -55,7 +55,7 @@ EVERYTHING: dict[str, Any] = {
     "datum": {"kind": "inner"},
     "sigmas": {"scale": {"distance": 2.0}},
     "adjustment": {"pairs": "closed"}, "vertical": {"free": ["tilt_1", "tilt_2"], "sigma": {"tilt_1_arcsec": 1.0}},
-    "bearings": {},
+    "bearings": {}, "temperatures_degC": {"e1": 21.5},
     "spots": {"cameras": ["X"]},
     "instruments": {"ts": {"sigma_distance_mm": 1.0}},
     "setups": {"s1": {}},
@@ -72,7 +72,8 @@ PLACES: dict[str, tuple[str, ...]] = {
     "lens_tie": ("cameras", "X", "lens", "tie", "fy"), "station": ("stations", "carried"),
     "pose": ("stations", "head", "world_from_station"), "poses": ("stations", "head", "epochs"),
     "turntable": ("tables", "tt"), "turntable_geometry": ("tables", "tt", "geometry"),
-    "turntable_sigma": ("tables", "tt", "geometry_sigma"), "target_checkerboard": ("targets", "board"),
+    "turntable_sigma": ("tables", "tt", "geometry_sigma"),
+    "harmonics": ("tables", "tt", "harmonics"), "target_checkerboard": ("targets", "board"),
     "target_charuco": ("targets", "cha"), "target_marker_grid": ("targets", "grid"),
     "target_marker_block": ("targets", "block"), "target_points": ("targets", "list"),
     "markers": ("targets", "block", "markers"), "warp": ("targets", "board", "warp"), "point": ("points", "P1"),
@@ -81,7 +82,8 @@ PLACES: dict[str, tuple[str, ...]] = {
     "setup": ("setups", "s1"), "beam": ("beams", "b1"), "surface_plane": ("surfaces", "floor"),
     "surface_line": ("surfaces", "rail"), "surface_sphere": ("surfaces", "ball"),
     "vector_sigma": ("vertical", "sigma"), "align": ("align", "a1"), "feet": ("align", "a1", "feet_mm"),
-    "tolerance": ("tolerances", "t1"), "identification": ("identification",), "closure": ("closures", "plate"),
+    "tolerance": ("tolerances", "t1"), "identification": ("identification",),
+    "temperatures": ("temperatures_degC",), "closure": ("closures", "plate"),
 }  # fmt: skip
 NEED_MORE = {("station", "motion"), ("lens", "balance_radius_mm")}
 KEYS = [(d, key) for d in DECLARATIONS for key in d.keys]

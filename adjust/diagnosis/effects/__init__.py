@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from adjust.diagnosis.case import Case
+from adjust.diagnosis.effects.axes import unsteady_axes
 from adjust.diagnosis.effects.bent import bent_targets
 from adjust.diagnosis.effects.clocks import clocks
 from adjust.diagnosis.effects.effect import Effect
@@ -26,8 +27,9 @@ _MOST = 6
 
 
 def hypotheses(case: Case) -> Iterator[Hypothesis]:
-    """The few changes that explain most for what they cost, each kind of them once; targets that are bent."""
+    """The few changes that explain most for what they cost, each kind once; bent targets, axes that run unevenly."""
     yield from bent_targets(case)
+    yield from unsteady_axes(case)
     yield from _scored(case)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, of_shifts
-from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey
+from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey, SetKey
 from adjust.diagnosis.prediction import Prediction
 from adjust.diagnosis.score import Linear, Score
 from adjust.diagnosis.targets.size import reshaped, well_known
@@ -28,11 +28,12 @@ def _scale(a: float) -> FloatArray:
     return (1.0 + a) * np.eye(3)
 
 
-_SHAPES: tuple[tuple[str, Callable[[float], FloatArray], str], ...] = (
+_SHAPES: tuple[tuple[str, Callable[[float], FloatArray], str, str], ...] = (
     ("target stretched", _stretch,
-     "its columns stand {:.6g} times as far from each other against its rows as they should"),
-    ("target sheared", _shear, "its rows and columns are not at right angles: they lean by {:.6g} of their length"),
-    ("target scaled", _scale, "it is {:.6g} times as large as its definition says"),
+     "its columns stand {:.6g} times as far from each other against its rows as they should", "scale_x"),
+    ("target sheared", _shear, "its rows and columns are not at right angles: they lean by {:.6g} of their length",
+     "shear"),
+    ("target scaled", _scale, "it is {:.6g} times as large as its definition says", ""),
 )  # fmt: skip
 
 
@@ -45,7 +46,9 @@ def shapes(case: Case) -> Iterator[Effect]:
                 yield from (_of(case, linear, target.target_id, *shape) for shape in _SHAPES)
 
 
-def _of(case: Case, linear: Linear, target: str, name: str, shape: Callable[[float], FloatArray], what: str) -> Effect:
+def _of(
+    case: Case, linear: Linear, target: str, name: str, shape: Callable[[float], FloatArray], what: str, component: str
+) -> Effect:
     def scored(at: Linear) -> Score:
         survey = at.result.survey
         now, then = (Prediction(s, at.result) for s in (survey, reshaped(survey, target, shape(_STEP))))
@@ -67,9 +70,11 @@ def _of(case: Case, linear: Linear, target: str, name: str, shape: Callable[[flo
         }  # fmt: skip
 
     remedy = ("multiply its square or marker size by that" if shape is _scale else
-              'measure it in both directions, and give its points in a file of kind "points"')  # fmt: skip
-    hypothesis = Hypothesis(name, "", remedy, Place("target", (target,), "square_mm" if shape is _scale else ""),
-                            case.survey, (), 1.0, 0)  # fmt: skip
+              f'let the adjustment find it: warp = {{ free = ["{component}"] }}; or measure it in both directions')
+    given = next(t for t in case.survey.targets if t.target_id == target).warp
+    edits = (SetKey(("targets", target, "warp", "free"), (component,)),) if component and given is None else ()
+    hypothesis = Hypothesis(name, "", remedy, Place("target", (target,), "square_mm" if shape is _scale else "warp"),
+                            case.survey, edits, 1.0, 0)  # fmt: skip
 
     def said(theta: FloatArray, sigmas: FloatArray) -> str:
         value = float(theta[0]) + (0.0 if shape is _shear else 1.0)

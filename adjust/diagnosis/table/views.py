@@ -8,6 +8,7 @@ from gtsam import Pose3
 
 from adjust.adjustment import adjust
 from adjust.diagnosis.case import own_lens, single_views
+from adjust.frames.tables import table_motions
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray, PoseParameter, Station, Survey, Table, Target
@@ -42,16 +43,10 @@ class TableViews:
         geometry: (2,) non-orthogonality (rad) and axis offset (m), where they are not those given.
         """
         a = self.angles if angles is None else angles
-        given = dict(zip(self.table.geometry.names, self.table.geometry.values, strict=True))
-        skewness, offset = given_geometry(self.table) if geometry is None else geometry
-        axes = ["xyz".index(x) for x in self.table.axes]
-        zeros = np.array([given.get(f"zero_{i + 1}", 0.0) for i in range(len(axes))])
-        turns = [rotation_exp((a[:, i] + zeros[i])[:, None] * np.eye(3)[axis]) for i, axis in enumerate(axes)]
-        if len(axes) == 1:
-            return rigid(turns[0], np.zeros(3))
-        third = np.eye(3)[3 - axes[0] - axes[1]]
-        between = rotation_exp(skewness * third)
-        return rigid(turns[0] @ between @ turns[1], turns[0] @ (offset * third))
+        given = dict(zip(self.table.geometry.names, self.table.geometry.values.tolist(), strict=True))
+        if geometry is not None and len(self.table.axes) > 1:
+            given |= dict(zip(("non_orthogonality", "axis_offset"), geometry.tolist(), strict=True))
+        return rigid(*table_motions(self.table.axes, given, a)[:2])
 
     def by_geometry(self) -> FloatArray:
         """(e, 6, 2): how non-orthogonality and axis offset move the mount, a small motion on the left in the mount."""

@@ -4,7 +4,7 @@ A block's rows are the upper triangular square root of its augmented normal matr
 warp | residual]: the same linear system and chi-square as its 2n rows, for any n (Lawson and Hanson 1974, chapter 27).
 """
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
 
@@ -14,6 +14,7 @@ import numpy as np
 from adjust.frames.chains import evaluate_chains
 from adjust.frames.state import State
 from adjust.frames.unknowns import Chain
+from adjust.model.boards import warming_of
 from adjust.model.observations import ImageBlock
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
 from adjust.native.images import (
@@ -47,14 +48,6 @@ def square_root_information(cov: FloatArray) -> FloatArray:
 def whitened_squares(v: FloatArray, W: FloatArray) -> FloatArray:
     """|W v|^2 (n,) of residuals v (n, 2) with W (n, 3) upper triangular."""
     return np.asarray((W[:, 0] * v[:, 0] + W[:, 1] * v[:, 1]) ** 2 + (W[:, 2] * v[:, 1]) ** 2)
-
-
-def warp_shape(x: FloatArray) -> FloatArray:
-    """The two unit sags 4u(1-u), 4v(1-v) at points (n, 3), u and v running from 0 to 1 over the target."""
-    low, high = x[:, :2].min(axis=0), x[:, :2].max(axis=0)
-    span = np.where(high > low, high - low, 1.0)
-    u = (x[:, :2] - low) / span
-    return np.asarray(4.0 * u * (1.0 - u))
 
 
 class Chains:
@@ -96,9 +89,9 @@ class ImageBatch:
 
     def __init__(
         self, survey: Survey, state: State, blocks: Sequence[ImageBlock], chains: Sequence[Chain],
-        x_in_world: FloatArray, n_warp: Mapping[str | None, int],
+        x_in_world: FloatArray,
     ) -> None:  # fmt: skip
-        """x_in_world: points (P, 3) m of the world, for blocks without a target. n_warp: free components by target."""
+        """x_in_world: points (P, 3) m of the world, for blocks without a target."""
         self.blocks = tuple(blocks)
         self.state = state
         self.chains = Chains(chains)
@@ -106,15 +99,18 @@ class ImageBatch:
         self.camera = np.array([state.cameras[b.camera_id] for b in blocks], dtype=np.int64)
         warped: dict[str | None, int] = {t: i for t, i in state.targets.items() if state.warp_maps[i] is not None}
         self.warp_id = np.array([warped.get(b.target_id, -1) for b in blocks], dtype=np.int64)
-        self.n_warp = np.array([n_warp[b.target_id] for b in blocks], dtype=np.int64)
+        n_free = [0 if m is None else len(m.free) for m in state.warp_maps]
+        self.n_warp = np.array([n_free[i] if i >= 0 else 0 for i in self.warp_id.tolist()], dtype=np.int64)
+        warming = [warming_of(survey, survey.targets[i], b.epoch_id) if i >= 0 else 0.0
+                   for i, b in zip(self.warp_id.tolist(), blocks, strict=True)]  # fmt: skip
         self.n_points = int(self.ptr[-1])
         self.W_all = square_root_information(np.concatenate([np.zeros((0, 2, 2)), *(b.cov for b in blocks)]))
         self.used: BoolArray = used_points(blocks)
         self.W_all_columns = np.ascontiguousarray(self.W_all.T)
         self.W = self.W_all_columns * self.used
         self._weighed: tuple[BoolArray, FloatArray] | None = None
-        self.arrays = BlockArrays(self.ptr, self.camera, self.warp_id, self.n_warp)
-        self.points = _point_arrays(survey, blocks, x_in_world, warped.keys())
+        self.arrays = BlockArrays(self.ptr, self.camera, self.warp_id, self.n_warp, np.array(warming, dtype=float))
+        self.points = _point_arrays(survey, blocks, x_in_world)
         self._place_keys()
 
     def _place_keys(self) -> None:
@@ -136,7 +132,7 @@ class ImageBatch:
     def at(self, W: FloatArray) -> BlocksAt:
         """All blocks where the chains were last evaluated, weighted by W (3, N)."""
         s, c = self.state, self.chains
-        return BlocksAt(self.arrays, self.points, W, s.lenses, c.R, c.t, s.warp)
+        return BlocksAt(self.arrays, self.points, W, s.lenses, c.R, c.t, s.warps)
 
     @property
     def by_keys(self) -> ByKeys:
@@ -292,9 +288,7 @@ def used_points(blocks: Sequence[ImageBlock]) -> BoolArray:
     return used
 
 
-def _point_arrays(
-    survey: Survey, blocks: Sequence[ImageBlock], x_in_world: FloatArray, warped: Set[str | None]
-) -> PointArrays:
+def _point_arrays(survey: Survey, blocks: Sequence[ImageBlock], x_in_world: FloatArray) -> PointArrays:
     """All image points with what they show: taken from the points of all targets seen, one after the other."""
     targets: dict[str | None, FloatArray] = {t.target_id: t.x_in_target for t in survey.targets}
     targets[None] = x_in_world
@@ -307,11 +301,7 @@ def _point_arrays(
         raise IndexError("an image block shows points that its target does not have")
     rows = index + np.repeat(np.array([start[b.target_id] for b in blocks], dtype=np.int64), sizes)
     uv = np.ascontiguousarray(np.concatenate([np.zeros((0, 2)), *(b.uv for b in blocks)]).T)
-    shape = np.zeros((2, len(rows)))
-    if not warped.isdisjoint(seen):
-        bent = [warp_shape(targets[t]) if t in warped else np.zeros((len(targets[t]), 2)) for t in seen]
-        shape = np.ascontiguousarray(np.concatenate(bent)[rows].T)
-    return PointArrays(np.ascontiguousarray(np.concatenate(x)[rows].T), shape, uv)
+    return PointArrays(np.ascontiguousarray(np.concatenate(x)[rows].T), uv)
 
 
 def _callback(batch: ImageBatch, b: int):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped

@@ -99,6 +99,7 @@ def _numbered(rows: IntArray, block: IntArray, link: IntArray, n_blocks: int) ->
     total = np.concatenate([[0], np.cumsum(width)])
     place = total[:-1] - total[ptr[of_key]]
     segments = SegmentArrays(
-        np.searchsorted(block, numbers).astype(np.int64), kind, link, table, start, n, place[of_segment]
+        np.searchsorted(block, numbers).astype(np.int64), kind, link, table, start, n, place[of_segment],
+        np.ones(len(n)),
     )
     return BlockKeys(ptr, key[first], of_key, width, place, np.diff(total[ptr]), segments, of_segment)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.survey import FloatArray, Survey
@@ -20,7 +21,6 @@ from adjust.start.closed_forms.triangulation import intersect
 from adjust.start.network import ChainObservation
 from adjust.start.positions import Positions
 from adjust.start.readings.sights import Node, node_of, spread_differences, ties
-from adjust.start.views import target_points
 
 _PARALLAX = np.deg2rad(0.3)
 _TOGETHER = np.deg2rad(75.0)
@@ -124,7 +124,7 @@ class TiltedSetups:
             mine = [i for i, n in enumerate(nodes) if n in self.known]
             there = np.array([self.known[nodes[i]] for i in mine]).reshape(-1, 3)
             unknown = self.positions.network.open_slots(self.positions.chain(frame))
-            if unknown and _spans(there) and self._tell(frame, align(there, target_points(target)[mine])):
+            if unknown and _spans(there) and self._tell(frame, align(there, deformed(target)[mine])):
                 return True
         return False
 

@@ -7,11 +7,11 @@ from typing import cast
 import numpy as np
 from gtsam import Pose3
 
+from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
 from adjust.model.observations import FrameRef, ImageBlock
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.survey import Camera, FloatArray, Station, Survey, Target
-from adjust.observations.images.batch import warp_shape
 from survey.interop.cameras.lens_maps import MappedLens, mapped_lens
 from survey.interop.cameras.rig import Rig, RigCamera
 from survey.project import Project
@@ -74,14 +74,9 @@ class CameraValues:
         return None if found is None else found.x_in_world.value
 
     def x_in_target(self, target: Target) -> FloatArray:
-        """Points (n, 3) m of a target, sag included."""
-        x = np.array(target.x_in_target, dtype=float)
+        """Points (n, 3) m of a target, its warp included, at its reference temperature."""
         estimate = self.estimates.get(("warp", target.target_id))
-        if estimate is not None and not isinstance(estimate.value, Pose3):
-            x[:, 2] += warp_shape(target.x_in_target) @ np.asarray(estimate.value)
-        elif target.warp is not None:
-            x[:, 2] += warp_shape(target.x_in_target) @ target.warp.values
-        return x
+        return deformed(target, None if estimate is None else np.asarray(estimate.value))
 
     def station_from_camera(self, camera: Camera) -> Pose3:
         """Where a camera is on its station. Raises SurveyError where that is not known."""

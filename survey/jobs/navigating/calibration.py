@@ -87,6 +87,7 @@ def keep(path: Path, key: str, calibration: Calibration) -> None:
             {"camera_id": c.camera_id, "image_size": c.image_size, "model": c.model} for c in head.cameras
         ],
         "axes": None if table is None else table.axes,
+        "geometry": [] if table is None else list(table.geometry),
     }  # fmt: skip
     arrays: dict[str, FloatArray] = {"cov": head.cov, "x": beacons.x_in_world, "cov_x": beacons.cov}
     if beacons.cross_cov is not None:
@@ -95,7 +96,7 @@ def keep(path: Path, key: str, calibration: Calibration) -> None:
         arrays |= {f"lens{i}": c.lens, f"constants{i}": c.constants, f"pose{i}": c.station_from_camera.matrix()}
     if table is not None:
         arrays |= {"base": table.world_from_table.matrix(), "mount": table.mount_from_station.matrix(),
-                   "geometry": table.geometry}  # fmt: skip
+                   "geometry": np.array(list(table.geometry.values()), dtype=float)}  # fmt: skip
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -104,6 +105,7 @@ def keep(path: Path, key: str, calibration: Calibration) -> None:
 
 _ABOUT = {
     "key": str, "sigma0": Either((POSITIVE, None)), "beacon_ids": [str], "axes": Either(([str], None)),
+    "geometry": [str],
     "cameras": [{"camera_id": str, "image_size": [WHOLE], "model": lambda name: name in MODELS}],
 }  # fmt: skip
 
@@ -121,8 +123,8 @@ def _problem(about: Any, arrays: dict[str, FloatArray]) -> str | None:
         shapes |= {f"lens{i}": (lens,), f"constants{i}": (4,), f"pose{i}": (4, 4)}
         p += lens + 6
     if about["axes"] is not None:
-        shapes |= {"base": (4, 4), "mount": (4, 4), "geometry": (4,)}
-        p += 16
+        shapes |= {"base": (4, 4), "mount": (4, 4), "geometry": (len(about["geometry"]),)}
+        p += 12 + len(about["geometry"])
     shapes |= {"cov": (p, p), "x": (n // 3, 3), "cov_x": (n, n)} | ({"cross": (p, n)} if "cross" in arrays else {})
     fits = (k in arrays and arrays[k].shape == shape and arrays[k].dtype == float for k, shape in shapes.items())
     return None if all(fits) else "an array has not the size that its cameras and beacons say"
@@ -138,6 +140,7 @@ def _restored(about: dict[str, Any], arrays: dict[str, FloatArray]) -> Calibrati
     )  # fmt: skip
     table = None
     if about["axes"] is not None:
-        table = HeadTable(tuple(about["axes"]), Pose3(arrays["base"]), arrays["geometry"], Pose3(arrays["mount"]))
+        geometry = dict(zip(about["geometry"], arrays["geometry"].tolist(), strict=True))
+        table = HeadTable(tuple(about["axes"]), Pose3(arrays["base"]), geometry, Pose3(arrays["mount"]))
     beacons = Beacons(tuple(about["beacon_ids"]), arrays["x"], arrays["cov_x"], arrays.get("cross"))
     return Calibration(Head(cameras, arrays["cov"], table), beacons, about["sigma0"], True)

@@ -1,6 +1,6 @@
 """Every table of ``survey.toml`` with its keys: what readers allow, what the reference says, what editors complete."""
 
-from survey.project.declared.keys import NOTHING, REQUIRED, Declared, Key, vector_keys_declared
+from survey.project.declared.keys import REQUIRED, Declared, Key, vector_keys_declared
 
 _XYZ = ("x", "y", "z")
 _SIX = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -16,6 +16,10 @@ INSTRUMENT_UNITS = {
     "distance_offset": "mm", "distance_scale": "ppm", "refraction": "1", "vertical_index": "arcsec",
 }  # fmt: skip
 BEAM_UNITS = {"offset_1": "mm", "offset_2": "mm", "slope_1": "1", "slope_2": "1"}
+WARP_UNITS = {
+    "warp_x": "mm", "warp_y": "mm", "warp_xy": "mm", "scale_x": "ppm", "scale_y": "ppm", "shear": "ppm",
+    "expansion": "ppm_per_K",
+}  # fmt: skip
 SURFACE_UNITS: dict[str, dict[str, str]] = {
     "plane": {"normal_1": "deg", "normal_2": "deg", "distance": "mm"},
     "line": {"direction_1": "deg", "direction_2": "deg", "offset_1": "mm", "offset_2": "mm"},
@@ -56,7 +60,7 @@ def _target(kind: str, what: str, *keys: Key) -> Declared:
             choices=("fixed", "epoch")),
         Key("pose", "table", "carrier_from_target: the target in the station or the world", table="pose"),
         Key("epochs", "table", "its pose at single epochs, where motion is epoch: epochs.EPOCH", table="poses"),
-        Key("warp", "table", "a board that is not flat; not of a marker_block", table="warp"),
+        Key("warp", "table", "a board that is bent, stretched, sheared or grown; not of a marker_block", table="warp"),
         Key("cameras", "names", "the only cameras that may see it; default: all", refers="cameras"),
     )  # fmt: skip
     return Declared(f"target_{kind}", "targets.ID", what, common, of=("kind", kind))
@@ -88,6 +92,7 @@ DECLARATIONS: tuple[Declared, ...] = (
             Key("closures", "table", "loops of pairs through a mount, by name", table="closure"),
             Key("spots", "table", "beacons as bright spots, found without a name", table="spots"),
             Key("vertical", "table", "the plumb line", table="vertical"),
+            Key("temperatures_degC", "table", "by epoch, for targets that expand", table="temperatures"),
             Key("bearings", "table", "how horizontal angles count", table="bearings"),
             Key("instruments", "table", "total stations, levels by id", table="instrument"),
             Key("setups", "table", "set-ups of instruments by id", table="setup"),
@@ -184,18 +189,29 @@ DECLARATIONS: tuple[Declared, ...] = (
             Key("geometry", "table", "how its axes stand to each other", table="turntable_geometry"),
             Key("geometry_sigma", "table", "sigmas of priors at the values of geometry, under the same keys",
                 table="turntable_sigma"),
+            Key("harmonics", "table", "errors of its axes as they turn, up to which order (remedies.md)",
+                table="harmonics"),
+        ),
+    ),
+    Declared(
+        "harmonics", "tables.ID.harmonics", "Harmonics of an axis that are unknown, up to this order.",
+        tuple(
+            Key(f"{kind}_{axis}", "whole", f"{what} of axis {axis}", 0, least=0)
+            for kind, what in (("angle", "graduation and eccentricity of the encoder"), ("axial", "shift along it"),
+                               ("radial", "run-out"), ("tilt", "wobble"))
+            for axis in (1, 2)
         ),
     ),
     Declared(
         "turntable_geometry", "tables.ID.geometry", "Two axes have all four parameters, one axis zero_1 alone.",
         (
-            Key("free", "names", "which are unknown; of two axes the first two unless said", NOTHING,
-                choices=("non_orthogonality", "axis_offset", "zero_1", "zero_2")),
+            Key("free", "names", "which are unknown, harmonics too; of two axes the first two unless said"),
             Key("non_orthogonality_arcsec", "number", "what the angle between the axes has beyond 90 degrees", 0.0),
             Key("axis_offset_mm", "number", "shortest distance of the axes", 0.0),
             Key("zero_1_deg", "number", "reading of the first encoder at the table's zero", 0.0),
             Key("zero_2_deg", "number", "of the second", 0.0),
         ),
+        free_keys=Key("HARMONIC", "number", "angle_2_cos_1_arcsec, radial_2_re_m1_mm and so on: its value", 0.0),
     ),
     Declared(
         "turntable_sigma", "tables.ID.geometry_sigma", "Sigmas of priors of free parameters.",
@@ -203,6 +219,7 @@ DECLARATIONS: tuple[Declared, ...] = (
             Key(name, "number", "sigma", positive=True)
             for name in ("non_orthogonality_arcsec", "axis_offset_mm", "zero_1_deg", "zero_2_deg")
         ),
+        free_keys=Key("HARMONIC", "number", "sigma of a harmonic, under the key of its value", positive=True),
     ),
     _target(
         "checkerboard", "A checkerboard; its points rRcC are the inner corners, row R, column C from the upper left.",
@@ -243,12 +260,20 @@ DECLARATIONS: tuple[Declared, ...] = (
         free_keys=Key("NUMBER", "matrix", "four corners, x, y, z", size=(4, 3)),
     ),
     Declared(
-        "warp", "targets.ID.warp", "Two parabolas across a board: how far its middle stands out.",
+        "warp", "targets.ID.warp", "How the points of a board deviate from their nominal places (remedies.md).",
         (
-            Key("free", "flag", "unknown; else the values are kept", True),
-            Key("warp_x_mm", "number", "along x", 0.0),
-            Key("warp_y_mm", "number", "along y", 0.0),
-            Key("sigma_mm", "sigma", "of a prior at these values", size=(2,)),
+            Key("free", "flag", "which are unknown; true: warp_x and warp_y, false: none", True,
+                choices=tuple(WARP_UNITS)),
+            Key("warp_x_mm", "number", "how far the middle stands out, along x", 0.0),
+            Key("warp_y_mm", "number", "and along y", 0.0),
+            Key("warp_xy_mm", "number", "how far two corners stand out, the other two back", 0.0),
+            Key("scale_x_ppm", "number", "how much longer it is along x", 0.0),
+            Key("scale_y_ppm", "number", "and along y", 0.0),
+            Key("shear_ppm", "number", "how far points move along x with their y", 0.0),
+            Key("expansion_ppm_per_K", "number", "how much it grows with temperatures_degC", 0.0),
+            Key("reference_degC", "number", "the temperature for which its lengths hold", 20.0),
+            Key("sigma_mm", "sigma", "of a prior of warp_x and warp_y at these values", size=(2,)),
+            Key("sigma", "table", "a prior: sigmas of free values, under their keys", table="vector_sigma"),
         ),
     ),
     Declared(
@@ -381,6 +406,10 @@ DECLARATIONS: tuple[Declared, ...] = (
     _surface("plane", Key("normal", "numbers", "about; needed where positions lie beside the plane", size=(3,))),
     _surface("line", Key("direction", "numbers", "about", size=(3,))),
     _surface("sphere", None),
+    Declared(
+        "temperatures", "temperatures_degC", "Epoch = temperature, where something is to expand with it.",
+        free_keys=Key("EPOCH", "number", "degC"),
+    ),
     Declared(
         "vector_sigma", "SIGMA", "Sigmas of priors, under the keys of the values.",
         free_keys=Key("KEY", "number", "sigma, in the unit of the key", positive=True),

@@ -16,7 +16,7 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Estimate
 from adjust.model.survey import Survey
 from survey.folder.units import from_si
-from survey.project.declared.owners import GEOMETRY_UNITS, geometry_key
+from survey.project.declared.owners import geometry_key, geometry_unit
 from survey.project.declared.poses import quaternion_wxyz
 
 LENGTHS = ("square_mm", "marker_mm", "gap_mm", "markers")
@@ -148,12 +148,14 @@ def _of_vector(document: Any, estimate: Estimate, component: str, treatment: str
     before = set(declared[kind, owner])
     after = before | set(wanted) if treatment == "free" else before - set(wanted)
     entry["free"] = [n for n in names if n in after]
+    if kind == "table_geometry":
+        _table(document, "tables", owner).pop("harmonics", None)  # they stand in free now
     if treatment == "free":
         return
     values = dict(zip(names, np.asarray(estimate.value, dtype=float).tolist(), strict=True))
     if kind == "table_geometry":
         for key in wanted:
-            entry[geometry_key(key)] = float(from_si(values[key], GEOMETRY_UNITS[key]))
+            entry[geometry_key(key)] = float(from_si(values[key], geometry_unit(key)))
         return
     known = _table(entry, "values")
     for key in values if not known else wanted:

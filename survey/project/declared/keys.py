@@ -15,15 +15,15 @@ REQUIRED = object()
 """The default of a key that must be there."""
 NOTHING = None
 """The default of a key that may be absent and then says nothing."""
-_UNITS = ("mm2", "mm", "m", "arcsec", "mgon", "cc", "deg", "px", "ppm")
+_UNITS = ("ppm_per_K", "mm2", "mm", "m", "arcsec", "mgon", "cc", "deg", "px", "ppm")
 
 
 @dataclass(frozen=True)
 class Key:
     """One key. size: numbers in a list, rows of a square matrix, components of a sigma (one number for all, or a list).
 
-    choices: words allowed, of names too; refers: the table whose ids are allowed; least: of a number;
-    positive: above zero; table: name of the declaration of what stands below it.
+    choices: words allowed, of names too, and of a flag in whose place a list of them may stand; refers: the table whose
+    ids are allowed; least: of a number; positive: above zero; table: name of the declaration of what stands below it.
     """
 
     name: str
@@ -40,7 +40,8 @@ class Key:
     @property
     def unit(self) -> str:
         """The unit that the name ends with, empty where it has none."""
-        return next((unit.replace("mm2", "mm²") for unit in _UNITS if self.name.endswith(f"_{unit}")), "")
+        unit = next((unit for unit in _UNITS if self.name.endswith(f"_{unit}")), "")
+        return unit.replace("mm2", "mm²").replace("_per_", "/")
 
 
 @dataclass(frozen=True)

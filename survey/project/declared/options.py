@@ -8,6 +8,7 @@ from gtsam import Rot3
 
 from adjust.model.observations import Closure, frame_text
 from adjust.model.survey import Survey
+from adjust.model.tables import unit_of
 from survey.folder.units import from_si, to_si
 from survey.project.declared.declarations import keys_of
 from survey.project.declared.node import Node
@@ -112,7 +113,7 @@ def tolerance_sections(tolerances: tuple[Tolerance, ...]) -> list[Section]:
 
 def _unit_of(x: Tolerance) -> str:
     if x.of == "table_geometry":
-        return "mm" if x.quantity == "axis_offset" else "arcsec"
+        return "mm" if unit_of(x.quantity) == "m" else "arcsec"
     return "px" if x.quantity in ("fx", "fy", "u0", "v0", "skew") else "1"
 
 

@@ -14,6 +14,7 @@ from adjust.model.survey import (
     VectorParameter,
     VectorPrior,
 )
+from adjust.model.tables import HARMONICS, HIGHEST, harmonic_names, in_order, unit_of
 from survey.folder.text import suggestion
 from survey.folder.units import to_si
 from survey.project.declared.declarations import keys_of
@@ -21,7 +22,7 @@ from survey.project.declared.lenses import read_lens
 from survey.project.declared.node import Node
 from survey.project.declared.poses import read_pose
 
-GEOMETRY_UNITS = {"non_orthogonality": "arcsec", "axis_offset": "mm", "zero_1": "deg", "zero_2": "deg"}
+_GEOMETRY_UNITS = {"non_orthogonality": "arcsec", "axis_offset": "mm", "zero_1": "deg", "zero_2": "deg"}
 
 
 def read_cameras(root: Node, station_ids: tuple[str, ...]) -> tuple[Camera, ...]:
@@ -92,28 +93,47 @@ def read_tables(root: Node) -> tuple[tuple[Table, ...], dict[str, FloatArray]]:
     return tuple(tables), sigmas
 
 
+def geometry_unit(name: str) -> str:
+    """The unit of a geometry parameter in a project: of harmonics arcsec or mm."""
+    return _GEOMETRY_UNITS.get(name) or {"rad": "arcsec", "m": "mm"}[unit_of(name)]
+
+
 def geometry_key(name: str) -> str:
     """The key of a geometry parameter: its name with the unit."""
-    return f"{name}_{GEOMETRY_UNITS[name]}"
+    return f"{name}_{geometry_unit(name)}"
 
 
 def _read_geometry(node: Node, n_axes: int) -> VectorParameter:
-    names = TABLE_GEOMETRY if n_axes == 2 else ("zero_1",)
-    geometry = node.table("geometry")
-    keys = tuple(geometry_key(name) for name in names)
+    base = TABLE_GEOMETRY if n_axes == 2 else ("zero_1",)
+    geometry, sigma = node.table("geometry"), node.table("geometry_sigma")
+    known = (*base, *(n for kind in HARMONICS for i in range(n_axes) for n in harmonic_names(kind, i, HIGHEST)))
+    keys = {geometry_key(name): name for name in known}
     geometry.allow("free", *keys)
-    free = geometry.references("free", names, "table parameter", names[:2] if n_axes == 2 else ())
-    values = np.array([to_si(geometry.number(geometry_key(name), 0.0), GEOMETRY_UNITS[name]) for name in names])
-    table = node.table("geometry_sigma")
-    for key in table.values:
+    free = geometry.references("free", known, "table parameter", base[:2] if n_axes == 2 else ())
+    free = (*free, *(n for n in _harmonics(node.table("harmonics"), n_axes) if n not in free))
+    values = {name: float(to_si(geometry.number(key, 0.0), geometry_unit(name))) for key, name in keys.items()}
+    for key in sigma.values:
         if key not in keys:
-            raise table.error(f"unknown key; {suggestion(key, keys)}", key)
-    priors = tuple(name for name in names if geometry_key(name) in table.values)
-    for name in priors:
-        if name not in free:
-            raise table.error(f"{name} has a sigma but is not free; add it to geometry.free", geometry_key(name))
-    if not priors:
-        return VectorParameter(names, values, free)
-    sigmas = np.array([to_si(table.number(geometry_key(n), positive=True), GEOMETRY_UNITS[n]) for n in priors])
-    mean = np.array([values[names.index(name)] for name in priors])
-    return VectorParameter(names, values, free, VectorPrior(priors, mean, np.diag(sigmas**2)))
+            raise sigma.error(f"unknown key; {suggestion(key, keys)}", key)
+        if keys[key] not in free:
+            raise sigma.error(f"{keys[key]} has a sigma but is not free; add it to geometry.free", key)
+    names = tuple(in_order([n for n in known if n in base or n in free or values[n]]))
+    chosen, given = np.array([values[n] for n in names]), tuple(n for n in names if geometry_key(n) in sigma.values)
+    free = tuple(n for n in names if n in free)
+    if not given:
+        return VectorParameter(names, chosen, free)
+    sigmas = np.array([to_si(sigma.number(geometry_key(n), positive=True), geometry_unit(n)) for n in given])
+    mean = np.array([values[name] for name in given])
+    return VectorParameter(names, chosen, free, VectorPrior(given, mean, np.diag(sigmas**2)))
+
+
+def _harmonics(node: Node, n_axes: int) -> list[str]:
+    """All components of the harmonics that the table asks for."""
+    node.allow(*(f"{kind}_{axis + 1}" for kind in HARMONICS for axis in range(n_axes)))
+    found: list[str] = []
+    for key in node.values:
+        kind, axis = key.rsplit("_", 1)
+        if (highest := node.integer(key, 0)) > HIGHEST:
+            raise node.error(f"found {highest}; harmonics have names up to order {HIGHEST}", key)
+        found += harmonic_names(kind, int(axis) - 1, highest)
+    return found

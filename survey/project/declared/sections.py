@@ -15,17 +15,16 @@ from adjust.model.survey import (
     Survey,
     Table,
     Target,
-    VectorParameter,
 )
 from survey.folder.units import from_si
+from survey.project.declared.declarations import WARP_UNITS
 from survey.project.declared.instruments import body_sections, instrument_sections, vertical_sections
 from survey.project.declared.lenses import lens_to_toml
 from survey.project.declared.options import closure_sections, tolerance_sections
-from survey.project.declared.owners import GEOMETRY_UNITS, geometry_key
+from survey.project.declared.owners import geometry_key, geometry_unit
 from survey.project.declared.poses import quaternion_wxyz
-from survey.project.declared.targets import WARP
 from survey.project.declared.toml_text import Section
-from survey.project.declared.vectors import check_vector
+from survey.project.declared.vectors import check_vector, vector_to_toml
 from survey.project.project import FORMAT, AdjustmentOptions, Sigmas, SpotsRequest
 from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind
 
@@ -46,6 +45,8 @@ def survey_sections(survey: Survey, kinds: Mapping[str, TargetKind], sigmas: Sig
     sections += vertical_sections(survey.vertical, survey.bearings)
     sections += instrument_sections(survey.instruments, survey.setups, sigmas.instruments)
     sections += body_sections(survey.beams, survey.surfaces)
+    if survey.temperatures:
+        sections.append((("temperatures_degC",), dict(survey.temperatures)))
     datum: dict[str, Any] = {"kind": survey.datum.kind}
     datum |= {"points": survey.datum.points} if survey.datum.points else {}
     datum |= {"stations": survey.datum.stations} if survey.datum.stations else {}
@@ -151,13 +152,13 @@ def _table(table: Table, sigma: FloatArray | None) -> dict[str, Any]:
     geometry, where = table.geometry, f"tables.{table.table_id}.geometry"
     check_vector(geometry, where)
     numbers = {
-        geometry_key(name): float(from_si(value, GEOMETRY_UNITS[name]))
+        geometry_key(name): float(from_si(value, geometry_unit(name)))
         for name, value in zip(geometry.names, geometry.values, strict=True)
     }
     values["geometry"] = {"free": geometry.free, **numbers}
     if geometry.prior is not None:
         sigmas = zip(geometry.prior.names, np.sqrt(np.diagonal(geometry.prior.cov)), strict=True)
-        values["geometry_sigma"] = {geometry_key(n): float(from_si(s, GEOMETRY_UNITS[n])) for n, s in sigmas}
+        values["geometry_sigma"] = {geometry_key(n): float(from_si(s, geometry_unit(n))) for n, s in sigmas}
     return values
 
 
@@ -168,21 +169,10 @@ def _target(target: Target, kind: TargetKind) -> list[Section]:
         values["station"] = target.station_id
     values |= _poses({"pose": target.carrier_from_target}, ".".join(path))
     if target.warp is not None:
-        values["warp"] = _warp(target.warp, f"targets.{target.target_id}.warp")
+        units = {name: WARP_UNITS[name] for name in target.warp.names}
+        reference = {} if target.reference_temperature == 20.0 else {"reference_degC": target.reference_temperature}
+        values["warp"] = vector_to_toml(target.warp, units, f"targets.{target.target_id}.warp") | reference
     return [(path, values), *_epochs(path, target.epochs)]
-
-
-def _warp(warp: VectorParameter, where: str) -> dict[str, Any]:
-    check_vector(warp, where)
-    if warp.names != WARP or warp.free not in ((), WARP) or (warp.prior and warp.prior.names != WARP):
-        raise SurveyError(f"{where}: the two components are free, held or known together, else they cannot be written")
-    numbers = {f"{name}_mm": float(from_si(value, "mm")) for name, value in zip(WARP, warp.values, strict=True)}
-    sigma = np.sqrt(np.diagonal(warp.prior.cov)) if warp.prior else None
-    return {
-        "free": bool(warp.free),
-        **numbers,
-        **({"sigma_mm": from_si(sigma, "mm").tolist()} if sigma is not None else {}),
-    }
 
 
 def points_file(target_id: str) -> str:

@@ -1,24 +1,26 @@
 """Targets of ``survey.toml``, and what of them a program can find."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
+from adjust.model.boards import BENT
 from adjust.model.survey import FloatArray, Target, VectorParameter, VectorPrior
 from survey.folder.text import suggestion
 from survey.folder.units import to_si
-from survey.project.declared.declarations import DECLARATIONS, keys_of
+from survey.project.declared.declarations import DECLARATIONS, WARP_UNITS, keys_of
 from survey.project.declared.node import Node
 from survey.project.declared.owners import read_epochs
 from survey.project.declared.poses import read_pose
+from survey.project.declared.vectors import key_of, read_vector
 from survey.project.tables.files import read_table
 from survey.project.tables.reading import Layout
 from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid, PointList, TargetKind
 
 _KINDS = tuple(d.of[1] for d in DECLARATIONS if d.path == "targets.ID" and d.of is not None)
 _MOST_ON_BOARD = 250_000  # squares or markers
-WARP = ("warp_x", "warp_y")
 POINTS_LAYOUT = Layout("points of a target", ("point_id",), ("x_mm", "y_mm", "z_mm"))
 
 
@@ -47,6 +49,7 @@ def read_targets(
                 read_pose(node.table("pose")),
                 read_epochs(node, motion == "fixed"),
                 _warp(node.table("warp"), kind_name) if node.has("warp") else None,
+                node.table("warp").number("reference_degC", 20.0),
             )
         )
         kinds[target_id] = kind
@@ -136,14 +139,24 @@ def _points(node: Node, inputs: dict[str, str]) -> TargetKind:
 
 
 def _warp(node: Node, kind_name: str) -> VectorParameter:
+    """Its first two components always, the others where they are free or not zero."""
     if kind_name == "marker_block":
         raise node.error(f"a target of kind {kind_name!r} is no flat board and has no warp; remove it")
     node.allow(*keys_of("warp"))
-    free = WARP if node.flag("free", True) else ()
-    values = np.array([to_si(node.number(f"{name}_mm", 0.0), "mm") for name in WARP])
+    free: tuple[str, ...] = BENT
+    if not isinstance(node.value("free", True), bool):
+        free = node.references("free", WARP_UNITS, "parameter")
+    elif not node.flag("free", True):
+        free = ()
+    asked, keys = (*BENT, *free), {n: key_of(n, WARP_UNITS) for n in WARP_UNITS}
+    units = {n: u for n, u in WARP_UNITS.items()
+             if n in asked or keys[n] in node.table("sigma").values or node.number(keys[n], 0.0)}  # fmt: skip
+    found = read_vector(node, units, (), chosen=tuple(n for n in units if n in free))
     sigma = node.sigmas("sigma", ("mm",), 2)
     if sigma is None:
-        return VectorParameter(WARP, values, free)
-    if not free:
+        return found
+    if not set(BENT) <= set(free):
         raise node.error("the warp has a sigma but is not free; write free = true or remove the sigma", "sigma_mm")
-    return VectorParameter(WARP, values, free, VectorPrior(WARP, values, np.diag(sigma**2)))
+    if found.prior is not None:
+        raise node.error("both sigma and sigma_mm are given; keep sigma", "sigma_mm")
+    return replace(found, prior=VectorPrior(BENT, found.values[:2], np.diag(sigma**2)))

@@ -28,10 +28,15 @@ def key_of(name: str, units: Units) -> str:
     return name if units[name] == "1" else f"{name}_{units[name]}"
 
 
-def read_vector(node: Node, units: Units, free: tuple[str, ...], missing: float = 0.0) -> VectorParameter:
-    """The parameters of a table; ``free`` where it does not say, ``missing`` for what has no value."""
+def read_vector(
+    node: Node, units: Units, free: tuple[str, ...], missing: float = 0.0, chosen: tuple[str, ...] | None = None
+) -> VectorParameter:
+    """The parameters of a table; ``free`` where it does not say, ``missing`` for what has no value.
+
+    chosen: those that are free, where the caller has read that.
+    """
     names = tuple(units)
-    chosen = node.references("free", names, "parameter", free)
+    chosen = node.references("free", names, "parameter", free) if chosen is None else chosen
     values = np.full(len(names), missing)
     for i, name in enumerate(names):
         if node.has(key_of(name, units)):

@@ -77,7 +77,19 @@ def vector_table(entry: dict[str, Any], ratios: dict[str, float] | None = None) 
         rows.append(row)
     columns = ["<Parameter", "Value", "σ", "<Unit", "<Status"] + ([] if ratios is None else ["|value| / σ"])
     at_zero = note(t("Held at zero: {names}.", names=joined(idle, ", "))) if idle else Markup()
-    return (table(columns, rows) if rows else Markup()) + at_zero
+    return (table(columns, rows) if rows else Markup()) + at_zero + _tests(entry.get("significance", {}))
+
+
+def _tests(found: dict[str, Any]) -> Markup:
+    """Which terms of a model differ from zero, and which do not."""
+    parts = []
+    for term, test in found.items():
+        kind = pill("quiet", t("significant")) if test["significant"] else pill("warn", t("not significant"))
+        said = t("{term}: {statistic} with {freedom} degrees of freedom, p {p}", term=term.replace("_", " "),
+                 statistic=general(test["statistic"], 4), freedom=", ".join(map(count, test["freedom"])),
+                 p=general(test["p_value"], 2))  # fmt: skip
+        parts.append(note(joined((kind, said), " ")))
+    return joined(parts)
 
 
 def _pose_row(pose: _Pose) -> list[str]:

@@ -1,0 +1,71 @@
+"""Whether estimated terms of a model differ from zero: one test for all of them.
+
+Terms that only mean something together (a cosine and a sine, bends along both edges) are tested together: with values
+x (k,) and covariance C, ``x' inv(C) x`` is chi-square with k degrees of freedom where sigma0 is known, and
+``x' inv(C) x / (k sigma0^2)`` Fisher's F(k, f) where it comes from f redundant observations (Koch 1999, 4.2.1).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.model.boards import BENT
+from adjust.model.result import Adjustment, Estimate
+from adjust.model.survey import FloatArray
+from adjust.model.tables import harmonic
+from adjust.testing.distributions import chi2, fisher
+
+LEVEL = 0.05
+"""Error probability where the adjustment has no global test."""
+_BOARD = {"bend": (*BENT, "warp_xy"), "stretch": ("scale_x", "scale_y", "shear"), "expansion": ("expansion",)}
+
+
+@dataclass(frozen=True)
+class Significance:
+    """The test of one term. statistic: F, or chi-square where sigma0 is known and ``freedom`` has one number."""
+
+    term: str
+    components: tuple[str, ...]
+    statistic: float
+    freedom: tuple[int, ...]
+    p: float
+    significant: bool
+
+
+def zero_test(x: FloatArray, cov: FloatArray, redundancy: int | None = None) -> tuple[float, tuple[int, ...], float]:
+    """Statistic, degrees of freedom and p-value that x (k,) is zero; redundancy: of the sigma0^2 that is in ``cov``."""
+    k = len(x)
+    statistic = float(x @ np.linalg.solve(cov, x))
+    if redundancy is None:
+        return statistic, (k,), float(chi2.sf(statistic, k))
+    return statistic / k, (k, redundancy), float(fisher.sf(statistic / k, k, redundancy))
+
+
+def terms_of(estimate: Estimate) -> Mapping[str, Sequence[str]]:
+    """The terms of an estimate that may be zero, with their components that are estimated; none for most."""
+    known: Mapping[str, Sequence[str]] = _BOARD if estimate.name[0] == "warp" else _harmonics(estimate.components)
+    free = {c for c, status in zip(estimate.components, estimate.status, strict=True) if status not in ("held", "tied")}
+    return {term: kept for term, names in known.items() if (kept := [n for n in names if n in free])}
+
+
+def _harmonics(components: Sequence[str]) -> Mapping[str, Sequence[str]]:
+    """The pairs of components of a table's geometry that are harmonics."""
+    out: dict[str, list[str]] = {}
+    for name in components:
+        if (found := harmonic(name)) is not None:
+            out.setdefault(found.term, []).append(name)
+    return out
+
+
+def significances(adjustment: Adjustment, estimate: Estimate, estimated_sigma0: bool) -> tuple[Significance, ...]:
+    """The tests of all terms of an estimate, with sigma0 of the adjustment or with one."""
+    redundancy = adjustment.redundancy if estimated_sigma0 else None
+    level = LEVEL if adjustment.global_test is None else adjustment.global_test.alpha
+    values, factor = np.asarray(estimate.value, dtype=float), adjustment.sigma0**2 if estimated_sigma0 else 1.0
+    out = []
+    for term, names in terms_of(estimate).items():
+        at = [estimate.components.index(name) for name in names]
+        statistic, freedom, p = zero_test(values[at], factor * estimate.cov[np.ix_(at, at)], redundancy)
+        out.append(Significance(term, tuple(names), statistic, freedom, p, p < level))
+    return tuple(out)

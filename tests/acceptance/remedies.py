@@ -1,0 +1,124 @@
+"""Terms that an adjustment may be given beside the usual unknowns: are they found, are their sigmas true, are they
+silent where there is nothing?
+
+``python -m tests.acceptance.remedies 100`` prints a table: for every kind of term, over so many repeats with fresh
+noise, the mean of d' inv(C) d over its degrees of freedom (1 where the sigmas are true), the share of repeats in which
+the truth lies in the 95 % region, how often the test finds the term, and how often it finds it where it is zero. Names
+after the number choose kinds.
+"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adjust.adjustment import adjust
+from adjust.model.result import ParameterName
+from adjust.model.survey import FloatArray, Survey, VectorParameter
+from adjust.model.tables import harmonic_names
+from adjust.testing.distributions import chi2
+from adjust.testing.significance import significances
+from survey.simulate import Truth, head_on_table, resample, stereo
+
+
+@dataclass(frozen=True, eq=False)
+class Remedy:
+    """A survey that estimates some terms, with their true values and without them; which estimate they are part of."""
+
+    name: str
+    survey: Survey
+    truth: Truth
+    innocent: Truth
+    of: ParameterName
+    term: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of n repeats: degrees of freedom k, d' inv(C) d (n,), how often the test found the term, and where it is zero."""
+
+    k: int
+    squares: FloatArray
+    found: int
+    false: int
+
+    @property
+    def covered(self) -> int:
+        """Repeats whose 95 % region holds the truth."""
+        return int(np.sum(self.squares <= chi2.ppf(0.95, self.k)))
+
+
+def board(name: str, term: str, values: dict[str, float], free: tuple[str, ...] | None = None) -> Remedy:
+    """A board that a stereo rig of known length sees 12 times, at temperatures of its own."""
+    survey, truth = stereo(21, n_pairs=12)
+    target, names = survey.targets[0], free or tuple(values)
+    epochs = dict.fromkeys(b.epoch_id for b in survey.image_blocks)
+    warp = VectorParameter(names, np.zeros(len(names)), names)
+    survey = replace(survey, targets=(replace(target, warp=warp),),
+                     temperatures={e: 17.0 + 0.5 * i for i, e in enumerate(epochs)})  # fmt: skip
+    key = ("warp", target.target_id)
+    true = np.array([values.get(n, 0.0) for n in names])
+    return Remedy(name, survey, truth | {key: true}, truth | {key: np.zeros(len(names))}, key, term)
+
+
+def table(name: str, term: str, harmonics: dict[str, int], values: dict[str, float]) -> Remedy:
+    """Two cameras on a table that turns all round; harmonics up to some order, of which few are not zero."""
+    survey, truth = head_on_table(22, n_cameras=2, n_table_epochs=14, n_free_epochs=4)
+    turntable = survey.tables[0]
+    given = turntable.geometry
+    waves = tuple(n for key, k in harmonics.items() for n in harmonic_names(key[:-2], int(key[-1]) - 1, k))
+    key = ("table_geometry", turntable.table_id)
+    geometry = replace(given, names=(*given.names, *waves), values=np.append(given.values, np.zeros(len(waves))),
+                       free=(*given.free, *waves))  # fmt: skip
+    survey = replace(survey, tables=(replace(turntable, geometry=geometry),))
+    base = np.asarray(truth[key])
+    true, none = (np.append(base, [v.get(n, 0.0) for n in waves]) for v in (values, {}))
+    return Remedy(name, survey, truth | {key: true}, truth | {key: none}, key, term)
+
+
+REMEDIES: dict[str, Callable[[], Remedy]] = {
+    "board bent": lambda: board("board bent", "bend", {"warp_x": 3e-4, "warp_y": -2e-4, "warp_xy": 5e-5}),
+    "board stretched": lambda: board("board stretched", "stretch", {"scale_y": 6e-4, "shear": -4e-4}),
+    "board expands": lambda: board("board expands", "expansion", {"expansion": 80e-6}),
+    "encoder eccentric": lambda: table(
+        "encoder eccentric", "angle_2_order_1", {"angle_2": 2}, {"angle_2_cos_1": 2e-4, "angle_2_sin_1": -1e-4}
+    ),
+    "axis runs out": lambda: table(
+        "axis runs out", "radial_2_order_-1", {"radial_2": 2}, {"radial_2_re_m1": 2e-4, "radial_2_im_m1": 1e-4}
+    ),
+    "axis wobbles": lambda: table(
+        "axis wobbles", "tilt_2_order_+2", {"tilt_2": 2, "axial_2": 1}, {"tilt_2_re_p2": 3e-4, "axial_2_cos_1": 1e-4}
+    ),
+}
+
+
+def outcome(remedy: Remedy, repeats: int, seed: int = 1) -> Outcome:
+    """Adjusted again and again with fresh noise, with the terms and without."""
+    squares, found, false, k = [], 0, 0, 0
+    for i in range(repeats):
+        for truth in (remedy.truth, remedy.innocent):
+            result = adjust(resample(remedy.survey, truth, 1000 * seed + i))
+            estimate = result.estimates[remedy.of]
+            test = next(s for s in significances(result, estimate, True) if s.term == remedy.term)
+            if truth is remedy.innocent:
+                false += test.significant
+                continue
+            at = [estimate.components.index(c) for c in test.components]
+            d = (np.asarray(estimate.value) - np.asarray(truth[remedy.of]))[at]
+            squares.append(float(d @ np.linalg.solve(estimate.cov[np.ix_(at, at)], d)))
+            found, k = found + test.significant, len(at)
+    return Outcome(k, np.array(squares), found, false)
+
+
+def main() -> None:
+    repeats, chosen = int(sys.argv[1]), sys.argv[2:] or list(REMEDIES)
+    print("| term | freedom | mean square | in 95 % region | found | found where zero |")
+    print("|---|---|---|---|---|---|")
+    for name in chosen:
+        o = outcome(REMEDIES[name](), repeats)
+        print(f"| {name} | {o.k} | {o.squares.mean() / o.k:.2f} | {o.covered} | {o.found} | {o.false} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""Boards that deviate, temperatures and harmonics of tables: from survey.toml to the report, and back."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import survey as labsurvey
+from adjust.model.errors import SurveyError
+from adjust.model.survey import TABLE_GEOMETRY, Survey, VectorParameter, VectorPrior
+from adjust.model.tables import harmonic_names
+from survey.project import read, write_project
+from survey.report.page import report_html
+from survey.report.terminal import summary_text
+from survey.simulate import Truth, head_on_table, resample
+from tests.survey.test_files import differences
+
+WAVES = (*harmonic_names("angle", 1, 2), *harmonic_names("radial", 1, 1))
+BENT = ("warp_x", "warp_y", "shear", "expansion")
+
+
+def uneven() -> tuple[Survey, Truth]:
+    """A head on a table with an eccentric encoder, before a board that is bent and leans, at two temperatures."""
+    survey, truth = head_on_table(5, n_cameras=2, n_table_epochs=9, n_free_epochs=4)
+    (table,), (board,) = survey.tables, survey.targets
+    given = table.geometry
+    prior = VectorPrior(WAVES[-1:], np.zeros(1), np.array([[1e-8]]))
+    geometry = replace(given, names=(*given.names, *WAVES), values=np.append(given.values, np.zeros(len(WAVES))),
+                       free=(*given.free, *WAVES), prior=prior)  # fmt: skip
+    warp = VectorParameter(BENT, np.array([0.0, 0.0, 0.0, 23e-6]), BENT[:3],
+                           VectorPrior(BENT[:1], np.zeros(1), np.array([[1e-6]])))  # fmt: skip
+    epochs = dict.fromkeys(b.epoch_id for b in survey.image_blocks)
+    survey = replace(survey, tables=(replace(table, geometry=geometry),),
+                     targets=(replace(board, warp=warp, reference_temperature=18.5),),
+                     temperatures={e: 20.0 + i % 2 for i, e in enumerate(epochs)})  # fmt: skip
+    key = ("table_geometry", table.table_id)
+    waves = [3e-4, -2e-4, 0.0, 0.0, 0.0, 0.0]
+    truth = truth | {key: np.append(np.asarray(truth[key]), waves),
+                     ("warp", "board"): np.array([3e-4, 0.0, -4e-4, 23e-6])}  # fmt: skip
+    made = resample(survey, truth, 1)
+    return replace(made, tables=survey.tables, targets=survey.targets), truth  # priors at the values that are written
+
+
+def test_a_project_says_what_deviates(tmp_path: Path) -> None:
+    survey, _ = uneven()
+    write_project(tmp_path / "a", survey)
+    again = read(tmp_path / "a")
+    for name in ("tables", "targets", "temperatures"):
+        assert differences(getattr(again.survey, name), getattr(survey, name)) == []
+    write_project(tmp_path / "b", again.survey, target_kinds=again.target_kinds)
+    assert (tmp_path / "b" / "survey.toml").read_text() == (tmp_path / "a" / "survey.toml").read_text()
+
+
+def test_harmonics_up_to_an_order_are_all_their_components(tmp_path: Path) -> None:
+    survey, _ = uneven()
+    write_project(tmp_path, survey)
+    path = tmp_path / "survey.toml"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("geometry")]
+    path.write_text("\n".join(lines).replace("[tables.turntable]", "[tables.turntable]\nharmonics.tilt_2 = 2"))
+    (table,) = read(tmp_path).survey.tables
+    assert table.geometry.names == (*TABLE_GEOMETRY, *harmonic_names("tilt", 1, 2))
+    assert table.geometry.free == (*TABLE_GEOMETRY[:2], *harmonic_names("tilt", 1, 2))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("[tables.turntable]", "[tables.turntable]\nharmonics.tilt_3 = 2", r"tilt_3: unknown key"),
+        ("[tables.turntable]", "[tables.turntable]\nharmonics.tilt_2 = 9", r"tilt_2: found 9; .* up to order 8"),
+        ('"shear"', '"sheer"', r"free.*unknown parameter 'sheer'.*shear"),
+        ("shear_ppm = 0.0", "sheer_ppm = 0.0", r"sheer_ppm: unknown key.*shear_ppm"),
+    ],
+)
+def test_what_there_is_not_is_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
+    survey, _ = uneven()
+    write_project(tmp_path, survey)
+    path = tmp_path / "survey.toml"
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(SurveyError, match=rf"survey\.toml:\d+: .*{said}"):
+        read(tmp_path)
+
+
+def test_an_epoch_without_a_temperature_is_named(tmp_path: Path) -> None:
+    survey, _ = uneven()
+    first = next(iter(survey.temperatures))
+    write_project(tmp_path, replace(survey, temperatures={e: t for e, t in survey.temperatures.items() if e != first}))
+    with pytest.raises(SurveyError, match=f"target 'board' expands, but epoch '{first}' has no temperature"):
+        labsurvey.adjust(tmp_path)
+
+
+@pytest.mark.slow
+def test_values_and_tests_reach_result_and_report(tmp_path: Path) -> None:
+    survey, _ = uneven()
+    write_project(tmp_path, survey)
+    solution = labsurvey.adjust(tmp_path)
+    warp, geometry = (solution.as_dict[kind][owner][key] for kind, owner, key in (
+        ("targets", "board", "warp"), ("tables", "turntable", "geometry")))  # fmt: skip
+    assert abs(warp["shear_ppm"] + 400.0) < 4.0 * warp["sigma_shear_ppm"]
+    assert warp["expansion_ppm_per_K"] == pytest.approx(23.0)
+    assert warp["significance"]["bend"]["significant"]
+    assert warp["significance"]["stretch"]["components"] == ["shear"]
+    wanted = 3e-4 * 180 * 3600 / np.pi
+    assert abs(geometry["angle_2_cos_1_arcsec"] - wanted) < 4.0 * geometry["sigma_angle_2_cos_1_arcsec"]
+    assert geometry["significance"]["angle_2_order_1"]["significant"]
+    for language, said in (("en", "not significant"), ("de", "nicht signifikant")):
+        page = report_html(solution.adjustment, solution.run, None, None, language)
+        assert "angle 2 order 1" in page
+        assert said in page
+    text = summary_text(solution.adjustment, solution.run)
+    assert "target board" in text
+    assert "angle 2 order 1" in text
