@@ -106,8 +106,8 @@ def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> 
     sums = (np.add.reduceat(x[every], edges[:-1]).tolist() for x in (found.n, found.redundancy, found.omega))
     total = int(np.count_nonzero(found.n))
     return tuple(
-        Part(*label, every[i:j], n, r, omega)
-        for label, (i, j), n, r, omega in zip(members, pairwise(edges.tolist()), *sums, strict=True)
+        Part(kind, name, every[i:j], n, r, omega)
+        for (kind, name), (i, j), n, r, omega in zip(members, pairwise(edges.tolist()), *sums, strict=True)
         if r > _LEAST and j - i < total
     )
 
@@ -164,9 +164,10 @@ def tested_parts(
         found = _p_relative(adjustment, r, omega)
     else:
         found = upper_tail_bound(omega, r)
-        for i in _undecided(system, parts, (n, r, omega, found), level) if system is not None else ():
-            rows = _rows(system, parts[i])
-            found[i] = min(found[i], upper_tail(omega[i], eigenvalues(system, rows, round(n[i]))))
+        if system is not None:
+            for i in _undecided(system, parts, (n, r, omega, found), level):
+                rows = _rows(system, parts[i])
+                found[i] = min(found[i], upper_tail(omega[i], eigenvalues(system, rows, round(n[i]))))
     out = [
         PartTest(part.kind, part.name, round(part.n), part.redundancy, part.omega, part.omega / part.redundancy, p,
                  p < level) for part, p in zip(parts, found.tolist(), strict=True)
