@@ -240,15 +240,22 @@ def test_it_ends_with_pages_still_open(mine):
         assert list(socket) == []  # closed by the server
 
 
-def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine):
-    """The first adjustment is held at its first step until the observations have been asked for."""
+@pytest.mark.parametrize("kept", [True, False])
+def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine, kept):
+    """The first adjustment is held at its first step; results of the same inputs stand for it until then."""
+    if not kept:
+        with (mine / "survey.toml").open("a") as stream:
+            stream.write("\n")  # other inputs than those of the results
     bench, seen = Workbench(mine), threading.Event()
     server = Server(bench, TOKEN)
     bench.watch = lambda _step, _omega: seen.wait(20.0)
     with TestClient(server.app(), base_url="http://127.0.0.1:8790") as client:
-        assert client.get("/api/state", headers=HERE).json()["solution"] is None
+        state = client.get("/api/state", headers=HERE).json()
+        assert state["solution"] is None
+        assert (state["kept"] is not None) == kept
         assert client.get("/api/points", headers=HERE).status_code == 200
-        assert client.get("/api/findings", headers=HERE).json()["findings"] == []
+        early = client.get("/api/findings", headers=HERE).json()
+        assert bool(early["findings"]) == kept
         assert client.get("/api/state", headers=HERE).json()["solution"] is None
         seen.set()
         for _ in range(400):
@@ -257,7 +264,13 @@ def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine):
                 break
             time.sleep(0.05)
         assert state["solution"]["verdict"]
+        assert state["kept"] is None
         assert client.get("/api/parameters", headers=HERE).status_code == 200
+        if kept:
+            late = client.get("/api/findings", headers=HERE).json()
+            of_points = [f["id"] for f in late["findings"] if f["kind"] == "image_point"]
+            assert [f["id"] for f in early["findings"]][:10] == of_points[:10]
+            assert early["verdict"] == late["verdict"]
 
 
 def test_messages_are_in_the_language_that_is_asked_for(mine):

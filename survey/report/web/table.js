@@ -94,7 +94,7 @@ export class Table {
 
   row(place) {
     const i = this.shown[place], state = this.data.state?.(i) ?? "";
-    const row = make("div", { role: "row", class: `row ${state}`, "aria-rowindex": place + 2, "aria-selected": this.selected.has(this.data.id(i)), data: { place } });
+    const row = make("div", { role: "row", class: `row ${state}`, "aria-rowindex": place + 2, "aria-selected": this.selected.has(this.data.id(i)), data: { place, id: this.data.id(i) } });
     for (const column of this.data.columns) {
       row.append(make("span", { role: "gridcell", class: column.values ? "r" : "l" }, this.text(column, i)));
     }

@@ -3,15 +3,20 @@
 import { button, colour, make, surface } from "./dom.js";
 import { count, number, t } from "./words.js";
 import { current, names, select } from "./store.js";
-import { picture, pointId, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./source.js";
+import { pointId, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./columns.js";
 
 const NEAR = 14; // px on the screen: what a click takes hold of
+const FILM = 60; // pictures in the strip, about the one that is shown: each is a canvas
 const SCALES = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
 
 export class ImageView {
-  /** @param {any} bench the page's values: `points`, `sizes` of images by camera, `limit` of w */
-  constructor(bench) {
+  /**
+   * @param {any} bench the page's values: `points`, `sizes` of images by camera, `limit` of w
+   * @param {((image: string, size: string|number) => Promise<ImageBitmap>)|null} picture of an image; null: there are none
+   */
+  constructor(bench, picture) {
     this.bench = bench;
+    this.picture = picture;
     this.image = "";
     this.enlarged = 200;
     this.overlay = true;
@@ -98,9 +103,10 @@ export class ImageView {
     this.title.textContent = image.replace("/", " · ");
     this.film();
     this.note.textContent = "";
+    if (!this.picture) { this.surface.redraw(); return; }
     const started = performance.now();
     try {
-      const bitmap = await picture(image, 1600);
+      const bitmap = await this.picture(image, 1600);
       if (this.image !== image) return;
       this.bitmap = bitmap;
       this.size ??= [bitmap.width, bitmap.height];
@@ -115,9 +121,12 @@ export class ImageView {
   /** Pictures of the same camera, or those of the same moment; only what is in sight is fetched. */
   film() {
     const [camera, epoch] = this.image.split("/"), data = this.bench.points;
-    const near = data.images.filter((name) => name.startsWith(`${camera}/`));
-    if (near.join() !== this.filmed) {
-      this.filmed = near.join();
+    if (!this.picture) return;
+    const all = data.images.filter((name) => name.startsWith(`${camera}/`)), at = all.indexOf(this.image);
+    const k = this.filmed?.indexOf(this.image) ?? -1, cut = (k < 6 && this.filmed?.[0] !== all[0]) || (k > FILM - 6 && this.filmed?.at(-1) !== all.at(-1));
+    if (k < 0 || cut || this.filmedOf !== all.length) {
+      const from = Math.max(0, Math.min(at - FILM / 2, all.length - FILM)), near = all.slice(from, from + FILM);
+      [this.filmed, this.filmedOf] = [near, all.length];
       this.seen?.disconnect();
       this.seen = new IntersectionObserver((entries) => { for (const entry of entries) if (entry.isIntersecting) this.thumbnail(entry.target); }, { root: this.strip, rootMargin: "200px" });
       this.strip.replaceChildren(...near.map((name) => {
@@ -137,7 +146,7 @@ export class ImageView {
   async thumbnail(place) {
     this.seen.unobserve(place);
     try {
-      const bitmap = await picture(place.dataset.image, 240), canvas = place.querySelector("canvas");
+      const bitmap = await this.picture(place.dataset.image, 240), canvas = place.querySelector("canvas");
       const scale = Math.min(96 / bitmap.width, 72 / bitmap.height);
       canvas.getContext("2d").drawImage(bitmap, (96 - scale * bitmap.width) / 2, (72 - scale * bitmap.height) / 2, scale * bitmap.width, scale * bitmap.height);
     } catch { /* an image without a file keeps its name only */ }
@@ -236,9 +245,9 @@ export class ImageView {
 
   sharper() {
     const image = this.image;
-    if (this.asked === image) return;
+    if (this.asked === image || !this.picture) return;
     this.asked = image;
-    picture(image, "full").then((bitmap) => { if (this.image === image) { this.bitmap = bitmap; this.surface.redraw(); } }, () => {}).finally(() => { this.asked = ""; });
+    this.picture(image, "full").then((bitmap) => { if (this.image === image) { this.bitmap = bitmap; this.surface.redraw(); } }, () => {}).finally(() => { this.asked = ""; });
   }
 
   marks(context, rows) {
