@@ -194,14 +194,14 @@ def every_observation(c: Context) -> Markup:
         texts[:, mine], values[:, mine] = part_texts, part_values
     names = dict(zip(_NAMES, texts.tolist(), strict=True))
     numbers = _numbers(values) | _reliability(c, values)
-    columns = [
+    made = [
         {"key": x, "title": known(x)}
         | (_coded(names[x]) if x in _NAMES else _numeric(x, numbers[x], _digits(x, numbers, values))) for x in COLUMNS
     ]  # fmt: skip
     n_images = len(c.adjustment.image_residuals.test)
     readings = ["" if k < n_images else name_of_residual(c.adjustment.other_residuals[k - n_images])
                 for k in values[10].astype(int).tolist()]  # fmt: skip
-    data = {"rows": len(chosen), "columns": columns, "flags": values[9].astype(int).tolist(),
+    data = {"rows": len(chosen), "columns": made, "flags": values[9].astype(int).tolist(),
             "places": _coded(readings), "at": [COLUMNS.index("Where"), COLUMNS.index("Point")]}  # fmt: skip
     said = t(
         "Every observation, one row per component, largest |w| first. w: Baarda's standardized residual. Gross error: "
