@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+import capture.web
 from survey.examples import write_example
 from survey.report.language import catalogue
 from survey.report.modules import WEB as SHARED
@@ -28,6 +29,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 WRONG = ("tX05", "X", "board", "c40")  # an image point that is moved by 4 px
 NAME = "X/tX05/board/c40"
 SECONDS = 30.0
+READY = "document.body.dataset.ready !== undefined"
 VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations",
          "settings", "network", "jobs")  # fmt: skip
 ROWS = "Number(document.querySelector('#tables [role=grid]').getAttribute('aria-rowcount'))"
@@ -45,7 +47,7 @@ def need_playwright() -> Any:
 class Page:
     """A page of the workbench, with what it complained of and what it asked of others."""
 
-    def __init__(self, browser: Any, address: str, width: int, **given: Any) -> None:
+    def __init__(self, browser: Any, address: str, width: int, ready: str = READY, **given: Any) -> None:
         self.context = browser.new_context(viewport={"width": width, "height": 800}, locale="en-GB", **given)
         self.page = self.context.new_page()
         self.complaints: list[str] = []
@@ -54,7 +56,7 @@ class Page:
         self.page.on("request", lambda r: None if r.url.startswith((address.split("#")[0], "blob:")) else
                      self.complaints.append(r.url))  # fmt: skip
         self.page.goto(address)
-        self.wait("document.body.dataset.ready !== undefined")
+        self.wait(ready)
 
     def wait(self, expression: str) -> None:
         """Polls from outside: inside the page the content policy forbids evaluating a text."""
@@ -262,6 +264,7 @@ def test_german(page: Page) -> None:
 def said_by_the_page() -> set[str]:
     """Every text that the scripts hand to ``t``, directly or from the lists of views, tables, keys and regions."""
     sources = {path.name: path.read_text() for at in (SHARED, WEB) for path in at.glob("*.js")}
+    sources["capture.js"] = (Path(capture.web.__file__).parent / "app.js").read_text()
     found = {text for source in sources.values() for text in re.findall(r'\bt\(\s*"((?:[^"\\]|\\.)*)"', source)}
     app = sources["app.js"]
     views = re.search(r"const VIEWS = \{.*?\n\};", app, re.DOTALL)
@@ -269,6 +272,7 @@ def said_by_the_page() -> set[str]:
     found |= set(re.findall(r': \["([^"]+)"', views[0]))
     for line in re.findall(r"const (?:REGIONS|TABLES) = .*", app + sources["tables.js"]):
         found |= set(re.findall(r'(?:", |: )"([^"]+)"', line))
+    found |= {"not started", "running", "paused", "finished", "stopped", "broken off", "live"}  # states of a session
     jobs = re.search(r"const JOBS = \[.*?\n\];", sources["jobs.js"], re.DOTALL)
     assert jobs is not None
     found |= set(re.findall(r'\["\w+", "([^"]+)"', jobs[0]))

@@ -13,10 +13,12 @@ export class ImageView {
   /**
    * @param {any} bench the page's values: `points`, `sizes` of images by camera, `limit` of w
    * @param {((image: string, size: string|number) => Promise<ImageBitmap>)|null} picture of an image; null: there are none
+   * @param {boolean} [steady] one camera whose pictures come by themselves: its place stays, nothing is chosen
    */
-  constructor(bench, picture) {
+  constructor(bench, picture, steady = false) {
     this.bench = bench;
     this.picture = picture;
+    this.steady = steady;
     this.image = "";
     this.enlarged = 200;
     this.overlay = true;
@@ -30,9 +32,9 @@ export class ImageView {
     this.strip = make("div", { class: "filmstrip", role: "listbox", "aria-label": t("Images of this camera") });
     this.element = make("div", { class: "view image" },
       make("div", { class: "bar" }, this.title, this.scale,
-        button("−", () => this.enlarge(-1), "-", { "aria-label": t("shorter vectors") }), button("+", () => this.enlarge(1), "+", { "aria-label": t("longer vectors") }),
+        steady ? null : [button("−", () => this.enlarge(-1), "-", { "aria-label": t("shorter vectors") }), button("+", () => this.enlarge(1), "+", { "aria-label": t("longer vectors") })],
         button("⤢", () => { this.fit = true; this.surface.redraw(); }, "0", { "aria-label": t("Whole") }), button("1:1", () => this.zoomTo(1 / (devicePixelRatio || 1)), "", { "aria-label": "1:1" })),
-      make("div", { class: "stage" }, canvas, this.note), this.strip);
+      make("div", { class: "stage" }, canvas, this.note), steady ? null : this.strip);
     this.listen(canvas);
     this.follow();
   }
@@ -97,8 +99,7 @@ export class ImageView {
 
   async open(image) {
     this.image = image;
-    this.bitmap = null;
-    this.fit = true;
+    if (!this.steady) { this.bitmap = null; this.fit = true; }
     this.size = this.bench.sizes[image.split("/")[0]];
     this.title.textContent = image.replace("/", " · ");
     this.film();
@@ -121,7 +122,7 @@ export class ImageView {
   /** Pictures of the same camera, or those of the same moment; only what is in sight is fetched. */
   film() {
     const [camera, epoch] = this.image.split("/"), data = this.bench.points;
-    if (!this.picture) return;
+    if (!this.picture || this.steady) return;
     const all = data.images.filter((name) => name.startsWith(`${camera}/`)), at = all.indexOf(this.image);
     const k = this.filmed?.indexOf(this.image) ?? -1, cut = (k < 6 && this.filmed?.[0] !== all[0]) || (k > FILM - 6 && this.filmed?.at(-1) !== all.at(-1));
     if (k < 0 || cut || this.filmedOf !== all.length) {
@@ -216,7 +217,7 @@ export class ImageView {
 
   click(event) {
     const at = this.nearest(event.offsetX, event.offsetY);
-    if (at < 0) return;
+    if (at < 0 || this.steady) return;
     const id = `image_point:${pointId(this.bench.points, at)}`, { kind, ids } = current();
     if (event.shiftKey && kind === "obs") select("obs", ids.includes(id) ? ids.filter((x) => x !== id) : [...ids, id]);
     else select("obs", id);
@@ -235,9 +236,9 @@ export class ImageView {
       context.imageSmoothingEnabled = this.s * size[0] < 4 * this.bitmap.width;
       context.drawImage(this.bitmap, this.ox, this.oy, this.s * size[0], this.s * size[1]);
     } else { context.fillStyle = colour("sunk"); context.fillRect(this.ox, this.oy, this.s * size[0], this.s * size[1]); }
-    this.scale.textContent = this.overlay ? `v × ${count(this.enlarged)}` : t("overlay off (o)");
-    this.scale.title = t("residual vectors enlarged");
     const rows = rowsOfImage(data, this.image);
+    this.scale.textContent = !this.overlay ? t("overlay off (o)") : this.steady ? t("{n} points", { n: count(rows.length) }) : `v × ${count(this.enlarged)}`;
+    this.scale.title = this.steady ? "" : t("residual vectors enlarged");
     if (this.overlay) this.marks(context, rows);
     const out = rows.reduce((sum, i) => sum + (data.used[i] ? 0 : 1), 0);
     this.surface.canvas.setAttribute("aria-label", t("Image {image}: {n} points, {out} left out, residual vectors enlarged {k} times", { image: this.image, n: rows.length, out, k: this.enlarged }));

@@ -3,7 +3,8 @@
 import { button, by, make } from "./dom.js";
 import { known, number, significant, spoken, t } from "./words.js";
 import { current, go, names, start, subscribe } from "./store.js";
-import { get, live, picture, points, post, speak, takeToken, wantedLanguage } from "./source.js";
+import { get, live, picture, points, post, takeToken } from "./source.js";
+import { changeLanguage, speak, wantedLanguage } from "./speech.js";
 import { Tables } from "./tables.js";
 import { askReason, previewText, showKeys, tell } from "./dialogs.js";
 import { drawTree, markTree } from "./tree.js";
@@ -201,7 +202,7 @@ const KEYS = [
   ["+", "longer vectors, larger ellipsoids", () => enlarge(1)], ["-", "shorter vectors, smaller ellipsoids", () => enlarge(-1)],
   ["0", "the whole image or scene", () => whole()], ["o", "overlay on or off", () => { const view = viewOf(ImageView); if (view) { view.overlay = !view.overlay; view.surface.redraw(); } }],
   ["d", "before and after", () => actions.show("compare", "left")], ["v", "next view in this pane", () => nextView(1)], ["V", "previous view in this pane", () => nextView(-1)],
-  ["g", "language", () => changeLanguage()], ["Escape", "give up what is being adjusted", () => { if (busy) post("cancel").catch(() => {}); else by("message").replaceChildren(); }], ["?", "these keys", () => showKeys(KEYS.map(([key, does]) => [key, t(`key ${does}`)]))],
+  ["g", "language", () => otherLanguage()], ["Escape", "give up what is being adjusted", () => { if (busy) post("cancel").catch(() => {}); else by("message").replaceChildren(); }], ["?", "these keys", () => showKeys(KEYS.map(([key, does]) => [key, t(`key ${does}`)]))],
 ];
 
 function viewStep(step) {
@@ -254,7 +255,7 @@ function drawDoing() {
     by("doing").dataset.language = spoken();
     by("doing").setAttribute("aria-label", t("Actions"));
     by("doing").replaceChildren(make("output", { id: "working", class: "working", hidden: true }), button(t("Adjust"), () => actions.adjust("warm"), "a", { id: "adjust" }), button(t("Undo"), () => actions.undo(), "u", { id: "undo" }), button(t("Redo"), () => actions.redo(), "U", { id: "redo" }), button(t("Save"), () => actions.save(), "s", { id: "save", class: "primary" }),
-      button(spoken() === "en" ? "DE" : "EN", () => changeLanguage(), "g", { "aria-label": t("language") }), button("?", () => KEYS.at(-1)?.[2](), "?", { "aria-label": t("Keys") }));
+      button(spoken() === "en" ? "DE" : "EN", () => otherLanguage(), "g", { "aria-label": t("language") }), button("?", () => KEYS.at(-1)?.[2](), "?", { "aria-label": t("Keys") }));
   }
   by("undo").disabled = !state.undo.length || state.read_only;
   by("redo").disabled = !state.redo.length || state.read_only;
@@ -268,10 +269,8 @@ function drawTabs() {
   by("tabs").replaceChildren(...REGIONS.map(([id, title]) => make("button", { type: "button", "aria-current": document.body.dataset.pane === id ? "page" : null, onclick: () => focus(id) }, t(PANES.includes(id) ? VIEWS[panes()[PANES.indexOf(id)]][0] : title))));
 }
 
-async function changeLanguage() {
-  const to = spoken() === "en" ? "de" : "en";
-  localStorage.setItem("language", to);
-  await speak(to);
+async function otherLanguage() {
+  await changeLanguage();
   bench.state = null; // what the server says is said in its language too
   await renew(null);
   drawn();

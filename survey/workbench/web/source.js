@@ -1,8 +1,8 @@
-// What the server says, as values: words, columns of image points, tables, pictures, live messages.
+// What the server says, as values: columns of image points, tables, pictures, live messages.
 
 import { columns, withImages } from "./columns.js";
 import { parts } from "./store.js";
-import { spoken, use } from "./words.js";
+import { spoken } from "./words.js";
 
 let token = "";
 
@@ -14,15 +14,6 @@ export function takeToken() {
   const rest = location.hash.replace(/^#/, "").split("&").filter((part) => part && !part.startsWith("token="));
   history.replaceState(null, "", rest.length ? `#${rest.join("&")}` : location.pathname);
 }
-
-/** The language asked for: by the reader, then by the browser. */
-export function wantedLanguage() {
-  const kept = localStorage.getItem("language");
-  return kept || (navigator.language.toLowerCase().startsWith("de") ? "de" : "en");
-}
-
-/** @param {string} wanted "en" or "de" */
-export const speak = async (wanted) => use(wanted, await (await fetch(new URL(`${wanted}.json`, import.meta.url))).json());
 
 /** An answer that is not the one asked for, with the server's own words. */
 export class Refused extends Error {
