@@ -115,7 +115,7 @@ async function refresh() {
 const views = () => [...cameras.values()].map((one) => one.view);
 const KEYS = {
   o: () => views().forEach((view) => { view.overlay = !view.overlay; view.surface.redraw(); }),
-  0: () => views().forEach((view) => { view.fit = true; view.surface.redraw(); }),
+  0: () => views().forEach((view) => view.whole()),
   g: () => changeLanguage().then(() => { drawDoing(); if (last) show(last); }),
   s: () => { if (document.querySelector(".stop")) command("/stop", {}); },
 };

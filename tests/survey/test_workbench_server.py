@@ -1,10 +1,12 @@
 """The local server of the workbench: what it refuses, what it answers, and the loop of a mistake found and mended."""
 
 import json
+import re
 import shutil
 import threading
 import time
 from contextlib import contextmanager
+from pathlib import Path
 from urllib.request import Request, urlopen
 
 import cv2
@@ -297,3 +299,20 @@ def test_remedies_jobs_and_the_network_are_asked_for_as_the_page_does(mine):
         assert client.get("/api/network", headers=HERE).json()["lines"] == []
     with page(mine, read_only=True) as client:
         assert post(client, "/api/jobs/batch", {}).status_code == 403
+
+
+def test_the_page_goes_to_another_project(mine):
+    other = shutil.copytree(mine, mine.parent / "other")
+    text = (other / "survey.toml").read_text()
+    (other / "survey.toml").write_text(re.sub(r"(?m)^title = .*", 'title = "the other"', text))
+    (mine.parent / "empty").mkdir()
+    with page(mine) as client:
+        assert post(client, "/api/jobs/show", {"folder": "empty"}).status_code == 409
+        told = post(client, "/api/jobs/show", {"folder": "other"}).json()
+        assert told["state"]["title"] == "the other"
+        state = client.get("/api/state", headers=HERE).json()
+        assert (state["folder"], state["solution"]["verdict"]) == (str(other), told["state"]["solution"]["verdict"])
+        rows = post(client, "/api/jobs/batch", {"folders": ["lab", "other"]}).json()["summary"]["rows"]
+    assert [Path(row["folder"]).name for row in rows] == ["lab", "other"]
+    assert {row["state"] for row in rows} <= {"done", "test_failed"}
+    assert all(row["sigma0"] > 0 and row["redundancy"] > 0 and not row["error"] for row in rows)

@@ -33,7 +33,7 @@ export class ImageView {
     this.element = make("div", { class: "view image" },
       make("div", { class: "bar" }, this.title, this.scale,
         steady ? null : [button("−", () => this.enlarge(-1), "-", { "aria-label": t("shorter vectors") }), button("+", () => this.enlarge(1), "+", { "aria-label": t("longer vectors") })],
-        button("⤢", () => { this.fit = true; this.surface.redraw(); }, "0", { "aria-label": t("Whole") }), button("1:1", () => this.zoomTo(1 / (devicePixelRatio || 1)), "", { "aria-label": "1:1" })),
+        button("⤢", () => this.whole(), "0", { "aria-label": t("Whole") }), button("1:1", () => this.zoomTo(1 / (devicePixelRatio || 1)), "", { "aria-label": "1:1" })),
       make("div", { class: "stage" }, canvas, this.note), steady ? null : this.strip);
     this.listen(canvas);
     this.follow();
@@ -160,6 +160,9 @@ export class ImageView {
     const to = among[(among.indexOf(this.image) + by + among.length) % among.length];
     if (to) select("image", to, true);
   }
+
+  /** All of the image in sight again. */
+  whole() { this.fit = true; this.surface.redraw(); }
 
   enlarge(by) {
     const at = SCALES.findIndex((scale) => scale >= this.enlarged);

@@ -25,7 +25,7 @@ export class SceneView {
     this.element = make("div", { class: "view scene" },
       make("div", { class: "bar" }, this.told,
         button("−", () => this.enlarge(0.5), "-", { "aria-label": t("smaller ellipsoids") }), button("+", () => this.enlarge(2), "+", { "aria-label": t("larger ellipsoids") }),
-        button("⤢", () => { Object.assign(this, { zoom: 1, dx: 0, dy: 0 }); this.surface.redraw(); }, "0", { "aria-label": t("Whole") })),
+        button("⤢", () => this.whole(), "0", { "aria-label": t("Whole") })),
       make("div", { class: "stage" }, this.surface.canvas, this.note));
     this.listen(this.surface.canvas);
     this.measure();
@@ -45,12 +45,16 @@ export class SceneView {
     const places = [...scene.spots.map((spot) => spot.x), ...scene.shots.map((shot) => [shot.pose[3], shot.pose[7], shot.pose[11]]), ...scene.outlines.flatMap((line) => line.x)];
     for (const x of places) for (let k = 0; k < 3; k++) { low[k] = Math.min(low[k], x[k]); high[k] = Math.max(high[k], x[k]); }
     this.low = low;
+    this.places = places;
     this.high = high;
     this.middle = low.map((x, k) => (x + high[k]) / 2);
     this.reach = Math.max(1e-3, Math.hypot(...low.map((x, k) => high[k] - x)) / 2);
     const largest = Math.max(1e-12, ...scene.spots.map((spot) => Math.sqrt(Math.max(spot.cov[0][0], spot.cov[1][1], spot.cov[2][2]))));
     if (this.factor === null) this.factor = 10 ** Math.round(Math.log10(0.08 * this.reach / largest));
   }
+
+  /** Everything in sight again. */
+  whole() { Object.assign(this, { zoom: 1, dx: 0, dy: 0, fitted: "" }); this.surface.redraw(); }
 
   follow() { this.measure(); this.surface.redraw(); }
 
@@ -107,12 +111,18 @@ export class SceneView {
       return (x) => [cx + scale * (x[a] - middle[a]), cy - scale * (x[b] - middle[b])];
     }
     const ca = Math.cos(this.azimuth), sa = Math.sin(this.azimuth), ce = Math.cos(this.elevation), se = Math.sin(this.elevation);
-    const unit = 0.6 * this.zoom * Math.min(width, height) / reach;
-    return (x) => {
+    const ray = (x) => {
       const d = [x[0] - middle[0], x[1] - middle[1], x[2] - middle[2]], along = ca * d[0] + sa * d[1];
-      const scale = unit * 2.4 * reach / Math.max(2.4 * reach - (ce * along + se * d[2]), 0.3 * reach);
-      return [cx + scale * (ca * d[1] - sa * d[0]), cy - scale * (ce * d[2] - se * along)];
+      const scale = 2.4 * reach / Math.max(2.4 * reach - (ce * along + se * d[2]), 0.3 * reach);
+      return [scale * (ca * d[1] - sa * d[0]), scale * (ce * d[2] - se * along)];
     };
+    const key = `${width}/${height}/${reach}`;
+    if (this.fitted !== key) { // as large as everything is in sight; it stays while the scene is turned
+      const [across, up] = this.places.map(ray).reduce((most, x) => [Math.max(most[0], Math.abs(x[0])), Math.max(most[1], Math.abs(x[1]))], [1e-9, 1e-9]);
+      [this.fitted, this.unit] = [key, Math.min((0.5 * width - 34) / across, (0.5 * height - 26) / up)];
+    }
+    const unit = this.unit * this.zoom;
+    return (x) => { const [u, v] = ray(x); return [cx + unit * u, cy - unit * v]; };
   }
 
   paint(context, width, height) {

@@ -213,7 +213,7 @@ function viewStep(step) {
 
 const nextView = (by) => { const all = Object.keys(VIEWS), at = all.indexOf(panes()[PANES.indexOf(lastPane)]); actions.show(all[(at + by + all.length) % all.length], lastPane); };
 const enlarge = (by) => PANES.forEach((pane) => { const view = shown[pane]?.view; if (view instanceof ImageView) view.enlarge(by); else if (view instanceof SceneView) view.enlarge(2 ** by); });
-const whole = () => PANES.forEach((pane) => { const view = shown[pane]?.view; if (view instanceof ImageView) view.fit = true; else if (view instanceof SceneView) Object.assign(view, { zoom: 1, dx: 0, dy: 0 }); else return; view.surface.redraw(); });
+const whole = () => PANES.forEach((pane) => shown[pane]?.view.whole?.());
 
 function focus(region) {
   document.body.dataset.pane = region;
