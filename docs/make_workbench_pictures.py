@@ -2,8 +2,11 @@
 
 Run in the project's folder: python -m docs.make_workbench_pictures FOLDER docs/pictures
 FOLDER is a project, such as that of: labsurvey example full-lab FOLDER. The others are made on the way.
+With --every: every view of FOLDER, and its report, light and dark, on a desk and on a phone, in English and German, to
+be looked at.
 """
 
+import itertools
 import sys
 import tempfile
 import time
@@ -22,6 +25,7 @@ from survey.workbench.session import Workbench
 from tests.survey.test_workbench_faults import write_spoilt
 
 CHROMIUM = "/usr/bin/chromium"
+DESK, PHONE = (1440, 900), (390, 844)
 Act = Callable[[Any], None]
 
 
@@ -63,6 +67,41 @@ def main(folder: Path, out: Path) -> None:
         browser.close()
 
 
+def every(folder: Path, out: Path) -> None:
+    """Every view and region as VIEW-SCHEME-WIDTH-LANGUAGE.png."""
+    from survey.report import report_html
+
+    out.mkdir(parents=True, exist_ok=True)
+    bench, token = Workbench(folder), new_token()
+    bench.adjust()
+    with sync_playwright() as playwright, Listening(Server(bench, token), "127.0.0.1", 0) as listening:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        for language, scheme, size in itertools.product(("en", "de"), ("light", "dark"), (DESK, PHONE)):
+            mark = f"{scheme}-{size[0]}-{language}.png"
+            sized = {"width": size[0], "height": size[1]}
+            context = browser.new_context(viewport=sized, color_scheme=scheme, locale=language)
+            page = context.new_page()
+            page.on("console", lambda said, mark=mark: print(mark, said.text, file=sys.stderr))
+            page.goto(f"{listening.address}#token={token}")
+            settled(page)
+            for region in ("left", "tree", "tables", "inspector") if size is PHONE else ("left",):
+                page.evaluate(f"document.body.dataset.pane = '{region}'")
+                page.screenshot(path=out / f"{region}-{mark}")
+            page.evaluate("document.body.dataset.pane = 'right'")
+            chooser = page.locator("#right .chooser select")
+            for view in chooser.locator("option").evaluate_all("(all) => all.map((one) => one.value)"):
+                page.locator("#right .chooser select").select_option(view)
+                page.wait_for_timeout(1500)
+                page.screenshot(path=out / f"{view}-{mark}")
+            report = out / f"report-{language}.html"
+            report.write_text(report_html(bench.adjustment, bench.run(), None, bench.statistics, language))
+            page.goto(report.resolve().as_uri())
+            page.wait_for_timeout(1500)
+            page.screenshot(path=out / f"report-{mark}", full_page=True)
+            context.close()
+        browser.close()
+
+
 def picture(browser: Any, folder: Path, out: Path, place: str, width: int, colours: str, act: Act) -> None:
     """One picture of a place, after something was done there."""
     bench, token = Workbench(folder), new_token()
@@ -90,4 +129,5 @@ def settled(page: Any, seconds: float = 20.0) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    given = [text for text in sys.argv[1:] if text != "--every"]
+    (every if "--every" in sys.argv else main)(Path(given[0]), Path(given[1]))

@@ -18,16 +18,18 @@ from urllib.parse import unquote, urlsplit
 
 from adjust.model.errors import SurveyError
 from capture.plan.plan import read_plan
-from capture.web.state import FolderView, LiveView, View, png_with_overlay
+from capture.web.state import FolderView, LiveView, View, png_of
+from survey.report.modules import WEB as SHARED
 from survey.workbench import guard
 
-_FILES = {
-    "/": ("page.html", "text/html"),
-    "/style.css": ("style.css", "text/css"),
-    "/app.js": ("app.js", "text/javascript"),
-}
+_WEB = Path(__file__).parent
+_KINDS = {".js": "text/javascript", ".css": "text/css", ".json": "application/json", ".svg": "image/svg+xml"}
+_FILES = {"/": (_WEB / "page.html", "text/html")} | {
+    f"/{path.name}": (path, _KINDS[path.suffix])
+    for at in (SHARED, _WEB) for path in at.glob("*") if path.suffix in _KINDS
+}  # fmt: skip
 _HEADERS = {**guard.HEADERS, "Cache-Control": "no-store"}
-_LONGEST_BODY = 4096
+_LONGEST_BODY, _LONGEST_PX = 4096, 1600
 _ENDINGS = {signal.SIGINT, signal.SIGTERM}
 
 
@@ -69,17 +71,21 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._is_from_here():
             return
         if path in _FILES:
-            name, kind = _FILES[path]
-            self._answer((Path(__file__).parent / name).read_bytes(), f"{kind}; charset=utf-8")
+            file, kind = _FILES[path]
+            self._answer(file.read_bytes(), f"{kind}; charset=utf-8")
         elif path == "/status.json":
-            status = {**self.server.view.status(), "may_move": self.server.token is not None}
-            self._answer(json.dumps(status).encode(), "application/json")
+            view = self.server.view
+            status = view.status()
+            shown_now = {name: s.as_dict() for name in status["cameras"] if (s := view.shown(name)) is not None}
+            said = {**status, "shown": shown_now, "may_move": self.server.token is not None}
+            self._answer(json.dumps(said).encode(), "application/json")
         elif path.startswith("/image/") and path.endswith(".png"):
             shown = self.server.view.shown(unquote(path.removeprefix("/image/").removesuffix(".png")))
             if shown is None:
                 self._refuse(HTTPStatus.NOT_FOUND, "no image yet")
             else:
-                self._answer(png_with_overlay(shown), "image/png")
+                longest_px = None if "size=full" in urlsplit(self.path).query.split("&") else _LONGEST_PX
+                self._answer(png_of(shown.image, longest_px), "image/png")
         else:
             self._refuse(HTTPStatus.NOT_FOUND, "no such page")
 

@@ -43,6 +43,10 @@ class Shown:
     image: GrayImage
     points: FloatArray
 
+    def as_dict(self) -> dict[str, Any]:
+        """Size (px) and points for the page, which draws them over the image."""
+        return {"size": [self.image.shape[1], self.image.shape[0]], "points": np.round(self.points, 2).tolist()}
+
 
 class View(Protocol):
     """What the server asks for."""
@@ -80,6 +84,7 @@ class FolderView:
 
     def __init__(self, plan: CapturePlan) -> None:
         self._plan = plan
+        self._last: dict[str, tuple[str, Shown]] = {}  # by camera, of which epoch
 
     def status(self) -> dict[str, Any]:
         """See ``View``."""
@@ -107,6 +112,15 @@ class FolderView:
         epoch_id, planned = status.get("epoch_id"), {camera.camera_id for camera in self._plan.cameras}
         if epoch_id is None or camera_id not in planned:
             return None
+        known = self._last.get(camera_id)
+        if known is not None and known[0] == epoch_id:
+            return known[1]
+        shown = self._read(camera_id, epoch_id)
+        if shown is not None and len(shown.points):  # what is looked at later may find more
+            self._last[camera_id] = epoch_id, shown
+        return shown
+
+    def _read(self, camera_id: str, epoch_id: str) -> Shown | None:
         try:
             read = read_image(self._plan.project / IMAGES_FOLDER / camera_id / f"{epoch_id}.png")
         except SurveyError:
@@ -225,17 +239,13 @@ class LiveView:
         self._lock.release()
 
 
-def png_with_overlay(shown: Shown, longest_px: int = 900) -> bytes:
-    """The image in 8 bit, made smaller, with its target points ringed."""
-    image = shown.image
+def png_of(image: GrayImage, longest_px: int | None) -> bytes:
+    """The image in 8 bit, made smaller where it has more than ``longest_px``."""
     gray = image if image.dtype == np.uint8 else np.clip(image / max(float(image.max()), 1.0) * 255.0, 0, 255)
-    factor = min(1.0, longest_px / max(image.shape))
+    factor = min(1.0, (longest_px or max(image.shape)) / max(image.shape))
     size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
     small = cv2.resize(gray.astype(np.uint8), size, interpolation=cv2.INTER_AREA)
-    picture = np.asarray(cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), np.uint8)
-    for u, v in (shown.points + 0.5) * factor - 0.5:
-        cv2.circle(picture, (round(u * 16), round(v * 16)), 4 * 16, (60, 200, 60), 1, cv2.LINE_AA, 4)
-    done, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    done, data = cv2.imencode(".png", small, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
         raise ValueError("no PNG")
     return data.tobytes()

@@ -15,6 +15,7 @@ from markupsafe import Markup
 
 from survey.report.drawing import DARK
 from survey.report.language import TURNING, esc, known, language, localised, t
+from survey.report.modules import looks
 
 MISSING = "–"
 MINUS = "−"
@@ -57,7 +58,7 @@ def document(title: str, body: Markup, after: Markup | str = "") -> str:
 
     On a dark screen the pictures follow the page; ``after`` follows the body's main part.
     """
-    style = Markup((_HERE / "style.css").read_text(encoding="utf-8"))
+    style = Markup(looks("colours", "parts") + (_HERE / "style.css").read_text(encoding="utf-8"))
     page: Template = _environment().get_template("document.html")
     values = {"title": title, "style": style, "colours": tuple(DARK.items()), "body": body, "after": after}
     return page.render(values).translate(TURNING) + "\n"

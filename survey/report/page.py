@@ -1,5 +1,6 @@
 """The report as one HTML page that needs nothing but itself, and printed from it as PDF."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -12,9 +13,9 @@ from markupsafe import Markup
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from survey.report.context import Context
-from survey.report.drawing import DARK
-from survey.report.language import localised, speaking, t
+from survey.report.language import language, localised, speaking, t
 from survey.report.markup import document, element, joined, json_script, part
+from survey.report.modules import WEB, bundled
 from survey.report.sections import diagnosis, loops, observations, overview, published, statistics, unknowns
 from survey.solution.dictionary import RunInfo, solution_dict
 from survey.solution.quantities import scale_of
@@ -78,21 +79,18 @@ def report_html(
 def _page(c: Context) -> str:
     made = [(name, anchor, make(c)) for name, anchor, make in _SECTIONS]
     nav = part("nav", [(anchor, t(name)) for name, anchor, body in made if body])
-    script = Path(__file__).with_name("script.js").read_text(encoding="utf-8")
     title = f"{c.solution['summary']['title'] or c.run.folder} – {t('Adjustment report')}"
     shown = overview.header(c) + nav + joined((body for _, _, body in made), "\n")
-    return document(title, shown, json_script("words", _words()) + element("script", Markup(script)))
+    return document(title, shown, json_script("words", _words()) + element("script", Markup(bundled("report"))))
 
 
 def _words() -> dict[str, Any]:
     """What the script says."""
+    of_modules = json.loads((WEB / f"{language()}.json").read_text(encoding="utf-8"))
     return {
-        "decimal": localised("."),
-        "dark": DARK,
-        "filter": t("filter"),
+        "language": language(), "decimal": localised("."), "texts": of_modules,
         "flags": ["", t("suspect"), t("not used")],
-        "where": t("page {{page}} of {{pages}}, {{n}} rows").replace("{{", "{").replace("}}", "}"),
-    }
+    }  # fmt: skip
 
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")

@@ -15,12 +15,12 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Target
 from survey.report import drawing as d
 from survey.report.markup import json_script, part
+from survey.solution.dictionary import plain
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import Scale
 
 _MOST_EPOCHS = 24
 _MOST_POINTS = 500
-_MOST_NAMES = 80
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +77,7 @@ class Scene:
 def scene_of(adjustment: Adjustment, scale: Scale) -> Scene:
     """The scene at the adjusted values; of many epochs an even selection."""
     frames, scene = AdjustedFrames(adjustment), Scene()
-    epochs = list(dict.fromkeys(b.epoch_id for b in adjustment.survey.image_blocks)) or [""]
-    shown = [epochs[i] for i in np.unique(np.linspace(0, len(epochs) - 1, min(len(epochs), _MOST_EPOCHS)).astype(int))]
+    shown = _shown(adjustment)
     _add_cameras(scene, adjustment, frames, shown)
     _add_stations(scene, adjustment, scale)
     _add_targets(scene, adjustment, frames, shown)
@@ -88,6 +87,12 @@ def scene_of(adjustment: Adjustment, scale: Scale) -> Scene:
             scene.tables.append((table.table_id, pose, table.axes))
     _add_points(scene, adjustment, scale)
     return scene
+
+
+def _shown(adjustment: Adjustment) -> list[str]:
+    """Epochs that are drawn: all, or an even selection."""
+    epochs = list(dict.fromkeys(b.epoch_id for b in adjustment.survey.image_blocks)) or [""]
+    return [epochs[i] for i in np.unique(np.linspace(0, len(epochs) - 1, min(len(epochs), _MOST_EPOCHS)).astype(int))]
 
 
 def _add_points(scene: Scene, adjustment: Adjustment, scale: Scale) -> None:
@@ -164,90 +169,44 @@ def enlargement(scene: Scene, ellipsoid: float, extent: float) -> float:
     return d.round_below(extent * min(0.035 / float(np.median(semi_axes)), 0.2 / float(semi_axes.max())))
 
 
-def space(scene: Scene, ellipsoid: float) -> Markup:
-    """Canvas, slider and data; nothing for an empty scene. ``ellipsoid``: semi-axes of the region, in sigmas."""
+def scene_values(adjustment: Adjustment, scale: Scale, drawn: Scene | None = None) -> dict[str, Any]:
+    """The scene as a page draws it, in the world (m), covariances (m^2) as sigmas are given.
+
+    images: ``world_from_camera`` by image, three rows of four; of all images, or, where ``drawn`` is given already, of
+    its epochs alone.
+    """
+    every = drawn is None
+    drawn, frames = drawn or scene_of(adjustment, scale), AdjustedFrames(adjustment)
+    taken = dict.fromkeys((b.camera_id, b.epoch_id) for b in adjustment.survey.image_blocks)
+    shown = set(_shown(adjustment))
+    poses = {key: frames.world_from(FrameRef("camera", *key)) for key in taken if every or key[1] in shown}
+    return dict(plain({
+        "ellipsoid": scale.ellipsoid,
+        "images": {"/".join(key): pose.matrix()[:3].ravel() for key, pose in poses.items() if pose is not None},
+        "cameras": {s.label: {"index": s.camera_idx, "half_angles_rad": s.half_angles} for s in drawn.shots},
+        "spots": [{"id": s.label, "kind": s.kind, "x": s.x, "cov": s.cov.ravel()} for s in drawn.spots],
+        "outlines": [{"target": label, "x": x} for label, x in drawn.outlines],
+        "clouds": [{"target": label, "x": x} for label, x in drawn.clouds],
+        "tables": [{"id": table, "world_from_table": pose.matrix()[:3].ravel(), "axes": axes}
+                   for table, pose, axes in drawn.tables],
+        "moves": drawn.moves, "n_left_out": drawn.n_left_out,
+    }))  # fmt: skip
+
+
+def space(adjustment: Adjustment, scale: Scale, scene: Scene) -> Markup:
+    """The place of the view in space and its data; nothing for an empty scene."""
     everything = scene.positions()
     if not len(everything):
         return Markup()
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    reach = max(float(np.linalg.norm(high - low)) / 2.0, 1e-3)
-    data = {
-        "middle": rounded(0.5 * (low + high)),
-        "reach": reach,
-        "enlarged": enlargement(scene, ellipsoid, 2.0 * reach),
-        "lines": _ground(low, high) + _lines(scene, reach),
-        "spots": _spots(scene, ellipsoid),
-        "labels": _names(scene),
-    }
-    return part("space", of="report.html") + json_script("space-data", data)
+    extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
+    data = scene_values(adjustment, scale, scene) | {"enlarged": enlargement(scene, scale.ellipsoid, extent)}
+    return part("space", of="report.html") + json_script("space-data", _short(data))
 
 
-def rounded(x: FloatArray) -> Any:
-    """Coordinates to a hundredth of a millimetre: enough for a picture."""
-    return np.round(x, 5).tolist()
-
-
-def _spots(scene: Scene, ellipsoid: float) -> list[dict[str, Any]]:
-    variances, vectors = np.linalg.eigh(scene.spot_covs())
-    axes = np.swapaxes(vectors * (ellipsoid * np.sqrt(np.clip(variances, 0.0, None)))[:, None], 1, 2)
-    # seven significant digits: enlarged ellipsoids stay round, and equal input gives equal bytes
-    shown = ([[float(f"{a:.7g}") for a in axis] for axis in of_one] for of_one in axes.tolist())
-    return [
-        {"x": x, "axes": own, "colour": d.RED if s.kind == "point" else d.GREEN}
-        for s, x, own in zip(scene.spots, rounded(scene.spot_places()), shown, strict=True)
-    ]
-
-
-def _line(x: FloatArray, colour: str, width: float, alpha: float = 1.0) -> dict[str, Any]:
-    return {"x": rounded(x), "colour": colour, "width": width, "alpha": alpha}
-
-
-def _ground(low: FloatArray, high: FloatArray) -> list[dict[str, Any]]:
-    step = d.round_below(float((high - low)[:2].max()) / 4.0)
-    out = []
-    for axis in (0, 1):
-        other = 1 - axis
-        for at in np.arange(np.ceil(low[axis] / step), np.floor(high[axis] / step) + 1) * step:
-            ends = np.array([low, low])
-            ends[:, axis], ends[1, other] = at, high[other]
-            out.append(_line(ends, d.GRID, 1.0))
-    return out
-
-
-def _lines(scene: Scene, reach: float) -> list[dict[str, Any]]:
-    out = [_line(np.vstack([x, x[:1]]), d.INK, 1.2) for _, x in scene.outlines]
-    for i, colour in enumerate((d.X_AXIS, d.Y_AXIS, d.Z_AXIS)):
-        out.append(_line(np.array([np.zeros(3), 0.14 * reach * np.eye(3)[i]]), colour, 2.0))
-    for _, pose, axes in scene.tables:
-        for axis in axes:
-            end = 0.12 * reach * np.eye(3)["xyz".index(axis)]
-            out.append(_line(pose.transformFrom(np.column_stack([-end, end])).T, d.INK, 1.2))
-    for shot in scene.shots:
-        colour = d.CAMERA_COLOURS[shot.camera_idx % len(d.CAMERA_COLOURS)]
-        out += [_line(x, colour, 1.1 if shot.main else 0.8, 1.0 if shot.main else 0.4) for x in _frustum(shot, reach)]
-    cross = 0.006 * reach * np.eye(3)
-    for _, cloud in scene.clouds:
-        out += [_line(np.array([x - c, x + c]), d.INK, 1.0) for x in cloud for c in cross]
-    return out
-
-
-def _frustum(shot: Shot, reach: float) -> list[FloatArray]:
-    depth = 0.15 * reach
-    if not shot.main:
-        return [shot.pose.transformFrom(np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 1.3 * depth)]).T).T]
-    tx, ty = np.tan(shot.half_angles)
-    rim = depth * np.array([(-tx, -ty, 1.0), (tx, -ty, 1.0), (tx, ty, 1.0), (-tx, ty, 1.0), (-tx, -ty, 1.0)])
-    corners = shot.pose.transformFrom(rim.T).T
-    eye = np.asarray(shot.pose.translation())
-    return [corners, *(np.array([eye, corner]) for corner in corners[:4])]
-
-
-def _names(scene: Scene) -> list[dict[str, Any]]:
-    out = [(label, x.mean(axis=0), d.INK) for label, x in scene.outlines + scene.clouds if label]
-    for shot in scene.shots:
-        if shot.main:
-            colour = d.CAMERA_COLOURS[shot.camera_idx % len(d.CAMERA_COLOURS)]
-            out.append((shot.label, np.asarray(shot.pose.translation()), colour))
-    out += [(table_id, np.asarray(pose.translation()), d.INK) for table_id, pose, _ in scene.tables]
-    out += [(s.label, s.x, d.RED if s.kind == "point" else d.GREEN) for s in scene.spots if s.label]
-    return [{"text": text, "x": rounded(x), "colour": colour} for text, x, colour in out[:_MOST_NAMES]]
+def _short(value: Any) -> Any:
+    """Numbers to seven significant digits: enlarged ellipsoids stay round, and equal input gives equal bytes."""
+    if isinstance(value, float):
+        return float(f"{value:.7g}")
+    if isinstance(value, dict):
+        return {k: _short(v) for k, v in value.items()}
+    return [_short(v) for v in value] if isinstance(value, list | tuple) else value

@@ -100,6 +100,8 @@ def _plan(bench: Workbench, body: Body, _: Any) -> Told:
 
 
 JOBS: Mapping[str, Callable[[Workbench, Body, "Callable[[ImageReport], None]"], Told]] = {
+    "init": lambda bench, body, _: bench.start(body.text("images"), body.text("folder")),
+    "show": lambda bench, body, _: bench.show(body.text("folder")),
     "detect": lambda bench, body, found: bench.detect(everything=body.flag("all", False), told=found),
     "plan": _plan,
     "navigate": lambda bench, body, _: bench.navigate(body.text("station"), body.number("interval_s", 0.0) or None),

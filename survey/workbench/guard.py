@@ -7,10 +7,15 @@ holds.
 
 import ipaddress
 import secrets
+from collections.abc import Mapping
 from urllib.parse import urlsplit
+
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from adjust.model.errors import SurveyError
 
+LONGEST_BODY = 1 << 20
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob:; connect-src 'self'; frame-ancestors 'none'; "
     "base-uri 'none'; form-action 'none'",
@@ -69,3 +74,80 @@ def loopback_address(host: str, port: int = 8780) -> str:
 def port_error(number: int, error: OSError) -> SurveyError:
     """What to say where a port cannot be listened on."""
     return SurveyError(f"port {number} cannot be used ({error.strerror}); name another with --port, 0 takes a free one")
+
+
+class Guard:
+    """Refuses everything that does not come from a browser on this machine that has the token.
+
+    token: what requests must bring in the header X-Token; images and the socket by a cookie of the name ``cookie``,
+    which no script can read and no other site sends.
+    """
+
+    def __init__(self, app: ASGIApp, token: str, cookie: str, read_only: bool) -> None:
+        self.app, self.token, self.cookie, self.read_only = app, token, cookie, read_only
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request."""
+        if scope["type"] not in ("http", "websocket"):
+            await self.app(scope, receive, send)
+            return
+        headers = {k.decode("latin-1"): v.decode("latin-1") for k, v in scope["headers"]}
+        refused = self._refused(scope, headers)
+        if refused is not None and scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+            return
+        answer = _with_headers(send)
+        if refused is not None:
+            await JSONResponse({"error": refused[1]}, refused[0])(scope, receive, answer)
+            return
+        await self.app(scope, _limited(receive) if scope["type"] == "http" else receive, answer)
+
+    def _refused(self, scope: Scope, headers: Mapping[str, str]) -> tuple[int, str] | None:
+        is_socket, path, method = scope["type"] == "websocket", scope["path"], scope.get("method")
+        if not is_from_here(headers.get("host", ""), headers.get("origin"), needed=is_socket):
+            return 403, NOT_FROM_HERE
+        if not (is_socket or path.startswith("/api/")):
+            return None if method in ("GET", "HEAD") else (405, "only GET")
+        by_cookie = is_socket or (method in ("GET", "HEAD") and path.startswith("/api/image/"))
+        if not is_token(headers.get("x-token", ""), self.token) and not (by_cookie and self._in_cookie(headers)):
+            return 403, WRONG_TOKEN
+        if method == "POST" and self.read_only:
+            return 403, "the project is open for reading only"
+        if method == "POST" and headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+            return 415, "the body has to be application/json"
+        return None
+
+    def _in_cookie(self, headers: Mapping[str, str]) -> bool:
+        found = (c.strip().partition("=") for c in headers.get("cookie", "").split(";"))
+        return any(name == self.cookie and is_token(value, self.token) for name, _, value in found)
+
+
+def _with_headers(send: Send) -> Send:
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            extra = dict(HEADERS)
+            names = {k.lower() for k, _ in message["headers"]}
+            extra |= {} if b"cache-control" in names else {"Cache-Control": "no-store"}
+            message["headers"] = [*message["headers"], *((k.encode(), v.encode()) for k, v in extra.items())]
+        await send(message)
+
+    return sending
+
+
+def _limited(receive: Receive) -> Receive:
+    """A body of so many bytes that were read, whatever was announced."""
+    n = 0
+
+    async def receiving() -> Message:
+        nonlocal n
+        message = await receive()
+        n += len(message.get("body", b""))
+        if n > LONGEST_BODY:
+            raise TooLongError
+        return message
+
+    return receiving
+
+
+class TooLongError(Exception):
+    """A body of more than ``LONGEST_BODY`` bytes."""

@@ -16,12 +16,13 @@ from adjust.model.survey import FloatArray, PoseParameter
 from survey.folder.replacing import changing, replace_parts
 from survey.jobs.adjusting.job import AdjustOutcome, Clock, command_line, kept_run, made
 from survey.project.project import DEFINITION_FILE, RESULTS
+from survey.report.scene import scene_values
 from survey.solution.dictionary import plain
 from survey.solution.earlier.runs import remove_empty
 from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import scale_of
 from survey.workbench.deciding import Deciding
-from survey.workbench.places import Places, scene_values
+from survey.workbench.places import Places
 
 if TYPE_CHECKING:  # detection brings in OpenCV, planning much else
     from survey.detection import ImageReport
@@ -146,8 +147,31 @@ class Jobs(Deciding):
         lines = [(name, [before[name], x]) for name, x in after.items() if name in before]
         return Told(outcome.text(), outcome.summary(), Drawn(lines=lines))
 
+    def start(self, images: str | Path, folder: str | Path) -> Told:
+        """Begin another project with images that lie beside this one, or anywhere, as ``labsurvey init`` does.
+
+        folder: the new one, beside this one; ``summary["folder"]`` names it. This project stays as it is.
+        """
+        from survey.jobs.starting import start_project
+
+        self._check(None)
+        if not str(folder).strip():
+            raise SurveyError("name the folder of the new project; it is made beside this one")
+        outcome = start_project(self._other(images), self.folder.resolve().parent / Path(folder).expanduser())
+        return Told(outcome.text(), outcome.summary())
+
+    def show(self, folder: str | Path) -> Told:
+        """Another project folder, for a page that is to show it instead of this one: ``summary["folder"]``."""
+        path = self._other(folder)
+        if not (path / DEFINITION_FILE).is_file():
+            raise SurveyError(f"{path}: holds no {DEFINITION_FILE}; begin a project with its images")
+        return Told(str(path), {"folder": str(path)})
+
     def batch(self, folders: Sequence[str | Path] = ()) -> Told:
-        """Adjust several projects (none: all beside this one), side by side; each has its results afterwards."""
+        """Adjust several projects (none: all beside this one), side by side; each has its results afterwards.
+
+        ``summary["rows"]``: of each its ``folder``, ``state``, ``verdict``, ``sigma0``, ``redundancy`` and ``error``.
+        """
         from survey.batch.run import BatchOptions, run_batch
         from survey.batch.tables import summary_table
 
@@ -155,8 +179,10 @@ class Jobs(Deciding):
         chosen = [self._other(f) for f in folders] or sorted(
             p.parent for p in self.folder.resolve().parent.glob(f"*/{DEFINITION_FILE}"))  # fmt: skip
         found = run_batch(chosen, BatchOptions(progress=False))
-        return Told(summary_table(found), {"folders": [str(r.folder) for r in found],
-                                           "states": [str(r.state) for r in found]})  # fmt: skip
+        rows = [{"folder": str(r.folder), "state": str(r.state), "error": r.error,
+                 **{k: r.summary.get(k) for k in ("verdict", "sigma0", "redundancy")}} for r in found]  # fmt: skip
+        return Told(summary_table(found), {"folders": [row["folder"] for row in rows],
+                                           "states": [row["state"] for row in rows], "rows": rows})  # fmt: skip
 
     def _other(self, folder: str | Path) -> Path:
         """Another project folder; a relative one lies beside this one. Raises SurveyError."""

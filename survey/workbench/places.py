@@ -7,12 +7,8 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model.observations import FrameRef, PositionRef
-from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Point
-from survey.report.scene import scene_of
-from survey.solution.dictionary import plain
 from survey.solution.frames import AdjustedFrames
-from survey.solution.quantities import Scale
 
 
 def refs_of(item: Any) -> list[FrameRef | PositionRef]:
@@ -63,23 +59,3 @@ class Places:
         if target is not None and point_id is not None:
             return np.asarray(pose.transformFrom(target.x_in_target[target.point_ids.index(point_id)]))
         return np.asarray(pose.translation())
-
-
-def scene_values(adjustment: Adjustment, scale: Scale) -> dict[str, Any]:
-    """Cameras, targets, tables, points and stations in the world (m), covariances (m^2) as sigmas are given."""
-    drawn, frames = scene_of(adjustment, scale), AdjustedFrames(adjustment)
-    images = {}
-    for camera, epoch in dict.fromkeys((b.camera_id, b.epoch_id) for b in adjustment.survey.image_blocks):
-        pose = frames.world_from(FrameRef("camera", camera, epoch))
-        if pose is not None:
-            images[f"{camera}/{epoch}"] = pose.matrix()[:3].ravel()
-    return dict(plain({
-        "ellipsoid": scale.ellipsoid, "images": images,
-        "cameras": {s.label: {"index": s.camera_idx, "half_angles_rad": s.half_angles} for s in drawn.shots},
-        "spots": [{"id": s.label, "kind": s.kind, "x": s.x, "cov": s.cov.ravel()} for s in drawn.spots],
-        "outlines": [{"target": label, "x": x} for label, x in drawn.outlines],
-        "clouds": [{"target": label, "x": x} for label, x in drawn.clouds],
-        "tables": [{"id": table, "world_from_table": pose.matrix()[:3].ravel(), "axes": axes}
-                   for table, pose, axes in drawn.tables],
-        "moves": drawn.moves, "n_left_out": drawn.n_left_out,
-    }))  # fmt: skip

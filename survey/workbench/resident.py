@@ -23,6 +23,7 @@ from survey.project.reading import leaving_out, read_all
 from survey.solution.earlier.changes import Changes, snapshot, solution_changes
 from survey.solution.quantities import Scale, scale_of
 from survey.solution.statistics import Statistics, statistics_of
+from survey.workbench.kept import Kept, kept_results, with_kept
 from survey.workbench.rows import PointRows, point_rows
 from survey.workbench.situation import (
     CancelledError,
@@ -36,6 +37,7 @@ from survey.workbench.situation import (
 )
 
 Watch = Callable[[int, float], None]
+_UNREAD = object()
 
 
 class Resident:
@@ -52,6 +54,7 @@ class Resident:
         self._values, self._lock, self._cancel = KnownValues(), threading.RLock(), threading.Event()
         self._statistics: tuple[int, Statistics] | None = None
         self._rows: tuple[Situation, PointRows] | None = None
+        self._kept: object = _UNREAD
         self.situation = self._read()
 
     def _read(self) -> Situation:
@@ -78,9 +81,19 @@ class Resident:
         """All image points with the solution, also while the next one is adjusted."""
         kept, now = self._rows, self.situation
         if kept is None or kept[0] is not now:
-            kept = now, point_rows(now.survey, now.now, now.adjustment)
+            made = point_rows(now.survey, now.now, now.adjustment)
+            kept = now, made if self.kept is None else with_kept(made, now)
             self._rows = kept
         return kept[1]
+
+    @property
+    def kept(self) -> Kept | None:
+        """What the results in the folder say, until there is a solution."""
+        if self.version or self.failure is not None:
+            return None
+        if self._kept is _UNREAD:
+            self._kept = kept_results(self.situation)
+        return self._kept if isinstance(self._kept, Kept) else None
 
     @property
     def statistics(self) -> Statistics:

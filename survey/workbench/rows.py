@@ -56,10 +56,11 @@ class PointRows:
 
     def point_ids(self, block: ImageBlock) -> Sequence[str]:
         """The names that ``block.point_idx`` counts."""
-        return self._names[block.target_id]
+        return self.point_names[block.target_id]
 
     @cached_property
-    def _names(self) -> Mapping[str | None, Sequence[str]]:
+    def point_names(self) -> Mapping[str | None, Sequence[str]]:
+        """By target, None: of the world."""
         return {t.target_id: t.point_ids for t in self.survey.targets} | {
             None: tuple(p.point_id for p in self.survey.points)
         }  # fmt: skip
@@ -146,13 +147,14 @@ def columns(rows: PointRows, limit: float, version: int, chosen: IntArray | None
         "redundancy": rows.redundancy.mean(axis=1), "used": rows.used.astype(np.uint8), "why": rows.why,
     }  # fmt: skip
     typed = {k: a[every].astype("<f4" if a.dtype.kind == "f" else a.dtype, copy=False) for k, a in arrays.items()}
+    seen = {b.target_id for b in blocks}
     header = {
         "version": version, "n": len(every), "limit": limit,
         "rows": None if chosen is None else chosen.tolist(),
         "columns": [{"name": k, "type": a.dtype.str.lstrip("<|")} for k, a in typed.items()],
         "blocks": [{"camera": b.camera_id, "epoch": b.epoch_id, "target": b.target_id, "group": b.group}
                    for b in blocks],
-        "points": {t or "": list(names) for t, names in rows._names.items() if any(b.target_id == t for b in blocks)},
+        "points": {t or "": list(names) for t, names in rows.point_names.items() if t in seen},
     }  # fmt: skip
     text = json.dumps(header, ensure_ascii=False, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)  # the columns of 4 bytes begin at a multiple of 4

@@ -7,7 +7,7 @@ Everything that it answers is a method of :class:`survey.workbench.session.Workb
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from contextvars import copy_context
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,12 @@ from adjust.model.errors import SurveyError
 from survey.folder.locking import BusyError
 from survey.folder.text import suggestion
 from survey.report.language import LANGUAGES, message, speaking
+from survey.report.modules import WEB as SHARED
 from survey.solution.earlier.runs import pin_run
 from survey.workbench import cameras, pictures, views
 from survey.workbench.bodies import JOBS, Body, BodyError, distance_of, json_of
-from survey.workbench.gate import LONGEST_BODY, Guard, TooLongError
+from survey.workbench.guard import LONGEST_BODY, Guard, TooLongError
 from survey.workbench.live import Live
-from survey.workbench.network import network
 from survey.workbench.session import Workbench
 from survey.workbench.situation import CancelledError, ChangedError
 
@@ -45,8 +45,9 @@ class Server:
     def __init__(self, bench: Workbench, token: str, cookie: str = "labsurvey") -> None:
         self.bench, self.token, self.cookie = bench, token, cookie
         self.live, self._worker = Live(), ThreadPoolExecutor(1, "workbench")
-        self._running = ""
-        self._files = {f"/{p.relative_to(WEB).as_posix()}": p for p in WEB.rglob("*") if p.suffix in _KINDS}
+        self._running, self._seen = "", asyncio.Event()
+        self._files = {f"/{p.relative_to(at).as_posix()}": p for at in (SHARED, WEB) for p in at.rglob("*")
+                       if p.suffix in _KINDS}  # fmt: skip
         bench.watch = self._progress
 
     def app(self) -> ASGIApp:
@@ -56,7 +57,7 @@ class Server:
             "/api/readings": self._view(views.readings), "/api/parameters": self._view(views.parameters),
             "/api/scene": self._view(views.scene), "/api/findings": self._view(views.findings),
             "/api/changes": self._view(_changes), "/api/loops": self._view(views.loops),
-            "/api/network": self._view(network),
+            "/api/network": self._view(views.network),
             "/api/table_residuals": self._view(views.table_residuals), "/api/camera/{camera}": self._camera,
             "/api/camera/{camera}/difference": self._difference, "/api/runs": self._view(views.runs),
             "/api/compare": self._compare,
@@ -93,7 +94,9 @@ class Server:
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     async def _first(self) -> None:
-        """The first adjustment, while the page already shows what there is."""
+        """The first adjustment, while the page already shows what there is: once it has it, or nobody asks."""
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._seen.wait(), _LOOK_S)
         try:
             await self._run("adjust", self.bench.adjust)
         except (SurveyError, OSError) as error:
@@ -161,7 +164,14 @@ class Server:
         path = self._files.get("/index.html" if request.url.path == "/" else request.url.path)
         if path is None:
             return JSONResponse({"error": "no such page"}, 404)
-        return Response(path.read_bytes(), media_type=_KINDS[path.suffix])
+        return Response(self._page() if path.suffix == ".html" else path.read_bytes(), media_type=_KINDS[path.suffix])
+
+    def _page(self) -> bytes:
+        """The page, which names all modules: they come at once and not one after the other has named it."""
+        modules = sorted(name[1:] for name in self._files if name.endswith(".js") and name != "/report.js")
+        named = (f'<link rel="modulepreload" href="{name}">\n' for name in modules)
+        text = (WEB / "index.html").read_text(encoding="utf-8")
+        return text.replace("</head>", "".join(named) + "</head>").encode()
 
     async def _state(self, _request: Request) -> Response:
         found = await asyncio.to_thread(views.state, self.bench)
@@ -180,6 +190,7 @@ class Server:
         camera, _, epoch = q.get("image", "").partition("/")
         worst = int(q["worst"]) if q.get("worst", "").isdecimal() else 0
         data = await self._run("view", lambda: views.points(self.bench, camera, epoch, min(worst, _MOST_ROWS)))
+        self._seen.set()
         return Response(data, media_type="application/octet-stream")
 
     async def _statistics(self, request: Request) -> Response:
@@ -286,7 +297,16 @@ class Server:
             raise SurveyError(f"there is no job {name!r}; {suggestion(name, JOBS)}")
         found = lambda report: self.live.post({"type": "detected"} | pictures.found_in(report))  # noqa: E731
         told = await self._run(name, lambda: JOBS[name](self.bench, body, found))
+        if name in ("init", "show"):
+            await self._run("adjust", lambda: self._show(Path(told.summary["folder"])))
         return JSONResponse(told.as_dict() | {"state": await asyncio.to_thread(views.state, self.bench)})
+
+    def _show(self, folder: Path) -> None:
+        """Another project from now on; one of which nothing is found yet says what is missing."""
+        bench = Workbench(folder, read_only=self.bench.read_only, watch=self._progress)
+        with suppress(SurveyError):
+            bench.adjust()
+        self.bench = bench
 
     async def _cancel(self, _request: Request) -> Response:
         self.bench.cancel()

@@ -1,6 +1,6 @@
 """What the views of the workbench show, as plain values: state, findings, parameters, scene, exclusions."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,17 +8,20 @@ from gtsam import Pose3
 
 from adjust.diagnosis.hypothesis import Place
 from adjust.model.errors import SurveyError
+from adjust.model.observations import Reading
 from adjust.model.result import Adjustment
 from survey.folder.text import suggestion
-from survey.project.observed import name_of_residual
+from survey.project.observed import Observed, name_of_residual
 from survey.report.language import message
+from survey.report.scene import scene_values
 from survey.solution.anchors import ANCHORED, anchor, anchors_in
 from survey.solution.dictionary import plain, solution_dict
 from survey.solution.earlier.changes import snapshot
 from survey.solution.earlier.runs import list_runs
+from survey.solution.frames import AdjustedFrames
 from survey.solution.quantities import ARCSEC_PER_RAD, sigma_unit_for_people, sigmas_of, status_of, unit_for_people
 from survey.solution.verdict import suspects
-from survey.workbench.places import scene_values
+from survey.workbench.places import Places, refs_of
 from survey.workbench.rows import BY_THIS_RUN, IN_USE, columns, reading_rows
 from survey.workbench.session import Workbench
 
@@ -27,12 +30,11 @@ _MOST_FITTING = 20
 _CAUSE = "probable cause: "
 
 
-def limits(adjustment: Adjustment | None) -> tuple[float, float]:
+def limits(bench: Workbench) -> tuple[float, float]:
     """Of |w| of image points (square root of the chi-square test's) and of other observations."""
-    if adjustment is None:
-        return 1.0, 1.0
-    found = suspects(adjustment)
-    return float(np.sqrt(found.image_limit)), found.w_limit
+    adjustment = bench.situation.adjustment
+    found = bench.kept if adjustment is None else suspects(adjustment)
+    return (1.0, 1.0) if found is None else (float(np.sqrt(found.image_limit)), found.w_limit)
 
 
 def state(bench: Workbench) -> dict[str, Any]:
@@ -45,7 +47,8 @@ def state(bench: Workbench) -> dict[str, Any]:
         "unsaved": bench.n_unsaved, "undo": bench.undoable, "redo": bench.redoable,
         "solution": None if solved is None else _summary(solved) | {
             "mode": now.mode, "seconds": now.seconds, "sigmas": bench.scale.sigmas},
-        "warnings": [] if solved is None else [message(w) for w in solved.warnings],
+        "kept": None if bench.kept is None else _in_words(bench.kept.summary) | {"date": bench.kept.date},
+        "warnings": [message(w) for w in _warnings(bench)],
         "failure": None if bench.failure is None else message(str(bench.failure)),
         "exclusions": [{"name": str(e.name), "what": e.name.what, "id": e.name.id, "reason": e.reason,
                         "author": e.author, "time": e.time, "line": e.line} for e in now.exclusions.values()],
@@ -59,8 +62,17 @@ def state(bench: Workbench) -> dict[str, Any]:
 
 
 def _summary(solved: Adjustment) -> dict[str, Any]:
-    found = dict(snapshot(solved).summary)
-    return found | {"reason": message(str(found["reason"]))}
+    return _in_words(snapshot(solved).summary)
+
+
+def _in_words(summary: Mapping[str, Any]) -> dict[str, Any]:
+    return {**summary, "reason": message(str(summary["reason"]))}
+
+
+def _warnings(bench: Workbench) -> Sequence[str]:
+    """Of the solution, or of the results until there is one."""
+    found = bench.situation.adjustment or bench.kept
+    return () if found is None else found.warnings
 
 
 def _tree(bench: Workbench) -> dict[str, Any]:
@@ -86,13 +98,13 @@ def points(bench: Workbench, camera: str = "", epoch: str = "", worst: int = 0) 
         chosen = rows.in_image(camera, epoch)
     elif 0 < worst < len(rows.test):
         chosen = np.sort(np.argpartition(-np.nan_to_num(rows.test, nan=-1.0), worst)[:worst])
-    return columns(rows, limits(bench.situation.adjustment)[0], bench.version, chosen)
+    return columns(rows, limits(bench)[0], bench.version, chosen)
 
 
 def readings(bench: Workbench) -> dict[str, Any]:
     """All observations that are no image points."""
     now = bench.situation
-    limit = limits(now.adjustment)[1]
+    limit = limits(bench)[1]
     rows = reading_rows(now.everything.survey, now.left, now.adjustment, limit)
     return {"version": bench.version, "limit": limit, "rows": rows}
 
@@ -125,8 +137,9 @@ def findings(bench: Workbench) -> dict[str, Any]:
     solved = bench.situation.adjustment
     known: dict[str, Any] = {"verdict": "failed", "reason": message(str(bench.failure or "")), "warnings": [],
                              "causes": [], "n_failing": 0, "findings": []}  # fmt: skip
-    if solved is not None:
-        known = _of_solution(bench, solved)
+    kept = bench.kept
+    if solved is not None or kept is not None:
+        known = _of_solution(bench, _in_words(kept.summary) if kept is not None else _summary(bench.adjustment))
     return dict(plain({"version": bench.version, **known, "remedies": remedies(bench)}))
 
 
@@ -149,18 +162,18 @@ def _anchor_of(place: Place) -> str | None:
     return anchor(place.kind, "/".join(place.ids)) if place.kind in ANCHORED and place.ids else None
 
 
-def _of_solution(bench: Workbench, solved: Adjustment) -> dict[str, Any]:
-    image_limit, limit = limits(solved)
+def _of_solution(bench: Workbench, summary: Mapping[str, Any]) -> dict[str, Any]:
+    (image_limit, limit), warnings = limits(bench), _warnings(bench)
     found = [*_of_points(bench, image_limit), *_of_readings(bench, limit)]
     worst = sorted(found, key=lambda f: -(f["share"] or 0.0))
     failing = [f for f in worst if f["why"] == BY_THIS_RUN or (f["share"] or 0.0) > 1.0]
     fitting = [f for f in worst if f["why"] == IN_USE and (f["share"] or 0.0) <= 1.0]
     told = bench.diagnosis.lines if bench.diagnosis is not None else ()
-    causes = [w.removeprefix(_CAUSE) for w in solved.warnings if w.startswith(_CAUSE)]
+    causes = [w.removeprefix(_CAUSE) for w in warnings if w.startswith(_CAUSE)]
     shown = [*_of_images(bench, failing), *failing[:_MOST_FINDINGS], *fitting[:_MOST_FITTING]]
     return {
-        **{k: v for k, v in _summary(solved).items() if k in ("verdict", "reason")},
-        "warnings": [_said(w) for w in solved.warnings if not w.startswith(_CAUSE)],
+        **{k: v for k, v in summary.items() if k in ("verdict", "reason")},
+        "warnings": [_said(w) for w in warnings if not w.startswith(_CAUSE)],
         "causes": [_said(c) for c in causes if c not in told], "n_failing": len(failing), "findings": shown,
     }  # fmt: skip
 
@@ -173,7 +186,9 @@ def _said(text: str) -> dict[str, Any]:
 def _of_points(bench: Workbench, limit: float) -> Iterable[dict[str, Any]]:
     rows = bench.rows
     test = np.where((rows.why == IN_USE) | (rows.why == BY_THIS_RUN), np.nan_to_num(rows.test, nan=-1.0), -1.0)
-    for row in np.argsort(-test)[: _MOST_FINDINGS + _MOST_FITTING].tolist():
+    most = min(_MOST_FINDINGS + _MOST_FITTING, len(test))
+    largest = np.sort(np.argpartition(-test, most - 1)[:most]) if most else np.zeros(0, dtype=np.int64)
+    for row in largest[np.argsort(-test[largest], kind="stable")].tolist():
         if test[row] >= 0.0:
             name, w = rows.id_of(row), float(np.sqrt(test[row]))
             yield {
@@ -260,3 +275,34 @@ def statistics_part(bench: Workbench, part: str) -> dict[str, Any]:
         raise SurveyError(f"there are no statistics {part!r}; {suggestion(part, PARTS)}")
     solution, key = solution_dict(bench.adjustment, bench.run(), bench.statistics), PARTS[part]
     return {"version": bench.version, part: solution if key is None else solution[key]}
+
+
+def network(bench: Workbench) -> dict[str, Any]:
+    """Every reading that joins places, and the set-ups of instruments.
+
+    lines: ``id``, ``table``, ``kind``, ends in the world ``x`` (m), largest ``w`` of its components and ``share`` of
+    the limit, ``why`` as of readings. marks: the same of readings of a single place. n_nowhere: readings of which an
+    end has no place. setups: ``id``, ``instrument``, ``x``, ``n`` readings. Raises SurveyError where nothing is solved.
+    """
+    survey, solved = bench.situation.everything.survey, bench.adjustment
+    places = Places(AdjustedFrames(solved), solved.survey.points)
+    found: dict[str, dict[str, Any]] = {}
+    for row in readings(bench)["rows"]:
+        if row["id"] not in found or (row["share"] or 0.0) > (found[row["id"]]["share"] or 0.0):
+            found[row["id"]] = {k: row[k] for k in ("id", "table", "w", "share", "why")}
+    out: dict[str, Any] = {"lines": [], "marks": [], "n_nowhere": 0}
+    setups: dict[str, dict[str, Any]] = {}
+    instruments = {s.setup_id: s.instrument_id for s in survey.setups}
+    for name, where in Observed(survey, ()).readings.items():
+        field, i = where[0]
+        item = getattr(survey, field)[i]
+        known = places.lines(item)
+        out["n_nowhere"] += not known and bool(refs_of(item))
+        said = found[name] | {"kind": getattr(item, "kind", found[name]["table"])}
+        for line in known:
+            out["lines" if len(line) > 1 else "marks"].append({**said, "x": line})
+        if isinstance(item, Reading) and item.setup_id and known:
+            one = setups.setdefault(item.setup_id, {"id": item.setup_id, "x": known[0][0], "n": 0,
+                                                    "instrument": instruments.get(item.setup_id)})  # fmt: skip
+            one["n"] += 1
+    return dict(plain({"version": bench.version, **out, "setups": list(setups.values())}))

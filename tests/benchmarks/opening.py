@@ -1,8 +1,8 @@
 """How long ``labsurvey open`` takes, from the command to what a click shows, and what the browser holds.
 
 ``python -m tests.benchmarks.opening FOLDER`` of a project, or ``--points 1000000`` of a stereo head with so many; with
-``--report`` how long its ``report.html`` takes. Times are of the wall and of a machine that does nothing else; a few
-rounds, the least of each is printed.
+``--report`` how long its ``report.html`` takes. Times are of the wall and of a machine that does nothing else, but for
+those of the processor; a few rounds, the least of each is printed.
 """
 
 import argparse
@@ -11,6 +11,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +41,8 @@ def wait(page: Any, expression: str) -> None:
         time.sleep(0.01)
 
 
-def browser_processes(root: int) -> list[Path]:
-    """Those of a browser, below a process, in /proc."""
+def browsers(root: int) -> list[Path]:
+    """The processes of a browser, as folders of /proc."""
     parents = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -50,26 +52,30 @@ def browser_processes(root: int) -> list[Path]:
     mine = {root}
     while more := {pid for pid, above in parents.items() if above in mine} - mine:
         mine |= more
-    return [Path(f"/proc/{pid}") for pid in mine if b"chrom" in _told(Path(f"/proc/{pid}/cmdline")).split(b"\0")[0]]
-
-
-def _told(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError:  # it is gone
-        return b""
+    found = []
+    for pid in mine:
+        with suppress(OSError):
+            if b"chrom" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[0]:
+                found.append(Path(f"/proc/{pid}"))
+    return found
 
 
 def browser_mb(root: int) -> float:
     """What the processes of a browser hold by themselves and their share of what they hold together, MB."""
-    texts = [_told(process / "smaps_rollup").decode() for process in browser_processes(root)]
-    return sum(int(text.split("\nPss:")[1].split()[0]) for text in texts if "\nPss:" in text) / 1024.0
+    total = 0
+    for place in browsers(root):
+        with suppress(OSError, IndexError):
+            total += int((place / "smaps_rollup").read_text().split("\nPss:")[1].split()[0])
+    return total / 1024.0
 
 
-def browser_cpu_s(root: int) -> float:
-    """Processor seconds that these processes have used."""
-    fields = [_told(process / "stat").decode().rpartition(")")[2].split() for process in browser_processes(root)]
-    return sum(int(f[11]) + int(f[12]) for f in fields if f) / os.sysconf("SC_CLK_TCK")
+def processor_s(places: Iterable[Path]) -> float:
+    """Seconds of processor that processes have taken so far, whatever else the machine does."""
+    total = 0
+    for place in places:
+        with suppress(OSError):
+            total += sum(int(x) for x in (place / "stat").read_text().rpartition(")")[2].split()[11:13])
+    return total / os.sysconf("SC_CLK_TCK")
 
 
 def report(folder: Path) -> dict[str, float]:
@@ -78,11 +84,11 @@ def report(folder: Path) -> dict[str, float]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
         page = browser.new_context(viewport={"width": 1280, "height": 800}, locale="en-GB").new_page()
-        used, begin = browser_cpu_s(os.getpid()), time.perf_counter()
+        used, begin = processor_s(browsers(os.getpid())), time.perf_counter()
         page.goto(path.resolve().as_uri())
         page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
         out["report loaded and drawn, s"] = time.perf_counter() - begin
-        out["processor of the browser, s"] = browser_cpu_s(os.getpid()) - used
+        out["processor of the browser, s"] = processor_s(browsers(os.getpid())) - used
         begin = time.perf_counter()
         page.locator("#all-observations th button, #all-observations th").nth(3).click()
         page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
@@ -99,18 +105,23 @@ def measured(folder: Path) -> dict[str, float]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
         page = browser.new_context(viewport={"width": 1280, "height": 800}, locale="en-GB").new_page()
-        empty = browser_mb(os.getpid())
+        empty, idle = browser_mb(os.getpid()), processor_s(browsers(os.getpid()))
         begin = time.perf_counter()
         command = [sys.executable, "-m", "survey", "open", str(folder), "--port", "0", "--no-browser"]
         server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        mine = [Path(f"/proc/{server.pid}")]
         try:
             address = server.stdout.readline().strip() if server.stdout else ""
             out["address printed, s"] = time.perf_counter() - begin
             page.goto(address)
             wait(page, "document.body.dataset.ready !== undefined")
             out["first view, s"] = time.perf_counter() - begin
-            wait(page, "document.querySelector('#facts').textContent.includes('sigma0')")
+            out["  first view: processor, server, s"] = processor_s(mine)
+            out["  first view: processor, browser, s"] = processor_s(browsers(os.getpid())) - idle
+            wait(page, "document.body.dataset.results !== undefined")
             out["first solution, s"] = time.perf_counter() - begin
+            out["  first solution: processor, server, s"] = processor_s(mine)
+            out["  first solution: processor, browser, s"] = processor_s(browsers(os.getpid())) - idle
             out |= clicks(page)
             page.context.new_cdp_session(page).send("HeapProfiler.collectGarbage")
             out |= {"browser without a page, MB": empty, "browser, MB": browser_mb(os.getpid())}
@@ -167,7 +178,7 @@ def main() -> None:
             subprocess.run([sys.executable, "-m", "survey", "adjust", str(folder), "--quiet"], check=True)
         rounds = [(report if given.report else measured)(folder) for _ in range(given.rounds)]
     for name in rounds[0]:
-        print(f"{name:<32}{min(one[name] for one in rounds):10.2f}")
+        print(f"{name:<42}{min(one[name] for one in rounds):10.2f}")
 
 
 if __name__ == "__main__":

@@ -176,7 +176,7 @@ def test_signs_that_turn_the_line_round_are_shown_as_such() -> None:
     assert esc("Grüße, 標的, مرصد") == "Grüße, 標的, مرصد"
 
 
-@pytest.mark.parametrize("name", ["survey/report/script.js", "capture/web"])
+@pytest.mark.parametrize("name", ["survey/report/web", "survey/workbench/web", "capture/web"])
 def test_scripts_write_text_not_markup(name: str) -> None:
     place = Path(__file__).parents[2] / name
     for path in [place] if place.is_file() else [*place.glob("*.js"), *place.glob("*.html")]:

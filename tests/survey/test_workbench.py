@@ -23,7 +23,6 @@ from survey.project import read
 from survey.solution.earlier.changes import snapshot, solution_changes
 from survey.solution.earlier.runs import MOST, list_runs, load_run
 from survey.workbench import views
-from survey.workbench.network import network
 from survey.workbench.pictures import picture
 from survey.workbench.rows import BY_PEOPLE, IN_USE, columns, point_rows
 from survey.workbench.session import Workbench
@@ -471,7 +470,7 @@ def test_the_network_of_readings_is_where_the_solution_is(tmp_path):
     path.write_text("\n".join([*lines[:2], ",".join(cells), *lines[3:]]) + "\n")
     bench = Workbench(tmp_path / "lab")
     bench.adjust()
-    found = network(bench)
+    found = views.network(bench)
     assert found["n_nowhere"] == 0
     adjusted = {o.ids[0]: o.adjusted[0] for o in bench.adjustment.other_residuals if o.kind == "distance"}
     ends = {x["id"].split(":")[1]: np.array(x["x"]) for x in found["lines"] if x["table"] == "distances"}

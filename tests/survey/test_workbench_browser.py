@@ -13,8 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
+import capture.web
 from survey.examples import write_example
 from survey.report.language import catalogue
+from survey.report.modules import WEB as SHARED
 from survey.report.terminal import summary_text
 from survey.workbench.guard import new_token
 from survey.workbench.live import Listening
@@ -27,6 +29,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 WRONG = ("tX05", "X", "board", "c40")  # an image point that is moved by 4 px
 NAME = "X/tX05/board/c40"
 SECONDS = 30.0
+READY = "document.body.dataset.ready !== undefined"
 VIEWS = ("scene", "plan", "south", "east", "camera", "compare", "history", "angles", "loops", "correlations",
          "settings", "network", "jobs")  # fmt: skip
 ROWS = "Number(document.querySelector('#tables [role=grid]').getAttribute('aria-rowcount'))"
@@ -44,7 +47,7 @@ def need_playwright() -> Any:
 class Page:
     """A page of the workbench, with what it complained of and what it asked of others."""
 
-    def __init__(self, browser: Any, address: str, width: int, **given: Any) -> None:
+    def __init__(self, browser: Any, address: str, width: int, ready: str = READY, **given: Any) -> None:
         self.context = browser.new_context(viewport={"width": width, "height": 800}, locale="en-GB", **given)
         self.page = self.context.new_page()
         self.complaints: list[str] = []
@@ -53,7 +56,7 @@ class Page:
         self.page.on("request", lambda r: None if r.url.startswith((address.split("#")[0], "blob:")) else
                      self.complaints.append(r.url))  # fmt: skip
         self.page.goto(address)
-        self.wait("document.body.dataset.ready !== undefined")
+        self.wait(ready)
 
     def wait(self, expression: str) -> None:
         """Polls from outside: inside the page the content policy forbids evaluating a text."""
@@ -260,14 +263,16 @@ def test_german(page: Page) -> None:
 
 def said_by_the_page() -> set[str]:
     """Every text that the scripts hand to ``t``, directly or from the lists of views, tables, keys and regions."""
-    sources = {path.name: path.read_text() for path in WEB.glob("*.js")}
+    sources = {path.name: path.read_text() for at in (SHARED, WEB) for path in at.glob("*.js")}
+    sources["capture.js"] = (Path(capture.web.__file__).parent / "app.js").read_text()
     found = {text for source in sources.values() for text in re.findall(r'\bt\(\s*"((?:[^"\\]|\\.)*)"', source)}
     app = sources["app.js"]
     views = re.search(r"const VIEWS = \{.*?\n\};", app, re.DOTALL)
     assert views is not None
     found |= set(re.findall(r': \["([^"]+)"', views[0]))
-    for line in re.findall(r"const (?:REGIONS|TABLES) = .*", app):
+    for line in re.findall(r"const (?:REGIONS|TABLES) = .*", app + sources["tables.js"]):
         found |= set(re.findall(r'(?:", |: )"([^"]+)"', line))
+    found |= {"not started", "running", "paused", "finished", "stopped", "broken off", "live"}  # states of a session
     jobs = re.search(r"const JOBS = \[.*?\n\];", sources["jobs.js"], re.DOTALL)
     assert jobs is not None
     found |= set(re.findall(r'\["\w+", "([^"]+)"', jobs[0]))
@@ -280,7 +285,7 @@ def said_by_the_page() -> set[str]:
 def test_every_text_is_there_in_german_and_as_the_report_says_it() -> None:
     said = said_by_the_page()
     assert len(said) > 150
-    german, english = (json.loads((WEB / f"{name}.json").read_text()) for name in ("de", "en"))
+    german, english = (json.loads((SHARED / f"{name}.json").read_text()) for name in ("de", "en"))
     assert said <= set(german)
     assert {text for text in said if text.startswith(("key ", "kind "))} <= set(english) <= set(german)
     report = catalogue("de").texts
@@ -290,7 +295,7 @@ def test_every_text_is_there_in_german_and_as_the_report_says_it() -> None:
 
 def test_scripts_make_no_markup_and_need_no_exception_of_the_policy() -> None:
     unwanted = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function"
-    for path in WEB.glob("*.js"):
+    for path in [*WEB.glob("*.js"), *SHARED.glob("*.js")]:
         assert not re.search(unwanted, path.read_text()), path
     assert not re.search(r"<style|\bstyle=|<script(?! type=\"module\" src=)|\bon\w+=", (WEB / "index.html").read_text())
 
@@ -316,7 +321,7 @@ def test_columns_as_the_page_reads_them(page: Page, folder: Path) -> None:
     bench.adjust()
     data = columns(bench.rows, 4.0, 1)
     found = page.page.evaluate(
-        """async (bytes) => { const { columns, withImages, pointId, rowsOfImage } = await import("./source.js");
+        """async (bytes) => { const { columns, withImages, pointId, rowsOfImage } = await import("./columns.js");
         const data = withImages(columns(Uint8Array.from(bytes).buffer)); const k = 1234;
         return [data.n, pointId(data, k), data.u[k], data.images.length, [...rowsOfImage(data, "X/tX05")].length]; }""",
         list(data),
@@ -344,7 +349,7 @@ def test_images_are_detected_and_shown_as_they_come(browser: Any, tmp_path: Path
     with Listening(Server(Workbench(tmp_path / "lab"), token), "127.0.0.1", 0) as listening:
         page = Page(browser, f"{listening.address}#token={token}&view=findings,jobs", 1280)
         p = page.page
-        assert "nothing to adjust" in p.inner_text("#left .verdict")
+        page.wait("document.querySelector('#left .verdict').textContent.includes('nothing to adjust')")
         page.done(lambda: p.get_by_label("Run: Detect").click())
         page.wait("document.querySelectorAll('#right .arrived canvas').length === 6")
         assert p.inner_text("#right .told").startswith(str(tmp_path))

@@ -44,6 +44,26 @@ def test_images_are_detected_one_by_one_and_the_project_is_adjusted(pictures, tm
     assert again == []
 
 
+def test_another_project_is_begun_beside_this_one_and_found_again(pictures, tmp_path):
+    folder = shutil.copytree(pictures, tmp_path / "lab")
+    (tmp_path / "recordings").mkdir()
+    for path in (folder / "images").glob("*/*"):
+        shutil.copy(path, tmp_path / "recordings" / path.name)
+    bench = Workbench(folder)
+    told = bench.start("recordings", "new")
+    assert told.summary["folder"] == str(tmp_path / "new")
+    assert set(read(tmp_path / "new").images) == {("recordings", p.stem) for p in (folder / "images").glob("*/*")}
+    assert bench.show("new").summary == {"folder": str(tmp_path / "new")}
+    with pytest.raises(SurveyError, match="name the folder of the new project"):
+        bench.start("recordings", " ")
+    with pytest.raises(SurveyError, match="nowhere"):
+        bench.start("nowhere", "other")
+    with pytest.raises(SurveyError, match=r"recordings: holds no survey\.toml"):
+        bench.show("recordings")
+    with pytest.raises(SurveyError, match="reading only"):
+        Workbench(folder, read_only=True).start("recordings", "third")
+
+
 def test_a_plan_draws_what_it_chose_where_it_would_be(tmp_path):
     folder = tmp_path / "lab"
     write_lab(folder)

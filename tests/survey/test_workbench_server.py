@@ -1,10 +1,12 @@
 """The local server of the workbench: what it refuses, what it answers, and the loop of a mistake found and mended."""
 
 import json
+import re
 import shutil
 import threading
 import time
 from contextlib import contextmanager
+from pathlib import Path
 from urllib.request import Request, urlopen
 
 import cv2
@@ -240,15 +242,22 @@ def test_it_ends_with_pages_still_open(mine):
         assert list(socket) == []  # closed by the server
 
 
-def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine):
-    """The first adjustment is held at its first step until the observations have been asked for."""
+@pytest.mark.parametrize("kept", [True, False])
+def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine, kept):
+    """The first adjustment is held at its first step; results of the same inputs stand for it until then."""
+    if not kept:
+        with (mine / "survey.toml").open("a") as stream:
+            stream.write("\n")  # other inputs than those of the results
     bench, seen = Workbench(mine), threading.Event()
     server = Server(bench, TOKEN)
     bench.watch = lambda _step, _omega: seen.wait(20.0)
     with TestClient(server.app(), base_url="http://127.0.0.1:8790") as client:
-        assert client.get("/api/state", headers=HERE).json()["solution"] is None
+        state = client.get("/api/state", headers=HERE).json()
+        assert state["solution"] is None
+        assert (state["kept"] is not None) == kept
         assert client.get("/api/points", headers=HERE).status_code == 200
-        assert client.get("/api/findings", headers=HERE).json()["findings"] == []
+        early = client.get("/api/findings", headers=HERE).json()
+        assert bool(early["findings"]) == kept
         assert client.get("/api/state", headers=HERE).json()["solution"] is None
         seen.set()
         for _ in range(400):
@@ -257,7 +266,13 @@ def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine):
                 break
             time.sleep(0.05)
         assert state["solution"]["verdict"]
+        assert state["kept"] is None
         assert client.get("/api/parameters", headers=HERE).status_code == 200
+        if kept:
+            late = client.get("/api/findings", headers=HERE).json()
+            of_points = [f["id"] for f in late["findings"] if f["kind"] == "image_point"]
+            assert [f["id"] for f in early["findings"]][:10] == of_points[:10]
+            assert early["verdict"] == late["verdict"]
 
 
 def test_messages_are_in_the_language_that_is_asked_for(mine):
@@ -284,3 +299,20 @@ def test_remedies_jobs_and_the_network_are_asked_for_as_the_page_does(mine):
         assert client.get("/api/network", headers=HERE).json()["lines"] == []
     with page(mine, read_only=True) as client:
         assert post(client, "/api/jobs/batch", {}).status_code == 403
+
+
+def test_the_page_goes_to_another_project(mine):
+    other = shutil.copytree(mine, mine.parent / "other")
+    text = (other / "survey.toml").read_text()
+    (other / "survey.toml").write_text(re.sub(r"(?m)^title = .*", 'title = "the other"', text))
+    (mine.parent / "empty").mkdir()
+    with page(mine) as client:
+        assert post(client, "/api/jobs/show", {"folder": "empty"}).status_code == 409
+        told = post(client, "/api/jobs/show", {"folder": "other"}).json()
+        assert told["state"]["title"] == "the other"
+        state = client.get("/api/state", headers=HERE).json()
+        assert (state["folder"], state["solution"]["verdict"]) == (str(other), told["state"]["solution"]["verdict"])
+        rows = post(client, "/api/jobs/batch", {"folders": ["lab", "other"]}).json()["summary"]["rows"]
+    assert [Path(row["folder"]).name for row in rows] == ["lab", "other"]
+    assert {row["state"] for row in rows} <= {"done", "test_failed"}
+    assert all(row["sigma0"] > 0 and row["redundancy"] > 0 and not row["error"] for row in rows)

@@ -25,7 +25,6 @@ from survey.report.markup import (
     element,
     fixed,
     general,
-    heads,
     joined,
     json_script,
     part,
@@ -48,7 +47,6 @@ COLUMNS = (
     "Observed", "Adjusted", "Unit", "σ adj.", "Kind", "Group",
 )  # fmt: skip
 _NAMES = ("Kind", "Group", "Where", "Point", "Component", "Unit", "Unit of σ")
-_SORTED_BY = COLUMNS.index("w")
 _BY_SIZE = {"Residual", "w", "Gross error"}
 _N_VALUES = 12
 _Rows = tuple[npt.NDArray[np.object_], FloatArray]
@@ -196,13 +194,14 @@ def every_observation(c: Context) -> Markup:
         texts[:, mine], values[:, mine] = part_texts, part_values
     names = dict(zip(_NAMES, texts.tolist(), strict=True))
     numbers = _numbers(values) | _reliability(c, values)
-    columns = [
-        _coded(names[x]) if x in _NAMES else _numeric(x, numbers[x], _digits(x, numbers, values)) for x in COLUMNS
-    ]
+    made = [
+        {"key": x, "title": known(x)}
+        | (_coded(names[x]) if x in _NAMES else _numeric(x, numbers[x], _digits(x, numbers, values))) for x in COLUMNS
+    ]  # fmt: skip
     n_images = len(c.adjustment.image_residuals.test)
     readings = ["" if k < n_images else name_of_residual(c.adjustment.other_residuals[k - n_images])
                 for k in values[10].astype(int).tolist()]  # fmt: skip
-    data = {"rows": len(chosen), "columns": columns, "flags": values[9].astype(int).tolist(),
+    data = {"rows": len(chosen), "columns": made, "flags": values[9].astype(int).tolist(),
             "places": _coded(readings), "at": [COLUMNS.index("Where"), COLUMNS.index("Point")]}  # fmt: skip
     said = t(
         "Every observation, one row per component, largest |w| first. w: Baarda's standardized residual. Gross error: "
@@ -215,12 +214,8 @@ def every_observation(c: Context) -> Markup:
     if len(w) > len(chosen):
         shown = {"shown": count(len(chosen)), "n": count(len(w))}
         said += " " + t("The worst {shown} of {n}; all in residuals.csv and residuals_other.csv.", **shown)
-    table = part("all_observations", heads(_left(x) for x in COLUMNS), _SORTED_BY, of="report.html")
+    table = part("all_observations", of="report.html")
     return section("all-observations", "All observations", table + json_script("all-data", data), said)
-
-
-def _left(column: str) -> str:
-    return f"<{column}" if column in _NAMES else column
 
 
 def _coded(values: Sequence[str]) -> dict[str, Any]:

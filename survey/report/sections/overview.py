@@ -222,7 +222,7 @@ def picture(c: Context) -> Markup:
         "Cameras are drawn at the first epoch; thin lines are their axes at others, dash-dotted lines those of tables.",
         n=general(enlarged, 3),
     ) + left_out
-    return section("picture", "The survey", figures(drawn) + space(scene, c.scale.ellipsoid), said)
+    return section("picture", "The survey", figures(drawn) + space(c.adjustment, c.scale, scene), said)
 
 
 def inputs(c: Context) -> Markup:

@@ -1,12 +1,13 @@
 // The page: one set of values from the server, views that follow one selection, keys, and what may be done.
 
 import { button, by, make } from "./dom.js";
-import { known, number, significant, speak, spoken, t, wantedLanguage } from "./words.js";
-import { current, go, names, select, start, subscribe } from "./store.js";
-import { get, live, pointId, points, post, rowOf, takeToken } from "./source.js";
-import { Table, named, numbers } from "./table.js";
-import { askReason, showKeys, tell } from "./dialogs.js";
-import { drawTree, markTree, placeOf } from "./tree.js";
+import { known, number, significant, spoken, t } from "./words.js";
+import { current, go, names, start, subscribe } from "./store.js";
+import { get, live, picture, points, post, takeToken } from "./source.js";
+import { changeLanguage, speak, wantedLanguage } from "./speech.js";
+import { Tables } from "./tables.js";
+import { askReason, previewText, showKeys, tell } from "./dialogs.js";
+import { drawTree, markTree } from "./tree.js";
 import { drawHeader, FindingsView } from "./findings.js";
 import { ImageView } from "./image.js";
 import { SceneView } from "./scene.js";
@@ -16,13 +17,13 @@ import { NetworkView } from "./network.js";
 import { JobsView } from "./jobs.js";
 import { SettingsView } from "./settings.js";
 import { chosenNames, drawInspector } from "./inspector.js";
-import { findingsOf, parametersOf, readingsOf, sceneOf, shiftsOf, sizesOf, stateOf } from "./shapes.js";
+import { findingsOf, leftOut, parametersOf, readingsOf, sceneOf, shiftsOf, sizesOf, stateOf } from "./shapes.js";
 
 /** Everything the views show; new values replace old ones, nothing is changed in place. */
 const bench = { state: null, points: null, limit: 1, readings: [], parameters: [], findings: {}, scene: null, sizes: {}, leftOut: new Map(), shifts: new Map(), told: {}, toldAt: 0, arrived: [], drawn: null, planned: null };
 const VIEWS = {
   findings: ["Findings", () => new FindingsView(bench, actions)],
-  image: ["Image", () => new ImageView(bench)],
+  image: ["Image", () => new ImageView(bench, picture)],
   scene: ["Scene", () => new SceneView(bench, "scene")],
   plan: ["Plan", () => new SceneView(bench, "plan")],
   south: ["South view", () => new SceneView(bench, "south")],
@@ -40,8 +41,7 @@ const VIEWS = {
 const PANES = ["left", "right"];
 const REGIONS = [["tree", "Project"], ["left", "First view"], ["right", "Second view"], ["tables", "Tables"], ["inspector", "Details"]];
 const shown = { left: null, right: null };
-const TABLES = { points: "Image points", readings: "Readings", parameters: "Parameters", exclusions: "Excluded by people" };
-let followed = "", table = null, tableName = "points", lastPane = "right", asked = false, busy = false; // asked: for a table by its tab
+let lastPane = "right", busy = false;
 
 // what may be done
 
@@ -89,11 +89,6 @@ const actions = {
   done: (answer) => renew(answer),
 };
 
-function previewText(p) {
-  const lost = [...(p.epochs_lost ?? []).map((e) => t("epoch {id} loses its only image", { id: e })), ...(p.images_lost ?? []).slice(0, 5).map((i) => t("image {id} has no points any more", { id: i }))];
-  return [t("Leaves out: {what}", { what: p.text }), ...lost].join(". ");
-}
-
 /** Something that makes a new solution; what the server refuses is said in its words. */
 async function act(ask, said = "") {
   if (busy) { tell(t("Still adjusting; Esc gives it up.")); return; }
@@ -128,34 +123,33 @@ function working(text) { by("working").textContent = text; by("working").hidden 
 
 // values and views
 
-/** What the server says of this solution; of a survey that cannot be adjusted its observations and what is wrong. */
-const parts = (solved) => Promise.all([points(), get("readings"), solved ? get("parameters") : null, get("findings"), solved ? get("scene") : null]);
+const tables = new Tables(bench, { show: (view, pane) => actions.show(view, pane) });
 
-/** New values, then every view with them. @param {any} answer a state, or null to ask for it */
+/** New values, then every view with them: observations and what is wrong first. @param {any} answer a state, or null to ask for it */
 async function renew(answer) {
   const raw = answer?.state ?? (answer?.version !== undefined && answer.exclusions ? answer : await get("state"));
   const state = stateOf(raw);
-  const fresh = !bench.state || bench.state.version !== state.version || (state.failure ?? "") !== (bench.state.failure ?? "");
+  const fresh = !bench.state || bench.state.version !== state.version || bench.state.folder !== state.folder || (state.failure ?? "") !== (bench.state.failure ?? "");
   if (fresh) {
-    const [columns, readings, parameters, findings, scene] = await parts(state.solved);
-    const before = bench.scene;
-    Object.assign(bench, { state, points: columns, readings: readingsOf(readings), limit: readings.limit, parameters: parameters ? parametersOf(parameters) : [], findings: findingsOf(findings, raw), scene: scene && sceneOf(scene), sizes: sizesOf(raw) });
-    bench.shifts = scene ? shiftsOf(before, bench.scene) : new Map();
-    bench.leftOut = leftOut(columns);
+    const [columns, readings, findings] = await Promise.all([points(), get("readings"), get("findings")]);
+    Object.assign(bench, { state, points: columns, readings: readingsOf(readings), limit: readings.limit, findings: findingsOf(findings, raw), sizes: sizesOf(raw), leftOut: leftOut(columns) });
+    if (!state.solved) Object.assign(bench, { parameters: [], scene: null, shifts: new Map() });
     state.changes = answer?.changes ?? (state.solved ? (await get("changes")).changes : null);
   } else Object.assign(bench, { state: { ...state, changes: bench.state?.changes } });
   drawAll(fresh);
   if (state.changed_files?.length) changedOutside(state.changed_files);
+  if (fresh && state.solved) await results(state.version);
 }
 
-function leftOut(data) {
-  const out = new Map();
-  for (let k = 0; k < data.images.length; k++) {
-    let n = 0;
-    for (let j = data.first[k]; j < data.first[k + 1]; j++) n += 1 - data.used[data.rows[j]];
-    if (n) out.set(data.images[k], n);
-  }
-  return out;
+/** What was estimated, behind the observations. */
+async function results(version) {
+  const [parameters, raw] = await Promise.all([get("parameters"), get("scene")]), scene = sceneOf(raw);
+  if (bench.state.version !== version) return;
+  Object.assign(bench, { parameters: parametersOf(parameters), scene, shifts: shiftsOf(bench.scene, scene) });
+  for (const pane of PANES) drawPane(pane);
+  tables.renew("parameters");
+  drawInspector(bench, actions);
+  document.body.dataset.results = String(version);
 }
 
 function changedOutside(files) {
@@ -169,7 +163,7 @@ function drawAll(fresh) {
   document.body.dataset.ready ??= String(Math.round(performance.now()));
   if (fresh) drawTree(bench);
   for (const pane of PANES) drawPane(pane);
-  drawTable(fresh);
+  tables.draw(fresh);
   drawInspector(bench, actions);
 }
 
@@ -191,69 +185,6 @@ function drawPane(pane) {
 
 function viewOf(type) { return PANES.map((pane) => shown[pane]?.view).find((view) => view instanceof type); }
 
-// the table below
-
-function tableData() {
-  const data = bench.points;
-  if (tableName === "points") {
-    const name = (key) => ({ names: [...new Set(data.blocks.map((b) => b[key] ?? ""))] });
-    const code = (key, found) => { const idx = new Map(found.names.map((x, k) => [x, k])), of = data.blocks.map((b) => idx.get(b[key] ?? "")); return Uint32Array.from(data.block, (b) => of[b]); };
-    const column = (key, title) => { const found = name(key); return { key, title, names: found.names, codes: code(key, found), wide: 5 }; };
-    const all = [...new Set(Object.values(data.points).flat())], place = new Map(all.map((x, k) => [x, k]));
-    const lists = data.blocks.map((b) => data.points[b.target ?? ""].map((x) => place.get(x)));
-    const residual = Float32Array.from(data.du, (du, i) => Math.hypot(du, data.dv[i]));
-    return {
-      n: data.n, id: (i) => `image_point:${pointId(data, i)}`, state: (i) => (data.used[i] ? (data.w[i] > data.limit ? "suspect" : "") : "out"),
-      columns: [column("camera", t("camera")), column("epoch", t("kind epoch")), column("target", t("target")),
-        { key: "point", title: t("point"), names: all, codes: Uint32Array.from(data.point, (p, i) => lists[data.block[i]][p]), wide: 5 },
-        { key: "residual", title: t("residual, px"), values: residual, digits: 3, size: true }, { key: "w", title: "w", values: data.w, digits: 2, size: true },
-        ...(data.redundancy ? [{ key: "r", title: "r", values: data.redundancy, digits: 3 }] : []), { key: "used", title: t("used"), values: data.used, digits: 0, text: (i) => (data.used[i] ? "✓" : "✕") }],
-      kind: "obs", sort: "w",
-    };
-  }
-  if (tableName === "readings") {
-    const rows = bench.readings;
-    return { n: rows.length, id: (i) => rows[i].id, state: (i) => (rows[i].used ? (rows[i].share > 1 ? "suspect" : "") : "out"), kind: "reading", sort: "w",
-      columns: [named("table", t("sort of reading"), rows.map((r) => known(r.table.replaceAll("_", " ")))), named("name", t("reading"), rows.map((r) => r.name)), named("component", t("component"), rows.map((r) => r.component)),
-        number4("observed", t("observed"), rows), number4("residual", t("residual"), rows, true), named("unit", t("unit"), rows.map((r) => r.sigma_unit ?? "")), numbers("w", "w", rows.map((r) => r.w), { digits: 2, size: true }), numbers("r", "r", rows.map((r) => r.redundancy), { digits: 3 }), numbers("used", t("used"), rows.map((r) => Number(r.used)), { text: (i) => (rows[i].used ? "✓" : "✕") })] };
-  }
-  if (tableName === "parameters") {
-    const rows = bench.parameters;
-    return { n: rows.length, id: (i) => rows[i].name, kind: "param", columns: [named("name", t("parameter"), rows.map((r) => r.name), { wide: 14 }), number4("value", t("value"), rows), named("unit", t("unit"), rows.map((r) => r.unit ?? "")), number4("sigma", t("sigma"), rows), named("unit of sigma", t("unit"), rows.map((r) => r.sigma_unit ?? "")), named("treatment", t("treatment"), rows.map((r) => known(r.treatment ?? "")))] };
-  }
-  const rows = bench.state.exclusions;
-  return { n: rows.length, id: (i) => rows[i].name, kind: "exclusion", columns: [named("what", t("what"), rows.map((r) => t(`kind ${r.what}`))), named("id", "id", rows.map((r) => r.id), { wide: 12 }), named("reason", t("reason"), rows.map((r) => r.reason), { wide: 12 }), named("author", t("who"), rows.map((r) => r.author ?? "")), named("time", t("time"), rows.map((r) => r.time ?? ""))] };
-}
-
-const number4 = (key, title, rows, size = false) => numbers(key, title, rows.map((r) => r[key]), { size, text: (i) => significant(rows[i][key], 6) });
-
-/** Tables in which a chosen thing is found. */
-const TABLE_OF = { obs: "points", reading: "readings", param: "parameters" };
-
-function drawTable(fresh) {
-  const wanted = TABLE_OF[current().kind];
-  if (wanted && wanted !== tableName && followed !== current().ids[0]) { tableName = wanted; table = null; }
-  followed = current().ids[0];
-  const first = bench.points.n ? "points" : "readings";
-  if (!asked && fresh && tableName !== first) { tableName = first; table = null; }
-  if (!table) {
-    const data = tableData();
-    table = new Table(t(TABLES[tableName]), data, { sort: data.sort, onselect: (rows, quiet) => selectRows(data.kind, rows, quiet), onenter: (row) => { selectRows(data.kind, [row], false); actions.show("image", "right"); } });
-    const tab = (name, title) => make("button", { type: "button", role: "tab", "aria-selected": name === tableName, onclick: () => { asked = true; tableName = name; table = null; drawTable(false); } }, t(title));
-    by("tables").replaceChildren(make("div", { role: "tablist", "aria-label": t("Tables"), class: "tabs" }, ...Object.entries(TABLES).map(([name, title]) => tab(name, title))), table.element);
-  } else if (fresh) table.renew(tableData());
-  const { kind, ids } = current();
-  if (tableName === "points" && kind === "obs") table.mark(ids, ids[0]?.startsWith("image_point:") ? rowOf(bench.points, names(ids[0]).ids) : -1);
-  else if (tableName === "readings" && kind === "reading") table.mark(ids, bench.readings.findIndex((r) => r.id === ids[0]));
-  else if (tableName === "parameters" && kind === "param") table.mark(ids, bench.parameters.findIndex((r) => r.name === ids[0]));
-  else table.mark([]);
-}
-
-function selectRows(kind, rows, quiet) {
-  if (!rows.length) return;
-  if (kind === "exclusion") { const row = bench.state.exclusions[rows[0]]; select(...placeOf(row.what, row.id), quiet); } else select(kind, rows.slice(0, 1000).map((i) => table.data.id(i)), quiet);
-}
-
 // keys and the frame
 
 /** Key, what it says under "?", and what it does. */
@@ -266,12 +197,12 @@ const KEYS = [
   ["m", "carry out the first remedy", () => { if (bench.findings.remedies?.[0]?.possible && !bench.state.read_only) actions.remedy(1); }],
   ["a", "adjust again", () => actions.adjust("warm")], ["A", "adjust from the beginning", () => actions.adjust("cold")],
   ["u", "undo (also Ctrl-Z)", () => actions.undo()], ["U", "redo (also Ctrl-Shift-Z)", () => actions.redo()], ["s", "save (also Ctrl-S)", () => actions.save()],
-  ["f", "filter the table", () => { table?.field.focus(); table?.field.select(); }],
+  ["f", "filter the table", () => tables.find()],
   ["1", "project", () => focus("tree")], ["2", "first view", () => focus("left")], ["3", "second view", () => focus("right")], ["4", "tables", () => focus("tables")], ["5", "details", () => focus("inspector")],
   ["+", "longer vectors, larger ellipsoids", () => enlarge(1)], ["-", "shorter vectors, smaller ellipsoids", () => enlarge(-1)],
   ["0", "the whole image or scene", () => whole()], ["o", "overlay on or off", () => { const view = viewOf(ImageView); if (view) { view.overlay = !view.overlay; view.surface.redraw(); } }],
   ["d", "before and after", () => actions.show("compare", "left")], ["v", "next view in this pane", () => nextView(1)], ["V", "previous view in this pane", () => nextView(-1)],
-  ["g", "language", () => changeLanguage()], ["Escape", "give up what is being adjusted", () => { if (busy) post("cancel").catch(() => {}); else by("message").replaceChildren(); }], ["?", "these keys", () => showKeys(KEYS.map(([key, does]) => [key, t(`key ${does}`)]))],
+  ["g", "language", () => otherLanguage()], ["Escape", "give up what is being adjusted", () => { if (busy) post("cancel").catch(() => {}); else by("message").replaceChildren(); }], ["?", "these keys", () => showKeys(KEYS.map(([key, does]) => [key, t(`key ${does}`)]))],
 ];
 
 function viewStep(step) {
@@ -282,13 +213,23 @@ function viewStep(step) {
 
 const nextView = (by) => { const all = Object.keys(VIEWS), at = all.indexOf(panes()[PANES.indexOf(lastPane)]); actions.show(all[(at + by + all.length) % all.length], lastPane); };
 const enlarge = (by) => PANES.forEach((pane) => { const view = shown[pane]?.view; if (view instanceof ImageView) view.enlarge(by); else if (view instanceof SceneView) view.enlarge(2 ** by); });
-const whole = () => PANES.forEach((pane) => { const view = shown[pane]?.view; if (view instanceof ImageView) view.fit = true; else if (view instanceof SceneView) Object.assign(view, { zoom: 1, dx: 0, dy: 0 }); else return; view.surface.redraw(); });
+const whole = () => PANES.forEach((pane) => shown[pane]?.view.whole?.());
 
 function focus(region) {
   document.body.dataset.pane = region;
   drawTabs();
   if (PANES.includes(region)) lastPane = region;
   by(region).querySelector("[tabindex='0'], button, select, input")?.focus();
+}
+
+let pointed = 0;
+
+/** The picture of what is pointed at is fetched before the click. */
+function ahead(event) {
+  const { image, id = "" } = event.target.closest?.("[data-image], [data-id]")?.dataset ?? {}, { what, ids } = names(id);
+  const wanted = image ?? (what === "image_point" ? ids.slice(0, 2).join("/") : id);
+  clearTimeout(pointed);
+  if (bench.points?.imageIdx.has(wanted) && viewOf(ImageView)) pointed = setTimeout(() => picture(wanted, 1600).catch(() => {}), 40);
 }
 
 function pressed(event) {
@@ -314,7 +255,7 @@ function drawDoing() {
     by("doing").dataset.language = spoken();
     by("doing").setAttribute("aria-label", t("Actions"));
     by("doing").replaceChildren(make("output", { id: "working", class: "working", hidden: true }), button(t("Adjust"), () => actions.adjust("warm"), "a", { id: "adjust" }), button(t("Undo"), () => actions.undo(), "u", { id: "undo" }), button(t("Redo"), () => actions.redo(), "U", { id: "redo" }), button(t("Save"), () => actions.save(), "s", { id: "save", class: "primary" }),
-      button(spoken() === "en" ? "DE" : "EN", () => changeLanguage(), "g", { "aria-label": t("language") }), button("?", () => KEYS.at(-1)?.[2](), "?", { "aria-label": t("Keys") }));
+      button(spoken() === "en" ? "DE" : "EN", () => otherLanguage(), "g", { "aria-label": t("language") }), button("?", () => KEYS.at(-1)?.[2](), "?", { "aria-label": t("Keys") }));
   }
   by("undo").disabled = !state.undo.length || state.read_only;
   by("redo").disabled = !state.redo.length || state.read_only;
@@ -328,10 +269,8 @@ function drawTabs() {
   by("tabs").replaceChildren(...REGIONS.map(([id, title]) => make("button", { type: "button", "aria-current": document.body.dataset.pane === id ? "page" : null, onclick: () => focus(id) }, t(PANES.includes(id) ? VIEWS[panes()[PANES.indexOf(id)]][0] : title))));
 }
 
-async function changeLanguage() {
-  const to = spoken() === "en" ? "de" : "en";
-  localStorage.setItem("language", to);
-  await speak(to);
+async function otherLanguage() {
+  await changeLanguage();
   bench.state = null; // what the server says is said in its language too
   await renew(null);
   drawn();
@@ -341,7 +280,8 @@ async function changeLanguage() {
 function drawn() {
   for (const [id, title] of REGIONS) by(id).setAttribute("aria-label", t(title));
   drawTabs();
-  shown.left = shown.right = table = null;
+  shown.left = shown.right = null;
+  tables.forget();
   by("tree").replaceChildren();
   drawAll(true);
 }
@@ -363,9 +303,10 @@ async function begin() {
   subscribe((changed) => {
     if (!bench.points) return;
     for (const pane of PANES) drawPane(pane);
-    if (changed.has("ids")) { markTree(); drawInspector(bench, actions); drawTable(false); }
+    if (changed.has("ids")) { markTree(); drawInspector(bench, actions); tables.draw(false); }
   });
   document.addEventListener("keydown", pressed);
+  document.addEventListener("pointerover", ahead);
   for (const pane of PANES) for (const name of ["pointerdown", "focusin"]) by(pane).addEventListener(name, () => { lastPane = pane; });
   addEventListener("error", (event) => tell(event.message, "bad"));
   addEventListener("unhandledrejection", (event) => tell(event.reason?.message ?? String(event.reason), "bad"));

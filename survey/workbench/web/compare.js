@@ -66,12 +66,11 @@ export class HistoryView {
     try { runs = (await get("runs")).runs; } catch (error) { fill(this.element, make("p", { class: "warn" }, error.message)); return; }
     const { state } = this.bench, chosen = current();
     const pick = (name, run) => make("input", { type: "radio", name, "aria-label": `${t(name)} ${run}`, checked: String(chosen[name === "before" ? "against" : "run"]) === String(run), onchange: () => go(name === "before" ? { against: String(run) } : { run: String(run) }, true) });
-    const rows = runs.map((run) => [pick("before", run.number), pick("after", run.number), link(`#run=${run.number}`, String(run.number)), time(run.time), run.author ?? "", run.command ?? "",
-      t(`verdict ${run.summary.verdict}`), number(run.summary.sigma0, 4), count(run.summary.redundancy),
-      state.read_only ? null : make("span", {}, button(run.pinned ? "★" : "☆", () => this.act("pin", run), "", { "aria-label": run.pinned ? t("not kept for ever") : t("keep for ever") }), " ", button(t("restore"), () => this.act("restore", run)))]);
+    const acts = (run) => (state.read_only ? null : make("span", {}, button(run.pinned ? "★" : "☆", () => this.act("pin", run), "", { "aria-label": `${run.pinned ? t("not kept for ever") : t("keep for ever")}: ${run.number}` }), " ", button(t("restore"), () => this.act("restore", run), "", { "aria-label": `${t("restore")}: ${run.number}` })));
+    const rows = runs.map((run) => [pick("before", run.number), pick("after", run.number), link(`#run=${run.number}`, String(run.number)), t(`verdict ${run.summary.verdict}`), number(run.summary.sigma0, 4), count(run.summary.redundancy), acts(run), time(run.time), run.author ?? "", run.command ?? ""]);
     const steps = (title, labels) => labels?.length ? make("div", {}, make("h3", {}, title), make("ol", {}, ...labels.map((label) => make("li", {}, label)))) : null;
     fill(this.element, make("h2", {}, t("History")), steps(t("Can be undone"), state.undo), steps(t("Can be done again"), state.redo), make("h3", {}, t("Runs")),
-      rows.length ? plainTable(t("Runs"), [t("before"), t("after"), t("run"), t("time"), t("who"), t("Command"), t("verdict"), "sigma0", t("redundancy"), ""], rows, [7, 8]) : make("p", { class: "quiet" }, t("No runs are kept yet; Save writes one.")),
+      rows.length ? plainTable(t("Runs"), [t("before"), t("after"), t("run"), t("verdict"), "sigma0", t("redundancy"), "", t("time"), t("who"), t("Command")], rows, [4, 5]) : make("p", { class: "quiet" }, t("No runs are kept yet; Save writes one.")),
       rows.length > 1 ? button(t("Compare"), () => this.compare(), "d", { class: "primary" }) : null);
   }
 

@@ -40,6 +40,12 @@ export async function askReason(things, preview) {
   return lastReason;
 }
 
+/** What leaving something out would take with it. @param {any} p answer of the server */
+export function previewText(p) {
+  const lost = [...(p.epochs_lost ?? []).map((e) => t("epoch {id} loses its only image", { id: e })), ...(p.images_lost ?? []).slice(0, 5).map((i) => t("image {id} has no points any more", { id: i }))];
+  return [t("Leaves out: {what}", { what: p.text }), ...lost].join(". ");
+}
+
 const READ_MS = 8000;
 
 /** A message; a warning stays until it is read. @param {string} text @param {string} [kind] warn or bad */

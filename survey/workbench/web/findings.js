@@ -1,9 +1,9 @@
 // What is wrong, worst first: verdict, warnings, suspects with their probable cause and what may be done about them.
 
 import { button, by, fill, link, make, plainTable } from "./dom.js";
-import { count, known, number, significant, t } from "./words.js";
+import { count, known, number, significant, t, time } from "./words.js";
 import { anchor, current, select } from "./store.js";
-import { rowOf, rowsOfImage } from "./source.js";
+import { rowOf, rowsOfImage } from "./columns.js";
 import { placeOf } from "./tree.js";
 
 /** The places that a message names. */
@@ -29,13 +29,14 @@ export class FindingsView {
   draw(state, findings) {
     const suspects = findings.suspects ?? [], causes = findings.causes ?? [];
     fill(this.element, 
-      state.waiting ? make("p", { class: "verdict" }, t("adjusting …")) : make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
+      state.waiting && !state.known ? make("p", { class: "verdict" }, t("adjusting …")) : make("p", { class: `verdict ${state.verdict}` }, make("b", {}, verdictText(state.verdict)), " ", make("span", {}, state.reason ?? "")),
+      state.waiting && state.known ? make("p", { class: "quiet" }, t("As saved {time}; it is being adjusted again.", { time: time(state.date) })) : null,
       ...causes.map((cause) => this.cause(cause)),
       findings.remedies?.length ? make("h2", {}, t("What would mend it")) : null,
       ...(findings.remedies ?? []).map((remedy) => this.remedy(remedy)),
       (findings.warnings ?? []).length ? make("ul", { class: "problems" }, ...findings.warnings.map((w) => make("li", {}, w.text, ...places(w)))) : null,
-      state.solved ? make("h2", {}, t("Suspects"), " ", make("span", { class: "quiet" }, count(findings.n_suspects ?? suspects.length))) : null,
-      !state.solved ? null : suspects.length ? this.suspects(t("Suspects, worst first"), suspects) : make("p", { class: "quiet" }, t("Nothing disagrees with the others.")),
+      state.known ? make("h2", {}, t("Suspects"), " ", make("span", { class: "quiet" }, count(findings.n_suspects ?? suspects.length))) : null,
+      !state.known ? null : suspects.length ? this.suspects(t("Suspects, worst first"), suspects) : make("p", { class: "quiet" }, t("Nothing disagrees with the others.")),
       state.exclusions.length ? this.exclusions(state.exclusions) : null,
       (findings.groups ?? []).length ? make("h2", {}, t("Groups")) : null,
       (findings.groups ?? []).length ? this.groups(findings.groups) : null,
@@ -93,10 +94,11 @@ export const verdictText = (verdict) => ({ passed: `✓ ${t("verdict passed")}`,
 export function drawHeader(state) {
   by("title").textContent = state.title;
   document.title = `${state.title} · labsurvey`;
-  by("verdict").className = state.waiting ? "" : state.verdict;
-  by("verdict").textContent = state.waiting ? "" : verdictText(state.verdict);
+  const none = state.waiting && !state.known;
+  by("verdict").className = none ? "" : state.verdict;
+  by("verdict").textContent = none ? "" : verdictText(state.verdict);
   const fact = (name, value) => make("span", {}, make("span", { class: "quiet" }, `${name} `), value);
-  fill(by("facts"), ...(state.solved ? [fact("sigma0", number(state.sigma0, 4)), fact(t("redundancy"), count(state.redundancy))] : []),
+  fill(by("facts"), ...(state.known ? [fact("sigma0", number(state.sigma0, 4)), fact(t("redundancy"), count(state.redundancy))] : []),
     fact(t("excluded"), count(state.exclusions.length)), state.n_not_used ? fact(t("not used"), count(state.n_not_used)) : null, state.unsaved ? fact(t("unsaved"), count(state.unsaved)) : null, state.read_only ? make("span", { class: "pill" }, t("for reading only")) : null);
 }
 

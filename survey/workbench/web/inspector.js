@@ -3,7 +3,7 @@
 import { button, by, fill, link, make, plainTable } from "./dom.js";
 import { count, known, measure, number, significant, t } from "./words.js";
 import { anchor, current, names } from "./store.js";
-import { pointId, pointName, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./source.js";
+import { pointId, pointName, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./columns.js";
 
 const WHY = ["in use", "used = false in its table", "excluded by people", "left out by this adjustment"];
 const MOST = 40;

@@ -1,19 +1,22 @@
 // The other jobs of a project: what they ask, what they said, what of it is drawn in the scene, pictures as they come.
 
-import { button, fill, make } from "./dom.js";
-import { count, t } from "./words.js";
-import { select } from "./store.js";
+import { button, fill, make, plainTable } from "./dom.js";
+import { count, number, t } from "./words.js";
+import { verdictText } from "./findings.js";
+import { go, select } from "./store.js";
 import { picture, post } from "./source.js";
 
 const MOST = 60; // pictures shown at once
 
 /** Name, title, what it does, and its fields: key, label, kind (text, number, flag, words), what stands there first. */
 const JOBS = [
+  ["init", "New project", "Begin a project with a folder of images; cameras, sizes and boards are read out of them, and it is shown here.", [["images", "folder of images", "text", ""], ["folder", "folder", "text", ""]]],
   ["detect", "Detect", "Find targets in images that are new or have changed, and adjust.", [["all", "all images anew", "flag", false]]],
   ["plan", "Plan", "What to measure next, of what plan.toml lists; drawn in the scene.", [["wanted", "to become precise", "text", ""], ["add", "candidates to choose", "number", 5], ["navigation", "poses from beacons", "flag", false]]],
   ["navigate", "Navigate", "A pose for every epoch that shows beacons and no target; drawn in the scene.", [["station", "station", "text", ""], ["interval_s", "seconds between epochs", "number", 0]]],
   ["add", "Add", "Let the network grow by another folder, and adjust.", [["folder", "folder", "text", ""]]],
   ["compare", "Compare epochs", "What moved since another folder of the same laboratory; drawn in the scene.", [["folder", "folder", "text", ""]]],
+  ["show", "Other project", "Another project folder on this page instead of this one.", [["folder", "folder", "text", ""]]],
   ["batch", "Batch", "Adjust several projects; none named: all beside this one.", [["folders", "folders", "words", ""]]],
 ];
 
@@ -40,14 +43,22 @@ export class JobsView {
     const told = this.bench.told[name];
     return make("section", { "aria-label": t(title) }, make("h2", {}, t(title)), make("p", { class: "quiet" }, t(does)),
       make("div", { class: "actions" }, ...inputs.map(({ label, input }) => make("label", {}, t(label), " ", input)),
-        button(t("Run"), () => this.run(name, Object.fromEntries(inputs.map(({ key, kind, input }) => [key, valueOf(kind, input)]))), "", { "aria-label": `${t("Run")}: ${t(title)}`, disabled: this.bench.state.read_only && name !== "compare" })),
-      name === "detect" ? this.strip : null, told ? make("pre", { class: "told" }, told.text) : null,
+        button(t("Run"), () => this.run(name, Object.fromEntries(inputs.map(({ key, kind, input }) => [key, valueOf(kind, input)]))), "", { "aria-label": `${t("Run")}: ${t(title)}`, disabled: this.bench.state.read_only && !["compare", "show"].includes(name) })),
+      name === "detect" ? this.strip : null, told?.summary.rows ? this.overview(told.summary.rows) : told ? make("pre", { class: "told" }, told.text) : null,
       told && hasDrawing(told.drawn) ? button(t("Show in the scene"), () => { this.bench.drawn = told.drawn; this.actions.show("scene"); }) : null);
+  }
+
+  /** The projects of a batch, those that failed first, each a click away. */
+  overview(rows) {
+    const of = (row) => ["failed", "test_failed", "done"].indexOf(row.state), short = (folder) => folder.split(/[\\/]/).filter(Boolean).at(-1);
+    return plainTable(t("Batch"), [t("folder"), t("verdict"), "sigma0", t("redundancy"), "", ""], [...rows].sort((a, b) => of(a) - of(b)).map((row) => [make("span", { title: row.folder }, short(row.folder)), make("span", { class: row.state === "done" ? "" : "bad" }, verdictText(row.verdict ?? "failed")),
+      number(row.sigma0, 4), number(row.redundancy, 0), make("span", { class: "wide" }, row.error.split("\n")[0]), button(t("Open"), () => this.run("show", { folder: row.folder }), "", { "aria-label": `${t("Open")}: ${short(row.folder)}` })]), [2, 3]);
   }
 
   async run(name, asked) {
     if (name === "detect") { this.bench.arrived = []; this.strip.replaceChildren(); }
     await this.actions.job(name, () => post(`jobs/${name}`, asked));
+    if (name === "init" || name === "show") go({ kind: "", ids: [] }); // what was chosen is of the other project
     this.draw();
   }
 

@@ -22,6 +22,7 @@ class Asked {
     if (key === this.key) return;
     this.key = key;
     this.element.setAttribute("aria-busy", "true");
+    if (!this.element.childElementCount) this.element.replaceChildren(make("p", { class: "quiet" }, t("computing …")));
     try {
       const parts = await this.parts();
       if (this.key === key) this.element.replaceChildren(...parts);
@@ -96,7 +97,7 @@ export class CorrelationsView extends Asked {
     const [correlated, weak] = await Promise.all(["correlations", "weak"].map(async (part) => (await get(`statistics/${part}`))[part] ?? []));
     const name = (id) => link(anchor("param", id), id);
     return [make("h2", {}, t("Correlations"), " ", make("span", { class: "quiet" }, count(correlated.length))),
-      plainTable(t("Correlations"), [t("parameter"), t("parameter"), t("correlation")], correlated.slice(0, 300).map((c) => [name(c.a), name(c.b), number(c.correlation, 4)]), [2]),
+      plainTable(t("Correlations"), [t("correlation"), t("parameter"), t("parameter")], correlated.slice(0, 300).map((c) => [number(c.correlation, 4), name(c.a), name(c.b)]), [0]),
       make("h2", {}, t("Weak directions")),
       ...weak.slice(0, 8).map((w) => make("p", {}, make("b", {}, `× ${significant(w.inflation, 3)}`), "  ", Object.entries(w.parts).slice(0, 6).map(([id, share]) => `${id} ${number(share, 3)}`).join("   ")))];
   }

@@ -12,7 +12,7 @@ export function drawTree(bench) {
   const { tree } = bench.state, root = by("tree"), open = new Set([...root.querySelectorAll("details[open]")].map((d) => d.dataset.branch));
   const cameras = new Map(tree.cameras.map((c) => [c.id, c.images])), epochs = new Map(tree.epochs.map((epoch) => [epoch, []])), { targets } = tree;
   for (const [camera, mine] of cameras) for (const epoch of mine) epochs.get(epoch)?.push(camera);
-  const spots = bench.scene?.spots ?? tree.points.map((id) => ({ kind: "point", id })).concat(tree.stations.map((id) => ({ kind: "station", id }))), groups = new Map();
+  const groups = new Map();
   for (const row of bench.readings) if (!groups.get(row.table)?.has(row.id)) groups.set(row.table, (groups.get(row.table) ?? new Set()).add(row.id));
   const branch = (id, title, n, fill) => {
     const inner = make("ul", { role: "group" });
@@ -31,8 +31,8 @@ export function drawTree(bench) {
     branch("cameras", t("Cameras"), cameras.size, () => [...cameras.keys()].map((camera) => make("li", {}, leaf("camera", camera).firstChild, branch(`camera ${camera}`, t("Images"), cameras.get(camera).length, () => images(camera))))),
     branch("epochs", t("Epochs"), epochs.size, () => [...epochs.keys()].map((epoch) => leaf("epoch", epoch, epoch, epochs.get(epoch).join(" ")))),
     branch("targets", t("Targets"), targets.length, () => targets.map((target) => leaf("target", target))),
-    branch("points", t("Points"), spots.filter((s) => s.kind === "point").length, () => spots.filter((s) => s.kind === "point").map((s) => leaf("point", s.id))),
-    branch("stations", t("Stations"), spots.filter((s) => s.kind !== "point").length, () => spots.filter((s) => s.kind !== "point").map((s) => leaf("station", s.id))),
+    branch("points", t("Points"), tree.points.length, () => tree.points.map((id) => leaf("point", id))),
+    branch("stations", t("Stations"), tree.stations.length, () => tree.stations.map((id) => leaf("station", id))),
     branch("readings", t("Readings"), [...groups.values()].reduce((sum, ids) => sum + ids.size, 0), () => [...groups].map(([table, ids]) => make("li", {}, branch(`table ${table}`, known(table.replaceAll("_", " ")), ids.size, () => [...ids].map((id) => leaf("reading", id, id.slice(table.length + 1))))))),
     branch("exclusions", t("Excluded by people"), bench.state.exclusions.length, () => bench.state.exclusions.map((row) => leaf(...placeOf(row.what, row.id), `${t(`kind ${row.what}`)} ${row.id}`))),
   );

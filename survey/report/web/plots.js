@@ -30,16 +30,16 @@ function legend(context, box, low, high, unit) {
 /**
  * Values on a regular grid over an image (rows from the top), with arrows where there are any.
  * @param {string} label
- * @param {{size: number[], columns: number, rows: number, values: (number|null)[], unit: string, low?: number, arrows?: number[][], counts?: boolean}} grid
+ * @param {{size: number[], columns: number, rows: number, values: (number|null)[], unit: string, low?: number, said?: string, arrows?: number[][], counts?: boolean}} grid
  *   arrows: u, v, du, dv (px)
  */
 export function heat(label, grid) {
   const known = grid.values.filter((x) => x !== null && Number.isFinite(x)), high = Math.max(...known, 1e-300), low = grid.low ?? Math.min(...known, high);
   const longest = Math.max(...(grid.arrows ?? []).map((a) => Math.hypot(a[2], a[3])), 1e-300);
   const { canvas } = surface(label, (context, width, height) => {
-    const box = frame(grid.size, width, height), dx = box.w / grid.columns, dy = box.h / grid.rows;
+    const box = frame(grid.size, width, height, high > low ? 70 : 0), dx = box.w / grid.columns, dy = box.h / grid.rows;
     grid.values.forEach((value, k) => {
-      context.fillStyle = value === null || !Number.isFinite(value) ? colour("sunk") : ramp((value - low) / Math.max(1e-300, high - low));
+      context.fillStyle = value === null || !Number.isFinite(value) ? colour("sunk") : ramp(high > low ? (value - low) / (high - low) : 0.7);
       context.fillRect(box.x + (k % grid.columns) * dx, box.y + Math.floor(k / grid.columns) * dy, dx + 0.5, dy + 0.5);
     });
     if (grid.arrows) {
@@ -49,9 +49,9 @@ export function heat(label, grid) {
     context.strokeStyle = colour("edge");
     context.lineWidth = 1;
     context.strokeRect(box.x, box.y, box.w, box.h);
-    if (known.length) legend(context, box, low, high, grid.unit);
+    if (high > low) legend(context, box, low, high, grid.unit);
   });
-  const said = known.length ? t("from {a} to {b} {unit}", { a: significant(low, 3), b: significant(high, 3), unit: grid.unit }) : t("no values");
+  const said = grid.said ?? (known.length ? t("from {a} to {b} {unit}", { a: significant(low, 3), b: significant(high, 3), unit: grid.unit }) : t("no values"));
   return figure(label, said, canvas);
 }
 

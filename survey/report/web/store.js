@@ -54,7 +54,7 @@ export function go(to, quiet = false) {
   if (changed.has("kind")) changed.add("ids");
   if (!changed.size) return;
   Object.assign(place, to);
-  history[quiet ? "replaceState" : "pushState"](null, "", written());
+  try { history[quiet ? "replaceState" : "pushState"](null, "", written()); } catch { /* in a mail the address is not ours */ }
   for (const listener of listeners) listener(changed);
 }
 

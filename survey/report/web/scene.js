@@ -3,7 +3,7 @@
 import { button, colour, make, surface } from "./dom.js";
 import { number, significant, t } from "./words.js";
 import { current, names, select } from "./store.js";
-import { rowsOfPoint } from "./source.js";
+import { rowsOfPoint } from "./columns.js";
 
 /** Right and up of the flat views, by axes of the world. */
 const FLAT = { plan: [0, 1], south: [0, 2], east: [1, 2] };
@@ -12,10 +12,12 @@ const CIRCLE = Array.from({ length: 33 }, (_, k) => [Math.cos((k * Math.PI) / 16
 const MOST = 1e5; // points drawn at once
 
 export class SceneView {
-  /** @param {any} bench `scene`: shots, spots, outlines, clouds, moves; `shifts` of points @param {string} mode scene, plan, south or east */
-  constructor(bench, mode) {
+  /** @param {any} bench `scene`: shots, spots, outlines, clouds, moves; `shifts` of points @param {string} mode scene, plan, south or east
+   *  @param {boolean} [calm] in a page that scrolls: the bare wheel is the page's */
+  constructor(bench, mode, calm = false) {
     this.bench = bench;
     this.mode = mode;
+    this.calm = calm;
     Object.assign(this, { azimuth: -1.08, elevation: 0.47, zoom: 1, dx: 0, dy: 0, hover: null, factor: null });
     this.surface = surface(t("The survey in space"), (context, width, height) => this.paint(context, width, height));
     this.note = make("p", { class: "note floating", "aria-live": "polite" });
@@ -23,11 +25,14 @@ export class SceneView {
     this.element = make("div", { class: "view scene" },
       make("div", { class: "bar" }, this.told,
         button("−", () => this.enlarge(0.5), "-", { "aria-label": t("smaller ellipsoids") }), button("+", () => this.enlarge(2), "+", { "aria-label": t("larger ellipsoids") }),
-        button("⤢", () => { Object.assign(this, { zoom: 1, dx: 0, dy: 0 }); this.surface.redraw(); }, "0", { "aria-label": t("Whole") })),
+        button("⤢", () => this.whole(), "0", { "aria-label": t("Whole") })),
       make("div", { class: "stage" }, this.surface.canvas, this.note));
     this.listen(this.surface.canvas);
     this.measure();
   }
+
+  /** Half axes of ellipsoids in sigmas: one, or as many as the page says. */
+  get region() { return this.bench.region ?? 1; }
 
   /** The solution, or what is planned where there is none. */
   get scene() { return this.bench.scene ?? this.bench.planned; }
@@ -40,6 +45,7 @@ export class SceneView {
     const places = [...scene.spots.map((spot) => spot.x), ...scene.shots.map((shot) => [shot.pose[3], shot.pose[7], shot.pose[11]]), ...scene.outlines.flatMap((line) => line.x)];
     for (const x of places) for (let k = 0; k < 3; k++) { low[k] = Math.min(low[k], x[k]); high[k] = Math.max(high[k], x[k]); }
     this.low = low;
+    this.places = places;
     this.high = high;
     this.middle = low.map((x, k) => (x + high[k]) / 2);
     this.reach = Math.max(1e-3, Math.hypot(...low.map((x, k) => high[k] - x)) / 2);
@@ -47,11 +53,14 @@ export class SceneView {
     if (this.factor === null) this.factor = 10 ** Math.round(Math.log10(0.08 * this.reach / largest));
   }
 
+  /** Everything in sight again. */
+  whole() { Object.assign(this, { zoom: 1, dx: 0, dy: 0, fitted: "" }); this.surface.redraw(); }
+
   follow() { this.measure(); this.surface.redraw(); }
 
   listen(canvas) {
     const held = new Map();
-    canvas.addEventListener("wheel", (event) => { event.preventDefault(); this.nearer(Math.exp(-event.deltaY * 0.0012), event.offsetX, event.offsetY); }, { passive: false });
+    canvas.addEventListener("wheel", (event) => { if (this.calm && !event.ctrlKey && !event.metaKey) return; event.preventDefault(); this.nearer(Math.exp(-event.deltaY * 0.0012), event.offsetX, event.offsetY); }, { passive: false });
     canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); held.set(event.pointerId, event); this.moved = 0; });
     canvas.addEventListener("pointermove", (event) => {
       const before = held.get(event.pointerId);
@@ -102,12 +111,18 @@ export class SceneView {
       return (x) => [cx + scale * (x[a] - middle[a]), cy - scale * (x[b] - middle[b])];
     }
     const ca = Math.cos(this.azimuth), sa = Math.sin(this.azimuth), ce = Math.cos(this.elevation), se = Math.sin(this.elevation);
-    const unit = 0.5 * this.zoom * Math.min(width, height) / reach;
-    return (x) => {
+    const ray = (x) => {
       const d = [x[0] - middle[0], x[1] - middle[1], x[2] - middle[2]], along = ca * d[0] + sa * d[1];
-      const scale = unit * 2.4 * reach / Math.max(2.4 * reach - (ce * along + se * d[2]), 0.3 * reach);
-      return [cx + scale * (ca * d[1] - sa * d[0]), cy - scale * (ce * d[2] - se * along)];
+      const scale = 2.4 * reach / Math.max(2.4 * reach - (ce * along + se * d[2]), 0.3 * reach);
+      return [scale * (ca * d[1] - sa * d[0]), scale * (ce * d[2] - se * along)];
     };
+    const key = `${width}/${height}/${reach}`;
+    if (this.fitted !== key) { // as large as everything is in sight; it stays while the scene is turned
+      const [across, up] = this.places.map(ray).reduce((most, x) => [Math.max(most[0], Math.abs(x[0])), Math.max(most[1], Math.abs(x[1]))], [1e-9, 1e-9]);
+      [this.fitted, this.unit] = [key, Math.min((0.5 * width - 34) / across, (0.5 * height - 26) / up)];
+    }
+    const unit = this.unit * this.zoom;
+    return (x) => { const [u, v] = ray(x); return [cx + unit * u, cy - unit * v]; };
   }
 
   paint(context, width, height) {
@@ -126,6 +141,12 @@ export class SceneView {
     context.strokeStyle = colour("ink");
     for (const outline of scene.outlines) line(outline.x, true);
     this.clouds(context, to);
+    for (const { world_from_table: m, axes } of scene.tables ?? []) for (const axis of axes) {
+      const k = "xyz".indexOf(axis), end = (far) => [0, 1, 2].map((i) => m[4 * i + 3] + far * m[4 * i + k]);
+      context.setLineDash([9, 3, 2, 3]);
+      line([end(-0.12 * this.reach), end(0.12 * this.reach)]);
+      context.setLineDash([]);
+    }
     const chosen = this.chosen();
     for (const shot of scene.shots) this.shot(context, line, to, shot, chosen.image ? shot.image === chosen.image : chosen.cameras.has(shot.camera) && shot.main);
     this.rays(context, line, chosen);
@@ -133,7 +154,8 @@ export class SceneView {
     if (this.bench.drawn) this.told_(context, line, to);
     this.labels(context, to);
     this.ruler(context, width, height);
-    this.told.textContent = t("ellipsoids × {k}", { k: significant(this.factor, 2) });
+    const k = significant(this.factor, 2);
+    this.told.textContent = this.region === 1 ? t("ellipsoids × {k}", { k }) : t("95 % ellipsoids × {k}", { k });
     this.surface.canvas.setAttribute("aria-label", t("{view}: {c} camera places, {n} points and stations; the same in the tables below", { view: t(NAMES[this.mode] ?? "The survey in space"), c: scene.shots.length, n: scene.spots.length }));
   }
 
@@ -205,7 +227,7 @@ export class SceneView {
     context.strokeStyle = colour("point-here");
     context.lineWidth = 1;
     context.setLineDash([5, 4]);
-    for (const spot of scene.spots) if (spot.kind === "point" && chosen.points.has(spot.id)) {
+    for (const spot of points ? scene.spots : []) if (spot.kind === "point" && chosen.points.has(spot.id)) {
       for (const i of rowsOfPoint(points, null, spot.id)) {
         const block = points.blocks[points.block[i]], pose = scene.poses[`${block.camera}/${block.epoch}`];
         if (pose) line([[pose[3], pose[7], pose[11]], spot.x]);
@@ -220,7 +242,7 @@ export class SceneView {
     context.fillStyle = context.strokeStyle;
     context.lineWidth = here ? 1.8 : 0.9;
     context.globalAlpha = 0.8;
-    for (const [a, b] of [[0, 1], [0, 2], [1, 2]]) line(CIRCLE.map(([c, s]) => spot.x.map((x, k) => x + this.factor * (c * axes[a][k] + s * axes[b][k]))));
+    for (const [a, b] of [[0, 1], [0, 2], [1, 2]]) line(CIRCLE.map(([c, s]) => spot.x.map((x, k) => x + this.factor * this.region * (c * axes[a][k] + s * axes[b][k]))));
     context.globalAlpha = 1;
     context.beginPath();
     if (spot.kind === "point") context.arc(u, v, here ? 5 : 3, 0, 7);

@@ -2,8 +2,12 @@
 
 import { parts } from "./store.js";
 
-/** @param {any} raw answer of /api/state */
-export const stateOf = (raw) => ({ ...raw, ...(raw.solution ?? {}), version: raw.version, title: raw.title || raw.folder, reason: raw.solution?.reason ?? raw.failure ?? "", verdict: raw.solution?.verdict ?? (raw.failure ? "failed" : "check"), solved: raw.solution !== null, waiting: raw.solution === null && !raw.failure });
+/** Until there is a solution, what the results in the folder say stands for it. @param {any} raw answer of /api/state */
+export function stateOf(raw) {
+  const found = raw.solution ?? (raw.failure ? null : raw.kept);
+  return { ...raw, ...found, version: raw.version, title: raw.title || raw.folder, reason: found?.reason ?? raw.failure ?? "", verdict: found?.verdict ?? (raw.failure ? "failed" : "check"),
+    solved: raw.solution !== null, known: Boolean(found), waiting: raw.solution === null && !raw.failure };
+}
 
 /** Image sizes by camera. @param {any} raw */
 export const sizesOf = (raw) => Object.fromEntries(raw.tree.cameras.map((c) => [c.id, c.size]));
@@ -43,4 +47,15 @@ export function sceneOf(raw) {
 export function shiftsOf(before, after) {
   const old = new Map((before?.spots ?? []).map((s) => [s.id, s.x]));
   return new Map(after.spots.filter((s) => old.has(s.id)).map((s) => [s.id, s.x.map((x, k) => x - old.get(s.id)[k])]));
+}
+
+/** How many points of each image take no part. @param {any} data */
+export function leftOut(data) {
+  const out = new Map();
+  for (let k = 0; k < data.images.length; k++) {
+    let n = 0;
+    for (let j = data.first[k]; j < data.first[k + 1]; j++) n += 1 - data.used[data.rows[j]];
+    if (n) out.set(data.images[k], n);
+  }
+  return out;
 }

@@ -3,15 +3,22 @@
 import { button, colour, make, surface } from "./dom.js";
 import { count, number, t } from "./words.js";
 import { current, names, select } from "./store.js";
-import { picture, pointId, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./source.js";
+import { pointId, rowOf, rowsOfImage, rowsOfPoint, rowsWhere } from "./columns.js";
 
 const NEAR = 14; // px on the screen: what a click takes hold of
+const FILM = 60; // pictures in the strip, about the one that is shown: each is a canvas
 const SCALES = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
 
 export class ImageView {
-  /** @param {any} bench the page's values: `points`, `sizes` of images by camera, `limit` of w */
-  constructor(bench) {
+  /**
+   * @param {any} bench the page's values: `points`, `sizes` of images by camera, `limit` of w
+   * @param {((image: string, size: string|number) => Promise<ImageBitmap>)|null} picture of an image; null: there are none
+   * @param {boolean} [steady] one camera whose pictures come by themselves: its place stays, nothing is chosen
+   */
+  constructor(bench, picture, steady = false) {
     this.bench = bench;
+    this.picture = picture;
+    this.steady = steady;
     this.image = "";
     this.enlarged = 200;
     this.overlay = true;
@@ -25,9 +32,9 @@ export class ImageView {
     this.strip = make("div", { class: "filmstrip", role: "listbox", "aria-label": t("Images of this camera") });
     this.element = make("div", { class: "view image" },
       make("div", { class: "bar" }, this.title, this.scale,
-        button("−", () => this.enlarge(-1), "-", { "aria-label": t("shorter vectors") }), button("+", () => this.enlarge(1), "+", { "aria-label": t("longer vectors") }),
-        button("⤢", () => { this.fit = true; this.surface.redraw(); }, "0", { "aria-label": t("Whole") }), button("1:1", () => this.zoomTo(1 / (devicePixelRatio || 1)), "", { "aria-label": "1:1" })),
-      make("div", { class: "stage" }, canvas, this.note), this.strip);
+        steady ? null : [button("−", () => this.enlarge(-1), "-", { "aria-label": t("shorter vectors") }), button("+", () => this.enlarge(1), "+", { "aria-label": t("longer vectors") })],
+        button("⤢", () => this.whole(), "0", { "aria-label": t("Whole") }), button("1:1", () => this.zoomTo(1 / (devicePixelRatio || 1)), "", { "aria-label": "1:1" })),
+      make("div", { class: "stage" }, canvas, this.note), steady ? null : this.strip);
     this.listen(canvas);
     this.follow();
   }
@@ -92,15 +99,15 @@ export class ImageView {
 
   async open(image) {
     this.image = image;
-    this.bitmap = null;
-    this.fit = true;
+    if (!this.steady) { this.bitmap = null; this.fit = true; }
     this.size = this.bench.sizes[image.split("/")[0]];
     this.title.textContent = image.replace("/", " · ");
     this.film();
     this.note.textContent = "";
+    if (!this.picture) { this.surface.redraw(); return; }
     const started = performance.now();
     try {
-      const bitmap = await picture(image, 1600);
+      const bitmap = await this.picture(image, 1600);
       if (this.image !== image) return;
       this.bitmap = bitmap;
       this.size ??= [bitmap.width, bitmap.height];
@@ -115,9 +122,12 @@ export class ImageView {
   /** Pictures of the same camera, or those of the same moment; only what is in sight is fetched. */
   film() {
     const [camera, epoch] = this.image.split("/"), data = this.bench.points;
-    const near = data.images.filter((name) => name.startsWith(`${camera}/`));
-    if (near.join() !== this.filmed) {
-      this.filmed = near.join();
+    if (!this.picture || this.steady) return;
+    const all = data.images.filter((name) => name.startsWith(`${camera}/`)), at = all.indexOf(this.image);
+    const k = this.filmed?.indexOf(this.image) ?? -1, cut = (k < 6 && this.filmed?.[0] !== all[0]) || (k > FILM - 6 && this.filmed?.at(-1) !== all.at(-1));
+    if (k < 0 || cut || this.filmedOf !== all.length) {
+      const from = Math.max(0, Math.min(at - FILM / 2, all.length - FILM)), near = all.slice(from, from + FILM);
+      [this.filmed, this.filmedOf] = [near, all.length];
       this.seen?.disconnect();
       this.seen = new IntersectionObserver((entries) => { for (const entry of entries) if (entry.isIntersecting) this.thumbnail(entry.target); }, { root: this.strip, rootMargin: "200px" });
       this.strip.replaceChildren(...near.map((name) => {
@@ -137,7 +147,7 @@ export class ImageView {
   async thumbnail(place) {
     this.seen.unobserve(place);
     try {
-      const bitmap = await picture(place.dataset.image, 240), canvas = place.querySelector("canvas");
+      const bitmap = await this.picture(place.dataset.image, 240), canvas = place.querySelector("canvas");
       const scale = Math.min(96 / bitmap.width, 72 / bitmap.height);
       canvas.getContext("2d").drawImage(bitmap, (96 - scale * bitmap.width) / 2, (72 - scale * bitmap.height) / 2, scale * bitmap.width, scale * bitmap.height);
     } catch { /* an image without a file keeps its name only */ }
@@ -150,6 +160,9 @@ export class ImageView {
     const to = among[(among.indexOf(this.image) + by + among.length) % among.length];
     if (to) select("image", to, true);
   }
+
+  /** All of the image in sight again. */
+  whole() { this.fit = true; this.surface.redraw(); }
 
   enlarge(by) {
     const at = SCALES.findIndex((scale) => scale >= this.enlarged);
@@ -207,7 +220,7 @@ export class ImageView {
 
   click(event) {
     const at = this.nearest(event.offsetX, event.offsetY);
-    if (at < 0) return;
+    if (at < 0 || this.steady) return;
     const id = `image_point:${pointId(this.bench.points, at)}`, { kind, ids } = current();
     if (event.shiftKey && kind === "obs") select("obs", ids.includes(id) ? ids.filter((x) => x !== id) : [...ids, id]);
     else select("obs", id);
@@ -226,9 +239,9 @@ export class ImageView {
       context.imageSmoothingEnabled = this.s * size[0] < 4 * this.bitmap.width;
       context.drawImage(this.bitmap, this.ox, this.oy, this.s * size[0], this.s * size[1]);
     } else { context.fillStyle = colour("sunk"); context.fillRect(this.ox, this.oy, this.s * size[0], this.s * size[1]); }
-    this.scale.textContent = this.overlay ? `v × ${count(this.enlarged)}` : t("overlay off (o)");
-    this.scale.title = t("residual vectors enlarged");
     const rows = rowsOfImage(data, this.image);
+    this.scale.textContent = !this.overlay ? t("overlay off (o)") : this.steady ? t("{n} points", { n: count(rows.length) }) : `v × ${count(this.enlarged)}`;
+    this.scale.title = this.steady ? "" : t("residual vectors enlarged");
     if (this.overlay) this.marks(context, rows);
     const out = rows.reduce((sum, i) => sum + (data.used[i] ? 0 : 1), 0);
     this.surface.canvas.setAttribute("aria-label", t("Image {image}: {n} points, {out} left out, residual vectors enlarged {k} times", { image: this.image, n: rows.length, out, k: this.enlarged }));
@@ -236,9 +249,9 @@ export class ImageView {
 
   sharper() {
     const image = this.image;
-    if (this.asked === image) return;
+    if (this.asked === image || !this.picture) return;
     this.asked = image;
-    picture(image, "full").then((bitmap) => { if (this.image === image) { this.bitmap = bitmap; this.surface.redraw(); } }, () => {}).finally(() => { this.asked = ""; });
+    this.picture(image, "full").then((bitmap) => { if (this.image === image) { this.bitmap = bitmap; this.surface.redraw(); } }, () => {}).finally(() => { this.asked = ""; });
   }
 
   marks(context, rows) {

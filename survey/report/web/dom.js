@@ -77,7 +77,7 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => colo
 /** The colour of a custom property as it is now, light or dark. @param {string} name @returns {string} */
 export function colour(name) {
   if (!colours.has(name)) {
-    const probe = by("probe");
+    const probe = by("probe") ?? document.body.appendChild(make("span", { id: "probe", hidden: true }));
     probe.style.color = `var(--${name})`;
     colours.set(name, getComputedStyle(probe).color);
   }

@@ -5,20 +5,13 @@
 let texts = {};
 let language = "en";
 
-/** @param {string} wanted "en" or "de" */
-export async function speak(wanted) {
-  const found = await (await fetch(new URL(`${wanted}.json`, import.meta.url))).json();
+/** What is said from now on. @param {string} wanted "en" or "de" @param {Object<string, string>} found */
+export function use(wanted, found) {
   [texts, language] = [found, wanted]; // at once: something may be drawn while they are fetched
   document.documentElement.lang = wanted;
 }
 
 export const spoken = () => language;
-
-/** The language asked for: by the reader, then by the browser. */
-export function wantedLanguage() {
-  const kept = localStorage.getItem("language");
-  return kept || (navigator.language.toLowerCase().startsWith("de") ? "de" : "en");
-}
 
 /** A text, with `{name}` filled in; one that the language does not have is a bug that the tests find. @param {string} text */
 export function t(text, values = {}) {

@@ -7,6 +7,14 @@ import { chosen, conditions, orderOf, ranks } from "./order.js";
 const ROW = 24;
 const MOST = 30e6; // px: taller than this no browser draws
 
+const NARROW = 700; // px of a screen on which not all columns are in sight
+
+/** What the rows are sorted by behind the name they begin with. */
+function foremost(data, key) {
+  const of = data.columns.find((c) => c.key === key), [first, ...others] = data.columns.filter((c) => c !== of);
+  return of ? { ...data, columns: [first, of, ...others] } : data;
+}
+
 export class Table {
   /**
    * @param {string} label
@@ -14,7 +22,7 @@ export class Table {
    * @param {{onselect: (rows: number[], quiet: boolean) => void, onenter?: (row: number) => void, sort?: string}} how
    */
   constructor(label, data, how) {
-    this.data = data;
+    this.data = how.sort && innerWidth < NARROW ? foremost(data, how.sort) : data;
     this.how = how;
     this.sorted = null;
     this.selected = new Set();
@@ -32,14 +40,14 @@ export class Table {
     new ResizeObserver(() => this.draw()).observe(this.scroll);
     this.heads();
     this.order = Uint32Array.from({ length: data.n }, (_, i) => i);
-    const first = how.sort && data.columns.findIndex((c) => c.key === how.sort);
+    const first = how.sort && this.data.columns.findIndex((c) => c.key === how.sort);
     if (first !== undefined && first !== "" && first >= 0) this.sort(first, false);
     else this.filter();
   }
 
   /** The same table with new values: order, filter and place stay. */
   renew(data) {
-    this.data = data;
+    this.data = this.how.sort && innerWidth < NARROW ? foremost(data, this.how.sort) : data;
     if (this.sorted) this.sort(this.sorted.column, this.sorted.up);
     else { this.order = Uint32Array.from({ length: data.n }, (_, i) => i); this.filter(); }
   }
@@ -94,7 +102,7 @@ export class Table {
 
   row(place) {
     const i = this.shown[place], state = this.data.state?.(i) ?? "";
-    const row = make("div", { role: "row", class: `row ${state}`, "aria-rowindex": place + 2, "aria-selected": this.selected.has(this.data.id(i)), data: { place } });
+    const row = make("div", { role: "row", class: `row ${state}`, "aria-rowindex": place + 2, "aria-selected": this.selected.has(this.data.id(i)), data: { place, id: this.data.id(i) } });
     for (const column of this.data.columns) {
       row.append(make("span", { role: "gridcell", class: column.values ? "r" : "l" }, this.text(column, i)));
     }

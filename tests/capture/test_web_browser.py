@@ -1,0 +1,60 @@
+"""The page of ``labcapture view`` in a real browser."""
+
+import threading
+from typing import Any
+
+import pytest
+
+from capture.plan.plan import read_plan
+from capture.session.run import run_plan
+from capture.web.serve import PageServer
+from capture.web.state import FolderView
+from tests.capture.session_runs import write_plan
+from tests.survey.test_report_browser import CONTRAST, need_browser
+from tests.survey.test_workbench_browser import Page, need_playwright
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Any:
+    with need_playwright().sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=need_browser(), args=["--no-sandbox"])
+        yield found
+        found.close()
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Of a session that has taken its images."""
+    plan = read_plan(write_plan(tmp_path_factory.mktemp("view")))
+    run_plan(plan, shown=False)
+    with PageServer(FolderView(plan)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server.url
+        server.shutdown()
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_images_overlay_and_coverage_are_shown(browser: Any, address: str, width: int, scheme: str) -> None:
+    page = Page(browser, address, width, "document.querySelector('.camera') !== null", color_scheme=scheme)
+    p = page.page
+    page.wait("document.body.dataset.picture !== undefined")
+    assert p.inner_text("#state") == "finished"
+    assert "6 of 6 epochs" in p.inner_text("#count")
+    assert p.locator(".camera").first.inner_text().startswith("X · t06")
+    inked = """(() => { const c = document.querySelector('.stage canvas'), d = c.getContext('2d')
+        .getImageData(0, 0, c.width, c.height).data; return d.filter((x, k) => k % 4 === 3 && x > 0).length; })()"""
+    page.wait(f"{inked} > 1000")
+    for k in range(p.locator("canvas").count()):
+        assert p.locator("canvas").nth(k).get_attribute("aria-label")
+    ratio, text = p.evaluate(CONTRAST)
+    assert ratio >= 4.5, text
+    assert p.evaluate("document.documentElement.scrollWidth") <= width
+    p.keyboard.press("g")
+    page.wait("document.querySelector('#state').textContent === 'fertig'")
+    p.keyboard.press("o")
+    page.wait("document.querySelector('.bar output').textContent.includes('(o)')")
+    assert page.complaints == []
+    page.context.close()
