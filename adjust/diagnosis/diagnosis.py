@@ -73,7 +73,7 @@ def diagnose(case: Case, families: Sequence[Family] | None = None, most: int = M
             first = queue.pop(0)
             names.append(first.name)
             left -= 1
-            trial = tried(first, case)
+            trial = tried(first, case, base)
             more = list(first.follow(trial.result)) if first.follow is not None and trial.result is not None else []
             same = [replace(trial, hypothesis=h) for h in more if h.survey is first.survey]
             trials += same or [trial]
