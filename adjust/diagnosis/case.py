@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
+MOST = 10.0
+"""Adjustments that a diagnosis may take."""
 _LEFT_OUT = 4
 _FAR = 25.0
 """Variance factor from which a solution may be another one than that of the observations without their mistake."""
@@ -40,7 +42,7 @@ _SOLVE = SolveOptions(max_step=1e-3, max_iterations=40)
 class Budget:
     """What a diagnosis may still adjust, in adjustments of its survey; a part of it counts as its share of images."""
 
-    left: float = 10.0
+    left: float = MOST
 
     def spend(self, share: float) -> None:
         """SurveyError where nothing is left."""

@@ -31,8 +31,10 @@ def adjusted_values(result: Adjustment) -> Altered:
 
 def started_values(start: StartValues) -> Altered:
     """The start values of all unknowns."""
-    lenses = {("lens", c): v for c, v in start.lenses.items()}
-    return {**start.poses, **start.vectors, **lenses, **{("point", p): x for p, x in start.points.items()}}
+    out: dict[ParameterName, Pose3 | FloatArray] = {**start.poses, **start.vectors}
+    out.update({("lens", c): v for c, v in start.lenses.items()})
+    out.update({("point", p): x for p, x in start.points.items()})
+    return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from adjust.model.survey import FloatArray
 from adjust.testing.distributions import chi2
 
 _ALPHA = 1e-4
+_NOISE = 3.0  # sigmas
 _EXPLAINED = 0.5  # share of the excess that a cause takes away at least
 _LOG_LARGEST = 600.0
 
@@ -51,7 +52,7 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
         critical = float(chi2.isf(_ALPHA / number, max(1, trial.hypothesis.parameters)))
         statistic = (base.omega - _cost(trial)) / scale
         share = (base.omega - _cost(trial)) / max(base.excess, 1e-9)
-        enough = share > _EXPLAINED or _is_noise(trial)
+        enough = share > _EXPLAINED or (trial.misfit.is_noise(_NOISE) and not trial.hypothesis.penalty)
         if statistic > critical and enough and trial.misfit.unused <= base.unused:
             sigma0 = trial.result.sigma0 if trial.result is not None else float("nan")
             explained = float(np.clip(share, 0.0, 1.0))
@@ -61,12 +62,6 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
 
 def _cost(trial: Trial) -> float:
     return trial.misfit.cost + trial.hypothesis.penalty
-
-
-def _is_noise(trial: Trial) -> bool:
-    """Whether v'Pv is within three of its own sigmas of the redundancy."""
-    r = max(trial.misfit.redundancy, 1)
-    return _cost(trial) < r + 3.0 * float(np.sqrt(2.0 * r))
 
 
 def _probabilities(base: Misfit, trials: Sequence[Trial]) -> FloatArray:

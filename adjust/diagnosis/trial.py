@@ -11,8 +11,8 @@ from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 
-NOISE = 1.2
-"""Variance factor up to which what is left is noise."""
+_NOISE = 5.0
+"""Sigmas of v'Pv up to which what is left is noise."""
 _FACTORS = 2.0 ** np.arange(24.0)
 
 
@@ -37,6 +37,11 @@ class Misfit:
     def cost(self) -> float:
         """What explanations are compared by."""
         return self.omega + 2.0 * self.dropped
+
+    def is_noise(self, sigmas: float = _NOISE) -> bool:
+        """Whether what is left is within so many of its own sigmas of what is expected (chi-square)."""
+        r = max(self.redundancy, 1)
+        return self.omega < r + sigmas * float(np.sqrt(2.0 * r))
 
     @property
     def excess(self) -> float:
@@ -71,7 +76,7 @@ def tried(hypothesis: Hypothesis, case: Case, base: Misfit) -> Trial:
         misfit = replace(misfit_of(result, survey), dropped=dropped)
         if best.result is None or misfit.omega < best.misfit.omega:
             best = Trial(hypothesis, misfit, result)
-        led = case.is_near or misfit.omega < NOISE * misfit.redundancy
+        led = case.is_near or misfit.is_noise()
         if led and best.misfit.unused == 0 and misfit.omega < base.omega:
             break
     return best

@@ -48,11 +48,12 @@ class Effect:
         found: list[Mapping[str, Any]] = []
 
         def made() -> Survey | None:
-            theta, result, sigmas = self._estimated(case, linear, self.first.theta)
-            at, nearer = self, self.nearer(result, theta)
+            at, (theta, result, sigmas) = self, self._estimated(case, linear, self.first.theta)
+            nearer = self.nearer(result, theta)
             if nearer is not None:
-                at = nearer
-                theta, result, sigmas = at._estimated(case, linear, theta)
+                at, (theta, result, sigmas) = nearer, nearer._estimated(case, linear, theta)
+            if not at._last and not case.is_near:
+                return None  # far from where it belongs, and on no way there
             of = at.hypothesis
             as_found = {"cause": at.said(theta, sigmas), "place": of.place, "edits": of.edits, "change": of.change}
             theta, changes = at.known(theta, sigmas) or (theta, as_found)

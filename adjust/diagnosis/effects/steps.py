@@ -105,7 +105,7 @@ def _of_images(linear: Linear, name: ParameterName, rows: IntArray) -> Iterator[
     images = rows[rows < ptr[-1]]
     known = np.unique(of[images])
     by_epoch = [images[of[images] == k] for k in known]
-    for components in (FOCAL, CENTRE) if name[0] == "lens" else ((),):
+    for components in (FOCAL, CENTRE, FOCAL + CENTRE) if name[0] == "lens" else ((),):
         columns = linear.columns(name, components)
         if len(columns):
             labels = tuple(epochs[k] for k in known)
@@ -144,7 +144,7 @@ def _step(case: Case, course: _Course, cut: int, first: Score, looked_at: int) -
     later = course.labels[cut:]
     name, kind, what = _MOVED.get(course.name[0], ("", "camera", ""))
     if course.name[0] == "lens":
-        name = "focus touched" if course.components == FOCAL else "images shifted"
+        name = "images shifted" if course.components == CENTRE else "focus touched"
     place = Place(kind, (thing,), epochs=later if course.kind == "image" else ())
     before = "before epoch" if course.kind == "image" else f"before {course.kind}"
     names = [c for c in course.components if c in _components(case, course.name)]

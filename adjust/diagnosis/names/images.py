@@ -140,18 +140,26 @@ _Found = tuple[float, tuple[str, str], dict[str, str], dict[int, ImageBlock]]
 def _exchanges(
     now: Now, found: Sequence[_Found], name: str, column: str, things: str, looked_at: int
 ) -> Iterator[Hypothesis]:
-    survey = now.prediction.survey
     for gain, (a, b), other, blocks in sorted(found, key=lambda f: -f[0])[:_MOST]:
-        where = [survey.image_blocks[i] for i in sorted(blocks)]
-        epochs = tuple(dict.fromkeys(x.epoch_id for x in where))
-        cameras = tuple(dict.fromkeys(x.camera_id for x in where))
-        yield Hypothesis(
-            name, f"{things} {a} and {b} are called by each other's names in {len(blocks)} images, the first at epoch "
-            f"{epochs[0]}: wrong names, or they changed places", f"exchange them in {column} of image_points.csv",
-            Place(column.removesuffix("_id"), (a, b), column, epochs), _renamed(survey, blocks),
-            (Rename("image_points", column, other, {"camera_id": cameras, "epoch_id": epochs}),), now.ratio(gain), 1,
-            looked_at,
-        )  # fmt: skip
+        kind = name, column, things
+        yield exchange(now.prediction.survey, (a, b), other, blocks, kind, now.ratio(gain), looked_at)
+
+
+def exchange(
+    survey: Survey, ids: tuple[str, str], other: dict[str, str], blocks: dict[int, ImageBlock],
+    kind: tuple[str, str, str], evidence: float, looked_at: int,
+) -> Hypothesis:  # fmt: skip
+    """The names of two things exchanged in some images. kind: name of the mistake, column of the table, the things."""
+    (name, column, things), (a, b) = kind, ids
+    where = [survey.image_blocks[i] for i in sorted(blocks)]
+    epochs = tuple(dict.fromkeys(x.epoch_id for x in where))
+    cameras = tuple(dict.fromkeys(x.camera_id for x in where))
+    return Hypothesis(
+        name, f"{things} {a} and {b} are called by each other's names in {len(blocks)} images, the first at epoch "
+        f"{epochs[0]}: wrong names, or they changed places", f"exchange them in {column} of image_points.csv",
+        Place(column.removesuffix("_id"), (a, b), column, epochs), _renamed(survey, blocks),
+        (Rename("image_points", column, other, {"camera_id": cameras, "epoch_id": epochs}),), evidence, 1, looked_at,
+    )  # fmt: skip
 
 
 def _cameras(now: Now) -> Iterator[Hypothesis]:
