@@ -1,6 +1,6 @@
 """The survey that does not fit, with the data from which hypotheses are formed; everything costly is found once."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -8,31 +8,103 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gtsam import Pose3
 
-from adjust.adjustment import AdjustOptions, adjust
-from adjust.graph.assembly import values_of
+from adjust.adjustment import AdjustOptions, adjust, start_values
+from adjust.diagnosis.prediction import Altered, Prediction, adjusted_values, started_values
+from adjust.graph.assembly import StartValues, values_of
+from adjust.graph.solver import SolveOptions
 from adjust.model.boards import deformed
-from adjust.model.errors import SurveyError
-from adjust.model.result import Adjustment
+from adjust.model.errors import IndeterminateError, SurveyError
+from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import Camera, FloatArray, Survey
+from adjust.spatial.averaging import mean_pose
+from adjust.spatial.rigid import inverse
+from adjust.start import find_start
 from adjust.start.lenses import Sighting, start_lens
 from adjust.start.views import View, Views, focal_px, joined, make_views, rays_by_block
 
 if TYPE_CHECKING:
     from adjust.diagnosis.score import Linear
 
-CAP = 25.0
+CAP = 50.0
 """The most that one component of an observation counts: what is left out, or cannot be predicted, counts so."""
+MOST = 10.0
+"""Adjustments that a diagnosis may take."""
 _LEFT_OUT = 4
+_FAR = 25.0
+"""Variance factor from which a solution may be another one than that of the observations without their mistake."""
+_WARM, _START, _LOST_ROUNDS = 0.3, 0.4, 3
+"""What adjusting from near values costs, and what finding start values does, against a whole adjustment."""
+_SOLVE = SolveOptions(max_step=1e-3, max_iterations=40)
+"""A survey that is right converges soon, and is only compared with others."""
+
+
+@dataclass
+class Budget:
+    """What a diagnosis may still adjust, in adjustments of its survey; a part of it counts as its share of images."""
+
+    left: float = MOST
+
+    def spend(self, share: float) -> None:
+        """SurveyError where nothing is left."""
+        if self.left <= 0.0:
+            raise SurveyError("the time of the diagnosis is spent")
+        self.left -= share
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A survey, and what became of it: its adjustment, or the error instead. run: how this survey is adjusted."""
+    """A survey, and what became of it: its adjustment, or the error instead; what its diagnosis may still adjust."""
 
     survey: Survey
     result: Adjustment | None = None
     error: SurveyError | None = None
-    run: Callable[[Survey], Adjustment] = field(default=adjust)
+    budget: Budget = field(default_factory=Budget)
+
+    def run(self, survey: Survey) -> Adjustment:
+        """A survey like this one, or a part of it, adjusted from its own start. SurveyError where that fails."""
+        blocks = len(survey.image_blocks), len(self.survey.image_blocks)
+        self.budget.spend(blocks[0] / blocks[1] if blocks[0] and blocks[1] else 1.0)
+        return adjust(survey, None, AdjustOptions(solve=_SOLVE))
+
+    def warm(self, survey: Survey) -> Adjustment:
+        """A survey that is much like this one, with all images, adjusted from the values of this one.
+
+        SurveyError where that fails.
+        """
+        if self._last and self._last[0][0] is survey:
+            return self._last[0][1]
+        if self.linear is None:
+            raise SurveyError("there are no values to begin with")
+        start = completed(survey, values_of(self.linear.result))
+        self.budget.spend(_WARM)
+        result = adjust(survey, start, AdjustOptions(reject_blocks=False, solve=_SOLVE))
+        self._last[:] = [(survey, result)]
+        return result
+
+    @cached_property
+    def _last(self) -> list[tuple[Survey, Adjustment]]:
+        """The survey that was adjusted last, and how."""
+        return []
+
+    @cached_property
+    def values(self) -> Altered | None:
+        """Adjusted values of all unknowns, start values where there is no adjustment; None where nothing is found."""
+        return adjusted_values(self.result) if self.result is not None else self.rough(self.survey)
+
+    def rough(self, survey: Survey) -> Altered | None:
+        """Start values of a survey: closed forms and robust means of what agrees; None where these find none."""
+        for _ in range(_LOST_ROUNDS):
+            try:
+                self.budget.spend(_START)
+                return started_values(start_values(find_start(survey)))
+            except IndeterminateError as error:
+                lost = {n.removeprefix("point ") for n in error.parameters}
+                if not lost & {p.point_id for p in survey.points}:
+                    return None
+                survey = without_points(survey, lost)
+            except (SurveyError, RuntimeError):
+                return None
+        return None
 
     @cached_property
     def views(self) -> Mapping[int, View]:
@@ -45,8 +117,8 @@ class Case:
         return own_lenses(self.survey)
 
     @cached_property
-    def without_one(self) -> tuple[tuple[tuple[str, str], Adjustment], ...]:
-        """(("camera_id" or "target_id", id), adjustment of the survey without its images), where one succeeds.
+    def without_one(self) -> tuple[tuple[tuple[str, str], Altered], ...]:
+        """(("camera_id" or "target_id", id), start values of the survey without its images), where there are any.
 
         Of the few cameras and targets with the largest misfit, or with most images where nothing is adjusted.
         """
@@ -54,10 +126,9 @@ class Case:
         for field_name in ("target_id", "camera_id"):
             ids = [t for t in dict.fromkeys(getattr(b, field_name) for b in self.survey.image_blocks) if t is not None]
             for owner in self._worst(field_name, ids)[:_LEFT_OUT] if len(ids) > 1 else ():
-                try:
-                    out.append(((field_name, owner), self.run(without(self.survey, field_name, owner))))
-                except SurveyError:
-                    continue
+                values = self.rough(without(self.survey, field_name, owner))
+                if values is not None:
+                    out.append(((field_name, owner), values))
         return tuple(out)
 
     def _worst(self, field_name: str, ids: list[str]) -> list[str]:
@@ -75,28 +146,28 @@ class Case:
 
         if self.result is None or not self.result.redundancy > 0:
             return None
-        if _is_whole(self.survey, self.result):
+        if self.is_whole:
             return Linear(self.result)
         try:
-            return Linear(adjust(self.survey, None, AdjustOptions(reject_blocks=False)))
+            self.budget.spend(1.0)
+            return Linear(adjust(self.survey, None, AdjustOptions(reject_blocks=False, solve=_SOLVE)))
         except SurveyError:
             return None
 
-    def warm(self, survey: Survey) -> Adjustment:
-        """A survey that is much like this one, adjusted from the values of this one; as :attr:`run` does without any.
+    @property
+    def is_near(self) -> bool:
+        """Whether all observations take part in its adjustment, and leave its values near to where they belong."""
+        return self.is_whole and self.linear is not None and self.linear.scale < _FAR
 
-        SurveyError where that fails.
-        """
-        linear = self.linear
-        start = None if linear is None else values_of(linear.result, survey)
-        if start is None or any(c.camera_id not in start.lenses for c in survey.cameras):
-            return self.run(survey)
-        return adjust(survey, start, AdjustOptions(reject_blocks=False))
+    @cached_property
+    def is_whole(self) -> bool:
+        """Whether every image point and observation in use takes part in the adjustment."""
+        return self.result is not None and _is_whole(self.survey, self.result)
 
     @cached_property
     def block_misfit(self) -> FloatArray:
         """(b,) bounded sum of squares of the image points of each block over their sigmas; all of it, unadjusted."""
-        return block_misfits(self.survey, self.result)
+        return np.array([np.minimum(s, 2.0 * CAP).sum() for s in block_squares(self.survey, self.result)])
 
     @cached_property
     def error_px(self) -> FloatArray:
@@ -120,9 +191,20 @@ def without(survey: Survey, field_name: str, owner: str) -> Survey:
     return replace(survey, image_blocks=blocks, cameras=cameras)
 
 
-def block_misfits(survey: Survey, result: Adjustment | None) -> FloatArray:
-    """(b,) bounded sums of squares over sigmas by image block; the bound for what is not adjusted or predicted."""
-    out = np.array([2.0 * CAP * len(b.uv) for b in survey.image_blocks])
+def without_points(survey: Survey, ids: Collection[str]) -> Survey:
+    """The survey less the image points of some points of the world."""
+    lost = [i for i, p in enumerate(survey.points) if p.point_id in ids]
+    blocks = []
+    for b in survey.image_blocks:
+        kept = np.full(len(b.uv), True) if b.target_id is not None else ~np.isin(b.point_idx, lost)
+        used = kept if b.used is None else b.used & kept
+        blocks.append(b if kept.all() else replace(b, used=used))
+    return replace(survey, image_blocks=tuple(b for b in blocks if b.used is None or b.used.any()))
+
+
+def block_squares(survey: Survey, result: Adjustment | None) -> list[FloatArray]:
+    """Squares over sigmas (n,) of the points of each image block; infinite for what is not adjusted or predicted."""
+    out = [np.full(len(b.uv), np.inf) for b in survey.image_blocks]
     if result is None:
         return out
     ptr, residuals = result.image_residuals.block_ptr, result.image_residuals.residuals
@@ -132,7 +214,7 @@ def block_misfits(survey: Survey, result: Adjustment | None) -> FloatArray:
         squares = np.einsum("ni,nij,nj->n", r, np.linalg.inv(block.cov), r)
         i = place.get(block.place)
         if i is not None:
-            out[i] = np.minimum(np.where(np.isfinite(squares), squares, np.inf), 2.0 * CAP).sum()
+            out[i] = np.where(np.isfinite(squares), squares, np.inf)
     return out
 
 
@@ -168,6 +250,34 @@ def single_views(survey: Survey, lenses: Mapping[str, FloatArray]) -> Views:
     seen = {i: points[str(blocks[i].target_id)][blocks[i].point_idx[blocks[i].mask]] for i in rays}
     sights = joined([(i, x, rays[i], focal[blocks[i].camera_id]) for i, x in seen.items() if len(x) >= 3])
     return make_views(sights)[0]
+
+
+def completed(survey: Survey, start: StartValues) -> StartValues:
+    """Start values with the lenses of new cameras and the poses of what is new, as single images tell them."""
+    new = {c.camera_id: own_lens(survey, c) for c in survey.cameras if c.camera_id not in start.lenses}
+    start = replace(start, lenses={**start.lenses, **new})
+    prediction = Prediction(survey, started_values(start))
+    missing: dict[ParameterName, list[int]] = {}
+    for i, block in enumerate(survey.image_blocks):
+        for name, _ in prediction.links(block) if block.target_id is not None else ():
+            if prediction.link(name) is None:
+                missing.setdefault(name, []).append(i)
+    if not missing:
+        return start
+    chosen = sorted({i for of in missing.values() for i in of})
+    some = replace(survey, image_blocks=tuple(survey.image_blocks[i] for i in chosen))
+    views = {chosen[v.block_idx]: v for v in single_views(some, start.lenses)}
+    poses = dict(start.poses)
+    for name, of in missing.items():
+        found = []
+        for i in of:
+            said = prediction.implied(survey.image_blocks[i], views[i].poses[0], name) if i in views else None
+            if said is not None:
+                inverted = dict(prediction.links(survey.image_blocks[i]))[name]
+                found.append(inverse(said[0]) if inverted else said[0])
+        if found:
+            poses[name] = Pose3(mean_pose(np.array(found), 1.0)[0])
+    return replace(start, poses=poses)
 
 
 def with_lenses(survey: Survey, result: Adjustment) -> Survey:

@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
-from adjust.diagnosis.case import Case
+from adjust.diagnosis.case import MOST, Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.ranking import Candidate, ranked
-from adjust.diagnosis.trial import NOISE, Misfit, Trial, misfit_of, tried
+from adjust.diagnosis.trial import Misfit, Trial, misfit_of, tried
 from adjust.model.errors import SurveyError
 
-MOST_TRIALS = 10
 _SHOWN = 3
 _FAINT = 0.2
+_KEPT = 4.0  # adjustments for the second families
 
 FAMILIES: tuple[tuple[str, ...], ...] = (
     ("effects", "images", "names", "units", "time", "weights"),
@@ -31,17 +31,21 @@ Family = Callable[[Case], Iterable[Hypothesis]]
 class Diagnosis:
     """What explains that a survey does not fit: candidates, the best first; empty where nothing that was tried does.
 
-    tried: names of the kinds of causes that were tried, whether they explain anything or not.
+    tried: names of the kinds of causes that were tried, whether they explain anything or not. untried: of those that
+    evidence speaks for, but the time of a diagnosis did not suffice for.
     """
 
     candidates: tuple[Candidate, ...]
     tried: tuple[str, ...]
     misfit: Misfit
+    untried: tuple[str, ...] = ()
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """For people: the first cause, what it changes, how sure it is, and the next one."""
-        return tuple(_text(i, c) for i, c in enumerate(self.candidates[:_SHOWN], start=1))
+        """For people: the first cause, what it changes, how sure it is, and the next one; what was not tried."""
+        *others, last = [_text(i, c) for i, c in enumerate(self.candidates[:_SHOWN], start=1)] or [""]
+        spent = f"; not tried, as the time of {MOST:.0f} adjustments was spent: {', '.join(self.untried)}"
+        return (*others, last + spent * bool(self.untried)) if last else ()
 
     def told(self) -> list[dict[str, Any]]:
         """The candidates for machines: name, cause, change, ids, epochs, how sure it is, and where to edit."""
@@ -57,38 +61,43 @@ class Diagnosis:
         ]  # fmt: skip
 
 
-def diagnose(case: Case, families: Sequence[Family] | None = None, most: int = MOST_TRIALS) -> Diagnosis:
+def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
     """Form the hypotheses of all families, try the likeliest of them, and rank those that explain the misfit.
 
-    families: those of ``FAMILIES`` where None. most: adjustments at most. Nothing is repaired, nothing is written.
+    families: those of ``FAMILIES`` where None. As many are tried as the budget of the case allows. Nothing is repaired,
+    nothing is written.
     """
     base = misfit_of(case.result, case.survey)
     trials: list[Trial] = []
     names: list[str] = []
-    left, looked_at = most, 0
-    for rooms in _all_families() if families is None else [families]:
+    queue: list[Hypothesis] = []
+    looked_at = 0
+    stages = _all_families() if families is None else [families]
+    for stage, rooms in enumerate(stages, start=1):
+        kept = _KEPT * (stage < len(stages))
         formed = [h for family in rooms for h in _formed(family, case)]
         looked_at += sum(h.looked_at for h in formed)
-        queue = _in_turn(formed)
-        while queue and left > 0 and not _done(trials, queue[0].evidence):
+        queue = _in_turn(queue + formed)
+        while queue and case.budget.left > kept and not _done(trials, queue[0].evidence):
             first = queue.pop(0)
             names.append(first.name)
-            left -= 1
-            trial = tried(first, case)
+            trial = tried(first, case, base)
             more = list(first.follow(trial.result)) if first.follow is not None and trial.result is not None else []
             same = [replace(trial, hypothesis=h) for h in more if h.survey is first.survey]
             trials += same or [trial]
             queue[:0] = [h for h in more if h.survey is not first.survey]
         if _done(trials, 0.0):
             break
-    return Diagnosis(ranked(base, trials, looked_at), tuple(dict.fromkeys(names)), base)
+    spent = case.budget.left <= 0.0 and not _done(trials, max((h.evidence for h in queue), default=0.0))
+    untried = dict.fromkeys(h.name for h in queue if h.name not in names) if spent else {}
+    return Diagnosis(ranked(base, trials, looked_at), tuple(dict.fromkeys(names)), base, tuple(untried))
 
 
 def _done(trials: Sequence[Trial], following: float) -> bool:
     """Whether one explains everything down to the noise, and what follows has much less evidence."""
     return any(
         t.result is not None and t.misfit.unused + t.misfit.dropped == 0
-        and t.misfit.omega < NOISE * t.misfit.redundancy and following < _FAINT * t.hypothesis.evidence
+        and t.misfit.is_noise() and following < _FAINT * t.hypothesis.evidence
         for t in trials
     )  # fmt: skip
 

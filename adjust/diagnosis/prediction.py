@@ -1,6 +1,6 @@
 """What an adjustment says an image block should show, also under another name or with another value of one unknown."""
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -8,7 +8,8 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.frames.tables import table_motions
-from adjust.frames.unknowns import Chain, FrameTree, Unknowns
+from adjust.frames.unknowns import FrameTree, Unknowns
+from adjust.graph.assembly import StartValues
 from adjust.lenses.models import LensModel, camera_constants, lens_model, project
 from adjust.model.boards import deformed
 from adjust.model.errors import SurveyError
@@ -18,44 +19,125 @@ from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.rigid import inverse, rigid
 
 Altered = Mapping[ParameterName, Pose3 | FloatArray]
+Links = tuple[tuple[ParameterName, bool], ...]
+"""A chain: of every link its name, and whether it is inverted."""
+_DELTA = 1e-5
 
 
-def chains_of(survey: Survey) -> tuple[dict[int, str | tuple[str, ...]], list[Chain]]:
-    """The names of all slots, and the chain ``camera_from_target`` of every block."""
-    unknowns = Unknowns()
-    frames = FrameTree(survey, unknowns)
-    chains = [frames.of_image(block) for block in survey.image_blocks]
-    return {slot: name for name, slot in unknowns.slot_of.items()}, chains
+def adjusted_values(result: Adjustment) -> Altered:
+    """The adjusted values of all unknowns."""
+    return {n: e.value for n, e in result.estimates.items()}
 
 
-def adjusted_pose(survey: Survey, result: Adjustment, name: ParameterName) -> FloatArray | None:
-    """(4, 4) of a slot; None where the adjustment has no value of it."""
-    if name[0] == "table_motion":
-        angles = result.estimates.get(("table_angles", name[1], name[2]))
-        geometry = result.estimates.get(("table_geometry", name[1]))
-        read = next((r for r in survey.table_readings if (r.table_id, r.epoch_id) == name[1:]), None)
-        if geometry is None or (angles is None and read is None):
-            return None
-        table = next(t for t in survey.tables if t.table_id == name[1])
-        g = dict(zip(geometry.components, np.asarray(geometry.value), strict=True))
-        said = np.asarray(angles.value) if angles is not None else read.angles if read is not None else np.zeros(0)
-        R, t, _ = table_motions(table.axes, g, said[None].astype(float))
-        return rigid(R[0], t[0])
-    estimate = result.estimates.get(name)
-    return estimate.value.matrix() if estimate is not None and isinstance(estimate.value, Pose3) else None
+def started_values(start: StartValues) -> Altered:
+    """The start values of all unknowns."""
+    out: dict[ParameterName, Pose3 | FloatArray] = {**start.poses, **start.vectors}
+    out.update({("lens", c): v for c, v in start.lenses.items()})
+    out.update({("point", p): x for p, x in start.points.items()})
+    return out
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Image points of the blocks of ``survey`` by the values of an adjustment, perhaps of another survey."""
+    """Image points of the blocks of ``survey``, and of others of its things, by values of its unknowns."""
 
     survey: Survey
-    result: Adjustment
+    values: Altered
+
+    def uv(self, block: ImageBlock, altered: Altered | None = None) -> FloatArray | None:
+        """(n, 2) px of a block, nan where a point is not known; None where another value is not, or one lies behind.
+
+        altered: other values, by the name of the unknown: of a pose, a lens, a point. ("station_body", id) and
+        ("target_body", id): motions of bodies whose poses are held, in their own frames.
+        """
+        other = altered or {}
+        pose, x = self.pose(block, other), self._points(block, other)
+        return None if pose is None or x is None else self._project(block, x @ pose[:3, :3].T + pose[:3, 3], other)
+
+    def squares(self, block: ImageBlock, altered: Altered | None = None) -> FloatArray | None:
+        """(n,) squares over sigmas of what a block shows against what it should show."""
+        uv = self.uv(block, altered)
+        return None if uv is None else np.einsum("ni,nij,nj->n", uv - block.uv, np.linalg.inv(block.cov), uv - block.uv)
+
+    def by_motion(self, block: ImageBlock, body: ParameterName) -> FloatArray | None:
+        """(n, 2, 6) px by a small motion of a body whose pose is held, as in :meth:`uv`; by central differences."""
+        pose, x = self.pose(block, {}), self._points(block, {})
+        if pose is None or x is None:
+            return None
+        moved = np.array([self._moved_body(block, pose, {body: step}) for step in _STEPS])
+        every = np.einsum("kij,nj->kni", moved[:, :3, :3], x) + moved[:, None, :3, 3]
+        uv = self._project(block, every.reshape(-1, 3), {})
+        if uv is None:
+            return None
+        both = uv.reshape(6, 2, -1, 2)
+        return np.asarray(np.moveaxis((both[:, 0] - both[:, 1]) / (2.0 * _DELTA), 0, -1))
+
+    def pose(self, block: ImageBlock, altered: Altered) -> FloatArray | None:
+        """(4, 4) ``camera_from_target`` of a block."""
+        out = np.eye(4)
+        for name, inverted in self.links(block):
+            new = altered.get(name)
+            value = new.matrix() if isinstance(new, Pose3) else self.link(name)
+            if value is None:
+                return None
+            out = out @ (inverse(value) if inverted else value)
+        return self._moved_body(block, out, altered)
+
+    def implied(
+        self, block: ImageBlock, pose: FloatArray, name: ParameterName, alone: Container[ParameterName] = ()
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """What a block that is seen in a pose (4, 4) says of one link of its chain, (4, 4) as it stands there.
+
+        Also the motion (4, 4) from the camera to that link. alone: links of which this block alone tells: None there.
+        """
+        before, after, found = np.eye(4), np.eye(4), False
+        for other, inverted in self.links(block):
+            if other == name:
+                found = True
+                continue
+            value = None if other in alone else self.link(other)
+            if value is None:
+                return None
+            value = inverse(value) if inverted else value
+            before, after = (before, after @ value) if found else (before @ value, after)
+        back = inverse(before)
+        return (back @ pose @ inverse(after), back) if found else None
+
+    def links(self, block: ImageBlock) -> Links:
+        """The chain ``camera_from_target`` of a block."""
+        place = block.camera_id, block.epoch_id, block.target_id
+        if place not in self._links:
+            chain = self._tree.of_image(block)
+            slots = self._tree.unknowns.slot_of
+            for name in list(slots)[len(self._names) :]:
+                self._names.append(tuple(name))
+            self._links[place] = tuple((self._names[link.slot], link.inverse) for link in chain)
+        return self._links[place]
+
+    def link(self, name: ParameterName) -> FloatArray | None:
+        """(4, 4) of a link; None where there is no value of it."""
+        if name not in self._poses:
+            value = self.values.get(name)
+            moved = self._table_motion(name) if name[0] == "table_motion" else None
+            self._poses[name] = value.matrix() if isinstance(value, Pose3) else moved
+        return self._poses[name]
 
     @cached_property
-    def _frames(self) -> tuple[dict[int, str | tuple[str, ...]], list[Chain], dict[int, FloatArray | None]]:
-        names, chains = chains_of(self.survey)
-        return names, chains, {s: adjusted_pose(self.survey, self.result, tuple(n)) for s, n in names.items()}
+    def _tree(self) -> FrameTree:
+        return FrameTree(self.survey, Unknowns())
+
+    @cached_property
+    def _names(self) -> list[ParameterName]:
+        """By slot."""
+        return []
+
+    @cached_property
+    def _links(self) -> dict[tuple[str, str, str | None], Links]:
+        return {}
+
+    @cached_property
+    def _poses(self) -> dict[ParameterName, FloatArray | None]:
+        return {}
 
     @cached_property
     def _lenses(self) -> dict[str, tuple[LensModel, FloatArray]]:
@@ -65,61 +147,54 @@ class Prediction:
     def _targets(self) -> dict[str, FloatArray]:
         return {t.target_id: deformed(t) for t in self.survey.targets}
 
-    def uv(self, i: int, altered: Altered | None = None) -> FloatArray | None:
-        """(n, 2) px of block i; None where a value is not known, or a point lies behind the camera.
+    @cached_property
+    def _stations(self) -> dict[str, str]:
+        return {c.camera_id: c.station_id for c in self.survey.cameras}
 
-        altered: other values, by the name of the unknown: of a pose, a lens, a point. ("station_body", id) and
-        ("target_body", id): motions of bodies whose poses are held, in their own frames.
-        """
-        block, other = self.survey.image_blocks[i], altered or {}
-        pose, lens = self.pose(i, other), self._value(("lens", block.camera_id), other)
-        x = self._points(block, other)
-        if pose is None or lens is None or x is None:
+    @cached_property
+    def _readings(self) -> dict[tuple[str, str], FloatArray]:
+        return {(r.table_id, r.epoch_id): r.angles for r in self.survey.table_readings}
+
+    def _table_motion(self, name: ParameterName) -> FloatArray | None:
+        geometry = self.values.get(("table_geometry", name[1]))
+        said = self.values.get(("table_angles", name[1], name[2]), self._readings.get((name[1], name[2])))
+        if geometry is None or said is None or isinstance(geometry, Pose3) or isinstance(said, Pose3):
             return None
-        model, constants = self._lenses[block.camera_id]
-        try:
-            return project(model, lens, constants, x @ pose[:3, :3].T + pose[:3, 3])
-        except SurveyError:
-            return None
-
-    def squares(self, i: int) -> FloatArray | None:
-        """(n,) squares over sigmas of what block i shows against what it should show."""
-        block, uv = self.survey.image_blocks[i], self.uv(i)
-        return None if uv is None else np.einsum("ni,nij,nj->n", uv - block.uv, np.linalg.inv(block.cov), uv - block.uv)
-
-    def pose(self, i: int, altered: Altered) -> FloatArray | None:
-        """(4, 4) ``camera_from_target`` of block i."""
-        names, chains, poses = self._frames
-        out = np.eye(4)
-        for link in chains[i]:
-            new = altered.get(tuple(names[link.slot]))
-            value = new.matrix() if isinstance(new, Pose3) else poses[link.slot]
-            if value is None:
-                return None
-            out = out @ (inverse(value) if link.inverse else value)
-        return self._moved_body(self.survey.image_blocks[i], out, altered)
+        table = next(t for t in self.survey.tables if t.table_id == name[1])
+        g = dict(zip(table.geometry.names, np.asarray(geometry), strict=True))
+        R, t, _ = table_motions(table.axes, g, np.asarray(said, float)[None])
+        return rigid(R[0], t[0])
 
     def _moved_body(self, block: ImageBlock, pose: FloatArray, altered: Altered) -> FloatArray:
         station = altered.get(("station_body", self._stations[block.camera_id]))
         if isinstance(station, Pose3):
-            own = adjusted_pose(self.survey, self.result, ("station_from_camera", block.camera_id))
+            own = self.link(("station_from_camera", block.camera_id))
             own = np.eye(4) if own is None else own
             pose = inverse(own) @ inverse(station.matrix()) @ own @ pose
         target = altered.get(("target_body", block.target_id or ""))
         return pose @ target.matrix() if isinstance(target, Pose3) else pose
 
-    @cached_property
-    def _stations(self) -> dict[str, str]:
-        return {c.camera_id: c.station_id for c in self.survey.cameras}
+    def _project(self, block: ImageBlock, x_in_camera: FloatArray, altered: Altered) -> FloatArray | None:
+        lens = self._value(("lens", block.camera_id), altered)
+        if lens is None:
+            return None
+        model, constants = self._lenses[block.camera_id]
+        known, uv = np.isfinite(x_in_camera).all(axis=1), np.full((len(x_in_camera), 2), np.nan)
+        try:
+            uv[known] = project(model, lens, constants, x_in_camera[known])
+            return uv
+        except SurveyError:
+            return None
 
     def _value(self, name: ParameterName, altered: Altered) -> FloatArray | None:
-        found = altered.get(name)
-        if found is None and name in self.result.estimates:
-            found = self.result.estimates[name].value
+        found = altered.get(name, self.values.get(name))
         return None if found is None or isinstance(found, Pose3) else np.asarray(found)
 
     def _points(self, block: ImageBlock, altered: Altered) -> FloatArray | None:
         if block.target_id is not None:
             return self._targets[block.target_id][block.point_idx]
         found = [self._value(("point", self.survey.points[int(i)].point_id), altered) for i in block.point_idx]
-        return None if any(x is None for x in found) else np.array(found)
+        return np.array([np.full(3, np.nan) if x is None else x for x in found])
+
+
+_STEPS = tuple(Pose3.Expmap(s * _DELTA * np.eye(6)[k]) for k in range(6) for s in (1.0, -1.0))

@@ -12,6 +12,7 @@ from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
 _ALPHA = 1e-4
+_NOISE = 3.0  # sigmas
 _EXPLAINED = 0.5  # share of the excess that a cause takes away at least
 _LOG_LARGEST = 600.0
 
@@ -39,20 +40,22 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
 
     Each drop of v'Pv is tested against chi-square with as many degrees of freedom as the change has parameters, at a
     level shared by all hypotheses that were looked at (Sidak). Compared with each other by v'Pv plus p ln n
-    (Schwarz 1978), all in units of the least variance factor that any of them leaves.
+    (Schwarz 1978), with variances of each group as they suit each best: else wrong sigmas would explain all that a
+    cause leaves. A cause explains the misfit if half of it goes, or if what is left is noise.
     """
     good = [t for t in trials if t.result is not None]
     if not good:
         return ()
     scale = max(1.0, min(t.misfit.omega / max(t.misfit.redundancy, 1) for t in good))
     number = max(looked_at, len(trials), 1)
-    weight = _probabilities(base, good, scale)
+    weight = _probabilities(base, good)
     out = []
     for trial, probability in zip(good, weight, strict=True):
         critical = float(chi2.isf(sidak(_ALPHA, number), max(1, trial.hypothesis.parameters)))
         statistic = (base.omega - _cost(trial)) / scale
         share = (base.omega - _cost(trial)) / max(base.excess, 1e-9)
-        if statistic > critical and share > _EXPLAINED and trial.misfit.unused <= base.unused:
+        enough = share > _EXPLAINED or (trial.misfit.is_noise(_NOISE) and not trial.hypothesis.penalty)
+        if statistic > critical and enough and trial.misfit.unused <= base.unused:
             sigma0 = trial.result.sigma0 if trial.result is not None else float("nan")
             explained = float(np.clip(share, 0.0, 1.0))
             out.append(Candidate(trial.hypothesis, explained, statistic, critical, float(probability), sigma0))
@@ -63,10 +66,11 @@ def _cost(trial: Trial) -> float:
     return trial.misfit.cost + trial.hypothesis.penalty
 
 
-def _probabilities(base: Misfit, trials: Sequence[Trial], scale: float) -> FloatArray:
+def _probabilities(base: Misfit, trials: Sequence[Trial]) -> FloatArray:
     """(k,) of the trials, with the survey as it stands as one more explanation."""
     n = max(base.count, 2)
-    score = [base.omega / scale, *(_cost(t) / scale + t.hypothesis.parameters * np.log(n) for t in trials)]
+    fitted = [t.misfit.fitted + 2.0 * t.misfit.dropped + t.hypothesis.penalty for t in trials]
+    score = [base.omega, *(f + t.hypothesis.parameters * np.log(n) for f, t in zip(fitted, trials, strict=True))]
     half = -0.5 * (np.array(score) - min(score))
     likelihood = np.exp(np.maximum(half, -_LOG_LARGEST))
     return np.asarray((likelihood / likelihood.sum())[1:])

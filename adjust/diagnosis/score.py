@@ -16,7 +16,7 @@ from adjust.model.survey import FloatArray, IntArray
 from adjust.statistics.system import LinearSystem, linear_system
 from adjust.statistics.weakness import times_covariance
 
-_SEEN = 1e-4
+_SEEN = 1e-7
 """Share of a change's column that no unknown takes over, below which it does not show."""
 _CUTS = 40
 

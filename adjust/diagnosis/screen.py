@@ -4,13 +4,13 @@ The closed forms of the start are robust: what one set-up or one pair says wrong
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from adjust.adjustment import start_values
-from adjust.diagnosis.case import CAP
-from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues
+from adjust.diagnosis.case import CAP, Case
+from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, StartValues, values_of
 from adjust.model.errors import SurveyError
 from adjust.model.survey import FloatArray, Survey
 from adjust.start import find_start
@@ -45,7 +45,7 @@ class Screen:
         found = [(2.0 * o.factor.error(self.graph.start), max(1, len(o.components))) for o in self.graph.others]
         return _finite(np.array([square / n for square, n in found]))
 
-    @property
+    @cached_property
     def scale(self) -> float:
         """Variance factor of the rough values: they miss by more than noise; of the typical observation."""
         every = np.concatenate([self.readings, self.others])
@@ -70,6 +70,14 @@ def screen(survey: Survey, start: StartValues | None = None) -> Screen | None:
         return Screen(graph, start)
     except (SurveyError, RuntimeError):  # GTSAM raises the latter where a convention that is not meant fits nothing
         return None
+
+
+@lru_cache(maxsize=2)
+def at_best(case: Case) -> Screen | None:
+    """At the adjustment where there is one that left out what contradicts, else at the start."""
+    if case.result is not None and case.result.global_test is not None and case.result.global_test.passed:
+        return screen(case.survey, values_of(case.result)) or screen(case.survey)
+    return screen(case.survey)
 
 
 def improvement(before: float, after: float, n: int) -> float:

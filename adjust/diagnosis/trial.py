@@ -5,14 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from adjust.diagnosis.case import CAP, Case, block_misfits
+from adjust.diagnosis.case import CAP, Case, block_squares
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 
-NOISE = 1.2
-"""Variance factor up to which what is left is noise."""
+_NOISE = 5.0
+"""Sigmas of v'Pv up to which what is left is noise."""
+_FACTORS = 2.0 ** np.arange(24.0)
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,9 @@ class Misfit:
     """What a survey leaves unexplained. omega: sum of squares over sigmas, each bounded by ``CAP``, all observations.
 
     unused: components that take no part, or cannot be predicted. count: of all components. redundancy: of the
-    adjustment, 0 where there is none.
+    adjustment, 0 where there is none. dropped: components that it does without. fitted: as omega, but with variances
+    of each group multiplied by what suits them best, whose logarithms count: so causes are compared that explain most,
+    yet leave more than noise.
     """
 
     omega: float
@@ -28,11 +31,17 @@ class Misfit:
     count: int
     redundancy: int
     dropped: int = 0
+    fitted: float = np.inf
 
     @property
     def cost(self) -> float:
         """What explanations are compared by."""
         return self.omega + 2.0 * self.dropped
+
+    def is_noise(self, sigmas: float = _NOISE) -> bool:
+        """Whether what is left is within so many of its own sigmas of what is expected (chi-square)."""
+        r = max(self.redundancy, 1)
+        return self.omega < r + sigmas * float(np.sqrt(2.0 * r))
 
     @property
     def excess(self) -> float:
@@ -49,14 +58,17 @@ class Trial:
     result: Adjustment | None
 
 
-def tried(hypothesis: Hypothesis, case: Case) -> Trial:
-    """The survey of a hypothesis adjusted from the values of its case, and where that does not fit as its case was."""
+def tried(hypothesis: Hypothesis, case: Case, base: Misfit) -> Trial:
+    """The survey of a hypothesis adjusted from the values of its case, and where that leads nowhere from its own start.
+
+    So it is, too, where these values may be spoilt by what the case does not explain. base: what that is.
+    """
     survey = hypothesis.changed()
     if survey is None:
         return Trial(hypothesis, misfit_of(None, case.survey), None)
     dropped = max(0, misfit_of(None, case.survey).count - misfit_of(None, survey).count)
     best = Trial(hypothesis, replace(misfit_of(None, survey), dropped=dropped), None)
-    for run in (case.warm, case.run) if case.linear is not None else (case.run,):
+    for run in (case.warm, case.run):
         try:
             result = run(survey)
         except (SurveyError, RuntimeError):  # the latter from GTSAM, where a hypothesis fits nothing at all
@@ -64,7 +76,8 @@ def tried(hypothesis: Hypothesis, case: Case) -> Trial:
         misfit = replace(misfit_of(result, survey), dropped=dropped)
         if best.result is None or misfit.omega < best.misfit.omega:
             best = Trial(hypothesis, misfit, result)
-        if best.misfit.unused == 0 and misfit.omega < NOISE * misfit.redundancy:
+        led = case.is_near or misfit.is_noise()
+        if led and best.misfit.unused == 0 and misfit.omega < base.omega:
             break
     return best
 
@@ -80,12 +93,27 @@ def misfit_of(result: Adjustment | None, survey: Survey) -> Misfit:
     if result is None:
         return Misfit(CAP * (points + n_others), points + n_others, points + n_others, 0)
     images = result.image_residuals
-    others = np.concatenate([np.zeros(0), *(_squares(o.residual, o.sigma) for o in result.other_residuals)])
+    groups: dict[str, list[FloatArray]] = {}
+    out = _left_out(survey)
+    others = [o for o in result.other_residuals if o.used or not out & {o.ids, o.ids[:1]}]
+    for o in others:
+        groups.setdefault(o.group, []).append(_squares(o.residual, o.sigma))
+    n_adjusted = sum(len(s) for of in groups.values() for s in of)
+    for block, squares in zip(survey.image_blocks, block_squares(survey, result), strict=True):
+        groups.setdefault(block.group, []).append(np.repeat(0.5 * squares, 2))
     gone = max(0, n_others - n_other_components(result.survey, used_only=False))
     unused = points - 2 * int(images.used.sum()) + gone
-    unused += sum(len(o.residual) for o in result.other_residuals if not o.used)
-    omega = float(block_misfits(survey, result).sum() + np.minimum(others, CAP).sum()) + CAP * gone
-    return Misfit(omega, unused, points + max(len(others), n_others), result.redundancy)
+    unused += sum(len(o.residual) for o in others if not o.used)
+    every = [np.concatenate(of) for of in groups.values()]
+    omega = float(sum(np.minimum(s, CAP).sum() for s in every)) + CAP * gone
+    fitted = sum(_at_best_scale(s) for s in every) + CAP * gone
+    return Misfit(omega, unused, points + max(n_adjusted, n_others), result.redundancy, fitted=fitted)
+
+
+def _at_best_scale(squares: FloatArray) -> float:
+    """Minus twice the log likelihood of squares (n,), each bounded, with the best common factor for their variances."""
+    scaled = np.minimum(squares[None] / _FACTORS[:, None], CAP).sum(axis=1) + len(squares) * np.log(_FACTORS)
+    return float(scaled.min())
 
 
 def n_other_components(survey: Survey, used_only: bool = True) -> int:
@@ -93,6 +121,12 @@ def n_other_components(survey: Survey, used_only: bool = True) -> int:
     kinds = (survey.table_readings, survey.pairs, survey.distances, survey.coordinates, survey.readings, survey.levels,
              survey.coordinate_differences, survey.alignments, survey.laser_spots, survey.on_surfaces)  # fmt: skip
     return sum(_n_components(o) for kind in kinds for o in kind if o.used or not used_only)
+
+
+def _left_out(survey: Survey) -> set[tuple[str, ...]]:
+    """Ids of the pairs and table readings that the survey itself does not use."""
+    pairs = {(p.pair_id,) for p in survey.pairs if not p.used}
+    return pairs | {(r.table_id, r.epoch_id) for r in survey.table_readings if not r.used}
 
 
 def _n_components(observed: Any) -> int:

@@ -13,7 +13,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.frames.unknowns import FrameTree, Unknowns
 from adjust.model.boards import deformed
-from adjust.model.errors import SurveyError
+from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.observations.geometry.building import frame_refs, position_refs
@@ -273,7 +273,8 @@ class _Search:
         lost = np.flatnonzero(~self.points.known & (self.points.seen() | ~self.readings.concerned))
         missing = undetermined(self.survey, self.network, self.points, slots, lost.tolist())
         if missing:
-            raise SurveyError(missing)
+            points = tuple(f"point {self.survey.points[row].point_id}" for row in lost.tolist())
+            raise IndeterminateError(missing, (*(" ".join(self.network.names[s]) for s in slots), *points))
 
     def _use_open_prior(self) -> bool:
         """Start a pose that no image or pair reaches at the mean of its prior, though that leaves components open."""

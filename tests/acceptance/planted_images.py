@@ -18,7 +18,8 @@ Plant = Callable[[Survey, Truth, float], Survey]
 class Mistake:
     """name: of the cause that must be named; about: an id that must be named with it, "" for any; sizes by kinds.
 
-    alike: other names of the same, where observations cannot tell them apart. title: where several have a name.
+    alike: other names, and other ids, of the same, where observations cannot tell them apart. title: where several have
+    a name.
     """
 
     name: str
@@ -430,11 +431,12 @@ IMAGE_MISTAKES = (
     Mistake("images shifted", camera_of, ("stereo", "head"), (12.0, 40.0, 160.0), shifted),
     Mistake("images resized", camera_of, ("stereo", "head"), (0.5, 0.8, 1.5), resized),
     Mistake("images copied", camera_of, ("stereo", "rig"), (0.1, 0.3, 0.6), copied),
-    Mistake("pixel origin", of("points"), ("beacons", "lab"), (0.5, -0.5), origin(of_points),
+    Mistake("pixel origin", of("points"), ("beacons", "lab"), (0.5, -0.5), origin(of_points), ("board",),
             title="of a second detector"),
     Mistake("focus touched", camera_of, ("stereo", "head"), (0.004, 0.01, 0.03), zoomed),
     Mistake("lens drifts", camera_of, ("stereo", "head"), (1.0, 3.0, 10.0), drifting),
-    Mistake("camera moved", camera_of, ("stereo", "head"), (2.0, 6.0, 20.0), moved(second_camera, 0.5)),
+    Mistake("camera moved", camera_of, ("stereo", "head"), (2.0, 6.0, 20.0), moved(second_camera, 0.5),
+            ("station moved", "head")),
     Mistake("cameras exchanged", camera_of, ("stereo", "rig"), (0.1, 0.2, 0.4), exchanged),
     Mistake("target moved", board_of, ("relay", "head"), (3.0, 10.0, 40.0), moved(second_target, 0.4)),
     Mistake("target scaled", board_of, ("relay", "lab"), (25.0 / 25.4, 0.8, 2.0),
@@ -449,11 +451,11 @@ IMAGE_MISTAKES = (
     Mistake("points exchanged", beacon, ("beacons", "lab"), (0.2, 0.4, 0.6), beacons_exchanged, title="in images"),
     Mistake("point moved", beacon, ("beacons", "lab"), (4.0, 10.0, 30.0), point_moved),
     Mistake("station moved", of("head"), ("head", "lab"), (1.0, 5.0, 20.0), bumped(_MOUNT, 0.5, on_table),
-            title="on its table"),
+            ("camera moved", "Y"), "on its table"),
     Mistake("target moved", anything, ("head", "sweep"), (1.0, 5.0, 20.0), bumped(_TABLE, 0.4, on_table),
             ("table moved",), "or the table"),
     Mistake("station moved", of("post"), ("tripods",), (1.0, 5.0, 20.0),
-            bumped(("world_from_station", "post"), 0.5, of_post), ("camera moved",), "a tripod"),
+            bumped(("world_from_station", "post"), 0.5, of_post), ("camera moved", "right"), "a tripod"),
     Mistake("motion forgotten", of("board"), ("stereo", "rig"), (12.0, 8.0, 5.0), still("target"), title="of a target"),
     Mistake("motion forgotten", of("relay"), ("relay",), (12.0, 8.0, 6.0), still("station"), title="of a station"),
     Mistake("epochs shifted", anything, ("stereo", "rig"), (1.0, 2.0, -1.0), shifted_epochs),

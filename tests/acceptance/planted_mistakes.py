@@ -28,20 +28,32 @@ SEED = 3
 
 def diagnosed(survey: Survey) -> Diagnosis:
     """The diagnosis of a survey, whether it can be adjusted or not."""
+    return diagnose(_adjusted(survey))
+
+
+def _adjusted(survey: Survey) -> Case:
     try:
-        return diagnose(Case(survey, adjust.solve(survey)))
+        return Case(survey, adjust.solve(survey))
     except SurveyError as error:
-        return diagnose(Case(survey, None, error))
+        return Case(survey, None, error)
 
 
-def outcome_of(mistake: Mistake, kind: str, size: float, seed: int = SEED) -> tuple[str, str]:
-    """(outcome, what was named first)."""
+def outcome_of(mistake: Mistake, kind: str, size: float, seed: int = SEED) -> dict[str, Any]:
+    """outcome; first: what was named first; adjustment (without the mistake), diagnosis: CPU s of either."""
     survey, truth = survey_of(kind, seed)
-    found = diagnosed(mistake.plant(survey, truth, size)).candidates
+    case = _adjusted(mistake.plant(survey, truth, size))
+    begin = time.process_time()
+    adjust.solve(survey)
+    between = time.process_time()
+    found = diagnose(case).candidates
+    end = time.process_time()
     about, names = mistake.about(survey), (mistake.name, *mistake.alike)
-    right = [c.hypothesis.name in names and (not about or about in c.hypothesis.place.ids) for c in found[:3]]
+    right = [c.hypothesis.name in names and (not about or bool({about, *mistake.alike} & {*c.hypothesis.place.ids}))
+             for c in found[:3]]  # fmt: skip
     outcome = "first" if right and right[0] else "among three" if any(right) else "another" if right else "silent"
-    return outcome, f"{found[0].hypothesis.name} {' '.join(found[0].hypothesis.place.ids)}" if found else ""
+    first = f"{found[0].hypothesis.name} {' '.join(found[0].hypothesis.place.ids)}" if found else ""
+    return {"outcome": outcome, "first": first, "adjustment": round(between - begin, 3),
+            "diagnosis": round(end - between, 3)}  # fmt: skip
 
 
 def rows() -> Iterator[tuple[Mistake, str, float]]:
@@ -65,12 +77,10 @@ def run(results: Path, part: tuple[int, int], again: Sequence[str]) -> None:
         if i % part[1] != part[0] - 1 or (name in known and not any(a in (known[name]["outcome"], mistake.name)
                                                                     for a in again)):  # fmt: skip
             continue
-        begin = time.process_time()
-        outcome, first = outcome_of(mistake, kind, size)
-        line = {"key": name, "outcome": outcome, "first": first, "seconds": round(time.process_time() - begin, 2)}
+        line = {"key": name, **outcome_of(mistake, kind, size)}
         with results.open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
-        print(f"{name:60} {outcome:12} {first if outcome != 'first' else ''}", flush=True)
+        print(f"{name:60} {line['outcome']:12} {line['first'] if line['outcome'] != 'first' else ''}", flush=True)
 
 
 def read(results: Path) -> dict[str, dict[str, Any]]:

@@ -88,7 +88,7 @@ def hand_path(t: float) -> Pose3:
 
 ROBOT_COV = np.diag(np.repeat([2e-4, 2e-4], 3) ** 2)
 HAND_FROM_CAMERA = Pose3(Rot3.RzRyRx(0.02, -0.03, 0.5), np.array([0.05, 0.02, 0.08]))
-BOARD_PLACE = Pose3(Rot3.RzRyRx(0.01, 0.02, 0.3), np.array([0.52, 0.0, 0.01]))
+BOARD_PLACE = Pose3(Rot3.RzRyRx(np.pi + 0.01, 0.02, 0.3), np.array([0.52, 0.12, 0.01]))
 
 
 def hand(seed: int, n: int = 16, on_hand: bool = True) -> tuple[Survey, Truth]:

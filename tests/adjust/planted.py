@@ -14,9 +14,9 @@ from tests.adjust.terrestrial_networks import measured, polar_network
 
 def case_of(survey: Survey) -> Case:
     try:
-        return Case(survey, adjust(survey), None, adjust)
+        return Case(survey, adjust(survey))
     except SurveyError as error:
-        return Case(survey, None, error, adjust)
+        return Case(survey, None, error)
 
 
 def diagnosed(survey: Survey, *families: Family) -> Diagnosis:

@@ -9,6 +9,7 @@ from adjust.diagnosis.bodies.split import epochs_from
 from adjust.diagnosis.bodies.targets import moved_target
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.prediction import adjusted_values
 
 __all__ = ["hypotheses"]
 _MOST = 4
@@ -26,10 +27,11 @@ def hypotheses(case: Case) -> Iterable[Hypothesis]:
 def _steps(case: Case) -> Iterator[Step]:
     found = []
     if case.result is not None:
-        found = [step for series in series_of(case, case.result) if (step := step_of(series)) is not None]
+        every = series_of(case, adjusted_values(case.result))
+        found = [step for series in every if (step := step_of(series)) is not None]
     if not found:
-        for (_, owner), result in case.without_one:
-            steps = [step_of(s) for s in series_of(case, result) if s.name[1] == owner]
+        for (_, owner), values in case.without_one:
+            steps = [step_of(s) for s in series_of(case, values) if s.name[1] == owner]
             found += [s for s in steps if s is not None]
     yield from found
     yield from lens_steps(case)

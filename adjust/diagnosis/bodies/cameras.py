@@ -10,7 +10,7 @@ from adjust.diagnosis.bodies.series import Step
 from adjust.diagnosis.bodies.split import split_camera
 from adjust.diagnosis.bodies.targets import motion_text
 from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place
-from adjust.diagnosis.images.maps import TURNED, edits_of, mapped
+from adjust.diagnosis.images.maps import TURNED, turned
 from adjust.model.result import Adjustment, Estimate
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.rigid import rotation_log
@@ -106,15 +106,8 @@ def turned_images(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Iterat
     for degrees, back in ((90.0, 270), (180.0, 180), (-90.0, 90)):
         off = min(float(np.linalg.norm(turn - s * np.radians([0.0, 0.0, degrees]))) for s in (1, 1 - 2 * (back == 180)))
         if off < _NEAR:
-            camera, how = step.name[1], TURNED[back]
-            yield Hypothesis(
-                "images turned",
-                f"camera {camera}: its images are turned from epoch {epochs[0]} on",
-                f"turn them by {how.text}, and detect them again",
-                Place("camera", (camera,), epochs=epochs), mapped(survey, camera, set(epochs), how),
-                edits_of(survey, camera, epochs, how), looked_at=step.cuts,
-                evidence=(0.9 if step.motion is None else 1.1) * step.gain,
-            )  # fmt: skip
+            evidence = (0.9 if step.motion is None else 1.1) * step.gain
+            yield turned(survey, step.name[1], epochs, TURNED[back], evidence, step.cuts)
 
 
 def _named(hypothesis: Hypothesis, found: Difference) -> Hypothesis:

@@ -3,9 +3,10 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
-from adjust.adjustment import adjust
+import numpy as np
+
 from adjust.diagnosis.bodies.series import Step
-from adjust.diagnosis.case import Case
+from adjust.diagnosis.case import Case, own_lenses, single_views
 from adjust.diagnosis.table.views import single_camera_survey
 from adjust.diagnosis.trial import misfit_of
 from adjust.model.errors import SurveyError
@@ -13,38 +14,59 @@ from adjust.model.survey import Survey
 from adjust.testing.distributions import chi2
 
 _LEAST = 3  # images on either side
-_CUTS = 7
+_NEAR = 1
+_BOUND = 100.0  # of the misfit of an image, times that of the typical one
 
 
 def lens_steps(case: Case) -> Iterator[Step]:
-    """For every camera that does not even fit by itself: where two lenses explain its images best."""
+    """For every camera that does not even fit by itself: where two lenses explain its images best.
+
+    The lens of its first images and that of its last ones tell which of the others are of either.
+    """
     for camera in case.survey.cameras:
         alone = single_camera_survey(case.survey, camera.camera_id)
         n = len(alone.image_blocks)
         if n < 2 * _LEAST or not camera.lens.free:
             continue
-        whole = _misfit(alone)
+        whole = _misfit(case, alone)
         if whole < _limit(alone):
             continue
-        costs = {k: _both(alone, k) for k in range(_LEAST, n - _LEAST + 1, max(1, (n - 2 * _LEAST) // _CUTS))}
-        best = min(costs, key=lambda k: costs[k])
-        near = {k: _both(alone, k) for k in range(best - 2, best + 3) if _LEAST <= k <= n - _LEAST and k not in costs}
-        costs |= near
-        best = min(costs, key=lambda k: costs[k])
+        best = _cut(case, alone)
+        costs = {k: _both(case, alone, k) for k in range(best - _NEAR, best + _NEAR + 1) if _LEAST <= k <= n - _LEAST}
+        best = min(costs, key=lambda k: costs[k], default=0)
         mine = [i for i, b in enumerate(case.survey.image_blocks)
                 if b.camera_id == camera.camera_id and b.target_id is not None]  # fmt: skip
-        if whole - costs[best] > 0.5 * (whole - _limit(alone)):
-            yield Step(("station_from_camera", camera.camera_id), mine[best], whole - costs[best], len(costs))
+        if costs and whole - costs[best] > 0.5 * (whole - _limit(alone)):
+            yield Step(("station_from_camera", camera.camera_id), mine[best], whole - costs[best], n - 2 * _LEAST + 1)
 
 
-def _both(alone: Survey, cut: int) -> float:
+def _cut(case: Case, alone: Survey) -> int:
+    """Before which image the lens of the last ones explains them better than that of the first ones does."""
+    n, blocks = len(alone.image_blocks), alone.image_blocks
+    third = max(_LEAST, n // 3)
+    errors = []
+    for part in (blocks[:third], blocks[n - third :]):
+        try:
+            lenses = own_lenses(replace(alone, image_blocks=part))
+        except SurveyError:
+            return 0
+        found = {v.block_idx: float(v.error_px[0]) for v in single_views(alone, lenses)}
+        errors.append(np.array([found.get(i, np.inf) for i in range(n)]))
+    first, last = errors
+    typical = max(float(np.median(np.minimum(first, last))), 1e-3)
+    first, last = (np.minimum((e / typical) ** 2, _BOUND) for e in (first, last))
+    costs = np.concatenate([[0.0], np.cumsum(first)]) + np.concatenate([np.cumsum(last[::-1])[::-1], [0.0]])
+    return int(np.argmin(costs))
+
+
+def _both(case: Case, alone: Survey, cut: int) -> float:
     parts = (alone.image_blocks[:cut], alone.image_blocks[cut:])
-    return sum(_misfit(replace(alone, image_blocks=part)) for part in parts)
+    return sum(_misfit(case, replace(alone, image_blocks=part)) for part in parts)
 
 
-def _misfit(survey: Survey) -> float:
+def _misfit(case: Case, survey: Survey) -> float:
     try:
-        return misfit_of(adjust(survey), survey).omega
+        return misfit_of(case.run(survey), survey).omega
     except SurveyError:
         return misfit_of(None, survey).omega
 

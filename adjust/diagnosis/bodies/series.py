@@ -1,15 +1,13 @@
 """What every single image says about one pose of a survey, when all the others are as an adjustment has them."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.diagnosis.case import Case
-from adjust.diagnosis.prediction import adjusted_pose, chains_of
+from adjust.diagnosis.prediction import Altered, Prediction
 from adjust.diagnosis.table.views import view_covariance
-from adjust.frames.unknowns import Chain
-from adjust.model.result import Adjustment, ParameterName
+from adjust.model.result import ParameterName
 from adjust.model.survey import FloatArray, IntArray
 from adjust.spatial.rigid import adjoint, inverse, rotation_log
 from adjust.testing.criteria import sidak
@@ -48,69 +46,52 @@ class Step:
     motion: FloatArray | None = None
 
 
-def series_of(case: Case, result: Adjustment) -> list[Series]:
+def series_of(case: Case, values: Altered) -> list[Series]:
     """For every pose of a camera or a target that is the same for several images: what each of them says about it."""
-    names, chains = chains_of(case.survey)
-    poses = {slot: adjusted_pose(case.survey, result, tuple(name)) for slot, name in names.items()}
-    users: dict[int, list[int]] = {}
-    for i, chain in enumerate(chains):
-        for link in chain:
-            users.setdefault(link.slot, []).append(i)
-    alone = {s for s, name in names.items() if name[0] != "table_motion" and len(users.get(s, ())) < 2}
+    prediction, blocks = Prediction(case.survey, values), case.survey.image_blocks
+    users: dict[ParameterName, list[int]] = {}
+    for i, block in enumerate(blocks):
+        for name, _ in prediction.links(block):
+            users.setdefault(name, []).append(i)
+    alone = {name for name, of in users.items() if name[0] != "table_motion" and len(of) < 2}
     out = []
-    for slot, name in names.items():
+    for name, of in users.items():
         if name[0] not in ("station_from_camera", "carrier_from_target") or len(name) > 2:
             continue
-        rows = [_implied(case, poses, chains[i], slot, i, alone) for i in users.get(slot, ())]
-        found = [r for r in rows if r is not None]
+        found = [(i, *x) for i in of if i in case.views and (x := _implied(case, prediction, i, name, alone))]
         if len(found) >= 2 * _LEAST:
-            blocks, links, cov = zip(*found, strict=True)
-            out.append(Series(tuple(name), np.array(blocks), np.array(links), np.array(cov)))
+            rows, links, cov = zip(*found, strict=True)
+            out.append(Series(name, np.array(rows), np.array(links), np.array(cov)))
     return out
 
 
 def _implied(
-    case: Case, poses: Mapping[int, FloatArray | None], chain: Chain, slot: int, i: int, alone: set[int]
-) -> tuple[int, FloatArray, FloatArray] | None:
-    """Position, link and covariance of a block; None where a pose that it alone determines takes up what it says."""
-    if i not in case.views or case.survey.image_blocks[i].target_id is None:
+    case: Case, prediction: Prediction, i: int, name: ParameterName, alone: set[ParameterName]
+) -> tuple[FloatArray, FloatArray] | None:
+    """Link and covariance of a block; None where a pose that it alone determines takes up what it says."""
+    block, view = case.survey.image_blocks[i], case.views[i]
+    found = prediction.implied(block, view.poses[0], name, alone)
+    if found is None:
         return None
-    before, after, side = np.eye(4), np.eye(4), 0
-    for link in chain:
-        if link.slot == slot:
-            side = 1
-            continue
-        value = poses[link.slot]
-        if value is None or link.slot in alone:
-            return None
-        value = inverse(value) if link.inverse else value
-        if side:
-            after = after @ value
-        else:
-            before = before @ value
-    view, back = case.views[i], inverse(before)
-    A = adjoint(back[None])[0]
-    return i, back @ view.poses[0] @ inverse(after), A @ view_covariance(case.survey.image_blocks[i], view) @ A.T
+    A = adjoint(found[1][None])[0]
+    return found[0], A @ view_covariance(block, view) @ A.T
 
 
-def placed_views(case: Case, result: Adjustment, target_id: str) -> tuple[FloatArray, FloatArray]:
+def placed_views(case: Case, values: Altered, target_id: str) -> tuple[FloatArray, FloatArray]:
     """Places (n, 3) m of the cameras that see a target that stands still, and (n, 3) m from each to its origin.
 
-    Both in the frame that carries the target, by an adjustment without it; the second from single images.
+    Both in the frame that carries the target, by values of a survey without it; the second from single images.
     """
-    names, chains = chains_of(case.survey)
-    slot = next((s for s, name in names.items() if name == ("carrier_from_target", target_id)), None)
-    poses = {s: adjusted_pose(case.survey, result, tuple(name)) for s, name in names.items()}
-    places, offsets = [], []
-    for i, chain in enumerate(chains):
-        if slot is None or case.survey.image_blocks[i].target_id != target_id:
+    prediction, places, offsets = Prediction(case.survey, values), [], []
+    for i, view in sorted(case.views.items()):
+        block = case.survey.image_blocks[i]
+        if block.target_id != target_id:
             continue
-        found = _implied(case, poses, chain, slot, i, set())
+        found = prediction.implied(block, view.poses[0], ("carrier_from_target", target_id))
         if found is not None:
-            link, view = found[1], case.views[i].poses[0]
-            c = (link @ inverse(view))[:3, 3]
+            c = (found[0] @ inverse(view.poses[0]))[:3, 3]
             places.append(c)
-            offsets.append(link[:3, 3] - c)
+            offsets.append(found[0][:3, 3] - c)
     return np.array(places).reshape(-1, 3), np.array(offsets).reshape(-1, 3)
 
 

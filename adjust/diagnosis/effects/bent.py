@@ -6,18 +6,29 @@ from dataclasses import replace
 import numpy as np
 
 from adjust.diagnosis.case import Case
+from adjust.diagnosis.effects.effect import of_shifts, ratio
 from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
+from adjust.diagnosis.prediction import Prediction, adjusted_values
+from adjust.diagnosis.score import Linear
 from adjust.model.result import Adjustment
-from adjust.model.survey import VectorParameter
+from adjust.model.survey import FloatArray, Survey, Target, VectorParameter
+from adjust.testing.distributions import chi2
 
-_MOST = 2  # targets
+_ALPHA = 1e-4
+_FLAT = 0.1
+_STEP = 1e-4  # m of sag
 
 
 def bent_targets(case: Case) -> Iterator[Hypothesis]:
-    """The sag of a flat target as an unknown of its own."""
-    for target, share in _suspects(case):
-        given = next(t for t in case.survey.targets if t.target_id == target)
-        if given.warp is not None and given.warp.free:
+    """The sag of a flat target as an unknown of its own, where the score of a sag is clear."""
+    linear = case.linear
+    if linear is None:
+        return
+    flat = [t for t in case.survey.targets if np.ptp(t.x_in_target[:, 2]) < _FLAT * np.ptp(t.x_in_target[:, :2])]
+    limit = linear.scale * float(chi2.isf(_ALPHA / max(len(flat), 1), 2))
+    for given in flat:
+        target, clear = given.target_id, _drop(linear, given)
+        if (given.warp is not None and given.warp.free) or clear < limit:
             continue
         warp = VectorParameter(("warp_x", "warp_y"), np.zeros(2), free=("warp_x", "warp_y"))
         survey = replace(
@@ -31,7 +42,7 @@ def bent_targets(case: Case) -> Iterator[Hypothesis]:
             Place("target", (target,), "warp"),
             survey,
             (SetKey(("targets", target, "warp", "free"), True),),
-            evidence=0.5 * share, parameters=2,
+            evidence=ratio(linear, clear), parameters=2, looked_at=len(flat),
         )  # fmt: skip
         yield replace(hypothesis, follow=_sag_told(hypothesis, target))
 
@@ -48,11 +59,23 @@ def _sag_told(hypothesis: Hypothesis, target: str) -> Callable[[Adjustment], lis
     return told
 
 
-def _suspects(case: Case) -> list[tuple[str, float]]:
-    """The flat targets with the largest misfit beyond noise, and that misfit over its square root of count."""
-    share: dict[str, float] = {}
-    for block, value in zip(case.survey.image_blocks, case.block_misfit, strict=True):
-        if block.target_id is not None:
-            share[block.target_id] = share.get(block.target_id, 0.0) + float(value) - 2.0 * len(block.uv)
-    ranked = sorted(share.items(), key=lambda item: -item[1])[:_MOST]
-    return [(name, value**0.5) for name, value in ranked if value > 0.0]
+def _drop(linear: Linear, target: Target) -> float:
+    """Of v'Pv, by the score of a sag along x and along y."""
+    survey, values = linear.result.survey, adjusted_values(linear.result)
+    low, span = target.x_in_target.min(axis=0), np.maximum(np.ptp(target.x_in_target, axis=0), 1e-12)
+    u = (target.x_in_target - low)[:, :2] / span[:2]
+    sags = [_STEP * 4.0 * u[:, k] * (1.0 - u[:, k]) for k in range(2)]
+    flat, *bent = (Prediction(_with_sag(survey, target, s), values) for s in (0.0 * sags[0], *sags))
+    shifts = {}
+    for i, block in enumerate(survey.image_blocks):
+        if block.target_id == target.target_id:
+            uv = [p.uv(block) for p in (flat, *bent)]
+            if not any(x is None for x in uv):
+                shifts[i] = np.moveaxis((np.array(uv[1:]) - np.array(uv[0])) / _STEP, 0, -1)
+    return of_shifts(linear, shifts).drop
+
+
+def _with_sag(survey: Survey, target: Target, sag: FloatArray) -> Survey:
+    x = target.x_in_target + np.outer(sag, [0.0, 0.0, 1.0])
+    return replace(survey, targets=tuple(
+        replace(t, x_in_target=x) if t.target_id == target.target_id else t for t in survey.targets))  # fmt: skip

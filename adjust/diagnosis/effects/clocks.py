@@ -6,10 +6,13 @@ neighbouring epochs. A value that was read dt late is ``f(t + dt) = f + dt f' + 
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from gtsam import Pose3
+from gtsam import Pose3, Rot3
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, Shifts, of_others, of_shifts
@@ -20,6 +23,7 @@ from adjust.model.observations import ImageBlock, TableReading
 from adjust.model.survey import FloatArray, Survey
 
 _FEWEST = 6
+_STEP = 1e-3  # intervals
 _CLEAR = 4.0  # sigmas
 
 
@@ -36,26 +40,41 @@ def clocks(case: Case) -> Iterator[Effect]:
 # -- cameras ---------------------------------------------------------------------------------------------------------
 
 
+@lru_cache(maxsize=2)
 def _motion(survey: Survey) -> dict[int, tuple[int, int, FloatArray, FloatArray]]:
-    """By block: its number in the course of its camera and target, their length, speed and acceleration (n, 2) px."""
+    """By block: its number in the course of its camera and target, their length, speed and acceleration (n, 2) px.
+
+    Of points that the whole course shows by splines, of others by the images before and after; zero where unknown.
+    """
     courses: dict[tuple[str, str | None], list[int]] = {}
     for i, b in enumerate(survey.image_blocks):
         courses.setdefault((b.camera_id, b.target_id), []).append(i)
     out = {}
     for blocks in courses.values():
-        for k, i in enumerate(blocks[1:-1], start=1):
-            block = survey.image_blocks[i]
-            before, after = (_at_points(survey.image_blocks[blocks[k + s]], block) for s in (-1, 1))
-            speed, bend = 0.5 * (after - before), after - 2.0 * block.uv + before
-            whole = np.isfinite(speed.sum(axis=1, keepdims=True))
-            out[i] = k, len(blocks), np.where(whole, speed, 0.0), np.where(whole, bend, 0.0)
+        if len(blocks) < _FEWEST:
+            continue
+        uv = np.full((len(blocks), 1 + max(int(survey.image_blocks[i].point_idx.max()) for i in blocks), 2), np.nan)
+        for k, i in enumerate(blocks):
+            uv[k, survey.image_blocks[i].point_idx] = survey.image_blocks[i].uv
+        speed, bend = _smooth(uv)
+        for k, i in enumerate(blocks):
+            rows = survey.image_blocks[i].point_idx
+            if speed[k, rows].any():
+                out[i] = k, len(blocks), speed[k, rows], bend[k, rows]
     return out
 
 
-def _at_points(other: ImageBlock, block: ImageBlock) -> FloatArray:
-    """(n, 2) px of the points of ``block`` in another one, nan where it does not show them."""
-    at = {int(p): k for k, p in enumerate(other.point_idx)}
-    return np.array([other.uv[at[int(p)]] if int(p) in at else (np.nan, np.nan) for p in block.point_idx])
+def _smooth(uv: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Speed and acceleration of tracks (e, n, 2) at e epochs."""
+    whole, e = np.isfinite(uv).all(axis=(0, 2)), np.arange(len(uv))
+    speed, bend = np.zeros(uv.shape), np.zeros(uv.shape)
+    speed[1:-1], bend[1:-1] = 0.5 * (uv[2:] - uv[:-2]), uv[2:] - 2.0 * uv[1:-1] + uv[:-2]
+    if whole.any():
+        course = spline(uv[:, whole])
+        speed[:, whole], bend[:, whole] = course(e, 1), course(e, 2)
+    unknown = ~np.isfinite(speed.sum(axis=2) + bend.sum(axis=2))
+    speed[unknown], bend[unknown] = 0.0, 0.0
+    return speed, bend
 
 
 def _always(_: int, n: int, block: ImageBlock, height: int) -> FloatArray:
@@ -103,7 +122,7 @@ def _late(survey: Survey, cameras: Sequence[str], weight: Any) -> Shifts:
 
 
 def _in_time(survey: Survey, cameras: Sequence[str], weight: Any, theta: FloatArray) -> Survey:
-    """The image points as they are theta intervals earlier; of first and last images nothing is known, they go."""
+    """The image points as they are theta intervals earlier; images of which no speed is known go."""
     heights = {c.camera_id: c.image_size[1] for c in survey.cameras}
     motion, blocks = _motion(survey), []
     for i, block in enumerate(survey.image_blocks):
@@ -147,7 +166,7 @@ def _of_tables(case: Case, linear: Linear) -> Iterator[Effect]:
         if len(mine) < _FEWEST:
             continue
         angles = np.array([r.angles for r in mine])
-        speed = np.gradient(angles, axis=0)
+        speed = spline(angles)(np.arange(len(mine)), 1)
         ids = [(r.table_id, r.epoch_id) for r in mine]
         times = drift_times(len(mine))[:, None]
         for name, D, text in (
@@ -190,32 +209,36 @@ def _of_hands(case: Case, linear: Linear) -> Iterator[Effect]:
         rows = [i for i, _ in poses.values()]
         if len(rows) < _FEWEST:
             continue
-        speed = _pose_speeds(case.survey, rows)
+        path = [p for i in rows if isinstance(p := case.survey.pairs[i].b_from_a, Pose3)]
         times = drift_times(len(rows))
         for name, w, text in (
             ("clock offset", np.ones(len(rows)), "are late by {:+.3f} +- {:.3f} intervals between epochs"),
             ("clock drift", times, "drift by {:+.3f} +- {:.3f} intervals over the session against the images"),
         ):  # fmt: skip
-            D = {i: (w[k] * speed[k]) for k, i in enumerate(rows)}
-            yield _hand_effect(case, linear, station, name, D, text)
+            yield _hand_effect(case, linear, station, name, (rows, path, w), text)
 
 
-def _pose_speeds(survey: Survey, rows: Sequence[int]) -> FloatArray:
-    """(n, 6) tangents of measured poses per interval, by their neighbours."""
-    poses = [survey.pairs[i].b_from_a for i in rows]
-    motions = [p for p in poses if isinstance(p, Pose3)]
-    out = np.zeros((len(motions), 6))
-    for k in range(len(motions)):
-        a, b = max(k - 1, 0), min(k + 1, len(motions) - 1)
-        out[k] = Pose3.Logmap(motions[a].between(motions[b])) / (b - a)
-    return out
+def _at(path: Sequence[Pose3], dt: FloatArray) -> list[Pose3]:
+    """Poses of a path at dt (n,) intervals after each of them: cubic splines of their places and of their turns."""
+    R = np.array([p.rotation().matrix() for p in path])
+    times = np.arange(len(path)) + dt
+    turns = RotationSpline(np.arange(len(path)), Rotation.from_matrix(R))
+    places = spline([p.translation() for p in path])
+    return [Pose3(Rot3(M), t) for M, t in zip(turns(times).as_matrix(), places(times), strict=True)]
+
+
+def spline(values: Any) -> CubicSpline:
+    """Through values (n, ...) at 0, 1, 2 ..."""
+    return CubicSpline(np.arange(len(values)), np.array(values))
 
 
 def _hand_effect(
-    case: Case, linear: Linear, station: str, name: str, D: dict[int, FloatArray], text: str
+    case: Case, linear: Linear, station: str, name: str, course: tuple[list[int], list[Pose3], FloatArray], text: str
 ) -> Effect:
-    pairs = case.survey.pairs
-    shifts = {pairs[i].pair_id: d[:, None] for i, d in D.items()}
+    """course: rows of the pairs, their poses, and by how much of the change each is late."""
+    pairs, (rows, path, w) = case.survey.pairs, course
+    speed = [(a.between(b)) for a, b in zip(_at(path, -_STEP * w), _at(path, _STEP * w), strict=True)]
+    shifts = {pairs[i].pair_id: Pose3.Logmap(d)[:, None] / (2.0 * _STEP) for i, d in zip(rows, speed, strict=True)}
 
     def scored(at: Linear) -> Score:
         ids = {o.ids: shifts[o.ids[0]] for o in at.system.precision.graph.others
@@ -223,12 +246,9 @@ def _hand_effect(
         return of_others(at, "pair", ids)
 
     def mended(theta: FloatArray) -> Survey:
-        new = {}
-        for i, d in D.items():
-            m = pairs[i].b_from_a
-            if isinstance(m, Pose3):
-                new[i] = replace(pairs[i], b_from_a=m.compose(Pose3.Expmap(-theta[0] * d)))
-        return with_pairs(case.survey, new)
+        at = zip(rows, _at(path, -theta[0] * w), strict=True)  # of the ends a spline knows little: they go
+        return with_pairs(case.survey, {i: replace(pairs[i], b_from_a=m, used=i not in (rows[0], rows[-1]))
+                                        for i, m in at})  # fmt: skip
 
     hypothesis = Hypothesis(
         name, "", "stop the motion at every epoch, or read pose and image at the same time, and measure again",

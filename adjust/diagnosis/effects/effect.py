@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.precision.precision import noise_of
 
-ROUNDS = 3
+ROUNDS = 6
+_SLOW = 0.5  # share of the last drop that the next one is at most, while it is on its way
 _SMALL = 9.0  # a further drop of v'Pv that is not worth another adjustment
 
 
@@ -25,6 +27,7 @@ class Effect:
     score: once more, at another adjustment of the same observations. mended: the survey without it, of size theta (k,),
     with the values of an adjustment. said: its cause in words, by theta and sigmas. added: theta and a further change.
     known: a size that explains itself near this one, and what that makes of the hypothesis; None where there is none.
+    nearer: the same change at another epoch, that an adjustment with the change shows to be the right one, or None.
     """
 
     hypothesis: Hypothesis
@@ -34,6 +37,7 @@ class Effect:
     said: Callable[[FloatArray, FloatArray], str]
     added: Callable[[FloatArray, FloatArray], FloatArray] = np.add
     known: Callable[[FloatArray, FloatArray], tuple[FloatArray, Mapping[str, Any]] | None] = lambda theta, sigmas: None
+    nearer: Callable[[Adjustment, FloatArray], "Effect | None"] = lambda result, theta: None
 
     def value(self, scale: float, n: int) -> float:
         """By how much more it explains than its parameters cost (Schwarz 1978), over a variance factor."""
@@ -44,35 +48,63 @@ class Effect:
         found: list[Mapping[str, Any]] = []
 
         def made() -> Survey | None:
-            theta, result, sigmas = self._estimated(case, linear)
-            known = self.known(theta, sigmas)
-            theta, changes = known or (theta, {"cause": self.said(theta, sigmas)})
+            at, (theta, result, sigmas) = self, self._estimated(case, linear, self.first.theta)
+            nearer = self.nearer(result, theta)
+            if nearer is not None:
+                at, (theta, result, sigmas) = nearer, nearer._estimated(case, linear, theta)
+            if not at._last and not case.is_near:
+                return None  # far from where it belongs, and on no way there
+            of = at.hypothesis
+            as_found = {"cause": at.said(theta, sigmas), "place": of.place, "edits": of.edits, "change": of.change}
+            theta, changes = at.known(theta, sigmas) or (theta, as_found)
             found.append(changes)
-            return self.mended(result, theta)
+            return at.made(result, theta)
 
         def told(_: Adjustment) -> Sequence[Hypothesis]:
             return [replace(hypothesis, **found[-1])] if found else []
 
         sigmas = np.sqrt(np.maximum(np.diag(self.first.cov), 0.0))
         hypothesis = replace(self.hypothesis, survey=made, cause=self.said(self.first.theta, sigmas),
-                             evidence=self.first.drop, parameters=self.hypothesis.parameters + self.first.seen,
-                             looked_at=looked_at)  # fmt: skip
+                             parameters=self.hypothesis.parameters + self.first.seen, looked_at=looked_at,
+                             evidence=ratio(linear, self.first.drop))  # fmt: skip
         return replace(hypothesis, follow=told)
 
-    def _estimated(self, case: Case, linear: Linear) -> tuple[FloatArray, Adjustment, FloatArray]:
+    def made(self, result: Adjustment, theta: FloatArray) -> Survey:
+        """The survey that was adjusted last, where it is that of theta."""
+        last = self._last[-1] if self._last else None
+        return last[1] if last is not None and np.array_equal(last[0], theta) else self.mended(result, theta)
+
+    @cached_property
+    def _last(self) -> list[tuple[FloatArray, Survey]]:
+        return []
+
+    def _estimated(
+        self, case: Case, linear: Linear, theta: FloatArray
+    ) -> tuple[FloatArray, Adjustment, FloatArray]:
         """Its size, the adjustment at which that was found, and the sigmas (k,)."""
-        theta, cov, now = self.first.theta, self.first.cov, linear
+        cov, now, last = self.first.cov, linear, np.inf
         for _ in range(ROUNDS - 1):
             try:
-                new = Linear(case.warm(self.mended(now.result, theta)))
+                survey = self.mended(now.result, theta)
+                new = Linear(case.warm(survey))
                 more = self.score(new)
             except SurveyError:
                 break
             if more.drop < _SMALL * new.scale:
                 cov, now = more.cov if more.seen else cov, new
+                self._last.append((theta, survey))
                 break
-            theta, cov, now = self.added(theta, more.theta), more.cov, new
+            if more.drop > _SLOW * last:
+                break
+            theta, cov, now, last = self.added(theta, more.theta), more.cov, new, more.drop
         return theta, now.result, np.sqrt(np.maximum(np.diag(cov), 0.0) * now.scale)
+
+
+def ratio(linear: Linear, drop: float) -> float:
+    """How many times smaller the misfit beyond noise becomes by a drop of v'Pv; noise itself is some of it."""
+    redundancy = max(linear.result.redundancy, 1)
+    noise, excess = float(np.sqrt(2.0 * redundancy)), linear.result.omega - redundancy
+    return (max(excess, drop) + noise) / (max(excess - drop, 0.0) + noise)
 
 
 Shifts = Mapping[int, FloatArray]

@@ -45,7 +45,7 @@ def _of(case: Case, kind: str, field: str, owner: str | None) -> Effect:
         return f"the image points of {what} are shifted by ({by}) px: another region of the sensor, or another origin"
 
     def known(theta: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, Mapping[str, Any]] | None:
-        half = np.full(2, np.copysign(_HALF, theta[0]))
+        half = np.full(2, np.copysign(_HALF, theta[0]))  # where two detectors differ, either may be meant
         if not (np.abs(theta - half) < _NEAR + 4.0 * sigmas).all():
             return None
         centre = "(0.5, 0.5)" if theta[0] > 0.0 else "(-0.5, -0.5)"

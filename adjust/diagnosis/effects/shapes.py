@@ -8,7 +8,7 @@ import numpy as np
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect, of_shifts
 from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey, SetKey
-from adjust.diagnosis.prediction import Prediction
+from adjust.diagnosis.prediction import Prediction, adjusted_values
 from adjust.diagnosis.score import Linear, Score
 from adjust.diagnosis.targets.size import reshaped, well_known
 from adjust.model.survey import FloatArray, Survey
@@ -51,11 +51,12 @@ def _of(
 ) -> Effect:
     def scored(at: Linear) -> Score:
         survey = at.result.survey
-        now, then = (Prediction(s, at.result) for s in (survey, reshaped(survey, target, shape(_STEP))))
+        values = adjusted_values(at.result)
+        now, then = (Prediction(s, values) for s in (survey, reshaped(survey, target, shape(_STEP))))
         shifts = {}
         for i, block in enumerate(survey.image_blocks):
             if block.target_id == target:
-                a, b = now.uv(i), then.uv(i)
+                a, b = now.uv(block), then.uv(block)
                 if a is not None and b is not None:
                     shifts[i] = ((b - a) / _STEP)[:, :, None]
         return of_shifts(at, shifts)

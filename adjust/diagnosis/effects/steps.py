@@ -11,7 +11,7 @@ from adjust.diagnosis.bodies.targets import motion_text
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect
 from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place
-from adjust.diagnosis.prediction import Prediction
+from adjust.diagnosis.prediction import Prediction, adjusted_values
 from adjust.diagnosis.score import Linear, Part, Score, drift_times
 from adjust.diagnosis.sequences import with_pairs
 from adjust.model.observations import FrameRef, ImageBlock, Pair
@@ -20,7 +20,7 @@ from adjust.model.survey import FloatArray, IntArray, Survey
 
 FOCAL, CENTRE = ("fx", "fy", "c"), ("u0", "v0", "xp", "yp")
 _FEWEST = 4
-_DELTA = 1e-5
+_BOUND = 50.0  # of the square of one image point
 _MOVED = {  # name of the unknown: of the mistake, kind of the thing, what happened to it
     "station_from_camera": ("camera moved", "camera", "camera {} was moved on its station"),
     "carrier_from_target": ("target moved", "target", "target {} was moved"),
@@ -61,7 +61,7 @@ def steps(case: Case) -> Iterator[Effect]:
             yield _drift(case, course, linear.drift(course.parts))
 
 
-def _courses(linear: Linear) -> Iterator[_Course]:
+def _courses(linear: Linear, only: ParameterName | None = None) -> Iterator[_Course]:
     survey, columns = linear.result.survey, linear.system.columns
     ptr, row_of = linear.system.ptr, linear.system.row_of
     first_reading = len(ptr) - 1 - len(survey.readings)
@@ -73,7 +73,7 @@ def _courses(linear: Linear) -> Iterator[_Course]:
         of = [np.arange(ptr[i], ptr[i + 1]) for i in numbers]
         return _Course(name, (), kind, tuple(ids[i] for i in numbers), tuple(linear.parts(columns.at[name], of)))
 
-    for name, at in columns.at.items():
+    for name, at in columns.at.items() if only is None else [(n, columns.at[n]) for n in (only,) if n in columns.at]:
         if name[0] not in (*_MOVED, "lens") or not len(at) or len(name) > 2 or _is_the_world(survey, name):
             continue
         rows = np.unique(At[:, at].indices)
@@ -84,7 +84,7 @@ def _courses(linear: Linear) -> Iterator[_Course]:
         elif name[0] == "orientation":
             ids = {first_reading + k: r.reading_id for k, r in enumerate(survey.readings)}
             yield course(name, "reading", ids, rows)
-    yield from _of_held(linear)
+    yield from _of_held(linear, only)
 
 
 def _is_the_world(survey: Survey, name: ParameterName) -> bool:
@@ -105,43 +105,33 @@ def _of_images(linear: Linear, name: ParameterName, rows: IntArray) -> Iterator[
     images = rows[rows < ptr[-1]]
     known = np.unique(of[images])
     by_epoch = [images[of[images] == k] for k in known]
-    for components in (FOCAL, CENTRE) if name[0] == "lens" else ((),):
+    for components in (FOCAL, CENTRE, FOCAL + CENTRE) if name[0] == "lens" else ((),):
         columns = linear.columns(name, components)
         if len(columns):
             labels = tuple(epochs[k] for k in known)
             yield _Course(name, components, "image", labels, tuple(linear.parts(columns, by_epoch)))
 
 
-def _of_held(linear: Linear) -> Iterator[_Course]:
+def _of_held(linear: Linear, only: ParameterName | None) -> Iterator[_Course]:
     """Bodies whose poses are held: the targets that tell the datum, the mounts of stations; by differences."""
     survey, free = linear.result.survey, linear.system.columns.at
     still = [t.target_id for t in survey.targets if t.motion == "fixed"]
     turned = [s.station_id for s in survey.stations if s.motion == "table"]
     held = [("target_body", t) for t in still if ("carrier_from_target", t) not in free]
     held += [("station_body", s) for s in turned if ("mount_from_station", s) not in free]
-    prediction = Prediction(survey, linear.result)
+    prediction = Prediction(survey, adjusted_values(linear.result))
     on_table = {r.epoch_id for r in survey.table_readings}
-    for name in held:
+    for name in held if only is None else [n for n in held if n == only]:
         by_epoch: dict[str, list[Part]] = {}
         cameras = {c.camera_id for c in survey.cameras if c.station_id == name[1]}
         mine = {i for i, b in enumerate(survey.image_blocks) if b.target_id == name[1] or
                 (name[0] == "station_body" and b.camera_id in cameras and b.epoch_id in on_table)}  # fmt: skip
         for i in sorted(mine):
-            D = _by_motion(prediction, i, name)
+            D = prediction.by_motion(survey.image_blocks[i], name)
             if D is not None:
                 by_epoch.setdefault(survey.image_blocks[i].epoch_id, []).extend(linear.image_parts({i: D}))
         parts = tuple((np.concatenate([r for r, _ in p]), np.concatenate([B for _, B in p])) for p in by_epoch.values())
         yield _Course(name, (), "image", tuple(by_epoch), parts)
-
-
-def _by_motion(prediction: Prediction, i: int, name: ParameterName) -> FloatArray | None:
-    """(n, 2, 6) px by a small motion of a body."""
-    steps = [{name: Pose3.Expmap(s * _DELTA * np.eye(6)[k])} for k in range(6) for s in (1.0, -1.0)]
-    uv = [prediction.uv(i, step) for step in steps]
-    if any(x is None for x in uv):
-        return None
-    both = np.array(uv).reshape(6, 2, -1, 2)
-    return np.asarray(np.moveaxis((both[:, 0] - both[:, 1]) / (2.0 * _DELTA), 0, -1))
 
 
 def _other_rows(linear: Linear, kind: str) -> list[int]:
@@ -154,7 +144,7 @@ def _step(case: Case, course: _Course, cut: int, first: Score, looked_at: int) -
     later = course.labels[cut:]
     name, kind, what = _MOVED.get(course.name[0], ("", "camera", ""))
     if course.name[0] == "lens":
-        name = "focus touched" if course.components == FOCAL else "images shifted"
+        name = "images shifted" if course.components == CENTRE else "focus touched"
     place = Place(kind, (thing,), epochs=later if course.kind == "image" else ())
     before = "before epoch" if course.kind == "image" else f"before {course.kind}"
     names = [c for c in course.components if c in _components(case, course.name)]
@@ -175,10 +165,31 @@ def _step(case: Case, course: _Course, cut: int, first: Score, looked_at: int) -
     chosen = frozenset(later)
     return Effect(
         hypothesis, first,
-        lambda linear: _at(linear, course, lambda parts: linear.steps(parts)[cut]),
+        lambda linear: _at(linear, course, lambda parts: linear.of_parts(parts[cut:])),
         lambda result, theta: _mended(case.survey, result, course, dict.fromkeys(chosen, 1.0), theta),
         said, _composed if _is_pose(case, course.name) else np.add,
+        nearer=lambda result, theta: _nearer(case, course, cut, first, looked_at, result, theta),
     )  # fmt: skip
+
+
+def _nearer(
+    case: Case, course: _Course, cut: int, first: Score, looked_at: int, result: Adjustment, theta: FloatArray
+) -> Effect | None:
+    """The same step before another epoch, if its images, each as before and as after, say so; None else."""
+    if course.kind != "image":
+        return None
+    prediction = Prediction(case.survey, adjusted_values(result))
+    altered = {course.name: _altered(result, course, theta)}
+    number = {label: k for k, label in enumerate(course.labels)}
+    gain = np.zeros(len(number))  # of v'Pv, where an epoch is after the step
+    for block in case.survey.image_blocks:
+        if block.epoch_id in number and _concerns(block, course):
+            before, after = (prediction.squares(block, a) for a in ({}, altered))
+            if before is not None and after is not None:
+                gain[number[block.epoch_id]] += float(np.fmin(before, _BOUND).sum() - np.fmin(after, _BOUND).sum())
+    since = np.cumsum(gain[::-1])[::-1]
+    best = 1 + int(np.argmax(since[1:]))
+    return None if best == cut else _step(case, course, best, replace(first, theta=theta), looked_at)
 
 
 def _drift(case: Case, course: _Course, first: Score) -> Effect:
@@ -199,8 +210,8 @@ def _drift(case: Case, course: _Course, first: Score) -> Effect:
 
 def _at(linear: Linear, course: _Course, score: Callable[[Sequence[Part]], Score]) -> Score:
     """The score of the same course at another adjustment; what that has left out is no part of it."""
-    for again in _courses(linear):
-        if (again.name, again.components) == (course.name, course.components) and again.labels == course.labels:
+    for again in _courses(linear, course.name):
+        if again.components == course.components and again.labels == course.labels:
             return score(again.parts)
     return Score(np.zeros(0), np.zeros((0, 0)), 0.0, 0)
 
@@ -288,13 +299,13 @@ def _mended(
 def _mended_images(
     survey: Survey, result: Adjustment, course: _Course, weights: Mapping[str, float], theta: FloatArray
 ) -> Survey:
-    prediction, blocks = Prediction(survey, result), []
+    prediction, blocks = Prediction(survey, adjusted_values(result)), []
     values: dict[float, Pose3 | FloatArray] = {}
-    for i, block in enumerate(survey.image_blocks):
+    for block in survey.image_blocks:
         w = weights.get(block.epoch_id, 0.0)
         if w and _concerns(block, course):
             altered = values.setdefault(w, _altered(result, course, w * theta))
-            now, then = prediction.uv(i), prediction.uv(i, {course.name: altered})
+            now, then = prediction.uv(block), prediction.uv(block, {course.name: altered})
             block = block if now is None or then is None else replace(block, uv=block.uv - then + now)
         blocks.append(block)
     return replace(survey, image_blocks=tuple(blocks))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.diagnosis.hypothesis import ChangeColumns, Edit
+from adjust.diagnosis.hypothesis import ChangeColumns, Edit, Hypothesis, Place
 from adjust.model.survey import FloatArray, Survey
 
 
@@ -42,6 +42,17 @@ def mapped(survey: Survey, camera_id: str, epochs: Container[str], how: ImageMap
         for x in survey.image_blocks
     )
     return replace(survey, image_blocks=blocks)
+
+
+def turned(
+    survey: Survey, camera: str, epochs: tuple[str, ...], how: ImageMap, evidence: float, looked_at: int
+) -> Hypothesis:
+    """The images of a camera at some epochs turned back."""
+    return Hypothesis(
+        "images turned", f"camera {camera}: its images are turned from epoch {epochs[0]} on",
+        f"turn them by {how.text}, and detect them again", Place("camera", (camera,), epochs=epochs),
+        mapped(survey, camera, set(epochs), how), edits_of(survey, camera, epochs, how), evidence, looked_at=looked_at,
+    )  # fmt: skip
 
 
 def edits_of(survey: Survey, camera_id: str, epochs: tuple[str, ...], how: ImageMap) -> tuple[Edit, ...]:

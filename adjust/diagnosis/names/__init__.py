@@ -8,6 +8,7 @@ from adjust.diagnosis.names.epochs import misplaced_epochs
 from adjust.diagnosis.names.given import wrong_given
 from adjust.diagnosis.names.images import misnamed_images
 from adjust.diagnosis.names.points import exchanged_points
+from adjust.diagnosis.names.rays import exchanged_in_images
 from adjust.diagnosis.names.setups import rows_of_another_setup
 
 
@@ -17,4 +18,5 @@ def hypotheses(case: Case) -> Iterator[Hypothesis]:
     yield from wrong_given(case)
     yield from misplaced_epochs(case)
     yield from misnamed_images(case)
+    yield from exchanged_in_images(case)
     yield from rows_of_another_setup(case)

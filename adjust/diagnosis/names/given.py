@@ -15,6 +15,7 @@ from adjust.diagnosis.screen import Screen, improvement, screen
 from adjust.model.survey import FloatArray, Point, Survey
 
 _CLEARLY = 2.0
+_MISSING = 25.0
 _MOST, _TRIALS = 4, 80
 _SLIPS = (10.0, 0.1, 100.0, 0.01, 1000.0, 0.001)
 _LARGE = 2500
@@ -27,7 +28,8 @@ def wrong_given(case: Case) -> Iterator[Hypothesis]:
     if not given or not survey.readings or len(survey.readings) > _LARGE:
         return
     before = screen(survey)
-    tried = [*_exchanges(survey, given), *_slips(survey, given), *_axes(survey, given)][:_TRIALS]
+    tried = [h for h in (*_exchanges(survey, given), *_slips(survey, given), *_axes(survey, given))
+             if before is None or _misses(survey, before, h.place.ids)][:_TRIALS]  # fmt: skip
     found = []
     for h in tried:
         changed = h.changed()
@@ -35,6 +37,12 @@ def wrong_given(case: Case) -> Iterator[Hypothesis]:
         if evidence > _CLEARLY:
             found.append(replace(h, evidence=evidence, looked_at=len(tried)))
     yield from sorted(found, key=lambda h: -h.evidence)[:_MOST]
+
+
+def _misses(survey: Survey, before: Screen, ids: tuple[str, ...]) -> bool:
+    """Whether readings from or to one of these points do."""
+    bad = before.readings > _MISSING * before.scale
+    return any(b and {r.at.point_id, r.to.point_id} & {*ids} for b, r in zip(bad, survey.readings, strict=True))
 
 
 def _evidence(before: Screen | None, after: Screen | None) -> float:

@@ -4,7 +4,7 @@ Evidence: what the adjustment says such a block should show under the other name
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -16,37 +16,59 @@ from adjust.model.observations import ImageBlock
 from adjust.model.survey import FloatArray, Survey
 
 _CLEARLY = 3.0
+_MEDIAN = 1.386  # of chi-square with two degrees of freedom
 _POINTS, _TARGETS, _BLOCKS, _MOST = 6, 8, 24, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Now:
+    """squares: of every block those over sigmas of its points (n,), over scale, bounded."""
+
+    prediction: Prediction
+    squares: list[FloatArray]
+    scale: float
+
+    def ratio(self, gain: float) -> float:
+        """How many times smaller the misfit beyond noise becomes."""
+        n = 2.0 * sum(len(s) for s in self.squares)
+        excess = max(float(sum(s.sum() for s in self.squares)) - n, gain)
+        return float((excess + np.sqrt(2.0 * n)) / (excess - gain + np.sqrt(2.0 * n)))
 
 
 def misnamed_images(case: Case) -> Iterator[Hypothesis]:
     """The clearest of each kind."""
     yield from _copies(case.survey)
-    if case.result is not None and case.survey.image_blocks:
-        now = np.array([_misfit(Prediction(case.survey, case.result), i) for i in range(len(case.survey.image_blocks))])
-        yield from _targets(case, now)
-        yield from _points(case, now)
-        yield from _cameras(case, now)
+    if case.values is not None and case.survey.image_blocks:
+        prediction = Prediction(case.survey, case.values)
+        found = [x for b in case.survey.image_blocks if (x := prediction.squares(b)) is not None]
+        scale = max(1.0, float(np.nanmedian(np.concatenate([*found, np.ones(1)]))) / _MEDIAN)  # start values are rough
+        now = Now(prediction, [_squares(prediction, b, scale) for b in case.survey.image_blocks], scale)
+        yield from _targets(now)
+        yield from _points(now)
+        yield from _cameras(now)
 
 
-def _misfit(prediction: Prediction, i: int) -> float:
-    """Of a block, each point bounded; all of it where it cannot be predicted."""
-    squares, n = prediction.squares(i), len(prediction.survey.image_blocks[i].uv)
-    return 2.0 * CAP * n if squares is None else float(np.minimum(squares, 2.0 * CAP).sum())
+def _squares(prediction: Prediction, block: ImageBlock, scale: float) -> FloatArray:
+    """Of a block, bounded: the bound where it cannot be predicted."""
+    squares = prediction.squares(block)
+    return np.full(len(block.uv), 2.0 * CAP) if squares is None else np.fmin(squares / scale, 2.0 * CAP)
 
 
 def _renamed(survey: Survey, blocks: dict[int, ImageBlock]) -> Survey:
     return replace(survey, image_blocks=tuple(blocks.get(i, b) for i, b in enumerate(survey.image_blocks)))
 
 
-def _better(case: Case, now: FloatArray, other: dict[int, ImageBlock]) -> tuple[list[int], float]:
-    """The blocks that are clearly better under their other names, and by how much in all."""
-    if case.result is None:
-        return [], 0.0
-    prediction = Prediction(_renamed(case.survey, other), case.result)
-    gains = {i: (now[i], _misfit(prediction, i)) for i in other}
-    good = [i for i, (a, b) in gains.items() if a > _CLEARLY * b and a > _CLEARLY * 2.0 * len(other[i].uv)]
-    return good, sum(gains[i][0] - gains[i][1] for i in good)
+def _better(now: Now, other: dict[int, ImageBlock]) -> tuple[list[int], float]:
+    """The blocks whose renamed points are clearly better under their other names, and by how much in all."""
+    blocks, good, gain = now.prediction.survey.image_blocks, [], 0.0
+    for i, block in other.items():
+        same = block.target_id is None and block.camera_id == blocks[i].camera_id
+        rows = np.flatnonzero(block.point_idx != blocks[i].point_idx) if same else np.arange(len(block.uv))
+        before, after = (float(x[rows].sum()) for x in (now.squares[i], _squares(now.prediction, block, now.scale)))
+        gain += before - after
+        if before > _CLEARLY * max(after, 2.0 * len(rows)):
+            good.append(i)
+    return good, gain
 
 
 def _copies(survey: Survey) -> Iterator[Hypothesis]:
@@ -76,8 +98,8 @@ def _copies(survey: Survey) -> Iterator[Hypothesis]:
                 break
 
 
-def _targets(case: Case, now: FloatArray) -> Iterator[Hypothesis]:
-    survey = case.survey
+def _targets(now: Now) -> Iterator[Hypothesis]:
+    survey = now.prediction.survey
     points = {t.target_id: len(t.point_ids) for t in survey.targets if t.motion == "fixed"}
     found = []
     pairs = [(a, b) for a, b in combinations(list(points)[:_TARGETS], 2) if points[a] == points[b]]
@@ -85,65 +107,76 @@ def _targets(case: Case, now: FloatArray) -> Iterator[Hypothesis]:
         other = {a: b, b: a}
         blocks = {i: replace(x, target_id=other[str(x.target_id)]) for i, x in enumerate(survey.image_blocks)
                   if x.target_id in other}  # fmt: skip
-        good, gain = _better(case, now, blocks)
+        good, gain = _better(now, blocks)
         if good:  # those, and all from the first of them on: what is spoilt itself may hide the others
             found.append((gain, (a, b), other, {i: x for i, x in blocks.items() if i >= min(good)}))
             found.append((0.9 * gain, (a, b), other, {i: blocks[i] for i in good}))
-    yield from _exchanges(survey, found, "targets exchanged", "target_id", "targets", len(pairs))
+    yield from _exchanges(now, found, "targets exchanged", "target_id", "targets", len(pairs))
 
 
-def _points(case: Case, now: FloatArray) -> Iterator[Hypothesis]:
-    survey = case.survey
+def _points(now: Now) -> Iterator[Hypothesis]:
+    survey = now.prediction.survey
     ids = [p.point_id for p in survey.points]
     share: dict[int, float] = {}
     for i, block in enumerate(survey.image_blocks):
-        for p in block.point_idx.tolist() if block.target_id is None else ():
-            share[p] = share.get(p, 0.0) + float(now[i]) / len(block.uv)
+        of = zip(block.point_idx.tolist(), now.squares[i].tolist(), strict=True)
+        for p, square in of if block.target_id is None else ():
+            share[p] = share.get(p, 0.0) + square
     found, pairs = [], list(combinations(sorted(share, key=lambda p: -share[p])[:_POINTS], 2))
     for a, b in pairs:
         swap = np.arange(len(ids))
         swap[[a, b]] = b, a
         blocks = {i: replace(x, point_idx=swap[x.point_idx]) for i, x in enumerate(survey.image_blocks)
                   if x.target_id is None and bool(np.isin([a, b], x.point_idx).any())}  # fmt: skip
-        good, gain = _better(case, now, blocks)
+        good, gain = _better(now, blocks)
         if good:
             found.append((gain, (ids[a], ids[b]), {ids[a]: ids[b], ids[b]: ids[a]}, {i: blocks[i] for i in good}))
-    yield from _exchanges(survey, found, "points exchanged", "point_id", "points", len(pairs))
+    yield from _exchanges(now, found, "points exchanged", "point_id", "points", len(pairs))
 
 
 _Found = tuple[float, tuple[str, str], dict[str, str], dict[int, ImageBlock]]
 
 
 def _exchanges(
-    survey: Survey, found: Sequence[_Found], name: str, column: str, things: str, looked_at: int
+    now: Now, found: Sequence[_Found], name: str, column: str, things: str, looked_at: int
 ) -> Iterator[Hypothesis]:
     for gain, (a, b), other, blocks in sorted(found, key=lambda f: -f[0])[:_MOST]:
-        where = [survey.image_blocks[i] for i in sorted(blocks)]
-        epochs = tuple(dict.fromkeys(x.epoch_id for x in where))
-        at = {c: tuple(dict.fromkeys(x.epoch_id for x in where if x.camera_id == c)) for c in
-              dict.fromkeys(x.camera_id for x in where)}  # fmt: skip
-        yield Hypothesis(
-            name, f"{things} {a} and {b} are called by each other's names in {len(blocks)} images, the first at epoch "
-            f"{epochs[0]}: wrong names, or they changed places", f"exchange them in {column} of image_points.csv",
-            Place(column.removesuffix("_id"), (a, b), column, epochs), _renamed(survey, blocks),
-            tuple(Rename("image_points", column, other, {"camera_id": (c,), "epoch_id": e}) for c, e in at.items()),
-            gain, 1, looked_at,
-        )  # fmt: skip
+        kind = name, column, things
+        yield exchange(now.prediction.survey, (a, b), other, blocks, kind, now.ratio(gain), looked_at)
 
 
-def _cameras(case: Case, now: FloatArray) -> Iterator[Hypothesis]:
+def exchange(
+    survey: Survey, ids: tuple[str, str], other: dict[str, str], blocks: dict[int, ImageBlock],
+    kind: tuple[str, str, str], evidence: float, looked_at: int,
+) -> Hypothesis:  # fmt: skip
+    """The names of two things exchanged in some images. kind: name of the mistake, column of the table, the things."""
+    (name, column, things), (a, b) = kind, ids
+    where = [survey.image_blocks[i] for i in sorted(blocks)]
+    epochs = tuple(dict.fromkeys(x.epoch_id for x in where))
+    at = {c: tuple(dict.fromkeys(x.epoch_id for x in where if x.camera_id == c))
+          for c in dict.fromkeys(x.camera_id for x in where)}  # fmt: skip
+    return Hypothesis(
+        name, f"{things} {a} and {b} are called by each other's names in {len(blocks)} images, the first at epoch "
+        f"{epochs[0]}: wrong names, or they changed places", f"exchange them in {column} of image_points.csv",
+        Place(column.removesuffix("_id"), (a, b), column, epochs), _renamed(survey, blocks),
+        tuple(Rename("image_points", column, other, {"camera_id": (c,), "epoch_id": e}) for c, e in at.items()),
+        evidence, 1, looked_at,
+    )  # fmt: skip
+
+
+def _cameras(now: Now) -> Iterator[Hypothesis]:
     """All that a camera is said to show at an epoch, under the name of another one that shows nothing then."""
-    survey = case.survey
+    survey = now.prediction.survey
     images: dict[tuple[str, str], list[int]] = {}
     for i, b in enumerate(survey.image_blocks):
         images.setdefault((b.camera_id, b.epoch_id), []).append(i)
-    bad = sorted(images, key=lambda k: -sum(now[i] for i in images[k]))[:_BLOCKS]
+    bad = sorted(images, key=lambda k: -sum(float(now.squares[i].sum()) for i in images[k]))[:_BLOCKS]
     found: dict[tuple[str, str], tuple[float, list[str], dict[int, ImageBlock]]] = {}
     for camera, epoch in bad:
         for other in (c.camera_id for c in survey.cameras):
             if (other, epoch) not in images:
                 blocks = {i: replace(survey.image_blocks[i], camera_id=other) for i in images[camera, epoch]}
-                good, gain = _better(case, now, blocks)
+                good, gain = _better(now, blocks)
                 if len(good) == len(blocks):
                     before, epochs, chosen = found.get((camera, other), (0.0, [], {}))
                     found[camera, other] = before + gain, [*epochs, epoch], chosen | blocks
@@ -152,6 +185,6 @@ def _cameras(case: Case, now: FloatArray) -> Iterator[Hypothesis]:
             "images of another camera", f"the images of camera {camera} at epochs {', '.join(epochs)} are those of "
             f"camera {other}", f"move them to images/{other}", Place("camera", (camera, other), "", tuple(epochs)),
             _renamed(survey, chosen),
-            (Rename("image_points", "camera_id", {camera: other}, {"epoch_id": tuple(epochs)}),), gain, 1,
+            (Rename("image_points", "camera_id", {camera: other}, {"epoch_id": tuple(epochs)}),), now.ratio(gain), 1,
             len(bad) * len(survey.cameras),
         )  # fmt: skip

@@ -11,8 +11,8 @@ import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, Rename
-from adjust.diagnosis.screen import Screen, screen
-from adjust.diagnosis.units.readings import at_best, drop
+from adjust.diagnosis.screen import Screen, at_best, screen
+from adjust.diagnosis.units.readings import drop
 from adjust.model.observations import PositionRef, Reading
 from adjust.model.survey import IntArray, Survey
 

@@ -7,13 +7,14 @@ import numpy as np
 
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
-from adjust.diagnosis.screen import Screen, screen
-from adjust.diagnosis.units.readings import at_best, drop
+from adjust.diagnosis.screen import Screen, at_best, screen
+from adjust.diagnosis.units.readings import drop
 from adjust.model.observations import Reading
 from adjust.model.survey import IntArray, Survey
 
 _CLEARLY = 2.0
 _MOST, _LARGE = 2, 600
+_MISSES = 25.0
 
 
 def rows_of_another_setup(case: Case) -> Iterator[Hypothesis]:
@@ -28,24 +29,26 @@ def rows_of_another_setup(case: Case) -> Iterator[Hypothesis]:
     found, looked_at = [], 0
     for a in homes:
         for b in homes:
-            rows = [r for r in _sights(survey, a) if a != b and survey.readings[r[0]].to != homes[b].at]
+            rows = [r for r in _sights(survey, before, a) if a != b and survey.readings[r[0]].to != homes[b].at]
             looked_at += len(rows)
             good = [r for r in rows if _drop(survey, before, r, homes[b]) > 1.0 + 0.5 * (_CLEARLY - 1.0) / len(rows)]
             every = np.concatenate([np.zeros(0, dtype=np.int64), *good])
-            if len(every) and len(good) < len(rows):
+            if len(every):
                 found.append((_drop(survey, before, every, homes[b]), a, b, every))
     for evidence, a, b, every in sorted(found, key=lambda f: -f[0])[:_MOST]:
         if evidence > _CLEARLY:
             yield _hypothesis(survey, a, homes[b], every, evidence, looked_at)
 
 
-def _sights(survey: Survey, setup_id: str) -> list[IntArray]:
-    """The readings of a set-up to each of its targets that miss together."""
-    by_target: dict[object, list[int]] = {}
+def _sights(survey: Survey, before: Screen, setup_id: str) -> list[IntArray]:
+    """The readings of a set-up to each of its targets, every time that it was sighted, which miss."""
+    by_target: dict[tuple[object, int], list[int]] = {}
+    times: dict[tuple[object, str], int] = {}
     for i, r in enumerate(survey.readings):
         if r.setup_id == setup_id and r.second is None:
-            by_target.setdefault(r.to, []).append(i)
-    return [np.array(rows) for rows in by_target.values()]
+            times[r.to, r.kind] = times.get((r.to, r.kind), 0) + 1
+            by_target.setdefault((r.to, times[r.to, r.kind]), []).append(i)
+    return [np.array(rows) for rows in by_target.values() if before.readings[rows].max() > _MISSES * before.scale]
 
 
 def _given(survey: Survey, rows: IntArray, home: Reading) -> Survey:

@@ -8,7 +8,7 @@ import numpy as np
 from adjust.diagnosis.bodies.series import placed_views
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place, ScaleKey
-from adjust.model.result import Adjustment
+from adjust.diagnosis.prediction import Altered
 from adjust.model.survey import FloatArray, Survey
 
 KNOWN = (  # factor from what is said to what is meant, and how that comes about
@@ -38,10 +38,10 @@ def wrong_sizes(case: Case) -> Iterator[Hypothesis]:
     """For each target that the rest contradicts: its size as the rest says it, and the nearest known cause."""
     if len({b.target_id for b in case.survey.image_blocks}) < 2:
         return
-    for (field, owner), result in case.without_one:
+    for (field, owner), values in case.without_one:
         if field != "target_id":
             continue
-        found = _ratio(case, result, owner)
+        found = _ratio(case, values, owner)
         if found is not None and abs(found[0] - 1.0) > _CLEAR * found[1] and found[0] > 0.0:
             yield from _hypotheses(case.survey, owner, *found)
 
@@ -83,13 +83,13 @@ def reshaped(survey: Survey, target: str, A: FloatArray) -> Survey:
     return replace(survey, targets=targets)
 
 
-def _ratio(case: Case, result: Adjustment, target: str) -> tuple[float, float] | None:
+def _ratio(case: Case, values: Altered, target: str) -> tuple[float, float] | None:
     """True size over said size, with its sigma: with it the places of the target's origin agree.
 
     A view of a target that is believed too small by 1/s has it too near by 1/s: where cameras at c_i with rotations R_i
     see it at t_i, the places c_i + s R_i t_i of one origin are one (least squares over s, robust by medians of pairs).
     """
-    c, a = placed_views(case, result, target)
+    c, a = placed_views(case, values, target)
     if len(c) < 3:
         return None
     i, j = np.triu_indices(len(c), 1)

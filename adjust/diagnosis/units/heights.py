@@ -10,8 +10,7 @@ import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
-from adjust.diagnosis.screen import Screen
-from adjust.diagnosis.units.readings import at_best
+from adjust.diagnosis.screen import Screen, at_best
 from adjust.model.observations import Reading
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.statistics.system import linear_system

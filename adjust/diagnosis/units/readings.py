@@ -11,9 +11,8 @@ import numpy as np
 
 from adjust.diagnosis.case import CAP, Case
 from adjust.diagnosis.hypothesis import ChangeReadings, Hypothesis, Place
-from adjust.diagnosis.screen import Screen, improvement, screen
+from adjust.diagnosis.screen import Screen, at_best, improvement, screen
 from adjust.diagnosis.units.conventions import ANGLES, LENGTHS, MISREADINGS, SLIPS, TURNS, Misreading, Scope
-from adjust.graph.assembly import values_of
 from adjust.model.observations import Reading
 from adjust.model.survey import FloatArray, IntArray, Survey
 from adjust.observations.terrestrial.batch import circular_median
@@ -24,6 +23,7 @@ _CLEARLY = 3.0
 _MOST, _SINGLE = 6, 8
 _FAR = 1000.0
 """Square over sigma of a single reading from which it is no matter how much larger it is."""
+_BAD, _FEW, _ROUGH = 25.0, 0.1, 4.0
 _LARGE_START = 2500
 """Readings up to which start values are found anew for every hypothesis that concerns all of a kind."""
 
@@ -64,13 +64,6 @@ def _slips(survey: Survey, before: Screen | None) -> list[tuple[float, Scope, Mi
             if evidence > _CLEARLY:
                 out.append((evidence, scope, slip))
     return out
-
-
-def at_best(case: Case) -> Screen | None:
-    """At the adjustment where there is one that left out what contradicts, else at the start."""
-    if case.result is not None and case.result.global_test is not None and case.result.global_test.passed:
-        return screen(case.survey, values_of(case.result)) or screen(case.survey)
-    return screen(case.survey)
 
 
 def scopes(survey: Survey) -> Iterator[Scope]:
@@ -121,6 +114,8 @@ def mended(survey: Survey, rows: IntArray, misreading: Misreading) -> Survey:
 def _evidence(survey: Survey, before: Screen | None, scope: Scope, misreading: Misreading) -> float:
     """How many times smaller the bounded misfit becomes."""
     n, whole = len(survey.readings), _concerns_all(survey, scope)
+    if whole and before is not None and _fits_as_it_is(before, scope.rows):
+        return 0.0
     if before is not None and not (whole and n <= _LARGE_START):
         return drop(before, scope.rows, _mended_squares(before, scope.rows, misreading))
     after = screen(mended(survey, scope.rows, misreading))
@@ -130,6 +125,12 @@ def _evidence(survey: Survey, before: Screen | None, scope: Scope, misreading: M
         return improvement(CAP * n, after.misfit(after.scale), n)
     scale = min(before.scale, after.scale)
     return improvement(before.misfit(scale), after.misfit(scale), n)
+
+
+def _fits_as_it_is(before: Screen, rows: IntArray) -> bool:
+    """Whether so few readings miss, of these and of all, that these cannot be misread throughout."""
+    bad = before.readings > _BAD * before.scale
+    return bool(before.scale < _ROUGH and bad.mean() < _FEW and bad[rows].mean() < 0.5)
 
 
 def drop(before: Screen, rows: IntArray, after: FloatArray) -> float:

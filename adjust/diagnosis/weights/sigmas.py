@@ -93,13 +93,12 @@ def _with_usual(case: Case, field: str, kind: str, group: str, odd: list[Any], u
     chosen = {id(o) for o in odd}
     every = getattr(case.survey, field)
     changed: dict[str, Any] = {field: tuple(replace(o, sigma=usual) if id(o) in chosen else o for o in every)}
-    penalty = float(sum(2.0 * np.log(usual / max(o.sigma, 1e-300)) for o in odd))
     ratio = max(max(o.sigma / usual, usual / max(o.sigma, 1e-300)) for o in odd)
     return Hypothesis(
         "odd sigma", f"{kind} {listed(ids, 5)}: the sigma "
         f"is {ratio:.0f} times off the usual one of group {group}", "give the sigma that was meant, or none",
         Place("reading", tuple(ids), "sigma"), replace(case.survey, **changed), (),
-        min(ratio, 10.0), penalty=penalty,
+        min(ratio, 10.0), len(odd),  # if the sigma were right, doing nearly without it would be worth chi-square
     )  # fmt: skip
 
 

@@ -1,0 +1,116 @@
+"""Two points of the world that are called by each other's names in some images: their rays meet in other places.
+
+The points themselves may be spoilt: of cameras that targets or a table place, the rays of both names are gathered, and
+divided anew between the two places where most of them meet.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from adjust.diagnosis.case import Case
+from adjust.diagnosis.hypothesis import Hypothesis
+from adjust.diagnosis.names.images import exchange
+from adjust.diagnosis.prediction import Prediction
+from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+from adjust.start.views import focal_px, rays_by_block
+
+_NEAR_PX = 15.0
+"""Rays of rough poses that miss a point by less are its own."""
+_PARALLAX = 0.01  # rad
+_SUSPECTS, _MOST, _PAIRS = 8, 3, 300
+_EVIDENCE = 100.0  # places without any residual: as of what single images show
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """blocks, points: (n,) of which image block and which point. o, d: (n, 3) m, unit, world. focal_px: (n,)."""
+
+    blocks: IntArray
+    points: IntArray
+    o: FloatArray
+    d: FloatArray
+    focal_px: FloatArray
+
+    def near(self, rows: IntArray, x: FloatArray) -> BoolArray:
+        """Which of the rays (k,) pass a place (3,) in front of their camera."""
+        to = x - self.o[rows]
+        along = np.einsum("ni,ni->n", to, self.d[rows])
+        off = np.linalg.norm(to - along[:, None] * self.d[rows], axis=1)
+        return np.asarray((along > 0.0) & (off * self.focal_px[rows] < _NEAR_PX * along))
+
+    def meeting(self, rows: IntArray) -> IntArray:
+        """Those of the rays (k,) that meet in one place: as many of them as possible."""
+        best: IntArray = rows[:0]
+        for i, j in list(combinations(rows.tolist(), 2))[:_PAIRS]:
+            c = float(self.d[i] @ self.d[j])
+            if 1.0 - c * c < _PARALLAX**2:
+                continue
+            between = self.o[j] - self.o[i]
+            s, t = np.linalg.solve([[1.0, -c], [c, -1.0]], [between @ self.d[i], between @ self.d[j]])
+            x = 0.5 * (self.o[i] + s * self.d[i] + self.o[j] + t * self.d[j])
+            found = rows[self.near(rows, x)]
+            if i in found and j in found and len(found) > len(best):
+                best = found
+        return best
+
+
+def exchanged_in_images(case: Case) -> Iterator[Hypothesis]:
+    """The exchanges after which most rays meet."""
+    rays = _rays(case) if any(b.target_id is None for b in case.survey.image_blocks) else None
+    if rays is None:
+        return
+    of = {p: np.flatnonzero(rays.points == p) for p in np.unique(rays.points).tolist()}
+    meet = {p: len(rays.meeting(rows)) for p, rows in of.items()}
+    suspects = sorted((p for p in of if meet[p] < len(of[p]) > 1), key=lambda p: meet[p] - len(of[p]))[:_SUSPECTS]
+    found, pairs = [], list(combinations(suspects, 2))
+    for a, b in pairs:
+        every = np.concatenate([of[a], of[b]])
+        one = rays.meeting(every)
+        other = rays.meeting(np.setdiff1d(every, one))
+        gain = len(one) + len(other) - meet[a] - meet[b]
+        if gain > 0 and len(one) + len(other) == len(every):
+            name = a if 2 * (rays.points[one] == a).sum() >= len(one) else b
+            right = np.isin(every, one) == (rays.points[every] == name)
+            found.append((gain, a, b, sorted(set(rays.blocks[every[~right]].tolist()))))
+    for _, a, b, blocks in sorted(found, key=lambda f: -f[0])[:_MOST]:
+        yield _exchanged(case.survey, a, b, blocks, len(pairs))
+
+
+def _exchanged(survey: Survey, a: int, b: int, blocks: list[int], looked_at: int) -> Hypothesis:
+    ids, swap = [p.point_id for p in survey.points], np.arange(len(survey.points))
+    swap[[a, b]] = b, a
+    new = {i: replace(survey.image_blocks[i], point_idx=swap[survey.image_blocks[i].point_idx]) for i in blocks}
+    names = {ids[a]: ids[b], ids[b]: ids[a]}
+    return exchange(survey, (ids[a], ids[b]), names, new, ("points exchanged", "point_id", "points"), _EVIDENCE,
+                    looked_at)  # fmt: skip
+
+
+def _rays(case: Case) -> Rays | None:
+    """Of all image points of the world whose cameras are placed without them; None where there are none."""
+    survey = case.survey
+    values = case.rough(without_world(survey))
+    if values is None:
+        return None
+    prediction = Prediction(survey, values)
+    cameras = {c.camera_id: c for c in survey.cameras if ("lens", c.camera_id) in values}
+    lenses = {c: np.asarray(values["lens", c]) for c in cameras}
+    mine = {i: b.uv for i, b in enumerate(survey.image_blocks) if b.target_id is None and b.camera_id in lenses}
+    parts = []
+    for i, rays in rays_by_block(replace(survey, cameras=tuple(cameras.values())), lenses, mine)[0].items():
+        block, n = survey.image_blocks[i], len(rays)
+        pose = prediction.pose(block, {})
+        if pose is not None:
+            focal = focal_px(cameras[block.camera_id], lenses[block.camera_id])
+            o = np.tile(-pose[:3, :3].T @ pose[:3, 3], (n, 1))
+            parts.append((np.full(n, i), block.point_idx, o, rays @ pose[:3, :3], np.full(n, focal)))
+    return Rays(*(np.concatenate(x) for x in zip(*parts, strict=True))) if parts else None
+
+
+def without_world(survey: Survey) -> Survey:
+    """The survey with its targets, tables and stations alone: no points of the world, and what is measured to them."""
+    blocks = tuple(b for b in survey.image_blocks if b.target_id is not None)
+    return replace(survey, points=(), image_blocks=blocks, distances=(), coordinates=(), coordinate_differences=(),
+                   readings=(), reading_covariances=(), alignments=(), laser_spots=(), on_surfaces=())  # fmt: skip
