@@ -6,16 +6,23 @@ upper left one of the upright marker, clockwise, as in OpenCV.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from adjust.model.survey import FloatArray, IntArray
 
 
-def _grid(columns: int, rows: int, spacing_m: float) -> tuple[tuple[str, ...], FloatArray]:
+@lru_cache
+def _places(columns: int, rows: int, spacing_m: float) -> tuple[tuple[str, ...], FloatArray]:
     ids = tuple(f"r{row}c{column}" for row in range(rows) for column in range(columns))
     x = np.array([(column * spacing_m, row * spacing_m, 0.0) for row in range(rows) for column in range(columns)])
     return ids, x
+
+
+def _grid(columns: int, rows: int, spacing_m: float) -> tuple[tuple[str, ...], FloatArray]:
+    ids, x = _places(columns, rows, spacing_m)
+    return ids, x.copy()
 
 
 @dataclass(frozen=True)

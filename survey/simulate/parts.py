@@ -105,7 +105,7 @@ def _board_in_table() -> FloatArray:
 
 def shoot_board_from_table(draft: Draft, camera_id: str, n: int) -> None:
     """``n`` epochs of the table with the whole board in one camera, over its whole frame and on both faces."""
-    taken = 0
+    border, taken = outline(BOARD, _BOARD_BORDER), 0
     for trial in range(_TRIALS):
         if taken == n:
             return
@@ -115,7 +115,7 @@ def shoot_board_from_table(draft: Draft, camera_id: str, n: int) -> None:
             continue
         epoch_id = add_table_epoch(draft, "t", angles)
         shot = Shot(camera_id, epoch_id, ("board",))
-        if draft.outline_visible(shot, "board", outline(BOARD, _BOARD_BORDER), 8.0):
+        if draft.outline_visible(shot, "board", border, 8.0):
             draft.shots.append(shot)
             taken += 1
         else:
@@ -164,13 +164,14 @@ def shoot_board_by_hand(draft: Draft, camera_id: str, n: int) -> None:
     """``n`` epochs with the head taken off the table and held before the board."""
     camera = draft.truth["station_from_camera", camera_id]
     camera_from_station = np.linalg.inv(camera.matrix()) if isinstance(camera, Pose3) else np.eye(4)
+    border = outline(BOARD, _BOARD_BORDER)
     for number in range(n):
         for _ in range(_TRIALS):
             world_from_camera = np.linalg.inv(hand_pose(draft, camera_id, BOARD, number, (0.45, 1.0)))
             shot = Shot(camera_id, f"h{camera_id}{number + 1:02d}", ("board",))
             name = ("world_from_station", "head", shot.epoch_id)
             draft.truth[name] = Pose3(world_from_camera @ camera_from_station)
-            if draft.outline_visible(shot, "board", outline(BOARD, _BOARD_BORDER), 8.0):
+            if draft.outline_visible(shot, "board", border, 8.0):
                 draft.shots.append(shot)
                 break
         else:

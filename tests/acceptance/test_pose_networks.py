@@ -48,7 +48,7 @@ def test_published_optimum_is_met_from_nothing(name: str, capsys: pytest.Capture
 
 
 def test_stations_are_added_at_a_constant_price(capsys: pytest.CaptureFixture[str]) -> None:
-    done = grow(5000 if LONG else 750, 2)
+    done = grow(5000 if LONG else 400, 2)
     with capsys.disabled():
         print(f"\n{done}")
     k = len(done.ms) // 5

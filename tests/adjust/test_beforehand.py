@@ -1,5 +1,6 @@
 """What is told of a survey before it is adjusted: planted weaknesses by kind, and nothing of a sound survey."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +17,8 @@ def kinds(survey: Survey) -> dict[str, tuple[str, ...]]:
 
 
 @pytest.mark.parametrize("made", [hall, lambda: hall(2, plane=True), lambda: stereo(1)[0]])
-def test_a_sound_survey_has_no_problems(survey: Survey) -> None:
-    assert [f for f in look_beforehand(survey).findings if f.level == "problem"] == []
+def test_a_sound_survey_has_no_problems(made: Callable[[], Survey]) -> None:
+    assert [f for f in look_beforehand(made()).findings if f.level == "problem"] == []
 
 
 def test_nothing_is_changed_and_the_redundancy_is_that_of_the_adjustment() -> None:

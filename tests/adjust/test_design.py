@@ -62,6 +62,7 @@ def all_blocks(survey):
     return out
 
 
+@pytest.mark.slow
 def test_predicted_images_are_those_of_opencv_and_what_it_sees_is_seen(lab):
     survey, start, truth = lab
     scene = Scene(survey, truth)
@@ -74,6 +75,7 @@ def test_predicted_images_are_those_of_opencv_and_what_it_sees_is_seen(lab):
         np.testing.assert_allclose(b.uv, scene.project(b.camera_id, b.epoch_id, x[b.point_idx]), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_visibility_obeys_depth_incidence_side_and_number(walls):
     survey, start, truth = walls
     scene = Scene(survey, truth)

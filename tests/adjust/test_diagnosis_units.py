@@ -120,6 +120,7 @@ def _quaternion_last_first(m: Pose3) -> Pose3:
          "rotations inverted", ("all",)),
     ],
 )  # fmt: skip
+@pytest.mark.slow
 def test_a_robots_poses_in_another_convention(change, name: str, ids: tuple[str, ...]) -> None:
     first = next(misread_pairs(robot(change)))
     assert (first.name, first.place.ids) == (name, ids)

@@ -58,6 +58,7 @@ def adjusted(survey: Survey, building: Building) -> tuple[AdjustmentGraph, Preci
 
 
 @pytest.mark.parametrize("inner", [False, True])
+@pytest.mark.slow
 def test_cut_and_whole_give_the_same(monkeypatch: pytest.MonkeyPatch, inner: bool) -> None:
     """Solution, every covariance, of unknowns of different blocks too, residuals, redundancy numbers, tests."""
     building = build(ROOMS)

@@ -115,6 +115,7 @@ def test_wrong_pairs_that_passed_the_first_sorting_are_found_by_their_tests(monk
     assert _left_out(adjust_cleaned(survey_of(sim.network))) == set(sim.wrong)
 
 
+@pytest.mark.slow
 def test_a_crowd_of_wrong_pairs_costs_one_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     sim = simulate(30, 6, seed=1, wrong=40, extra=200)
     solutions, adjusted = [], search.adjust

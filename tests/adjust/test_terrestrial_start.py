@@ -51,6 +51,7 @@ def test_polar_points_and_intersections(plane: bool) -> None:
     check(kinds_only(survey, "direction", "zenith"), truth, 0.05)
 
 
+@pytest.mark.slow
 def test_trilateration_in_a_plane() -> None:
     survey, truth = polar_network(3, plane=True, stations=8, extra=False, held=3)
     survey = kinds_only(measured(survey, truth, 1), "horizontal_distance")

@@ -143,9 +143,10 @@ def test_backlash_is_in_the_readback():
         assert math.degrees(table.position[0]) == pytest.approx(expected, abs=1e-9)
 
 
-def test_restless_readback_does_not_settle():
-    settle = Settle(0.5 * DEG, 0.001 * DEG, window_s=0.05, stall_s=0.15, timeout_s=0.4, poll_s=0.002)
-    table, controller = make(AxisPhysics(200 * DEG, 4000 * DEG, encoder_noise=0.01 * DEG), settle=settle)
+@pytest.mark.parametrize("poll_s", [0.002, 0.06])  # also where a window has one reading or none
+def test_restless_readback_does_not_settle(poll_s):
+    settle = Settle(0.5 * DEG, 0.001 * DEG, window_s=0.05, stall_s=0.15, timeout_s=0.4, poll_s=poll_s)
+    table, controller = make(AxisPhysics(200 * DEG, 4000 * DEG, encoder_noise=0.1 * DEG), settle=settle)
     with pytest.raises(NotSettledError, match=r"not at rest after 0\.4 s"):
         table.set(np.radians([1.0, 0.0])).wait(3.0)
     assert controller.received[-1][1] == "stop"

@@ -68,6 +68,7 @@ def test_sigmas_from_few_observations_raise_no_more_alarms_than_known_ones() -> 
     assert (found[freedom] < 2.5 * expected + 5.0).all(), found
 
 
+@pytest.mark.slow
 def test_broken_folders_are_failures_with_a_reason(records: tuple[Record, ...]) -> None:
     assert [r.state == FAILED for r in records] == [False, False, True, False, True, False, False]
     assert records[2].cause == "files"

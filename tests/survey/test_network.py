@@ -257,6 +257,7 @@ def _with_loose_reading(survey):
 
 
 @pytest.mark.parametrize("beside", ["distance", "point"])
+@pytest.mark.slow
 def test_a_survey_of_pairs_is_one_with_anything_beside(beside):
     """Estimates, covariances, tests, exclusions, decisions and variance components, whatever else is observed."""
     survey, _ = _network(7, combinations(range(7), 2), 2.0)

@@ -47,6 +47,7 @@ def rewritten(lab, tmp_path, old, new, name="plan.toml"):
     return folder
 
 
+@pytest.mark.slow
 def test_predicted_images_are_opencvs(lab):
     _, _, _, planned, truth = lab
     survey = planned.survey
@@ -80,6 +81,7 @@ def test_hand_held_epochs_show_the_board_where_they_say(lab):
             assert 0.5 <= board[2] <= 0.9
 
 
+@pytest.mark.slow
 def test_the_plan_is_the_covariance_of_adjusting_it(lab, outcome):
     """Simulated observations of the very same design, adjusted from their own start: to rounding at the truth."""
     _, _, _, planned, _ = lab

@@ -24,6 +24,8 @@ from capture.devices.turntable import (
     degrees_text,
 )
 
+_LEAST = 3  # readings that tell rest from motion
+
 
 class MovingTable:
     """A ``Turntable`` over a ``Controller``; a thread of its own watches each move.
@@ -216,7 +218,7 @@ class MovingTable:
             angles = np.array([state.angle for state in states])
             seen.append((now, angles))
             # one sample older than the window stays, so that the window is always spanned
-            while len(seen) > 1 and now - seen[1][0] >= max(settle.window_s, settle.stall_s):
+            while len(seen) > _LEAST and now - seen[1][0] >= max(settle.window_s, settle.stall_s):
                 seen.popleft()
             moving = any(state.moving for state in states)
             arrived = targets is None or bool(np.all(np.abs(angles - targets) <= settle.tolerance))
@@ -244,11 +246,14 @@ class MovingTable:
         return bool(np.all(self._spread(seen, now, span_s) <= self._settle.still))
 
     def _spread(self, seen: deque[tuple[float, FloatArray]], now: float, span_s: float) -> FloatArray:
-        """Spread (n,) of the readback over the last ``span_s``; infinite until they have passed."""
-        if now - seen[0][0] < span_s:
+        """Spread (n,) of the readback over the last ``span_s``; infinite until they have passed.
+
+        Where a slow line or a busy machine leaves few readings in them, older ones count too: one alone spreads nothing.
+        """
+        if now - seen[0][0] < span_s or len(seen) < _LEAST:
             return np.full(len(self._axes), np.inf)
-        inside = np.array([angles for at, angles in seen if now - at <= span_s] or [seen[-1][1]])
-        return np.asarray(np.ptp(inside, axis=0))
+        n = max(_LEAST, sum(now - at <= span_s for at, _ in seen))
+        return np.asarray(np.ptp(np.array([angles for _, angles in list(seen)[-n:]]), axis=0))
 
     def _require_no_fault(self, states: Sequence[AxisState]) -> None:
         for axis, state in zip(self._axes, states, strict=True):
