@@ -21,7 +21,7 @@ class Parser(argparse.ArgumentParser):
         """Commands are called by the program's name; argparse would put the whole usage in front of them."""
         return super().add_subparsers(**{"prog": self.prog, **options})
 
-    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
+    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]  # its overloads
         """The arguments; what is left over is an error of the command that it was given to."""
         found, left = self.parse_known_args(args, namespace)
         if left:

@@ -284,7 +284,10 @@ class Server:
         name, body = request.path_params["name"], Body(await json_of(request))
         if name not in JOBS:
             raise SurveyError(f"there is no job {name!r}; {suggestion(name, JOBS)}")
-        found = lambda report: self.live.post({"type": "detected"} | pictures.found_in(report))  # noqa: E731
+
+        def found(report: Any) -> None:
+            self.live.post({"type": "detected"} | pictures.found_in(report))
+
         told = await self._run(name, lambda: JOBS[name](self.bench, body, found))
         return JSONResponse(told.as_dict() | {"state": await asyncio.to_thread(views.state, self.bench)})
 
