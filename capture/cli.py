@@ -6,13 +6,14 @@ messages to stderr. Heavy imports happen inside the commands.
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from adjust.model.errors import SurveyError
-from survey.commands.common import DONE, Version, is_set, print_json, run_as_program, run_command, say
+from survey.commands.common import DONE, is_set, print_json, run_as_program, run_command, say
 from survey.commands.completion import declare_completion
-from survey.commands.parser import Parser, name_commands, port, project_folder
+from survey.commands.parser import port, program_parser, project_folder
 
 if TYPE_CHECKING:
     from capture.devices.camera import CameraInfo
@@ -44,28 +45,12 @@ def program() -> NoReturn:
 
 def build_parser() -> argparse.ArgumentParser:
     """All commands and flags."""
-    shared = argparse.ArgumentParser(add_help=False)
-    # SUPPRESS: a flag before the command is not reset by the command's own default
-    shared.add_argument(
-        "--json", action="store_true", default=argparse.SUPPRESS, help="print the summary as one JSON object"
-    )
-    shared.add_argument(
-        "--quiet", action="store_true", default=argparse.SUPPRESS, help="no progress and no messages on stderr"
-    )
-    shaped: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "parents": [shared]}
-    parser = Parser(
-        "labcapture", usage=f"{_OPENING}   (labcapture COMMAND ...)", description=_DESCRIPTION, epilog=_EPILOG, **shaped
-    )
-    parser.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    _add_run(commands, shaped)
-    _add_cameras(commands, shaped)
-    _add_table(commands, shaped)
-    _add_view(commands, shaped)
-    _add_export(commands, shaped)
-    declare_completion("labcapture", build_parser, commands, shaped)
-    name_commands(commands)
-    return parser
+    flags = {
+        "--json": "print the summary as one JSON object", "--quiet": "no progress and no messages on stderr",
+    }  # fmt: skip
+    declared = (_add_run, _add_cameras, _add_table, _add_view, _add_export,
+                partial(declare_completion, "labcapture", build_parser))  # fmt: skip
+    return program_parser("labcapture", _OPENING, _DESCRIPTION, _EPILOG, flags, declared)
 
 
 def _add_run(commands: Any, shaped: dict[str, Any]) -> None:

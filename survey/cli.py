@@ -7,10 +7,11 @@ Results go to stdout, progress and messages to stderr. Heavy imports happen insi
 
 import argparse
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from functools import partial
+from typing import NoReturn
 
 from survey.commands.adjusting import declare_adjust
-from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, Version, run_as_program, run_command
+from survey.commands.common import DONE, FAILED, INTERRUPTED, TEST_FAILED, USAGE, run_as_program, run_command
 from survey.commands.comparing import declare_compare
 from survey.commands.completion import declare_completion
 from survey.commands.converting import declare_convert
@@ -19,7 +20,7 @@ from survey.commands.excluding import declare_exclude, declare_include
 from survey.commands.navigating import declare_align, declare_navigate
 from survey.commands.networks import declare_add, declare_pairs, declare_remove, declare_trackers
 from survey.commands.opening import declare_open, declare_runs
-from survey.commands.parser import Parser, name_commands
+from survey.commands.parser import program_parser
 from survey.commands.planning import declare_check, declare_plan
 from survey.commands.reporting import declare_report
 from survey.commands.starting import declare_detect, declare_init
@@ -74,26 +75,12 @@ def program() -> NoReturn:
 
 def build_parser() -> argparse.ArgumentParser:
     """All commands and flags."""
-    shared = argparse.ArgumentParser(add_help=False)
-    # SUPPRESS: a flag before the command is not reset by the command's own default
-    shared.add_argument(
-        "--json", action="store_true", default=argparse.SUPPRESS, help="print the summary as one JSON object"
-    )
-    shared.add_argument("-v", "--verbose", action="store_true", default=argparse.SUPPRESS, help="say more on stderr")
-    shared.add_argument(
-        "--quiet", action="store_true", default=argparse.SUPPRESS, help="no progress bars and no messages on stderr"
-    )
-    shaped: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "parents": [shared]}
-    parser = Parser(
-        "labsurvey", usage=f"{_OPENING}   (labsurvey COMMAND ...)", description=_DESCRIPTION, epilog=_EPILOG, **shaped
-    )
-    parser.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for declare in _COMMANDS:
-        declare(commands, shaped)
-    declare_completion("labsurvey", build_parser, commands, shaped)
-    name_commands(commands)
-    return parser
+    flags = {
+        "--json": "print the summary as one JSON object", "-v --verbose": "say more on stderr",
+        "--quiet": "no progress bars and no messages on stderr",
+    }  # fmt: skip
+    completion = partial(declare_completion, "labsurvey", build_parser)
+    return program_parser("labsurvey", _OPENING, _DESCRIPTION, _EPILOG, flags, (*_COMMANDS, completion))
 
 
 if __name__ == "__main__":

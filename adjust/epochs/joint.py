@@ -6,6 +6,7 @@ from typing import Any
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import PositionRef
+from adjust.model.subsets import with_positions
 from adjust.model.survey import Datum, Point, Survey
 
 _PARTS = ("cameras", "stations", "tables", "targets", "image_blocks", "table_readings", "pairs", "levels", "alignments",
@@ -61,17 +62,12 @@ def joint_survey(epochs: Mapping[str, Survey], stable: Collection[str]) -> Surve
 def _renamed(item: Any, epoch: str, stable: Collection[str]) -> Any:
     """An observation or setup of one epoch, with its own ids and points."""
     changed: dict[str, Any] = {}
-    for name in item.__dataclass_fields__:
+    for name in {"setup_id", *_IDS} & set(item.__dataclass_fields__):
         value = getattr(item, name)
-        if isinstance(value, PositionRef):
-            changed[name] = _position(value, epoch, stable)
-        elif isinstance(value, tuple) and value and isinstance(value[0], PositionRef):
-            changed[name] = tuple(_position(v, epoch, stable) for v in value)
-        elif (name == "setup_id" and value) or name in _IDS:
-            changed[name] = epoch_name(value, epoch)
-        elif name == "reading_ids":
-            changed[name] = tuple(epoch_name(v, epoch) for v in value)
-    return replace(item, **changed)
+        changed[name] = epoch_name(value, epoch) if value or name in _IDS else value
+    if hasattr(item, "reading_ids"):
+        changed["reading_ids"] = tuple(epoch_name(v, epoch) for v in item.reading_ids)
+    return with_positions(replace(item, **changed), lambda ref: _position(ref, epoch, stable))
 
 
 def _position(ref: PositionRef, epoch: str, stable: Collection[str]) -> PositionRef:

@@ -53,6 +53,7 @@ def convert(
     model_to: LensModel,
     constants_to: FloatArray,
     image_size: tuple[int, int],
+    *,
     free: Sequence[str] | None = None,
     cov: FloatArray | None = None,
     radius_px: float | None = None,
@@ -74,7 +75,7 @@ def convert(
     else:
         start = _start(model_from, values, constants_from, model_to, constants_to, columns)
         fitted = _fit(model_to, start, constants_to, columns, rays, uv)
-    jacobian = _jacobian(model_from, values, constants_from, model_to, fitted, constants_to, columns, rays, uv)
+    jacobian = _jacobian((model_from, values, constants_from), (model_to, fitted, constants_to), columns, rays, uv)
 
     check = _grid(image_size, CHECK_STEPS, radius_px)
     seen = project(model_to, fitted, constants_to, _rays(model_from, values, constants_from, model_to, check))
@@ -255,23 +256,17 @@ def _factorised(matrix: FloatArray, names: list[str]) -> _Factorised:
 
 
 def _jacobian(
-    model_from: LensModel,
-    values_from: FloatArray,
-    constants_from: FloatArray,
-    model_to: LensModel,
-    values_to: FloatArray,
-    constants_to: FloatArray,
-    columns: list[int],
-    rays: FloatArray,
-    uv: FloatArray,
-) -> FloatArray:
+    old: tuple[LensModel, FloatArray, FloatArray], new: tuple[LensModel, FloatArray, FloatArray], columns: list[int],
+    rays: FloatArray, uv: FloatArray,
+) -> FloatArray:  # fmt: skip
     """Derivative (m, n) of the fitted parameters x by the old ones.
 
     A pixel keeps its place while its ray q follows the old lens: dq = -(dr/dq)^+ (dr/dlens) dlens, across the ray. The
     fit keeps J'r = 0, so (J'J + S) dx = -(J'A + T) dlens with J = dr/dx, A = dr/dlens and, since the models differ,
     the second-order parts S = (dJ/dx)' r and T = (dJ/dlens)' r (by central differences; they vanish with the misfit).
     """
-    _, by_old, by_q_old = lens_derivatives(model_from, values_from, constants_from, rays, uv)
+    _, by_old, by_q_old = lens_derivatives(*old, rays, uv)
+    (model_from, *_), (model_to, values_to, constants_to) = old, new
     ray_by_old = -np.linalg.pinv(by_q_old) @ by_old
 
     def new_lens(values: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

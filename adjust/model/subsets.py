@@ -1,12 +1,27 @@
-"""A survey less the observations that concern positions it is to do without."""
+"""Positions that observations name: other ones in their place, or a survey less what concerns some of them."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 
 from adjust.model.observations import PositionRef, ReadingCovariance
 from adjust.model.survey import Survey
+
+Item = TypeVar("Item", bound=Any)
+
+
+def with_positions(item: Item, new: Callable[[PositionRef], PositionRef]) -> Item:
+    """An observation with other positions in the place of those that it names."""
+    changed: dict[str, Any] = {}
+    for name in item.__dataclass_fields__:
+        value = getattr(item, name)
+        if isinstance(value, PositionRef):
+            changed[name] = new(value)
+        elif isinstance(value, tuple) and value and isinstance(value[0], PositionRef):
+            changed[name] = tuple(map(new, value))
+    return replace(item, **changed)
 
 
 def only_between(survey: Survey, keep: Callable[[PositionRef], bool]) -> Survey:

@@ -80,11 +80,22 @@ def _times(epochs: Sequence[NavigationEpoch]) -> FloatArray:
     return np.array(given, dtype=float)
 
 
+@dataclass(frozen=True, eq=False)
+class _At:
+    """An epoch that is to be solved."""
+
+    system: System
+    seen: Sightings
+    epoch: NavigationEpoch
+    time_s: float
+    options: NavigateOptions
+
+
 def _solve(
     system: System, seen: Sightings, epoch: NavigationEpoch, time_s: float, state: MotionState | None,
     options: NavigateOptions,
 ) -> _Step:  # fmt: skip
-    motion = options.motion
+    motion, at = options.motion, _At(system, seen, epoch, time_s, options)
     now = predicted(state, time_s, motion) if state is not None and motion is not None else None
     prior, bridge = _prior(system, epoch, now, options)
     candidates: tuple[Candidate, ...] = ()
@@ -93,12 +104,12 @@ def _solve(
         if not _plausible(system, seen, prior, candidates):
             afresh = without_prior(system, seen, options)
             if _certain(seen, afresh, options):
-                return _from_candidates(system, seen, epoch, time_s, afresh, None, "", None, options)
+                return _from_candidates(at, afresh, None, "", None)
             candidates = candidates if bridge == "motion" else ()
     elif len(seen.uv):
         candidates = without_prior(system, seen, options)
     if candidates:
-        return _from_candidates(system, seen, epoch, time_s, candidates, prior, bridge, now, options)
+        return _from_candidates(at, candidates, prior, bridge, now)
     return _Step(_from_little(system, seen, epoch, prior, bridge), now)
 
 
@@ -134,20 +145,19 @@ def _certain(seen: Sightings, candidates: Sequence[Candidate], options: Navigate
 
 
 def _from_candidates(
-    system: System, seen: Sightings, epoch: NavigationEpoch, time_s: float, candidates: Sequence[Candidate],
-    prior: Prior | None, bridge: Bridge, now: MotionState | None, options: NavigateOptions,
-) -> _Step:  # fmt: skip
-    best = candidates[0]
+    at: _At, candidates: Sequence[Candidate], prior: Prior | None, bridge: Bridge, now: MotionState | None
+) -> _Step:
+    best, system, seen, options = candidates[0], at.system, at.seen, at.options
     certain = _certain(seen, candidates, options) if prior is None else best.probability >= options.probability
     own = _own(system, seen, best, prior)
     fit, used_prior = (own, None) if own is not None else (best.fit, prior)
     if not certain and prior is None:
-        return _Step(_result(system, seen, epoch, fit, best, candidates, None, "", "ambiguous", options), now)
+        return _Step(_result(at, fit, best, candidates, None, "", "ambiguous"), now)
     status = "ambiguous" if not certain else ("fixed" if used_prior is None else "bridged")
-    result = _result(system, seen, epoch, fit, best, candidates, used_prior, bridge, status, options)
+    result = _result(at, fit, best, candidates, used_prior, bridge, status)
     if options.motion is None or not certain:
         return _Step(result, now)
-    return _Step(result, _next_state(system, seen, best, fit, used_prior, time_s, now, options))
+    return _Step(result, _next_state(at, best, fit, used_prior, now))
 
 
 def _own(system: System, seen: Sightings, best: Candidate, prior: Prior | None) -> PoseFit | None:
@@ -164,16 +174,16 @@ def _own(system: System, seen: Sightings, best: Candidate, prior: Prior | None) 
 
 
 def _next_state(
-    system: System, seen: Sightings, best: Candidate, fit: PoseFit, used_prior: Prior | None, time_s: float,
-    now: MotionState | None, options: NavigateOptions,
-) -> MotionState | None:  # fmt: skip
+    at: _At, best: Candidate, fit: PoseFit, used_prior: Prior | None, now: MotionState | None
+) -> MotionState | None:
+    system, seen, options = at.system, at.seen, at.options
     if options.motion is None:
         return None
     if now is not None:
         filtered = fit_pose(system, seen, best.fit.used, best.fit.beacon, best.fit.pose, now.prior)
         if filtered is not None and filtered.chi_square < chi2.isf(_AGREES, max(filtered.redundancy, 1)):
             return updated(now, filtered, spot_noise(seen, best.fit.used))
-    return started(fit, own_covariance(seen, fit, used_prior), time_s, options.motion)
+    return started(fit, own_covariance(seen, fit, used_prior), at.time_s, options.motion)
 
 
 def _labels(
@@ -198,10 +208,11 @@ def _solution(system: System, seen: Sightings, epoch: NavigationEpoch, candidate
 
 
 def _result(
-    system: System, seen: Sightings, epoch: NavigationEpoch, fit: PoseFit, best: Candidate,
-    candidates: Sequence[Candidate], prior: Prior | None, bridge: Bridge, status: str, options: NavigateOptions,
+    at: _At, fit: PoseFit, best: Candidate, candidates: Sequence[Candidate], prior: Prior | None, bridge: Bridge,
+    status: str,
 ) -> EpochPose:  # fmt: skip
-    several = tuple(_solution(system, seen, epoch, c) for c in candidates[: options.max_alternatives])
+    system, seen, epoch = at.system, at.seen, at.epoch
+    several = tuple(_solution(system, seen, epoch, c) for c in candidates[: at.options.max_alternatives])
     result = EpochPose(
         epoch.epoch_id, "fixed", bridge if prior is not None else "", _pose3(fit.pose), fit.cov,
         _labels(system, seen, epoch, fit),

@@ -40,10 +40,12 @@ def gaussian(cov: FloatArray) -> gtsam.noiseModel.Gaussian:
     return gtsam.noiseModel.Gaussian.Covariance(np.atleast_2d(cov), False)
 
 
-def custom(keys: Sequence[int], cov: FloatArray, residual: Residual) -> gtsam.CustomFactor:
+def custom(
+    keys: Sequence[int], noise: FloatArray | gtsam.noiseModel.Base, residual: Residual
+) -> gtsam.CustomFactor:
     """The one place that knows GTSAM's callback: from ``values -> (residual, [(key, jacobian)])`` to a factor.
 
-    A key that comes more than once has its Jacobians added.
+    noise: covariance, or a model of GTSAM's. A key that comes more than once has its Jacobians added.
     """
     at = {key: i for i, key in enumerate(keys)}
 
@@ -57,7 +59,8 @@ def custom(keys: Sequence[int], cov: FloatArray, residual: Residual) -> gtsam.Cu
                 jacobians[at[key]] = np.ascontiguousarray(block)
         return r
 
-    return gtsam.CustomFactor(gaussian(cov), list(keys), call)
+    model = noise if isinstance(noise, gtsam.noiseModel.Base) else gaussian(noise)
+    return gtsam.CustomFactor(model, list(keys), call)
 
 
 class ChainPose:

@@ -23,6 +23,7 @@ from adjust.pose_network.growth import Batch, Growth, Tree, moved_over
 from adjust.pose_network.network import PoseNetwork, pose_network
 from adjust.pose_network.solution import NetworkSolution, as_solution, solve_network
 from adjust.pose_network.solve import DEFAULTS, NetworkOptions, minimize
+from adjust.spatial.rigid import rigid
 
 _SHARE = 0.3
 _WINDOW = 20
@@ -296,7 +297,7 @@ class NetworkSession:
     def network(self) -> PoseNetwork:
         """The whole network as it stands."""
         base, g = self._base, self._grown
-        start = {i: _rigid(base.station_rotations[i], base.station_translations[i]) for i in range(base.n_stations)
+        start = {i: rigid(base.station_rotations[i], base.station_translations[i]) for i in range(base.n_stations)
                  if np.isfinite(base.station_translations[i]).all()}  # fmt: skip
         ids = [*base.pair_ids, *g.ids]
         used = np.array([*base.used.tolist(), *[True] * len(g.ids)]) & ~np.isin(ids, sorted(self._removed))
@@ -326,9 +327,3 @@ class NetworkSession:
         """The solution of all pairs: batch Gauss-Newton from the present estimates to the minimum."""
         network = self.network()
         return as_solution(network, minimize(network, self.poses(), self.solve_options))
-
-
-def _rigid(R: FloatArray, t: FloatArray) -> FloatArray:
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = R, t
-    return out

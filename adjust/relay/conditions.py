@@ -23,6 +23,7 @@ import numpy as np
 
 from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
+from adjust.observations.factors import Jacobians, custom
 from adjust.pose_network.loops import Loops, evaluate_loops
 from adjust.relay.counts import parts
 from adjust.relay.loops import LoopBasis, loop_basis, loop_misclosures
@@ -235,7 +236,7 @@ def _closure_factor(basis: LoopBasis, loop: int, dim: int) -> gtsam.CustomFactor
     n = len(keys)
     alone = Loops(np.array([0, n]), np.arange(n), basis.sense[rows], basis.start_idx[loop : loop + 1])
 
-    def call(_factor, values, jacobians):  # type: ignore[no-untyped-def]  # GTSAM's protocol, bound untyped
+    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
         if dim == 3:
             motions = Motions(np.array([values.atRot3(key).matrix() for key in keys]))
         else:
@@ -244,9 +245,6 @@ def _closure_factor(basis: LoopBasis, loop: int, dim: int) -> gtsam.CustomFactor
                 np.array([p.rotation().matrix() for p in poses]), np.array([p.translation() for p in poses])
             )
         w, blocks = evaluate_loops(alone, motions)
-        if jacobians is not None:
-            for i in range(n):
-                jacobians[i] = blocks[i]
-        return w[0]
+        return w[0], list(zip(keys, blocks, strict=True))
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Constrained.All(dim), keys, call)
+    return custom(keys, gtsam.noiseModel.Constrained.All(dim), residual)

@@ -7,17 +7,16 @@ score test; Rao 1948, Silvey 1959; in geodesy the test of an additional paramete
 can be paid for; each that is found is added to the model before the next is looked for.
 """
 
-import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
 
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS
+from adjust.model.errors import natural_key
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, IntArray
 from adjust.native.parallel import side_by_side
@@ -82,13 +81,6 @@ class _Chosen:
     Y: FloatArray
     inverse: FloatArray
     amounts: FloatArray
-
-
-@cache
-def natural(name: str) -> tuple[tuple[int, str], ...]:
-    """Key that sorts names with numbers as people do: e2 before e10."""
-    parts = re.split(r"(\d+)", name)
-    return tuple((int(x), "") if x.isdigit() else (0, x) for x in parts)
 
 
 class ChangeSearch:
@@ -276,7 +268,7 @@ def _by_runs(u: Unit) -> Unit:
 
 def _coded(epochs: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
     """Number (k,) of every epoch among the different ones, and these in natural order."""
-    names = tuple(sorted(set(epochs), key=natural))
+    names = tuple(sorted(set(epochs), key=natural_key))
     number = {e: i for i, e in enumerate(names)}
     return np.array([number[e] for e in epochs], dtype=np.int64), names
 

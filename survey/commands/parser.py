@@ -3,9 +3,11 @@
 import argparse
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
+
+from survey.commands.common import Version
 
 _CHOICE = re.compile(
     r"argument (?P<what>.+?): invalid choice: '?(?P<found>.*?)'? \(choose from (?P<known>.*)\)", re.DOTALL
@@ -21,7 +23,7 @@ class Parser(argparse.ArgumentParser):
         """Commands are called by the program's name; argparse would put the whole usage in front of them."""
         return super().add_subparsers(**{"prog": self.prog, **options})
 
-    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
+    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]  # its overloads
         """The arguments; what is left over is an error of the command that it was given to."""
         found, left = self.parse_known_args(args, namespace)
         if left:
@@ -35,10 +37,28 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {_mended(message, self.prog)}\n")
 
 
-def name_commands(commands: Any) -> None:
-    """Every command's arguments know the parser that they came through."""
-    for parser in commands.choices.values():
-        parser.set_defaults(parser=parser)
+Declare = Callable[[Any, dict[str, Any]], None]
+
+
+def program_parser(
+    program: str, opening: str, description: str, epilog: str, flags: Mapping[str, str],
+    declared: Iterable[Declare],
+) -> Parser:  # fmt: skip
+    """A program's parser with all its commands. flags: that stand before or after any of them, with their help."""
+    shared = argparse.ArgumentParser(add_help=False)
+    for names, help in flags.items():  # SUPPRESS: a flag before the command is not reset by the command's own default
+        shared.add_argument(*names.split(), action="store_true", default=argparse.SUPPRESS, help=help)
+    shaped: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "parents": [shared]}
+    parser = Parser(
+        program, usage=f"{opening}   ({program} COMMAND ...)", description=description, epilog=epilog, **shaped
+    )
+    parser.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for declare in declared:
+        declare(commands, shaped)
+    for each in commands.choices.values():  # every command's arguments know the parser that they came through
+        each.set_defaults(parser=each)
+    return parser
 
 
 def project_folder(text: str) -> Path:

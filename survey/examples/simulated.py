@@ -68,7 +68,7 @@ def head_files(seed: int) -> dict[str, str]:
     }
     for k in looks:
         for i in range(11):
-            photographer.on_table(k, f"t{k}{i + 1:02d}", lambda i=i, k=k: draws[k](i))  # type: ignore[misc]
+            photographer.on_table(k, f"t{k}{i + 1:02d}", lambda i=i, k=k: draws[k](i))  # type: ignore[misc]  # defaults bind
         for i in range(10):
             photographer.by_hand(k, f"h{k}{i + 1:02d}")
     return _files(photographer.survey(), truth, seed, "Three-camera head on a two-axis table")

@@ -19,7 +19,7 @@ from adjust.model.errors import SurveyError
 try:
     import fcntl
 except ImportError:  # no such locks on this system
-    fcntl = None  # type: ignore[assignment]
+    fcntl = None  # type: ignore[assignment]  # a module, or none
 
 OBSERVATIONS_FOLDER, RESULTS = "observations", "results"
 """In a project folder: what is given, what is found."""

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from adjust.model.errors import SurveyError
+from adjust.model.errors import natural_key as natural_key
 from survey.folder.locking import hold, remove_unheld
 
 LARGEST_FILE = 4 * 2**30  # bytes; longer observations go into several projects
@@ -124,14 +125,6 @@ def decode(path: Path, data: bytes) -> str:
         line = data.count(b"\n", 0, error.start) + 1
         found = f"byte 0x{data[error.start]:02x}"
         raise SurveyError(f"{path}:{line}: {found} is not UTF-8; save the file with the encoding UTF-8") from error
-
-
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Key that sorts ``e2`` before ``e10``; different names have different keys."""
-    parts = re.split(r"(\d+)", name)
-    # 4000: the interpreter refuses to take longer numbers apart
-    numbers = [(0, int(part[:4000]), part) if part.isdecimal() else (1, 0, part) for part in parts if part]
-    return tuple(numbers)
 
 
 @functools.lru_cache(1 << 16)

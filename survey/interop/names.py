@@ -5,6 +5,7 @@ from typing import Any
 
 from adjust.model.errors import listed
 from adjust.model.observations import PositionRef
+from adjust.model.subsets import with_positions
 from adjust.model.survey import Survey
 from survey.folder.text import FORBIDDEN_IN_IDS, formula_problem, id_problem
 
@@ -38,27 +39,18 @@ def with_safe_ids(survey: Survey) -> tuple[Survey, tuple[str, ...]]:
     def ref(position: PositionRef) -> PositionRef:
         return PositionRef(points[position.point_id]) if position.point_id in points else position
 
-    def refs(positions: tuple[PositionRef, ...]) -> tuple[PositionRef, ...]:
-        return tuple(ref(p) for p in positions)
-
     changed: dict[str, Any] = {
         "points": tuple(replace(p, point_id=points.get(p.point_id, p.point_id)) for p in survey.points),
         "setups": tuple(replace(s, setup_id=setups.get(s.setup_id, s.setup_id)) for s in survey.setups),
         "readings": tuple(
-            replace(
-                r, reading_id=readings.get(r.reading_id, r.reading_id), at=ref(r.at), to=ref(r.to),
-                second=ref(r.second) if r.second else None, setup_id=setups.get(r.setup_id, r.setup_id),
-            )
-            for r in survey.readings
+            replace(with_positions(r, ref), reading_id=readings.get(r.reading_id, r.reading_id),
+                    setup_id=setups.get(r.setup_id, r.setup_id)) for r in survey.readings
         ),
         "reading_covariances": tuple(
             replace(c, reading_ids=tuple(readings.get(i, i) for i in c.reading_ids)) for c in survey.reading_covariances
         ),
-        "coordinate_differences": tuple(
-            replace(d, at=refs(d.at), to=refs(d.to)) for d in survey.coordinate_differences
-        ),
-        "coordinates": tuple(replace(c, positions=refs(c.positions)) for c in survey.coordinates),
-        "distances": tuple(replace(d, a=ref(d.a), b=ref(d.b)) for d in survey.distances),
+        **{kind: tuple(with_positions(x, ref) for x in getattr(survey, kind))
+           for kind in ("coordinate_differences", "coordinates", "distances")},
         "datum": replace(survey.datum, points=tuple(points.get(p, p) for p in survey.datum.points)),
     }  # fmt: skip
     shown = [f"{old} -> {new}" for old, new in points.items()]

@@ -35,7 +35,6 @@ WHAT = ("image_point", "image", "target", "point", "epoch", "camera", "reading",
 EXCLUDED, INCLUDED = "excluded", "included"
 EXCLUSIONS = Layout("exclusions", ("what", "id"), (), ("state", "reason", "author", "time"), ("u_px", "v_px"))
 _PARTS = {"image_point": (3, 4), "image": (2,), "target": (1, 3), "epoch": (1,), "camera": (1,), "spot": (3,)}
-_MOST_PARTS = 4
 
 
 @dataclass(frozen=True)

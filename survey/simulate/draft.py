@@ -9,6 +9,7 @@ from gtsam import Pose3
 
 from adjust.model.observations import ImageBlock, TableReading
 from adjust.model.survey import Camera, FloatArray, LensParameter, Point, PoseParameter, Station, Survey, Table, Target
+from adjust.spatial.rigid import rigid
 from survey.project.targets import TargetKind
 from survey.simulate.scene import BROWN, Scene, Truth, rotation_about, transform
 
@@ -118,14 +119,6 @@ def looking_at(direction: FloatArray, down: FloatArray) -> FloatArray:
     x = np.cross(down, z)
     x = x / np.linalg.norm(x)
     return np.column_stack([x, np.cross(z, x), z])
-
-
-def rigid(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """(4, 4) of a rotation (3, 3) and a translation (3,) m."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    matrix[:3, 3] = translation
-    return matrix
 
 
 def rotation_vector(degrees: FloatArray) -> FloatArray:

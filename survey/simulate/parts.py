@@ -12,6 +12,7 @@ import numpy as np
 from gtsam import Pose3
 
 from adjust.model.survey import FloatArray, Point, Station, Table
+from adjust.spatial.rigid import rigid
 from survey.project.targets import Charuco, Checkerboard, MarkerGrid, TargetKind
 from survey.simulate.draft import (
     ARCSEC,
@@ -24,7 +25,6 @@ from survey.simulate.draft import (
     outline,
     pixel_in_cell,
     ray,
-    rigid,
     rotation_vector,
     table_angles,
 )

@@ -295,7 +295,10 @@ class Server:
         name, body = request.path_params["name"], Body(await json_of(request))
         if name not in JOBS:
             raise SurveyError(f"there is no job {name!r}; {suggestion(name, JOBS)}")
-        found = lambda report: self.live.post({"type": "detected"} | pictures.found_in(report))  # noqa: E731
+
+        def found(report: Any) -> None:
+            self.live.post({"type": "detected"} | pictures.found_in(report))
+
         told = await self._run(name, lambda: JOBS[name](self.bench, body, found))
         if name in ("init", "show"):
             await self._run("adjust", lambda: self._show(Path(told.summary["folder"])))

@@ -7,9 +7,10 @@ import pytest
 from scipy.stats import chi2
 
 from adjust.adjustment import adjust
+from adjust.model.errors import natural_key
 from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray, Survey
-from adjust.statistics.changes import ChangeSearch, natural
+from adjust.statistics.changes import ChangeSearch
 from adjust.statistics.condensed import condensed_system
 from adjust.statistics.consistency import consistency, eigenvalues, parts_of
 from adjust.statistics.result import Change, Consistency
@@ -116,7 +117,7 @@ def test_a_lens_that_changes_is_named_with_its_epoch() -> None:
     assert consistent(survey, start).fits
     readings = {r.epoch_id for r in survey.table_readings}
     camera = survey.image_blocks[-1].camera_id
-    mine = sorted({b.epoch_id for b in survey.image_blocks if b.camera_id == camera} & readings, key=natural)
+    mine = sorted({b.epoch_id for b in survey.image_blocks if b.camera_id == camera} & readings, key=natural_key)
     late = mine[len(mine) // 2 :]
     moved = tuple(
         replace(b, uv=b.uv + np.array([1.0, 0.0])) if b.camera_id == camera and b.epoch_id in late else b
@@ -141,7 +142,7 @@ def test_a_table_that_slips_and_one_whose_circle_is_eccentric() -> None:
     worst = found.changes[0]
     assert (worst.kind, worst.what) == ("table", "reading of axis1")
     assert not found.fits
-    epochs = sorted((r.epoch_id for r in survey.table_readings), key=natural)
+    epochs = sorted((r.epoch_id for r in survey.table_readings), key=natural_key)
     late = epochs[3 * len(epochs) // 4 :]
     slipped = tuple(
         replace(r, angles=r.angles + np.array([0.0, 90.0 * ARCSEC])) if r.epoch_id in late else r
@@ -169,7 +170,7 @@ def test_the_status_of_a_global_test() -> None:
 
 
 def test_names_are_sorted_as_people_do() -> None:
-    assert sorted(["e10", "e2", "t1", "e2b"], key=natural) == ["e2", "e2b", "e10", "t1"]
+    assert sorted(["e10", "e2", "t1", "e2b"], key=natural_key) == ["e2", "e2b", "e10", "t1"]
 
 
 def test_texts_of_changes() -> None:

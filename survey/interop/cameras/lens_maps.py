@@ -60,7 +60,7 @@ def mapped_lens(
     free = tuple(n for n in usable if wanted.name != "brown" or n not in ("k4", "k5", "k6"))
     found = convert(
         model, values, camera_constants(camera), wanted, lens_constants(wanted, camera.image_size), camera.image_size,
-        free, cov,
+        free=free, cov=cov,
     )  # fmt: skip
     u, v = found.largest_at
     largest = found.largest_difference_px
