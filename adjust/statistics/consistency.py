@@ -106,8 +106,8 @@ def parts_of(adjustment: Adjustment, system: LinearSystem, blocks: IntArray) -> 
     sums = (np.add.reduceat(x[every], edges[:-1]).tolist() for x in (found.n, found.redundancy, found.omega))
     total = int(np.count_nonzero(found.n))
     return tuple(
-        Part(*label, every[i:j], n, r, omega)
-        for label, (i, j), n, r, omega in zip(members, pairwise(edges.tolist()), *sums, strict=True)
+        Part(kind, name, every[i:j], n, r, omega)
+        for (kind, name), (i, j), n, r, omega in zip(members, pairwise(edges.tolist()), *sums, strict=True)
         if r > _LEAST and j - i < total
     )
 
@@ -160,11 +160,9 @@ def tested_parts(
     if not parts:
         return ()
     n, r, omega = (np.array([getattr(part, x) for part in parts]) for x in ("n", "redundancy", "omega"))
-    if relative:
-        found = _p_relative(adjustment, r, omega)
-    else:
-        found = upper_tail_bound(omega, r)
-        for i in _undecided(system, parts, (n, r, omega, found), level) if system is not None else ():
+    found = _p_relative(adjustment, r, omega) if relative else upper_tail_bound(omega, r)
+    if system is not None and not relative:
+        for i in _undecided(system, parts, (n, r, omega, found), level):
             rows = _rows(system, parts[i])
             found[i] = min(found[i], upper_tail(omega[i], eigenvalues(system, rows, round(n[i]))))
     out = [

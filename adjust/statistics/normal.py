@@ -57,7 +57,7 @@ class _Piece:
 
     def own(self, b: FloatArray) -> FloatArray:
         """Inverses times (p k, r)."""
-        return np.matmul(self.inverse, b.reshape(*self.inverse.shape[:2], -1)).reshape(b.shape)
+        return np.asarray(np.matmul(self.inverse, b.reshape(*self.inverse.shape[:2], -1)).reshape(b.shape))
 
 
 class Arrow:
@@ -126,7 +126,8 @@ def _arrow(scaled: sparse.csc_matrix) -> Arrow | None:
         sets = np.argsort(label, kind="stable")[np.repeat(sizes, sizes) == k].reshape(-1, k)
         for mine in np.array_split(sets, -(-sets.size // _PIECE)):
             rows = mine.ravel()
-            pieces.append(_Piece(rest[rows], np.linalg.inv(_blocks(own, mine)), across[rows].toarray()))
+            inverse: FloatArray = np.linalg.inv(_blocks(own, mine)).astype(np.float64, copy=False)
+            pieces.append(_Piece(rest[rows], inverse, across[rows].toarray()))
     return Arrow(core, N[core][:, core].toarray(), pieces)
 
 
