@@ -160,14 +160,11 @@ def tested_parts(
     if not parts:
         return ()
     n, r, omega = (np.array([getattr(part, x) for part in parts]) for x in ("n", "redundancy", "omega"))
-    if relative:
-        found = _p_relative(adjustment, r, omega)
-    else:
-        found = upper_tail_bound(omega, r)
-        if system is not None:
-            for i in _undecided(system, parts, (n, r, omega, found), level):
-                rows = _rows(system, parts[i])
-                found[i] = min(found[i], upper_tail(omega[i], eigenvalues(system, rows, round(n[i]))))
+    found = _p_relative(adjustment, r, omega) if relative else upper_tail_bound(omega, r)
+    if system is not None and not relative:
+        for i in _undecided(system, parts, (n, r, omega, found), level):
+            rows = _rows(system, parts[i])
+            found[i] = min(found[i], upper_tail(omega[i], eigenvalues(system, rows, round(n[i]))))
     out = [
         PartTest(part.kind, part.name, round(part.n), part.redundancy, part.omega, part.omega / part.redundancy, p,
                  p < level) for part, p in zip(parts, found.tolist(), strict=True)

@@ -105,6 +105,11 @@ class LinearSystem:
         """The normal matrix of the used observations and the datum."""
         return self.normal_of(self.used[self.row_of].astype(float))
 
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """A priori covariance (n, n) of the unknowns in the survey's datum, of systems that are solved as a whole."""
+        return self.normal.covariance(self.datum)
+
     def normal_of(self, weights: FloatArray) -> Normal:
         """The normal matrix with weights (m,) of the rows."""
         kept = weights > 0.0

@@ -61,7 +61,10 @@ def _in_tree(system: LinearSystem) -> bool:
 
 def _some_columns(system: LinearSystem) -> Callable[[IntArray], FloatArray]:
     """What gives some columns (n, k) of the covariance matrix where very many are wanted."""
-    if len(system.columns) <= DENSE or not _in_tree(system):
+    if len(system.columns) <= DENSE:
+        whole = system.covariance
+        return lambda part: whole[:, part]
+    if not _in_tree(system):
         _ = system.normal  # factored before threads ask for it
         return lambda part: covariance_columns(system, part)
     precision, c = system.precision, system.columns
@@ -167,7 +170,7 @@ def _variances(system: LinearSystem, index: IntArray) -> FloatArray:
     """Of these columns (k,): as they are solved in small surveys, as the tree has them in large ones."""
     if len(system.columns) > DENSE:
         return np.asarray(system.sigmas[index] ** 2)
-    return np.diag(system.normal.covariance(system.datum))[index]
+    return np.diag(system.covariance)[index]
 
 
 def _within(system: LinearSystem, number: IntArray, limit: float) -> list[tuple[int, int, float]]:

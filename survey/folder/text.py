@@ -5,7 +5,6 @@ import errno
 import functools
 import hashlib
 import os
-import re
 import stat
 import tempfile
 import threading

@@ -8,6 +8,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -198,13 +199,21 @@ def _link_into(path: Path, merged: Merged) -> None:
 
 def _merge_table(merged: Merged, old: Path, new: Path, target: Path) -> None:
     new_header, new_rows = table_rows(new)
-    old_header, old_rows = table_rows(old) if old.is_file() else (new_header, [])
+    text = decode(old, read_bytes(old)[0]).replace("\r\n", "\n") if old.is_file() else ""
+    old_header = next(csv.reader(io.StringIO(text, newline=""), strict=True), new_header)
     header = [*old_header, *(name for name in new_header if name not in old_header)]
+    as_it_is = bool(text) and len(header) == len(old_header) and "\r" not in text
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header)
-    origins: list[Origin] = [(old if old.is_file() else new, 1)]
-    for path, names, rows in ((old, old_header, old_rows), (new, new_header, new_rows)):
+    if as_it_is:  # what is new goes behind what is there
+        stream.write(text if text.endswith("\n") else f"{text}\n")
+        origins: list[Origin] = list(zip(repeat(old), range(1, stream.getvalue().count("\n") + 1)))
+        parts = [(new, new_header, new_rows)]
+    else:
+        writer.writerow(header)
+        origins = [(old if text else new, 1)]
+        parts = [(old, old_header, table_rows(old)[1] if text else []), (new, new_header, new_rows)]
+    for path, names, rows in parts:
         place = {name: i for i, name in enumerate(names)}
         order = [place.get(name) for name in header]
         for line, row in rows:

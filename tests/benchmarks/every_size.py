@@ -35,6 +35,8 @@ from tests.survey.planning_lab import write_lab
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 LONGEST_S = 60.0
 """Processor seconds that one command may need, were it linear; a larger one is not run."""
+START_S = 0.6
+"""What loading the program takes at any size."""
 Commands = dict[str, list[str]]
 
 
@@ -180,13 +182,13 @@ def profile(kinds: Sequence[str], sizes: Sequence[int], threads: Sequence[int], 
 def _at(kind: str, n: int, before: dict[tuple[str, str], Any], longest_s: float, threads: int) -> dict[str, Run]:
     """All commands of a kind that may be run at this size."""
     last = {name: (m, run) for (k, name), (m, run) in before.items() if k == kind}
-    if last and min(run.cpu_s * n / m for m, run in last.values()) > longest_s:
+    if last and min(_expected(run, n / m) for m, run in last.values()) > longest_s:
         return {}
     out = {}
     with tempfile.TemporaryDirectory() as place:
         for name, command in KINDS[kind](Path(place), n).items():
             m, run = last.get(name, (n, None))
-            if run is not None and run.cpu_s * n / m > longest_s:
+            if run is not None and _expected(run, n / m) > longest_s:
                 continue
             if name == "add":
                 measured(["adjust", command[1]])
@@ -195,6 +197,10 @@ def _at(kind: str, n: int, before: dict[tuple[str, str], Any], longest_s: float,
             except RuntimeError as error:
                 print(f"{kind}, {n}: {error}", file=sys.stderr, flush=True)
     return out
+
+
+def _expected(run: Run, times: float) -> float:
+    return START_S + (run.cpu_s - START_S) * times
 
 
 def _largest(run: Run) -> tuple[str, str, str]:

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -439,3 +440,27 @@ def test_a_free_network_needs_no_held_station():
     survey, _ = _network(4, combinations(range(4), 2), 1.0)
     free = replace(survey, stations=tuple(_station(s.station_id) for s in survey.stations), datum=Datum("inner"))
     assert adjust_cleaned(free).omega == pytest.approx(adjust_cleaned(survey).omega, rel=1e-8)
+
+
+def test_what_is_there_stays_as_it_is_written(tmp_path: Path) -> None:
+    """New rows go behind it, in its columns; a new column alone has all rows written anew."""
+    old = '"p1",a,b,1.0,0,0,0\r\n'
+    new = {"q": "pair_id,qw,qx,qy,qz,b_id,a_id\np2,1,0,0,0,b,a\n",
+           "group": "pair_id,a_id,b_id,qw,qx,qy,qz,group\np2,a,b,1,0,0,0,g\n"}  # fmt: skip
+    (tmp_path / "lab" / "observations").mkdir(parents=True)
+    (tmp_path / "lab" / "survey.toml").write_text("format = 1\n[stations.a]\n[stations.b]\n")
+    table = tmp_path / "lab" / "observations" / "pairs.csv"
+    table.write_bytes(f"pair_id,a_id,b_id,qw,qx,qy,qz\r\n{old}\r\n".encode())
+    found = {}
+    for name, text in new.items():
+        (tmp_path / name / "observations").mkdir(parents=True)
+        (tmp_path / name / "observations" / "pairs.csv").write_text(text)
+        place = tmp_path / f"{name}-place"
+        place.mkdir()
+        merged = merge(tmp_path / "lab", tmp_path / name, place)
+        found[name] = (place / "observations" / "pairs.csv").read_text()
+        lines = merged.origins["observations/pairs.csv"]
+        assert len(lines) == found[name].count("\n")
+        assert (lines[1], lines[-1][0].parent.parent.name, lines[-1][1]) == ((table, 2), name, 2)
+    assert found["q"] == 'pair_id,a_id,b_id,qw,qx,qy,qz\n"p1",a,b,1.0,0,0,0\n\np2,a,b,1,0,0,0\n'
+    assert found["group"].splitlines()[1:] == ["p1,a,b,1.0,0,0,0,", "p2,a,b,1,0,0,0,g"]
