@@ -162,6 +162,8 @@ class _LensSearch:
             centre = found.values[2:] if found.variant == "full" else None
             trials.append((self._values(found.values[0], found.values[1], centre), f"Zhang, {found.variant}"))
             errors.append(self._error_px(trials[-1][0], trial_images))
+            if errors[-1] < _SIMPLE_PX:  # nor does it need another one
+                break
         if errors and min(errors) < _GOOD_START * max(self.size):
             return trials[int(np.argmin(errors))]
         low, high = (0.15, 2.0) if self.model.name == "fisheye" else (0.35, 8.0)
