@@ -5,6 +5,7 @@ mm) to ``f(r) = r N(r^2) / D(r^2)``, N and D polynomials with ascending coeffici
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -42,18 +43,17 @@ class RadialProfile:
 def radial_profile(kind: int, values: FloatArray, constants: FloatArray) -> RadialProfile:
     """The radial function of a lens: undistorted to distorted radius, measured to corrected for backward models."""
     v = [float(x) for x in values]
-    one = np.array([1.0])
     if kind == kernels.BROWN:
-        return _profile(np.array([1.0, v[5], v[6], v[9]]), np.array([1.0, v[10], v[11], v[12]]))
+        return _profile((1.0, v[5], v[6], v[9]), (1.0, v[10], v[11], v[12]))
     if kind == kernels.FISHEYE:
-        return _profile(np.array([1.0, *v[5:9]]), one, largest=float(np.pi))
+        return _profile((1.0, *v[5:9]), largest=float(np.pi))
     if kind == kernels.BROWN_BACKWARD:
-        return _profile(np.array([1.0, *v[3:6]]), one)
+        return _profile((1.0, *v[3:6]))
     if kind == kernels.BROWN_BACKWARD_DBAT:
-        return _profile(np.array([1.0, *v[4:7]]), one)
+        return _profile((1.0, *v[4:7]))
     w0 = float(constants[3]) ** 2
     balance = w0 * (v[3] + w0 * (v[4] + w0 * v[5]))
-    return _profile(np.array([1.0 - balance, *v[3:6]]), one)
+    return _profile((1.0 - balance, *v[3:6]))
 
 
 def invert_radius(profile: RadialProfile, target: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -80,10 +80,14 @@ def invert_radius(profile: RadialProfile, target: FloatArray) -> tuple[FloatArra
     return radius, found
 
 
-def _profile(numerator: FloatArray, denominator: FloatArray, largest: float = float("inf")) -> RadialProfile:
+@lru_cache(64)  # a search for start values asks again and again for the lens without distortion
+def _profile(
+    numerator: tuple[float, ...], denominator: tuple[float, ...] = (1.0,), largest: float = float("inf")
+) -> RadialProfile:
     """The profile with its limit: the first radius where f stops growing or its denominator vanishes."""
-    limit = min(_first_root(_growth(numerator, denominator)), _first_root(denominator), largest)
-    return RadialProfile(numerator, denominator, limit)
+    top, bottom = np.array(numerator), np.array(denominator)
+    limit = min(_first_root(_growth(top, bottom)), _first_root(bottom), largest)
+    return RadialProfile(top, bottom, limit)
 
 
 def _growth(numerator: FloatArray, denominator: FloatArray) -> FloatArray:

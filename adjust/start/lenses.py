@@ -162,6 +162,8 @@ class _LensSearch:
             centre = found.values[2:] if found.variant == "full" else None
             trials.append((self._values(found.values[0], found.values[1], centre), f"Zhang, {found.variant}"))
             errors.append(self._error_px(trials[-1][0], trial_images))
+            if errors[-1] < _SIMPLE_PX:  # nor does it need another one
+                break
         if errors and min(errors) < _GOOD_START * max(self.size):
             return trials[int(np.argmin(errors))]
         low, high = (0.15, 2.0) if self.model.name == "fisheye" else (0.35, 8.0)
@@ -309,11 +311,12 @@ def spread_out(images: Sequence[Sighting], n: int = _MOST_IMAGES) -> list[Sighti
         return list(images)
     features = _features(images)
     features = (features - features.mean(axis=0)) / np.maximum(features.std(axis=0), 1e-9)
+    squares = ((features[:, None] - features) ** 2).sum(axis=2)  # of at most _MOST_SCREENED images
     chosen = [int(np.argmax([len(s.x) for s in images]))]
-    distance = np.linalg.norm(features - features[chosen[0]], axis=1)
+    nearest = squares[chosen[0]]
     while len(chosen) < n:
-        chosen.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, squares[chosen[-1]])
     return [images[i] for i in sorted(chosen)]
 
 

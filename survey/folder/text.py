@@ -5,6 +5,7 @@ import errno
 import functools
 import hashlib
 import os
+import re
 import stat
 import tempfile
 import threading

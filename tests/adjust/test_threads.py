@@ -11,6 +11,9 @@ from adjust.adjustment import adjust
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
 from adjust.native.parallel import Beside, side_by_side
+from adjust.pose_network.network import survey_of as survey_of_pairs
+from adjust.statistics.screened_adjustment import adjust_cleaned
+from tests.adjust import pose_networks
 from tests.benchmarks import bundle
 from tests.benchmarks.building import Plan, build
 from tests.benchmarks.data import calibration
@@ -29,6 +32,11 @@ def building() -> Adjustment:
     return adjust(survey_of(rooms), bundle.start(rooms.bundle))
 
 
+def pairs() -> Adjustment:
+    """A network of 1,000 stations with five wrong pairs, which are looked for."""
+    return adjust_cleaned(survey_of_pairs(pose_networks.simulate(20, 50, 1, wrong=5).network))
+
+
 def numbers(found: Adjustment) -> list[FloatArray]:
     values = [e.value.matrix() if isinstance(e.value, Pose3) else np.asarray(e.value) for e in found.estimates.values()]
     covariances = [np.asarray(e.cov) for e in found.estimates.values()]
@@ -37,7 +45,7 @@ def numbers(found: Adjustment) -> list[FloatArray]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [boards, building])
+@pytest.mark.parametrize("make", [boards, building, pairs])
 def test_the_same_bits_for_any_number_of_threads(
     make: Callable[[], Adjustment], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,9 +34,9 @@ class PoseGraph(Arrays):
     start: FloatArray
 
 
-def read(path: Path) -> PoseGraph:
+def read(path: Path, block_diagonal: bool = False) -> PoseGraph:
     """A g2o file, with the start that ours finds."""
-    network = read_g2o_file(path).network
+    network = read_g2o_file(path, block_diagonal=block_diagonal).network
     start = np.tile(np.eye(4), (network.n_stations, 1, 1))
     start[:, :3, :3], start[:, :3, 3] = find_network_start(network)
     return PoseGraph(
@@ -71,7 +71,8 @@ def ours(case: PoseGraph) -> Competitor:
     return run
 
 
-def _gtsam(case: PoseGraph, gauss_newton: bool, marginals: bool) -> Competitor:
+def gtsam_solve(case: PoseGraph, gauss_newton: bool, marginals: bool) -> Competitor:
+    """GTSAM's own factors, one of its optimisers, and its marginals."""
     def run() -> Outcome:
         t0 = perf_counter()
         graph, values = _native(case)
@@ -124,6 +125,6 @@ OURS, GAUSS_NEWTON = "ours: solve, covariances, tests", "GTSAM Gauss-Newton: sol
 LEVENBERG = "GTSAM Levenberg-Marquardt: solve only"
 GRAPHS: dict[str, Callable[[PoseGraph], Competitor]] = {
     OURS: ours,
-    GAUSS_NEWTON: lambda case: _gtsam(case, True, True),
-    LEVENBERG: lambda case: _gtsam(case, False, False),
+    GAUSS_NEWTON: lambda case: gtsam_solve(case, True, True),
+    LEVENBERG: lambda case: gtsam_solve(case, False, False),
 }

@@ -1,0 +1,66 @@
+"""Pose graphs from file to report beside the plain solve: ``python -m tests.benchmarks.graph_commands FILE.g2o ...``.
+
+The command: reading, start values, solution, covariances, tests, results and report, with and without the search for
+wrong pairs. The plain solve: GTSAM's Gauss-Newton from the start that ours finds, graph built, nothing else. Processor
+time of one thread, the least of all rounds, in turn.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from contextlib import redirect_stdout
+from pathlib import Path
+from time import process_time
+
+from survey import cli
+from tests.benchmarks import pose_graphs
+from tests.benchmarks.tables import table
+
+_LEFT_OUT = {"command": "reject_pairs = false", "with the search": "reject_pairs = true"}
+
+
+def main() -> None:
+    """Measure the files, and print their table."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.graph_commands", description=__doc__)
+    parser.add_argument("files", type=Path, nargs="+", help="pose graphs")
+    parser.add_argument("--block-diagonal", action="store_true", help="read their information block by block")
+    parser.add_argument("--rounds", type=int, default=3, help="runs of each (default 3)")
+    options = parser.parse_args()
+    rows = []
+    for path in options.files:
+        with tempfile.TemporaryDirectory() as folder:
+            rows.append(_measured(path, Path(folder), options))
+        print("\t".join(rows[-1]), flush=True)
+    print(table(("", "plain solve, CPU s", "command, CPU s", "with the search, CPU s", "times the solve, each"), rows))
+
+
+def _measured(path: Path, folder: Path, options: argparse.Namespace) -> list[str]:
+    times: dict[str, list[float]] = {name: [] for name in ("solve", *_LEFT_OUT)}
+    how = ["--block-diagonal"] if options.block_diagonal else []
+    for name, option in _LEFT_OUT.items():
+        with redirect_stdout(sys.stderr):
+            cli.main(["convert", str(path), str(folder / name), "--quiet", *how])
+        definition = folder / name / "survey.toml"
+        definition.write_text(definition.read_text().replace(_LEFT_OUT["command"], option))
+    case = pose_graphs.read(path, options.block_diagonal)
+    for _ in range(options.rounds):
+        begin = process_time()
+        pose_graphs.gtsam_solve(case, gauss_newton=True, marginals=False)()
+        times["solve"].append(process_time() - begin)
+        for name in _LEFT_OUT:
+            before = os.times()
+            subprocess.run([sys.executable, "-m", "survey", "adjust", str(folder / name), "--quiet"],
+                           env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "LABSURVEY_THREADS": "1"},
+                           stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)  # fmt: skip
+            after = os.times()
+            children = after.children_user - before.children_user + after.children_system - before.children_system
+            times[name].append(children)
+    least = {name: min(found) for name, found in times.items()}
+    ratios = " and ".join(f"{least[name] / least['solve']:.1f}" for name in _LEFT_OUT)
+    return [path.stem, *(f"{seconds:.2f}" for seconds in least.values()), ratios]
+
+
+if __name__ == "__main__":
+    main()
