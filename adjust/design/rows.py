@@ -104,7 +104,7 @@ def _image(p: Predictor, number: int, block: ImageBlock, by_key: dict[int, slice
     pose, jacobians = ChainPose(p.graph.unknowns, p.graph.state, chain)(p.values)
     R, x = pose.rotation().matrix(), p.points_in_frame(block.target_id, block.epoch_id)[idx]
     q = x @ R.T + pose.translation()
-    model, lens = MODELS[camera.lens.model], p.lens(camera)
+    model, lens = MODELS[camera.lens.model], p.lens(camera, block.epoch_id)
     _, by_lens, by_q = lens_derivatives(model, lens, camera_constants(camera), q, block.uv[used])
     W = _whitening(block.cov[used])
     out: dict[int, FloatArray] = {}
@@ -112,9 +112,12 @@ def _image(p: Predictor, number: int, block: ImageBlock, by_key: dict[int, slice
     def add(key: int, J: FloatArray) -> None:
         out[key] = out[key] + J if key in out else J
 
-    vector = p.graph.unknowns.vectors["lens", camera.camera_id]
-    if vector.key is not None:
-        add(vector.key, by_lens @ vector.matrix)
+    states = p.graph.state.lens_states
+    by_free = by_lens @ p.graph.unknowns.vectors["lens", camera.camera_id].matrix
+    for part in states.parts(states.of(camera.camera_id, block.epoch_id)):
+        J = np.zeros((len(idx), 2, p.graph.unknowns.by_key[part.key].dim))
+        J[:, :, part.within : part.within + part.n] = part.factor * by_free[:, :, part.first : part.first + part.n]
+        add(part.key, J)
     by_x = by_q @ R
     by_pose = np.concatenate([by_x @ -skew(x), by_x], axis=2)
     for key, J in jacobians:

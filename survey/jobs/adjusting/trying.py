@@ -113,13 +113,19 @@ def _definition(path: Path, text: str, edit: ScaleKey | SetKey) -> str:
             lines[where[key] - 1] = _scaled(lines[where[key] - 1], str(key[-1]), edit.factor)
     elif edit.path in where:
         raise SurveyError(f"{path}:{where[edit.path]}: {edit.path[-1]} is given; set it to {_toml(edit.value)}")
-    elif edit.path[:2] not in where:
-        raise SurveyError(f"{path}: [{'.'.join(edit.path[:2])}] is not there; set {'.'.join(edit.path)} yourself")
     else:
-        new = f"{'.'.join(edit.path[2:])} = {_toml(edit.value)}\n"
-        lines.insert(where[edit.path[:2]], new)
+        # below the header of the innermost table that has one: a dotted key above it would begin that table twice
+        headed = [k for k in range(2, len(edit.path)) if edit.path[:k] in where
+                  and lines[where[edit.path[:k]] - 1].lstrip().startswith("[")]  # fmt: skip
+        if not headed:
+            raise SurveyError(f"{path}: [{'.'.join(edit.path[:-1])}] is not there; set {'.'.join(edit.path)} yourself")
+        new = f"{'.'.join(edit.path[headed[-1]:])} = {_toml(edit.value)}\n"
+        lines.insert(where[edit.path[: headed[-1]]], new)
     changed = "".join(lines)
-    tomllib.loads(changed)
+    try:
+        tomllib.loads(changed)
+    except tomllib.TOMLDecodeError as error:  # what the key belongs to stands there as a value, { ... } in one line
+        raise SurveyError(f"{path}: {'.'.join(edit.path)} has no place of its own there; set it yourself") from error
     return changed
 
 
