@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 import survey as labsurvey
+from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
 from adjust.model.errors import SurveyError
-from adjust.model.survey import TABLE_GEOMETRY, LensDrift, Survey, VectorParameter, VectorPrior
+from adjust.model.survey import TABLE_GEOMETRY, LensDrift, Survey, Table, VectorParameter, VectorPrior
 from adjust.model.tables import harmonic_names
+from survey.jobs.adjusting.trying import edited
 from survey.project import read, write_project
 from survey.report.page import report_html
 from survey.report.terminal import summary_text
@@ -160,3 +162,28 @@ def test_values_and_tests_reach_result_and_report(tmp_path: Path) -> None:
     text = summary_text(solution.adjustment, solution.run)
     assert "target board" in text
     assert "angle 2 order 1" in text
+
+
+def test_keys_of_remedies_are_written_where_they_belong(tmp_path: Path) -> None:
+    """Several keys of one table after each other; below the innermost header; not into a table in one line."""
+    survey, _ = stereo(3, n_pairs=8)
+    write_project(tmp_path, replace(survey, tables=(Table("turntable"),)))
+    path, chosen = tmp_path / "survey.toml", Hypothesis("", "", "", Place("", ()), survey)
+    for place, value in (
+        (("tables", "turntable", "harmonics", "angle_2"), 2),
+        (("tables", "turntable", "harmonics", "tilt_2"), 1),
+        (("cameras", "right", "lens", "drift", "parameters"), ("fx", "u0")),
+        (("cameras", "right", "lens", "drift", "begins"), ("e03",)),
+        (("targets", "board", "warp", "free"), ("scale_x",)),
+    ):
+        path.write_text(edited(tmp_path, SetKey(place, value), chosen)[2])
+    again = read(tmp_path).survey
+    assert set(again.tables[0].geometry.free) >= {"angle_2_sin_2", "tilt_2_im_m1"}
+    assert again.cameras[1].lens.drift is not None
+    assert again.cameras[1].lens.drift.parameters == ("fx", "u0")
+    assert again.targets[0].warp is not None
+    assert again.targets[0].warp.free == ("scale_x",)
+    path.write_text(path.read_text().replace("harmonics.angle_2 = 2", "harmonics = { angle_2 = 2 }"))
+    path.write_text(path.read_text().replace("harmonics.tilt_2 = 1\n", ""))
+    with pytest.raises(SurveyError, match=r"tables\.turntable\.harmonics\.tilt_2 has no place of its own there"):
+        edited(tmp_path, SetKey(("tables", "turntable", "harmonics", "tilt_2"), 1), chosen)
