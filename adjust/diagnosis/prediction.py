@@ -7,14 +7,15 @@ from functools import cached_property
 import numpy as np
 from gtsam import Pose3
 
+from adjust.frames.lens_states import block_starts
 from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import Chain, FrameTree, Unknowns
 from adjust.lenses.models import LensModel, camera_constants, lens_model, project
-from adjust.model.boards import deformed
+from adjust.model.boards import deformed, warming_of
 from adjust.model.errors import SurveyError
 from adjust.model.observations import ImageBlock
 from adjust.model.result import Adjustment, ParameterName
-from adjust.model.survey import FloatArray, Survey
+from adjust.model.survey import FloatArray, Survey, Target
 from adjust.spatial.rigid import inverse, rigid
 
 Altered = Mapping[ParameterName, Pose3 | FloatArray]
@@ -62,8 +63,40 @@ class Prediction:
         return {c.camera_id: (lens_model(c.lens.model), camera_constants(c)) for c in self.survey.cameras}
 
     @cached_property
-    def _targets(self) -> dict[str, FloatArray]:
-        return {t.target_id: deformed(t) for t in self.survey.targets}
+    def _targets(self) -> dict[str, Target]:
+        return {t.target_id: t for t in self.survey.targets}
+
+    def _on_target(self, target: Target, epoch_id: str) -> FloatArray:
+        """(n, 3) m of its points, with the warp that was found."""
+        found = self.result.estimates.get(("warp", target.target_id))
+        same = found is not None and target.warp is not None and found.components == target.warp.names
+        values = np.asarray(found.value) if same and found is not None else None
+        return deformed(target, values, warming_of(self.survey, target, epoch_id))
+
+    @cached_property
+    def _drifting(self) -> dict[str, dict[str, str | None]]:
+        """Of cameras whose lens changes by blocks, by epoch where the block begins."""
+        return {c.camera_id: block_starts(self.survey, c) for c in self.survey.cameras if c.lens.drift is not None}
+
+    def _lens(self, block: ImageBlock, altered: Altered) -> FloatArray | None:
+        """The lens (n,) at the epoch of a block."""
+        own = self._value(("lens", block.camera_id), altered)
+        starts = self._drifting.get(block.camera_id)
+        if own is None or starts is None:
+            return own
+        camera = next(c for c in self.survey.cameras if c.camera_id == block.camera_id)
+        reference = camera.lens.drift.reference_temperature if camera.lens.drift is not None else None
+        start = starts.get(block.epoch_id) or ""
+        name: ParameterName = ("lens_drift", block.camera_id, *(() if reference is not None else (start,)))
+        found = self.result.estimates.get(name)
+        if found is None:
+            return own
+        factor = 1.0 if reference is None else self.survey.temperatures[block.epoch_id] - reference
+        names, out = self._lenses[block.camera_id][0].names, own.copy()
+        change = dict(zip(found.components, factor * np.asarray(found.value), strict=True))
+        change |= {tie.name: tie.factor * change[tie.to] for tie in camera.lens.ties if tie.to in change}
+        out[[names.index(x) for x in change]] += list(change.values())
+        return out
 
     def uv(self, i: int, altered: Altered | None = None) -> FloatArray | None:
         """(n, 2) px of block i; None where a value is not known, or a point lies behind the camera.
@@ -72,7 +105,7 @@ class Prediction:
         ("target_body", id): motions of bodies whose poses are held, in their own frames.
         """
         block, other = self.survey.image_blocks[i], altered or {}
-        pose, lens = self.pose(i, other), self._value(("lens", block.camera_id), other)
+        pose, lens = self.pose(i, other), self._lens(block, other)
         x = self._points(block, other)
         if pose is None or lens is None or x is None:
             return None
@@ -120,6 +153,6 @@ class Prediction:
 
     def _points(self, block: ImageBlock, altered: Altered) -> FloatArray | None:
         if block.target_id is not None:
-            return self._targets[block.target_id][block.point_idx]
+            return self._on_target(self._targets[block.target_id], block.epoch_id)[block.point_idx]
         found = [self._value(("point", self.survey.points[int(i)].point_id), altered) for i in block.point_idx]
         return None if any(x is None for x in found) else np.array(found)
