@@ -38,7 +38,8 @@ def _block(p: Predictor, block: ImageBlock) -> ImageBlock:
     camera = p.cameras[block.camera_id]
     uv, q = p.image(block)
     if np.isnan(uv).any():
-        uv = project(MODELS[camera.lens.model], p.lens(camera), camera_constants(camera), q)  # says why there is none
+        lens = p.lens(camera, block.epoch_id)
+        uv = project(MODELS[camera.lens.model], lens, camera_constants(camera), q)  # says why there is none
     return replace(block, uv=uv)
 
 

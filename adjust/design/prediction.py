@@ -50,9 +50,10 @@ class Predictor:
         """The motion between two frames."""
         return ChainPose(self.graph.unknowns, self.graph.state, self.frames.relative(a, b))(self.values)[0]
 
-    def lens(self, camera: Camera) -> FloatArray:
-        """Full lens vector (n,)."""
-        return self.graph.unknowns.vectors["lens", camera.camera_id].full(self.values)
+    def lens(self, camera: Camera, epoch_id: str) -> FloatArray:
+        """Full lens vector (n,) at an epoch."""
+        states = self.graph.state.lens_states
+        return states.full(states.of(camera.camera_id, epoch_id), self.values)
 
     def points_in_frame(self, target_id: str | None, epoch_id: str | None = None) -> FloatArray:
         """All points of a target in its frame, its warp included, or all world points; (n, 3) m."""
@@ -75,7 +76,7 @@ class Predictor:
         pose = self.b_from_a(ref, FrameRef("camera", block.camera_id, block.epoch_id))
         x = self.points_in_frame(block.target_id, block.epoch_id)[block.point_idx]
         q = x @ pose.rotation().matrix().T + pose.translation()
-        return projected(camera, self.lens(camera), q), q
+        return projected(camera, self.lens(camera, block.epoch_id), q), q
 
     def seen(self, block: ImageBlock, seeing: Seeing) -> ImageBlock | None:
         """The block with what is visible of it, at its predicted place; None where that is too little."""
@@ -83,7 +84,7 @@ class Predictor:
         camera = self.cameras[block.camera_id]
         keep = _inside(camera, uv, seeing.margin_px) & (q[:, 2] >= seeing.nearest_m) & (q[:, 2] <= seeing.farthest_m)
         if keep.any():
-            keep[keep] = grows_outwards(camera, self.lens(camera), q[keep])
+            keep[keep] = grows_outwards(camera, self.lens(camera, block.epoch_id), q[keep])
         if block.target_id is not None:
             keep &= self._facing(block, seeing)
         fewest = seeing.fewest_points if block.target_id is not None else 1

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 import gtsam
 import numpy as np
 
+from adjust.frames.lens_states import LensStates
 from adjust.frames.tables import table_motions
 from adjust.frames.unknowns import TableSlot, Unknowns, VectorMap, vector_map
 from adjust.lenses.models import MODELS, camera_constants
@@ -30,9 +31,8 @@ class State:
 
     def __init__(self, survey: Survey, unknowns: Unknowns) -> None:
         self.unknowns = unknowns
-        self.cameras = {c.camera_id: i for i, c in enumerate(survey.cameras)}
         self.targets = {t.target_id: i for i, t in enumerate(survey.targets)}
-        self.lens_maps = [unknowns.vectors[("lens", c.camera_id)] for c in survey.cameras]
+        self.lens_states = LensStates(survey, unknowns)
         self.warp_maps: list[VectorMap | None] = [unknowns.vectors.get(("warp", t.target_id)) for t in survey.targets]
         self.lenses = self._lens_arrays(survey)
         n = len(unknowns.slot_key)
@@ -59,23 +59,26 @@ class State:
         self._slots_by_key = np.array([s for s, _ in sorted(self._free_slots, key=lambda x: x[1])], dtype=np.int64)
 
     def _lens_arrays(self, survey: Survey) -> LensArrays:
-        n = len(survey.cameras)
+        states = self.lens_states
+        n = len(states.states)
+        cameras = [survey.cameras[s.camera] for s in states.states]
+        maps = [states.maps[s.camera] for s in states.states]
         integers = (np.zeros((n, MAX_LENS), dtype=np.int64), np.zeros((n, MAX_LENS), dtype=np.int64))
         arrays = LensArrays(
-            np.array([MODELS[c.lens.model].kind for c in survey.cameras], dtype=np.int64),
+            np.array([MODELS[c.lens.model].kind for c in cameras], dtype=np.int64),
             np.zeros((n, MAX_LENS)),
             np.zeros((n, 4)),
-            np.array([len(m.free) for m in self.lens_maps], dtype=np.int64),
+            np.array([len(m.free) for m in maps], dtype=np.int64),
             np.zeros(n, dtype=np.int64),
             *integers,
             np.zeros((n, MAX_LENS)),
         )
-        for i, camera in enumerate(survey.cameras):
+        for i, camera in enumerate(cameras):
             arrays.constants[i] = camera_constants(camera)
-            sources, columns = np.nonzero(self.lens_maps[i].matrix)
+            sources, columns = np.nonzero(maps[i].matrix)
             k = arrays.n_map[i] = len(sources)
             arrays.source[i, :k], arrays.column[i, :k] = sources, columns
-            arrays.factor[i, :k] = self.lens_maps[i].matrix[sources, columns]
+            arrays.factor[i, :k] = maps[i].matrix[sources, columns]
         return arrays
 
     def _warp_arrays(self, survey: Survey) -> WarpArrays:
@@ -138,8 +141,8 @@ class State:
             self.points[:] = x if len(x) == len(self.points) else [values.atPoint3(key) for key in self.point_rows]
 
     def _load_lenses(self, values: gtsam.Values) -> None:
-        for i, lens_map in enumerate(self.lens_maps):
-            full = lens_map.full(values)
+        for i in range(len(self.lens_states.states)):
+            full = self.lens_states.full(i, values)
             self.lenses.values[i, : full.size] = full
         for i, warp_map in enumerate(self.warp_maps):
             if warp_map is not None:

@@ -26,6 +26,7 @@ from adjust.observations.factors import (
     hold_factor,
     pair_factor,
     pose_prior_factor,
+    step_factor,
     vector_prior_factor,
 )
 from adjust.observations.geometry.building import GeometryFactors, position_refs
@@ -348,7 +349,7 @@ class GraphBuilder:
         survey = geometry.find_starts(state, at, values, start.vectors)
         first_pair = self._other_factors(state, at, pair_chains)
         self.others += geometry.factors(state, at, values)
-        self._priors()
+        self._priors(state)
         others = gtsam.NonlinearFactorGraph()
         for item in self.others:
             if item.used:
@@ -521,7 +522,7 @@ class GraphBuilder:
         self._other(factor, "pair", pair.group, (pair.pair_id, frame_text(pair.a), frame_text(pair.b)),
                     POSE_COMPONENTS[:n], POSE_UNITS[:n], observed, pair.used)  # fmt: skip
 
-    def _priors(self) -> None:
+    def _priors(self, state: State) -> None:
         u = self.unknowns
         for name, parameter in u.parameters.items():
             if parameter.treatment == "prior":
@@ -550,6 +551,10 @@ class GraphBuilder:
         owners += [(("surface", s.surface_id), s.parameters.prior) for s in self.survey.surfaces if s.parameters]
         owners += [(("vertical",), self.survey.vertical.tilt.prior)]
         owners += self.terrestrial.priors.items()
+        for name, before, sigmas in state.lens_states.priors:
+            change = u.vectors[name]
+            factor = step_factor(change, None if before is None else u.vectors[before], sigmas)
+            self._other(factor, "prior", "prior", name, change.names, change.units, np.zeros(len(sigmas)))
         for name, prior in owners:
             vector = u.vectors.get(name)
             if prior is not None and vector is not None and vector.key is not None:
@@ -613,6 +618,8 @@ class GraphBuilder:
             full = start.vectors[name]
         elif name in self.vector_starts:
             full = self.vector_starts[name]
+        elif name[0] == "lens_drift":
+            full = np.zeros(len(vector.names))
         elif name[0] in ("vertical", "instrument", "orientation", "centring"):
             full = full_start(name, self.survey)
         elif name[0] == "table_geometry":

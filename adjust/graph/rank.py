@@ -31,6 +31,7 @@ def readable(unknown: Unknown) -> str:
     kind, *ids = unknown.name
     owner = {
         "lens": "lens of camera {}",
+        "lens_drift": "change of the lens of camera {}",
         "station_from_camera": "pose of camera {} on its station",
         "mount_from_station": "pose of station {} on the table's mount",
         "world_from_station": "pose of station {}",

@@ -97,6 +97,22 @@ class VectorParameter:
 
 
 @dataclass(frozen=True, eq=False)
+class LensDrift:
+    """How parameters of a lens change: from one block of epochs to the next, or with the temperature.
+
+    parameters: k free ones of the lens. begins: epochs at which a new block begins, as the camera's images are ordered;
+    the first block has the lens itself, the others differences from it. step_sigmas: (k,) in the units of the model, of
+    a random walk from block to block; None: every block by itself. reference_temperature: degC; where it is given, the
+    parameters are linear in ``Survey.temperatures``, the lens holds there, and there are no blocks.
+    """
+
+    parameters: tuple[str, ...]
+    begins: tuple[str, ...] = ()
+    step_sigmas: FloatArray | None = None
+    reference_temperature: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class LensParameter:
     """The lens of a camera and how it is treated.
 
@@ -114,6 +130,7 @@ class LensParameter:
     ties: tuple[Tie, ...] = ()
     pixel_size_mm: float | None = None
     balance_radius_mm: float = 0.0
+    drift: LensDrift | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,8 +33,9 @@ struct Points {
     In<double, 2> X, uv;
 };
 struct Segments {
-    explicit Segments(Reader &r) : ptr(r), kind(r), link(r), table(r), start(r), n(r), place(r), factor(r) {}
-    Ints ptr, kind, link, table, start, n, place;
+    explicit Segments(Reader &r)
+        : ptr(r), kind(r), link(r), table(r), start(r), n(r), place(r), within(r), dim(r), factor(r) {}
+    Ints ptr, kind, link, table, start, n, place, within, dim;  // within: the first of its key's dim columns that it has
     In<double, 1> factor;  // of a lens or a warp: what the local unknown moves by one of its key
 };
 // Where the blocks stand: camera_from_target of each, and the warps: values, the extent of the target (least x and y, and
@@ -387,13 +388,13 @@ inline void serve(Ints which, const Blocks &blocks, const Lenses &lenses, const 
         half_cholesky(T, n);
         for (int j = 0; j < n; ++j) r_out(b, j) = T[j][n - 1];
         std::memset(flat.data + at[b], 0, sizeof(double) * n * width[b]);
-        const auto key = [&](int64_t s) { return flat.data + at[b] + n * S.place[s]; };
+        const auto key = [&](int64_t s) { return flat.data + at[b] + n * (S.place[s] - S.within[s]) + S.within[s]; };
         each_segment(S, b, nl,
             [&](int64_t s, int64_t first) {
                 double *o = key(s);
-                const int64_t k = S.n[s];
+                const int64_t k = S.n[s], dim = S.dim[s];
                 for (int j = 0; j < n; ++j)
-                    for (int64_t c = 0; c < k; ++c) o[j * k + c] += S.factor[s] * T[j][first + c];
+                    for (int64_t c = 0; c < k; ++c) o[j * dim + c] += S.factor[s] * T[j][first + c];
             },
             [&](int64_t s) {
                 double *o = key(s);

@@ -24,7 +24,7 @@ N_SHAPE = 4
 BLOCKS = "ptr[B+1] camera[B] warp_id[B] n_warp[B] warming[B]"
 LENSES = "kind[c] values[c,14] constants[c,4] n_free[c] n_map[c] source[c,14] column[c,14] factor[c,14]"
 WARPS = "warp[T,7] extent[T,4] of_warp[T,7]"
-SEGMENTS = "segment_ptr[B+1] segment_kind[S] link[S] table[S] start[S] n[S] place[S] factor[S]"
+SEGMENTS = "segment_ptr[B+1] segment_kind[S] link[S] table[S] start[S] n[S] place[S] within[S] dim[S] factor[S]"
 _BATCH = f"{BLOCKS} X[3,N] uv[2,N] W[3,N] {LENSES} R[B,3,3] t[B,3] {WARPS}"
 CHAINED = "C[*,6,6] D[*,6,*]"
 _evaluate_chains = Function(
@@ -95,8 +95,8 @@ class WarpArrays(NamedTuple):
 class SegmentArrays(NamedTuple):
     """How a block's condensed columns reach its keys: kind, link of the chain, table slot, start, width.
 
-    place: first column among those of all the block's keys. ptr: segments of every block. factor: what a local unknown
-    of a lens or a warp moves by one of its key.
+    place: first column among those of all the block's keys, within: among the dim ones of its own key. ptr: segments of
+    every block. factor: what a local unknown of a lens or a warp moves by one of its key.
     """
 
     ptr: IntArray
@@ -106,6 +106,8 @@ class SegmentArrays(NamedTuple):
     start: IntArray
     n: IntArray
     place: IntArray
+    within: IntArray
+    dim: IntArray
     factor: FloatArray
 
 

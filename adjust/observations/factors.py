@@ -228,6 +228,19 @@ def vector_prior_factor(prior: VectorPrior, vector: VectorMap) -> gtsam.Nonlinea
     return custom([key], prior.cov, residual)
 
 
+def step_factor(vector: VectorMap, before: VectorMap | None, sigmas: FloatArray) -> gtsam.NonlinearFactor:
+    """A step of a random walk: the vector less the one before it (zero where there is none), with sigmas (k,)."""
+    if vector.key is None or (before is not None and before.key is None):
+        raise ValueError("a step is between unknowns")
+    terms = [(vector.key, np.eye(len(sigmas)))]
+    terms += [] if before is None or before.key is None else [(before.key, -np.eye(len(sigmas)))]
+
+    def residual(values: gtsam.Values) -> tuple[FloatArray, Jacobians]:
+        return np.asarray(sum(J @ values.atVector(key) for key, J in terms)), terms
+
+    return custom([key for key, _ in terms], np.diag(sigmas**2), residual)
+
+
 def pose_prior_factor(parameter: PoseParameter, key: int) -> gtsam.NonlinearFactor:
     """Prior on a pose; components with an infinite variance carry none."""
     if parameter.value is None or parameter.prior_cov is None:

@@ -69,3 +69,16 @@ def significances(adjustment: Adjustment, estimate: Estimate, estimated_sigma0: 
         statistic, freedom, p = zero_test(values[at], factor * estimate.cov[np.ix_(at, at)], redundancy)
         out.append(Significance(term, tuple(names), statistic, freedom, p, p < level))
     return tuple(out)
+
+
+def significance_of_drift(adjustment: Adjustment, camera_id: str, estimated_sigma0: bool) -> Significance | None:
+    """Whether a lens changes at all: of all its changes together; None where none is estimated."""
+    found = [(n, e) for n, e in adjustment.estimates.items() if n[:2] == ("lens_drift", camera_id)]
+    if not found or adjustment.precision is None:
+        return None
+    x = np.concatenate([np.asarray(e.value, dtype=float) for _, e in found])
+    factor = adjustment.sigma0**2 if estimated_sigma0 else 1.0
+    cov = factor * np.asarray(adjustment.precision.joint([n for n, _ in found]))
+    level = LEVEL if adjustment.global_test is None else adjustment.global_test.alpha
+    statistic, freedom, p = zero_test(x, cov, adjustment.redundancy if estimated_sigma0 else None)
+    return Significance("lens_drift", found[0][1].components, statistic, freedom, p, p < level)

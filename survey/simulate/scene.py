@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from gtsam import Pose3
 
+from adjust.frames.lens_states import block_starts
 from adjust.model.boards import BOARD
 from adjust.model.observations import FrameRef, PositionRef
 from adjust.model.result import ParameterName
@@ -172,6 +173,23 @@ class Scene:
         """All of the survey's points, (n, 3) m, in its order."""
         return np.array([self.vector("point", p.point_id) for p in self.survey.points]).reshape(-1, 3)
 
+    def _lens(self, camera_id: str, epoch_id: str) -> dict[str, float]:
+        """The parameters of a lens as it was at an epoch."""
+        lens = dict(zip(BROWN, self.vector("lens", camera_id).tolist(), strict=True))
+        drift = self._cameras[camera_id].lens.drift
+        if drift is None:
+            return lens
+        name: ParameterName = ("lens_drift", camera_id)
+        factor, reference = 1.0, drift.reference_temperature
+        if reference is not None:
+            factor = self.survey.temperatures[epoch_id] - reference
+        else:
+            name = (*name, block_starts(self.survey, self._cameras[camera_id])[epoch_id] or "")
+        if name in self.truth:
+            for parameter, value in zip(drift.parameters, self.vector(*name).tolist(), strict=True):
+                lens[parameter] += factor * value
+        return lens
+
     def project(self, camera_id: str, epoch_id: str, x_in_world: FloatArray) -> FloatArray:
         """Image coordinates (n, 2) px by OpenCV, NaN where a point is behind the camera or far outside its field."""
         world_from_camera = self.world_from_camera(camera_id, epoch_id)
@@ -180,7 +198,7 @@ class Scene:
         uv = np.full((len(x), 2), np.nan)
         if not ahead.any():
             return uv
-        lens = dict(zip(BROWN, self.vector("lens", camera_id), strict=True))
+        lens = self._lens(camera_id, epoch_id)
         matrix = np.array([[lens["fx"], lens["skew"], lens["u0"]], [0.0, lens["fy"], lens["v0"]], [0.0, 0.0, 1.0]])
         distortion = np.array([lens[name] for name in _OPENCV_DISTORTION])
         # OpenCV ignores the skew of its camera matrix, so its part is added here from the normalized coordinates

@@ -14,7 +14,7 @@ from adjust.model.result import Adjustment, Estimate, GroupSummary, ImageResidua
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.precision import in_conditions
 from adjust.testing.distributions import norm
-from adjust.testing.significance import significances
+from adjust.testing.significance import Significance, significance_of_drift, significances
 from survey.project.detected import DetectedImage
 from survey.project.project import LeftOut
 from survey.solution.instruments import instrument_entries
@@ -244,6 +244,8 @@ def _cameras(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, An
         lens = adjustment.estimates.get(("lens", camera.camera_id))
         if lens is not None:
             entry["lens"] = _lens(lens, camera.lens.model, scale)
+        if camera.lens.drift is not None:
+            entry["lens_drift"] = _drift(adjustment, camera.camera_id, scale)
         entry |= pose(("station_from_camera", camera.camera_id), "station_from_camera")
         out[camera.camera_id] = entry | _images(adjustment, camera.camera_id, sums)
     return out
@@ -323,14 +325,23 @@ def _tables(adjustment: Adjustment, pose: PoseOf, scale: Scale) -> dict[str, Any
     return out
 
 
+def _drift(adjustment: Adjustment, camera_id: str, scale: Scale) -> dict[str, Any]:
+    """How a lens changes: by the epoch at which a block begins, or per kelvin; and whether it changes at all."""
+    found = {n: e for n, e in adjustment.estimates.items() if n[:2] == ("lens_drift", camera_id)}
+    test = significance_of_drift(adjustment, camera_id, scale.sigmas == "a_posteriori")
+    parts = {n[2] if len(n) > 2 else "per_kelvin": vector_entry(e, scale) for n, e in found.items()}
+    return {"changes": parts, "significance": {} if test is None else {test.term: _test(test)}}
+
+
+def _test(s: Significance) -> dict[str, Any]:
+    return {"components": list(s.components), "statistic": s.statistic, "freedom": list(s.freedom), "p_value": s.p,
+            "significant": s.significant}  # fmt: skip
+
+
 def _terms(adjustment: Adjustment, estimate: Estimate, scale: Scale) -> dict[str, Any]:
     """The components, and the tests of those that may be zero."""
     found = significances(adjustment, estimate, scale.sigmas == "a_posteriori")
-    tests = {
-        s.term: {"components": list(s.components), "statistic": s.statistic, "freedom": list(s.freedom), "p_value": s.p,
-                 "significant": s.significant}
-        for s in found
-    }  # fmt: skip
+    tests = {s.term: _test(s) for s in found}
     return vector_entry(estimate, scale) | ({"significance": tests} if tests else {})
 
 

@@ -72,7 +72,7 @@ def unit_for_people(component: str, unit: str) -> tuple[str, float]:
         return "ppm", 1e6
     if unit == "1/K":
         return "ppm_per_K", 1e6
-    return ("" if unit in ("1", "") else unit), 1.0
+    return ("" if unit in ("1", "") else unit.replace("/K", "_per_K")), 1.0
 
 
 def sigma_unit_for_people(unit: str, component: str = "") -> tuple[str, float]:

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adjust.adjustment import adjust
-from adjust.model.result import ParameterName
-from adjust.model.survey import FloatArray, Survey, VectorParameter
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import FloatArray, LensDrift, Survey, VectorParameter
 from adjust.model.tables import harmonic_names
 from adjust.testing.distributions import chi2
-from adjust.testing.significance import significances
+from adjust.testing.significance import Significance, significance_of_drift, significances
 from survey.simulate import Truth, head_on_table, resample, stereo
 
 
@@ -77,6 +77,34 @@ def table(name: str, term: str, harmonics: dict[str, int], values: dict[str, flo
     return Remedy(name, survey, truth | {key: true}, truth | {key: none}, key, term)
 
 
+def lens(name: str, changes: dict[str, FloatArray], drift: LensDrift) -> Remedy:
+    """A stereo rig whose second lens changes: at given epochs, or with the temperature."""
+    survey, truth = stereo(23, n_pairs=18)
+    epochs = list(dict.fromkeys(b.epoch_id for b in survey.image_blocks))
+    camera = survey.cameras[1]
+    changed = replace(camera, lens=replace(camera.lens, drift=drift))
+    survey = replace(survey, cameras=(survey.cameras[0], changed),
+                     temperatures={e: 18.0 + 0.4 * i for i, e in enumerate(epochs)})  # fmt: skip
+    keys: dict[ParameterName, FloatArray] = {
+        ("lens_drift", camera.camera_id, *([e] if e else [])): v for e, v in changes.items()}  # fmt: skip
+    none = {key: np.zeros(len(v)) for key, v in keys.items()}
+    return Remedy(name, survey, truth | keys, truth | none, next(iter(keys)), "lens_drift")
+
+
+def _estimated(result: Adjustment, remedy: Remedy, truth: Truth) -> tuple[FloatArray, FloatArray, Significance]:
+    """What was found less what is true, its covariance, and the test of the term."""
+    if remedy.term == "lens_drift":
+        names = [n for n in result.estimates if n[:2] == remedy.of[:2]]
+        d = np.concatenate([np.asarray(result.estimates[n].value) - np.asarray(truth[n]) for n in names])
+        test = significance_of_drift(result, remedy.of[1], estimated_sigma0=True)
+        assert test is not None
+        return d, np.asarray(result.precision.joint(names)), test
+    estimate = result.estimates[remedy.of]
+    test = next(s for s in significances(result, estimate, True) if s.term == remedy.term)
+    at = [estimate.components.index(c) for c in test.components]
+    return (np.asarray(estimate.value) - np.asarray(truth[remedy.of]))[at], estimate.cov[np.ix_(at, at)], test
+
+
 REMEDIES: dict[str, Callable[[], Remedy]] = {
     "board bent": lambda: board("board bent", "bend", {"warp_x": 3e-4, "warp_y": -2e-4, "warp_xy": 5e-5}),
     "board stretched": lambda: board("board stretched", "stretch", {"scale_y": 6e-4, "shear": -4e-4}),
@@ -86,6 +114,13 @@ REMEDIES: dict[str, Callable[[], Remedy]] = {
     ),
     "axis runs out": lambda: table(
         "axis runs out", "radial_2_order_-1", {"radial_2": 2}, {"radial_2_re_m1": 2e-4, "radial_2_im_m1": 1e-4}
+    ),
+    "lens by blocks": lambda: lens(
+        "lens by blocks", {"e07": np.array([3.0, 1.0, 0.0]), "e13": np.array([4.0, 1.0, -1.0])},
+        LensDrift(("fx", "u0", "v0"), ("e07", "e13")),
+    ),
+    "lens with temperature": lambda: lens(
+        "lens with temperature", {"": np.array([0.5, 0.1])}, LensDrift(("fx", "u0"), (), None, 20.0)
     ),
     "axis wobbles": lambda: table(
         "axis wobbles", "tilt_2_order_+2", {"tilt_2": 2, "axial_2": 1}, {"tilt_2_re_p2": 3e-4, "axial_2_cos_1": 1e-4}
@@ -99,15 +134,12 @@ def outcome(remedy: Remedy, repeats: int, seed: int = 1) -> Outcome:
     for i in range(repeats):
         for truth in (remedy.truth, remedy.innocent):
             result = adjust(resample(remedy.survey, truth, 1000 * seed + i))
-            estimate = result.estimates[remedy.of]
-            test = next(s for s in significances(result, estimate, True) if s.term == remedy.term)
+            d, cov, test = _estimated(result, remedy, truth)
             if truth is remedy.innocent:
                 false += test.significant
                 continue
-            at = [estimate.components.index(c) for c in test.components]
-            d = (np.asarray(estimate.value) - np.asarray(truth[remedy.of]))[at]
-            squares.append(float(d @ np.linalg.solve(estimate.cov[np.ix_(at, at)], d)))
-            found, k = found + test.significant, len(at)
+            squares.append(float(d @ np.linalg.solve(cov, d)))
+            found, k = found + test.significant, len(d)
     return Outcome(k, np.array(squares), found, false)
 
 

@@ -10,7 +10,7 @@ from scipy.linalg import qr
 from adjust.graph.datum import independent_rows
 from adjust.model.errors import IndeterminateError, SurveyError
 from adjust.model.observations import FrameRef, Pair
-from adjust.model.survey import Camera, Datum, Point, PoseParameter, Station, Survey, VectorParameter
+from adjust.model.survey import Camera, Datum, Point, PoseParameter, Station, Survey, Table, VectorParameter
 from adjust.precision.precision import Precision
 from survey.simulate import beacons, head_on_table, single_camera, stereo
 from survey.simulate.scene import Truth
@@ -118,8 +118,7 @@ def test_table_turned_about_one_axis_only() -> None:
     survey = Survey(
         cameras=(replace(base.cameras[0], lens=lens),),
         stations=(replace(base.stations[0], mount_from_station=held),),
-        tables=(replace(base.tables[0], geometry=replace(base.tables[0].geometry, values=np.zeros(4),
-                                                         free=("non_orthogonality", "axis_offset"))),),
+        tables=(Table("table"),),
         targets=(board,), image_blocks=tuple(blocks), table_readings=tuple(readings),
     )  # fmt: skip
     text = message(h.resample(survey, truth, 1), truth)

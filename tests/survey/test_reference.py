@@ -39,6 +39,7 @@ EVERYTHING: dict[str, Any] = {
         "X": {"station": "head", "image_size_px": [640, 480], "lens": {
             "model": "brown", "free": ["fx"], "values": {"fx": 1000, "fy": 1000, "u0": 320, "v0": 240},
             "prior": {"fx": {"value": 1000, "sigma": 1}}, "tie": {"fy": {"to": "fx"}},
+            "drift": {"parameters": ["fx"], "begins": ["e2"], "sigma": {"fx": 0.1}},
         }},
     },
     "targets": {
@@ -69,7 +70,9 @@ EVERYTHING: dict[str, Any] = {
 PLACES: dict[str, tuple[str, ...]] = {
     "root": (), "camera": ("cameras", "X"), "lens": ("cameras", "X", "lens"),
     "lens_values": ("cameras", "X", "lens", "values"), "lens_prior": ("cameras", "X", "lens", "prior", "fx"),
-    "lens_tie": ("cameras", "X", "lens", "tie", "fy"), "station": ("stations", "carried"),
+    "lens_tie": ("cameras", "X", "lens", "tie", "fy"),
+    "lens_drift": ("cameras", "X", "lens", "drift"), "lens_step": ("cameras", "X", "lens", "drift", "sigma"),
+    "station": ("stations", "carried"),
     "pose": ("stations", "head", "world_from_station"), "poses": ("stations", "head", "epochs"),
     "turntable": ("tables", "tt"), "turntable_geometry": ("tables", "tt", "geometry"),
     "turntable_sigma": ("tables", "tt", "geometry_sigma"),

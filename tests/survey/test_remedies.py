@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 import survey as labsurvey
+from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
 from adjust.model.errors import SurveyError
-from adjust.model.survey import TABLE_GEOMETRY, Survey, VectorParameter, VectorPrior
+from adjust.model.survey import TABLE_GEOMETRY, LensDrift, Survey, Table, VectorParameter, VectorPrior
 from adjust.model.tables import harmonic_names
+from survey.jobs.adjusting.trying import edited
 from survey.project import read, write_project
 from survey.report.page import report_html
 from survey.report.terminal import summary_text
-from survey.simulate import Truth, head_on_table, resample
+from survey.simulate import Truth, head_on_table, resample, stereo
 from tests.survey.test_files import differences
 
 WAVES = (*harmonic_names("angle", 1, 2), *harmonic_names("radial", 1, 1))
@@ -40,6 +42,55 @@ def uneven() -> tuple[Survey, Truth]:
                      ("warp", "board"): np.array([3e-4, 0.0, -4e-4, 23e-6])}  # fmt: skip
     made = resample(survey, truth, 1)
     return replace(made, tables=survey.tables, targets=survey.targets), truth  # priors at the values that are written
+
+
+DRIFTS = (
+    LensDrift(("fx", "v0"), ("e03", "e05")),
+    LensDrift(("fx", "v0"), ("e03",), np.array([0.5, 0.1])),
+    LensDrift(("u0",), (), None, 21.5),
+)
+
+
+def changing(drift: LensDrift) -> Survey:
+    survey, _ = stereo(3, n_pairs=8)
+    camera = survey.cameras[1]
+    return replace(survey, cameras=(survey.cameras[0], replace(camera, lens=replace(camera.lens, drift=drift))),
+                   temperatures={b.epoch_id: 15.0 + int(b.epoch_id[1:]) for b in survey.image_blocks})  # fmt: skip
+
+
+@pytest.mark.parametrize("drift", DRIFTS, ids=["blocks", "walk", "temperature"])
+def test_lenses_that_change_are_written_and_reported(tmp_path: Path, drift: LensDrift) -> None:
+    survey = changing(drift)
+    write_project(tmp_path, survey)
+    assert differences(read(tmp_path).survey.cameras[1].lens.drift, drift) == []
+    solution = labsurvey.adjust(tmp_path)
+    entry = solution.as_dict["cameras"]["right"]["lens_drift"]
+    assert set(entry["changes"]) == (set(drift.begins) or {"per_kelvin"})
+    unit = "px_per_K" if drift.reference_temperature is not None else "px"
+    for change in entry["changes"].values():
+        assert all(change[f"sigma_{name}_{unit}"] > 0.0 for name in drift.parameters)
+    assert not entry["significance"]["lens_drift"]["significant"]
+    page = report_html(solution.adjustment, solution.run)
+    assert ("Change per kelvin" if drift.reference_temperature is not None else "Change from epoch e03 on") in page
+    assert "lens drift" in summary_text(solution.adjustment, solution.run)
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ('drift = { parameters = ["k3"], begins = ["e03"] }', "unknown free parameter 'k3'"),
+        ('drift = { parameters = ["fx"] }', "name the epochs at which a new block begins"),
+        ('drift = { parameters = ["fx"], begins = ["e03"], with_temperature = true }', "has no blocks"),
+        ('drift = { parameters = ["fx"], begins = ["e03"], sigma = { u0 = 1 } }', "unknown key"),
+        ('drift = { parameters = [], begins = ["e03"] }', "names no parameter"),
+    ],
+)
+def test_changes_that_cannot_be_meant_are_refused(tmp_path: Path, table: str, said: str) -> None:
+    write_project(tmp_path, stereo(3, n_pairs=8)[0])
+    path = tmp_path / "survey.toml"
+    path.write_text(path.read_text().replace("[cameras.right.lens]", f"[cameras.right.lens]\n{table}"))
+    with pytest.raises(SurveyError, match=rf"survey\.toml:\d+: cameras\.right\.lens\.drift.*{said}"):
+        read(tmp_path)
 
 
 def test_a_project_says_what_deviates(tmp_path: Path) -> None:
@@ -111,3 +162,28 @@ def test_values_and_tests_reach_result_and_report(tmp_path: Path) -> None:
     text = summary_text(solution.adjustment, solution.run)
     assert "target board" in text
     assert "angle 2 order 1" in text
+
+
+def test_keys_of_remedies_are_written_where_they_belong(tmp_path: Path) -> None:
+    """Several keys of one table after each other; below the innermost header; not into a table in one line."""
+    survey, _ = stereo(3, n_pairs=8)
+    write_project(tmp_path, replace(survey, tables=(Table("turntable"),)))
+    path, chosen = tmp_path / "survey.toml", Hypothesis("", "", "", Place("", ()), survey)
+    for place, value in (
+        (("tables", "turntable", "harmonics", "angle_2"), 2),
+        (("tables", "turntable", "harmonics", "tilt_2"), 1),
+        (("cameras", "right", "lens", "drift", "parameters"), ("fx", "u0")),
+        (("cameras", "right", "lens", "drift", "begins"), ("e03",)),
+        (("targets", "board", "warp", "free"), ("scale_x",)),
+    ):
+        path.write_text(edited(tmp_path, SetKey(place, value), chosen)[2])
+    again = read(tmp_path).survey
+    assert set(again.tables[0].geometry.free) >= {"angle_2_sin_2", "tilt_2_im_m1"}
+    assert again.cameras[1].lens.drift is not None
+    assert again.cameras[1].lens.drift.parameters == ("fx", "u0")
+    assert again.targets[0].warp is not None
+    assert again.targets[0].warp.free == ("scale_x",)
+    path.write_text(path.read_text().replace("harmonics.angle_2 = 2", "harmonics = { angle_2 = 2 }"))
+    path.write_text(path.read_text().replace("harmonics.tilt_2 = 1\n", ""))
+    with pytest.raises(SurveyError, match=r"tables\.turntable\.harmonics\.tilt_2 has no place of its own there"):
+        edited(tmp_path, SetKey(("tables", "turntable", "harmonics", "tilt_2"), 1), chosen)

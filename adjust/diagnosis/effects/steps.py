@@ -10,7 +10,7 @@ from gtsam import Pose3
 from adjust.diagnosis.bodies.targets import motion_text
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.effects.effect import Effect
-from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place
+from adjust.diagnosis.hypothesis import Edit, Hypothesis, LeaveOut, Place, SetKey
 from adjust.diagnosis.prediction import Prediction, adjusted_values
 from adjust.diagnosis.score import Linear, Part, Score, drift_times
 from adjust.diagnosis.sequences import with_pairs
@@ -200,9 +200,14 @@ def _drift(case: Case, course: _Course, first: Score) -> Effect:
         by = ", ".join(f"{n} {t:+.2f} +- {s:.2f}" for n, t, s in zip(names, theta, sigmas, strict=False))
         return f"camera {thing}: its lens drifts from epoch {course.labels[0]} to {course.labels[-1]} by {by} px"
 
+    n, lens = len(course.labels), next((c.lens for c in case.survey.cameras if c.camera_id == thing), None)
+    edits = () if course.kind != "image" or lens is None or lens.drift is not None or n < 6 else (
+        SetKey(("cameras", thing, "lens", "drift", "parameters"), tuple(x for x in names if x in lens.free)),
+        SetKey(("cameras", thing, "lens", "drift", "begins"), (course.labels[n // 3], course.labels[2 * n // 3])),
+    )  # fmt: skip
     hypothesis = Hypothesis(
-        "lens drifts", "", "let the camera warm up, or adjust its lens by blocks of epochs", Place("camera", (thing,)),
-        case.survey, (), 1.0, 0,
+        "lens drifts", "", "let the camera warm up, or adjust its lens by blocks of epochs: lens.drift",
+        Place("camera", (thing,), "lens"), case.survey, edits, 1.0, 0,
     )  # fmt: skip
     return Effect(hypothesis, first, lambda linear: _at(linear, course, linear.drift),
                   lambda result, theta: _mended(case.survey, result, course, weights, theta), said)  # fmt: skip

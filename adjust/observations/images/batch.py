@@ -96,7 +96,7 @@ class ImageBatch:
         self.state = state
         self.chains = Chains(chains)
         self.ptr: IntArray = np.cumsum([0] + [len(b.uv) for b in blocks])
-        self.camera = np.array([state.cameras[b.camera_id] for b in blocks], dtype=np.int64)
+        self.camera = np.array([state.lens_states.of(b.camera_id, b.epoch_id) for b in blocks], dtype=np.int64)
         warped: dict[str | None, int] = {t: i for t, i in state.targets.items() if state.warp_maps[i] is not None}
         self.warp_id = np.array([warped.get(b.target_id, -1) for b in blocks], dtype=np.int64)
         n_free = [0 if m is None else len(m.free) for m in state.warp_maps]

@@ -30,13 +30,12 @@ class PointFactor:
         self.block, self.point = int(batch.block[k]), int(batch.point[k])
         self.camera = int(batch.camera_of[k])
         self.point_key = batch.point_key.get(self.point)
-        lens = batch.state.lens_maps[self.camera].key
-        keys = [] if lens is None else [lens]
+        self.lens = batch.state.lens_states.parts(self.camera)
+        keys = [part.key for part in self.lens]
         for slot in batch.chains.slots(self.block):
             keys += batch.unknowns.link_keys(slot)
         keys += [] if self.point_key is None else [self.point_key]
         self.keys = list(dict.fromkeys(keys))
-        self.lens_key = lens
 
     def residual(self, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
         """What GTSAM's custom factor returns: predicted minus observed (2,), whitened, and its derivatives by key."""
@@ -61,8 +60,8 @@ class PointFactor:
     def _by_keys(self, A: FloatArray, C: FloatArray) -> list[FloatArray]:
         b = self.batch
         out = {key: np.zeros((2, b.unknowns.by_key[key].dim)) for key in self.keys}
-        if self.lens_key is not None:
-            out[self.lens_key] += A[:, : int(b.state.lenses.n_free[self.camera])]
+        for p in self.lens:
+            out[p.key][:, p.within : p.within + p.n] += p.factor * A[:, p.first : p.first + p.n]
         by_pose = A[:, MAX_LENS : MAX_LENS + 6]
         for slot, by_link in zip(b.chains.slots(self.block), C, strict=True):
             for key, J in b.state.by_keys(slot, by_link):

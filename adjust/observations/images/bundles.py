@@ -74,7 +74,7 @@ class BundleBatch:
         idx = np.concatenate([b.point_idx for b in blocks])
         present, self._point_of_rows = np.unique(idx, return_inverse=True)
         self.point_ids = tuple(points[i] for i in present.tolist())
-        self.camera = np.array([state.cameras[b.camera_id] for b in blocks], dtype=np.int64)
+        self.camera = np.array([state.lens_states.of(b.camera_id, b.epoch_id) for b in blocks], dtype=np.int64)
         self.block_ptr: IntArray = np.cumsum([0] + [len(b.uv) for b in blocks])
         self._choose_interface(outside)
         self._sort_observations()
@@ -104,7 +104,8 @@ class BundleBatch:
         may_hide = [k for k in pose_keys if k not in outside and may_be_hidden(self.unknowns, k)]
         self.hidden_poses = may_hide[1:-1]
         hidden = set(self.hidden_poses)
-        lens_keys = [m.key for i, m in enumerate(self.state.lens_maps) if m.key is not None and i in set(self.camera)]
+        lenses = sorted(set(self.camera.tolist()))
+        lens_keys = list(dict.fromkeys(p.key for i in lenses for p in self.state.lens_states.parts(i)))
         if not lens_keys and not pose_keys and not self.tied:
             self.tied = sorted(key_of)[:1]
             self.reduced = [i for i in self.reduced if i not in self.tied]
@@ -196,17 +197,17 @@ class BundleBatch:
                     links.append(link)
                     if key in own:
                         own[key].append((b, link))
-        keys = {i: self.state.lens_maps[i].key for i in sorted(set(self.camera.tolist()))}
-        fixed = [(int(self.lens_at[i]), self.key_at[key], int(self.state.lenses.n_free[i]))
-                 for i, key in keys.items() if key is not None]  # fmt: skip
-        fixed += [(at, self.key_at[self.point_key[i]], 3) for i, at in self.tied_at.items()]
+        lenses, states = sorted(set(self.camera.tolist())), self.state.lens_states
+        fixed = [(int(self.lens_at[i]) + p.first, self.key_at[p.key] + p.within, p.n, p.factor)
+                 for i in lenses for p in states.parts(i)]  # fmt: skip
+        fixed += [(at, self.key_at[self.point_key[i]], 3, 1.0) for i, at in self.tied_at.items()]
         at = np.array(rows, dtype=np.int64)[:, None, None] + np.arange(6)[:, None]
         to = np.array(columns, dtype=np.int64)[:, None, None] + np.arange(6)
         every = np.zeros((len(links), 6, 6), dtype=np.int64)
         self._G_links = np.array(links, dtype=np.int64)
-        self._G_rows = np.concatenate([(at + every).ravel(), *(r + np.arange(n) for r, _, n in fixed)])
-        self._G_columns = np.concatenate([(to + every).ravel(), *(c + np.arange(n) for _, c, n in fixed)])
-        self._G_ones = np.ones(sum(n for _, _, n in fixed))
+        self._G_rows = np.concatenate([(at + every).ravel(), *(r + np.arange(n) for r, _, n, _ in fixed)])
+        self._G_columns = np.concatenate([(to + every).ravel(), *(c + np.arange(n) for _, c, n, _ in fixed)])
+        self._G_direct = np.repeat([f for *_, f in fixed], [n for _, _, n, _ in fixed])
         owners = [block for key in self.hidden_poses for block in own[key]]
         blocks_of = [b for b, _ in owners]
         per_block = np.bincount(np.array(rows, dtype=np.int64), minlength=self.n_local + 1)
@@ -221,7 +222,7 @@ class BundleBatch:
     def local_from_keys(self) -> sparse.csr_matrix:
         """Derivative (n_local, n_keys) of the local unknowns by the keys: lens and points direct, poses by chains."""
         r, c = [self._G_rows], [self._G_columns]
-        v = [self.chains.C[self._G_links].ravel(), self._G_ones]
+        v = [self.chains.C[self._G_links].ravel(), self._G_direct]
         for row, slot, link in self._table_links:
             for key, J in self.state.by_keys(slot, self.chains.C[link]):
                 r.append(np.repeat(row + np.arange(6), J.shape[1]))

@@ -109,7 +109,7 @@ class PoseReduction:
         starts = np.cumsum(widths) - widths
         self.arrays = ReductionArrays(
             block_ptr, order, col_ptr, ranges(starts[self._shared], shared_width),
-            of_key[self.batch.of_blocks.of_segment],
+            of_key[self.batch.of_blocks.of_segment] + self.batch.of_blocks.segments.within,
         )  # fmt: skip
         self.L = np.zeros((len(self.hidden), 6, 6))
         self.T = np.zeros(6 * (int(col_ptr[-1]) + len(self.hidden)))

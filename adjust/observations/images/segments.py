@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adjust.frames.state import State
-from adjust.model.survey import IntArray
+from adjust.model.survey import FloatArray, IntArray
 from adjust.native.images import SEGMENT_LENS, SEGMENT_POSE, SEGMENT_TABLE, SEGMENT_WARP, SegmentArrays
 
 
@@ -46,18 +46,24 @@ class BlockKeys:
     of_segment: IntArray
 
 
-def _sources(state: State) -> tuple[IntArray, IntArray]:
-    """Segments (n, 5) of all lenses, slots and warps: key, kind, table slot, start, width; where each's begin."""
+def _sources(state: State) -> tuple[IntArray, IntArray, FloatArray]:
+    """Segments (n, 6) of all lenses, slots and warps: key, kind, table slot, start, width, first column of the key.
+
+    Then where each's begin, and the factors (n,).
+    """
     unknowns = state.unknowns
-    rows: list[tuple[int | None, int, int, int, int]] = []
-    ptr = [0]
+    rows: list[tuple[int | None, int, int, int, int, int]] = []
+    ptr, factors = [0], {}
 
     def close(*found: tuple[int | None, int, int, int, int]) -> None:
-        rows.extend(row for row in found if row[0] is not None and row[-1] > 0)
+        rows.extend((*row, 0) for row in found if row[0] is not None and row[-1] > 0)
         ptr.append(len(rows))
 
-    for lens in state.lens_maps:
-        close((lens.key, SEGMENT_LENS, -1, 0, len(lens.free)))
+    for i in range(len(state.lens_states.states)):
+        for p in state.lens_states.parts(i):
+            factors[len(rows)] = p.factor
+            rows.append((p.key, SEGMENT_LENS, -1, p.first, p.n, p.within))
+        ptr.append(len(rows))
     for slot, key in enumerate(unknowns.slot_key):
         table = unknowns.table_slots.get(slot)
         if table is None:
@@ -68,13 +74,14 @@ def _sources(state: State) -> tuple[IntArray, IntArray]:
             close(angles, (geometry.key, SEGMENT_TABLE, d, k, len(geometry.free)))
     for warp in state.warp_maps:
         close((warp.key if warp is not None else None, SEGMENT_WARP, -1, 0, len(warp.free) if warp is not None else 0))
-    return np.array(rows, dtype=np.int64).reshape(-1, 5), np.array(ptr, dtype=np.int64)
+    every = np.array([factors.get(i, 1.0) for i in range(len(rows))])
+    return np.array(rows, dtype=np.int64).reshape(-1, 6), np.array(ptr, dtype=np.int64), every
 
 
 def block_keys(state: State, camera: IntArray, link_ptr: IntArray, slot: IntArray, warp: IntArray) -> BlockKeys:
     """Keys and segments of blocks with these cameras, chains (slots of all links by ``link_ptr``) and warps (or -1)."""
-    table, table_ptr = _sources(state)
-    n_cameras, n_links = len(state.lens_maps), np.diff(link_ptr)
+    table, table_ptr, factors = _sources(state)
+    n_cameras, n_links = len(state.lens_states.states), np.diff(link_ptr)
     count = n_links + 1 + (warp >= 0)
     end = np.cumsum(count)
     source, link = np.empty(int(count.sum()), dtype=np.int64), np.full(int(count.sum()), -1, dtype=np.int64)
@@ -86,20 +93,23 @@ def block_keys(state: State, camera: IntArray, link_ptr: IntArray, slot: IntArra
     each = np.diff(table_ptr)[source]
     rows = ranges(table_ptr[source], each)
     block = np.repeat(np.repeat(np.arange(len(camera)), count), each)
-    return _numbered(table[rows], block, np.repeat(link, each), len(camera))
+    dims = np.array([state.unknowns.by_key[key].dim for key in table[:, 0].tolist()], dtype=np.int64)
+    return _numbered(table[rows], dims[rows], factors[rows], block, np.repeat(link, each), len(camera))
 
 
-def _numbered(rows: IntArray, block: IntArray, link: IntArray, n_blocks: int) -> BlockKeys:
+def _numbered(
+    rows: IntArray, dims: IntArray, factors: FloatArray, block: IntArray, link: IntArray, n_blocks: int
+) -> BlockKeys:
     """Keys in the order in which each block meets them; the segments' links stand for poses and tables alone."""
-    key, kind, table, start, n = np.ascontiguousarray(rows.T)
+    key, kind, table, start, n, within = np.ascontiguousarray(rows.T)
     number = np.unique(key, return_inverse=True)[1]
     first, of_segment = first_seen(block * (len(rows) + 1) + number)
-    numbers, of_key, width = np.arange(n_blocks + 1), block[first], n[first]
+    numbers, of_key, width = np.arange(n_blocks + 1), block[first], dims[first]
     ptr = np.searchsorted(of_key, numbers).astype(np.int64)
     total = np.concatenate([[0], np.cumsum(width)])
     place = total[:-1] - total[ptr[of_key]]
     segments = SegmentArrays(
-        np.searchsorted(block, numbers).astype(np.int64), kind, link, table, start, n, place[of_segment],
-        np.ones(len(n)),
+        np.searchsorted(block, numbers).astype(np.int64), kind, link, table, start, n,
+        place[of_segment] + within, within, dims, factors,
     )
     return BlockKeys(ptr, key[first], of_key, width, place, np.diff(total[ptr]), segments, of_segment)

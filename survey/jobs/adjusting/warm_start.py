@@ -17,6 +17,7 @@ from adjust.model.errors import NotConvergedError
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.rewriting import Rewriting, Vector
 from adjust.model.survey import FloatArray, LensParameter, PointParameter, PoseParameter, Survey
+from adjust.model.tables import unit_of
 from adjust.pose_network.from_survey import network_from_survey, network_of_pairs
 from adjust.start import find_start
 from survey.jobs.adjusting.steps import adjust_project
@@ -101,7 +102,7 @@ def _known_vectors(survey: Survey, previous: Previous, start: StartValues) -> di
                 axes = tuple(f"axis{i + 1}" for i in range(len(table.axes)))
                 _take(out, name, previous.vector(name, axes, ("rad",) * len(axes)))
         geometry = table.geometry
-        units = tuple("m" if x == "axis_offset" else "rad" for x in geometry.names)
+        units = tuple(unit_of(x) for x in geometry.names)
         name = ("table_geometry", table.table_id)
         if name in start.vectors:
             _take(out, name, previous.vector(name, geometry.names, units), start.vectors[name],

@@ -125,7 +125,24 @@ DECLARATIONS: tuple[Declared, ...] = (
             Key("tie", "table", "parameters that are a multiple of another one", table="lens_tie"),
             Key("pixel_size_mm", "number", "needed by the models in mm", positive=True),
             Key("balance_radius_mm", "number", "model aicon: where the radial distortion is zero", 0.0),
+            Key("drift", "table", "parameters that change in the course of the session", table="lens_drift"),
         ),
+    ),
+    Declared(
+        "lens_drift", "cameras.ID.lens.drift", "Free parameters that change: by blocks of epochs, or with the "
+        "temperature (remedies.md).",
+        (
+            Key("parameters", "names", "which", REQUIRED),
+            Key("begins", "names", "epochs at which a block begins; the first block has the lens itself", default=[]),
+            Key("sigma", "table", "of a random walk from block to block; absent: every block by itself",
+                table="lens_step"),
+            Key("with_temperature", "flag", "in proportion to temperatures_degC, without blocks", False),
+            Key("reference_degC", "number", "the temperature at which the lens itself holds", 20.0),
+        ),
+    ),
+    Declared(
+        "lens_step", "cameras.ID.lens.drift.sigma", "Parameter = sigma of its change from one block to the next.",
+        free_keys=Key("PARAMETER", "number", "in the unit of the parameter", positive=True),
     ),
     Declared(
         "lens_values", "cameras.ID.lens.values", "Parameter = value, in px, mm or without unit as the model has it.",

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from adjust.lenses.models import MODELS
-from adjust.model.survey import FloatArray, LensParameter, Tie, VectorPrior
+from adjust.model.survey import FloatArray, LensDrift, LensParameter, Tie, VectorPrior
 from survey.folder.text import suggestion
 from survey.project.declared.declarations import keys_of
 from survey.project.declared.node import Node
@@ -32,7 +32,30 @@ def read_lens(node: Node) -> LensParameter:
     pixel_size_mm = node.number("pixel_size_mm", positive=True) if node.has("pixel_size_mm") else None
     if MODELS[model].in_mm and pixel_size_mm is None:
         raise node.error(f"pixel_size_mm is missing; the model {model} is in millimetres", "pixel_size_mm")
-    return LensParameter(model, free, values, _prior(node, names, free), ties, pixel_size_mm, _balance(node, model))
+    drift = _drift(node.table("drift"), free) if node.has("drift") else None
+    balance = _balance(node, model)
+    return LensParameter(model, free, values, _prior(node, names, free), ties, pixel_size_mm, balance, drift)
+
+
+def _drift(node: Node, free: tuple[str, ...]) -> LensDrift:
+    node.allow(*keys_of("lens_drift"))
+    parameters = node.references("parameters", free, "free parameter")
+    if not parameters:
+        raise node.error("names no parameter; give some of free, or remove the table", "parameters")
+    begins, steps = node.names("begins", ()), node.table("sigma")
+    reference = node.number("reference_degC", 20.0)
+    if node.flag("with_temperature", False):
+        if begins or steps.values:
+            raise node.error("a change with the temperature has no blocks; remove begins and sigma", "with_temperature")
+        return LensDrift(parameters, (), None, reference)
+    if not begins:
+        raise node.error("name the epochs at which a new block begins, or write with_temperature = true", "begins")
+    for name in steps.values:
+        if name not in parameters:
+            raise steps.error(f"unknown key; {suggestion(name, parameters)}", name)
+    if not steps.values:
+        return LensDrift(parameters, begins)
+    return LensDrift(parameters, begins, np.array([steps.number(name, positive=True) for name in parameters]))
 
 
 def _balance(node: Node, model: str) -> float:
@@ -128,4 +151,16 @@ def lens_to_toml(lens: LensParameter) -> dict[str, Any]:
         table["pixel_size_mm"] = lens.pixel_size_mm
     if lens.balance_radius_mm:
         table["balance_radius_mm"] = lens.balance_radius_mm
+    if lens.drift is not None:
+        table["drift"] = _drift_to_toml(lens.drift)
     return table
+
+
+def _drift_to_toml(drift: LensDrift) -> dict[str, Any]:
+    out: dict[str, Any] = {"parameters": list(drift.parameters)}
+    if drift.reference_temperature is not None:
+        return out | {"with_temperature": True, "reference_degC": drift.reference_temperature}
+    out["begins"] = list(drift.begins)
+    if drift.step_sigmas is not None:
+        out["sigma"] = dict(zip(drift.parameters, drift.step_sigmas.tolist(), strict=True))
+    return out

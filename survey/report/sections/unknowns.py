@@ -174,11 +174,21 @@ def _camera(camera_id: str, entry: dict[str, Any], residuals: charts.CameraResid
     facts += " · " + t("RMS residual {rms} px", rms=fixed(entry["rms_residual_px"], 3))
     lens = entry.get("lens")
     shown = Markup() if lens is None else vector_table(lens, lens["value_over_sigma"]) + _remarks(lens)
+    shown += _drift(entry["lens_drift"]) if "lens_drift" in entry else Markup()
     makers = (charts.vector_field, charts.mean_field, charts.histogram)
     drawn = [make(residuals) for make in makers] if len(residuals.uv) else []
     rows = [row[:1] + row[2:] for row in map(_pose_row, _poses(camera_id, entry))]
     poses = table(_POSE_COLUMNS[:1] + _POSE_COLUMNS[2:], rows) if rows else ""
     return part("camera", camera_id, facts, shown, drawn, poses, of="report.html")
+
+
+def _drift(entry: dict[str, Any]) -> Markup:
+    """How the lens changes: a table for every block, or of what it does per kelvin."""
+    changes = list(entry["changes"].items())
+    heads = [t("Change per kelvin") if name == "per_kelvin" else t("Change from epoch {name} on", name=name)
+             for name, _ in changes]  # fmt: skip
+    parts = [note(head) + vector_table(change) for head, (_, change) in zip(heads, changes, strict=True)]
+    return joined((*parts[:_MOST_BLOCKS], _more(len(parts) - _MOST_BLOCKS))) + _tests(entry["significance"])
 
 
 def _remarks(lens: dict[str, Any]) -> Markup:
