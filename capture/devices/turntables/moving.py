@@ -248,7 +248,7 @@ class MovingTable:
     def _spread(self, seen: deque[tuple[float, FloatArray]], now: float, span_s: float) -> FloatArray:
         """Spread (n,) of the readback over the last ``span_s``; infinite until they have passed.
 
-        Where a slow line or a busy machine leaves few readings in them, older ones count too: one alone spreads nothing.
+        Where a slow line or a busy machine leaves few readings in them, older ones count too: one alone has no spread.
         """
         if now - seen[0][0] < span_s or len(seen) < _LEAST:
             return np.full(len(self._axes), np.inf)
