@@ -53,7 +53,8 @@ def test_other_dictionary_print_and_mirror_image_are_told(target: Charuco | Mark
     found = other_markers(image, wrong)
     assert found is not None
     assert found.dictionary == target.dictionary.replace("_100", "_50")
-    assert not (found.inverted or found.mirrored)
+    assert not found.inverted
+    assert not found.mirrored
     for seen, inverted, mirrored in ((255 - image, True, False), (np.ascontiguousarray(image[:, ::-1]), False, True),
                                      (np.ascontiguousarray(255 - image[:, ::-1]), True, True)):  # fmt: skip
         found = other_markers(seen, target)
