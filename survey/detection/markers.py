@@ -71,10 +71,10 @@ def find_charuco(gray: Gray32, gray8: Gray8, target: Charuco) -> Detection:
     """The board's inner corners that are seen, part of the board being enough."""
     detector = cv2.aruco.CharucoDetector(charuco_board(target))
     coarse, factor = reduced(gray8, _COARSE_PX)
-    point_idx, start, n_markers = _board_corners(detector, coarse)
+    point_idx, start, n_markers = board_corners(detector, coarse)
     start = (start + 0.5) * factor - 0.5
     if coarse is not gray8 and len(point_idx) < len(target.points()[0]):
-        point_idx, start, n_markers = _board_corners(detector, gray8)
+        point_idx, start, n_markers = board_corners(detector, gray8)
     if (n := len(point_idx)) < 4:
         return nothing_found(f"{n} corners by {n_markers} markers ({target.dictionary}) found; at least 4 are needed")
     edges = _board_edges(target, point_idx, start)
@@ -86,7 +86,7 @@ def find_charuco(gray: Gray32, gray8: Gray8, target: Charuco) -> Detection:
     return _detection(point_idx, fit, (), "corners")
 
 
-def _board_corners(detector: cv2.aruco.CharucoDetector, gray8: Gray8) -> tuple[IntArray, FloatArray, int]:
+def board_corners(detector: cv2.aruco.CharucoDetector, gray8: Gray8) -> tuple[IntArray, FloatArray, int]:
     """Positions (n,) and places (n, 2) px of a board's corners, and how many of its markers were seen."""
     corners, ids, _, marker_ids = detector.detectBoard(gray8)
     n_markers = 0 if marker_ids is None else len(np.ravel(marker_ids))

@@ -189,7 +189,7 @@ def add_job(folder: Path, new: Path, *, out: Path | None = None, progress: bool 
 
 def _read_merged(merged: Merged, project: Project, folder: Path) -> Project:
     try:
-        return read_copy(merged.place, project, folder)
+        return replace(read_copy(merged.place, project, folder), files=merged.place, origins=merged.origins)
     except SurveyError as error:
         raise merged.translated(error) from error
 

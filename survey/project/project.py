@@ -1,7 +1,7 @@
 """What a project folder holds, as frozen values."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
@@ -255,7 +255,8 @@ class Project(Definition):
     in ``survey``, nor among the ``spots``. n_left_out: how many observations that are, each once. n_unused_in_files:
     those that only a table marks ``used = false``. detected: what is known of every image and its points. to_detect:
     images whose points are to be found anew. notes: exclusions that name nothing. image_notes: images that are new,
-    have changed or are gone.
+    have changed or are gone. files: where they are, if not in ``folder`` yet. origins: by file, the file and line from
+    which each of its lines was taken, in a project that was merged.
     """
 
     spots: tuple[SpotBlock, ...] = ()
@@ -267,6 +268,8 @@ class Project(Definition):
     to_detect: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
     image_notes: tuple[str, ...] = ()
+    files: Path | None = None
+    origins: Mapping[str, Sequence[tuple[Path, int]]] = field(default_factory=dict)
 
     @property
     def contents(self) -> list[tuple[str, str]]:

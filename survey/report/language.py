@@ -99,14 +99,22 @@ def group_name(name: str) -> str:
 
 
 def message(text: str) -> str:
-    """A message that the adjustment has made, translated where its pattern is known, else as it is."""
+    """A message that the adjustment has made, translated where its pattern is known, else as it is.
+
+    A part that a pattern has as ``(.+)`` is a message itself.
+    """
     for pattern, said in catalogue(_current.get()).messages:
         found = re.fullmatch(pattern, text, re.DOTALL)
         if found:
             numeric = re.findall(r"(?<!\\)\(([^()]*)\)", pattern)
             values = zip(found.groups(), numeric, strict=True)
-            return said.format(*(localised(x) if kind == r"[\d.]+" else x for x, kind in values))
+            return said.format(*(_part(x, kind) for x, kind in values))
     return text
+
+
+def _part(text: str, kind: str) -> str:
+    """A part of a message by its pattern: numbers and messages are said in the language, the rest is data."""
+    return localised(text) if kind == r"[\d.]+" else message(text) if kind == ".+" else text
 
 
 def localised(number: str) -> str:

@@ -1,8 +1,8 @@
 """Real measurements, and surveys simulated by other code, with one thing wrong: what does ``labsurvey adjust`` name?
 
 ``python -m tests.acceptance.real_cases RESULTS`` runs what RESULTS (a file of lines) does not have yet, and prints the
-table: named first, among three, refused (naming the right set-up, not the cause), another, silent; of what is right:
-passes.
+table: named first, among three, later, refused (naming the right set-up, not the cause), another, silent; of what is
+right: passes.
 ``--again NAME`` runs what is known once more, ``--only NAME`` nothing else.
 """
 
@@ -134,7 +134,7 @@ def outcome_of(case: Case, code: int, said: Sequence[str]) -> str:
         return "refused"
     if at is None:
         return "another" if causes or code == 1 else "silent"
-    return "first" if at == 0 else "among three" if at < 3 else "refused" if code == 1 else "another"
+    return "first" if at == 0 else "among three" if at < 3 else "later"
 
 
 def run(results: Path, again: Sequence[str], only: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""Two epochs not congruent for another reason than motions: planted names, units, scales, hands, datums are named."""
+"""Two epochs that are not congruent: planted names, units, scales, hands, datums are named, motions are not blamed."""
 
 import json
 from collections.abc import Callable

@@ -34,6 +34,8 @@ NO_READERS = {
     "survey/report/page.py:_by_browser": "a PDF that was just printed",
     "survey/report/language.py:catalogue": "the program's own words",
     "survey/jobs/adjusting/edits.py:_table": "a table of a project that was read and diagnosed before",
+    "survey/project/declared/editing.py:with_product": "the text of survey.toml, read before",
+    "survey/project/declared/editing.py:_with_change": "the text of survey.toml, read before",
     "survey/project/declared/editing.py:with_sigma_scale": "the text of survey.toml, read before",
     "survey/project/declared/editing.py:with_datum": "the text of survey.toml, read before",
     "survey/project/declared/editing.py:with_treatment": "the text of survey.toml, read before",

@@ -414,6 +414,26 @@ def test_surveys_with_more_than_pairs_grow_from_their_last_solution(tmp_path, ca
         np.testing.assert_allclose(entry["world_from_station"]["translation_mm"], expected, atol=1e-7)
 
 
+def test_what_is_wrong_in_what_is_added_is_named_with_its_own_line(tmp_path, capsys):
+    """A new pair given the other way round: the line is that of the folder that holds what is new."""
+    survey, _ = _network(6, combinations(range(6), 2), 1.0)
+    old = [p for p in survey.pairs if p.b.frame_id != "S5"]
+    later = [p for p in survey.pairs if p.b.frame_id == "S5"]
+    later[2] = replace(later[2], b_from_a=later[2].b_from_a.inverse())
+    write_project(tmp_path / "lab", replace(survey, stations=survey.stations[:5], pairs=tuple(old)))
+    assert main(["adjust", str(tmp_path / "lab"), "--quiet"]) == 0
+    write_project(tmp_path / "more", Survey(stations=survey.stations, pairs=tuple(later)))
+    (tmp_path / "more" / "survey.toml").write_text("format = 1\n[stations.S5]\n")
+    table = tmp_path / "more" / "observations" / "pairs.csv"
+    line = next(i for i, row in enumerate(table.read_text().splitlines(), 1) if row.startswith(later[2].pair_id))
+    capsys.readouterr()
+    main(["add", str(tmp_path / "lab"), str(tmp_path / "more"), "--quiet"])
+    found = json.loads((tmp_path / "lab" / "results" / "solution.json").read_text())
+    assert found["warnings"][0].startswith(f"probable cause: pair {later[2].pair_id}: its values are a_from_b")
+    assert found["diagnosis"][0]["where"] == f"{table}:{line}"
+    assert main(["adjust", str(tmp_path / "lab"), "--quiet", "--try", "1"]) == 0
+
+
 def test_tables_with_other_columns_are_merged_under_one_header(tmp_path):
     survey, _ = _network(3, [(0, 1), (1, 2)])
     write_project(tmp_path / "lab", survey)

@@ -13,7 +13,7 @@ from gtsam import Pose3
 from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis, Place
 from adjust.diagnosis.sequences import Link, fitted, links
-from adjust.model.survey import PoseParameter, Station, Survey
+from adjust.model.survey import Camera, PoseParameter, Station, Survey
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import norm
 
@@ -47,6 +47,7 @@ def unsynchronised(case: Case) -> Iterator[Hypothesis]:
     alone, n_epochs = apart(case.survey, cameras[1:])
     if alone is None:
         return
+    alone = _with_own_lenses(alone, case, cameras)
     said = ", ".join(
         f"{o.camera_id} after {o.reference_id} by {o.intervals:+.2f} +- {o.sigma:.2f} intervals" for o in clear[:4]
     )
@@ -105,6 +106,15 @@ def apart(survey: Survey, cameras: tuple[str, ...]) -> tuple[Survey | None, int]
     bodies = tuple(Station(_own("body", c), world_from_station=_held()) for c in chosen)
     added = {b.epoch_id for b in blocks} - {b.epoch_id for b in survey.image_blocks}
     return replace(survey, cameras=new, image_blocks=blocks, stations=survey.stations + bodies), len(added)
+
+
+def _with_own_lenses(survey: Survey, case: Case, cameras: tuple[str, ...]) -> Survey:
+    """Each of these cameras with the lens that its own images give: alone, its focal length and poses wander."""
+    def own(c: Camera) -> Camera:
+        known = c.camera_id in cameras and c.camera_id in case.lenses
+        return replace(c, lens=replace(c.lens, values=case.lenses[c.camera_id], free=(), prior=None)) if known else c
+
+    return replace(survey, cameras=tuple(own(c) for c in survey.cameras))
 
 
 def _own(name: str, camera_id: str) -> str:

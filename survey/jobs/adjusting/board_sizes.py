@@ -1,4 +1,4 @@
-"""Boards that the images show in another size than ``survey.toml`` says, told once for each board."""
+"""Targets that the images show otherwise than ``survey.toml`` says: size, dictionary, print; told once for each."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from survey.project import Definition
-from survey.project.targets import Checkerboard
+from survey.project.targets import Charuco, Checkerboard, MarkerBlock, MarkerGrid
 
 if TYPE_CHECKING:  # brings in OpenCV
     from survey.detection import ImageReport
+    from survey.detection.other_markers import OtherMarkers
 
 _LOOKED_AT = 3  # images in which a board of another size is looked for where the one wanted is in none
 
@@ -32,7 +33,43 @@ def wrong_sizes(folder: Path, definition: Definition, reports: "Sequence[ImageRe
                 f"the images show a board of {columns} x {rows} inner corners; set columns = {columns}, rows = {rows} "
                 "(inner corners are counted, not squares)"
             )
+    return told | _other_markers(folder, definition, reports)
+
+
+def _other_markers(folder: Path, definition: Definition, reports: "Sequence[ImageReport]") -> dict[str, str]:
+    """Of targets with markers that were found in no image: what is in the images instead."""
+    told = {}
+    for target_id, kind in definition.target_kinds.items():
+        if not isinstance(kind, Charuco | MarkerGrid | MarkerBlock):
+            continue
+        mine = [r for r in reports if target_id in r.detections and r.status != "failed"]
+        if not mine or any(len(r.detections[target_id]) for r in mine):
+            continue
+        from survey.detection.gray import for_finding, gray_values, read_image
+        from survey.detection.other_markers import other_markers
+
+        some = mine[:: max(1, len(mine) // _LOOKED_AT)][:_LOOKED_AT]
+        seen = [o for r in some if (o := other_markers(for_finding(gray_values(read_image(r.path))), kind)) is not None]
+        if seen:
+            best = max(seen, key=lambda o: o.n)
+            told[target_id] = f"{folder}/survey.toml: [targets.{target_id}] {_said(kind.dictionary, best)}"
     return told
+
+
+def _said(declared: str, seen: "OtherMarkers") -> str:
+    if seen.legacy is not None:
+        return (f"begins with the other colour in the images (a board of {'before' if seen.legacy else 'after'} OpenCV "
+                f"4.6); set legacy = {str(seen.legacy).lower()}")  # fmt: skip
+    other = seen.dictionary != declared.upper().removeprefix("DICT_")
+    parts = [f'says dictionary = "{declared}", but the images show markers of {seen.dictionary}; set dictionary = '
+             f'"{seen.dictionary}"'] if other else []  # fmt: skip
+    if seen.inverted:
+        parts.append("is printed with black and white exchanged: its markers are found in the negative; print it anew, "
+                     "or invert the images")  # fmt: skip
+    if seen.mirrored:
+        parts.append("is mirrored in the images: its markers are found in the mirror image; mirror the images back, or "
+                     "print it anew")  # fmt: skip
+    return "; and ".join(parts)
 
 
 def _as_declared(size: tuple[int, int], board: Checkerboard) -> tuple[int, int]:

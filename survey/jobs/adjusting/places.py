@@ -1,9 +1,10 @@
 """The line of a project that a cause is about: where its change would be made, else where the thing stands."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from adjust.diagnosis.hypothesis import ChangeReadings, Edit, Hypothesis, LeaveO
 from survey.folder.text import decode, read_bytes
 from survey.project.declared.editing import LENGTHS
 from survey.project.declared.toml_text import key_lines
-from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER
+from survey.project.project import DEFINITION_FILE, OBSERVATIONS_FOLDER, Project
 from survey.project.reading import LAYOUTS
 from survey.project.tables.files import read_table
 from survey.project.tables.reading import Table
@@ -34,9 +35,9 @@ _IN_TABLES = ("epoch", "to_id", "target_height_m", "value", "sigma", "u_px", "ax
 _WHOLE = {"reading": "terrestrial", "pair": "pairs", "setup": "terrestrial"}
 
 
-def located(found: Diagnosis, folder: Path) -> Diagnosis:
+def located(found: Diagnosis, project: Project) -> Diagnosis:
     """The diagnosis with the place in the project's files beside every candidate."""
-    files = _Files(Path(folder))
+    files = _Files(project.files or project.folder, project.origins)
     candidates = tuple(replace(c, where=files.of(c.hypothesis)) for c in found.candidates)
     return replace(found, candidates=candidates)
 
@@ -44,8 +45,8 @@ def located(found: Diagnosis, folder: Path) -> Diagnosis:
 class _Files:
     """The files of a project, each read when it is first asked for."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, origins: Mapping[str, Sequence[tuple[Path, int]]] = MappingProxyType({})) -> None:
+        self.folder, self.origins = folder, origins
         self._tables: dict[str, Table | None] = {}
 
     @cached_property
@@ -88,7 +89,12 @@ class _Files:
         place: tuple[str | int, ...] = known[0] if known else tuple(map(str, above))
         while place and place not in self.keys:
             place = place[:-1]
-        return f"{DEFINITION_FILE}:{self.keys[place]}" if place else DEFINITION_FILE
+        return self._at(DEFINITION_FILE, self.keys[place]) if place else DEFINITION_FILE
+
+    def _at(self, name: str, line: int) -> str:
+        """``file:line``, of a merged project as its owner knows it."""
+        of = self.origins.get(name, ())
+        return f"{of[line - 1][0]}:{of[line - 1][1]}" if line <= len(of) else f"{name}:{line}"
 
     def rows(self, name: str, wanted: Wanted) -> str:
         """The first row of a table where every column has one of the values wanted, and how many there are."""
@@ -104,7 +110,7 @@ class _Files:
             mask &= np.array([fits(n) for n in text.names], dtype=np.bool_)[text.codes]
         if not mask.any():
             return ""
-        n, at = int(mask.sum()), f"{OBSERVATIONS_FOLDER}/{table.path.name}:{table.lines[int(mask.argmax())]}"
+        n, at = int(mask.sum()), self._at(f"{OBSERVATIONS_FOLDER}/{table.path.name}", int(table.lines[mask.argmax()]))
         return f"{at} and {n - 1} more rows" if n > 1 else at
 
     def _numbered(self, ids: Collection[str]) -> str:
@@ -113,7 +119,7 @@ class _Files:
         if table is None or not number.isdecimal() or not 0 < int(number) <= len(table):
             return ""
         more = f" and {len(ids) - 1} more rows" if len(ids) > 1 else ""
-        return f"{OBSERVATIONS_FOLDER}/{table.path.name}:{table.lines[int(number) - 1]}{more}"
+        return self._at(f"{OBSERVATIONS_FOLDER}/{table.path.name}", int(table.lines[int(number) - 1])) + more
 
     def _of_place(self, place: Place) -> str:
         in_table = place.key in _IN_TABLES or (place.key == "" and bool(place.epochs))

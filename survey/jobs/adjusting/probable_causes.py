@@ -3,12 +3,12 @@
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from adjust.model.errors import DiagnosedError, IndeterminateError, NotConvergedError, SurveyError
 from adjust.model.result import Adjustment
 from adjust.model.survey import Survey
+from survey.project import Project
 
 if TYPE_CHECKING:
     from adjust.diagnosis.diagnosis import Diagnosis
@@ -18,10 +18,13 @@ _LARGE = 1.15
 """sigma0 from which a mistake is looked for by trial; below, sigmas that are a little small explain as much."""
 
 
-def explained(survey: Survey, error: SurveyError, folder: Path) -> SurveyError:
-    """What an adjustment of the ``survey`` of a folder raised, with the probable causes in front, if any."""
+def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyError:
+    """What an adjustment of the ``survey`` of a project raised, with the probable causes in front, if any."""
     apart, contradictions = separate_epochs(survey), _probable_causes(survey)
-    diagnosis = _located(_diagnosis(survey, None, error, contradictions), folder)
+    diagnosis = _located(_diagnosis(survey, None, error, contradictions), project)
+    if diagnosis is not None and project.origins:  # of a project that has not grown there is nothing to try
+        done = (replace(c, hypothesis=replace(c.hypothesis, edits=())) for c in diagnosis.candidates)
+        diagnosis = replace(diagnosis, candidates=tuple(done))
     tried = diagnosis.lines if diagnosis is not None else ()
     if not apart and not contradictions and not tried:
         return error
@@ -31,8 +34,8 @@ def explained(survey: Survey, error: SurveyError, folder: Path) -> SurveyError:
     return SurveyError(message) if diagnosis is None else DiagnosedError(message, diagnosis)
 
 
-def with_probable_causes(survey: Survey, result: Adjustment, folder: Path) -> Adjustment:
-    """The adjustment of the ``survey`` of a folder; its first warnings are the probable causes of what contradicts."""
+def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -> Adjustment:
+    """The adjustment of the ``survey`` of a project; its first warnings are the probable causes of what contradicts."""
     warnings: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     if survey.tables:
@@ -43,11 +46,11 @@ def with_probable_causes(survey: Survey, result: Adjustment, folder: Path) -> Ad
         # what does not fit may have spoilt the lenses too: then those that the images alone give
         causes = _probable_causes(survey, result) or _probable_causes(survey)
         if not warnings:
-            diagnosis = _located(_diagnosis(survey, result, None, causes), folder)
+            diagnosis = _located(_diagnosis(survey, result, None, causes), project)
             warnings = diagnosis.lines if diagnosis is not None else ()
         warnings += tuple(c for c in causes if c not in warnings)
     if diagnosis is None and not warnings:
-        diagnosis = _located(_misread(survey, result), folder)
+        diagnosis = _located(_misread(survey, result), project)
         warnings = diagnosis.lines if diagnosis is not None else ()
     lines = tuple(f"probable cause: {c}" for c in warnings)
     return replace(result, warnings=lines + result.warnings, diagnosis=diagnosis)
@@ -84,12 +87,12 @@ def _misread(survey: Survey, result: Adjustment) -> "Diagnosis | None":
     return Diagnosis(found, names, misfit_of(result, survey)) if found else None
 
 
-def _located(found: "Diagnosis | None", folder: Path) -> "Diagnosis | None":
+def _located(found: "Diagnosis | None", project: Project) -> "Diagnosis | None":
     if found is None:
         return None
     from survey.jobs.adjusting.places import located  # here: as above
 
-    return located(found, folder)
+    return located(found, project)
 
 
 def _consequence(error: SurveyError) -> str:

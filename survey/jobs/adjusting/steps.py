@@ -108,7 +108,7 @@ def _adjusted(work: Work) -> Work:
             work.survey, lambda part: adjust_cleaned(part, how, work.progress, work.begin(part))
         )
     except SurveyError as error:
-        said = explained(work.survey, error, work.project.folder)
+        said = explained(work.survey, error, work.project)
         if said is error:
             raise
         raise said from error
@@ -116,7 +116,7 @@ def _adjusted(work: Work) -> Work:
 
 
 def _causes_named(work: Work) -> Work:
-    return replace(work, adjustment=with_probable_causes(work.survey, _result(work), work.project.folder))
+    return replace(work, adjustment=with_probable_causes(work.survey, _result(work), work.project))
 
 
 STEPS = (

@@ -220,9 +220,9 @@ def _calibrated(project: Project, station: str, without: Sequence[str], there: P
     if found is not None:
         return found
     try:
-        adjustment = with_probable_causes(survey, adjust(survey, options=options), project.folder)
+        adjustment = with_probable_causes(survey, adjust(survey, options=options), project)
     except SurveyError as error:
-        said = explained(survey, error, project.folder)
+        said = explained(survey, error, project)
         if said is error:
             raise
         raise said from error
