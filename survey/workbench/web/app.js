@@ -131,7 +131,7 @@ async function renew(answer) {
   const state = stateOf(raw);
   const fresh = !bench.state || bench.state.version !== state.version || bench.state.folder !== state.folder || (state.failure ?? "") !== (bench.state.failure ?? "");
   if (fresh) {
-    const [columns, readings, findings] = await Promise.all([points(), get("readings"), get("findings")]);
+    const [columns, readings, findings] = await Promise.all([points(bench.state?.folder === state.folder ? bench.points : null), get("readings"), get("findings")]);
     Object.assign(bench, { state, points: columns, readings: readingsOf(readings), limit: readings.limit, findings: findingsOf(findings, raw), sizes: sizesOf(raw), leftOut: leftOut(columns) });
     if (!state.solved) Object.assign(bench, { parameters: [], scene: null, shifts: new Map() });
     state.changes = answer?.changes ?? (state.solved ? (await get("changes")).changes : null);
