@@ -31,7 +31,7 @@ _COMMANDS = (
 )  # fmt: skip
 _SHIPPED = (
     *("adjust/py.typed", "survey/py.typed", "capture/py.typed"),
-    *("survey/report/style.css", "survey/report/web/report.js"),
+    *("survey/report/style.css", "survey/report/web/report.js", "survey/report/web/de.json"),
     *("capture/web/page.html", "capture/devices/turntables/dialects/two-axis.toml"),
     *("survey/report/templates/parts.html", "survey/report/catalogues/de.toml"),
 )

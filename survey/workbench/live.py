@@ -19,6 +19,7 @@ class Live:
     def __init__(self) -> None:
         self._queues: set[asyncio.Queue[dict[str, Any] | None]] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
+        self.joined = asyncio.Event()
 
     def begin(self) -> None:
         """Belong to the loop that runs."""
@@ -38,6 +39,7 @@ class Live:
         await page.accept()
         queue: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
         self._queues.add(queue)
+        self.joined.set()
         gone = asyncio.create_task(_until_gone(page))
         try:
             while not gone.done():

@@ -38,6 +38,7 @@ from survey.workbench.situation import (
 
 Watch = Callable[[int, float], None]
 _UNREAD = object()
+_MOST_KEPT = 300_000  # image points: of more only the verdict is taken from the results, to be there at once
 
 
 class Resident:
@@ -49,9 +50,11 @@ class Resident:
     def __init__(self, folder: str | Path, *, read_only: bool = False, watch: Watch | None = None) -> None:
         self.folder, self.read_only, self.watch = Path(folder), read_only, watch
         self.version = 0
+        self.layout = 0  # counts changes of which image points there are, and in which order
         self.changes: Changes | None = None
         self.failure: SurveyError | None = None
         self._values, self._lock, self._cancel = KnownValues(), threading.RLock(), threading.Event()
+        self._joining = threading.Lock()
         self._statistics: tuple[int, Statistics] | None = None
         self._rows: tuple[Situation, PointRows] | None = None
         self._kept: object = _UNREAD
@@ -79,12 +82,13 @@ class Resident:
     @property
     def rows(self) -> PointRows:
         """All image points with the solution, also while the next one is adjusted."""
-        kept, now = self._rows, self.situation
-        if kept is None or kept[0] is not now:
-            made = point_rows(now.survey, now.now, now.adjustment)
-            kept = now, made if self.kept is None else with_kept(made, now)
-            self._rows = kept
-        return kept[1]
+        with self._joining:
+            kept, now = self._rows, self.situation
+            if kept is None or kept[0] is not now:
+                made = point_rows(now.survey, now.now, now.adjustment)
+                kept = now, made if self.kept is None or len(made.test) > _MOST_KEPT else with_kept(made, now)
+                self._rows = kept
+            return kept[1]
 
     @property
     def kept(self) -> Kept | None:
@@ -157,7 +161,10 @@ class Resident:
         self._cancel.set()
 
     def _take(self, new: Situation, failure: SurveyError | None = None) -> Changes | None:
-        before, after, self.situation = self.situation.adjustment, new.adjustment, new
+        old, before, after = self.situation, self.situation.adjustment, new.adjustment
+        same = new.everything.survey is old.everything.survey and new.identified is old.identified
+        self.layout += not same
+        self.situation = new
         self.version, self.failure, self.changes = self.version + 1, failure, None
         if after is not None:
             self._values.keep(after)

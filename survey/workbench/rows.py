@@ -24,6 +24,7 @@ from survey.workbench.places import refs_of
 IN_USE, BY_FILE, BY_PEOPLE, BY_THIS_RUN = 0, 1, 2, 3
 """Why an image point takes no part: it does, a table says used = false, exclusions.csv does, this run left it out."""
 _Key = tuple[str, str, str | None]
+_MOST_SIGMAS = 300_000  # rows: a page of more does without the sigmas of places
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,37 +129,52 @@ def _key(block: ImageBlock) -> _Key:
     return block.camera_id, block.epoch_id, block.target_id
 
 
-def columns(rows: PointRows, limit: float, version: int, chosen: IntArray | None = None) -> bytes:
+def columns(
+    rows: PointRows, limit: float, version: int, chosen: IntArray | None = None, layout: int = 0, whole: bool = True
+) -> bytes:
     """Image points for a page: length of the header (u4), the header (JSON), then the columns it lists, little-endian.
 
-    limit: of |w|, the square root of the chi-square test's. chosen: these rows only.
+    limit: of |w|, the square root of the chi-square test's. chosen: these rows only. layout: of which rows there are in
+    which order; a page that knows it needs no more than what a solution says of them (not ``whole``).
     """
-    blocks, sizes = rows.survey.image_blocks, np.diff(rows.ptr)
-    every = np.arange(int(rows.ptr[-1])) if chosen is None else chosen
-    block = np.repeat(np.arange(len(blocks), dtype=np.uint32), sizes)
-    point = np.concatenate([*(b.point_idx for b in blocks), np.zeros(0, dtype=np.int64)])
-    uv = np.concatenate([*(b.uv for b in blocks), np.zeros((0, 2))])
-    sigma = np.sqrt(np.concatenate([*(np.einsum("nii->ni", b.cov) for b in blocks), np.zeros((0, 2))]))
+    every = slice(None) if chosen is None else chosen
     with np.errstate(invalid="ignore"):
-        w = np.sqrt(rows.test)
-    arrays: dict[str, npt.NDArray[Any]] = {
-        "block": block, "point": point.astype("<u4"), "u": uv[:, 0], "v": uv[:, 1], "du": rows.residuals[:, 0],
-        "dv": rows.residuals[:, 1], "w": w, "sigma_u": sigma[:, 0], "sigma_v": sigma[:, 1],
-        "redundancy": rows.redundancy.mean(axis=1), "used": rows.used.astype(np.uint8), "why": rows.why,
-    }  # fmt: skip
+        arrays: dict[str, npt.NDArray[Any]] = {
+            "du": rows.residuals[:, 0], "dv": rows.residuals[:, 1], "w": np.sqrt(rows.test),
+            "redundancy": rows.redundancy.mean(axis=1), "used": rows.used.astype(np.uint8), "why": rows.why,
+        }  # fmt: skip
+    header: dict[str, Any] = {"version": version, "limit": limit, "layout": layout, "whole": whole}
+    if whole:
+        said, seen = _seen(rows)
+        header, arrays = header | said, seen | arrays
     typed = {k: a[every].astype("<f4" if a.dtype.kind == "f" else a.dtype, copy=False) for k, a in arrays.items()}
-    seen = {b.target_id for b in blocks}
-    header = {
-        "version": version, "n": len(every), "limit": limit,
-        "rows": None if chosen is None else chosen.tolist(),
+    header |= {
+        "n": len(typed["w"]), "rows": None if chosen is None else chosen.tolist(),
         "columns": [{"name": k, "type": a.dtype.str.lstrip("<|")} for k, a in typed.items()],
-        "blocks": [{"camera": b.camera_id, "epoch": b.epoch_id, "target": b.target_id, "group": b.group}
-                   for b in blocks],
-        "points": {t or "": list(names) for t, names in rows.point_names.items() if t in seen},
     }  # fmt: skip
     text = json.dumps(header, ensure_ascii=False, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)  # the columns of 4 bytes begin at a multiple of 4
     return b"".join([len(text).to_bytes(4, "little"), text, *(a.tobytes() for a in typed.values())])
+
+
+def _seen(rows: PointRows) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    """What was observed, whatever the solution: names, and the columns of places and sigmas (these of so many rows)."""
+    blocks, sizes = rows.survey.image_blocks, np.diff(rows.ptr)
+    uv = np.concatenate([*(b.uv for b in blocks), np.zeros((0, 2))])
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "block": np.repeat(np.arange(len(blocks), dtype=np.uint32), sizes),
+        "point": np.concatenate([*(b.point_idx for b in blocks), np.zeros(0, dtype=np.int64)]).astype("<u4"),
+        "u": uv[:, 0], "v": uv[:, 1],
+    }  # fmt: skip
+    if len(uv) <= _MOST_SIGMAS:
+        sigma = np.sqrt(np.concatenate([*(np.einsum("nii->ni", b.cov) for b in blocks), np.zeros((0, 2))]))
+        arrays |= {"sigma_u": sigma[:, 0], "sigma_v": sigma[:, 1]}
+    names = {b.target_id for b in blocks}
+    return {
+        "blocks": [{"camera": b.camera_id, "epoch": b.epoch_id, "target": b.target_id, "group": b.group}
+                   for b in blocks],
+        "points": {t or "": list(ids) for t, ids in rows.point_names.items() if t in names},
+    }, arrays  # fmt: skip
 
 
 def reading_rows(survey: Survey, left: Hits, adjustment: Adjustment | None, limit: float) -> list[dict[str, Any]]:

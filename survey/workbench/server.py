@@ -34,7 +34,7 @@ from survey.workbench.situation import CancelledError, ChangedError
 WEB = Path(__file__).parent / "web"
 _KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json",
           ".svg": "image/svg+xml", ".png": "image/png", ".woff2": "font/woff2"}  # fmt: skip
-_LOOK_S = 2.0
+_LOOK_S, _PATIENCE_S = 2.0, 10.0
 _MOST_ROWS = 200_000  # of image points at once, where not all are asked for
 _Handler = Callable[[Request], Awaitable[Response]]
 
@@ -45,7 +45,8 @@ class Server:
     def __init__(self, bench: Workbench, token: str, cookie: str = "labsurvey") -> None:
         self.bench, self.token, self.cookie = bench, token, cookie
         self.live, self._worker = Live(), ThreadPoolExecutor(1, "workbench")
-        self._running, self._seen = "", asyncio.Event()
+        self._running, self._asked = "", asyncio.Event()
+        self.patience_s = _PATIENCE_S
         self._files = {f"/{p.relative_to(at).as_posix()}": p for at in (SHARED, WEB) for p in at.rglob("*")
                        if p.suffix in _KINDS}  # fmt: skip
         bench.watch = self._progress
@@ -94,9 +95,10 @@ class Server:
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     async def _first(self) -> None:
-        """The first adjustment, while the page already shows what there is: once it has it, or nobody asks."""
+        """The first adjustment, once a page has drawn what there is, or where none asks."""
         with suppress(TimeoutError):
-            await asyncio.wait_for(self._seen.wait(), _LOOK_S)
+            await asyncio.wait_for(self._asked.wait(), _LOOK_S)
+            await asyncio.wait_for(self.live.joined.wait(), self.patience_s)
         try:
             await self._run("adjust", self.bench.adjust)
         except (SurveyError, OSError) as error:
@@ -174,6 +176,7 @@ class Server:
         return text.replace("</head>", "".join(named) + "</head>").encode()
 
     async def _state(self, _request: Request) -> Response:
+        self._asked.set()
         found = await asyncio.to_thread(views.state, self.bench)
         response = JSONResponse(found | {"running": self._running})
         response.set_cookie(self.cookie, self.token, httponly=True, samesite="strict")
@@ -189,8 +192,9 @@ class Server:
         q = request.query_params
         camera, _, epoch = q.get("image", "").partition("/")
         worst = int(q["worst"]) if q.get("worst", "").isdecimal() else 0
-        data = await self._run("view", lambda: views.points(self.bench, camera, epoch, min(worst, _MOST_ROWS)))
-        self._seen.set()
+        known = int(q["layout"]) if q.get("layout", "").isdecimal() else None
+        most = min(worst, _MOST_ROWS)
+        data = await self._run("view", lambda: views.points(self.bench, camera, epoch, most, known))
         return Response(data, media_type="application/octet-stream")
 
     async def _statistics(self, request: Request) -> Response:

@@ -91,14 +91,20 @@ def _tree(bench: Workbench) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def points(bench: Workbench, camera: str = "", epoch: str = "", worst: int = 0) -> bytes:
-    """Image points as :func:`survey.workbench.rows.columns`: all, those of one image, or the ``worst`` by |w|."""
+def points(
+    bench: Workbench, camera: str = "", epoch: str = "", worst: int = 0, known: int | None = None
+) -> bytes:
+    """Image points as :func:`survey.workbench.rows.columns`: all, those of one image, or the ``worst`` by |w|.
+
+    known: the layout of the rows that the page has; where it is still that, only what the solution says of all.
+    """
     rows, chosen = bench.rows, None
     if camera and epoch:
         chosen = rows.in_image(camera, epoch)
     elif 0 < worst < len(rows.test):
         chosen = np.sort(np.argpartition(-np.nan_to_num(rows.test, nan=-1.0), worst)[:worst])
-    return columns(rows, limits(bench)[0], bench.version, chosen)
+    whole = chosen is not None or known != bench.layout
+    return columns(rows, limits(bench)[0], bench.version, chosen, bench.layout, whole)
 
 
 def readings(bench: Workbench) -> dict[str, Any]:

@@ -131,6 +131,6 @@ def test_causes_are_said_in_the_language_part_by_part() -> None:
     with speaking("de"):
         assert message(said) == (
             "wahrscheinliche Ursache: Tafel board bewegt sich zwischen den Epochen, soll aber stillstehen; "
-            "motion = \"epoch\" unter [targets.board] in survey.toml eintragen (erklärt 97 % der Widersprüche, sigma0 wird 1.02; "
-            "survey.toml:14; --try 1)"
+            "motion = \"epoch\" unter [targets.board] in survey.toml eintragen (erklärt 97 % der Widersprüche, "
+            "sigma0 wird 1.02; survey.toml:14; --try 1)"
         )

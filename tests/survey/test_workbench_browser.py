@@ -277,7 +277,7 @@ def said_by_the_page() -> set[str]:
     assert jobs is not None
     found |= set(re.findall(r'\["\w+", "([^"]+)"', jobs[0]))
     found |= set(re.findall(r'(?m)^  \["\w+", "[^"]+", "([^"]+)"', jobs[0]))
-    found |= {f"key {does}" for does in re.findall(r'\["[^"]+", "([^"]+)", \(\)', app)}
+    found |= {f"key {does}" for does in re.findall(r'\["[^"]+", "([^"]+)", \(\)', sources["keys.js"])}
     found |= set(re.findall(r'"([^"]+)"', re.findall(r"const WHY = .*", sources["inspector.js"])[0]))
     return found | set(re.findall(r': "([^"]+)"', re.findall(r"const NAMES = .*", sources["scene.js"])[0]))
 

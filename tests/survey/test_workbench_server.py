@@ -250,6 +250,7 @@ def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine, kep
             stream.write("\n")  # other inputs than those of the results
     bench, seen = Workbench(mine), threading.Event()
     server = Server(bench, TOKEN)
+    server.patience_s = 0.0  # no page joins here
     bench.watch = lambda _step, _omega: seen.wait(20.0)
     with TestClient(server.app(), base_url="http://127.0.0.1:8790") as client:
         state = client.get("/api/state", headers=HERE).json()
@@ -273,6 +274,31 @@ def test_what_there_is_is_shown_while_the_first_solution_is_waited_for(mine, kep
             of_points = [f["id"] for f in late["findings"] if f["kind"] == "image_point"]
             assert [f["id"] for f in early["findings"]][:10] == of_points[:10]
             assert early["verdict"] == late["verdict"]
+
+
+def test_a_page_that_knows_the_rows_gets_what_the_solution_says_of_them(mine):
+    def points(client, query=""):
+        data = client.get(f"/api/points{query}", headers=HERE).content
+        n = int.from_bytes(data[:4], "little")
+        header, found, at = json.loads(data[4 : 4 + n]), {}, 4 + n
+        for one in header["columns"]:
+            found[one["name"]] = np.frombuffer(data, "<" + one["type"], header["n"], at)
+            at += found[one["name"]].nbytes
+        return header, found
+
+    with page(mine) as client:
+        first, seen = points(client)
+        assert first["whole"]
+        assert post(client, "/api/exclusions", exclude(f"image:{image_of(mine)}", 1)).status_code == 200
+        later, changed = points(client, f"?layout={first['layout']}")
+        whole, again = points(client)
+        assert (later["whole"], "u" in changed, later["layout"]) == (False, False, whole["layout"])
+        assert np.array_equal(seen["u"], again["u"])
+        for name in ("du", "w", "used", "why"):
+            assert np.array_equal(changed[name], again[name], equal_nan=name != "used" and name != "why")
+        assert changed["used"].sum() < seen["used"].sum()
+        assert post(client, "/api/reload", {}).status_code == 200
+        assert points(client, f"?layout={first['layout']}")[0]["whole"], "they may be others now"
 
 
 def test_messages_are_in_the_language_that_is_asked_for(mine):

@@ -6,12 +6,13 @@ import { current, go, names, start, subscribe } from "./store.js";
 import { get, live, picture, points, post, takeToken } from "./source.js";
 import { changeLanguage, speak, wantedLanguage } from "./speech.js";
 import { Tables } from "./tables.js";
-import { askReason, previewText, showKeys, tell } from "./dialogs.js";
+import { askReason, previewText, tell } from "./dialogs.js";
+import { keysOf } from "./keys.js";
 import { drawTree, markTree } from "./tree.js";
 import { drawHeader, FindingsView } from "./findings.js";
 import { ImageView } from "./image.js";
 import { SceneView } from "./scene.js";
-import { CompareView, HistoryView } from "./compare.js";
+import { changedShortly, CompareView, HistoryView } from "./compare.js";
 import { CameraView, CorrelationsView, LoopsView, TableAnglesView } from "./relations.js";
 import { NetworkView } from "./network.js";
 import { JobsView } from "./jobs.js";
@@ -101,7 +102,7 @@ async function act(ask, said = "") {
     working("");
     by("message").replaceChildren();
     if (said) tell(said);
-    else tell(t("Done in {s} s.", { s: number((performance.now() - started) / 1000, 2) }) + changedText());
+    else tell(t("Done in {s} s.", { s: number((performance.now() - started) / 1000, 2) }) + changedShortly(bench.state.changes));
   } catch (error) {
     tell(error.status === 409 ? t("Not done: {why}", { why: error.message }) : error.message, "warn");
     if (error.status === 409) await renew(null).catch(() => {});
@@ -111,12 +112,6 @@ async function act(ask, said = "") {
     document.body.removeAttribute("aria-busy");
   }
   document.body.dataset.done = String(Math.round(performance.now() - started));
-}
-
-function changedText() {
-  const changes = bench.state.changes, first = changes?.components?.[0];
-  if (!first) return "";
-  return ` sigma0 ${number(changes.before.sigma0, 4)} → ${number(changes.after.sigma0, 4)}; ${t("largest change")} ${first.name} ${number(first.sigmas, 2)} σ`;
 }
 
 function working(text) { by("working").textContent = text; by("working").hidden = !text; }
@@ -131,7 +126,7 @@ async function renew(answer) {
   const state = stateOf(raw);
   const fresh = !bench.state || bench.state.version !== state.version || bench.state.folder !== state.folder || (state.failure ?? "") !== (bench.state.failure ?? "");
   if (fresh) {
-    const [columns, readings, findings] = await Promise.all([points(), get("readings"), get("findings")]);
+    const [columns, readings, findings] = await Promise.all([points(bench.state?.folder === state.folder ? bench.points : null), get("readings"), get("findings")]);
     Object.assign(bench, { state, points: columns, readings: readingsOf(readings), limit: readings.limit, findings: findingsOf(findings, raw), sizes: sizesOf(raw), leftOut: leftOut(columns) });
     if (!state.solved) Object.assign(bench, { parameters: [], scene: null, shifts: new Map() });
     state.changes = answer?.changes ?? (state.solved ? (await get("changes")).changes : null);
@@ -187,24 +182,6 @@ function viewOf(type) { return PANES.map((pane) => shown[pane]?.view).find((view
 
 // keys and the frame
 
-/** Key, what it says under "?", and what it does. */
-const KEYS = [
-  ["j", "next suspect", () => viewStep(1)], ["k", "previous suspect", () => viewStep(-1)],
-  ["]", "next image", () => viewOf(ImageView)?.next(1)], ["[", "previous image", () => viewOf(ImageView)?.next(-1)],
-  ["}", "next image of this epoch", () => viewOf(ImageView)?.next(1, true)], ["{", "previous image of this epoch", () => viewOf(ImageView)?.next(-1, true)],
-  ["Enter", "show the image", () => actions.show("image", "right")],
-  ["x", "leave out what is chosen (or take it back)", () => actions.toggle()], ["X", "leave out the whole image", () => actions.image()], ["e", "take back what is chosen", () => actions.include(chosenNames())],
-  ["m", "carry out the first remedy", () => { if (bench.findings.remedies?.[0]?.possible && !bench.state.read_only) actions.remedy(1); }],
-  ["a", "adjust again", () => actions.adjust("warm")], ["A", "adjust from the beginning", () => actions.adjust("cold")],
-  ["u", "undo (also Ctrl-Z)", () => actions.undo()], ["U", "redo (also Ctrl-Shift-Z)", () => actions.redo()], ["s", "save (also Ctrl-S)", () => actions.save()],
-  ["f", "filter the table", () => tables.find()],
-  ["1", "project", () => focus("tree")], ["2", "first view", () => focus("left")], ["3", "second view", () => focus("right")], ["4", "tables", () => focus("tables")], ["5", "details", () => focus("inspector")],
-  ["+", "longer vectors, larger ellipsoids", () => enlarge(1)], ["-", "shorter vectors, smaller ellipsoids", () => enlarge(-1)],
-  ["0", "the whole image or scene", () => whole()], ["o", "overlay on or off", () => { const view = viewOf(ImageView); if (view) { view.overlay = !view.overlay; view.surface.redraw(); } }],
-  ["d", "before and after", () => actions.show("compare", "left")], ["v", "next view in this pane", () => nextView(1)], ["V", "previous view in this pane", () => nextView(-1)],
-  ["g", "language", () => otherLanguage()], ["Escape", "give up what is being adjusted", () => { if (busy) post("cancel").catch(() => {}); else by("message").replaceChildren(); }], ["?", "these keys", () => showKeys(KEYS.map(([key, does]) => [key, t(`key ${does}`)]))],
-];
-
 function viewStep(step) {
   let view = viewOf(FindingsView);
   if (!view) { actions.show("findings", "left"); view = viewOf(FindingsView); }
@@ -214,6 +191,9 @@ function viewStep(step) {
 const nextView = (by) => { const all = Object.keys(VIEWS), at = all.indexOf(panes()[PANES.indexOf(lastPane)]); actions.show(all[(at + by + all.length) % all.length], lastPane); };
 const enlarge = (by) => PANES.forEach((pane) => { const view = shown[pane]?.view; if (view instanceof ImageView) view.enlarge(by); else if (view instanceof SceneView) view.enlarge(2 ** by); });
 const whole = () => PANES.forEach((pane) => shown[pane]?.view.whole?.());
+
+const giveUp = () => { if (busy) post("cancel").catch(() => {}); else by("message").replaceChildren(); };
+const KEYS = keysOf({ actions, bench, tables, image: () => viewOf(ImageView), step: viewStep, chosen: chosenNames, focus, enlarge, whole, nextView, language: () => otherLanguage(), giveUp });
 
 function focus(region) {
   document.body.dataset.pane = region;
@@ -310,14 +290,15 @@ async function begin() {
   for (const pane of PANES) for (const name of ["pointerdown", "focusin"]) by(pane).addEventListener(name, () => { lastPane = pane; });
   addEventListener("error", (event) => tell(event.message, "bad"));
   addEventListener("unhandledrejection", (event) => tell(event.reason?.message ?? String(event.reason), "bad"));
-  drawn0();
+  for (const [id, title] of REGIONS) by(id).setAttribute("aria-label", t(title));
+  drawTabs();
+  by("title").textContent = t("loading …");
+  by("doing").append(make("output", { id: "working", class: "working", hidden: true }));
   try {
     await renew(null);
     live(told); // its cookie comes with the first answer
     if (!bench.state.solved && !bench.state.failure) working(t("adjusting …")); // a message tells when it is done
   } catch (error) { tell(error.message, "bad"); }
 }
-
-function drawn0() { drawTabs(); for (const [id, title] of REGIONS) by(id).setAttribute("aria-label", t(title)); by("title").textContent = t("loading …"); by("doing").append(make("output", { id: "working", class: "working", hidden: true })); }
 
 await begin();

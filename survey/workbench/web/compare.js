@@ -24,6 +24,12 @@ export function changesText(changes) {
     make("p", { class: "quiet" }, t("{n} components, the one that moved by most of its sigmas first", { n: count(changes.n_components ?? changes.components.length) })));
 }
 
+/** The same in one line. @param {any} changes null where there was nothing before */
+export function changedShortly(changes) {
+  const first = changes?.components?.[0];
+  return first ? ` sigma0 ${number(changes.before.sigma0, 4)} → ${number(changes.after.sigma0, 4)}; ${t("largest change")} ${first.name} ${number(first.sigmas, 2)} σ` : "";
+}
+
 export class CompareView {
   /** @param {any} bench */
   constructor(bench) {

@@ -37,9 +37,15 @@ export const get = async (path) => (await ask(`/api/${path}`)).json();
 export const post = async (path, body = {}) =>
   (await ask(`/api/${path}`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) })).json();
 
-/** All image points, with the rows of every image in order. @returns {Promise<Points>} */
-export async function points() {
-  return withImages(columns(await (await ask("/api/points")).arrayBuffer()));
+/**
+ * All image points, with the rows of every image in order; of those that are known only what the solution says of them.
+ * @param {any} known the points of before, null for none @returns {Promise<import("./columns.js").Points>}
+ */
+export async function points(known) {
+  const data = columns(await (await ask(`/api/points${known ? `?layout=${known.layout}` : ""}`)).arrayBuffer());
+  if (!data.whole) return { ...known, ...data, rows: known.rows };
+  for (const name of ["block", "point", "u", "v", "sigma_u", "sigma_v"]) data[name] = data[name]?.slice(); // else they would keep the answer of every solution
+  return withImages(data);
 }
 
 const pictures = new Map(); // the last few only: a picture of 5 MP holds 20 MB
