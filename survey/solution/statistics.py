@@ -87,14 +87,14 @@ def statistics_of(adjustment: Adjustment, tolerances: tuple[Tolerance, ...], sca
     names = _budgeted(adjustment)
     _ = system.normal.structured, system.sigmas  # all of these ask for them
     with Beside() as made:
-        tested = made.of(lambda: consistency(adjustment, condensed, alpha))
+        consistent = made.of(lambda: consistency(adjustment, condensed, alpha))
         reliable = made.of(lambda: reliability(adjustment, system=condensed))
         weak = made.of(lambda: weak_directions(adjustment, system=system))
         correlated = made.of(lambda: correlations(adjustment, system=system))
         budget = made.of(lambda: _budget(adjustment, names[:MOST_BUDGETS], system, scale.factor))
         return Statistics(
-            reliable(), components, correlated(), weak(), near, budget(), drawn, adjustment.decisions, judged, tested(),
-            (*tested().left_out, *_left_out(adjustment, system, len(names))),
+            reliable(), components, correlated(), weak(), near, budget(), drawn, adjustment.decisions, judged,
+            consistent(), (*consistent().left_out, *_left_out(adjustment, system, len(names))),
         )  # fmt: skip
 
 
