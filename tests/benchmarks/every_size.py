@@ -129,7 +129,8 @@ def spots(place: Path, n: int) -> Commands:
 def planned(place: Path, n: int) -> Commands:
     """A head on its table before a board of 88 corners, beacons, and as many epochs by hand as are wanted."""
     write_lab(place / "lab")
-    by_hand = f'{{ camera = "X", target = "board", count = {max(n // 88, 2)}, distance_mm = [500, 900], tilt_deg = 35 }}'
+    count = f"count = {max(n // 88, 2)}"
+    by_hand = f'{{ camera = "X", target = "board", {count}, distance_mm = [500, 900], tilt_deg = 35 }}'
     with (place / "lab" / "plan.toml").open("a") as plan:
         plan.write(f'\n[[epochs]]\nname = "m"\nby_hand = {by_hand}\npoints = false\n')
     return {"plan": ["plan", str(place / "lab")]}
