@@ -127,8 +127,12 @@ def spots(place: Path, n: int) -> Commands:
 
 
 def planned(place: Path, n: int) -> Commands:
-    """A head on its table before a board of 88 corners, and beacons."""
-    write_lab(place / "lab", epochs=max(n // 88, 8))
+    """A head on its table before a board of 88 corners, beacons, and as many epochs by hand as are wanted."""
+    write_lab(place / "lab")
+    count = f"count = {max(n // 88, 2)}"
+    by_hand = f'{{ camera = "X", target = "board", {count}, distance_mm = [500, 900], tilt_deg = 35 }}'
+    with (place / "lab" / "plan.toml").open("a") as plan:
+        plan.write(f'\n[[epochs]]\nname = "m"\nby_hand = {by_hand}\npoints = false\n')
     return {"plan": ["plan", str(place / "lab")]}
 
 
