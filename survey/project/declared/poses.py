@@ -28,11 +28,12 @@ _SIGMAS = POSE_KEYS[4:-1]
 
 def rotation_from_quaternion(wxyz: FloatArray) -> Rot3 | None:
     """The rotation of a quaternion, or None where its length is not 1 within 1e-3."""
-    parts: list[float] = wxyz.tolist()
-    length = math.hypot(*parts)
+    if not max(map(abs, wxyz.tolist())) < 2.0:  # nor is there an end to what stands in files
+        return None
+    length = math.sqrt(wxyz @ wxyz)
     if not abs(length - 1.0) <= 1e-3:
         return None
-    return Rot3.Quaternion(*(part / length for part in parts))
+    return Rot3.Quaternion(*(wxyz / length).tolist())
 
 
 def quaternion_wxyz(rotation: Rot3) -> list[float]:
