@@ -77,18 +77,18 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
         formed = [h for family in rooms for h in _formed(family, case)]
         looked_at += sum(h.looked_at for h in formed)
         queue = _in_turn(queue + formed)
-        while queue and case.budget.left > kept and not _done(trials, queue[0].evidence):
+        while queue and case.budget.left > kept:
             first = queue.pop(0)
             names.append(first.name)
             trial = tried(first, case, base)
             more = list(first.follow(trial.result)) if first.follow is not None and trial.result is not None else []
             same = [replace(trial, hypothesis=h) for h in more if h.survey is first.survey]
             trials += same or [trial]
-            queue[:0] = [h for h in more if h.survey is not first.survey]
+            queue = [h for h in more if h.survey is not first.survey] + queue
+            queue = [h for h in queue if not _done(trials, h.evidence)]
         if _done(trials, 0.0):
             break
-    spent = case.budget.left <= 0.0 and not _done(trials, max((h.evidence for h in queue), default=0.0))
-    untried = dict.fromkeys(h.name for h in queue if h.name not in names) if spent else {}
+    untried = dict.fromkeys(h.name for h in queue if h.name not in names)
     return Diagnosis(ranked(base, trials, looked_at), tuple(dict.fromkeys(names)), base, tuple(untried))
 
 

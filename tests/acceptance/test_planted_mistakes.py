@@ -19,7 +19,7 @@ NAMED = {  # one size of each, in one kind of survey; the whole table is python 
     ("images shifted", "head"): 12.0,
     ("images resized", "stereo"): 0.8,
     ("focus touched", "stereo"): 0.01,
-    ("camera moved", "head"): 6.0,
+    ("camera moved", "stereo"): 6.0,
     ("target moved", "relay"): 10.0,
     ("target scaled", "relay"): 0.8,
     ("target stretched", "stereo"): 1.01,
