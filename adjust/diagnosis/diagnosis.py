@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
-from adjust.diagnosis.case import MOST, Case
+from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.ranking import Candidate, ranked
 from adjust.diagnosis.trial import Misfit, Trial, misfit_of, tried
@@ -44,7 +44,7 @@ class Diagnosis:
     def lines(self) -> tuple[str, ...]:
         """For people: the first cause, what it changes, how sure it is, and the next one; what was not tried."""
         *others, last = [_text(i, c) for i, c in enumerate(self.candidates[:_SHOWN], start=1)] or [""]
-        spent = f"; not tried, as the time of {MOST:.0f} adjustments was spent: {', '.join(self.untried)}"
+        spent = f"; not tried, as the time of a diagnosis was spent: {', '.join(self.untried)}"
         return (*others, last + spent * bool(self.untried)) if last else ()
 
     def told(self) -> list[dict[str, Any]]:
