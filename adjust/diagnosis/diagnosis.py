@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
-from adjust.diagnosis.case import MOST, Case
+from adjust.diagnosis.case import Case
 from adjust.diagnosis.hypothesis import Hypothesis
 from adjust.diagnosis.ranking import Candidate, ranked
 from adjust.diagnosis.trial import Misfit, Trial, misfit_of, tried
@@ -44,7 +44,7 @@ class Diagnosis:
     def lines(self) -> tuple[str, ...]:
         """For people: the first cause, what it changes, how sure it is, and the next one; what was not tried."""
         *others, last = [_text(i, c) for i, c in enumerate(self.candidates[:_SHOWN], start=1)] or [""]
-        spent = f"; not tried, as the time of {MOST:.0f} adjustments was spent: {', '.join(self.untried)}"
+        spent = f"; not tried, as the time of a diagnosis was spent: {', '.join(self.untried)}"
         return (*others, last + spent * bool(self.untried)) if last else ()
 
     def told(self) -> list[dict[str, Any]]:
@@ -78,18 +78,18 @@ def diagnose(case: Case, families: Sequence[Family] | None = None) -> Diagnosis:
         formed = [h for family in rooms for h in _formed(family, case)]
         looked_at += sum(h.looked_at for h in formed)
         queue = _in_turn(queue + formed)
-        while queue and case.budget.left > kept and not _done(trials, queue[0].evidence):
+        while queue and case.budget.left > kept:
             first = queue.pop(0)
             names.append(first.name)
             trial = tried(first, case, base)
             more = list(first.follow(trial.result)) if first.follow is not None and trial.result is not None else []
             same = [replace(trial, hypothesis=h) for h in more if h.survey is first.survey]
             trials += same or [trial]
-            queue[:0] = [h for h in more if h.survey is not first.survey]
+            queue = [h for h in more if h.survey is not first.survey] + queue
+            queue = [h for h in queue if not _done(trials, h.evidence)]
         if _done(trials, 0.0):
             break
-    spent = case.budget.left <= 0.0 and not _done(trials, max((h.evidence for h in queue), default=0.0))
-    untried = dict.fromkeys(h.name for h in queue if h.name not in names) if spent else {}
+    untried = dict.fromkeys(h.name for h in queue if h.name not in names)
     return Diagnosis(ranked(base, trials, looked_at), tuple(dict.fromkeys(names)), base, tuple(untried))
 
 

@@ -52,8 +52,6 @@ class Effect:
             nearer = self.nearer(result, theta)
             if nearer is not None:
                 at, (theta, result, sigmas) = nearer, nearer._estimated(case, linear, theta)
-            if not at._last and not case.is_near:
-                return None  # far from where it belongs, and on no way there
             of = at.hypothesis
             as_found = {"cause": at.said(theta, sigmas), "place": of.place, "edits": of.edits, "change": of.change}
             theta, changes = at.known(theta, sigmas) or (theta, as_found)
