@@ -80,7 +80,7 @@ def dom_after(page: str, actions: str, folder: Path, dark: bool = False) -> str:
         f"--blink-settings=preferredColorScheme={0 if dark else 1}",
         "--headless", "--disable-gpu", "--no-first-run", "--disable-background-networking",
         "--disable-component-update", "--disable-sync", "--disable-quic", f"--user-data-dir={folder / 'profile'}",
-        "--virtual-time-budget=2000", "--dump-dom", path.as_uri(),
+        "--virtual-time-budget=4000", "--dump-dom", path.as_uri(),
     ]  # fmt: skip
     if os.geteuid() == 0:
         command.insert(0, "--no-sandbox")
@@ -89,7 +89,7 @@ def dom_after(page: str, actions: str, folder: Path, dark: bool = False) -> str:
 
 def seen(page: str, measure: str, folder: Path, width: int = 1280, dark: bool = False) -> Any:
     """What the expression ``measure`` is on the page as first opened in a window of this width, px; nothing resizes."""
-    inner = page.replace("</body>", f"<script>setTimeout(() => top.found({measure}), 400)</script></body>")
+    inner = page.replace("</body>", f"<script>setTimeout(() => top.found({measure}), 1200)</script></body>")
     text = json.dumps(inner).replace("<", "\\u003c")
     outer = (
         f'<!doctype html><body><iframe style="border:0;width:{width}px;height:900px"></iframe><p id="found"></p></body>'
