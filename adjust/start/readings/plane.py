@@ -40,9 +40,9 @@ class PlaneStart:
     distance: Mapping[tuple[Node, Node], float]
 
     def __post_init__(self) -> None:
-        self.around: dict[Node, set[Node]] = {}
+        self.around: dict[Node, dict[Node, None]] = {}  # in the order of the distances, as all that follows
         for a, b in self.distance:
-            self.around.setdefault(a, set()).add(b)
+            self.around.setdefault(a, {})[b] = None
         self.sets_at: dict[Node, list[str]] = {}
         self.sets_to: dict[Node, list[str]] = {}
         self.azimuths_to: dict[Node, list[tuple[Node, float]]] = {}
@@ -54,7 +54,7 @@ class PlaneStart:
             for value in values:
                 self.azimuths_to.setdefault(b, []).append((a, value))
                 self.azimuths_to.setdefault(a, []).append((b, value + np.pi))
-        self.nodes = set(self.sets_at) | set(self.sets_to) | set(self.around) | set(self.azimuths_to)
+        self.nodes = sorted({*self.sets_at, *self.sets_to, *self.around, *self.azimuths_to})
 
     def find(self, known: Mapping[Node, complex]) -> System:
         """The system of ``known`` points, or one of its own where nothing is known, with all points that it reaches."""
@@ -225,7 +225,7 @@ class PlaneStart:
             self.grow(trial)
             return trial
 
-        best = best_of_places(self.nodes - set(main.xy), lambda node: self.candidates(main, node), grown,
+        best = best_of_places(set(self.nodes) - set(main.xy), lambda node: self.candidates(main, node), grown,
                               lambda trial: (-len(trial.xy), self.misfit(trial)))  # fmt: skip
         if best is not None:
             main.xy, main.turn = best.xy, best.turn

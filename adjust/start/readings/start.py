@@ -68,7 +68,7 @@ def _spread(
             assumed = dict(height)
             if rough:
                 mean = float(np.median(list(height.values()))) if height else 0.0
-                assumed = dict.fromkeys(sights.nodes, mean) | height
+                assumed = dict.fromkeys(sorted(sights.nodes), mean) | height
             found = PlaneStart(sights, sights.distances(assumed)).find(xy)
             xy = xy | found.xy
             height = spread_heights(sights, xy, height, heights_known)

@@ -230,7 +230,7 @@ class Snooping:
             found[o] = float(bias[k] @ np.linalg.solve(cov[k, k], bias[k])), float(np.linalg.norm(bias[k]))
         return found
 
-    def robust_squares(self, freedom: IntArray, factors: FloatArray, rounds: int = 20) -> FloatArray:
+    def robust_squares(self, freedom: IntArray, factors: FloatArray, rounds: int = 100) -> FloatArray:
         """Weighted squares (M,), over the factors (G,) of the groups, where Cauchy weights settle.
 
         What is kept keeps its weight.
