@@ -28,6 +28,16 @@ def _stages(workers: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(workers, thread_name_prefix="stage", initializer=setattr, initargs=(_here, "step", True))
 
 
+def _no_threads() -> None:
+    """In a forked process, which has none of its parent's threads: new ones where they are wanted."""
+    _pool.cache_clear()
+    _stages.cache_clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_no_threads)
+
+
 def workers() -> int:
     """Threads used: ``LABSURVEY_THREADS``, or the cores this process may use."""
     wanted = os.environ.get("LABSURVEY_THREADS", "")

@@ -1,6 +1,10 @@
 """Whole adjustments are the same to the last bit for any number of threads."""
 
+import os
+import signal
 import threading
+import time
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -86,3 +90,29 @@ def test_steps_beside_each_other(threads: str, monkeypatch: pytest.MonkeyPatch) 
         everything()
     assert done == [1]
     assert all(name.startswith("adjust") for name in others) == (threads == "3")
+
+
+def test_a_forked_process_begins_threads_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of its parent are not there: steps given to them would never be done."""
+    monkeypatch.setenv("LABSURVEY_THREADS", "2")
+
+    def both() -> int:
+        with Beside() as steps:
+            return steps.of(lambda: sum(side_by_side(lambda i: i, range(4))))()
+
+    assert both() == 6
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # the threads there are wait for work
+        pid = os.fork()
+    if not pid:
+        os._exit(both())
+    for _ in range(1000):
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
+            break
+        time.sleep(0.01)
+    else:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+        pytest.fail("the forked process waits for threads that it does not have")
+    assert os.waitstatus_to_exitcode(status) == 6
