@@ -68,12 +68,22 @@ def _expected(survey: Survey) -> tuple[Adjustment | None, list[Finding]]:
     """The precision to be expected, or why there is none."""
     try:
         survey = supported(survey)[0]
-        found = find_start(survey)
-        return expect(survey, start_values(found)), []
     except IndeterminateError as error:
-        return None, [Finding("problem", "undetermined", (), str(error), "measure or fix what is named")]
+        return None, [_undetermined(error)]
+    try:
+        found = find_start(survey)
     except SurveyError as error:
         return None, [Finding("problem", "no start values", (), str(error), "mend that first")]
+    try:
+        return expect(survey, start_values(found)), []
+    except IndeterminateError as error:
+        return None, [_undetermined(error)]
+    except SurveyError as error:
+        return None, [Finding("problem", "no start values", (), str(error), "mend that first")]
+
+
+def _undetermined(error: IndeterminateError) -> Finding:
+    return Finding("problem", "undetermined", (), str(error), "measure or fix what is named")
 
 
 def _usage(survey: Survey) -> Counter[str]:

@@ -75,7 +75,7 @@ class Case:
             return self._last[0][1]
         if self.linear is None:
             raise SurveyError("there are no values to begin with")
-        start = completed(survey, values_of(self.linear.result))
+        start = completed(survey, values_of(self.linear.result, survey))
         self.budget.spend(_WARM)
         result = adjust(survey, start, AdjustOptions(reject_blocks=False, solve=_SOLVE))
         self._last[:] = [(survey, result)]

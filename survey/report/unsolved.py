@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from adjust.diagnosis.diagnosis import Diagnosis
 from adjust.graph.divergence import Stopped, UnknownState
-from adjust.model.errors import DiagnosedError, NotConvergedError, SurveyError
+from adjust.model.errors import DiagnosedError, IndeterminateError, NotConvergedError, SurveyError
 from survey.report.language import group_name, message, speaking, t
 from survey.report.markup import count, document, element, general, joined, note, part, section, table
 from survey.report.sections.diagnosis import causes
@@ -21,7 +21,12 @@ _MOST = 200
 
 
 def unsolved_files(error: SurveyError, run: RunInfo, in_language: str = "en") -> dict[str, bytes]:
-    """``unsolved.json`` and ``unsolved.html`` of an adjustment that raised ``error``, by name."""
+    """``unsolved.json`` and ``unsolved.html`` of an adjustment that raised ``error``, by name.
+
+    None where there was nothing to adjust: the message says it all.
+    """
+    if not isinstance(error, DiagnosedError | IndeterminateError) and _stopped(error) is None:
+        return {}
     found = unsolved_dict(error, run)
     with speaking(in_language):
         return {JSON: solution_json(found).encode(), PAGE: _page(found).encode()}

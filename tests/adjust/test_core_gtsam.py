@@ -147,6 +147,7 @@ def test_gtsams_own_algorithms_reach_the_same_optimum_and_covariances(kind: str)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-13)
     parameters.setAbsoluteErrorTol(1e-10)
+    parameters.setDiagonalDamping(True)  # else its bound on lambda means something else for every unit
     theirs = gtsam.LevenbergMarquardtOptimizer(graph.graph, graph.start, parameters).optimize()
     ours = solve(graph, SolveOptions(max_step=1e-10))
     precision = Precision(graph, ours)

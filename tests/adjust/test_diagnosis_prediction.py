@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adjust.adjustment import adjust
-from adjust.diagnosis.prediction import Prediction
+from adjust.diagnosis.prediction import Prediction, adjusted_values
 from adjust.model.survey import LensDrift, Tie, VectorParameter
 from survey.simulate import resample, stereo
 
@@ -25,9 +25,9 @@ def test_images_are_predicted_with_warp_and_drift(drift: LensDrift) -> None:
     true = {("warp", "board"): np.array([4e-4, -8e-4, 60e-6]), ("lens_drift", "right", "e05"): np.array([5.0, -3.0]),
             ("lens_drift", "right"): np.array([0.8])}  # fmt: skip
     result = adjust(resample(survey, truth | true, 2))
-    predicted, ptr = Prediction(result.survey, result), result.image_residuals.block_ptr
+    predicted, ptr = Prediction(result.survey, adjusted_values(result)), result.image_residuals.block_ptr
     for i, block in enumerate(result.survey.image_blocks):
-        uv = predicted.uv(i)
+        uv = predicted.uv(block)
         assert uv is not None
         v = result.image_residuals.residuals[ptr[i] : ptr[i + 1]]
         np.testing.assert_allclose(uv - block.uv, v, atol=1e-6)

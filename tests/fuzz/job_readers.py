@@ -60,6 +60,16 @@ def _cache(folder: Path) -> Read:
     return in_file("lab/results/solution.json", read)(folder)
 
 
+def _kept(folder: Path) -> Read:
+    """A solution on disk, of the inputs as they are, which the page shows before it adjusts."""
+    from survey.workbench.kept import kept_results
+    from survey.workbench.session import Workbench
+
+    put(folder / "lab", adjusted())
+    situation = Workbench(folder / "lab", read_only=True).situation
+    return in_file("lab/results/solution.json", lambda path: kept_results(situation))(folder)
+
+
 @cache
 def _calibrations() -> list[bytes]:
     """A calibration kept by ``labsurvey navigate``, with and without a table."""
@@ -124,6 +134,7 @@ _NEW = {
 JOB_READERS: dict[str, Reader] = {
     "batch-journal": Reader(lambda: [_journal()], in_file("journal.jsonl", _batch_journal)),
     "batch-cache": Reader(lambda: [adjusted()["results/solution.json"]], _cache),
+    "kept-solution": Reader(lambda: [adjusted()["results/solution.json"]], _kept),
     "navigation-calibration": Reader(_calibrations, in_file("calibration.npz", _calibration), is_text=False),
     "navigation-times": Reader(lambda: [b"epoch_id,time_s\nt1,0.5\nt2,1.0\nt3,1.5\n"], in_file("times.csv", _times)),
     "added-definition": Reader(lambda: [_NEW["survey.toml"]], _adding("survey.toml")),

@@ -17,6 +17,11 @@ ROOT = Path(__file__).parents[2]
 CORPUS = ROOT / "tests" / "fuzz" / "corpus"
 NO_READERS = {
     "survey/commands/opening.py:_open": "a browser",
+    "survey/report/modules.py:bundled": "a part of the package",
+    "survey/report/modules.py:looks": "a part of the package",
+    "survey/report/page.py:_words": "a part of the package",
+    "survey/workbench/server.py:Server._page": "a part of the package",
+    "survey/solution/earlier/runs.py:record_run": "copies what was written or read before",
     "survey/batch/cache.py:fingerprint": "hashes whatever is there",
     "survey/batch/journal.py:Journal.__init__": "opens to write",
     "survey/batch/worker.py:Worker._answer": "a pipe from a process of its own",
@@ -30,7 +35,6 @@ NO_READERS = {
     "survey/project/tables/files.py:_last_start": "the line of what could not be read, for the message",
     "survey/jobs/starting.py:start_project": "copies images that read_image has read before",
     "survey/interop/cameras/colmap.py:reconstruction": "an empty model of pycolmap, to be filled and written",
-    "survey/report/page.py:_page": "the program's own script",
     "survey/report/page.py:_by_browser": "a PDF that was just printed",
     "survey/report/language.py:catalogue": "the program's own words",
     "survey/jobs/adjusting/edits.py:_table": "a table of a project that was read and diagnosed before",

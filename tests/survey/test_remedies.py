@@ -1,5 +1,6 @@
 """Boards that deviate, temperatures and harmonics of tables: from survey.toml to the report, and back."""
 
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from adjust.diagnosis.hypothesis import Hypothesis, Place, SetKey
 from adjust.model.errors import SurveyError
 from adjust.model.survey import TABLE_GEOMETRY, LensDrift, Survey, Table, VectorParameter, VectorPrior
 from adjust.model.tables import harmonic_names
-from survey.jobs.adjusting.trying import edited
+from survey.jobs.adjusting.edits import changed_files
 from survey.project import read, write_project
 from survey.report.page import report_html
 from survey.report.terminal import summary_text
@@ -165,10 +166,15 @@ def test_values_and_tests_reach_result_and_report(tmp_path: Path) -> None:
 
 
 def test_keys_of_remedies_are_written_where_they_belong(tmp_path: Path) -> None:
-    """Several keys of one table after each other; below the innermost header; not into a table in one line."""
+    """Several keys of one table after each other; below the innermost header; into a table in one line."""
     survey, _ = stereo(3, n_pairs=8)
     write_project(tmp_path, replace(survey, tables=(Table("turntable"),)))
-    path, chosen = tmp_path / "survey.toml", Hypothesis("", "", "", Place("", ()), survey)
+    path = tmp_path / "survey.toml"
+
+    def edited(place: tuple[str, ...], value: object) -> str:
+        chosen = Hypothesis("", "", "", Place("", ()), survey, (SetKey(place, value),))
+        return changed_files(tmp_path, chosen)[0].after
+
     for place, value in (
         (("tables", "turntable", "harmonics", "angle_2"), 2),
         (("tables", "turntable", "harmonics", "tilt_2"), 1),
@@ -176,14 +182,15 @@ def test_keys_of_remedies_are_written_where_they_belong(tmp_path: Path) -> None:
         (("cameras", "right", "lens", "drift", "begins"), ("e03",)),
         (("targets", "board", "warp", "free"), ("scale_x",)),
     ):
-        path.write_text(edited(tmp_path, SetKey(place, value), chosen)[2])
+        path.write_text(edited(place, value))
     again = read(tmp_path).survey
     assert set(again.tables[0].geometry.free) >= {"angle_2_sin_2", "tilt_2_im_m1"}
     assert again.cameras[1].lens.drift is not None
     assert again.cameras[1].lens.drift.parameters == ("fx", "u0")
     assert again.targets[0].warp is not None
     assert again.targets[0].warp.free == ("scale_x",)
-    path.write_text(path.read_text().replace("harmonics.angle_2 = 2", "harmonics = { angle_2 = 2 }"))
-    path.write_text(path.read_text().replace("harmonics.tilt_2 = 1\n", ""))
-    with pytest.raises(SurveyError, match=r"tables\.turntable\.harmonics\.tilt_2 has no place of its own there"):
-        edited(tmp_path, SetKey(("tables", "turntable", "harmonics", "tilt_2"), 1), chosen)
+    definition = path.read_text().replace("[tables.turntable.harmonics]\nangle_2 = 2\ntilt_2 = 1\n", "")
+    path.write_text(definition.replace("[tables.turntable]\n", "[tables.turntable]\nharmonics = { angle_2 = 2 }\n"))
+    after = edited(("tables", "turntable", "harmonics", "tilt_2"), 1)
+    assert "\nharmonics = {" in after
+    assert tomllib.loads(after)["tables"]["turntable"]["harmonics"] == {"angle_2": 2, "tilt_2": 1}

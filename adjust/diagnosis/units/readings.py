@@ -39,11 +39,9 @@ def misread_readings(case: Case) -> Iterator[Hypothesis]:
         for misreading in _possible(survey, scope):
             looked_at += 1
             found.append((_evidence(survey, before, scope, misreading), scope, misreading))
-    found.sort(key=lambda f: (-f[0], -len(f[1].rows)))
-    found += _slips(survey, before)
-    found.sort(key=lambda f: (-f[0], -len(f[1].rows)))
-    for evidence, scope, misreading in found[:_MOST]:
-        if evidence > _CLEARLY:
+    # what explains many first: that of single readings is of each alone, which many misread ones have as well
+    for some in ([f for f in found if f[0] > _CLEARLY], _slips(survey, before)):
+        for evidence, scope, misreading in sorted(some, key=lambda f: (-f[0], -len(f[1].rows)))[:_MOST]:
             yield _hypothesis(survey, scope, misreading, evidence, looked_at)
 
 

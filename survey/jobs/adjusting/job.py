@@ -131,6 +131,8 @@ def keep_failure(error: SurveyError, run: RunInfo, target: Path, place: Path, la
     For who is changing ``target``, with ``place`` for what is new. Where it cannot be written the error is as it was.
     """
     files = unsolved_files(error, run, language)
+    if not files:
+        return
     try:
         (place / RESULTS).mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
