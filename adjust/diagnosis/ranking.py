@@ -14,6 +14,8 @@ from adjust.testing.distributions import chi2
 _ALPHA = 1e-4
 _NOISE = 3.0  # sigmas
 _EXPLAINED = 0.5  # share of the excess that a cause takes away at least
+_LIKELY = 0.01
+"""Probability among all that were tried, and the survey as it stands, below which a cause is not named."""
 _LOG_LARGEST = 600.0
 
 
@@ -41,7 +43,8 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
     Each drop of v'Pv is tested against chi-square with as many degrees of freedom as the change has parameters, at a
     level shared by all hypotheses that were looked at (Sidak). Compared with each other by v'Pv plus p ln n
     (Schwarz 1978), with variances of each group as they suit each best: else wrong sigmas would explain all that a
-    cause leaves. A cause explains the misfit if half of it goes, or if what is left is noise.
+    cause leaves. A cause explains the misfit if half of it goes, or if what is left is noise; it is not named where
+    another one, though it explains less than that, is a hundred times as likely.
     """
     good = [t for t in trials if t.result is not None]
     if not good:
@@ -55,7 +58,7 @@ def ranked(base: Misfit, trials: Sequence[Trial], looked_at: int) -> tuple[Candi
         statistic = (base.omega - _cost(trial)) / scale
         share = (base.omega - _cost(trial)) / max(base.excess, 1e-9)
         enough = share > _EXPLAINED or (trial.misfit.is_noise(_NOISE) and not trial.hypothesis.penalty)
-        if statistic > critical and enough and trial.misfit.unused <= base.unused:
+        if statistic > critical and enough and trial.misfit.unused <= base.unused and probability > _LIKELY:
             sigma0 = trial.result.sigma0 if trial.result is not None else float("nan")
             explained = float(np.clip(share, 0.0, 1.0))
             out.append(Candidate(trial.hypothesis, explained, statistic, critical, float(probability), sigma0))
