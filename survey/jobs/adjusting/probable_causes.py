@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 _LARGE = 1.15
 """sigma0 from which a mistake is looked for by trial; below, sigmas that are a little small explain as much."""
+_MOST_UNKNOWNS = 1500
+"""Of networks without images: their steps are scored one by one, which takes minutes where there are more."""
 
 
 def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyError:
@@ -37,6 +39,7 @@ def explained(survey: Survey, error: SurveyError, project: Project) -> SurveyErr
 def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -> Adjustment:
     """The adjustment of the ``survey`` of a project; its first warnings are the probable causes of what contradicts."""
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     if survey.tables:
         from adjust.diagnosis.table import sign_warnings  # here: a survey without a table starts without it
@@ -45,15 +48,18 @@ def with_probable_causes(survey: Survey, result: Adjustment, project: Project) -
     if _contradicted(survey, result):
         # what does not fit may have spoilt the lenses too: then those that the images alone give
         causes = _probable_causes(survey, result) or _probable_causes(survey)
-        if not warnings:
+        if not survey.image_blocks and result.n_unknowns > _MOST_UNKNOWNS:
+            notes = (f"causes of what contradicts were not looked for: a network without images of {result.n_unknowns} "
+                     f"unknowns, more than {_MOST_UNKNOWNS}",)  # fmt: skip
+        elif not warnings:
             diagnosis = _located(_diagnosis(survey, result, None, causes), project)
             warnings = diagnosis.lines if diagnosis is not None else ()
         warnings += tuple(c for c in causes if c not in warnings)
-    if diagnosis is None and not warnings:
+    if diagnosis is None and not warnings and not notes:
         diagnosis = _located(_misread(survey, result), project)
         warnings = diagnosis.lines if diagnosis is not None else ()
     lines = tuple(f"probable cause: {c}" for c in warnings)
-    return replace(result, warnings=lines + result.warnings, diagnosis=diagnosis)
+    return replace(result, warnings=lines + result.warnings + notes, diagnosis=diagnosis)
 
 
 def _diagnosis(
