@@ -36,8 +36,11 @@ class TableServer:
         return [row for row in self.received() if row[1].startswith(("MA", "ST", "HM")) or row[1][1:3] in ("PA", "OR")]
 
     def truth_deg(self) -> list[float]:
-        """True angles of both axes."""
-        told = json.loads(self.truth_file.read_text())
+        """True angles of both axes, as of a moment after the call (the file is written anew every few milliseconds)."""
+        asked, limit = time.monotonic_ns(), time.monotonic() + 30.0
+        while (told := json.loads(self.truth_file.read_text()))["monotonic_ns"] < asked:
+            assert time.monotonic() < limit, f"{self.truth_file} is written no more"
+            time.sleep(0.002)
         return [math.degrees(told["axis1_rad"]), math.degrees(told["axis2_rad"])]
 
     def inject(self, words: str) -> int:

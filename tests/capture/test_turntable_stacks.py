@@ -42,7 +42,6 @@ def test_dialect_over_tcp(tmp_path, dialect):
     with table_server(tmp_path, "--language", dialect, "--noise", "1") as server, ascii_table(server, dialect) as table:
         table.set(np.radians([12.5, -30.25])).wait(5.0)
         assert np.allclose(np.degrees(table.position), [12.5, -30.25], atol=2e-3)
-        time.sleep(0.02)
         assert np.allclose(server.truth_deg(), [12.5, -30.25], atol=1e-5)
         table.home().wait(5.0)
         assert np.allclose(np.degrees(table.position), [0, 0], atol=2e-3)
