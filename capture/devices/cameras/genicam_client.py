@@ -10,36 +10,26 @@ from capture.devices.camera import (
     CameraError,
     DisconnectedError,
     FeatureValue,
-    FetchTimeoutError,
     Frame,
     GrayImage,
     IncompleteFrameError,
     InUseError,
-    OutOfRangeError,
 )
-from capture.devices.cameras.base import (
-    LOCKED_WHILE_ARMED,
-    OLDER_NAMES,
-    READY_S,
-    DriverCamera,
-    bits_of,
-    is_mosaic_or_gray,
-)
+from capture.devices.cameras.base import bits_of, is_mosaic_or_gray
+from capture.devices.cameras.genicam_camera import GenicamCamera, values_taken
 
 
-class GenicamClientCamera(DriverCamera):
+class GenicamClientCamera(GenicamCamera):
     """What is common to both transports; ``_connect`` and ``_answers`` differ."""
+
+    _refusals = (vg.GenApiError, vg.ParseError)
 
     def __init__(self, driver: str, place: str) -> None:
         super().__init__(driver, place)
-        self._camera: Any = None
         self._stream: Any = None
         self._ns_per_tick = 1.0
 
     def _connect(self) -> Any:
-        raise NotImplementedError
-
-    def _answers(self) -> bool:
         raise NotImplementedError
 
     def open(self) -> None:
@@ -57,86 +47,51 @@ class GenicamClientCamera(DriverCamera):
                 self._camera.close()
         self._camera = None
 
-    def get(self, name: str) -> FeatureValue:
-        """See ``Camera``."""
-        with self._translated(name):
-            return cast(FeatureValue, self._state(self._found(name)).value)
+    def _node(self, name: str) -> str | None:
+        return None if self._camera.node_info(name) is None else name
 
-    def set(self, name: str, value: FeatureValue) -> None:
-        """See ``Camera``."""
-        found = self._found(name)
-        if self._armed and name in LOCKED_WHILE_ARMED:
-            raise self._locked(name)
-        with self._translated(name):
-            try:
-                self._write(found, value)
-            except (vg.GenApiError, vg.ParseError) as error:
-                if not self._answers():
-                    raise self._gone() from error
-                state = self._state(found)
-                if "W" not in state.access:
-                    raise self._locked(name) from error
-                raise OutOfRangeError(self.address, f"{name} cannot be {value!r}", _range(state)) from error
+    def _value(self, node: str) -> FeatureValue:
+        return cast(FeatureValue, self._camera.feature_state(node).value)
 
-    def _write(self, name: str, value: FeatureValue) -> None:
+    def _write(self, node: str, value: FeatureValue) -> None:
         if isinstance(value, bool):
-            self._camera.set_bool(name, value)
+            self._camera.set_bool(node, value)
         else:
-            self._camera.set(name, str(value))
+            self._camera.set(node, str(value))
 
-    def _found(self, name: str) -> str:
-        """The name by which this camera knows the feature."""
-        if self._camera is None:
-            raise CameraError(self.address, "it is not open", "open it first")
-        with self._translated(name):
-            for candidate in (name, OLDER_NAMES.get(name, name)):
-                if self._camera.node_info(candidate) is not None:
-                    return candidate
-        raise self._unknown(name)
+    def _is_locked(self, node: str, refusal: Exception) -> bool:
+        if not self._answers():
+            raise self._gone() from refusal
+        return "W" not in self._camera.feature_state(node).access
 
-    def _state(self, name: str) -> Any:
-        return self._camera.feature_state(name)
+    def _takes(self, node: str) -> str:
+        state = self._camera.feature_state(node)
+        if state.range is None and not state.enum_entries:
+            return f"it takes a value of kind {state.kind}"
+        limits, step = (None, None) if state.range is None else ((state.range.min, state.range.max), state.range.inc)
+        return values_taken(state.enum_entries, limits, step)
 
-    def arm(self) -> None:
-        """See ``Camera``."""
-        self.disarm()
-        self._note_trigger()
-        pixel_format = str(self.get("PixelFormat"))
+    def _require_format(self, pixel_format: str) -> None:
         if not is_mosaic_or_gray(pixel_format):
             raise CameraError(self.address, f"it sends colour ({pixel_format})", "set PixelFormat to Mono8 or Mono12")
-        with self._translated("arm"):
-            # incomplete ones too, to tell them from images that never came
-            self._stream = self._camera.stream(deliver_incomplete=True)
-            self._stream.__enter__()
-            self._armed = True
-            if self.triggered:
-                self._wait_until_ready()
-        self._drain()
+
+    def _start(self) -> None:
+        # incomplete ones too, to tell them from images that never came
+        self._stream = self._camera.stream(deliver_incomplete=True)
+        self._stream.__enter__()
+
+    def _stop(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.__exit__(None, None, None)
+
+    def _execute(self, command: str) -> None:
+        self._camera.execute(command)
 
     def _wait_until_ready(self) -> None:
-        """Cameras that can tell whether they wait for a trigger are asked."""
         if self._camera.node_info("AcquisitionStatus") is not None:
             self._camera.set_enum("AcquisitionStatusSelector", "FrameTriggerWait")
             self._wait_for(lambda: self._camera.get_bool("AcquisitionStatus"))
-
-    def disarm(self) -> None:
-        """See ``Camera``."""
-        self._armed = False
-        stream, self._stream = self._stream, None
-        if stream is not None:
-            with self._translated("disarm"):
-                stream.__exit__(None, None, None)
-
-    def _execute_trigger(self) -> None:
-        with self._translated("trigger"):
-            self._wait_until_ready()
-            self._camera.execute("TriggerSoftware")
-
-    def _skip_pending(self) -> None:
-        with suppress(FetchTimeoutError):
-            while True:
-                self.fetch(0.0)
-        self.fetch(READY_S)  # its exposure began before the call
 
     def fetch(self, timeout_s: float) -> Frame:
         """See ``Camera``."""
@@ -166,14 +121,8 @@ class GenicamClientCamera(DriverCamera):
         why = f"{missing} packets are missing" if missing else f"status {received.status.value}"
         return self._incomplete(f"image {received.block_id}", why, frame)
 
-    def _no_image(self, timeout_s: float) -> CameraError:
-        if timeout_s > 0.0 and not self._answers():
-            return self._gone()
-        return self._late(timeout_s)
-
     @contextmanager
     def _translated(self, what: str) -> Iterator[None]:
-        """The client's exceptions as ours."""
         try:
             yield
         except vg.GenicamError as error:
@@ -191,13 +140,3 @@ def not_found(address: str, seen: list[str]) -> DisconnectedError:
 def held_by_another(address: str) -> InUseError:
     """Another program controls the camera."""
     return InUseError(address, "another program controls it", "close that program")
-
-
-def _range(state: Any) -> str:
-    """What the feature takes, in words."""
-    if state.enum_entries:
-        return f"it takes {', '.join(state.enum_entries)}"
-    if state.range is not None:
-        step = f" in steps of {state.range.inc:g}" if state.range.inc else ""
-        return f"it takes {state.range.min:g} to {state.range.max:g}{step}"
-    return f"it takes a value of kind {state.kind}"

@@ -18,20 +18,12 @@ from capture.devices.camera import (
     CameraInfo,
     DisconnectedError,
     FeatureValue,
-    FetchTimeoutError,
     Frame,
     InUseError,
-    OutOfRangeError,
+    UnknownFeatureError,
 )
-from capture.devices.cameras.base import (
-    LOCKED_WHILE_ARMED,
-    OLDER_NAMES,
-    READY_S,
-    DriverCamera,
-    bits_of,
-    gray_copy,
-    is_mosaic_or_gray,
-)
+from capture.devices.cameras.base import bits_of, gray_copy, is_mosaic_or_gray
+from capture.devices.cameras.genicam_camera import GenicamCamera, values_taken
 
 _BUFFERS = 8
 # a producer can be loaded once in a process, so its harvester stays until the end
@@ -81,15 +73,16 @@ def _is_held(producers: tuple[str, ...], device: Any) -> bool:
     return (producers, device.serial_number) in _OPEN or device.access_status not in (0, 1)
 
 
-class GentlCamera(DriverCamera):
+class GentlCamera(GenicamCamera):
     """A camera of a GenTL producer."""
+
+    _refusals = (genapi.OutOfRangeException, genapi.InvalidArgumentException, genapi.AccessException, TypeError)
 
     def __init__(self, place: str) -> None:
         super().__init__("gentl", place)
         file, found, serial = place.rpartition("#")
         self._producers = (file,) if found else _producers()
         self._wanted = serial
-        self._acquirer: Any = None
         self._lost_parts = False
 
     def open(self) -> None:
@@ -103,15 +96,15 @@ class GentlCamera(DriverCamera):
             found = f"no producer sees it (producers: {len(self._producers)}, cameras: {', '.join(seen) or 'none'})"
             raise DisconnectedError(self.address, found, "check cable and power, and GENICAM_GENTL64_PATH")
         with self._translated("open"):
-            self._acquirer = harvester.create({"serial_number": self._wanted})
-            self._acquirer.num_buffers = _BUFFERS
-            self._acquirer.add_callback(ImageAcquirer.Events.INCOMPLETE_BUFFER, self._note_lost_parts)
+            self._camera = harvester.create({"serial_number": self._wanted})
+            self._camera.num_buffers = _BUFFERS
+            self._camera.add_callback(ImageAcquirer.Events.INCOMPLETE_BUFFER, self._note_lost_parts)
         self._serial = self._wanted
         _OPEN.add((self._producers, self._serial))
 
     def close(self) -> None:
         """See ``Camera``."""
-        acquirer, self._acquirer = self._acquirer, None
+        acquirer, self._camera = self._camera, None
         self._armed = False
         if acquirer is not None:
             _OPEN.discard((self._producers, self._serial))
@@ -121,78 +114,56 @@ class GentlCamera(DriverCamera):
     def _note_lost_parts(self) -> None:
         self._lost_parts = True
 
-    def get(self, name: str) -> FeatureValue:
-        """See ``Camera``."""
-        node = self._node(name)
-        if node is None:
-            return self.serial
-        with self._translated(name):
-            return cast(FeatureValue, node.value)
-
-    def set(self, name: str, value: FeatureValue) -> None:
-        """See ``Camera``."""
-        node = self._node(name)
-        if node is None or (self._armed and name in LOCKED_WHILE_ARMED):
-            raise self._locked(name)
-        with self._translated(name):
-            try:
-                node.value = value
-            except (genapi.OutOfRangeException, genapi.InvalidArgumentException, TypeError) as error:
-                raise OutOfRangeError(self.address, f"{name} cannot be {value!r}", _range(node)) from error
-            except genapi.AccessException as error:
-                raise self._locked(name) from error
+    @property
+    def _nodes(self) -> Any:
+        return self._camera.remote_device.node_map
 
     def _node(self, name: str) -> Any:
-        """The feature's node; None for the serial number of a camera that tells it to its producer alone."""
-        if self._acquirer is None:
-            raise CameraError(self.address, "it is not open", "open it first")
-        nodes = self._acquirer.remote_device.node_map
-        for candidate in (name, OLDER_NAMES.get(name, name)):
-            if nodes.has_node(candidate):
-                return nodes.get_node(candidate)
-        if name == "DeviceSerialNumber":
-            return None
-        raise self._unknown(name)
+        return self._nodes.get_node(name) if self._nodes.has_node(name) else None
 
-    def arm(self) -> None:
-        """See ``Camera``."""
-        self.disarm()
-        self._note_trigger()
-        pixel_format = str(self.get("PixelFormat"))
+    def get(self, name: str) -> FeatureValue:
+        """See ``Camera``; some cameras tell their serial number to the producer alone."""
+        try:
+            return super().get(name)
+        except UnknownFeatureError:
+            if name != "DeviceSerialNumber":
+                raise
+            return self.serial
+
+    def _value(self, node: Any) -> FeatureValue:
+        return cast(FeatureValue, node.value)
+
+    def _write(self, node: Any, value: FeatureValue) -> None:
+        node.value = value
+
+    def _is_locked(self, node: Any, refusal: Exception) -> bool:
+        return isinstance(refusal, genapi.AccessException)
+
+    def _takes(self, node: Any) -> str:
+        limits = (node.min, node.max) if hasattr(node, "min") else None
+        return values_taken(getattr(node, "symbolics", None), limits, None)
+
+    def _require_format(self, pixel_format: str) -> None:
         if not is_mosaic_or_gray(pixel_format) or pixel_format.endswith(("p", "Packed")):
             advice = "set PixelFormat to Mono8, Mono10, Mono12 or Mono16, not packed"
             raise CameraError(self.address, f"it sends {pixel_format}", advice)
-        with self._translated("arm"):
-            self._acquirer.start()
-            self._armed, self._lost_parts = True, False
-            if self.triggered:
-                self._wait_until_ready()
-        self._drain()
+
+    def _start(self) -> None:
+        self._camera.start()
+        self._lost_parts = False
+
+    def _stop(self) -> None:
+        if self._camera is not None and self._camera.is_acquiring():
+            self._camera.stop()
+
+    def _execute(self, command: str) -> None:
+        self._nodes.get_node(command).execute()
 
     def _wait_until_ready(self) -> None:
-        """Cameras that can tell whether they wait for a trigger are asked."""
-        nodes = self._acquirer.remote_device.node_map
+        nodes = self._nodes
         if nodes.has_node("AcquisitionStatus"):
             nodes.AcquisitionStatusSelector.value = "FrameTriggerWait"
             self._wait_for(lambda: nodes.AcquisitionStatus.value)
-
-    def disarm(self) -> None:
-        """See ``Camera``."""
-        self._armed = False
-        if self._acquirer is not None and self._acquirer.is_acquiring():
-            with self._translated("disarm"):
-                self._acquirer.stop()
-
-    def _execute_trigger(self) -> None:
-        with self._translated("trigger"):
-            self._wait_until_ready()
-            self._acquirer.remote_device.node_map.TriggerSoftware.execute()
-
-    def _skip_pending(self) -> None:
-        with suppress(FetchTimeoutError):
-            while True:
-                self.fetch(1e-3)
-        self.fetch(READY_S)  # its exposure began before the call
 
     def fetch(self, timeout_s: float) -> Frame:
         """See ``Camera``."""
@@ -200,7 +171,7 @@ class GentlCamera(DriverCamera):
         self._lost_parts = False
         with self._translated("fetch"):
             # harvesters takes 0 for "without end"; it gives None after the time and for a buffer with missing parts
-            buffer = self._acquirer.try_fetch(timeout=max(timeout_s, 1e-3))
+            buffer = self._camera.try_fetch(timeout=max(timeout_s, 1e-3))
             if buffer is None:
                 raise self._incomplete("an image", "its number is lost") if self._lost_parts else self._late(timeout_s)
             with buffer:
@@ -213,7 +184,6 @@ class GentlCamera(DriverCamera):
 
     @contextmanager
     def _translated(self, what: str) -> Iterator[None]:
-        """GenICam's exceptions as ours."""
         try:
             yield
         except (gentl.ResourceInUseException, gentl.AccessDeniedException) as error:
@@ -230,12 +200,3 @@ def _time_stamp_ns(buffer: Any) -> int | None:
         return int(buffer.timestamp_ns)
     except gentl.GenericException:  # the device has no clock
         return None
-
-
-def _range(node: Any) -> str:
-    """What the feature takes, in words."""
-    if hasattr(node, "symbolics"):
-        return f"it takes {', '.join(node.symbolics)}"
-    if hasattr(node, "min"):
-        return f"it takes {node.min} to {node.max}"
-    return "give another type of value"

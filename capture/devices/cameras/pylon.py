@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, cast
 
 from capture.devices.camera import (
     CameraError,
@@ -12,16 +12,9 @@ from capture.devices.camera import (
     FeatureValue,
     Frame,
     InUseError,
-    OutOfRangeError,
 )
-from capture.devices.cameras.base import (
-    LOCKED_WHILE_ARMED,
-    OLDER_NAMES,
-    READY_S,
-    DriverCamera,
-    bits_of,
-    is_mosaic_or_gray,
-)
+from capture.devices.cameras.base import READY_S, bits_of, is_mosaic_or_gray
+from capture.devices.cameras.genicam_camera import GenicamCamera, values_taken
 
 with warnings.catch_warnings():
     # SWIG's types have no __module__; where warnings are errors, that one ends the interpreter
@@ -46,13 +39,14 @@ def _info(factory: Any, device: Any) -> CameraInfo:
     return CameraInfo(f"pylon:{serial}", device.GetVendorName(), device.GetModelName(), serial, in_use)
 
 
-class PylonCamera(DriverCamera):
+class PylonCamera(GenicamCamera):
     """A camera of pylon."""
+
+    _refusals = (genicam.OutOfRangeException, genicam.InvalidArgumentException, genicam.AccessException, TypeError)
 
     def __init__(self, place: str) -> None:
         super().__init__("pylon", place)
         self._place = place
-        self._camera: Any = None
         self._class = ""
         self._bits, self._mono = 8, True
 
@@ -94,73 +88,47 @@ class PylonCamera(DriverCamera):
 
     def get(self, name: str) -> FeatureValue:
         """See ``Camera``."""
-        if name == "DeviceSerialNumber":
-            return self.serial
-        with self._translated(name):
-            node = self._node(name)
-            if not _readable(node):
-                raise self._unknown(name)
-            value: FeatureValue = node.Value
-        return value
-
-    def set(self, name: str, value: FeatureValue) -> None:
-        """See ``Camera``."""
-        if self._armed and name in LOCKED_WHILE_ARMED:
-            raise self._locked(name)
-        with self._translated(name):
-            node = self._node(name)
-            try:
-                node.Value = value
-            except (genicam.OutOfRangeException, genicam.InvalidArgumentException, TypeError) as error:
-                raise OutOfRangeError(self.address, f"{name} cannot be {value!r}", _range(node)) from error
-            except genicam.AccessException as error:
-                raise self._locked(name) from error
+        return self.serial if name == "DeviceSerialNumber" else super().get(name)
 
     def _node(self, name: str) -> Any:
-        if self._camera is None:
-            raise CameraError(self.address, "it is not open", "open it first")
-        nodes = self._camera.GetNodeMap()
-        for candidate in (name, OLDER_NAMES.get(name, name)):
-            node = nodes.GetNode(candidate)
-            if node is not None and genicam.IsImplemented(node):
-                return node
-        raise self._unknown(name)
+        node = self._camera.GetNodeMap().GetNode(name)
+        return node if node is not None and genicam.IsImplemented(node) else None
 
-    def arm(self) -> None:
-        """See ``Camera``."""
-        self.disarm()
-        self._note_trigger()
-        pixel_format = str(self.get("PixelFormat"))
+    def _value(self, node: Any) -> FeatureValue:
+        if not _readable(node):
+            raise self._unknown(node.GetNode().GetName())
+        return cast(FeatureValue, node.Value)
+
+    def _write(self, node: Any, value: FeatureValue) -> None:
+        node.Value = value
+
+    def _is_locked(self, node: Any, refusal: Exception) -> bool:
+        return isinstance(refusal, genicam.AccessException)
+
+    def _takes(self, node: Any) -> str:
+        limits = (node.Min, node.Max) if hasattr(node, "Min") else None
+        return values_taken(getattr(node, "Symbolics", None), limits, getattr(node, "Inc", None))
+
+    def _require_format(self, pixel_format: str) -> None:
         self._bits, self._mono = bits_of(pixel_format), is_mosaic_or_gray(pixel_format)
-        with self._translated("arm"):
-            self._camera.StartGrabbing(pylon.GrabStrategy_OneByOne, pylon.GrabLoop_ProvidedByUser)
-            self._armed = True
-            if self._source_armed == "Software":
-                self._wait_until_ready()
-        self._drain()
+
+    def _start(self) -> None:
+        self._camera.StartGrabbing(pylon.GrabStrategy_OneByOne, pylon.GrabLoop_ProvidedByUser)
+
+    def _stop(self) -> None:
+        if self._camera is not None and self._camera.IsGrabbing():
+            self._camera.StopGrabbing()
+
+    def _execute(self, command: str) -> None:
+        self._camera.GetNodeMap().GetNode(command).Execute()
+
+    def _answers(self) -> bool:
+        return not self._camera.IsCameraDeviceRemoved()  # the question takes 2 ms
 
     def _wait_until_ready(self) -> None:
-        if self._camera.CanWaitForFrameTriggerReady():
+        if self._source_armed == "Software" and self._camera.CanWaitForFrameTriggerReady():
             wait_ms = int(1e3 * READY_S)
             self._wait_for(lambda: self._camera.WaitForFrameTriggerReady(wait_ms, pylon.TimeoutHandling_Return))
-
-    def disarm(self) -> None:
-        """See ``Camera``."""
-        self._armed = False
-        if self._camera is not None and self._camera.IsGrabbing():
-            with self._translated("disarm"):
-                self._camera.StopGrabbing()
-
-    def _execute_trigger(self) -> None:
-        with self._translated("trigger"):
-            self._wait_until_ready()
-            self._camera.ExecuteSoftwareTrigger()
-
-    def _skip_pending(self) -> None:
-        with self._translated("trigger"):
-            while (result := self._camera.RetrieveResult(0, pylon.TimeoutHandling_Return)).IsValid():
-                result.Release()
-            self.fetch(READY_S)  # its exposure began before the call
 
     def fetch(self, timeout_s: float) -> Frame:
         """See ``Camera``."""
@@ -185,14 +153,8 @@ class PylonCamera(DriverCamera):
             return frame
         raise self._incomplete(f"image {frame.block_id}", result.ErrorDescription or "no reason given", frame)
 
-    def _no_image(self, timeout_s: float) -> CameraError:
-        if timeout_s > 0.0 and self._camera.IsCameraDeviceRemoved():  # the question takes 2 ms
-            return self._gone()
-        return self._late(timeout_s)
-
     @contextmanager
     def _translated(self, what: str) -> Iterator[None]:
-        """GenICam's exceptions as ours."""
         try:
             yield
         except genicam.GenericException as error:
@@ -206,13 +168,3 @@ class PylonCamera(DriverCamera):
 
 def _readable(node: Any) -> bool:
     return node is not None and bool(genicam.IsReadable(node))
-
-
-def _range(node: Any) -> str:
-    """What the feature takes, in words."""
-    if hasattr(node, "Symbolics"):
-        return f"it takes {', '.join(node.Symbolics)}"
-    if hasattr(node, "Min"):
-        step = f" in steps of {node.Inc}" if hasattr(node, "Inc") else ""
-        return f"it takes {node.Min} to {node.Max}{step}"
-    return "give another type of value"
