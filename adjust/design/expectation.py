@@ -47,7 +47,7 @@ def expect(survey: Survey, start: StartValues) -> Adjustment:
 
 def shared_names(adjustment: Adjustment) -> tuple[ParameterName, ...]:
     """The unknowns that do not belong to one epoch alone."""
-    return tuple(n for n in adjustment.precision.graph.unknowns.by_name if not of_one_epoch(n))
+    return tuple(n for n in adjustment.precision.unknowns.by_name if not of_one_epoch(n))
 
 
 def of_one_epoch(name: ParameterName) -> bool:
@@ -57,7 +57,7 @@ def of_one_epoch(name: ParameterName) -> bool:
 
 def component_names(adjustment: Adjustment, names: tuple[ParameterName, ...]) -> list[tuple[str, str]]:
     """(unknown as people say it, component) of every row of ``precision.joint(names)``."""
-    by_name = adjustment.precision.graph.unknowns.by_name
+    by_name = adjustment.precision.unknowns.by_name
     return [(readable(by_name[n]), c) for n in names for c in by_name[n].components]
 
 

@@ -75,16 +75,10 @@ def relative_pose(adjustment: Adjustment, a: str, b: str) -> tuple[Pose3, FloatA
         raise SurveyError(f"a relative pose of station {a!r} to itself was asked for; name two stations")
     of_a, of_b = _station(adjustment, a), _station(adjustment, b)
     b_from_a = _pose(of_b).inverse() * _pose(of_a)
-    free = [e.name for e in (of_a, of_b) if any(s != "held" for s in e.status)]
-    if not free:
-        return b_from_a, np.zeros((6, 6))
     dim = 3 if rotations_only(adjustment) else 6
-    rows = (6 * np.arange(len(free))[:, None] + np.arange(dim)).ravel()
-    joint = np.asarray(adjustment.precision.joint(free))[np.ix_(rows, rows)]
-    by_a, by_b = np.eye(dim), -b_from_a.inverse().AdjointMap()[:dim, :dim]
-    J = np.hstack([by_a if name == of_a.name else by_b for name in free])
+    J = np.hstack([np.eye(6), -b_from_a.inverse().AdjointMap()])[:dim]
     cov = np.full((6, 6), np.nan)
-    cov[:dim, :dim] = J @ joint @ J.T
+    cov[:dim, :dim] = J @ adjustment.joint([of_a.name, of_b.name]) @ J.T
     if dim == 3:
         b_from_a = Pose3(b_from_a.rotation(), np.full(3, np.nan))
     return b_from_a, cov

@@ -82,18 +82,7 @@ def epoch_state(adjustment: Adjustment) -> EpochState:
     )
     if rotations_only(adjustment):
         values = tuple(Pose3(v.rotation(), np.full(3, np.nan)) for v in values if isinstance(v, Pose3))
-    state = EpochState(tuple(names), values, np.zeros((0, 0)), open_directions(adjustment))
-    starts = np.concatenate([[0], np.cumsum(state.sizes)]).astype(np.int64)
-    cov = np.zeros((int(starts[-1]),) * 2)
-    status = [adjustment.estimates[n].status for n in names]
-    free = [i for i, s in enumerate(status) if any(x != "held" for x in s)]
-    if free:
-        joint = np.asarray(adjustment.precision.joint([names[i] for i in free]))
-        rows = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in free])
-        held = np.concatenate([np.array(status[i]) == "held" for i in free])
-        joint = joint * np.outer(~held, ~held)
-        cov[np.ix_(rows, rows)] = joint
-    return replace(state, cov=cov)
+    return EpochState(tuple(names), values, adjustment.joint(names), open_directions(adjustment))
 
 
 def datum_carriers(adjustment: Adjustment) -> tuple[ParameterName, ...]:

@@ -112,6 +112,13 @@ class Unknowns:
         if names:
             self.held[unknown.key] = tuple(i for i, x in enumerate(unknown.components) if x in names)
 
+    def spread(self, name: ParameterName) -> FloatArray:
+        """Of an unknown, how its tangent moves all components (n, dim) of its parameter; zero rows of held ones."""
+        vector, unknown = self.vectors.get(name), self.by_name[name]
+        out = np.eye(unknown.dim) if vector is None else vector.matrix.copy()
+        out[list(self.held.get(unknown.key, ()))] = 0.0
+        return out
+
     def status(self, key: int | None, treatment: str, dim: int) -> tuple[str, ...]:
         """Per component: the treatment of the whole, or "held"."""
         held = self.held.get(key, ()) if key is not None else ()

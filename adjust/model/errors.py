@@ -2,6 +2,11 @@
 
 import re
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from adjust.diagnosis.diagnosis import Diagnosis
+    from adjust.graph.divergence import Stopped
 
 
 class SurveyError(Exception):
@@ -22,18 +27,18 @@ class IndeterminateError(SurveyError):
 class NotConvergedError(SurveyError):
     """The adjustment did not reach a minimum; the message says what kept moving.
 
-    stopped: where that was (``adjust.graph.divergence.Stopped``), None where it is not known.
+    stopped: where that was, None where it is not known.
     """
 
-    def __init__(self, message: str, stopped: object = None) -> None:
+    def __init__(self, message: str, stopped: "Stopped | None" = None) -> None:
         super().__init__(message)
         self.stopped = stopped
 
 
 class DiagnosedError(SurveyError):
-    """An adjustment that failed, with what explains it (``adjust.diagnosis.diagnosis.Diagnosis``)."""
+    """An adjustment that failed, with what explains it."""
 
-    def __init__(self, message: str, diagnosis: object) -> None:
+    def __init__(self, message: str, diagnosis: "Diagnosis") -> None:
         super().__init__(message)
         self.diagnosis = diagnosis
 

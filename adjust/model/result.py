@@ -3,12 +3,17 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from gtsam import Pose3
 
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
+
+if TYPE_CHECKING:
+    from adjust.diagnosis.diagnosis import Diagnosis
+    from adjust.precision.precision import Covariances
+    from adjust.statistics.result import Decision, VarianceComponents
 
 # ("lens", camera) ("station_from_camera", camera) ("world_from_station", station[, epoch])
 # ("mount_from_station", station) ("world_from_table", table) ("table_geometry", table) ("table_angles", table, epoch)
@@ -189,10 +194,9 @@ class Adjustment:
     max_step: the last step in sigmas of the unknowns. warnings: for people, worst first.
     other_residuals: of all that are not image points, the readings last, also as arrays in ``reading_residuals``.
     precision: gives joint covariances, ``precision.joint([name, ...])``.
-    variance_components: ``adjust.statistics.result.VarianceComponents``, where they were estimated. decisions: the log
-    of the search for gross errors, ``adjust.statistics.result.Decision``. n_screened: image points and other
-    observations that were in use and that this adjustment left out, where that was counted. diagnosis:
-    ``adjust.diagnosis.diagnosis.Diagnosis``, where something does not fit and is explained.
+    variance_components: where they were estimated. decisions: the log of the search for gross errors. n_screened: image
+    points and other observations that were in use and that this adjustment left out, where that was counted. diagnosis:
+    where something does not fit and is explained.
     """
 
     survey: Survey
@@ -211,12 +215,12 @@ class Adjustment:
     max_step: float
     converged: bool
     warnings: tuple[str, ...]
-    precision: Any = None
+    precision: "Covariances"
     reading_residuals: ReadingResiduals | None = None
-    variance_components: Any = None
-    decisions: tuple[Any, ...] = ()
+    variance_components: "VarianceComponents | None" = None
+    decisions: tuple["Decision", ...] = ()
     n_screened: int = 0
-    diagnosis: Any = None
+    diagnosis: "Diagnosis | None" = None
 
     @cached_property
     def other_arrays(self) -> OtherArrays:
@@ -234,6 +238,10 @@ class Adjustment:
             one, r = np.ones(len(readings.used), dtype=np.int64), readings
             parts.append((one, r.used, r.test, r.redundancy, r.standardized))
         return OtherArrays(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+
+    def joint(self, names: Sequence[ParameterName]) -> FloatArray:
+        """Joint covariance (n, n), a priori, of all components of these estimates in this order; zero of held ones."""
+        return self.precision.whole(names, [len(self.estimates[name].components) for name in names])
 
     def __repr__(self) -> str:
         """The key figures in one line."""

@@ -1,11 +1,10 @@
 """The calibrated head and its beacons, out of an adjustment, with their joint covariance."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from gtsam import Pose3
 
-from adjust.frames.unknowns import VectorMap
 from adjust.lenses.models import camera_constants
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, ParameterName
@@ -38,7 +37,8 @@ def head_and_beacons(adjustment: Adjustment, station_id: str, known: Beacons | N
         table_id = str(next(s for s in survey.stations if s.station_id == station_id).table_id)
         names += [("world_from_table", table_id), ("table_geometry", table_id), ("mount_from_station", station_id)]
     points = [("point", p.point_id) for p in survey.points] if known is None else []
-    cov, sizes = _joint(adjustment, [*names, *points], _full_sizes(cameras, table, len(points)))
+    sizes = _full_sizes(cameras, table, len(points))
+    cov = adjustment.precision.whole([*names, *points], sizes)
     p = sum(sizes[: len(names)])
     head = Head(cameras, cov[:p, :p], table)
     if known is not None:
@@ -94,27 +94,3 @@ def _vector(adjustment: Adjustment, name: ParameterName) -> FloatArray:
     if isinstance(value, Pose3):
         raise SurveyError(f"{'/'.join(name)} is a pose where numbers were expected")
     return np.asarray(value, dtype=float)
-
-
-def _joint(
-    adjustment: Adjustment, names: Sequence[ParameterName], sizes: Sequence[int]
-) -> tuple[FloatArray, Sequence[int]]:
-    """Joint covariance with the full components of every parameter; zero where one is held."""
-    unknowns = adjustment.precision.graph.unknowns
-    free = [name for name in names if name in unknowns.by_name]
-    joint = adjustment.precision.joint(free) if free else np.zeros((0, 0))
-    starts = dict(zip(names, np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(int), strict=True))
-    spread = np.zeros((sum(sizes), len(joint)))
-    column = 0
-    for name in free:
-        dim = unknowns.by_name[name].dim
-        full = _full(unknowns.vectors, name, dim)
-        spread[starts[name] : starts[name] + len(full), column : column + dim] = full
-        column += dim
-    return np.asarray(spread @ joint @ spread.T), sizes
-
-
-def _full(vectors: Mapping[ParameterName, VectorMap], name: ParameterName, dim: int) -> FloatArray:
-    """From free components to all of a parameter (n, dim)."""
-    vector = vectors.get(name)
-    return np.eye(dim) if vector is None else vector.matrix

@@ -12,52 +12,44 @@ import numpy as np
 from gtsam import Pose3, Rot3
 from scipy.linalg import block_diag
 
+from adjust.frames.unknowns import Unknowns
 from adjust.graph.assembly import AdjustmentGraph, GraphBuilder, values_of
 from adjust.graph.datum import InnerDatum, datum_rows, in_world, inner_datum, survey_motions
 from adjust.model.errors import SurveyError
 from adjust.model.result import Adjustment, Estimate, ParameterName
 from adjust.model.rewriting import Rewriting
 from adjust.model.survey import Datum, FloatArray, PointParameter, PoseParameter, Survey
-from adjust.precision.precision import Precision, rotations_only
+from adjust.precision.precision import Covariances, Precision, of_solution, rotations_only
 from adjust.precision.s_transformation import STransformation, s_transformation
 
 _ROUNDS, _SETTLED = 20, 1e-13
 
 
 @dataclass(frozen=True, eq=False)
-class TransformedPrecision:
-    """Covariances in the new datum; names as in ``Adjustment.estimates``, stacked with all their free components.
+class TransformedPrecision(Covariances):
+    """Covariances in the new datum.
 
     blocks: per key, how its tangent (dim, dim) turned and grew with the finite motion to the new coordinates.
     """
 
     precision: Precision
-    keys: Mapping[ParameterName, int]
-    dims: Mapping[int, int]
+    unknowns: Unknowns
     transformation: STransformation
     blocks: Mapping[int, FloatArray]
-    held: Mapping[int, tuple[int, ...]]
 
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:
-        """Joint covariance of several unknowns, stacked in this order."""
-        before = self.precision.graph.unknowns.by_name
+        """See :class:`Covariances`."""
+        before, now = self.precision.unknowns.by_name, self.unknowns.by_name
         old = [name for name in names if name in before]
-        keys = [self.keys[name] for name in names]
-        start = np.cumsum([0] + [self.dims[k] for k in keys])
+        keys = [now[name].key for name in names]
+        start = np.cumsum([0] + [now[name].dim for name in names])
         at = [np.arange(start[i], start[i + 1]) for i, name in enumerate(names) if name in before]
         Q = np.zeros((int(start[-1]),) * 2)
         if old:
             index = np.concatenate(at)
-            B = block_diag(*(self.blocks[self.keys[name]] for name in old))
+            B = block_diag(*(self.blocks[now[name].key] for name in old))
             Q[np.ix_(index, index)] = B @ self.precision.joint(old) @ B.T
         return self.transformation.apply(keys, Q)
-
-    def cov(self, name: ParameterName) -> FloatArray:
-        """Covariance of one unknown, zero for components that are held."""
-        Q = np.array(self.joint([name]))
-        held = list(self.held.get(self.keys[name], ()))
-        Q[held], Q[:, held] = 0.0, 0.0
-        return Q
 
 
 def in_datum(result: Adjustment, datum: Datum, reference: Mapping[str, FloatArray] | None = None) -> Adjustment:
@@ -69,11 +61,9 @@ def in_datum(result: Adjustment, datum: Datum, reference: Mapping[str, FloatArra
     """
     if datum.kind != "inner":
         raise SurveyError("a solution can be moved to a datum of kind 'inner' only; to hold points, adjust again")
-    if not isinstance(result.precision, Precision):
-        raise SurveyError("only a solution with its covariances can be moved to another datum; adjust the survey again")
+    precision = of_solution(result)
     if rotations_only(result):
         raise SurveyError("nothing but rotations was measured: there are no coordinates to be moved to another datum")
-    precision = result.precision
     survey = replace(released(result.survey), datum=datum)
     start = values_of(result)
     graph = GraphBuilder(survey, start.lenses).build(start)
@@ -93,11 +83,7 @@ def in_datum(result: Adjustment, datum: Datum, reference: Mapping[str, FloatArra
                 for k, m in motions.items()}  # fmt: skip
 
     transformation = s_transformation(datum_rows(inner.keys, motions), motions, products)
-    by_name = graph.unknowns.by_name
-    new = TransformedPrecision(
-        precision, {n: u.key for n, u in by_name.items()}, {u.key: u.dim for u in by_name.values()}, transformation,
-        blocks, graph.unknowns.held,
-    )  # fmt: skip
+    new = TransformedPrecision(precision, graph.unknowns, transformation, blocks)
     estimates = {name: _moved(graph, estimate, values, new) for name, estimate in result.estimates.items()}
     return replace(
         result, survey=survey, estimates=estimates, precision=new, datum_defect=inner.defect,
@@ -182,14 +168,14 @@ def _moved(graph: AdjustmentGraph, estimate: Estimate, values: gtsam.Values, new
     status = tuple("free" if s == "held" and estimate.name[0] == "point" else s for s in estimate.status)
     held = graph.unknowns.held.get(unknown.key, ())
     status = tuple("held" if i in held else s for i, s in enumerate(status))
+    cov = new.whole([estimate.name], [len(estimate.components)])
     if unknown.kind == "pose":
         free = tuple("free" if s == "held" and i not in held else s for i, s in enumerate(estimate.status))
-        return replace(estimate, value=values.atPose3(unknown.key), cov=new.cov(estimate.name), status=free)
+        return replace(estimate, value=values.atPose3(unknown.key), cov=cov, status=free)
     if unknown.kind == "point":
         x = np.asarray(values.atPoint3(unknown.key))
-        return replace(estimate, value=x, cov=new.cov(estimate.name), status=status)
+        return replace(estimate, value=x, cov=cov, status=status)
     vector = graph.unknowns.vectors.get(estimate.name)
-    if vector is None:
-        return replace(estimate, value=np.asarray(values.atVector(unknown.key)), cov=new.cov(estimate.name))
-    return replace(estimate, value=vector.full(values), cov=vector.matrix @ new.cov(estimate.name) @ vector.matrix.T)
+    value = np.asarray(values.atVector(unknown.key)) if vector is None else vector.full(values)
+    return replace(estimate, value=value, cov=cov)
 

@@ -4,6 +4,7 @@ Redundancy numbers and residual covariances follow Baarda (1968) and Foerstner (
 Q_vv P. For an image point both components are tested together: v' Q_vv^-1 v, chi-square with two degrees of freedom.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,10 +13,13 @@ from typing import TYPE_CHECKING
 import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
+from scipy.linalg import block_diag
 
+from adjust.frames.unknowns import Unknowns
 from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.datum import stacking, survey_motions
 from adjust.graph.solver import Solved
+from adjust.model.errors import SurveyError
 from adjust.model.result import (
     Adjustment,
     GlobalTest,
@@ -65,11 +69,35 @@ def _in_datum(datum: STransformation | None, keys: Sequence[int], Q: FloatArray)
     return Q if datum is None else datum.apply(keys, Q)
 
 
-class Precision:
-    """Covariances of the adjusted unknowns, a priori (sigma0 = 1), in the survey's datum."""
+class Covariances(ABC):
+    """Covariances of the adjusted ``unknowns``, a priori (sigma0 = 1), in the survey's datum."""
+
+    unknowns: Unknowns
+
+    @abstractmethod
+    def joint(self, names: Sequence[ParameterName]) -> FloatArray:
+        """Joint covariance of several unknowns, stacked in this order (of vectors their free components).
+
+        Raises KeyError for a name that is not an unknown.
+        """
+
+    def whole(self, names: Sequence[ParameterName], sizes: Sequence[int]) -> FloatArray:
+        """The same of all components, so many of each of these parameters; zero where one is held."""
+        free = [i for i, name in enumerate(names) if name in self.unknowns.by_name]
+        start = np.cumsum([0, *sizes])
+        out = np.zeros((int(start[-1]),) * 2)
+        if free:
+            at = np.concatenate([np.arange(start[i], start[i + 1]) for i in free])
+            J = block_diag(*(self.unknowns.spread(names[i]) for i in free))
+            out[np.ix_(at, at)] = J @ self.joint([names[i] for i in free]) @ J.T
+        return out
+
+
+class Precision(Covariances):
+    """The same from the tree of a solution, with all that else can be had from it."""
 
     def __init__(self, graph: AdjustmentGraph, solved: Solved) -> None:
-        self.graph, self.solved = graph, solved
+        self.graph, self.solved, self.unknowns = graph, solved, graph.unknowns
         self._rows: dict[ObservationFactor, ObservationRows] = {}
         dims = {key: unknown.dim for key, unknown in graph.unknowns.by_key.items()}
         self.tree = TreeCovariance(solved.tree, dims, solved.leaves)
@@ -136,10 +164,7 @@ class Precision:
         return Q
 
     def joint(self, names: Sequence[ParameterName]) -> FloatArray:
-        """Joint covariance of several unknowns, stacked in this order (of vectors their free components).
-
-        Raises KeyError for a name that is not an unknown.
-        """
+        """See :class:`Covariances`."""
         keys = [self.graph.unknowns.by_name[name].key for name in names]
         below = [(b, hidden) for b in self._hidden if (hidden := [k for k in keys if b.hides(k)])]
         if not below:
@@ -237,6 +262,13 @@ class Precision:
         """Whitened residual (k,), whitened A Q A' (k, k), and the square root information's inverse (k, k)."""
         rows = self.rows(item)
         return rows.e, rows.influence, rows.root
+
+
+def of_solution(adjustment: Adjustment) -> Precision:
+    """The precision of an adjustment from its solution; raises SurveyError where that was moved to another datum."""
+    if not isinstance(adjustment.precision, Precision):
+        raise SurveyError("this solution was moved to another datum; take the one it was moved from")
+    return adjustment.precision
 
 
 def rotations_only(adjustment: Adjustment) -> bool:

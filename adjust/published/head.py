@@ -231,13 +231,7 @@ def _mount_from_camera(adjusted: Adjustment, station: Station, camera_id: str) -
 
 def _joint_sigma(adjusted: Adjustment, names: tuple[ParameterName, ...], J: FloatArray, pose: Pose3) -> FloatArray:
     """(6,) of a motion whose tangent is J times those of the named ones; what is held has none."""
-    free = [i for i, n in enumerate(names) if n in adjusted.precision.graph.unknowns.by_name]
-    if not free:
-        return np.zeros(6)
-    columns = np.concatenate([6 * i + np.arange(6) for i in free])
-    part = J[:, columns]
-    cov = part @ adjusted.precision.joint([names[i] for i in free]) @ part.T
-    return _outside(cov, pose)
+    return _outside(J @ adjusted.joint(names) @ J.T, pose)
 
 
 def _outside(cov: FloatArray, pose: Pose3) -> FloatArray:

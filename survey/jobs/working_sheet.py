@@ -19,6 +19,7 @@ from adjust.model.observations import FrameRef
 from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray
 from adjust.observations.factors import ChainPose
+from adjust.precision.precision import of_solution
 from adjust.testing.distributions import norm
 from survey.project.project import AlignmentTask
 from survey.solution.quantities import SigmaKind, scale_of
@@ -109,7 +110,8 @@ def _sheet(adjustment: Adjustment, task: AlignmentTask, alpha: float, factor: fl
 
 def relative_rotation(adjustment: Adjustment, a: FrameRef, b: FrameRef) -> tuple[Rot3, FloatArray]:
     """The adjusted rotation ``b_from_a`` and its covariance (3, 3), in a."""
-    graph, values = adjustment.precision.graph, adjustment.precision.solved.values
+    precision = of_solution(adjustment)
+    graph, values = precision.graph, precision.solved.values
     u = graph.unknowns
     before = len(u.by_name), len(u.slot_key)
     chain = FrameTree(graph.survey, u).relative(a, b)
@@ -131,7 +133,7 @@ def relative_rotation(adjustment: Adjustment, a: FrameRef, b: FrameRef) -> tuple
     for key, J in jacobians:
         by_key[key] = by_key[key] + J[:3] if key in by_key else J[:3]
     A = np.hstack(list(by_key.values()))
-    Q = adjustment.precision.joint([u.by_key[key].name for key in by_key])
+    Q = precision.joint([u.by_key[key].name for key in by_key])
     return pose.rotation(), np.asarray(A @ Q @ A.T)
 
 

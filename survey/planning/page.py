@@ -96,7 +96,7 @@ def _seen(o: PlanningOutcome) -> Markup:
 
 
 def _sigmas(o: PlanningOutcome) -> Markup:
-    by_name = o.expected.precision.graph.unknowns.by_name
+    by_name = o.expected.precision.unknowns.by_name
     rows = []
     for name in (n for n in by_name if len(n) < 3):
         estimate, unknown = o.expected.estimates[name], by_name[name]

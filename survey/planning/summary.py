@@ -113,7 +113,7 @@ def plan_summary(o: PlanningOutcome) -> dict[str, Any]:
 
 
 def _sigmas(o: PlanningOutcome) -> dict[str, dict[str, float]]:
-    by_name = o.expected.precision.graph.unknowns.by_name
+    by_name = o.expected.precision.unknowns.by_name
     out = {}
     for name, unknown in by_name.items():
         estimate = o.expected.estimates[name]
@@ -231,7 +231,7 @@ def plan_text(o: PlanningOutcome) -> str:
 
 
 def _sigma_lines(o: PlanningOutcome) -> list[str]:
-    by_name = o.expected.precision.graph.unknowns.by_name
+    by_name = o.expected.precision.unknowns.by_name
     out = ["  expected sigmas (a priori)"]
     names = [n for n in by_name if len(n) < 3]
     for name in names[: 4 * _MOST]:

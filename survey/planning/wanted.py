@@ -21,7 +21,7 @@ def wanted_components(expected: Adjustment, patterns: Sequence[str]) -> tuple[Co
     shared = components_of(expected, shared_names(expected))
     if not patterns or EVERYTHING in patterns:
         return shared
-    every = components_of(expected, tuple(expected.precision.graph.unknowns.by_name))
+    every = components_of(expected, tuple(expected.precision.unknowns.by_name))
     chosen: dict[str, Component] = {}
     for pattern in patterns:
         found = [c for c in every if matches(c, pattern, expected.survey)]

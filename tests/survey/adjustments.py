@@ -307,7 +307,7 @@ def _assemble(
     test = GlobalTest(omega, redundancy, 0.05, float(chi2.ppf(0.025, redundancy)), float(chi2.ppf(0.975, redundancy)))
     return Adjustment(
         survey, estimates, images, tuple(others), tuple(groups), n_observations, n_unknowns, 0, redundancy, omega,
-        float(np.sqrt(omega / redundancy)), test, 6, 3e-7, True, warnings,
+        float(np.sqrt(omega / redundancy)), test, 6, 3e-7, True, warnings, None,
     )  # fmt: skip
 
 

@@ -89,7 +89,7 @@ def empty_adjustment() -> Adjustment:
         np.empty(0),
         np.empty(0, dtype=bool),
     )
-    return Adjustment(Survey(), {}, none, (), (), 0, 0, 0, 0, 0.0, float("nan"), None, 0, 0.0, True, ())
+    return Adjustment(Survey(), {}, none, (), (), 0, 0, 0, 0, 0.0, float("nan"), None, 0, 0.0, True, (), None)
 
 
 def test_page_is_well_formed_and_its_links_lead_somewhere(page: str) -> None:

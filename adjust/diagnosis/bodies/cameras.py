@@ -11,7 +11,7 @@ from adjust.diagnosis.bodies.split import split_camera
 from adjust.diagnosis.bodies.targets import motion_text
 from adjust.diagnosis.hypothesis import Hypothesis, LeaveOut, Place
 from adjust.diagnosis.images.maps import TURNED, turned
-from adjust.model.result import Adjustment, Estimate
+from adjust.model.result import Adjustment
 from adjust.model.survey import FloatArray, Survey
 from adjust.spatial.rigid import rotation_log
 from adjust.testing.distributions import chi2
@@ -77,8 +77,9 @@ def _difference(result: Adjustment, camera: str, new: str) -> Difference | None:
         return None
     free = [i for i, status in enumerate(lenses[0].status) if status in ("free", "prior")]
     motion = before.between(after)
-    cov = _joint(result, [*lenses, *poses], [free, free, list(range(6)), list(range(6))])
-    n, A = len(free), motion.inverse().AdjointMap()
+    n, A, full = len(free), motion.inverse().AdjointMap(), len(lenses[0].components)
+    rows = [*free, *(full + i for i in free), *range(2 * full, 2 * full + 12)]
+    cov = result.joint([e.name for e in (*lenses, *poses)])[np.ix_(rows, rows)]
     J = np.zeros((n + 6, 2 * n + 12))
     J[:n, : 2 * n] = np.hstack([-np.eye(n), np.eye(n)])
     J[n:, 2 * n :] = np.hstack([-A, np.eye(6)])
@@ -87,17 +88,6 @@ def _difference(result: Adjustment, camera: str, new: str) -> Difference | None:
     values = [np.asarray(x.value)[free] for x in lenses]
     d = np.concatenate([values[1] - values[0], Pose3.Logmap(motion)])
     return Difference(names, values[0], d, cov * max(1.0, result.sigma0**2), motion)
-
-
-def _joint(result: Adjustment, estimates: Sequence[Estimate], rows: Sequence[Sequence[int]]) -> FloatArray:
-    """Joint covariance of some components of several estimates, zero where they are held."""
-    sizes = [len(r) for r in rows]
-    at = np.cumsum([0, *sizes])
-    out = np.zeros((at[-1], at[-1]))
-    known = [k for k, e in enumerate(estimates) if e.name in result.precision.graph.unknowns.by_name]
-    where = np.concatenate([np.arange(at[k], at[k + 1]) for k in known])
-    out[np.ix_(where, where)] = result.precision.joint([estimates[k].name for k in known])
-    return out
 
 
 def turned_images(survey: Survey, step: Step, epochs: tuple[str, ...]) -> Iterator[Hypothesis]:
