@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from adjust.model.errors import IndeterminateError, NotConvergedError, SurveyError
     from adjust.model.result import Adjustment, Estimate
     from adjust.model.survey import Datum, Survey
-    from adjust.pose_network.session import NetworkSession
     from adjust.precision.other_datum import in_datum
+    from adjust.relay.session import NetworkSession
 
 _PLACES = {
     "AdjustOptions": ("adjust.adjustment", "AdjustOptions"),
@@ -28,7 +28,7 @@ _PLACES = {
     "Estimate": ("adjust.model.result", "Estimate"),
     "IndeterminateError": ("adjust.model.errors", "IndeterminateError"),
     "NotConvergedError": ("adjust.model.errors", "NotConvergedError"),
-    "NetworkSession": ("adjust.pose_network.session", "NetworkSession"),
+    "NetworkSession": ("adjust.relay.session", "NetworkSession"),
     "Survey": ("adjust.model.survey", "Survey"),
     "SurveyError": ("adjust.model.errors", "SurveyError"),
     "in_datum": ("adjust.precision.other_datum", "in_datum"),

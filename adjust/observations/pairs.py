@@ -17,6 +17,7 @@ from gtsam import Pose3, Rot3
 
 from adjust.frames.state import State
 from adjust.frames.unknowns import POSE_COMPONENTS, POSE_UNITS, FrameTree, Unknowns
+from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair, frame_text
 from adjust.model.result import ObservationResidual
 from adjust.model.survey import BoolArray, FloatArray, IntArray, Survey
@@ -92,6 +93,41 @@ def pair_arrays(pairs: Sequence[Pair]) -> PairArrays:
     R = [m.rotation().matrix() if isinstance(m, Pose3) else m.matrix() for m in measured]
     t = [m.translation() if isinstance(m, Pose3) else np.full(3, np.nan) for m in measured]
     return PairArrays(np.array(R).reshape(-1, 3, 3), np.array(t).reshape(-1, 3), cov, np.array([p.used for p in pairs]))
+
+
+def doubtful(pairs: PairArrays) -> BoolArray:
+    """Which pairs (E,) have a covariance that is not finite, symmetric and positive definite, by its correlations."""
+    wrong = np.zeros(len(pairs.used), dtype=np.bool_)
+    for rows, k in ((pairs.is_pose, 6), (~pairs.is_pose, 3)):
+        C = pairs.cov[rows][:, :k, :k]
+        scale = np.sqrt(np.maximum(np.diagonal(C, axis1=1, axis2=2), 1e-300))
+        correlation = C / scale[:, :, None] / scale[:, None, :]
+        finite = np.asarray(np.isfinite(correlation).all(axis=(1, 2)), dtype=np.bool_)
+        whole = np.where(finite[:, None, None], correlation, -1.0)
+        fine = np.asarray(np.linalg.eigvalsh(whole).min(axis=1, initial=1.0) > 1e-12)
+        fine = fine & (np.abs(whole - np.swapaxes(whole, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6)
+        wrong[np.flatnonzero(rows)[~fine]] = True
+    return wrong
+
+
+def checked_arrays(pairs: Sequence[Pair]) -> PairArrays:
+    """Pairs as arrays; raises SurveyError for the first whose covariance cannot be."""
+    for p in pairs:
+        n = 3 if isinstance(p.b_from_a, Rot3) else 6
+        if np.shape(p.cov) != (n, n):
+            raise SurveyError(f"{_said(p)}: its covariance has shape {np.shape(p.cov)}, expected ({n}, {n})")
+    found = pair_arrays(pairs)
+    wrong = np.flatnonzero(doubtful(found) | ~np.array([np.isfinite(p.cov).all() for p in pairs], dtype=np.bool_))
+    if len(wrong):
+        raise SurveyError(
+            f"{_said(pairs[int(wrong[0])])}: its covariance is not symmetric and positive definite; give every "
+            "direction a sigma"
+        )
+    return found
+
+
+def _said(pair: Pair) -> str:
+    return f"pair {pair.pair_id!r} ({frame_text(pair.a)} to {frame_text(pair.b)})"
 
 
 class NoiseCache:

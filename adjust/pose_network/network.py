@@ -12,14 +12,38 @@ from scipy.sparse import coo_array
 from adjust.model.errors import IndeterminateError, SurveyError, listed
 from adjust.model.observations import FrameRef, Pair
 from adjust.model.survey import BoolArray, Datum, FloatArray, IntArray, PoseParameter, Station, Survey, Treatment
-from adjust.observations.pairs import PairArrays
+from adjust.observations.pairs import PairArrays, doubtful
 from adjust.spatial.rigid import nearest_rotation
 
 _FEW = 8
 
 
 @dataclass(frozen=True, eq=False)
-class PoseNetwork:
+class Topology:
+    """Who was measured with whom: pair e joins stations ``a_idx[e]`` and ``b_idx[e]``."""
+
+    station_ids: tuple[str, ...]
+    pair_ids: tuple[str, ...]
+    a_idx: IntArray
+    b_idx: IntArray
+
+    @property
+    def n_stations(self) -> int:
+        """Number of stations."""
+        return len(self.station_ids)
+
+    @property
+    def n_pairs(self) -> int:
+        """Number of measured pairs."""
+        return len(self.pair_ids)
+
+    def ends(self, pair_idx: int) -> tuple[str, str]:
+        """Ids of the two stations of a pair."""
+        return self.station_ids[int(self.a_idx[pair_idx])], self.station_ids[int(self.b_idx[pair_idx])]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseNetwork(Topology):
     """N stations and E measured pairs ``b_from_a``; made by :func:`pose_network`, which checks everything.
 
     rotations (E, 3, 3), translations (E, 3) m, nan where only the rotation was measured. cov: (E, 6, 6) in the tangent
@@ -30,10 +54,6 @@ class PoseNetwork:
     survey: that it is of, None where there is only the network.
     """
 
-    station_ids: tuple[str, ...]
-    pair_ids: tuple[str, ...]
-    a_idx: IntArray
-    b_idx: IntArray
     rotations: FloatArray
     translations: FloatArray
     cov: FloatArray
@@ -44,16 +64,6 @@ class PoseNetwork:
     prior_cov: Mapping[int, FloatArray] = field(default_factory=dict)
     inner: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     survey: Survey | None = None
-
-    @property
-    def n_stations(self) -> int:
-        """Number of stations."""
-        return len(self.station_ids)
-
-    @property
-    def n_pairs(self) -> int:
-        """Number of measured pairs, used or not."""
-        return len(self.pair_ids)
 
     @cached_property
     def arrays(self) -> PairArrays:
@@ -205,25 +215,10 @@ def check_network(network: PoseNetwork) -> None:
     off = np.abs(network.rotations @ np.swapaxes(network.rotations, 1, 2) - np.eye(3)).max(axis=(1, 2))
     bad = ~(off < 1e-6) | ~(np.linalg.det(network.rotations) > 0.0)
     _pairs_where(network, bad, "has a matrix that is no rotation; normalize its quaternion")
-    _check_cov(network)
+    _pairs_where(network, doubtful(network.arrays), "has a covariance that is not symmetric and positive definite")
     free = [i for i in network.held.tolist() if not np.isfinite(network.station_translations[i]).all()]
     if free:
         raise SurveyError(f"station {network.station_ids[free[0]]!r} is held but has no pose")
-
-
-def _check_cov(network: PoseNetwork) -> None:
-    for rows, k in ((network.is_pose, 6), (~network.is_pose, 3)):
-        C = network.cov[rows][:, :k, :k]
-        at = np.flatnonzero(rows)
-        scale = np.sqrt(np.maximum(np.diagonal(C, axis1=1, axis2=2), 1e-300))
-        correlation = C / scale[:, :, None] / scale[:, None, :]
-        fine = np.asarray(np.isfinite(correlation).all(axis=(1, 2)), dtype=np.bool_)
-        whole = np.where(fine[:, None, None], correlation, -1.0)
-        fine = np.asarray(np.linalg.eigvalsh(whole).min(axis=1, initial=1.0) > 1e-12)
-        fine = fine & (np.abs(whole - np.swapaxes(whole, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6)
-        wrong = np.zeros(network.n_pairs, dtype=np.bool_)
-        wrong[at[np.logical_not(fine)]] = True
-        _pairs_where(network, wrong, "has a covariance that is not symmetric and positive definite")
 
 
 def _pairs_where(network: PoseNetwork, wrong: BoolArray, what: str) -> None:

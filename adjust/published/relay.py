@@ -20,7 +20,7 @@ from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.model.survey import FloatArray
 from adjust.pose_network.loops import evaluate_loops
 from adjust.relay.loops import LoopBasis, loop_basis
-from adjust.relay.network import Network
+from adjust.relay.network import MeasuredPairs
 from adjust.spatial.rigid import skew
 from adjust.spatial.rigid_motions import Motions, exp, right_jacobian
 from adjust.spatial.rotation_forms import euler_cov_from_tangent, euler_from_matrix, euler_jacobian, matrix_from_euler
@@ -65,7 +65,7 @@ class PaperSolution:
         return len(self.corrections)
 
 
-def paper_iteration(network: Network, options: PaperOptions = PaperOptions()) -> PaperSolution:
+def paper_iteration(network: MeasuredPairs, options: PaperOptions = PaperOptions()) -> PaperSolution:
     """Iterate the corrections of Euler angles. Raises SurveyError (poses, gimbal lock), NotConvergedError."""
     if network.dim != 3:
         raise SurveyError("the paper's iteration adjusts rotations alone; take the rotation part of the network")
@@ -129,7 +129,7 @@ def adjusted_covariances(found: PaperSolution, options: PaperOptions, cov: Float
     return np.asarray(J @ out @ np.swapaxes(J, -1, -2))
 
 
-def euler_covariances(network: Network) -> FloatArray:
+def euler_covariances(network: MeasuredPairs) -> FloatArray:
     """D (E, 3, 3) rad^2 of the measured Euler angles. Raises SurveyError at gimbal lock."""
     return euler_cov_from_tangent(euler_from_matrix(network.b_from_a.rotation), network.cov)
 

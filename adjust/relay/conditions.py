@@ -27,7 +27,7 @@ from adjust.observations.factors import Jacobians, custom
 from adjust.pose_network.loops import Loops, evaluate_loops
 from adjust.relay.counts import parts
 from adjust.relay.loops import LoopBasis, loop_basis, loop_misclosures
-from adjust.relay.network import Network, gtsam_motion, motions_from_values, prior_factor, station_values
+from adjust.relay.network import MeasuredPairs, gtsam_motion, motions_from_values, prior_factor, station_values
 from adjust.relay.normal_equations import (
     NormalEquations,
     SparseNormals,
@@ -67,7 +67,7 @@ class ConditionAdjustment:
     closure: float
 
 
-def adjust_conditions(network: Network, options: ConditionOptions = ConditionOptions()) -> ConditionAdjustment:
+def adjust_conditions(network: MeasuredPairs, options: ConditionOptions = ConditionOptions()) -> ConditionAdjustment:
     """Adjust by the normal equations of the conditions; any size, connected or not.
 
     Raises NotConvergedError, naming the loop that closes worst.
@@ -94,7 +94,9 @@ def adjust_conditions(network: Network, options: ConditionOptions = ConditionOpt
     )
 
 
-def adjust_condition_factors(network: Network, options: ConditionOptions = ConditionOptions()) -> ConditionAdjustment:
+def adjust_condition_factors(
+    network: MeasuredPairs, options: ConditionOptions = ConditionOptions()
+) -> ConditionAdjustment:
     """The same by GTSAM: a prior per pair and a hard closure factor per loop; for small sets of loops.
 
     Raises SurveyError for more loops than GTSAM eliminates safely, NotConvergedError where they do not close.
@@ -108,7 +110,7 @@ def adjust_condition_factors(network: Network, options: ConditionOptions = Condi
     return ConditionAdjustment(pairs, basis, found.closure)
 
 
-def adjust_loops(network: Network) -> ConditionAdjustment:
+def adjust_loops(network: MeasuredPairs) -> ConditionAdjustment:
     """By GTSAM's graph of priors and hard closures where that is safe, else by the normal equations; any size.
 
     Safe: few enough loops, all of them closed, and redundancy numbers that sum to the equations, which constraints lost
@@ -130,7 +132,7 @@ def adjust_loops(network: Network) -> ConditionAdjustment:
     return adjust_conditions(network)
 
 
-def _loop_kind(network: Network, options: ConditionOptions) -> Literal["shortest", "tree"]:
+def _loop_kind(network: MeasuredPairs, options: ConditionOptions) -> Literal["shortest", "tree"]:
     if options.loops != "auto":
         return options.loops
     top = network.topology
@@ -140,13 +142,15 @@ def _loop_kind(network: Network, options: ConditionOptions) -> Literal["shortest
     return "tree" if dense else "shortest"
 
 
-def _reach(network: Network) -> float:
+def _reach(network: MeasuredPairs) -> float:
     """The longest pair, m."""
     t = network.b_from_a.translation
     return 0.0 if t is None or not len(t) else float(np.linalg.norm(t, axis=1).max())
 
 
-def _linearise(network: Network, basis: LoopBasis, X: Motions) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _linearise(
+    network: MeasuredPairs, basis: LoopBasis, X: Motions
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     w, blocks = evaluate_loops(basis, X)
     r = (network.b_from_a.inverse() @ X).log()
     forward = right_jacobian(r)
@@ -159,13 +163,15 @@ def _normals(basis: LoopBasis, blocks: FloatArray, Q: FloatArray) -> NormalEquat
     return SparseNormals(basis, blocks, Q)
 
 
-def _finish(network: Network, basis: LoopBasis, X: Motions, closure: float, iterations: int) -> ConditionAdjustment:
+def _finish(
+    network: MeasuredPairs, basis: LoopBasis, X: Motions, closure: float, iterations: int
+) -> ConditionAdjustment:
     normals, joint = _precision(network, basis, X)
     cov, total = normals.adjusted_covariances(), network.dim * len(basis)
     return ConditionAdjustment(adjusted_pairs(network, X, cov, total, iterations, joint), basis, closure)
 
 
-def _precision(network: Network, basis: LoopBasis, X: Motions) -> tuple[NormalEquations, Joint]:
+def _precision(network: MeasuredPairs, basis: LoopBasis, X: Motions) -> tuple[NormalEquations, Joint]:
     """Normal equations at the solution, and the joint covariance of chosen pairs.
 
     GTSAM's own joint covariance inverts an information matrix, which pairs that close a loop do not have.
@@ -189,7 +195,7 @@ class _FactorSolution:
 
 
 def _solve_factors(
-    network: Network, basis: LoopBasis, limit: float, max_step: float, max_iterations: int
+    network: MeasuredPairs, basis: LoopBasis, limit: float, max_step: float, max_iterations: int
 ) -> _FactorSolution:
     """Full Gauss-Newton steps until all loops close and nothing moves. Raises SurveyError, NotConvergedError."""
     if len(basis) > MAX_HARD_LOOPS:
@@ -219,7 +225,7 @@ def _solve_factors(
     )
 
 
-def condition_graph(network: Network, basis: LoopBasis) -> gtsam.NonlinearFactorGraph:
+def condition_graph(network: MeasuredPairs, basis: LoopBasis) -> gtsam.NonlinearFactorGraph:
     """Priors on the pairs (keys are their positions) and hard closures of the loops."""
     graph = gtsam.NonlinearFactorGraph()
     for e in range(network.topology.n_pairs):

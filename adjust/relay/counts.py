@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from adjust.model.errors import listed
 from adjust.model.survey import IntArray
 from adjust.pose_network.cycles import loop_labels
-from adjust.relay.network import Topology
+from adjust.pose_network.network import Topology
 
 _NAMED = 12
 

@@ -9,7 +9,8 @@ import numpy as np
 from adjust.model.survey import FloatArray, IntArray
 from adjust.pose_network.cycles import adjacency, breadth_first, forest_loops, shortest_loops
 from adjust.pose_network.loops import Loops, misclosures, walked
-from adjust.relay.network import Network, Topology
+from adjust.pose_network.network import Topology
+from adjust.relay.network import MeasuredPairs
 from adjust.testing.criteria import sidak
 from adjust.testing.distributions import chi2
 
@@ -114,7 +115,7 @@ class LoopMisclosures:
         )
 
 
-def loop_misclosures(network: Network) -> LoopMisclosures:
+def loop_misclosures(network: MeasuredPairs) -> LoopMisclosures:
     """How well each loop closes, from the measured pairs alone."""
     basis = loop_basis(network.topology)
     w, cov = misclosures(basis, network.b_from_a, network.cov)

@@ -14,37 +14,15 @@ from gtsam import Pose3, Rot3
 
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair, frame_text
-from adjust.model.survey import FloatArray, IntArray
+from adjust.model.survey import FloatArray
 from adjust.observations.factors import gaussian
+from adjust.observations.pairs import checked_arrays
+from adjust.pose_network.network import Topology
 from adjust.spatial.rigid_motions import Motions
 
 
 @dataclass(frozen=True, eq=False)
-class Topology:
-    """Who was measured with whom: pair e joins stations ``a_idx[e]`` and ``b_idx[e]``."""
-
-    station_ids: tuple[str, ...]
-    pair_ids: tuple[str, ...]
-    a_idx: IntArray
-    b_idx: IntArray
-
-    @property
-    def n_stations(self) -> int:
-        """Number of stations."""
-        return len(self.station_ids)
-
-    @property
-    def n_pairs(self) -> int:
-        """Number of measured pairs."""
-        return len(self.pair_ids)
-
-    def ends(self, pair_idx: int) -> tuple[str, str]:
-        """Ids of the two stations of a pair."""
-        return self.station_ids[int(self.a_idx[pair_idx])], self.station_ids[int(self.b_idx[pair_idx])]
-
-
-@dataclass(frozen=True, eq=False)
-class Network:
+class MeasuredPairs:
     """Measured pairs ``b_from_a`` with covariances ``cov`` (E, dim, dim); all rotations, or all rigid motions."""
 
     topology: Topology
@@ -76,7 +54,7 @@ def topology(pairs: Iterable[tuple[str, str, str]], stations: Sequence[str] = ()
     return Topology(tuple(index), tuple(row[0] for row in rows), a.copy(), b.copy())
 
 
-def network_from_pairs(pairs: Sequence[Pair], rotations_only: bool = False) -> Network:
+def network_from_pairs(pairs: Sequence[Pair], rotations_only: bool = False) -> MeasuredPairs:
     """The network of the pairs in use; its stations are named as ``kind:id@epoch``.
 
     rotations_only: take of poses their rotation alone, as where some pairs have no translation.
@@ -92,12 +70,11 @@ def network_from_pairs(pairs: Sequence[Pair], rotations_only: bool = False) -> N
             "measure its translation"
         )
     dim = 3 if rotations or rotations_only else 6
+    top, found = topology((p.pair_id, frame_text(p.a), frame_text(p.b)) for p in used), checked_arrays(used)
     # of a pose the rotation comes first in the tangent, and its share of the covariance stands by itself
-    cov = np.array([_checked_covariance(p)[:dim, :dim] for p in used])
-    top = topology((p.pair_id, frame_text(p.a), frame_text(p.b)) for p in used)
-    rotation = np.array([_rotation(p.b_from_a).matrix() for p in used])
-    translation = np.array([p.b_from_a.translation() for p in used if isinstance(p.b_from_a, Pose3)])
-    return Network(top, Motions(rotation, translation if dim == 6 else None), cov)
+    cov = found.cov[:, :dim, :dim]
+    motions = found.motions if dim == 6 else Motions(found.rotations)
+    return MeasuredPairs(top, motions, 0.5 * (cov + np.swapaxes(cov, 1, 2)))
 
 
 def gtsam_motion(motions: Motions, idx: int) -> Rot3 | Pose3:
@@ -127,21 +104,3 @@ def prior_factor(key: int, motion: Rot3 | Pose3, cov: FloatArray) -> gtsam.Nonli
     if isinstance(motion, Rot3):
         return gtsam.PriorFactorRot3(key, motion, gaussian(cov))
     return gtsam.PriorFactorPose3(key, motion, gaussian(cov))
-
-
-def _rotation(motion: Pose3 | Rot3) -> Rot3:
-    return motion if isinstance(motion, Rot3) else motion.rotation()
-
-
-def _checked_covariance(pair: Pair) -> FloatArray:
-    n = 3 if isinstance(pair.b_from_a, Rot3) else 6
-    cov = np.asarray(pair.cov, dtype=float)
-    what = f"pair {pair.pair_id!r} ({frame_text(pair.a)} to {frame_text(pair.b)})"
-    if cov.shape != (n, n):
-        raise SurveyError(f"{what}: its covariance has shape {cov.shape}, expected ({n}, {n})")
-    if not np.allclose(cov, cov.T, rtol=1e-6, atol=0.0) or not np.isfinite(cov).all():
-        raise SurveyError(f"{what}: its covariance is not symmetric and finite; correct it")
-    scale = np.sqrt(np.abs(np.diag(cov)))
-    if not (scale > 0.0).all() or np.linalg.eigvalsh(cov / np.outer(scale, scale)).min() <= 1e-12:
-        raise SurveyError(f"{what}: its covariance is not positive definite; give every direction a sigma")
-    return np.asarray(0.5 * (cov + cov.T))

@@ -8,7 +8,7 @@ import numpy as np
 from adjust.model.result import GlobalTest
 from adjust.model.survey import FloatArray, IntArray
 from adjust.precision.precision import global_test
-from adjust.relay.network import Network
+from adjust.relay.network import MeasuredPairs
 from adjust.spatial.rigid_motions import Motions, right_jacobian_inverse
 from adjust.testing.distributions import chi2
 
@@ -30,7 +30,7 @@ class AdjustedPairs:
     joint: covariance of several adjusted pairs (k dim, k dim), by their positions.
     """
 
-    network: Network
+    network: MeasuredPairs
     b_from_a: Motions
     residual: FloatArray
     cov: FloatArray
@@ -55,7 +55,7 @@ class AdjustedPairs:
 
 
 def adjusted_pairs(
-    network: Network, b_from_a: Motions, cov: FloatArray, redundancy_total: int, iterations: int,
+    network: MeasuredPairs, b_from_a: Motions, cov: FloatArray, redundancy_total: int, iterations: int,
     joint: Joint,
 ) -> AdjustedPairs:  # fmt: skip
     """The statistics that follow from the adjusted pairs and their covariances: Q_vv = Q_ll - Q_adjusted."""

@@ -17,10 +17,11 @@ from adjust.model.observations import FrameRef, Pair, frame_text
 from adjust.model.result import Adjustment, ParameterName
 from adjust.model.survey import FloatArray, PoseParameter, Survey
 from adjust.pose_network.loops import evaluate_loops
+from adjust.pose_network.network import Topology
 from adjust.relay.closed import play
 from adjust.relay.counts import Counts, count
 from adjust.relay.loops import LoopMisclosures, loop_misclosures
-from adjust.relay.network import Network, Topology, topology
+from adjust.relay.network import MeasuredPairs, topology
 from adjust.spatial.rigid_motions import Motions
 from survey.folder.text import natural_key
 from survey.solution.quantities import ARCSEC_PER_RAD
@@ -175,7 +176,7 @@ def pair_loops(survey: Survey) -> LoopMisclosures | None:
         motions.append(given.value or Pose3())
         held = given.treatment == "held" or given.prior_cov is None
         covs.append(np.zeros((dim, dim)) if held else np.asarray(given.prior_cov)[:dim, :dim])
-    network = Network(_tied(ends, links), motion_arrays(motions, dim), np.array(covs))
+    network = MeasuredPairs(_tied(ends, links), motion_arrays(motions, dim), np.array(covs))
     return loop_misclosures(network)
 
 
@@ -282,7 +283,8 @@ def closures_dict(adjustment: Adjustment) -> dict[str, Any]:
         pairs = [by_id[i] for i in closure.pair_ids]
         dim = 6 if all(isinstance(p.b_from_a, Pose3) for p in pairs) else 3
         covs = np.array([np.asarray(p.cov)[:dim, :dim] for p in pairs])
-        loop = loop_misclosures(Network(topology(_ends(pairs)), motion_arrays([p.b_from_a for p in pairs], dim), covs))
+        motions = motion_arrays([p.b_from_a for p in pairs], dim)
+        loop = loop_misclosures(MeasuredPairs(topology(_ends(pairs)), motions, covs))
         w, cov = loop.vector[0], loop.cov[0]
         entry: dict[str, Any] = {"pairs": list(closure.pair_ids), "used": pairs[-1].used}
         entry |= {"sigma_arcsec": ARCSEC_PER_RAD * closure.rotation_sigma, "sigma_mm": 1e3 * closure.translation_sigma}

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from adjust.pose_network import solve_network
 from adjust.pose_network.network import survey_of
 from adjust.pose_network.solve import minimize
+from adjust.precision.precision import global_test
 from adjust.statistics.screened_adjustment import adjust_cleaned
 from survey.interop.networks.g2o import read_g2o_file
 from tests.adjust.chordal import chordal_cost, minimize_chordal
-from tests.adjust.pose_networks import exp6, simulate
+from tests.adjust.pose_networks import exp6, simulate, solve_network
 from tests.benchmarks.networks import batch, gradient, grow
 from tests.data import data_folder
 
@@ -62,7 +62,7 @@ def test_large_networks_reach_the_true_minimum(nx: int, ny: int, capsys: pytest.
     done = batch(nx, ny)
     with capsys.disabled():
         print(f"\n{done}")
-    test = done.solution.global_test(1e-3)
+    test = global_test(done.solution.omega, done.solution.redundancy, 1e-3)
     assert test is not None
     assert test.passed
     assert done.gradient < 1e-6

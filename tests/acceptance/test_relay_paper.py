@@ -12,7 +12,7 @@ from adjust.published.relay import paper_iteration
 from adjust.relay.conditions import MAX_HARD_LOOPS, ConditionOptions, adjust_condition_factors, adjust_conditions
 from adjust.relay.counts import count
 from adjust.relay.loops import loop_misclosures
-from adjust.relay.network import Network, topology
+from adjust.relay.network import MeasuredPairs, topology
 from adjust.spatial.rigid_motions import Motions
 from tests.adjust.relay_monte_carlo import MonteCarloOptions, simulate_complete
 from tests.adjust.relay_networks import ARCMIN, chain_with_chords, complete, differences, grid, simulate, suspects
@@ -110,7 +110,7 @@ def test_the_papers_iteration_takes_at_most_four():
             world.append(rotation(angles) @ world[-1])
         true = np.array([world[b] @ world[a].T for a, b in zip(top.a_idx, top.b_idx, strict=True)])
         angles = Rotation.from_matrix(true).as_euler("ZYX")[:, ::-1] + rng.normal(0, 5 * ARCMIN, (6, 3))
-        network = Network(top, Motions(rotation(angles)), np.broadcast_to(np.eye(3), (6, 3, 3)))
+        network = MeasuredPairs(top, Motions(rotation(angles)), np.broadcast_to(np.eye(3), (6, 3, 3)))
         iterations.append(paper_iteration(network).iterations)
     assert min(iterations) >= 2
     assert max(iterations) <= 4

@@ -29,7 +29,6 @@ from adjust.native import (
 )
 from adjust.native.library import Function
 from adjust.navigation import navigate
-from adjust.pose_network import solve_network
 from adjust.precision.precision import Precision, image_residuals
 from adjust.relay.loops import loop_basis
 from adjust.relay.network import topology
@@ -50,6 +49,7 @@ from tests.adjust.navigation import (
     turned,
     wide_head,
 )
+from tests.adjust.pose_networks import solve_network
 from tests.adjust.terrestrial_networks import measured, polar_network
 from tests.adjust.test_image_reduction import near, warped_stereo
 
@@ -126,7 +126,7 @@ def _images() -> None:
     batch.rows(np.array([0]))
     batch.condensed_rows(np.array([0]), np.ones((1, len(batch.blocks[0].uv), 4)))
     batch.local_from_keys(np.array([0]))
-    solve_network(pose_networks.simulate(3, 2).network).precision.pairs  # noqa: B018  # is computed when asked for
+    solve_network(pose_networks.simulate(3, 2).network).pairs  # noqa: B018  # is computed when asked for
     loop_basis(topology([(a + b, a, b) for a, b in ("AB", "BC", "CA", "CD", "DA")]))
     survey, truth = head_on_table(1, n_cameras=2, n_table_epochs=3, n_free_epochs=2)
     graph, done = h.solved(survey, near(truth))  # nothing to reduce: every block is condensed for itself

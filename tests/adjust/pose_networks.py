@@ -1,12 +1,18 @@
 """Simulated networks of stations, with rotations and noise by SciPy and plain lines."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from gtsam import Pose3, Rot3
 from scipy.spatial.transform import Rotation
 
 from adjust.model.survey import FloatArray
+from adjust.observations.pairs import PairStatistics
 from adjust.pose_network import PoseNetwork, pose_network
+from adjust.pose_network.solve import DEFAULTS, Minimum, NetworkOptions, minimize
+from adjust.precision.precision import Precision
 from adjust.spatial.rigid_motions import Motions, right_jacobian_inverse
 
 
@@ -16,6 +22,86 @@ class Simulated:
     rotations: FloatArray
     translations: FloatArray
     wrong: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A solved network by positions: rotations (N, 3, 3), translations (N, 3) m, and what its precision says."""
+
+    network: PoseNetwork
+    minimum: Minimum
+
+    @property
+    def rotations(self) -> FloatArray:
+        return self.minimum.rotations
+
+    @property
+    def translations(self) -> FloatArray:
+        return self.minimum.translations
+
+    @property
+    def omega(self) -> float:
+        return self.minimum.omega
+
+    @property
+    def iterations(self) -> int:
+        return self.minimum.solved.iterations
+
+    @property
+    def max_step(self) -> float:
+        return self.minimum.solved.max_step
+
+    @property
+    def redundancy(self) -> int:
+        graph, datum = self.minimum.graph, self.minimum.solved.datum
+        priors = sum(len(i.components) for i in graph.singles if i.kind == "prior")
+        n = int(self.network.sizes[self.network.used].sum()) + priors
+        return n - graph.unknowns.n_unknowns + (0 if datum is None else datum.defect)
+
+    @cached_property
+    def precision(self) -> Precision:
+        return Precision(self.minimum.graph, self.minimum.solved)
+
+    @cached_property
+    def pairs(self) -> PairStatistics:
+        return self.precision.pairs.first(self.network.dim)
+
+    @property
+    def world_from_station(self) -> Motions:
+        return Motions(self.rotations, None if self.network.rotation_only else self.translations)
+
+    def joint(self, stations: Sequence[int]) -> FloatArray:
+        """Covariance (k dim, k dim), zero of what is held."""
+        d, k = self.network.dim, len(stations)
+        names = [("world_from_station", self.network.station_ids[i]) for i in stations]
+        rows = (6 * np.arange(k)[:, None] + np.arange(d)).ravel()
+        return self.precision.whole(names, [6] * k)[np.ix_(rows, rows)]
+
+    @cached_property
+    def station_cov(self) -> FloatArray:
+        """Covariances (N, dim, dim) of all stations."""
+        d, by_name = self.network.dim, self.precision.unknowns.by_name
+        names = [("world_from_station", s) for s in self.network.station_ids]
+        keys = np.array([by_name[n].key if n in by_name else -1 for n in names])
+        out = np.zeros((len(keys), d, d))
+        out[keys >= 0] = self.precision.covs(keys[keys >= 0], 6)[:, :d, :d]
+        return out
+
+    def pose(self, station_id: str) -> Pose3:
+        i = self.network.index_of[station_id]
+        return Pose3(Rot3(self.rotations[i]), self.translations[i])
+
+    def relative(self, a_id: str, b_id: str) -> tuple[FloatArray, FloatArray]:
+        """``b_from_a`` (4, 4) and its covariance (dim, dim) in the tangent of a."""
+        d, (a, b) = self.network.dim, (self.network.index_of[i] for i in (a_id, b_id))
+        out = self.pose(b_id).between(self.pose(a_id))
+        J = np.hstack([np.eye(6), -out.inverse().AdjointMap()])[:d].reshape(d, 2, 6)[:, :, :d].reshape(d, 2 * d)
+        return out.matrix(), (J @ self.joint([a, b]) @ J.T if a != b else np.zeros((d, d)))
+
+
+def solve_network(network: PoseNetwork, start=None, options: NetworkOptions = DEFAULTS, progress=None) -> Solved:
+    """From nothing or from a start (N, 3, 3), (N, 3)."""
+    return Solved(network, minimize(network, start, options, progress))
 
 
 def exp6(x: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -6,7 +6,7 @@ import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.observations import FrameRef, Pair
-from adjust.relay.network import Network, topology
+from adjust.relay.network import MeasuredPairs, topology
 from adjust.spatial.rigid_motions import Motions
 
 ARCMIN = np.pi / 180 / 60
@@ -14,7 +14,7 @@ ARCMIN = np.pi / 180 / 60
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    network: Network
+    network: MeasuredPairs
     true: list  # b_from_a
     world: list  # world_from_station
 
@@ -65,7 +65,7 @@ def simulate(top, dim=3, seed=0, noise=1.0):
     true = [world[b].between(world[a]) for a, b in zip(top.a_idx, top.b_idx, strict=True)]
     expmap = Rot3.Expmap if dim == 3 else Pose3.Expmap
     measured = [motion * expmap(e) for motion, e in zip(true, errors, strict=True)]
-    return Simulated(Network(top, motions(measured), cov), true, world)
+    return Simulated(MeasuredPairs(top, motions(measured), cov), true, world)
 
 
 def motions(items):

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.pose_network import NetworkOptions, NetworkSolution, pose_network, solve_network
+from adjust.pose_network import NetworkOptions, pose_network
 from adjust.relay.result import AdjustedPairs, adjusted_pairs
 from adjust.spatial.rigid_motions import Motions
+from tests.adjust.pose_networks import Solved, solve_network
 from tests.adjust.relay_networks import as_gtsam
 
 OPTIONS = NetworkOptions(max_step=1e-9)
@@ -17,7 +18,7 @@ class Parametric:
     """Adjusted pairs, and the stations with their precision."""
 
     pairs: AdjustedPairs
-    solution: NetworkSolution
+    solution: Solved
 
     def pair(self, a_id, b_id):
         """``b_from_a`` of any two stations, measured or not, and its covariance."""
@@ -28,7 +29,7 @@ class Parametric:
         """``world_from_station`` and its covariance in the datum."""
         network = self.solution.network
         i, pose = network.index_of[station_id], self.solution.pose(station_id)
-        return pose if network.dim == 6 else pose.rotation(), self.solution.precision.station_cov[i]
+        return pose if network.dim == 6 else pose.rotation(), self.solution.station_cov[i]
 
 
 def adjust_parametric(network, held=None, inner=False, start=None, options=OPTIONS):
@@ -46,8 +47,7 @@ def adjust_parametric(network, held=None, inner=False, start=None, options=OPTIO
     if start is not None:
         poses = start.rotation, np.zeros((top.n_stations, 3)) if start.translation is None else start.translation
     solution = solve_network(net, poses, options)
-    precision = solution.precision
-    here = precision.world_from_station
+    here = solution.world_from_station
     b_from_a = here[top.b_idx].inverse() @ here[top.a_idx]
     by_b = -b_from_a.inverse().adjoint()
 
@@ -58,8 +58,8 @@ def adjust_parametric(network, held=None, inner=False, start=None, options=OPTIO
             J[row, :, stations.index(top.a_idx[e])] = np.eye(dim)
             J[row, :, stations.index(top.b_idx[e])] = by_b[e]
         J = J.reshape(len(index) * dim, -1)
-        return J @ precision.joint(stations) @ J.T
+        return J @ solution.joint(stations) @ J.T
 
-    cov = precision.pairs.adjusted_cov
+    cov = solution.pairs.adjusted_cov
     pairs = adjusted_pairs(network, b_from_a, cov, solution.redundancy, solution.iterations, joint)
     return Parametric(pairs, solution)

@@ -9,12 +9,12 @@ from adjust.graph.assembly import AdjustmentGraph
 from adjust.graph.pair_normals import PairNormals
 from adjust.graph.solver import damped
 from adjust.native.elimination import clique_pattern
-from adjust.pose_network import solve_network
 from adjust.pose_network.solve import minimize
 from adjust.precision import tree as tree_module
 from adjust.precision.tree import TreeCovariance
 from adjust.spatial.rigid_motions import Motions
 from tests.adjust import pose_networks
+from tests.adjust.pose_networks import solve_network
 
 
 def of_network(seed: int, nx: int = 10) -> AdjustmentGraph:
@@ -124,15 +124,15 @@ def test_one_factor_serves_several_steps_to_the_same_minimum(monkeypatch: pytest
     monkeypatch.setattr("adjust.graph.solver._NEAR", 0.0)
     fresh = solve_network(network)
     assert saved > 0
-    sigmas = np.sqrt(np.diagonal(fresh.precision.station_cov, axis1=1, axis2=2))[:, 3:]
+    sigmas = np.sqrt(np.diagonal(fresh.station_cov, axis1=1, axis2=2))[:, 3:]
     assert np.all(np.abs(kept.translations - fresh.translations) <= 1e-6 * sigmas)
-    np.testing.assert_allclose(kept.precision.station_cov, fresh.precision.station_cov, rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(kept.station_cov, fresh.station_cov, rtol=1e-6, atol=1e-15)
 
 
 def test_covariances_among_sparse_rows_are_those_of_the_whole_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tree_module, "_COLUMNS", 7)  # several passes
     rng = np.random.default_rng(0)
-    tree = solve_network(pose_networks.simulate(12, 4, 3, extra=12).network).precision.of_survey.tree
+    tree = solve_network(pose_networks.simulate(12, 4, 3, extra=12).network).precision.tree
     A = sparse.random_array((40, tree.n), density=0.01, rng=rng, format="csr")
     assert (np.diff(A.indptr) == 0).any()
     found, expected = tree.among(A), A @ (A @ tree.full()).T

@@ -9,7 +9,7 @@ from adjust.model.errors import NotConvergedError, SurveyError
 from adjust.published.relay import ARCSECOND, PaperOptions, loop_equations, paper_iteration
 from adjust.relay.conditions import adjust_conditions
 from adjust.relay.loops import loop_basis
-from adjust.relay.network import Network
+from adjust.relay.network import MeasuredPairs
 from adjust.spatial.rigid_motions import Motions
 from adjust.spatial.rotation_forms import euler_cov_from_tangent, euler_from_matrix
 from tests.adjust.relay_monte_carlo import MonteCarloOptions, adjust_batch, simulate_complete
@@ -35,7 +35,7 @@ def four_cameras(seed, y=None):
     top = complete(4)
     true = np.array([world[b] @ world[a].T for a, b in zip(top.a_idx, top.b_idx, strict=True)])
     angles = Rotation.from_matrix(true).as_euler("ZYX")[:, ::-1] + rng.normal(0, 5 * ARCMIN, (6, 3))
-    return Network(top, Motions(rotation(angles)), np.broadcast_to(np.eye(3) * (5 * ARCMIN) ** 2, (6, 3, 3)))
+    return MeasuredPairs(top, Motions(rotation(angles)), np.broadcast_to(np.eye(3) * (5 * ARCMIN) ** 2, (6, 3, 3)))
 
 
 @pytest.mark.parametrize("equations", [9, 3])

@@ -7,18 +7,20 @@ nothing to its minimum with all variances and tests; time, memory, v'Pv within i
 import argparse
 import resource
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from gtsam import Pose3, Rot3
 
 from adjust.model.observations import FrameRef, Pair
-from adjust.model.survey import FloatArray
-from adjust.pose_network import NetworkSolution, PoseNetwork, pose_network, solve_network
-from adjust.pose_network.session import NetworkSession
+from adjust.model.result import Adjustment
+from adjust.model.survey import FloatArray, Survey
+from adjust.pose_network import PoseNetwork
+from adjust.precision.precision import global_test
+from adjust.relay.session import NetworkSession
 from adjust.spatial.rigid_motions import Motions
-from tests.adjust.pose_networks import network_jacobians, simulate
+from tests.adjust.pose_networks import Solved, network_jacobians, simulate, solve_network
 
 
 def as_pair(network: PoseNetwork, e: int) -> Pair:
@@ -27,13 +29,11 @@ def as_pair(network: PoseNetwork, e: int) -> Pair:
     return Pair(network.pair_ids[e], a, b, Pose3(Rot3(network.rotations[e]), network.translations[e]), network.cov[e])
 
 
-def first_stations(network: PoseNetwork) -> PoseNetwork:
+def first_stations(network: PoseNetwork) -> Survey:
     """The first two stations and the pair between them, the first one held as in the whole."""
-    e = [k for k in range(network.n_pairs) if {network.a_idx[k], network.b_idx[k]} == {0, 1}][:1]
-    first = np.eye(4)
-    first[:3, :3], first[:3, 3] = network.station_rotations[0], network.station_translations[0]
-    return pose_network(network.station_ids[:2], [network.pair_ids[k] for k in e], network.a_idx[e], network.b_idx[e],
-                        network.rotations[e], network.translations[e], network.cov[e], held={0: first})  # fmt: skip
+    whole = network.as_survey
+    pair = next(p for p in whole.pairs if {p.a.frame_id, p.b.frame_id} == set(network.station_ids[:2]))
+    return replace(whole, stations=whole.stations[:2], pairs=(pair,))
 
 
 def additions(network: PoseNetwork) -> list[list[Pair]]:
@@ -46,15 +46,19 @@ def additions(network: PoseNetwork) -> list[list[Pair]]:
     return steps[2:]
 
 
-def difference(
-    poses: tuple[FloatArray, FloatArray], network: PoseNetwork, batch: NetworkSolution
-) -> tuple[float, float]:
+def difference(poses: Mapping[str, Pose3], batch: Solved) -> tuple[float, float]:
     """Largest difference to a batch solution: in m, and in sigmas of the station."""
-    order = np.array([network.index_of[s] for s in batch.network.station_ids])
-    mine = Motions(poses[0][order], poses[1][order])
-    d = (Motions(batch.rotations, batch.translations).inverse() @ mine).log()[1:]
-    sigma = np.sqrt(np.diagonal(batch.precision.station_cov[1:], axis1=1, axis2=2))
+    T = np.array([poses[s].matrix() for s in batch.network.station_ids])
+    mine = Motions(T[:, :3, :3], T[:, :3, 3])
+    free = ~batch.network.constants
+    d = (Motions(batch.rotations, batch.translations).inverse() @ mine).log()[free]
+    sigma = np.sqrt(np.diagonal(batch.station_cov[free], axis1=1, axis2=2))
     return float(np.linalg.norm(d[:, 3:], axis=1).max()), float((np.abs(d) / sigma).max())
+
+
+def adjusted(finished: Adjustment) -> dict[str, Pose3]:
+    """Adjusted ``world_from_station`` by station."""
+    return {n[1]: e.value for n, e in finished.estimates.items() if isinstance(e.value, Pose3)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,15 +101,14 @@ def grow(nx: int, ny: int) -> Grown:
     begin = time.perf_counter()
     batch = solve_network(network)
     batch_s = time.perf_counter() - begin
-    after = difference((finished.rotations, finished.translations), finished.network, batch)
-    return Grown(np.array(ms), difference(present, finished.network, batch), after, finish_s, batch_s)
+    return Grown(np.array(ms), difference(present, batch), difference(adjusted(finished), batch), finish_s, batch_s)
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
     """gradient: largest component over the largest it could be. redundancy_sum: of all redundancy numbers."""
 
-    solution: NetworkSolution
+    solution: Solved
     solve_s: float
     precision_s: float
     gradient: float
@@ -114,9 +117,9 @@ class Batch:
 
     def __str__(self) -> str:
         s = self.solution
-        test = s.global_test(1e-3)
+        test = global_test(s.omega, s.redundancy, 1e-3)
         band = f"{test.lower:.0f} to {test.upper:.0f}" if test else "none"
-        sigma = np.sqrt(np.diagonal(s.precision.station_cov[:, 3:, 3:], axis1=1, axis2=2).max())
+        sigma = np.sqrt(np.diagonal(s.station_cov[:, 3:, 3:], axis1=1, axis2=2).max())
         return (
             f"{s.network.n_stations} stations, {s.network.n_pairs} pairs: solved in {self.solve_s:.1f} s, "
             f"{s.iterations} iterations, v'Pv {s.omega:.2f}, redundancy {s.redundancy}, band {band}, relative gradient "
@@ -131,15 +134,15 @@ def batch(nx: int, ny: int) -> Batch:
     begin = time.perf_counter()
     solution = solve_network(network)
     middle = time.perf_counter()
-    total = float(solution.precision.pairs.redundancy.sum())
+    total = float(solution.pairs.redundancy.sum())
     end = time.perf_counter()
-    if not np.isfinite(solution.precision.station_cov).all():
+    if not np.isfinite(solution.station_cov).all():
         raise ValueError("variances are missing")
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     return Batch(solution, middle - begin, end - middle, gradient(solution), total, memory)
 
 
-def gradient(solution: NetworkSolution) -> float:
+def gradient(solution: Solved) -> float:
     """Largest component of the gradient over the norms of its column and of the residuals, by plain sums."""
     network = solution.network
     r, by_b, by_a, _ = network_jacobians(network, Motions(solution.rotations, solution.translations))

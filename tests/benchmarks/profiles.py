@@ -15,11 +15,11 @@ from adjust.graph.solver import _Loop, solve
 from adjust.observations.images.reduction import PoseReduction
 from adjust.observations.pairs import PairBatch
 from adjust.pose_network import solve as pose_solve
-from adjust.pose_network import solve_network
 from adjust.precision.precision import Precision
 from adjust.precision.tree import TreeCovariance
 from adjust.start import find_start
 from survey.interop.networks.g2o import read_g2o_file
+from tests.adjust.pose_networks import solve_network
 from tests.benchmarks import tables, terrestrial
 from tests.benchmarks.data import calibration, rough_start, survey
 from tests.data import data_folder
@@ -174,8 +174,8 @@ def pose_graphs(names: Sequence[str]) -> str:
         def run(clock: Clock, network: Any = network) -> None:
             fresh = network.with_used(network.used)
             solution = clock.timed("the rest of the solution", solve_network)(fresh)
-            clock.timed("covariances of stations", lambda s: s.precision.station_cov)(solution)
-            clock.timed("the rest of the tests", lambda s: s.precision.pairs)(solution)
+            clock.timed("covariances of stations", lambda s: s.station_cov)(solution)
+            clock.timed("the rest of the tests", lambda s: s.pairs)(solution)
 
         columns[name] = best_of(run, POSE_PARTS)
     return milliseconds(columns)

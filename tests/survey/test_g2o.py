@@ -5,13 +5,12 @@ import numpy as np
 import pytest
 
 from adjust.model.errors import SurveyError
-from adjust.pose_network import solve_network
 from survey.cli import main
 from survey.interop.networks.g2o import read_g2o_file, write_g2o
 from survey.jobs.adjusting.steps import adjust_project
 from survey.jobs.converting import convert_job
 from survey.project import read
-from tests.adjust.pose_networks import simulate
+from tests.adjust.pose_networks import simulate, solve_network
 from tests.data import data_folder
 
 EDGE = "EDGE_SE3:QUAT 0 1 1 2 3 0 0 0.1 1 " + " ".join(["1 0 0 0 0 0", "1 0 0 0 0", "1 0 0 0", "4 0 0", "4 0", "4"])

@@ -3,27 +3,27 @@
 iSAM2 (Kaess et al., IJRR 2012) over native factors, with QR, since its Cholesky refuses long corridors: an addition
 re-eliminates only what it touches, so on corridors the time stays flat however long they are. Where additions keep
 touching a large share of the network (grids, small networks), a batch iteration is cheaper and is used instead.
-:meth:`NetworkSession.finish` ends in batch Gauss-Newton, so that the result equals a batch solution of all the pairs.
+:meth:`NetworkSession.finish` ends in the adjustment of all the pairs.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from gtsam import Pose3, Rot3
 
+from adjust.adjustment import adjust
+from adjust.graph.assembly import StartValues
 from adjust.model.errors import SurveyError
 from adjust.model.observations import Pair
-from adjust.model.survey import FloatArray, PoseParameter, Survey
+from adjust.model.result import Adjustment, ParameterName
+from adjust.model.survey import FloatArray, PoseParameter, Station, Survey
 from adjust.observations.factors import pose_prior_factor
-from adjust.observations.pairs import NoiseCache, native_factor
+from adjust.observations.pairs import NoiseCache, checked_arrays, native_factor, pair_arrays
 from adjust.pose_network.from_survey import network_from_survey
-from adjust.pose_network.growth import Batch, Growth, Tree, moved_over
-from adjust.pose_network.network import PoseNetwork, pose_network
-from adjust.pose_network.solution import NetworkSolution, as_solution, solve_network
-from adjust.pose_network.solve import DEFAULTS, NetworkOptions, minimize
-from adjust.spatial.rigid import rigid
+from adjust.pose_network.network import PoseNetwork
+from adjust.relay.growth import Batch, Growth, Tree, moved_over
 
 _SHARE = 0.3
 _WINDOW = 20
@@ -62,72 +62,59 @@ class Addition:
     touched: int
 
 
-@dataclass(eq=False)
-class _Grown:
-    """Arrays that grow: one entry a pair."""
-
-    ids: list[str] = field(default_factory=list)
-    a: list[int] = field(default_factory=list)
-    b: list[int] = field(default_factory=list)
-    rotations: list[FloatArray] = field(default_factory=list)
-    translations: list[FloatArray] = field(default_factory=list)
-    cov: list[FloatArray] = field(default_factory=list)
-    factor: list[int] = field(default_factory=list)
-
-
 class NetworkSession:
-    """A solved network that takes additions; not a value, but the state of one piece of work."""
+    """An adjusted network that takes additions; not a value, but the state of one piece of work."""
 
-    def __init__(
-        self, network: Survey | PoseNetwork | NetworkSolution, options: SessionOptions = SessionOptions(),
-        solve: NetworkOptions = DEFAULTS,
-    ) -> None:  # fmt: skip
-        """network: fixed stations and pairs of poses between them, solved here where they are not.
+    def __init__(self, network: Survey | Adjustment, options: SessionOptions = SessionOptions()) -> None:
+        """network: fixed stations and pairs of poses between them, adjusted here where it is not.
 
         Raises SurveyError for a survey of anything else, and for rotations alone.
         """
-        if isinstance(network, Survey):
-            network = network_from_survey(network)
-        solution = network if isinstance(network, NetworkSolution) else solve_network(network, options=solve)
-        self.options, self.solve_options = options, solve
-        self._base = solution.network
-        if self._base.rotation_only:
+        survey = network if isinstance(network, Survey) else network.survey
+        if not survey.is_pose_network:
+            raise SurveyError("sessions take fixed stations and pairs between them; adjust the survey as a whole")
+        base = network_from_survey(survey)
+        if base.rotation_only:
             raise SurveyError("sessions take networks of poses; solve a network of rotations as a whole")
-        self._ids = list(self._base.station_ids)
-        self._index = dict(self._base.index_of)
-        self._pair_ids = set(self._base.pair_ids)
-        self._grown = _Grown()
+        self.options, self._survey = options, survey
+        self._ids = list(base.station_ids)
+        self._index = dict(base.index_of)
+        self._added: list[Pair] = []
+        self._removed: set[str] = set()
+        self._pair_ids = set(base.pair_ids)
+        adjusted = adjust(self.survey()) if isinstance(network, Survey) else network
         self._noise = NoiseCache()
         self._neighbours: list[list[int]] = [[] for _ in self._ids]
-        used = self._base.used
-        for a, b in zip(self._base.a_idx[used].tolist(), self._base.b_idx[used].tolist(), strict=True):
-            self._neighbours[a].append(b)
-            self._neighbours[b].append(a)
-        self._constant = {int(i): solution.pose(self._ids[i]) for i in np.flatnonzero(self._base.constants)}
-        self._removed: set[str] = set()
+        poses = [adjusted.estimates["world_from_station", s].value for s in self._ids]
+        self._last = {i: p for i, p in enumerate(poses) if isinstance(p, Pose3)}
+        self._constant = {i: self._last[i] for i in np.flatnonzero(base.constants).tolist()}
         self._shares: list[float] = []
         self._switched_at = 0
-        self._restart(solution)
+        self._factor_of: dict[str, int] = {}
+        self._growth: Growth = Tree(options.relinearize, options.wildfire, options.section)
+        self._begin(base)
 
-    def _restart(self, solution: NetworkSolution) -> None:
-        """A new tree at a solution."""
-        network = solution.network
-        R, t = solution.rotations, solution.translations
-        self._last = {i: Pose3(Rot3(R[i]), t[i]) for i in range(network.n_stations)}
-        graph, values, self._factor_of = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}
+    def _begin(self, network: PoseNetwork) -> None:
+        """The tree of what is known."""
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for i, cov in network.prior_cov.items():
             mean = Pose3(Rot3(network.station_rotations[i]), network.station_translations[i])
             graph.push_back(pose_prior_factor(PoseParameter(mean, "prior", cov), i))
         poses, W = network.arrays.poses, network.arrays.whitening
         for e in np.flatnonzero(network.used).tolist():
-            factor = self._native(int(network.a_idx[e]), int(network.b_idx[e]), poses[e], W[e])
+            factor = self._factor(int(network.a_idx[e]), int(network.b_idx[e]), poses[e], W[e])
             if factor is not None:
                 self._factor_of[network.pair_ids[e]] = graph.size()
                 graph.push_back(factor)
         for i in np.flatnonzero(~network.constants).tolist():
             values.insert(i, self._last[i])
-        self._growth: Growth = Tree(self.options.relinearize, self.options.wildfire, self.options.section)
         self._growth.update(graph, values)
+
+    def _factor(self, a: int, b: int, b_from_a: Pose3, W: FloatArray) -> gtsam.NonlinearFactor | None:
+        """Of a pair, which makes its ends neighbours; None between held stations."""
+        self._neighbours[a].append(b)
+        self._neighbours[b].append(a)
+        return native_factor(self._constant.get(a, a), self._constant.get(b, b), b_from_a, W, self._noise)
 
     @property
     def n_stations(self) -> int:
@@ -155,12 +142,14 @@ class NetworkSession:
             self._neighbours.append([])
             values.insert(self._index[station], start[station])
             self._last[self._index[station]] = start[station]
-        kept = []
-        for pair in pairs:
-            factor = self._take(pair)
+        kept, arrays = list[Pair](), pair_arrays(pairs)
+        for pair, b_from_a, W in zip(pairs, arrays.poses, arrays.whitening, strict=True):
+            factor = self._factor(self._index[pair.a.frame_id], self._index[pair.b.frame_id], b_from_a, W)
             if factor is not None:
                 graph.push_back(factor)
                 kept.append(pair)
+        self._added += pairs
+        self._pair_ids |= {pair.pair_id for pair in pairs}
         positions, touched = self._growth.update(graph, values)
         self._factor_of |= {pair.pair_id: n for pair, n in zip(kept, positions, strict=True)}
         self._choose(touched)
@@ -178,8 +167,7 @@ class NetworkSession:
             fresh.add(pair.pair_id)
             if pair.a.kind != "station" or pair.b.kind != "station" or pair.a.frame_id == pair.b.frame_id:
                 raise SurveyError(f"pair {pair.pair_id!r} does not join two stations")
-            if not np.isfinite(pair.cov).all() or np.linalg.eigvalsh(pair.cov).min() <= 0.0:
-                raise SurveyError(f"pair {pair.pair_id!r} has a covariance that is not symmetric and positive definite")
+        checked_arrays(pairs)
         ordered = sorted((p for p in pairs if isinstance(p.b_from_a, Pose3)), key=lambda p: float(np.trace(p.cov)))
         start: dict[str, Pose3] = {}
         while True:
@@ -206,37 +194,6 @@ class NetworkSession:
 
     def _pose_of(self, station: str, start: dict[str, Pose3]) -> Pose3:
         return start[station] if station in start else self.estimate(station)
-
-    def _take(self, pair: Pair) -> gtsam.NonlinearFactor | None:
-        """Note a pair down and make its factor (None between held stations)."""
-        a, b = self._index[pair.a.frame_id], self._index[pair.b.frame_id]
-        g, k = self._grown, len(pair.cov)
-        cov = np.zeros((6, 6))
-        cov[:k, :k] = pair.cov
-        measured = pair.b_from_a
-        full = isinstance(measured, Pose3)
-        g.ids.append(pair.pair_id)
-        g.a.append(a)
-        g.b.append(b)
-        g.rotations.append(measured.rotation().matrix() if isinstance(measured, Pose3) else measured.matrix())
-        g.translations.append(measured.translation() if isinstance(measured, Pose3) else np.full(3, np.nan))
-        if not full:
-            cov[3:, 3:] = np.diag([np.inf] * 3)
-        g.cov.append(cov)
-        self._pair_ids.add(pair.pair_id)
-        self._neighbours[a].append(b)
-        self._neighbours[b].append(a)
-        return self._factor(a, b, measured, pair.cov)
-
-    def _factor(self, a: int, b: int, measured: Pose3 | Rot3, cov: FloatArray) -> gtsam.NonlinearFactor | None:
-        k = len(cov)
-        info = np.linalg.inv(cov)
-        W = np.zeros((6, 6))
-        W[:k, :k] = np.linalg.cholesky(0.5 * (info + info.T)).T
-        return self._native(a, b, measured if isinstance(measured, Pose3) else Pose3(measured, np.zeros(3)), W)
-
-    def _native(self, a: int, b: int, b_from_a: Pose3, W: FloatArray) -> gtsam.NonlinearFactor | None:
-        return native_factor(self._constant.get(a, a), self._constant.get(b, b), b_from_a, W, self._noise)
 
     def _moved(self, ends: list[int], new: set[int]) -> dict[str, tuple[float, float]]:
         """Stations that moved since last asked, found by spreading from the ends of the added pairs."""
@@ -294,36 +251,20 @@ class NetworkSession:
         self._factor_of = {pair: table[n] for pair, n in self._factor_of.items()}
         self._growth, self._shares, self._switched_at = growth, [], len(self._ids)
 
-    def network(self) -> PoseNetwork:
-        """The whole network as it stands."""
-        base, g = self._base, self._grown
-        start = {i: rigid(base.station_rotations[i], base.station_translations[i]) for i in range(base.n_stations)
-                 if np.isfinite(base.station_translations[i]).all()}  # fmt: skip
-        ids = [*base.pair_ids, *g.ids]
-        used = np.array([*base.used.tolist(), *[True] * len(g.ids)]) & ~np.isin(ids, sorted(self._removed))
-        translations = np.concatenate([base.translations, np.array(g.translations).reshape(-1, 3)])
-        cov = np.nan_to_num(np.concatenate([base.cov, np.array(g.cov).reshape(-1, 6, 6)]), posinf=0.0)
-        return pose_network(
-            self._ids, ids, np.concatenate([base.a_idx, np.array(g.a, dtype=np.int64)]),
-            np.concatenate([base.b_idx, np.array(g.b, dtype=np.int64)]),
-            np.concatenate([base.rotations, np.array(g.rotations).reshape(-1, 3, 3)]), translations, cov,
-            held={int(i): start[int(i)] for i in base.held}, start=start,
-            prior={i: (start[i], c) for i, c in base.prior_cov.items()},
-            inner=base.inner.tolist() if base.anchor is not None else None, used=used,
+    def survey(self) -> Survey:
+        """All pairs and the stations that they reach, as they stand."""
+        pairs, given = (*self._survey.pairs, *self._added), {s.station_id: s for s in self._survey.stations}
+        return replace(
+            self._survey, stations=tuple(given.get(s, Station(s)) for s in self._ids),
+            pairs=tuple(replace(p, used=False) if p.pair_id in self._removed else p for p in pairs),
         )  # fmt: skip
 
-    def poses(self) -> tuple[FloatArray, FloatArray]:
-        """Present rotations (N, 3, 3) and translations (N, 3) of all stations."""
-        n = len(self._ids)
-        R, t = np.empty((n, 3, 3)), np.empty((n, 3))
-        rows = gtsam.utilities.extractPose3(self._growth.values())
-        free = np.array([i for i in range(n) if i not in self._constant], dtype=np.int64)
-        R[free], t[free] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
-        for i, pose in self._constant.items():
-            R[i], t[i] = pose.rotation().matrix(), pose.translation()
-        return R, t
+    def poses(self) -> dict[str, Pose3]:
+        """Present ``world_from_station`` of all stations."""
+        values = self._growth.values()
+        return {s: self._constant[i] if i in self._constant else values.atPose3(i) for i, s in enumerate(self._ids)}
 
-    def finish(self) -> NetworkSolution:
-        """The solution of all pairs: batch Gauss-Newton from the present estimates to the minimum."""
-        network = self.network()
-        return as_solution(network, minimize(network, self.poses(), self.solve_options))
+    def finish(self) -> Adjustment:
+        """The adjustment of all pairs, from the present estimates to the minimum, with its precision."""
+        poses: dict[ParameterName, Pose3] = {("world_from_station", s): p for s, p in self.poses().items()}
+        return adjust(self.survey(), StartValues({}, poses, {}))
